@@ -1,0 +1,35 @@
+# Every target sets up what it needs: Python 3.12, uv, a virtual environment, the pinned packages.
+VENV  ?= .venv
+PY    := $(VENV)/bin/python
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test test-fast check setup lock format clean
+
+setup: $(STAMP)
+
+$(STAMP): requirements.lock pyproject.toml scripts/setup.sh
+	@bash scripts/setup.sh $(VENV)
+	@touch $@
+
+demo: $(STAMP)
+	@$(VENV)/bin/v2p demo
+
+test: $(STAMP)
+	@$(PY) -m pytest -q
+
+test-fast: $(STAMP)
+	@$(PY) -m pytest -q -m "not slow and not gpu and not live_llm"
+
+check: $(STAMP)
+	@$(VENV)/bin/ruff check .
+	@$(VENV)/bin/ruff format --check .
+	@$(VENV)/bin/pyright --pythonpath $(PY)
+
+format: $(STAMP)
+	@$(VENV)/bin/ruff check --fix . && $(VENV)/bin/ruff format .
+
+lock: $(STAMP)
+	@uv pip compile pyproject.toml --extra dev --extra vlm --python-version 3.12 --generate-hashes --no-header --no-emit-index-url -o requirements.lock
+
+clean:
+	rm -rf $(VENV) outputs

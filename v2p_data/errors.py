@@ -1,0 +1,32 @@
+"""The errors a user can do something about. Anything else is a bug and keeps its traceback."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class V2PError(Exception):
+    """Bad input or a bad setting: one clear sentence for the user, exit code 2."""
+
+
+class ItemRejectedError(V2PError):
+    """One item (a video, an episode) cannot go on; the others can.
+
+    Args:
+        reason: slug that the report groups by, such as `camera_moves`.
+        detail: one sentence for a person.
+        value: the number that decided it, where there is one.
+    """
+
+    def __init__(self, reason: str, detail: str, value: float | None = None) -> None:
+        super().__init__(detail)
+        self.reason = reason
+        self.detail = detail
+        self.value = value
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return ` Did you mean 'x'? Known: ...` for an unknown word, to be appended to a message."""
+    names = sorted(known)
+    close = difflib.get_close_matches(word, names, n=1)
+    hint = f" Did you mean '{close[0]}'?" if close else ""
+    return f"{hint} Known: {', '.join(names)}."
