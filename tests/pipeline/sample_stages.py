@@ -1,0 +1,31 @@
+"""Stages small enough to read at a glance; a module of its own because workers must be able to import it."""
+
+import os
+import signal
+from dataclasses import dataclass
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.pipeline.runner import Stage
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    text: str = "a"
+    trouble: str = ""
+
+
+def make_text(config, inputs, out, runtime):
+    if config.trouble == "reject":
+        raise ItemRejectedError("too_dull", "the text is too dull", 0.1)
+    if config.trouble == "raise":
+        raise RuntimeError("boom")
+    if config.trouble == "crash":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    before = "".join((folder / "text").read_text() for folder in inputs.values())
+    (out / "text").write_text(before + config.text)
+    return {"letters": len(before + config.text)}
+
+
+def chain(first: Recipe, second: Recipe, item: str = "clip") -> Stage:
+    one = Stage(name="one", item=item, config=first, make=make_text)
+    return Stage(name="two", item=item, config=second, inputs={"one": one}, make=make_text)

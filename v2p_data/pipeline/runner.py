@@ -1,0 +1,208 @@
+"""Run stages: what is complete is kept, what is missing is made, what failed blocks only what needs it.
+
+Jobs run in worker processes, so that a crash in a decoder or a simulator is that job's own result.
+"""
+
+import logging
+import shutil
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.pipeline.artifact import (
+    Record,
+    commit_folder,
+    provenance,
+    read_record,
+    rejection,
+    write_record,
+)
+from v2p_data.pipeline.fingerprint import canonical, fingerprint
+
+logger = logging.getLogger(__name__)
+
+Status = Literal["kept", "made", "rejected", "failed", "blocked"]
+Progress = Callable[[float, str], None]
+"""Called with the share that is done (0 to 1) and a few words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Runtime:
+    """How a stage runs; never part of what its result is."""
+
+    root: Path
+    device: str = "cpu"
+    num_threads: int = 1
+    """Threads one job may use."""
+    workers: int = 1
+    """Jobs at the same time."""
+    progress: Progress = field(default=lambda share, words: None)
+
+
+Make = Callable[[Any, Mapping[str, Path], Path, Runtime], dict[str, Any] | None]
+"""`make(config, inputs, out, runtime)` fills the folder `out` and returns counts for the record."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One result to be had: its recipe, its inputs and the function that makes it."""
+
+    name: str
+    item: str
+    config: Any
+    inputs: Mapping[str, "Stage"] = field(default_factory=dict[str, "Stage"])
+    sources: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Digests of outside files that the result depends on."""
+    version: int = 1
+    """Raised by hand when the code means something new; a hash over the recipe does not see code."""
+    make: Make
+    resumes: bool = False
+    """The function goes on in a half-finished folder; otherwise it starts anew."""
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        return {
+            "stage": self.name,
+            "item": self.item,
+            "version": self.version,
+            "config": canonical(self.config),
+            "inputs": {k: s.folder_name for k, s in sorted(self.inputs.items())},
+            "sources": dict(sorted(self.sources.items())),
+        }
+
+    @property
+    def fingerprint(self) -> str:
+        return fingerprint(self.recipe)
+
+    @property
+    def folder_name(self) -> str:
+        return f"{self.item}-{self.fingerprint}"
+
+    def folder(self, root: Path) -> Path:
+        """Return where the result lies under `root`."""
+        return root / self.name / self.folder_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of one stage."""
+
+    stage: str
+    item: str
+    status: Status
+    folder: Path
+    seconds: float = 0.0
+    reason: str = ""
+    detail: str = ""
+
+    @property
+    def is_usable(self) -> bool:
+        return self.status in ("kept", "made")
+
+
+def stored_outcome(stage: Stage, root: Path) -> Outcome | None:
+    """Return the outcome of a complete stage, None if it has still to run."""
+    folder = stage.folder(root)
+    record = read_record(folder)
+    if record is None:
+        return None
+    if record.rejected:
+        return Outcome(
+            stage=stage.name,
+            item=stage.item,
+            status="rejected",
+            folder=folder,
+            seconds=record.seconds,
+            reason=str(record.rejected["reason"]),
+            detail=str(record.rejected["detail"]),
+        )
+    return Outcome(
+        stage=stage.name, item=stage.item, status="kept", folder=folder, seconds=record.seconds
+    )
+
+
+def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
+    """Make one result whose inputs are complete, and write its record last.
+
+    A rejected item gets a folder with a record too, so that running again does not try it again.
+    """
+    folder = stage.folder(runtime.root)
+    partial = folder.with_name(folder.name + ".partial")
+    if partial.exists() and not stage.resumes:
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True, exist_ok=True)
+    inputs = {name: source.folder(runtime.root) for name, source in stage.inputs.items()}
+    started = time.monotonic()
+    rejected: dict[str, Any] | None = None
+    counts: dict[str, Any] = {}
+    status: Status = "made"
+    reason = detail = ""
+    try:
+        counts = stage.make(stage.config, inputs, partial, runtime) or {}
+    except ItemRejectedError as error:
+        rejected = rejection(error)
+        status, reason, detail = "rejected", error.reason, error.detail
+    except V2PError as error:
+        return Outcome(
+            stage=stage.name, item=stage.item, status="failed", folder=folder,
+            seconds=time.monotonic() - started, reason="error", detail=str(error),
+        )  # fmt: skip
+    except Exception as error:
+        (partial / "traceback.txt").write_text(traceback.format_exc())
+        logger.exception("%s of %s failed", stage.name, stage.item)
+        return Outcome(
+            stage=stage.name, item=stage.item, status="failed", folder=folder,
+            seconds=time.monotonic() - started, reason=type(error).__name__,
+            detail=f"{error} (traceback in {partial / 'traceback.txt'})",
+        )  # fmt: skip
+    seconds = time.monotonic() - started
+    write_record(
+        partial,
+        Record(
+            stage=stage.name,
+            item=stage.item,
+            version=stage.version,
+            fingerprint=stage.fingerprint,
+            recipe=stage.recipe,
+            inputs={name: source.folder_name for name, source in stage.inputs.items()},
+            seconds=round(seconds, 2),
+            rejected=rejected,
+            counts=counts,
+            provenance=provenance(),
+        ),
+    )
+    commit_folder(partial, folder)
+    return Outcome(
+        stage=stage.name, item=stage.item, status=status, folder=folder,
+        seconds=seconds, reason=reason, detail=detail,
+    )  # fmt: skip
+
+
+def in_order(stages: Sequence[Stage]) -> Iterator[Stage]:
+    """Yield the stages and everything they need, each once, inputs before what needs them."""
+    seen: set[tuple[str, str]] = set()
+
+    def visit(stage: Stage) -> Iterator[Stage]:
+        key = (stage.name, stage.folder_name)
+        if key in seen:
+            return
+        seen.add(key)
+        for needed in stage.inputs.values():
+            yield from visit(needed)
+        yield stage
+
+    for stage in stages:
+        yield from visit(stage)
+
+
+def blocked_by(stage: Stage, outcomes: Mapping[tuple[str, str], Outcome]) -> Outcome | None:
+    """Return the outcome that keeps this stage from running, if there is one."""
+    for needed in stage.inputs.values():
+        outcome = outcomes.get((needed.name, needed.folder_name))
+        if outcome is not None and not outcome.is_usable:
+            return outcome
+    return None

@@ -1,0 +1,262 @@
+"""Worker processes that make stages, each job isolated from the others and from the caller.
+
+A worker that crashes (segmentation fault, out of memory) fails its job only and is replaced. Workers end
+when their parent is gone, however it went, so that a killed run leaves nothing that writes.
+"""
+
+import contextlib
+import fcntl
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, Literal, TextIO
+
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.runner import (
+    Outcome,
+    Runtime,
+    Stage,
+    blocked_by,
+    in_order,
+    make_stage,
+    stored_outcome,
+)
+
+PARENT_POLL_S = 0.5
+PROGRESS_EVERY_S = 0.2
+RUN_LOCK = ".lock"
+WORKER_LOCK = ".workers.lock"
+"""Shared by the workers: as long as one lives, no new run begins."""
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Something to show: a job began, moved on, or ended."""
+
+    kind: Literal["started", "progress", "ended"]
+    stage: Stage
+    share: float = 0.0
+    words: str = ""
+    outcome: Outcome | None = None
+
+
+@contextlib.contextmanager
+def only_run_in(root: Path) -> Generator[None]:
+    """Hold the run folder's lock, after the workers of a killed run are gone.
+
+    Raises:
+        V2PError: the folder cannot be written, or another run is at work in it.
+    """
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        stream: TextIO = (root / RUN_LOCK).open("a")
+    except OSError as error:
+        raise V2PError(
+            f"cannot write to {root}: {error.strerror}; choose another folder with --out"
+        ) from error
+    with stream:
+        _lock(stream, root, wait_s=0.0)
+        with (root / WORKER_LOCK).open("a") as workers:
+            _lock(workers, root, wait_s=10 * PARENT_POLL_S)
+        yield
+
+
+def _lock(stream: TextIO, root: Path, wait_s: float) -> None:
+    deadline = time.monotonic() + wait_s
+    while True:
+        try:
+            return fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if time.monotonic() >= deadline:
+                raise V2PError(
+                    f"another v2p run is at work in {root}; wait for it or choose another --out"
+                ) from error
+            time.sleep(0.1)
+
+
+def run_stages(
+    stages: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None]
+) -> dict[Key, Outcome]:
+    """Make every stage and what it needs; return the outcome per (stage name, folder name)."""
+    ordered = list(in_order(stages))
+    outcomes: dict[Key, Outcome] = {}
+    pending: list[Stage] = []
+    for stage in ordered:
+        stored = stored_outcome(stage, runtime.root)
+        if stored is None:
+            pending.append(stage)
+        else:
+            outcomes[_key(stage)] = stored
+            on_event(Event(kind="ended", stage=stage, outcome=stored))
+    if not pending:
+        return outcomes
+    pool = _Pool(runtime, size=min(max(1, runtime.workers), len(pending)))
+    try:
+        while pending or pool.is_busy:
+            for stage in list(pending):
+                blocker = blocked_by(stage, outcomes)
+                if blocker is not None:
+                    outcome = Outcome(
+                        stage=stage.name, item=stage.item, status="blocked",
+                        folder=stage.folder(runtime.root), reason=blocker.reason,
+                        detail=f"needs {blocker.stage} of {blocker.item}",
+                    )  # fmt: skip
+                elif all(_key(needed) in outcomes for needed in stage.inputs.values()):
+                    if not pool.has_room:
+                        continue
+                    pool.start(stage)
+                    on_event(Event(kind="started", stage=stage))
+                    pending.remove(stage)
+                    continue
+                else:
+                    continue
+                pending.remove(stage)
+                outcomes[_key(stage)] = outcome
+                on_event(Event(kind="ended", stage=stage, outcome=outcome))
+            for event in pool.events():
+                if event.outcome is not None:
+                    outcomes[_key(event.stage)] = event.outcome
+                on_event(event)
+    finally:
+        pool.close()
+    return outcomes
+
+
+def _key(stage: Stage) -> Key:
+    return (stage.name, stage.folder_name)
+
+
+@dataclass
+class _Worker:
+    process: BaseProcess
+    connection: Connection
+    stage: Stage | None = None
+    started: float = 0.0
+
+
+class _Pool:
+    def __init__(self, runtime: Runtime, size: int) -> None:
+        # Spawned, not forked: a fork would share the caller's OpenGL and thread state.
+        self.context = multiprocessing.get_context("spawn")
+        self.runtime = replace(runtime, progress=_no_progress)
+        self.size = size
+        self.workers: list[_Worker] = []
+
+    @property
+    def is_busy(self) -> bool:
+        return any(w.stage is not None for w in self.workers)
+
+    @property
+    def has_room(self) -> bool:
+        return len(self.workers) < self.size or any(w.stage is None for w in self.workers)
+
+    def start(self, stage: Stage) -> None:
+        worker = next((w for w in self.workers if w.stage is None), None)
+        if worker is None:
+            ours, theirs = self.context.Pipe()
+            log = self.runtime.root / "logs" / f"worker-{len(self.workers)}.log"
+            process = self.context.Process(
+                target=_work, args=(theirs, self.runtime, log, os.getpid()), daemon=True
+            )
+            process.start()
+            theirs.close()
+            worker = _Worker(process=process, connection=ours)
+            self.workers.append(worker)
+        worker.stage, worker.started = stage, time.monotonic()
+        worker.connection.send(stage)
+
+    def events(self) -> Iterator[Event]:
+        busy = [w for w in self.workers if w.stage is not None]
+        ready = wait([w.connection for w in busy], timeout=1.0)
+        for worker in busy:
+            if worker.connection not in ready or worker.stage is None:
+                continue
+            stage = worker.stage
+            try:
+                message: Any = worker.connection.recv()
+            except (EOFError, ConnectionResetError):
+                worker.process.join(5)
+                self.workers.remove(worker)
+                outcome = Outcome(
+                    stage=stage.name, item=stage.item, status="failed",
+                    folder=stage.folder(self.runtime.root), reason="crashed",
+                    seconds=time.monotonic() - worker.started,
+                    detail=_how_it_died(worker.process.exitcode, self.runtime.root),
+                )  # fmt: skip
+                yield Event(kind="ended", stage=stage, outcome=outcome)
+                continue
+            if isinstance(message, Outcome):
+                worker.stage = None
+                yield Event(kind="ended", stage=stage, outcome=message)
+            else:
+                share, words = message
+                yield Event(kind="progress", stage=stage, share=share, words=words)
+
+    def close(self) -> None:
+        for worker in self.workers:
+            worker.connection.close()
+            if worker.stage is not None:
+                worker.process.kill()
+        for worker in self.workers:
+            worker.process.join(5)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join(5)
+
+
+def _how_it_died(exitcode: int | None, root: Path) -> str:
+    how = "stopped without a word"
+    if exitcode is not None and exitcode < 0:
+        how = f"was killed by {signal.Signals(-exitcode).name}"
+    return f"the worker process {how}; its output is in {root / 'logs'}"
+
+
+def _no_progress(share: float, words: str) -> None:
+    del share, words
+
+
+def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends us
+    threading.Thread(target=_end_with_parent, args=(parent_pid,), daemon=True).start()
+    log.parent.mkdir(parents=True, exist_ok=True)
+    stream = log.open("a")
+    os.dup2(stream.fileno(), 1)
+    os.dup2(stream.fileno(), 2)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
+    _limit_threads(runtime.num_threads)
+    alive = (runtime.root / WORKER_LOCK).open("a")
+    fcntl.flock(alive, fcntl.LOCK_SH)
+    while True:
+        try:
+            stage: Stage = connection.recv()
+        except (EOFError, OSError):
+            return
+        last = 0.0
+
+        def progress(share: float, words: str) -> None:
+            nonlocal last
+            if time.monotonic() - last > PROGRESS_EVERY_S:
+                last = time.monotonic()
+                connection.send((share, words))
+
+        connection.send(make_stage(stage, replace(runtime, progress=progress)))
+
+
+def _limit_threads(num_threads: int) -> None:
+    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[variable] = str(num_threads)
+
+
+def _end_with_parent(parent_pid: int) -> None:
+    while os.getppid() == parent_pid:
+        time.sleep(PARENT_POLL_S)
+    os.kill(os.getpid(), signal.SIGKILL)
