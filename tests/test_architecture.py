@@ -1,0 +1,80 @@
+"""The arrows of the house: a room imports only rooms below it."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+BELOW: dict[str, set[str]] = {
+    "errors": set(),
+    "seeds": set(),
+    "pipeline": {"errors"},
+    "geometry": {"errors"},
+    "video": {"geometry", "errors", "seeds"},
+    "scene": {"video", "geometry", "errors", "seeds"},
+    "task": {"scene", "video", "geometry", "errors", "seeds"},
+    # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
+    "sim": {"task", "scene", "geometry", "errors", "seeds"},
+    "episodes": {"sim", "task", "scene", "geometry", "pipeline", "errors", "seeds"},
+    "reward": {"task", "sim", "scene", "errors", "seeds"},
+    "report": {"sim", "task", "scene", "geometry", "pipeline", "errors"},
+}
+TOP = {"stages", "cli", "commands"}
+
+
+def imported_modules(path: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            names.add(node.module)
+    return names
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(ROOT / "v2p_data").parts[0].removesuffix(".py")
+
+
+MODULES = sorted((ROOT / "v2p_data").rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_a_room_imports_only_rooms_below_it(path):
+    room = room_of(path)
+    if room in TOP or path.name == "__init__.py" and path.parent.name == "v2p_data":
+        return
+    ours = {n.split(".")[1] for n in imported_modules(path) if n.startswith("v2p_data.")}
+
+    assert ours - BELOW[room] - {room} == set()
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "policies").rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT))
+)
+def test_policies_know_nothing_of_the_engine(path):
+    assert not [n for n in imported_modules(path) if n.split(".")[0] == "v2p_data"]
+
+
+def test_the_engine_knows_policies_only_at_the_top():
+    users = {
+        room_of(p) for p in MODULES if any(n.split(".")[0] == "policies" for n in imported_modules(p))
+    }
+
+    assert users <= TOP
+
+
+def test_one_heavy_library_has_one_file():
+    homes = {"av": {"v2p_data/video", "v2p_data/scene", "v2p_data/report"}, "openai": {"v2p_data/task"}}
+    for library, allowed in homes.items():
+        users = {
+            str(p.parent.relative_to(ROOT))
+            for p in MODULES
+            if any(n.split(".")[0] == library for n in imported_modules(p))
+        }
+        assert users <= allowed, library
+
+
+def test_no_package_of_ours_hides_hugging_faces_datasets():
+    assert not (ROOT / "datasets" / "__init__.py").exists()

@@ -1,0 +1,130 @@
+"""The `v2p` command: parse, call, print what was made, the number that matters and the next command.
+
+Only light modules are imported here, so that `v2p --help` answers at once; each command imports what it needs.
+"""
+
+import contextlib
+import io
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from v2p_data.errors import V2PError, did_you_mean
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "generate": (
+        "run",
+        "a folder of videos becomes simulated tasks, experts and a LeRobot dataset",
+    ),
+    "train": ("run", "a dataset becomes a behaviour-cloning policy"),
+    "eval": ("run", "roll a policy out on tasks, seen and unseen, and give rates with intervals"),
+    "push": ("share", "push a dataset or a policy to the Hub"),
+    "scene": ("run", "videos -> scenes only: objects, meshes, sizes, poses"),
+    "task": ("run", "up to the task code and its audit"),
+    "expert": ("run", "up to the trained experts"),
+    "episodes": ("run", "up to the episodes, without packing them"),
+    "verify": ("share", "reopen a dataset with LeRobot and check every frame"),
+    "status": ("show", "what a run folder holds, and what failed and why"),
+    "report": ("show", "write a run's page again"),
+    "demo": ("run", "the whole chain on three sample clips"),
+}
+"""Command -> module of `v2p_data.commands` that holds it, and what it does."""
+
+
+def main() -> None:
+    """Run the command line; bad input ends with one sentence and exit code 2."""
+    # The Ctrl-C of a pipe's reader (`v2p status | head`) is no error of ours.
+    try:
+        sys.exit(run(sys.argv[1:]))
+    except BrokenPipeError:
+        os._exit(0)
+
+
+def run(argv: Sequence[str]) -> int:
+    """Return the exit code of `v2p` with these arguments."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(_help())
+        return 0
+    if argv[0] in ("-V", "--version"):
+        from importlib.metadata import version
+
+        print(f"v2p {version('lerobot_policy_v2p')}")
+        return 0
+    name = argv[0]
+    try:
+        if name not in COMMANDS:
+            raise V2PError(f"there is no command '{name}'.{did_you_mean(name, COMMANDS)}")
+        return _command(name)(list(argv[1:]))
+    except V2PError as error:
+        print(f"v2p {name}: {error}" if name in COMMANDS else f"v2p: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(
+            f"\nv2p {name}: stopped; what was finished is kept, the same command goes on from there",
+            file=sys.stderr,
+        )
+        return 130
+
+
+def parse[T](kind: type[T], argv: list[str], command: str, default: T | None = None) -> T:
+    """Return the arguments as the dataclass `kind`; field docstrings are the help.
+
+    Raises:
+        V2PError: an argument is wrong; tyro's own words in one sentence.
+    """
+    import tyro
+
+    wants_help = any(a in ("-h", "--help") for a in argv)
+    words = io.StringIO()
+    keywords: dict[str, Any] = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(words):
+            return tyro.cli(
+                kind,
+                args=argv,
+                prog=f"v2p {command}",
+                description=COMMANDS[command][1],
+                **keywords,
+            )
+    except SystemExit as error:
+        if wants_help or not error.code:
+            raise
+        raise V2PError(_one_sentence(words.getvalue(), command)) from error
+
+
+def _one_sentence(box: str, command: str) -> str:
+    text = re.sub(r"[╭╮╰╯│─]+", " ", box)
+    text = re.sub(r"\s+", " ", text).strip()
+    text = re.sub(r"^(Unrecognized options|Parsing error|Required options)\s+", "", text)
+    text = re.sub(r"For full helptext, run .*$", "", text).strip()
+    return f"{text}. See 'v2p {command} --help'"
+
+
+def _command(name: str) -> Callable[[list[str]], int]:
+    from importlib import import_module
+
+    module = import_module(f"v2p_data.commands.{COMMANDS[name][0]}")
+    return getattr(module, f"{name}_command")
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {words}" for name, (_, words) in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: v2p COMMAND ...",
+            "",
+            "A folder of ordinary videos becomes simulated tasks, experts, a LeRobot dataset and a policy.",
+            "",
+            *lines,
+            "",
+            "Start with:  v2p generate VIDEOS --out DIR --repo-id USER/NAME",
+            "More on one: v2p COMMAND --help",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()

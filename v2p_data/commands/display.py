@@ -1,0 +1,133 @@
+"""What a person sees while stages run: bars with the time left in a terminal, plain lines elsewhere."""
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from v2p_data.pipeline.runner import Outcome, Stage
+from v2p_data.pipeline.workers import Event
+
+PLAIN_EVERY_S = 15.0
+STAGE_ORDER = ("scene", "task", "expert", "episodes", "dataset", "policy", "evaluation")
+
+
+class Display:
+    """Shows events; use as a context manager and pass it to `run_stages`."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self.stream = stream or sys.stderr
+        self.is_terminal = self.stream.isatty()
+        self.bars: dict[str, TaskID] = {}
+        self.started: dict[str, float] = {}
+        self.spoken: dict[str, float] = {}
+        self.progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[words]}"),
+            console=Console(file=self.stream),
+            transient=True,
+        )
+
+    def __enter__(self) -> "Display":
+        if self.is_terminal:
+            self.progress.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self.is_terminal:
+            self.progress.stop()
+
+    def __call__(self, event: Event) -> None:
+        name = f"{event.stage.name} {event.stage.item}"
+        if event.kind == "started":
+            self.started[name] = time.monotonic()
+            if self.is_terminal:
+                self.bars[name] = self.progress.add_task(name, total=1.0, words="")
+            else:
+                self.say(f"{name}: started")
+        elif event.kind == "progress":
+            self._moved(name, event)
+        elif event.outcome is not None:
+            if name in self.bars:
+                self.progress.remove_task(self.bars.pop(name))
+            self.say(f"{name}: {describe(event.outcome)}")
+
+    def _moved(self, name: str, event: Event) -> None:
+        if self.is_terminal:
+            self.progress.update(self.bars[name], completed=event.share, words=event.words)
+            return
+        now = time.monotonic()
+        if now - self.spoken.get(name, self.started.get(name, now)) < PLAIN_EVERY_S:
+            return
+        self.spoken[name] = now
+        left = ""
+        if event.share > 0.02:
+            passed = now - self.started[name]
+            left = f", about {passed * (1 - event.share) / event.share:.0f} s left"
+        self.say(f"{name}: {event.share:.0%} {event.words}{left}")
+
+    def say(self, line: str) -> None:
+        """Print a line that stays."""
+        if self.is_terminal:
+            self.progress.console.print(line, markup=False, highlight=False)
+        else:
+            print(line, file=self.stream, flush=True)
+
+
+def describe(outcome: Outcome) -> str:
+    """Return an outcome in words."""
+    if outcome.status == "made":
+        return f"made in {outcome.seconds:.0f} s"
+    if outcome.status == "kept":
+        return "kept"
+    if outcome.status == "blocked":
+        return f"not run, {outcome.detail}"
+    return f"{outcome.status} ({outcome.reason}): {outcome.detail}"
+
+
+def outcome_table(outcomes: Sequence[Outcome]) -> str:
+    """Return which item came how far and why it stopped there, one line an item."""
+    by_item: dict[str, dict[str, Outcome]] = {}
+    for outcome in outcomes:
+        by_item.setdefault(outcome.item, {})[outcome.stage] = outcome
+    width = max((len(item) for item in by_item), default=0)
+    lines: list[str] = []
+    for item, stages in by_item.items():
+        good = [s for s in STAGE_ORDER if s in stages and stages[s].is_usable]
+        stopped = next((o for o in stages.values() if o.status in ("rejected", "failed")), None)
+        line = f"  {item:<{width}}  {' > '.join(good) or '-'}"
+        if stopped is not None:
+            line += f"  stopped at {stopped.stage} ({stopped.reason}): {stopped.detail}"
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def outcomes_json(
+    outcomes: Mapping[Any, Outcome], stages: Sequence[Stage]
+) -> list[dict[str, Any]]:
+    """Return the outcomes as they are kept in `run.json`, without paths of this machine."""
+    del stages
+    return [
+        {
+            "stage": o.stage,
+            "item": o.item,
+            "status": o.status,
+            "folder": o.folder.name,
+            "seconds": round(o.seconds, 2),
+            "reason": o.reason,
+            "detail": o.detail,
+        }
+        for o in outcomes.values()
+    ]
+
+
+def tally(outcomes: Sequence[Outcome], stage: str) -> Counter[str]:
+    """Return how many items of a stage are usable, rejected, failed or blocked."""
+    return Counter("usable" if o.is_usable else o.status for o in outcomes if o.stage == stage)

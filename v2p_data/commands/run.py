@@ -1,0 +1,384 @@
+"""Commands that make things: the whole chain, or up to one stage."""
+
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from v2p_data.cli import parse
+from v2p_data.commands.display import Display, describe, outcome_table, outcomes_json, tally
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage
+from v2p_data.pipeline.settings import load_settings
+from v2p_data.pipeline.workers import Key, only_run_in, run_stages
+from v2p_data.report.page import write_page
+from v2p_data.stages import (
+    EVALUATION_FILE,
+    POLICY_FOLDER,
+    ROOT_OF_TASKS,
+    EngineConfig,
+    chain,
+    dataset_stage,
+    evaluation_stage,
+    policy_stage,
+    scene_stage,
+    task_stage,
+)
+from v2p_data.task.task import TASK_FILE
+from v2p_data.video.captions import VideoItem, find_videos
+
+RUN_FILE = "run.json"
+REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class How:
+    """How to run; never part of what is made."""
+
+    workers: int = 0
+    """Jobs at the same time; 0: as many as there are cores."""
+    threads: int = 1
+    """Threads per job."""
+    device: str = "cpu"
+    """Where the policy trains: cpu, cuda, mps."""
+
+    def runtime(self, root: Path) -> Runtime:
+        workers = self.workers or os.cpu_count() or 1
+        return Runtime(root=root, workers=workers, num_threads=self.threads, device=self.device)
+
+
+Engine = Annotated[EngineConfig, tyro.conf.arg(name="")]
+Running = Annotated[How, tyro.conf.arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromVideos:
+    videos: tyro.conf.Positional[Path]
+    """Folder of videos, or one video; captions in captions.json beside them, or in the file names."""
+    out: Path
+    """Run folder; running again keeps what is done."""
+    config: Path | None = None
+    """YAML file with settings; flags go over it."""
+    engine: Engine = field(default_factory=EngineConfig)
+    how: Running = field(default_factory=How)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generate(FromVideos):
+    repo_id: str
+    """Name of the dataset on the Hub: USER/NAME. Nothing is uploaded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    dataset: tyro.conf.Positional[Path]
+    """Folder of a dataset that `v2p generate` made."""
+    out: Path | None = None
+    """Run folder; by default the one the dataset lies in."""
+    config: Path | None = None
+    """YAML file with settings; flags go over it."""
+    engine: Engine = field(default_factory=EngineConfig)
+    how: Running = field(default_factory=How)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    policy: tyro.conf.Positional[Path]
+    """Folder of a policy."""
+    tasks: tuple[Path, ...] = ()
+    """More task folders (or folders of tasks) to try: these count as unseen."""
+    out: Path | None = None
+    """Run folder; by default the one the policy lies in."""
+    config: Path | None = None
+    """YAML file with settings; flags go over it."""
+    engine: Engine = field(default_factory=EngineConfig)
+    how: Running = field(default_factory=How)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    out: Path = Path("outputs/demo")
+    """Run folder."""
+    how: Running = field(default_factory=How)
+
+
+# --- commands ------------------------------------------------------------------------------------------------
+
+
+def scene_command(argv: list[str]) -> int:
+    return _up_to("scene", argv, lambda video, cfg: scene_stage(video, cfg), "v2p task")
+
+
+def task_command(argv: list[str]) -> int:
+    return _up_to("task", argv, lambda v, cfg: task_stage(scene_stage(v, cfg), cfg), "v2p expert")
+
+
+def expert_command(argv: list[str]) -> int:
+    return _up_to("expert", argv, lambda v, cfg: chain(v, cfg).inputs["expert"], "v2p episodes")
+
+
+def episodes_command(argv: list[str]) -> int:
+    return _up_to("episodes", argv, chain, "v2p generate")
+
+
+def generate_command(argv: list[str]) -> int:
+    args = _with_config(Generate, argv, "generate")
+    root = _run_folder(args.out)
+    _check_repo_id(args.repo_id)
+    with only_run_in(root):
+        dataset = generate(args.videos, root, args.repo_id, args.engine, args.how.runtime(root))
+        page = write_page(root)
+    if dataset is None:
+        print(f"\nNo task came as far as episodes, so there is no dataset. See {page}")  # noqa: T201
+        return 1
+    counts = _record(dataset).counts
+    _say(
+        f"Made {dataset}",
+        f"{counts['episodes']} episodes, {counts['frames']} frames; page: {page}",
+        f"v2p train {shlex.quote(str(dataset))}",
+    )
+    return 0
+
+
+def train_command(argv: list[str]) -> int:
+    args = _with_config(Train, argv, "train")
+    root = _run_folder(args.out or args.dataset.resolve().parent.parent)
+    with only_run_in(root):
+        policy = train(args.dataset, root, args.engine, args.how.runtime(root))
+        page = write_page(root)
+    loss = _record(policy.parent).counts["final_loss"]
+    _say(
+        f"Made {policy}",
+        f"loss {loss:.3f} after {args.engine.policy.steps} steps; page: {page}",
+        f"v2p eval {shlex.quote(str(policy))}",
+    )
+    return 0
+
+
+def eval_command(argv: list[str]) -> int:
+    args = _with_config(Evaluate, argv, "eval")
+    root = _run_folder(args.out or args.policy.resolve().parent.parent.parent)
+    unseen = {name: path for folder in args.tasks for name, path in task_folders(folder).items()}
+    with only_run_in(root):
+        outcome, rows = evaluate(args.policy, unseen, root, args.engine, args.how.runtime(root))
+        page = write_page(root)
+    _say(
+        f"Made {outcome.folder / EVALUATION_FILE}",
+        "\n".join(rate_lines(rows)) + f"\npage: {page}",
+        f"v2p push {shlex.quote(str(args.policy))} --repo-id USER/NAME",
+    )
+    return 0
+
+
+def demo_command(argv: list[str]) -> int:
+    args = parse(Demo, argv, "demo")
+    samples = Path(__file__).parents[2] / "datasets" / "sample_videos"
+    settings = Path(__file__).parents[2] / "configs" / "demo.yaml"
+    if not samples.is_dir():
+        raise V2PError(
+            f"the sample clips are not at {samples}; run the demo from a clone of the repository"
+        )
+    root = _run_folder(args.out)
+    cfg = load_settings(settings, EngineConfig)
+    runtime = args.how.runtime(root)
+    print(  # noqa: T201
+        "v2p demo: three clips become tasks, experts, a dataset, a policy and a page; about 12 minutes on two"
+        f" cores.\nEverything goes to {root}; running again keeps what is done.",
+        flush=True,
+    )
+    with only_run_in(root):
+        dataset = generate(samples, root, "v2p/demo", cfg, runtime)
+        if dataset is None:
+            raise V2PError(f"no sample clip came as far as episodes; see {write_page(root)}")
+        policy = train(dataset, root, cfg, runtime)
+        unseen = _unseen_tasks(samples / "unseen", root, cfg, runtime)
+        _, rows = evaluate(policy, unseen, root, cfg, runtime)
+        page = write_page(root)
+    _say(
+        f"Made {page}",
+        "\n".join(rate_lines(rows)),
+        f"v2p generate YOUR_VIDEOS --out outputs/mine --repo-id USER/NAME   (dataset: {dataset})",
+    )
+    return 0
+
+
+# --- what they share -----------------------------------------------------------------------------------------
+
+
+def generate(
+    videos: Path, root: Path, repo_id: str, cfg: EngineConfig, runtime: Runtime
+) -> Path | None:
+    """Run the chain on every video and pack what came through; return the dataset, if there is one."""
+    chains = [chain(video, cfg) for video in find_videos(videos)]
+    outcomes = _run(chains, runtime)
+    good = [c for c in chains if outcomes[(c.name, c.folder_name)].is_usable]
+    good = [c for c in good if _record(c.folder(root)).counts.get("episodes", 0)]
+    print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
+    if not good:
+        return None
+    packed = dataset_stage(good, repo_id)
+    outcome = _run([packed], runtime)[(packed.name, packed.folder_name)]
+    _demand(outcome)
+    return outcome.folder
+
+
+def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Path:
+    """Train a policy on a finished dataset and return its folder."""
+    record = read_record(dataset)
+    if record is None or record.stage != "dataset":
+        raise V2PError(
+            f"{dataset} is no dataset of v2p generate; for others use"
+            " 'lerobot-train --policy.type=v2p_bc --dataset.root=...'"
+        )
+    stage = policy_stage(dataset.resolve(), record, cfg)
+    outcome = _run(
+        [stage], replace(runtime, num_threads=max(runtime.workers, runtime.num_threads))
+    )[(stage.name, stage.folder_name)]
+    _demand(outcome)
+    return outcome.folder / POLICY_FOLDER
+
+
+def evaluate(
+    policy: Path, unseen: dict[str, Path], root: Path, cfg: EngineConfig, runtime: Runtime
+) -> tuple[Outcome, list[dict[str, object]]]:
+    """Roll a policy out on its dataset's tasks and on unseen ones."""
+    if not (policy / "model.safetensors").is_file():
+        raise V2PError(f"{policy} holds no model.safetensors: it is no LeRobot policy")
+    record = read_record(policy.parent)
+    seen: dict[str, Path] = {}
+    if record is not None and record.stage == "policy":
+        for dataset in sorted((root / "dataset").glob(record.recipe["sources"]["dataset"])):
+            seen = task_folders(dataset / ROOT_OF_TASKS)
+    tasks = {**seen, **unseen}
+    if not tasks:
+        raise V2PError(f"no task is known for {policy}; name task folders with --tasks")
+    stage = evaluation_stage(policy.resolve(), tasks, cfg, seen=list(seen))
+    outcome = _run([stage], runtime)[(stage.name, stage.folder_name)]
+    _demand(outcome)
+    return outcome, _record(outcome.folder).counts["rows"]
+
+
+def task_folders(folder: Path) -> dict[str, Path]:
+    """Return the task folders at or below `folder` by name.
+
+    Raises:
+        V2PError: there is none.
+    """
+    if (folder / TASK_FILE).is_file():
+        return {_item_name(folder): folder}
+    found = {_item_name(p.parent): p.parent for p in sorted(folder.glob(f"*/{TASK_FILE}"))}
+    if not found:
+        raise V2PError(f"{folder} holds no task; tasks are the folders with a {TASK_FILE}")
+    return found
+
+
+def rate_lines(rows: Sequence[dict[str, object]]) -> list[str]:
+    """Return one line per task: seen or unseen, the rate and its interval."""
+    width = max(len(str(r["task"])) for r in rows)
+    return [
+        f"  {r['task']!s:<{width}}  {'seen  ' if r['seen'] else 'unseen'}  {r['successes']}/{r['trials']}"
+        f" = {r['value']:.0%}, 95 % interval {r['low']:.0%} to {r['high']:.0%}"
+        for r in rows
+    ]
+
+
+def _item_name(folder: Path) -> str:
+    return re.sub(r"-[0-9a-f]{8}$", "", folder.name)
+
+
+def _unseen_tasks(
+    videos: Path, root: Path, cfg: EngineConfig, runtime: Runtime
+) -> dict[str, Path]:
+    stages = [task_stage(scene_stage(video, cfg), cfg) for video in find_videos(videos)]
+    outcomes = _run(stages, runtime)
+    return {s.item: s.folder(root) for s in stages if outcomes[(s.name, s.folder_name)].is_usable}
+
+
+def _up_to(
+    name: str, argv: list[str], stage_of: Callable[[VideoItem, EngineConfig], Stage], then: str
+) -> int:
+    args = _with_config(FromVideos, argv, name)
+    root = _run_folder(args.out)
+    with only_run_in(root):
+        stages = [stage_of(video, args.engine) for video in find_videos(args.videos)]
+        outcomes = _run(stages, args.how.runtime(root))
+        page = write_page(root)
+    print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
+    counts = tally(list(outcomes.values()), name)
+    rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
+    _say(
+        f"Made {root / name}",
+        f"{counts['usable']} of {len(stages)} videos{f' ({rest})' if rest else ''}; page: {page}",
+        f"{then} {shlex.quote(str(args.videos))} --out {shlex.quote(str(args.out))}"
+        + (" --repo-id USER/NAME" if then == "v2p generate" else ""),
+    )
+    return 0 if counts["usable"] else 1
+
+
+def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:
+    with Display() as display:
+        outcomes = run_stages(stages, runtime, display)
+    path = runtime.root / RUN_FILE
+    write_json_atomically(path, outcomes_json(outcomes, stages))
+    return outcomes
+
+
+def _demand(outcome: Outcome) -> None:
+    if not outcome.is_usable:
+        raise V2PError(f"{outcome.stage} {outcome.item} {describe(outcome)}")
+
+
+def _record(folder: Path) -> Record:
+    record = read_record(folder)
+    if record is None:
+        raise V2PError(f"{folder} is not complete")
+    return record
+
+
+def _with_config[T: FromVideos | Train | Evaluate](kind: type[T], argv: list[str], name: str) -> T:
+    """Parse twice: once for --config, then with the file's values as the defaults of the flags."""
+    path = _flag(argv, "--config")
+    if path is None:
+        return parse(kind, argv, name)
+    engine = load_settings(Path(path), EngineConfig)
+    missing = {
+        field_name: tyro.MISSING
+        for field_name, f in kind.__dataclass_fields__.items()
+        if f.default is f.default_factory  # both MISSING: required
+    }
+    return parse(kind, argv, name, default=kind(engine=engine, **missing))
+
+
+def _flag(argv: Sequence[str], flag: str) -> str | None:
+    for index, word in enumerate(argv):
+        if word == flag and index + 1 < len(argv):
+            return argv[index + 1]
+        if word.startswith(flag + "="):
+            return word.split("=", 1)[1]
+    return None
+
+
+def _run_folder(out: Path) -> Path:
+    if (out / "meta" / "info.json").is_file():
+        raise V2PError(
+            f"{out} is a LeRobot dataset, and v2p never writes into one; choose another --out"
+        )
+    if out.exists() and not out.is_dir():
+        raise V2PError(f"{out} is a file; --out must be a folder")
+    return out
+
+
+def _check_repo_id(repo_id: str) -> None:
+    if not REPO_ID.fullmatch(repo_id):
+        raise V2PError(f"--repo-id must look like USER/NAME, got '{repo_id}'")
+
+
+def _say(made: str, number: str, then: str) -> None:
+    print(f"\n{made}\n{number}\nNext: {then}")  # noqa: T201

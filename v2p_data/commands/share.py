@@ -1,0 +1,55 @@
+"""Commands for finished things: check them, give them away."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from v2p_data.cli import parse
+from v2p_data.errors import V2PError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    dataset: tyro.conf.Positional[Path]
+    """Folder of a LeRobot v3 dataset, ours or anybody's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Push:
+    path: tyro.conf.Positional[Path]
+    """Folder of a dataset or of a policy."""
+    repo_id: str
+    """Where to: USER/NAME. The token comes from `hf auth login` or HF_TOKEN."""
+    private: bool = False
+    """Make the repository private."""
+
+
+def verify_command(argv: list[str]) -> int:
+    from v2p_data.episodes.verify import verify
+
+    args = parse(Verify, argv, "verify")
+    if not (args.dataset / "meta" / "info.json").is_file():
+        raise V2PError(f"{args.dataset} holds no meta/info.json: it is no LeRobot dataset")
+    report = verify(args.dataset)
+    print(json.dumps(report.as_dict(), indent=1))  # noqa: T201
+    return 0 if report.is_good else 1
+
+
+def push_command(argv: list[str]) -> int:
+    from v2p_data.episodes.hub import push_dataset, push_policy
+
+    args = parse(Push, argv, "push")
+    if (args.path / "meta" / "info.json").is_file():
+        url = push_dataset(args.path, args.repo_id, private=args.private)
+        then = f"LeRobotDataset('{args.repo_id}')"
+    elif (args.path / "model.safetensors").is_file():
+        url = push_policy(args.path, args.repo_id, private=args.private)
+        then = f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS"
+    else:
+        raise V2PError(
+            f"{args.path} is neither a LeRobot dataset (meta/info.json) nor a policy (model.safetensors)"
+        )
+    print(f"Pushed to {url}\nNext: {then}")  # noqa: T201
+    return 0

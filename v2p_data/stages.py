@@ -1,0 +1,510 @@
+"""START HERE: the engine's stages in the order they happen.
+
+    video --> scene --> task --> expert --> episodes --+--> dataset --> policy --> evaluation
+    video --> scene --> task --> expert --> episodes --+
+
+Each stage is a recipe and inputs (what it is) and a `make_*` function (how it comes about). A `make_*` loads
+its inputs, calls the craft, saves, and returns the counts that the record keeps. Heavy libraries are imported
+where they are used, so that listing stages costs little.
+"""
+
+import json
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from policies.ppo.train import PPOConfig
+
+from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
+from v2p_data.pipeline.fingerprint import file_digest
+from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.scene.reconstruct import SceneConfig
+from v2p_data.seeds import rng_for, seed_for
+from v2p_data.task.generate import TaskConfig
+from v2p_data.video.captions import VideoItem
+from v2p_data.video.decode import VideoConfig
+
+logger = logging.getLogger(__name__)
+
+ROOT_OF_TASKS = "v2p/tasks"
+"""Where a dataset carries the tasks that its episodes were made in."""
+EVALUATION_FILE = "evaluation.json"
+POLICY_FOLDER = "policy"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpertConfig:
+    """How an expert is trained and judged."""
+
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    num_envs: int = 512
+    """Worlds that learn at the same time; the flat optimum on two cores is 256 to 1024."""
+    eval_episodes: int = 64
+    """Episodes at the fine time step that judge the finished expert, on seeds of their own."""
+    min_success: float = 0.3
+    """Experts below this make too few demonstrations to be worth the wait."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_success <= 1:
+            raise ValueError(f"min_success must be between 0 and 1, got {self.min_success}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyConfig:
+    """How the behaviour-cloning policy is trained; anything else goes through `lerobot-train` itself."""
+
+    steps: int = 20_000
+    """Gradient steps."""
+    batch_size: int = 64
+    """Frames a step."""
+    input_size_px: int = 256
+    """Masks are scaled to this before the network; less is faster."""
+    num_workers: int = 1
+    """Processes that decode video while the network trains."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """How a policy is judged."""
+
+    episodes: int = 20
+    """Episodes per task."""
+    batch_size: int = 10
+    """Episodes at the same time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineConfig:
+    """Everything that decides what the engine makes."""
+
+    video: VideoConfig = field(default_factory=VideoConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    task: TaskConfig = field(default_factory=TaskConfig)
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    episodes: EpisodesConfig = field(default_factory=EpisodesConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    seed: int = 0
+    """All random streams derive from it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seeded:
+    """A recipe and the seed that goes with it."""
+
+    config: Any
+    seed: int
+
+
+# --- video -> scene ------------------------------------------------------------------------------------------
+
+
+def scene_stage(video: VideoItem, cfg: EngineConfig) -> Stage:
+    """Return the stage that understands one video."""
+    recipe = {
+        "video": cfg.video,
+        "scene": cfg.scene,
+        "seed": cfg.seed,
+        "caption": video.caption,
+        "objects": video.objects,
+        "hints": video.hints,
+    }
+    return Stage(
+        name="scene",
+        item=video.item,
+        config=recipe,
+        sources={"video": file_digest(video.path)},
+        version=1,
+        make=partial(make_scene, video=video),
+    )
+
+
+def make_scene(
+    cfg: dict[str, Any],
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    video: VideoItem,
+) -> dict[str, Any]:
+    """Decode the video and rebuild its objects."""
+    from v2p_data.scene.export import write_scene
+    from v2p_data.scene.reconstruct import reconstruct
+    from v2p_data.video.decode import read_clip
+
+    del inputs
+    runtime.progress(0.0, "decoding")
+    clip = read_clip(video, cfg["video"])
+    runtime.progress(0.2, "finding objects")
+    reconstruction = reconstruct(clip, cfg["scene"], rng_for(cfg["seed"], "scene", video.item))
+    scene = write_scene(reconstruction, out)
+    return {
+        "frames": len(clip.frames),
+        "objects": len(scene.objects),
+        "kind": scene.kind,
+        "confidence": round(scene.confidence, 3),
+    }
+
+
+# --- scene -> task -------------------------------------------------------------------------------------------
+
+
+def task_stage(scene: Stage, cfg: EngineConfig) -> Stage:
+    """Return the stage that writes and audits one scene's task code."""
+    return Stage(
+        name="task",
+        item=scene.item,
+        config=Seeded(config=cfg.task, seed=cfg.seed),
+        inputs={"scene": scene},
+        version=1,
+        make=make_task,
+    )
+
+
+def make_task(
+    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
+) -> dict[str, Any]:
+    """Write eight task codes, audit them, keep the best."""
+    from v2p_data.scene.scene import Scene
+    from v2p_data.task.generate import generate_task
+
+    scene = Scene.load(inputs["scene"])
+    runtime.progress(0.1, "writing task code")
+    generated = generate_task(scene, cfg.config, seed_for(cfg.seed, "task", scene.title))
+    generated.save(out)
+    return {
+        "kind": generated.bundle.kind,
+        "samples": len(generated.samples),
+        "runnable": sum(s.runnable for s in generated.samples),
+        "picked": generated.picked,
+    }
+
+
+# --- task -> expert ------------------------------------------------------------------------------------------
+
+
+def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
+    """Return the stage that learns one task.
+
+    A killed training starts anew: it lasts a minute or two, and only then is its result the same as an
+    undisturbed one's.
+    """
+    return Stage(
+        name="expert",
+        item=task.item,
+        config=Seeded(config=cfg.expert, seed=cfg.seed),
+        inputs={"task": task},
+        version=1,
+        make=make_expert,
+    )
+
+
+def make_expert(
+    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
+) -> dict[str, Any]:
+    """Train with PPO at the coarse time step, judge at the fine one with the independent referee."""
+    from policies.ppo.train import train_expert
+
+    from policies.evaluation.rate import wilson
+    from policies.ppo.policy import Expert
+    from v2p_data.episodes.collect import judge_expert
+    from v2p_data.report.sheet import write_contact_sheet
+    from v2p_data.sim.batch_env import BatchEnv, SimConfig
+    from v2p_data.sim.torchrl_env import TorchRLEnv
+    from v2p_data.task.task import TaskBundle
+
+    expert_cfg: ExpertConfig = cfg.config
+    bundle = TaskBundle.load(inputs["task"])
+    env = BatchEnv(
+        bundle,
+        SimConfig(),
+        num_envs=expert_cfg.num_envs,
+        seed=seed_for(cfg.seed, "expert", bundle.title),
+        num_threads=runtime.num_threads,
+    )
+    result = train_expert(
+        TorchRLEnv(env),
+        expert_cfg.ppo,
+        out,
+        seed=seed_for(cfg.seed, "ppo", bundle.title),
+        on_progress=lambda done, total, success: runtime.progress(
+            0.95 * done / total, f"success {success:.0%}"
+        ),
+    )
+    expert = Expert.load(out)
+    runtime.progress(0.95, "judging at the fine step")
+    judged = judge_expert(
+        bundle,
+        expert.act,
+        episodes=expert_cfg.eval_episodes,
+        seed=seed_for(cfg.seed, "expert-evaluation", bundle.title),
+        num_threads=runtime.num_threads,
+    )
+    rate = wilson(int(judged.successes.sum()), len(judged.successes))
+    write_contact_sheet(bundle, judged, out / "sheet.png")
+    counts = {
+        "steps": result.steps,
+        "train_seconds": round(result.seconds, 1),
+        "success": rate.as_dict(),
+        "task_success": float(judged.task_successes.mean()),
+    }
+    write_json_atomically(out / EVALUATION_FILE, counts)
+    if rate.value < expert_cfg.min_success:
+        raise ItemRejectedError(
+            "expert_not_learned",
+            f"after {result.steps} steps the expert succeeds in {rate} of episodes, "
+            f"below the {expert_cfg.min_success:.0%} that are worth collecting",
+            rate.value,
+        )
+    return counts
+
+
+# --- expert -> episodes --------------------------------------------------------------------------------------
+
+
+def episodes_stage(task: Stage, expert: Stage, cfg: EngineConfig) -> Stage:
+    """Return the stage that rolls one expert out under randomisation."""
+    return Stage(
+        name="episodes",
+        item=task.item,
+        config=Seeded(config=cfg.episodes, seed=cfg.seed),
+        inputs={"task": task, "expert": expert},
+        version=1,
+        make=make_episodes,
+        resumes=True,
+    )
+
+
+def make_episodes(
+    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
+) -> dict[str, Any]:
+    """Stage successful episodes one by one; list the failed ones."""
+    from policies.ppo.policy import Expert
+    from v2p_data.episodes.collect import collect
+    from v2p_data.task.task import TaskBundle
+
+    bundle = TaskBundle.load(inputs["task"])
+    collected = collect(
+        bundle,
+        Expert.load(inputs["expert"]).act,
+        cfg.config,
+        out,
+        seed=seed_for(cfg.seed, "episodes", bundle.title),
+        num_threads=runtime.num_threads,
+        on_progress=runtime.progress,
+    )
+    return collected.counts()
+
+
+# --- episodes -> dataset -------------------------------------------------------------------------------------
+
+
+def dataset_stage(episodes: Sequence[Stage], repo_id: str) -> Stage:
+    """Return the stage that packs all episodes into one LeRobot dataset."""
+    return Stage(
+        name="dataset",
+        item=repo_id.split("/")[-1],
+        config={"repo_id": repo_id},
+        inputs={stage.item: stage for stage in episodes},
+        version=1,
+        make=partial(make_dataset, tasks={s.item: s.inputs["task"] for s in episodes}),
+    )
+
+
+def make_dataset(
+    cfg: dict[str, Any],
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    tasks: Mapping[str, Stage],
+) -> dict[str, Any]:
+    """Write the dataset, reopen it with LeRobot and compare every frame with what was drawn."""
+    from v2p_data.episodes.card import write_card
+    from v2p_data.episodes.collect import staged_episodes
+    from v2p_data.episodes.verify import verify
+    from v2p_data.episodes.writer import pack
+
+    staged = [path for folder in inputs.values() for path in staged_episodes(folder)]
+    if not staged:
+        raise V2PError("no task gave a successful episode, so there is nothing to pack")
+    root = out / "packed"
+    pack(
+        staged,
+        cfg["repo_id"],
+        root,
+        provenance={
+            "items": {item: _history(folder, runtime.root) for item, folder in inputs.items()},
+            **provenance(),
+        },
+        on_progress=lambda share, words: runtime.progress(0.7 * share, words),
+    )
+    for item, stage in tasks.items():
+        shutil.copytree(
+            stage.folder(runtime.root),
+            root / ROOT_OF_TASKS / item,
+            ignore=shutil.ignore_patterns("record.json", "samples", "overlay*"),
+        )
+    runtime.progress(0.75, "comparing every frame")
+    report = verify(root, staged=staged)
+    if not report.is_good:
+        raise V2PError(f"the packed dataset differs from the episodes: {report.summary()}")
+    write_card(root, cfg["repo_id"])
+    for path in list(root.iterdir()):
+        path.rename(out / path.name)
+    root.rmdir()
+    return {
+        "episodes": report.num_episodes,
+        "frames": report.num_frames,
+        "repo_id": cfg["repo_id"],
+    }
+
+
+def _history(folder: Path, root: Path) -> dict[str, Any]:
+    """Return the recipes of a result and of everything it came from."""
+    record = read_record(folder)
+    if record is None:
+        return {}
+    needed = {
+        name: _history(path, root)
+        for name, source in record.inputs.items()
+        for path in root.glob(f"*/{source}")
+    }
+    return {
+        "stage": record.stage,
+        "folder": folder.name,
+        "recipe": record.recipe,
+        "counts": record.counts,
+        "inputs": needed,
+    }
+
+
+# --- dataset -> policy ---------------------------------------------------------------------------------------
+
+
+def policy_stage(dataset: Path, record: Record, cfg: EngineConfig) -> Stage:
+    """Return the stage that clones the experts' behaviour from a finished dataset."""
+    return Stage(
+        name="policy",
+        item=record.item,
+        config=Seeded(config=cfg.policy, seed=cfg.seed),
+        sources={"dataset": f"{record.item}-{record.fingerprint}"},
+        version=1,
+        make=partial(make_policy, dataset=dataset, repo_id=str(record.counts["repo_id"])),
+        resumes=True,
+    )
+
+
+def make_policy(
+    cfg: Seeded,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    dataset: Path,
+    repo_id: str,
+) -> dict[str, Any]:
+    """Run `lerobot-train` on the dataset, going on from its last checkpoint if there is one."""
+    from policies.bc.train import train
+
+    del inputs
+    policy_cfg: PolicyConfig = cfg.config
+    trained = train(
+        dataset=dataset,
+        repo_id=repo_id,
+        out=out,
+        steps=policy_cfg.steps,
+        batch_size=policy_cfg.batch_size,
+        input_size_px=policy_cfg.input_size_px,
+        num_workers=policy_cfg.num_workers,
+        seed=seed_for(cfg.seed, "policy") % 2**31,
+        num_threads=runtime.num_threads,
+        device=runtime.device,
+        on_progress=runtime.progress,
+    )
+    return {"steps": policy_cfg.steps, "final_loss": trained.final_loss, "policy": POLICY_FOLDER}
+
+
+# --- policy -> evaluation ------------------------------------------------------------------------------------
+
+
+def evaluation_stage(
+    policy: Path, tasks: Mapping[str, Path], cfg: EngineConfig, seen: Sequence[str]
+) -> Stage:
+    """Return the stage that rolls the policy out on each task.
+
+    Args:
+        policy: folder of a LeRobot policy.
+        tasks: folders of the tasks to try, by name.
+        cfg: settings.
+        seen: names of the tasks that the policy's dataset had.
+    """
+    return Stage(
+        name="evaluation",
+        item=policy.parent.name.rsplit("-", 1)[0] if policy.name == POLICY_FOLDER else policy.name,
+        config=Seeded(config=cfg.evaluation, seed=cfg.seed),
+        sources={
+            "policy": file_digest(policy / "model.safetensors"),
+            **{f"task {name}": file_digest(path / "task.py") for name, path in tasks.items()},
+        },
+        version=1,
+        make=partial(make_evaluation, policy=policy, tasks=dict(tasks), seen=tuple(seen)),
+    )
+
+
+def make_evaluation(
+    cfg: Seeded,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    policy: Path,
+    tasks: Mapping[str, Path],
+    seen: Sequence[str],
+) -> dict[str, Any]:
+    """Roll the policy out and write success rates with their intervals."""
+    from policies.evaluation.rollout import evaluate_policy
+
+    from policies.evaluation.rate import wilson
+
+    del inputs
+    rows: list[dict[str, Any]] = []
+    for index, (name, folder) in enumerate(tasks.items()):
+        runtime.progress(index / len(tasks), name)
+        first_seed = seed_for(cfg.seed, "evaluation", name) % 2**31
+        successes = evaluate_policy(
+            policy,
+            folder,
+            episodes=cfg.config.episodes,
+            batch_size=cfg.config.batch_size,
+            first_seed=first_seed,
+            videos=out / "videos" / name,
+        )
+        rows.append(
+            {
+                "task": name,
+                "seen": name in seen,
+                "first_seed": first_seed,
+                **wilson(int(sum(successes)), len(successes)).as_dict(),
+            }
+        )
+    (out / EVALUATION_FILE).write_text(json.dumps(rows, indent=1))
+    return {"tasks": len(rows), "rows": rows}
+
+
+# --- all of it -----------------------------------------------------------------------------------------------
+
+
+def chain(video: VideoItem, cfg: EngineConfig) -> Stage:
+    """Return the episodes stage of one video, with everything before it."""
+    scene = scene_stage(video, cfg)
+    task = task_stage(scene, cfg)
+    expert = expert_stage(task, cfg)
+    return episodes_stage(task, expert, cfg)
+
