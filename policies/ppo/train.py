@@ -1,0 +1,543 @@
+"""PPO on TorchRL: collect, estimate advantages, improve; one loop that may be killed at any moment.
+
+The first `num_deterministic` worlds act without exploration and are left out of the loss: their episodes
+are the success rate of the deterministic policy, for free and on the spot. All randomness of the learner
+comes from one generator that the checkpoint keeps. Where the environment's `state_dict` holds its state, a
+resumed run repeats an undisturbed one bit for bit; otherwise its worlds start anew at the resumption.
+"""
+
+import logging
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
+from torch import nn
+from torch.distributions import Independent, Normal
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from policies.evaluation.rate import Rate
+from policies.ppo.curve import CURVE_FILE, PICTURE_FILE, Row, append_row, cut_after, plot_curve
+from policies.ppo.evaluate import evaluate
+from policies.ppo.policy import ActorConfig, ActorCritic, Expert, load_weights, weights_of
+
+log = logging.getLogger(__name__)
+
+CHECKPOINT_FILE = "checkpoint.pt"
+BEST_FOLDER = "best"
+LAST_FOLDER = "last"
+DUMP_FILE = "not_finite.pt"
+FINITE_KEYS = (("next", "observation"), ("next", "reward"), "observation", "action")
+COMPONENTS_KEY = ("next", "components")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig:
+    """The recipe. Defaults are those that learned to lift in a minute on two cores."""
+
+    seed: int = 0
+    total_steps: int = 2_000_000
+    """Control steps over all worlds; the recipe's budget."""
+    max_seconds: float = 600.0
+    """Wall-clock safety net, added up over resumptions; a run it stops depends on the machine."""
+    target_success: float = 0.95
+    """Training stops once the deterministic worlds reach this."""
+    window_episodes: int = 128
+    """The success rates are taken over this many last episodes (one and a half to two rounds of the worlds)."""
+    min_window_episodes: int = 96
+    """With fewer episodes there is no rate yet."""
+    num_deterministic: int = 64
+    """Worlds that act without exploration and never enter the loss."""
+    batch_time: int = 16
+    """Control steps per world between two updates."""
+    epochs: int = 4
+    minibatch: int = 2048
+    learning_rate: float = 1e-3
+    """At the start; from then on it follows the KL divergence."""
+    min_learning_rate: float = 1e-4
+    max_learning_rate: float = 3e-3
+    kl_low: float = 0.01
+    """Below, the learning rate grows by a half."""
+    kl_high: float = 0.02
+    """Above, it shrinks by a third."""
+    kl_stop: float = 0.045
+    """Above, the remaining epochs of this batch are skipped."""
+    gamma: float = 0.97
+    """A horizon of about 1.7 s at 20 Hz."""
+    gae_lambda: float = 0.9
+    clip: float = 0.2
+    max_grad_norm: float = 1.0
+    warm_start_std: float = 0.5
+    """Exploration of a policy that starts from another expert's weights."""
+    checkpoint_seconds: float = 10.0
+    """A kill loses at most about this much work."""
+    num_threads: int = 1
+    """Threads of torch. Two cost a factor three when another process shares the cores."""
+    eval_episodes: int = 128
+    """Fresh episodes in `eval_env` at the end."""
+    actor: ActorConfig = field(default_factory=ActorConfig)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.min_window_episodes <= self.window_episodes:
+            raise ValueError(
+                "need 0 < min_window_episodes <= window_episodes, "
+                f"got {self.min_window_episodes} and {self.window_episodes}"
+            )
+        if not self.min_learning_rate <= self.learning_rate <= self.max_learning_rate:
+            raise ValueError(
+                "need min_learning_rate <= learning_rate <= max_learning_rate, "
+                f"got {self.min_learning_rate}, {self.learning_rate}, {self.max_learning_rate}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpertResult:
+    """What training ended with."""
+
+    folder: Path
+    """The best expert."""
+    success: float
+    """Deterministic success of the best window in training: chosen as the best of many, hence a little flattering."""
+    steps: int
+    seconds: float
+    stopped_by: Literal["target", "steps", "seconds"]
+    evaluation: Rate | None = None
+    """Fresh episodes of the best expert in `eval_env`."""
+
+
+class NotFiniteError(RuntimeError):
+    """A NaN or an infinity, named by key, world and step; the batch is dumped beside the checkpoint."""
+
+
+@dataclass(kw_only=True)
+class _Progress:
+    """Everything that changes while training, apart from weights, optimiser, generator and environment."""
+
+    iteration: int = 0
+    steps: int = 0
+    seconds: float = 0.0
+    learning_rate: float = 0.0
+    mean_square_return: float = 0.0
+    """Running mean square of the discounted return: rewards are divided by its root."""
+    discounted: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
+    """Discounted reward so far, per world."""
+    episode_return: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
+    """Plain sum of rewards so far, per world."""
+    deterministic: list[float] = field(default_factory=list[float])
+    exploring: list[float] = field(default_factory=list[float])
+    returns: list[float] = field(default_factory=list[float])
+    best_success: float = -1.0
+
+    def success(self, cfg: PPOConfig, *, deterministic: bool = True) -> float:
+        """Return the rate over the window, or NaN while there are too few episodes."""
+        outcomes = self.deterministic if deterministic else self.exploring
+        return float(np.mean(outcomes)) if len(outcomes) >= cfg.min_window_episodes else math.nan
+
+
+def train_expert(
+    env: EnvBase,
+    cfg: PPOConfig,
+    out: Path,
+    *,
+    eval_env: EnvBase | None = None,
+    warm_start: Path | None = None,
+    on_progress: Callable[[int, int, float], None] | None = None,
+) -> ExpertResult:
+    """Train until the target, the step budget or the time limit; go on from `out/checkpoint.pt` if it exists.
+
+    Args:
+        env: a batch of worlds (see the room's docstring) which the caller has seeded.
+        cfg: the recipe.
+        out: folder of checkpoint, experts and curve.
+        eval_env: where the best expert plays fresh episodes at the end.
+        warm_start: another expert's folder; its actor and normalisation are the starting point.
+        on_progress: called after every batch with steps, total steps and deterministic success (NaN at first).
+
+    Raises:
+        ValueError: the checkpoint was made with another recipe, or there are too few worlds.
+        NotFiniteError: a NaN came out of the environment or the update.
+    """
+    num_envs = env.batch_size[0]
+    if num_envs <= cfg.num_deterministic:
+        raise ValueError(
+            f"{num_envs} worlds leave none to learn from: num_deterministic is {cfg.num_deterministic}"
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    with _torch_threads(cfg.num_threads):
+        learner = _Learner(env, cfg, out, warm_start)
+        stopped_by = learner.run(on_progress)
+    progress = learner.progress
+    expert = out / BEST_FOLDER if progress.best_success >= 0 else out / LAST_FOLDER
+    rate = None
+    if eval_env is not None:
+        rate = evaluate(eval_env, Expert.load(expert).act, num_episodes=cfg.eval_episodes)
+        log.info("fresh episodes of the best expert: %s", rate)
+    return ExpertResult(
+        folder=expert,
+        success=max(progress.best_success, 0.0),
+        steps=progress.steps,
+        seconds=progress.seconds,
+        stopped_by=stopped_by,
+        evaluation=rate,
+    )
+
+
+class _Learner:
+    """The parts of one training run, so that the checkpoint can list them."""
+
+    def __init__(self, env: EnvBase, cfg: PPOConfig, out: Path, warm_start: Path | None) -> None:
+        self.env, self.cfg, self.out = env, cfg, out
+        self.num_envs = env.batch_size[0]
+        self.generator = torch.Generator().manual_seed(cfg.seed)
+        obs_dim = env.observation_spec["observation"].shape[-1]  # type: ignore[union-attr]
+        self.model = ActorCritic(obs_dim, env.action_spec.shape[-1], cfg.actor, self.generator)
+        self.progress = _Progress(
+            learning_rate=cfg.learning_rate,
+            discounted=torch.zeros(self.num_envs),
+            episode_return=torch.zeros(self.num_envs),
+        )
+        if warm_start is not None:
+            _start_from(self.model, Expert.load(warm_start), cfg)
+        explore = _Explorer(self.model.actor, cfg.num_deterministic, self.generator)
+        self.loss, self.gae = _losses(self.model, cfg)
+        self.optimiser = torch.optim.Adam(
+            self.model.parameters(), lr=cfg.learning_rate, eps=1e-5, fused=True
+        )
+        self.collector = Collector(
+            env,
+            TensorDictModule(explore, ["observation"], ["action", "action_log_prob"]),
+            frames_per_batch=self.num_envs * cfg.batch_time,
+            total_frames=-1,
+            trust_policy=True,
+            track_traj_ids=False,
+        )
+        self.best_weights = weights_of(self.model)
+        self._resume()
+
+    def run(
+        self, on_progress: Callable[[int, int, float], None] | None
+    ) -> Literal["target", "steps", "seconds"]:
+        """Go on until something stops it, and leave everything on disk."""
+        cfg, progress = self.cfg, self.progress
+        before, started = progress.seconds, time.monotonic()
+        last_save = started
+        batches = iter(self.collector)
+        while (reason := self._reason_to_stop()) is None:
+            row = self._iterate(next(batches))
+            progress.seconds = before + time.monotonic() - started
+            append_row(
+                self.out / CURVE_FILE, {"steps": progress.steps, "seconds": progress.seconds} | row
+            )
+            if on_progress is not None:
+                on_progress(progress.steps, cfg.total_steps, progress.success(cfg))
+            if time.monotonic() - last_save > cfg.checkpoint_seconds:
+                self._save()
+                last_save = time.monotonic()
+        self._save()
+        self.collector.shutdown(close_env=False)
+        if (self.out / CURVE_FILE).is_file():
+            plot_curve(self.out / CURVE_FILE, self.out / PICTURE_FILE)
+        return reason
+
+    def _reason_to_stop(self) -> Literal["target", "steps", "seconds"] | None:
+        cfg, progress = self.cfg, self.progress
+        if progress.best_success >= cfg.target_success:
+            return "target"
+        if progress.steps >= cfg.total_steps:
+            return "steps"
+        if progress.seconds >= cfg.max_seconds:
+            return "seconds"
+        return None
+
+    def _iterate(self, batch: TensorDictBase) -> Row:
+        """Learn from one batch (env, time) and return the numbers of its curve row."""
+        cfg, progress = self.cfg, self.progress
+        self._check_finite(batch)
+        self._follow_episodes(batch)
+        success = progress.success(cfg)
+        if success >= max(progress.best_success, 0.0):
+            progress.best_success = success
+            self.best_weights = weights_of(self.model)
+        learning = batch[cfg.num_deterministic :]
+        kl = 0.0
+        # An untouched normaliser: the first batch only shows what observations look like.
+        is_first = float(self.model.normaliser.count) == 0
+        if not is_first:
+            kl = self._update(learning)
+        self.model.normaliser.update(batch["observation"].flatten(0, 1))
+        progress.iteration += 1
+        progress.steps += batch.numel()
+        components: Any = batch.get(COMPONENTS_KEY, None)
+        means = (
+            {}
+            if components is None
+            else {
+                str(k): float(v[cfg.num_deterministic :].float().mean())
+                for k, v in components.items()
+            }
+        )
+        return {
+            "iteration": progress.iteration,
+            "success_deterministic": success,
+            "success_stochastic": progress.success(cfg, deterministic=False),
+            "return": float(np.mean(progress.returns)) if progress.returns else math.nan,
+            "kl": kl,
+            "learning_rate": progress.learning_rate,
+            "std": float(self.model.actor.log_std.detach().exp().mean()),
+            **{f"reward_{name}": mean for name, mean in sorted(means.items())},
+        }
+
+    def _follow_episodes(self, batch: TensorDictBase) -> None:
+        """Take note of finished episodes and of the scale of the returns."""
+        cfg, progress = self.cfg, self.progress
+        reward, done = batch["next", "reward"][..., 0], batch["next", "done"][..., 0]
+        success = batch["next", "success"].reshape(done.shape)
+        squares = torch.zeros(())
+        for t in range(cfg.batch_time):
+            progress.discounted = cfg.gamma * progress.discounted + reward[:, t]
+            progress.episode_return = progress.episode_return + reward[:, t]
+            squares += progress.discounted.square().mean() / cfg.batch_time
+            ended = done[:, t].nonzero()[:, 0]
+            for world in ended.tolist():
+                outcomes = (
+                    progress.deterministic if world < cfg.num_deterministic else progress.exploring
+                )
+                outcomes.append(float(success[world, t]))
+                progress.returns.append(float(progress.episode_return[world]))
+            progress.discounted[ended] = 0.0
+            progress.episode_return[ended] = 0.0
+        for outcomes in (progress.deterministic, progress.exploring, progress.returns):
+            del outcomes[: -cfg.window_episodes]
+        keep = 0.95 if progress.iteration else 0.0
+        progress.mean_square_return = keep * progress.mean_square_return + (1 - keep) * float(
+            squares
+        )
+
+    def _update(self, batch: TensorDictBase) -> float:
+        """Run the epochs over one batch and return the KL divergence from the collecting policy."""
+        cfg, progress = self.cfg, self.progress
+        batch["next", "reward"] = batch["next", "reward"] / max(
+            math.sqrt(progress.mean_square_return), 1e-6
+        )
+        with torch.no_grad():
+            self.gae(batch)
+        advantage = batch["advantage"]
+        batch["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        flat = batch.select(
+            "observation", "action", "action_log_prob", "advantage", "value_target"
+        ).reshape(-1)
+        num_chunks = max(1, round(flat.numel() / cfg.minibatch))
+        kl = 0.0
+        for _ in range(cfg.epochs):
+            order = torch.randperm(flat.numel(), generator=self.generator)
+            kls = [self._descend(flat[idx]) for idx in order.chunk(num_chunks)]
+            kl = float(np.mean(kls))
+            if kl > cfg.kl_stop:
+                break
+        if kl > cfg.kl_high:
+            progress.learning_rate = max(progress.learning_rate / 1.5, cfg.min_learning_rate)
+        elif kl < cfg.kl_low:
+            progress.learning_rate = min(progress.learning_rate * 1.5, cfg.max_learning_rate)
+        for group in self.optimiser.param_groups:
+            group["lr"] = progress.learning_rate
+        return kl
+
+    def _descend(self, minibatch: TensorDictBase) -> float:
+        losses = self.loss(minibatch)
+        self.optimiser.zero_grad()
+        (losses["loss_objective"] + losses["loss_critic"]).backward()
+        # Apart, so that a large value error does not silence the actor.
+        norms = [
+            nn.utils.clip_grad_norm_(part.parameters(), self.cfg.max_grad_norm)
+            for part in (self.model.actor, self.model.critic)
+        ]
+        if not all(bool(norm.isfinite()) for norm in norms):
+            raise NotFiniteError(
+                f"the gradient is not finite in iteration {self.progress.iteration}"
+            )
+        self.optimiser.step()
+        self.model.actor.clamp_std()
+        # mean(ratio - 1 - log ratio): unbiased and never negative (Schulman 2020, "k3").
+        return float((losses["mean_ratio"] - 1 + losses["kl_approx"]).detach())
+
+    def _check_finite(self, batch: TensorDictBase) -> None:
+        for key in FINITE_KEYS:
+            bad = ~torch.isfinite(batch.get(key)).flatten(2).all(-1)
+            if not bool(bad.any()):
+                continue
+            world, step = bad.nonzero()[0].tolist()
+            dump = self.out / DUMP_FILE
+            torch.save({str(k): batch.get(k)[world].clone() for k in FINITE_KEYS}, dump)
+            name = key if isinstance(key, str) else "/".join(key)
+            raise NotFiniteError(
+                f"'{name}' of world {world} is not finite at step {step} of iteration {self.progress.iteration} "
+                f"({int(bad.any(1).sum())} worlds affected); that world's batch is in {dump}"
+            )
+
+    def _save(self) -> None:
+        """Write experts and checkpoint, each atomically."""
+        Expert(self.model).save(self.out / LAST_FOLDER)
+        if self.progress.best_success >= 0:
+            best = ActorCritic(
+                self.model.obs_dim, self.model.act_dim, self.cfg.actor, torch.Generator()
+            )
+            load_weights(best, self.best_weights)
+            Expert(best).save(self.out / BEST_FOLDER)
+        checkpoint = {
+            "recipe": _recipe(self.cfg),
+            "progress": vars(self.progress),
+            "weights": weights_of(self.model),
+            "best_weights": self.best_weights,
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+            "env": dict(self.env.state_dict()),
+            # The observations and flags that the collector goes on from; it has no public way to hand them out.
+            "carrier": self.collector._carrier.clone().to_dict(),
+        }
+        partial = self.out / f"{CHECKPOINT_FILE}.partial"
+        torch.save(checkpoint, partial)
+        partial.replace(self.out / CHECKPOINT_FILE)
+
+    def _resume(self) -> None:
+        path = self.out / CHECKPOINT_FILE
+        if not path.is_file():
+            (self.out / CURVE_FILE).unlink(missing_ok=True)
+            return
+        saved: dict[str, Any] = torch.load(path, weights_only=True)
+        _check_recipe(saved["recipe"], _recipe(self.cfg), path)
+        for name, value in saved["progress"].items():
+            setattr(self.progress, name, value)
+        load_weights(self.model, saved["weights"])
+        self.best_weights = saved["best_weights"]
+        self.optimiser.load_state_dict(saved["optimiser"])
+        self.generator.set_state(saved["generator"])
+        cut_after(self.out / CURVE_FILE, self.progress.steps)
+        if saved["env"]:
+            self.env.load_state_dict(saved["env"])
+            self.collector._carrier.update(TensorDict(saved["carrier"], self.env.batch_size))
+        else:
+            self.progress.discounted.zero_()
+            self.progress.episode_return.zero_()
+            log.info(
+                "the environment keeps no state: its worlds start new episodes at this resumption"
+            )
+        log.info("going on from step %d of %d", self.progress.steps, self.cfg.total_steps)
+
+
+class _Explorer(nn.Module):
+    """The actor as the collector calls it: noise from our generator, and none for the deterministic worlds."""
+
+    def __init__(
+        self, actor: nn.Module, num_deterministic: int, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.actor, self.num_deterministic, self.generator = actor, num_deterministic, generator
+
+    def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean, std = self.actor(obs)
+        noise = torch.randn(mean.shape, generator=self.generator)
+        noise[: self.num_deterministic] = 0.0
+        action = mean + std * noise
+        return action, _Gaussian(mean, std).log_prob(action)
+
+
+class _Gaussian(Independent):
+    """Independent normals, one per action."""
+
+    def __init__(self, loc: torch.Tensor, scale: torch.Tensor) -> None:
+        super().__init__(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+
+
+def _losses(model: ActorCritic, cfg: PPOConfig) -> tuple[ClipPPOLoss, GAE]:
+    """Return TorchRL's loss and advantage over the model's two networks."""
+    gaussian = TensorDictModule(model.actor, ["observation"], ["loc", "scale"])
+    sample = ProbabilisticTensorDictModule(
+        ["loc", "scale"], ["action"], distribution_class=_Gaussian, return_log_prob=True
+    )
+    # A dict: the type stubs know no positional modules.
+    actor = ProbabilisticTensorDictSequential(OrderedDict(gaussian=gaussian, sample=sample))
+    critic = TensorDictModule(model.critic, ["observation"], ["state_value"])
+    loss = ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=cfg.clip,
+        entropy_bonus=False,
+        critic_coeff=1.0,
+        loss_critic_type="l2",
+        functional=False,
+    )
+    return loss, advantage_estimator(critic, cfg)
+
+
+def advantage_estimator(critic: TensorDictModule, cfg: PPOConfig) -> GAE:
+    """Return GAE in which a time limit bootstraps from the next state's value and a termination does not."""
+    return GAE(
+        gamma=cfg.gamma,
+        lmbda=cfg.gae_lambda,
+        value_network=critic,
+        shifted=False,
+        deactivate_vmap=True,
+        time_dim=1,
+    )
+
+
+def _start_from(model: ActorCritic, expert: Expert, cfg: PPOConfig) -> None:
+    """Take over actor and normalisation; the value starts at zero, for it belongs to another reward."""
+    load_weights(model, weights_of(expert.model))
+    with torch.no_grad():
+        model.actor.log_std.fill_(math.log(cfg.warm_start_std))
+        last = model.critic.net[-1]
+        for parameter in last.parameters():
+            parameter.zero_()
+    model.actor.clamp_std()
+
+
+def _recipe(cfg: PPOConfig) -> dict[str, Any]:
+    """The settings that must not change between a checkpoint and its continuation."""
+    free = {
+        "total_steps",
+        "max_seconds",
+        "target_success",
+        "checkpoint_seconds",
+        "num_threads",
+        "eval_episodes",
+    }
+    recipe = {k: v for k, v in asdict(cfg).items() if k not in free}
+    recipe["actor"] = {
+        k: list(v) if isinstance(v, tuple) else v for k, v in recipe["actor"].items()
+    }
+    return recipe
+
+
+def _check_recipe(saved: dict[str, Any], asked: dict[str, Any], path: Path) -> None:
+    changed = sorted(k for k in saved.keys() | asked.keys() if saved.get(k) != asked.get(k))
+    if changed:
+        what = ", ".join(f"{k} was {saved.get(k)}, is {asked.get(k)}" for k in changed)
+        raise ValueError(
+            f"{path} was made with another recipe ({what}); train in an empty folder instead"
+        )
+
+
+@contextmanager
+def _torch_threads(num_threads: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(num_threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

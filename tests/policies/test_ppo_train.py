@@ -1,0 +1,301 @@
+"""PPO learns, repeats itself, survives a kill, and tells time limits from terminations."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from policies.ppo.evaluate import evaluate
+from policies.ppo.policy import ActorConfig, Expert, weights_of
+from policies.ppo.train import NotFiniteError, PPOConfig, advantage_estimator, train_expert
+
+HORIZON = 20
+REACH = 0.15
+
+
+class PointMass(EnvBase):
+    """Position in the plane, action = velocity; success = near the goal at the end.
+
+    Observations are off-centre and badly scaled on purpose: normalisation has something to do.
+    """
+
+    def __init__(
+        self, num_envs: int, seed: int = 0, *, keeps_state: bool = True, nan_at: int | None = None
+    ):
+        super().__init__(device="cpu", batch_size=[num_envs])
+        n = num_envs
+        self.keeps_state, self.nan_at, self.num_calls = keeps_state, nan_at, 0
+        self.stream = torch.Generator().manual_seed(seed)
+        self.pos, self.goal = torch.zeros(n, 2), torch.zeros(n, 2)
+        self.t = torch.zeros(n, dtype=torch.long)
+        self.observation_spec = Composite(
+            observation=Unbounded((n, 4)),
+            success=Binary(1, (n, 1), dtype=torch.bool),
+            components=Composite(near=Unbounded((n, 1)), batch_size=[n]),
+            batch_size=[n],
+        )
+        self.action_spec = Bounded(-1, 1, (n, 2))
+        self.reward_spec = Unbounded((n, 1))
+        flag = Binary(1, (n, 1), dtype=torch.bool)
+        self.done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), batch_size=[n]
+        )
+
+    def _observe(self) -> torch.Tensor:
+        return torch.cat([1000 + 50 * self.pos, self.goal - self.pos], 1)
+
+    def _out(self, ends: torch.Tensor) -> dict:
+        near = (self.goal - self.pos).norm(dim=1, keepdim=True)
+        no = torch.zeros_like(ends)
+        return {
+            "observation": self._observe(),
+            "success": near < REACH,
+            "components": TensorDict({"near": -near}, self.batch_size),
+            "done": ends,
+            "terminated": no,
+            "truncated": ends.clone(),
+        }
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
+        everyone = torch.ones(self.batch_size[0], dtype=torch.bool)
+        mask = everyone if tensordict is None else tensordict.get("_reset", everyone).flatten()
+        n = int(mask.sum())
+        self.pos[mask] = torch.rand(n, 2, generator=self.stream) * 2 - 1
+        self.goal[mask] = torch.rand(n, 2, generator=self.stream) * 2 - 1
+        self.t[mask] = 0
+        return TensorDict(
+            self._out(torch.zeros(self.batch_size[0], 1, dtype=torch.bool)), self.batch_size
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self.pos = self.pos + 0.2 * tensordict["action"].clamp(-1, 1)
+        self.t = self.t + 1
+        out = self._out((self.t >= HORIZON)[:, None])
+        self.num_calls += 1
+        if self.nan_at is not None and self.num_calls == self.nan_at:
+            out["observation"][5, 1] = torch.nan
+        return TensorDict({**out, "reward": out["components"]["near"].clone()}, self.batch_size)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.stream.manual_seed(seed or 0)
+
+    def get_extra_state(self):
+        return {"pos": self.pos, "goal": self.goal, "t": self.t, "stream": self.stream.get_state()}
+
+    def set_extra_state(self, state):
+        self.pos, self.goal, self.t = (state[k].clone() for k in ("pos", "goal", "t"))
+        self.stream.set_state(state["stream"])
+
+    def state_dict(self, *args, **kwargs):
+        return super().state_dict(*args, **kwargs) if self.keeps_state else {}
+
+
+SMALL = PPOConfig(
+    batch_time=8,
+    minibatch=128,
+    num_deterministic=16,
+    window_episodes=32,
+    min_window_episodes=16,
+    # The last action of the point mass is no gripper.
+    actor=ActorConfig(hidden=(32, 32), gripper_mean_bound=1.5, gripper_min_std=0.1),
+)
+BATCH = 64 * 8
+
+
+def steps(num_batches: int) -> PPOConfig:
+    return replace(SMALL, total_steps=num_batches * BATCH, target_success=2.0)
+
+
+def weights_in(folder: Path) -> dict[str, torch.Tensor]:
+    return weights_of(Expert.load(folder / "last").model)
+
+
+def are_equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "curve.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_time_limit_bootstraps_and_a_termination_does_not():
+    # Values: 1 everywhere. Rewards 1, 1, 1; the second of three steps ends the episode.
+    gae = advantage_estimator(
+        TensorDictModule(lambda obs: torch.ones_like(obs), ["observation"], ["state_value"]),
+        replace(SMALL, gamma=0.5, gae_lambda=0.5),
+    )
+    ends = torch.tensor([[False, True, False]])[..., None].expand(2, 3, 1)
+    terminated = ends.clone()
+    terminated[0] = False
+    batch = TensorDict(
+        {
+            "observation": torch.zeros(2, 3, 1),
+            "next": {
+                "observation": torch.zeros(2, 3, 1),
+                "reward": torch.ones(2, 3, 1),
+                "done": ends,
+                "terminated": terminated,
+            },
+        },
+        [2, 3],
+    )
+
+    advantage = gae(batch)["advantage"][..., 0]
+
+    # delta = r + .5 V' - V: .5 where the next value counts, 0 where the episode terminated.
+    # Time limit: A = [.5 + .25 * .5, .5, .5]; termination: A = [.5 + .25 * 0, 0, .5].
+    torch.testing.assert_close(advantage, torch.tensor([[0.625, 0.5, 0.5], [0.5, 0.0, 0.5]]))
+
+
+@pytest.mark.slow
+def test_a_point_learns_to_reach_its_goal(tmp_path: Path):
+    cfg = replace(SMALL, total_steps=200_000, target_success=0.95, eval_episodes=200)
+
+    result = train_expert(PointMass(64, seed=1), cfg, tmp_path, eval_env=PointMass(64, seed=2))
+
+    assert result.stopped_by == "target"
+    assert result.evaluation is not None
+    assert result.evaluation.low > 0.8
+    assert (tmp_path / "curve.png").stat().st_size > 1000
+
+
+def test_an_untrained_point_rarely_reaches_its_goal(tmp_path: Path):
+    result = train_expert(
+        PointMass(64, seed=1), steps(1), tmp_path, eval_env=PointMass(64, seed=2)
+    )
+
+    assert result.evaluation is not None
+    assert result.evaluation.high < 0.3
+
+
+def test_the_same_seed_makes_the_same_weights_and_another_seed_others(tmp_path: Path):
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        train_expert(PointMass(64, seed=1), replace(steps(3), seed=seed), tmp_path / name)
+
+    assert are_equal(weights_in(tmp_path / "a"), weights_in(tmp_path / "b"))
+    assert not are_equal(weights_in(tmp_path / "a"), weights_in(tmp_path / "c"))
+
+
+def test_two_iterations_resumed_to_four_equal_four(tmp_path: Path):
+    train_expert(PointMass(64, seed=1), steps(4), tmp_path / "whole")
+
+    train_expert(PointMass(64, seed=1), steps(2), tmp_path / "parts")
+    train_expert(PointMass(64, seed=99), steps(4), tmp_path / "parts")
+
+    assert are_equal(weights_in(tmp_path / "whole"), weights_in(tmp_path / "parts"))
+    for whole, part in zip(rows_of(tmp_path / "whole"), rows_of(tmp_path / "parts"), strict=True):
+        assert {**whole, "seconds": ""} == {**part, "seconds": ""}
+
+
+def test_an_environment_without_state_resumes_with_new_episodes(tmp_path: Path):
+    train_expert(PointMass(64, seed=1, keeps_state=False), steps(2), tmp_path)
+    before = weights_in(tmp_path)
+
+    result = train_expert(PointMass(64, seed=2, keeps_state=False), steps(4), tmp_path)
+
+    assert result.steps == 4 * BATCH
+    assert not are_equal(before, weights_in(tmp_path))
+
+
+class KilledError(Exception):
+    pass
+
+
+def test_a_kill_after_the_last_checkpoint_changes_nothing(tmp_path: Path):
+    def kill(done: int, total: int, success: float) -> None:
+        if done == 3 * BATCH:
+            raise KilledError
+
+    train_expert(PointMass(64, seed=1), steps(5), tmp_path / "whole")
+
+    train_expert(PointMass(64, seed=1), steps(2), tmp_path / "killed")
+    with pytest.raises(KilledError):
+        train_expert(PointMass(64, seed=1), steps(5), tmp_path / "killed", on_progress=kill)
+    train_expert(PointMass(64, seed=1), steps(5), tmp_path / "killed")
+
+    assert are_equal(weights_in(tmp_path / "whole"), weights_in(tmp_path / "killed"))
+    assert [row["iteration"] for row in rows_of(tmp_path / "killed")] == ["1", "2", "3", "4", "5"]
+
+
+def test_a_finished_training_is_left_as_it_is(tmp_path: Path):
+    train_expert(PointMass(64, seed=1), steps(2), tmp_path)
+    weights, rows = weights_in(tmp_path), rows_of(tmp_path)
+
+    result = train_expert(PointMass(64, seed=1), steps(2), tmp_path)
+
+    assert result.stopped_by == "steps"
+    assert are_equal(weights, weights_in(tmp_path))
+    assert rows == rows_of(tmp_path)
+
+
+def test_a_checkpoint_of_another_recipe_is_refused_by_name(tmp_path: Path):
+    train_expert(PointMass(64, seed=1), steps(1), tmp_path)
+
+    with pytest.raises(ValueError, match=r"gamma was 0\.97, is 0\.5"):
+        train_expert(PointMass(64, seed=1), replace(steps(2), gamma=0.5), tmp_path)
+
+
+def test_a_nan_is_named_by_key_world_and_step(tmp_path: Path):
+    with pytest.raises(
+        NotFiniteError,
+        match="'next/observation' of world 5 is not finite at step 2 of iteration 1",
+    ):
+        train_expert(PointMass(64, seed=1, nan_at=8 + 3), steps(3), tmp_path)
+
+    assert (tmp_path / "not_finite.pt").is_file()
+
+
+def test_a_warm_start_begins_where_the_other_expert_ended(tmp_path: Path):
+    train_expert(PointMass(64, seed=1), steps(4), tmp_path / "first")
+    first = weights_in(tmp_path / "first")
+
+    # No budget: what is saved is what the run started from.
+    train_expert(
+        PointMass(64, seed=2),
+        steps(0),
+        tmp_path / "second",
+        warm_start=tmp_path / "first" / "last",
+    )
+    second = weights_in(tmp_path / "second")
+
+    actor = [k for k in first if k.startswith(("actor.net", "normaliser"))]
+    assert are_equal({k: first[k] for k in actor}, {k: second[k] for k in actor})
+    torch.testing.assert_close(
+        second["actor.log_std"].exp(), torch.full((2,), SMALL.warm_start_std)
+    )
+
+
+def test_worlds_that_are_all_deterministic_are_refused(tmp_path: Path):
+    with pytest.raises(ValueError, match="64 worlds leave none to learn from"):
+        train_expert(PointMass(64), replace(SMALL, num_deterministic=64), tmp_path)
+
+
+def test_the_curve_holds_every_reward_component_by_name(tmp_path: Path):
+    train_expert(PointMass(64, seed=1), steps(2), tmp_path)
+
+    near = [float(row["reward_near"]) for row in rows_of(tmp_path)]
+    # Two points drawn evenly in a square of side 2 are 1.04 apart on average.
+    assert -1.5 < near[0] < -0.7
+
+
+def test_evaluation_counts_whole_episodes_of_a_policy_that_knows_the_way():
+    def straight_there(obs: np.ndarray) -> np.ndarray:
+        return obs[:, 2:] / 0.2
+
+    def straight_away(obs: np.ndarray) -> np.ndarray:
+        return -obs[:, 2:]
+
+    good = evaluate(PointMass(64), straight_there, num_episodes=100)
+    bad = evaluate(PointMass(64), straight_away, num_episodes=100)
+
+    assert (good.successes, good.trials) == (100, 100)
+    # Only a point that starts at its goal can be there still: pi .15^2 / 4 = 1.8 %, and it moves away.
+    assert bad.successes <= 2
