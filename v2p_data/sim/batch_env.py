@@ -1,0 +1,517 @@
+"""Thousands of worlds of one task in step: actions in, observations, rewards and successes out.
+
+A numpy core on `mujoco.batch.Batch`. Actions move a target for the tool, which two leashes hold near the
+tool itself: 6 cm for the position, 8 mm for the fingers. Without the latter the command to close winds up
+and a policy practically never finds out how to release. There is no automatic reset: worlds that have
+ended go on until `reset` is called for them. Results depend on the seed only, not on the number of threads.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco's classes come from a compiled module that declares none of them.
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int
+from mujoco.batch import Batch
+
+from v2p_data.errors import V2PError
+from v2p_data.seeds import rng_for
+from v2p_data.sim import randomize
+from v2p_data.sim.randomize import RandomizationConfig, Randomizer
+from v2p_data.sim.robot import (
+    COARSE,
+    FINE,
+    FINGER_TRAVEL_M,
+    NUM_ARM_JOINTS,
+    NUM_CONTROLS,
+    QUAT_DOWN,
+    TARGET_HIGH_M,
+    TARGET_LOW_M,
+    ToolState,
+    tool_state,
+)
+from v2p_data.sim.states import Observed, StateBlock
+from v2p_data.sim.world import World, build_world
+from v2p_data.task.task import Task, TaskBundle
+
+ACT_DIM = 7
+HELD_STEPS = 5
+"""Success counts when it is true for this many steps on end (0.25 s)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimConfig:
+    """How a task is simulated."""
+
+    fine: bool = False
+    """Small time steps, for evaluation and recording; else large ones, for training."""
+    randomization: RandomizationConfig = field(default_factory=randomize.training)
+    position_step_m: float = 0.03
+    """Target displacement at action 1, per control step."""
+    rotation_step_rad: float = 0.2
+    finger_step_m: float = 0.012
+    position_leash_m: float = 0.06
+    """The target stays this near the tool, per axis."""
+    rotation_leash_rad: float = 0.5
+    finger_leash_m: float = 0.008
+    """The target of a finger that is blocked by an object runs ahead by this much at most."""
+    tilt_limit_rad: float = 0.35
+    """How far the gripper may lean from pointing straight down."""
+    success_bonus: float = 100.0
+    """Added to the task's reward at every step that counts as a success (the paper's value)."""
+    reward_scale: float = 100.0
+    """The sum is divided by this, so that values are about 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepResult:
+    """What one control step led to, per world."""
+
+    obs: Float32[np.ndarray, "env obs"]
+    reward: Float32[np.ndarray, "env"]
+    """`(task_reward + success_bonus * success) / reward_scale`."""
+    success: Bool[np.ndarray, "env"]
+    """The task's own judgement of this very moment."""
+    held: Bool[np.ndarray, "env"]
+    """Success for the last `HELD_STEPS` steps: what an episode is judged by, at its end."""
+    terminated: Bool[np.ndarray, "env"]
+    """The simulation broke down: the state is not finite, or MuJoCo warned and reset it."""
+    truncated: Bool[np.ndarray, "env"]
+    """The time is up."""
+    task_reward: Float32[np.ndarray, "env"]
+    components: dict[str, Float32[np.ndarray, "env"]]
+    """The task's named parts of its reward."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """All that is needed to draw some worlds later, or to continue them."""
+
+    qpos: Float[np.ndarray, "n q"]
+    qvel: Float[np.ndarray, "n v"]
+    geom_size: Float[np.ndarray, "n geom 3"]
+    geom_pos: Float[np.ndarray, "n geom 3"]
+    geom_dataid: Int[np.ndarray, "n geom"]
+
+    def write(self, model: mujoco.MjModel, data: mujoco.MjData, index: int) -> None:
+        """Put world `index` into a model and its data and compute positions, ready to be drawn."""
+        model.geom_size[:] = self.geom_size[index]
+        model.geom_pos[:] = self.geom_pos[index]
+        model.geom_dataid[:] = self.geom_dataid[index]
+        data.qpos[:] = self.qpos[index]
+        data.qvel[:] = self.qvel[index]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+
+    def rows(self, index: Int[np.ndarray, "k"]) -> "Snapshot":
+        """Return some of its worlds."""
+        return Snapshot(**{key: value[index] for key, value in self.arrays().items()})
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return its fields, e.g. for `np.savez`."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    @staticmethod
+    def from_arrays(arrays: dict[str, np.ndarray]) -> "Snapshot":
+        """Return what `arrays` gave."""
+        return Snapshot(
+            **{name: np.asarray(arrays[name]) for name in Snapshot.__dataclass_fields__}
+        )
+
+    def save(self, path: Path) -> None:
+        """Write it as `.npz`."""
+        np.savez_compressed(path, **self.arrays())  # pyright: ignore[reportArgumentType]
+
+    @staticmethod
+    def load(path: Path) -> "Snapshot":
+        """Read what `save` wrote."""
+        with np.load(path) as arrays:
+            return Snapshot.from_arrays(dict(arrays))
+
+
+class BatchEnv:
+    """Worlds of one task.
+
+    Args:
+        bundle: code and scene of the task.
+        cfg: how it is simulated.
+        num_envs: number of worlds; 256 to 1024 are fastest.
+        seed: everything drawn follows from it.
+        num_threads: 0 for all cores; changes no result.
+        task: the task, instead of `bundle.code`.
+
+    Raises:
+        ItemRejectedError: an object does not suit the robot, or the objects do not fit on the table.
+        V2PError: the task's observation is not what it says.
+    """
+
+    act_dim = ACT_DIM
+
+    def __init__(
+        self,
+        bundle: TaskBundle,
+        cfg: SimConfig | None = None,
+        *,
+        num_envs: int,
+        seed: int,
+        num_threads: int = 0,
+        task: type[Task] | None = None,
+    ) -> None:
+        self.cfg = cfg or SimConfig()
+        self.bundle = bundle
+        self.num_envs = num_envs
+        self.horizon = bundle.horizon_steps
+        self.physics = FINE if self.cfg.fine else COARSE
+        self.world: World = build_world(bundle.scene, self.physics)
+        self.object_names = [o.name for o in self.world.objects]
+        self.broken_count = 0
+        """Worlds whose simulation broke down since the environment was made."""
+        self._bind(num_threads)
+        self.randomizer = Randomizer(
+            self.world, self._batch, self.cfg.randomization, rng_for(seed, "start-poses")
+        )
+        self._rng = rng_for(seed, "worlds")
+        self._allocate()
+        self.task = self._load_task(task)
+        self.reset(np.arange(num_envs))
+        self.obs_dim = self._checked_obs_dim()
+
+    # -- what task code may ask for
+
+    def sample_object_poses(self, env_ids: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return per object poses `(n, 7)`, resting on the table and apart from each other."""
+        poses = self.randomizer.place(env_ids.numpy().astype(np.int64), self._rng)
+        return {name: torch.from_numpy(poses[:, k]) for k, name in enumerate(self.object_names)}
+
+    # -- the loop
+
+    def seed(self, seed: int) -> None:
+        """Restart the stream of everything drawn from now on."""
+        self._rng = rng_for(seed, "worlds")
+
+    def reset(self, ids: Int[np.ndarray, "n"]) -> None:
+        """Start new episodes in the worlds `ids`."""
+        n = len(ids)
+        if n == 0:
+            return
+        ids = np.asarray(ids, np.int64)
+        self._batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self.randomizer.draw(ids, self._rng)
+        arm, tool_pos, yaw = self.randomizer.start_arm(n, self._rng)
+        self._qpos[ids, :NUM_ARM_JOINTS] = arm
+        self._qpos[ids, NUM_ARM_JOINTS : NUM_ARM_JOINTS + 2] = FINGER_TRAVEL_M
+        self._target_pos[ids] = tool_pos
+        self._target_quat[ids] = _turned_down(yaw)
+        self._target_finger[ids] = FINGER_TRAVEL_M
+        poses = self.task.reset_objects_states(torch.from_numpy(ids))
+        for k, name in enumerate(self.object_names):
+            self._object_qpos[ids, k] = poses[name].numpy()
+        self._start_pose[ids] = self._object_qpos[ids]
+        self._steps[ids] = 0
+        self._held[ids] = 0
+        self._last_action[ids] = 0
+        self._touches[ids] = 0
+        self._broken[ids] = False
+        self._write_controls(ids)
+        # The delay line starts at the controls, not at zero, else the arm is pulled to the origin at first.
+        self._history[ids[:, None], self._history_values] = self._ctrl[ids][:, self._history_ctrl]
+        tool = tool_state(self._qpos[ids, :NUM_ARM_JOINTS], self._qvel[ids, :NUM_ARM_JOINTS])
+        for name in ("pos", "rotation", "quat_wxyz", "vel_linear", "vel_angular"):
+            getattr(self._tool, name)[ids] = getattr(tool, name)
+        self._fill(ids, tool)
+
+    def observe(self) -> Float32[np.ndarray, "env obs"]:
+        """Return the observation of all worlds as they are."""
+        states = self.states()
+        columns = [states[key] for key in self.task.compute_observation_key(states)]
+        parts = [c if c.ndim == 2 else c[:, None] for c in columns]
+        obs = parts[0].clone() if len(parts) == 1 else torch.cat(parts, dim=1)
+        array = obs.numpy()
+        return np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0).astype(
+            np.float32, copy=False
+        )
+
+    def step(self, action: Float[np.ndarray, "env 7"]) -> StepResult:
+        """Carry out one action of 50 ms in every world; actions are clipped to [-1, 1]."""
+        clipped = np.clip(np.nan_to_num(np.asarray(action, float)), -1.0, 1.0)
+        noise = self.cfg.randomization.action_noise
+        moved = clipped + self._rng.normal(0.0, noise, clipped.shape) if noise else clipped
+        self._move_targets(moved)
+        self._write_controls(slice(None))
+        self._batch.step(nstep=self.physics.substeps)
+        self._last_action[:] = clipped
+        self._steps += 1
+        self._touches[:] = self._sensordata.reshape(self.num_envs, -1, 2) > 0
+        self._find_broken()
+        self._tool = tool_state(self._qpos[:, :NUM_ARM_JOINTS], self._qvel[:, :NUM_ARM_JOINTS])
+        self._fill(slice(None), self._tool)
+        return self._judge(clipped)
+
+    def states(self) -> dict[str, torch.Tensor]:
+        """Return the tensors task code sees; they share memory that the next step or reset overwrites."""
+        return self._block.tensors()
+
+    def robot_state(self) -> Float32[np.ndarray, "env 7"]:
+        """Return `observation.state`: tool position [m], its rotation from straight down [rad], opening 0 to 1."""
+        fingers = self._qpos[:, NUM_ARM_JOINTS : NUM_ARM_JOINTS + 2].sum(1, keepdims=True)
+        return np.concatenate(
+            [
+                self._tool.pos,
+                _rotvec_from_down(self._tool.quat_wxyz),
+                np.clip(fingers / (2 * FINGER_TRAVEL_M), 0.0, 1.0),
+            ],
+            axis=1,
+            dtype=np.float32,
+        )
+
+    def snapshot(self, ids: Int[np.ndarray, "n"]) -> Snapshot:
+        """Return what is needed to draw the worlds `ids` as they are now."""
+        fields = {
+            name: self._batch.expand(name)[ids].copy()
+            for name in ("geom_size", "geom_pos", "geom_dataid")
+        }
+        return Snapshot(qpos=self._qpos[ids].copy(), qvel=self._qvel[ids].copy(), **fields)
+
+    def episode_params(self, env: int) -> dict[str, Any]:
+        """Return what was drawn for the episode in world `env`, for JSON."""
+        return {
+            **self.randomizer.drawn(env),
+            "start_poses": {
+                name: np.round(self._start_pose[env, k], 5).tolist()
+                for k, name in enumerate(self.object_names)
+            },
+            "fine": self.cfg.fine,
+        }
+
+    # -- inside
+
+    def _bind(self, num_threads: int) -> None:
+        model = self.world.model
+        self._batch = Batch(model, self.num_envs, num_threads)
+        self._qpos = self._batch.bind("qpos")
+        self._qvel = self._batch.bind("qvel")
+        self._ctrl = self._batch.bind("ctrl")
+        self._history = self._batch.bind("history")
+        self._sensordata = self._batch.bind("sensordata")
+        count = len(self.world.objects)
+        q, v = self.world.objects[0].qpos_adr, self.world.objects[0].dof_adr
+        self._object_qpos = self._qpos[:, q : q + 7 * count].reshape(self.num_envs, count, 7)
+        self._object_qvel = self._qvel[:, v : v + 6 * count].reshape(self.num_envs, count, 6)
+        if not np.shares_memory(self._object_qpos, self._qpos):
+            raise RuntimeError("object poses must be a view of qpos")
+        self._history_values, self._history_ctrl = _history_layout(model)
+
+    def _allocate(self) -> None:
+        n, count = self.num_envs, len(self.object_names)
+        self._block = StateBlock(self.world, n)
+        self._target_pos = np.zeros((n, 3))
+        self._target_quat = np.tile(np.asarray(QUAT_DOWN), (n, 1))
+        self._target_finger = np.zeros(n)
+        self._start_pose = np.zeros((n, count, 7))
+        self._touches = np.zeros((n, count, 2))
+        self._steps = np.zeros(n, np.int64)
+        self._held = np.zeros(n, np.int64)
+        self._last_action = np.zeros((n, ACT_DIM))
+        self._broken = np.zeros(n, bool)
+        self._tool = tool_state(np.zeros((n, NUM_ARM_JOINTS)), np.zeros((n, NUM_ARM_JOINTS)))
+
+    def _load_task(self, task: type[Task] | None) -> Task:
+        if task is not None:
+            return task(self, str(self.bundle.scene.folder), {})
+        from v2p_data.task.sandbox import load_task
+
+        return load_task(self.bundle.code, envs=self, scene=self.bundle.scene)
+
+    def _checked_obs_dim(self) -> int:
+        made, said = self.observe().shape[1], int(self.task.get_observation_space())
+        if made != said:
+            raise V2PError(
+                f"task '{self.bundle.title}' makes observations of length {made} but says {said}; "
+                "correct get_observation_space or compute_observation_key in its task.py"
+            )
+        return said
+
+    def _move_targets(self, action: np.ndarray) -> None:
+        cfg, tool = self.cfg, self._tool
+        pos = self._target_pos + action[:, :3] * cfg.position_step_m
+        pos = np.clip(pos, tool.pos - cfg.position_leash_m, tool.pos + cfg.position_leash_m)
+        self._target_pos = np.clip(pos, TARGET_LOW_M, TARGET_HIGH_M)
+        quat = _product(_exp(action[:, 3:6] * cfg.rotation_step_rad), self._target_quat)
+        quat = _leashed(quat, tool.quat_wxyz, cfg.rotation_leash_rad)
+        self._target_quat = _limit_tilt(quat, cfg.tilt_limit_rad)
+        travel = self._qpos[:, NUM_ARM_JOINTS : NUM_ARM_JOINTS + 2].mean(1)
+        finger = np.maximum(
+            self._target_finger - action[:, 6] * cfg.finger_step_m, travel - cfg.finger_leash_m
+        )
+        self._target_finger = np.clip(finger, 0.0, FINGER_TRAVEL_M)
+        for target, safe in (
+            (self._target_pos, (0.5, 0.0, 0.2)),
+            (self._target_quat, QUAT_DOWN),
+            (self._target_finger, FINGER_TRAVEL_M),
+        ):
+            if not np.isfinite(target).all():  # broken worlds wait for their reset
+                target[~np.isfinite(target.reshape(self.num_envs, -1)).all(1)] = safe
+
+    def _write_controls(self, rows: slice | np.ndarray) -> None:
+        self._ctrl[rows, 0:3] = self._target_pos[rows]
+        self._ctrl[rows, 3:7] = self._target_quat[rows]
+        self._ctrl[rows, 7] = self._target_finger[rows]
+
+    def _find_broken(self) -> None:
+        warned = self._batch.warning[:, _BAD_STATE_WARNINGS, 1].any(1)
+        finite = np.isfinite(self._qpos).all(1) & np.isfinite(self._qvel).all(1)
+        broken = warned | ~finite
+        self.broken_count += int((broken & ~self._broken).sum())
+        self._broken = broken
+
+    def _fill(self, rows: slice | np.ndarray, tool: ToolState) -> None:
+        self._block.fill(
+            rows,
+            Observed(
+                tool=tool,
+                fingers=self._qpos[rows, NUM_ARM_JOINTS : NUM_ARM_JOINTS + 2],
+                object_qpos=self._object_qpos[rows],
+                object_qvel=self._object_qvel[rows],
+                object_size=self.randomizer.size_m[rows],
+                start_pose=self._start_pose[rows],
+                touches=self._touches[rows],
+                target_pos=self._target_pos[rows],
+                target_finger=self._target_finger[rows],
+                last_action=self._last_action[rows],
+                progress=self._steps[rows] / self.horizon,
+            ),
+        )
+
+    def _judge(self, action: np.ndarray) -> StepResult:
+        states = self.states()
+        ok = ~self._broken
+        success = self.task.compute_success(states).numpy().astype(bool) & ok
+        total, parts = self.task.compute_reward(
+            torch.from_numpy(action.astype(np.float32)), states
+        )
+        task_reward = np.where(ok, total.detach().numpy(), 0.0).astype(np.float32)
+        finite = np.isfinite(task_reward)
+        if not finite.all():
+            env = int(np.flatnonzero(~finite)[0])
+            raise V2PError(
+                f"the reward of task '{self.bundle.title}' is {task_reward[env]} in world {env} although its state "
+                f"is finite; parts: { {k: float(v[env]) for k, v in parts.items()} }"
+            )
+        self._held = np.where(success, self._held + 1, 0)
+        reward = (task_reward + self.cfg.success_bonus * success) / self.cfg.reward_scale
+        return StepResult(
+            obs=self.observe(),
+            reward=reward.astype(np.float32),
+            success=success,
+            held=self._held >= HELD_STEPS,
+            terminated=self._broken.copy(),
+            truncated=(self._steps >= self.horizon) & ok,
+            task_reward=task_reward,
+            components={
+                k: np.where(ok, v.detach().numpy(), 0.0).astype(np.float32)
+                for k, v in parts.items()
+            },
+        )
+
+
+_BAD_STATE_WARNINGS = [
+    int(w)
+    for w in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+        mujoco.mjtWarning.mjWARN_BADCTRL,
+    )
+]
+
+
+def without_randomization(cfg: SimConfig) -> SimConfig:
+    """Return the same settings with the video's layout and nothing random."""
+    return replace(cfg, randomization=randomize.none())
+
+
+def _history_layout(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions of past control values in `history`, and the control each belongs to.
+
+    Per actuator the buffer holds a user slot, a cursor, `nsample` times, then `nsample` rows of values.
+    """
+    places, controls = [], []
+    for k in range(len(model.actuator_historyadr)):
+        start, samples = int(model.actuator_historyadr[k]), int(model.actuator_history[k, 0])
+        first, width = int(model.actuator_ctrladr[k]), int(model.actuator_ctrlnum[k])
+        places += range(start + 2 + samples, start + 2 + samples + samples * width)
+        controls += list(range(first, first + width)) * samples
+    if len(set(controls)) != NUM_CONTROLS:
+        raise RuntimeError("every control needs a delay line")
+    return np.array(places), np.array(controls)
+
+
+def _turned_down(yaw: np.ndarray) -> np.ndarray:
+    zero = np.zeros_like(yaw)
+    return np.stack([zero, np.cos(yaw / 2), np.sin(yaw / 2), zero], axis=1)
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    w1, x1, y1, z1 = a.T
+    w2, x2, y2, z2 = b.T
+    return np.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        axis=1,
+    )
+
+
+def _exp(rotvec: np.ndarray) -> np.ndarray:
+    half = np.linalg.norm(rotvec, axis=1, keepdims=True) / 2
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotvec], axis=1)
+
+
+def _leashed(quat: np.ndarray, anchor: np.ndarray, limit_rad: float) -> np.ndarray:
+    """Return `quat`, turned back towards `anchor` where it is further than the limit away; normalised."""
+    quat = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    dot = (quat * anchor).sum(1)
+    far = np.abs(dot) < np.cos(limit_rad / 2)
+    if far.any():
+        a, b = anchor[far], quat[far] * np.sign(dot[far])[:, None]
+        half = np.arccos(np.clip(np.abs(dot[far]), 0, 1))[:, None]
+        part = limit_rad / 2
+        quat[far] = (np.sin(half - part) * a + np.sin(part) * b) / np.sin(half)
+    return quat
+
+
+def _limit_tilt(quat: np.ndarray, limit_rad: float) -> np.ndarray:
+    """Return `quat`, leaned back where its z axis is further than the limit from straight down."""
+    w, x, y, z = quat.T
+    axis_x, axis_y = 2 * (x * z + w * y), 2 * (y * z - w * x)
+    axis_z = 1 - 2 * (x * x + y * y)
+    over = np.arccos(np.clip(-axis_z, -1, 1)) - limit_rad
+    far = over > 0
+    if far.any():
+        back = np.stack([-axis_y, axis_x, np.zeros_like(axis_x)], axis=1)[
+            far
+        ]  # axis cross (0, 0, -1)
+        back /= np.maximum(np.linalg.norm(back, axis=1, keepdims=True), 1e-12)
+        quat = quat.copy()
+        quat[far] = _product(_exp(back * over[far, None]), quat[far])
+    return quat
+
+
+def _rotvec_from_down(quat: np.ndarray) -> np.ndarray:
+    """Return the rotation vector of `R_down^T R`, with angle at most pi."""
+    w, x, y, z = quat.T
+    # conj(0, 1, 0, 0) * quat
+    relative = np.stack([x, -w, z, -y], axis=1)
+    relative *= np.where(relative[:, :1] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(relative[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(sine, relative[:, :1])
+    return relative[:, 1:] * np.where(sine < 1e-9, 2.0, angle / np.maximum(sine, 1e-12))

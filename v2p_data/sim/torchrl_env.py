@@ -1,0 +1,78 @@
+"""The batched worlds as a TorchRL environment, for its collectors and losses.
+
+Keys: `observation` and, after a step, `reward`, `success` and `held` (see `batch_env.StepResult`),
+`terminated` (the simulation broke down), `truncated` (time is up) and `done`. Partial resets follow TorchRL's
+`_reset` mask. Actions are not bounded by the specification; the environment clips them.
+"""
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from v2p_data.sim.batch_env import BatchEnv
+
+
+class TorchRLEnv(EnvBase):
+    """TorchRL's view of a `BatchEnv`.
+
+    Args:
+        env: the worlds; `batch_size` is their number.
+    """
+
+    batch_locked = True
+
+    def __init__(self, env: BatchEnv) -> None:
+        n = env.num_envs
+        super().__init__(device="cpu", batch_size=torch.Size([n]))
+        self.worlds = env
+        flag = Binary(1, (n, 1), dtype=torch.bool)
+        self.observation_spec = Composite(
+            observation=Unbounded(torch.Size([n, env.obs_dim])),
+            success=flag.clone(),
+            held=flag.clone(),
+            shape=(n,),
+        )
+        self.action_spec = Unbounded(torch.Size([n, env.act_dim]))
+        self.reward_spec = Unbounded(torch.Size([n, 1]))
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
+        )
+
+    @property
+    def horizon(self) -> int:
+        """Control steps per episode."""
+        return self.worlds.horizon
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
+        del kwargs
+        n = self.worlds.num_envs
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        ids = np.arange(n) if mask is None else np.flatnonzero(mask.reshape(n, -1).any(1).numpy())
+        self.worlds.reset(ids)
+        no = torch.zeros(n, 1, dtype=torch.bool)
+        flags = {key: no.clone() for key in ("success", "held", "done", "terminated", "truncated")}
+        return TensorDict({"observation": torch.from_numpy(self.worlds.observe()), **flags}, [n])
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        result = self.worlds.step(tensordict.get("action").detach().numpy())
+        columns = {
+            "reward": result.reward,
+            "success": result.success,
+            "held": result.held,
+            "terminated": result.terminated,
+            "truncated": result.truncated,
+            "done": result.terminated | result.truncated,
+        }
+        return TensorDict(
+            {
+                "observation": torch.from_numpy(result.obs),
+                **{key: torch.from_numpy(value)[:, None] for key, value in columns.items()},
+            },
+            [self.worlds.num_envs],
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.worlds.seed(seed)

@@ -1,0 +1,422 @@
+"""A scene becomes one MuJoCo model: table, robot, a camera `view`, and every object on a free joint.
+
+Boxes, cylinders and spheres stay primitives; a mesh collides (and is drawn) as its convex hull; a hollow
+object becomes a solid floor with walls, so that things can go in. Body `<object>`, geoms `<object>_<k>`, free
+joint `<object>`; the body's origin is the centre of the object's bounding box. Inertias are those of
+uniform density. The manipulated object comes first, as in the scene.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco's classes come from a compiled module that declares none of them.
+
+import logging
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.sim.robot import (
+    PADS,
+    PhysicsConfig,
+    ServoConfig,
+    option_xml,
+    robot_body_xml,
+    robot_rest_xml,
+)
+
+MAX_SIZE_M = 0.35
+MIN_SIZE_M = 0.015
+MAX_MASS_KG = 3.0
+MIN_THICKNESS_M = 0.01
+"""Thinner extents are thickened to this: the coarse time step cannot hold them apart."""
+MESH_SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
+"""Ready-made sizes of each mesh; a world picks one, because MuJoCo cannot scale a mesh per world."""
+ROUND_WALLS = 10
+HULL_VERTICES = 40
+CAMERA = "view"
+CAMERA_POS = (0.0, -0.6, 0.78)
+CAMERA_TARGET = (0.54, -0.02, 0.10)
+CAMERA_FOVY_DEG = 47.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One geom of an object, in the object's frame."""
+
+    kind: str
+    """`box`, `cylinder`, `sphere` or `mesh`."""
+    half_size: tuple[float, float, float]
+    """Half extents; cylinders (radius, radius, half height)."""
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectModel:
+    """Where one object is in the model, and what its unscaled values are."""
+
+    name: str
+    role: str
+    kind: str
+    """`box`, `cylinder`, `sphere`, `mesh`, `box_hollow` or `round_hollow`."""
+    size_m: tuple[float, float, float]
+    mass_kg: float
+    friction: float
+    body_id: int
+    qpos_adr: int
+    dof_adr: int
+    geom_ids: tuple[int, ...]
+    mesh_ids: tuple[int, ...]
+    """One per entry of `MESH_SCALES`, for meshes."""
+    rest_quat: tuple[float, float, float, float]
+    """Orientation in which it stands on the table, at zero yaw; from its first pose in the video."""
+    hull: Float[np.ndarray, "h 3"]
+    """Corner points of its hull, unscaled, from which its height and footprint follow."""
+
+    @property
+    def is_round(self) -> bool:
+        """Whether x and y must be scaled alike."""
+        return self.kind in {"cylinder", "round_hollow"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """The compiled model with the addresses of its objects."""
+
+    xml: str
+    model: mujoco.MjModel
+    physics: PhysicsConfig
+    objects: tuple[ObjectModel, ...]
+    scene: Scene
+
+
+def build_world(scene: Scene, physics: PhysicsConfig, servo: ServoConfig | None = None) -> World:
+    """Return the scene as a model.
+
+    Raises:
+        ItemRejectedError: an object is too large, too small or too heavy for this robot, or its mesh is flat.
+    """
+    servo = servo or ServoConfig()
+    drafts = [_draft(o, scene) for o in scene.objects]
+    sensors = "".join(
+        f'<contact name="{pad}_{o.name}" geom1="{pad}" body2="{o.name}" num="1" reduce="netforce" data="found"/>'
+        for o in scene.objects
+        for pad in PADS
+    )
+    xml = (
+        f'<mujoco model="{scene.title}"><compiler angle="radian" autolimits="true"/>{option_xml(physics)}'
+        '<visual><global offwidth="640" offheight="640"/><quality offsamples="0" shadowsize="1024"/>'
+        '<headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>'
+        f"<asset>{''.join(d.asset_xml for d in drafts)}</asset>"
+        f'<worldbody><light pos="0.5 -0.5 2" dir="0 0.2 -1" castshadow="false"/>{_camera_xml()}'
+        '<geom name="table" type="plane" size="1.5 1.5 0.1" contype="1" conaffinity="3" condim="4" '
+        f'friction="0.8 0.005 0.0001" solref="{physics.solref_s} 1" rgba="0.55 0.5 0.45 1"/>'
+        f"{robot_body_xml(physics, servo)}{''.join(d.body_xml(physics) for d in drafts)}</worldbody>"
+        f"{robot_rest_xml(servo)}<sensor>{sensors}</sensor></mujoco>"
+    )
+    model = mujoco.MjModel.from_xml_string(xml)
+    return World(
+        xml=xml,
+        model=model,
+        physics=physics,
+        objects=tuple(d.located(model) for d in drafts),
+        scene=scene,
+    )
+
+
+def hollow_parts(
+    size_m: tuple[float, float, float], *, is_round: bool, upside_down: bool = False
+) -> list[Part]:
+    """Return a container's floor and walls, filling a box of `size_m` about the origin.
+
+    The walls stand on the floor and do not reach the table: each further contact costs time. The floor is
+    at least 6 mm thick; through thin floors hard-pressed objects were pushed into the table.
+    """
+    half = np.asarray(size_m) / 2
+    floor = float(np.clip(0.2 * size_m[2], 0.006, 0.02))
+    wall = float(np.clip(0.08 * min(size_m[0], size_m[1]), 0.006, 0.012))
+    flip = -1.0 if upside_down else 1.0
+    wall_half_height = half[2] - floor / 2
+    wall_z = flip * floor / 2
+    floor_z = flip * (floor / 2 - half[2])
+    if is_round:
+        parts = [
+            Part(kind="cylinder", half_size=(half[0], half[0], floor / 2), pos=(0.0, 0.0, floor_z))
+        ]
+        reach = float(half[0] * np.cos(np.pi / ROUND_WALLS) - wall / 2)
+        width = float((reach + wall / 2) * np.tan(np.pi / ROUND_WALLS))
+        for k in range(ROUND_WALLS):
+            yaw = 2 * np.pi * k / ROUND_WALLS
+            parts.append(
+                Part(
+                    kind="box",
+                    half_size=(wall / 2, width, wall_half_height),
+                    pos=(reach * float(np.cos(yaw)), reach * float(np.sin(yaw)), wall_z),
+                    yaw_rad=yaw,
+                )
+            )
+        return parts
+    parts = [Part(kind="box", half_size=(half[0], half[1], floor / 2), pos=(0.0, 0.0, floor_z))]
+    for side in (1.0, -1.0):
+        parts.append(
+            Part(
+                kind="box",
+                half_size=(wall / 2, half[1], wall_half_height),
+                pos=(side * (half[0] - wall / 2), 0.0, wall_z),
+            )
+        )
+        parts.append(
+            Part(
+                kind="box",
+                half_size=(half[0] - wall, wall / 2, wall_half_height),
+                pos=(0.0, side * (half[1] - wall / 2), wall_z),
+            )
+        )
+    return parts
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Draft:
+    """An object before the model is compiled."""
+
+    obj: SceneObject
+    kind: str
+    size_m: tuple[float, float, float]
+    parts: tuple[Part, ...]
+    rest_quat: tuple[float, float, float, float]
+    hull: np.ndarray
+    com: np.ndarray
+    inertia: np.ndarray
+    """Full 3 x 3, about the centre of mass."""
+    asset_xml: str
+
+    def body_xml(self, physics: PhysicsConfig) -> str:
+        o = self.obj
+        i = self.inertia
+        if self.kind == "mesh":
+            moments = f'fullinertia="{i[0, 0]:.9g} {i[1, 1]:.9g} {i[2, 2]:.9g} {i[0, 1]:.9g} {i[0, 2]:.9g} {i[1, 2]:.9g}"'
+        else:
+            moments = f'diaginertia="{i[0, 0]:.9g} {i[1, 1]:.9g} {i[2, 2]:.9g}"'
+        geoms = ""
+        for k, part in enumerate(self.parts):
+            h = part.half_size
+            if part.kind == "mesh":
+                form = f'type="mesh" mesh="{_mesh_name(o.name, MESH_SCALES.index(1.0))}"'
+            else:
+                size = {"box": h, "cylinder": (h[0], h[2]), "sphere": (h[0],)}[part.kind]
+                form = f'type="{part.kind}" size="{_row(size)}" pos="{_row(part.pos)}" euler="0 0 {part.yaw_rad:.9g}"'
+            geoms += (
+                f'<geom name="{o.name}_{k}" {form} contype="1" conaffinity="3" condim="4" '
+                f'friction="{o.friction:.6g} 0.005 0.0001" solref="{physics.solref_s} 1" rgba="{_row(o.rgba)}"/>'
+            )
+        return (
+            f'<body name="{o.name}" pos="0.5 0 {self.size_m[2] / 2:.6g}"><freejoint name="{o.name}"/>'
+            f'<inertial mass="{o.mass_kg:.9g}" pos="{_row(tuple(self.com))}" {moments}/>{geoms}</body>'
+        )
+
+    def located(self, model: mujoco.MjModel) -> ObjectModel:
+        body = model.body(self.obj.name).id
+        joint = model.body_jntadr[body]
+        first = int(model.body_geomadr[body])
+        is_mesh = self.kind == "mesh"
+        return ObjectModel(
+            name=self.obj.name,
+            role=self.obj.role,
+            kind=self.kind,
+            size_m=self.size_m,
+            mass_kg=self.obj.mass_kg,
+            friction=self.obj.friction,
+            body_id=int(body),
+            qpos_adr=int(model.jnt_qposadr[joint]),
+            dof_adr=int(model.jnt_dofadr[joint]),
+            geom_ids=tuple(range(first, first + len(self.parts))),
+            mesh_ids=tuple(
+                int(model.mesh(_mesh_name(self.obj.name, k)).id) for k in range(len(MESH_SCALES))
+            )
+            if is_mesh
+            else (),
+            rest_quat=self.rest_quat,
+            hull=self.hull,
+        )
+
+
+def _draft(obj: SceneObject, scene: Scene) -> _Draft:
+    where = f"'{obj.name}' of scene '{scene.title}'"
+    largest = max(obj.size_m)
+    if largest > MAX_SIZE_M:
+        raise ItemRejectedError(
+            "object_too_large",
+            f"{where} is {largest:.2f} m large; at most {MAX_SIZE_M} m fits into the robot's workspace",
+            largest,
+        )
+    if largest < MIN_SIZE_M:
+        raise ItemRejectedError(
+            "object_too_small",
+            f"{where} is {largest * 1000:.0f} mm large; below {MIN_SIZE_M * 1000:.0f} mm it cannot be simulated",
+            largest,
+        )
+    if obj.mass_kg > MAX_MASS_KG:
+        raise ItemRejectedError(
+            "object_too_heavy",
+            f"{where} weighs {obj.mass_kg:.1f} kg; the robot carries at most {MAX_MASS_KG} kg",
+            obj.mass_kg,
+        )
+    x, y, z = (max(float(s), MIN_THICKNESS_M) for s in obj.size_m)
+    thick = (x, y, z)
+    if thick != tuple(obj.size_m):
+        logging.getLogger(__name__).warning(
+            "%s is thickened to %.0f mm", where, MIN_THICKNESS_M * 1000
+        )
+    hull = np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)]) / 2
+    asset, com, inertia = "", np.zeros(3), np.zeros((3, 3))
+    if obj.hollow:
+        is_round = obj.shape in {"cylinder", "sphere"} or (
+            obj.shape == "mesh" and abs(x - y) < 0.12 * max(x, y)
+        )
+        if is_round:
+            x = y = (x + y) / 2
+            thick = (x, y, z)
+            hull = _disc(x / 2, z / 2)
+        kind = "round_hollow" if is_round else "box_hollow"
+        parts = hollow_parts(thick, is_round=is_round, upside_down=obj.role == "cover")
+        com, inertia = _mass_properties(parts, obj.mass_kg)
+    elif obj.shape == "mesh":
+        kind = "mesh"
+        parts = [Part(kind="mesh", half_size=(x / 2, y / 2, z / 2))]
+        solid = _hull_mesh(obj, scene, thick)
+        hull = np.asarray(solid.vertices)
+        com = np.asarray(solid.center_mass)
+        inertia = np.asarray(solid.moment_inertia) * obj.mass_kg / solid.mass
+        asset = "".join(
+            f'<mesh name="{_mesh_name(obj.name, k)}" vertex="{_row(tuple((hull * s).ravel()))}"/>'
+            for k, s in enumerate(MESH_SCALES)
+        )
+    else:
+        kind = obj.shape
+        if kind == "cylinder":
+            x = y = (x + y) / 2
+            thick = (x, y, z)
+            hull = _disc(x / 2, z / 2)
+        elif kind == "sphere":
+            x = y = z = float(np.mean(thick))
+            thick = (x, y, z)
+            hull = np.concatenate([np.eye(3), -np.eye(3)]) * x / 2
+        parts = [Part(kind=kind, half_size=(x / 2, y / 2, z / 2))]
+        com, inertia = _mass_properties(parts, obj.mass_kg)
+    return _Draft(
+        obj=obj,
+        kind=kind,
+        size_m=thick,
+        parts=tuple(parts),
+        rest_quat=_rest_quat(obj, kind),
+        hull=hull,
+        com=com,
+        inertia=inertia,
+        asset_xml=asset,
+    )
+
+
+def _rest_quat(obj: SceneObject, kind: str) -> tuple[float, float, float, float]:
+    """Return the first pose's orientation without its yaw, snapped so that the nearest own axis is vertical.
+
+    Hollow things stand on their floors (covers on their walls) whatever the estimate says. A mesh further
+    than 30 degrees from an axis keeps the tilt it had.
+    """
+    if obj.hollow or kind == "sphere" or not obj.poses_world:
+        return (1.0, 0.0, 0.0, 0.0)
+    R = Rotation.from_quat(obj.first_pose[3:], scalar_first=True).as_matrix()
+    axis = int(np.argmax(np.abs(R[2])))
+    sign = 1.0 if R[2, axis] > 0 else -1.0
+    if kind == "mesh" and abs(R[2, axis]) < np.cos(np.radians(30)):
+        yaw = np.arctan2(R[1, 0], R[0, 0])
+        upright = Rotation.from_euler("z", -yaw).as_matrix() @ R
+    else:
+        upright = np.zeros((3, 3))  # rows: world axes in the object's frame
+        upright[2, axis] = sign
+        upright[0, (axis + 1) % 3] = 1.0
+        upright[1] = np.cross(upright[2], upright[0])
+    quat = Rotation.from_matrix(upright).as_quat(canonical=True, scalar_first=True)
+    return (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3]))
+
+
+def _hull_mesh(
+    obj: SceneObject, scene: Scene, size_m: tuple[float, float, float]
+) -> trimesh.Trimesh:
+    path = scene.folder / obj.mesh
+    if not obj.mesh or not path.is_file():
+        raise ItemRejectedError("mesh_missing", f"mesh of '{obj.name}' is missing: {path}")
+    loaded = trimesh.load(path, force="mesh", process=False)
+    vertices = np.asarray(loaded.vertices, float)
+    extents = np.ptp(vertices, axis=0)
+    if extents.min() < 1e-4:
+        raise ItemRejectedError(
+            "flat_mesh", f"mesh of '{obj.name}' in {path} is flat", float(extents.min())
+        )
+    centred = (vertices - (vertices.max(0) + vertices.min(0)) / 2) * (np.asarray(size_m) / extents)
+    hull = trimesh.convex.convex_hull(centred)
+    if len(hull.vertices) > HULL_VERTICES:
+        hull = trimesh.convex.convex_hull(_spread(np.asarray(hull.vertices), HULL_VERTICES))
+    return hull
+
+
+def _spread(points: np.ndarray, count: int) -> np.ndarray:
+    """Return the extreme points along the axes, then those farthest from the ones chosen already."""
+    chosen = sorted({int(f(points[:, k])) for f in (np.argmin, np.argmax) for k in range(3)})
+    distance = np.min([np.linalg.norm(points - points[i], axis=1) for i in chosen], axis=0)
+    while len(chosen) < count:
+        far = int(np.argmax(distance))
+        chosen.append(far)
+        distance = np.minimum(distance, np.linalg.norm(points - points[far], axis=1))
+    return points[chosen]
+
+
+def _disc(radius: float, half_height: float) -> np.ndarray:
+    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    ring = np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=1)
+    return np.concatenate([np.c_[ring, np.full(16, z)] for z in (-half_height, half_height)])
+
+
+def _mass_properties(parts: list[Part], mass_kg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre of mass and inertia about it of parts of one density."""
+    volumes, moments = [], []
+    for part in parts:
+        a, b, c = part.half_size
+        if part.kind == "box":
+            volumes.append(8 * a * b * c)
+            second = np.array([a * a, b * b, c * c]) / 3
+        elif part.kind == "cylinder":
+            volumes.append(2 * np.pi * a * a * c)
+            second = np.array([a * a / 4, a * a / 4, c * c / 3])
+        else:
+            volumes.append(4 / 3 * np.pi * a**3)
+            second = np.full(3, a * a / 5)
+        R = Rotation.from_euler("z", part.yaw_rad).as_matrix()
+        pos = np.asarray(part.pos)
+        moments.append(R @ np.diag(second) @ R.T + np.outer(pos, pos))
+    share = np.asarray(volumes) / np.sum(volumes)
+    com = share @ np.asarray([p.pos for p in parts])
+    second = mass_kg * (np.tensordot(share, moments, 1) - np.outer(com, com))
+    return com, np.trace(second) * np.eye(3) - second
+
+
+def _camera_xml() -> str:
+    """Return the camera: on the robot's side, so that +y is on the image's left."""
+    forward = np.subtract(CAMERA_TARGET, CAMERA_POS)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    return f'<camera name="{CAMERA}" pos="{_row(CAMERA_POS)}" xyaxes="{_row((*right, *up))}" fovy="{CAMERA_FOVY_DEG}"/>'
+
+
+def _mesh_name(name: str, scale_idx: int) -> str:
+    return f"{name}_mesh_{scale_idx}"
+
+
+def _row(values: tuple[float, ...]) -> str:
+    return " ".join(f"{v:.9g}" for v in values)
