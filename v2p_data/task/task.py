@@ -10,7 +10,7 @@ import json
 import shutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -56,6 +56,7 @@ def states_table(object_names: list[str]) -> str:
     return "\n".join(lines)
 
 
+@runtime_checkable
 class Placer(Protocol):
     """What task code may ask of the environment at a reset."""
 

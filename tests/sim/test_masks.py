@@ -1,0 +1,168 @@
+"""Masks against rays, palettes against the codec's arithmetic."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from v2p_data.errors import V2PError
+from v2p_data.geometry.camera import Camera
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.sim.masks import (
+    PALETTE,
+    MaskRenderer,
+    label_names,
+    labels_to_rgb,
+    rgb_to_labels,
+)
+from v2p_data.sim.robot import FINE, HOME_QPOS
+from v2p_data.sim.world import World, build_world
+
+SIZE_PX = 256
+
+
+@dataclass
+class Moments:
+    """What `BatchEnv.snapshot` gives, made by hand."""
+
+    qpos: np.ndarray
+    geom_size: np.ndarray | None = None
+
+    def write(self, model: mujoco.MjModel, data: mujoco.MjData, index: int) -> None:
+        if self.geom_size is not None:
+            model.geom_size[:] = self.geom_size[index]
+        data.qpos[:] = self.qpos[index]
+        mujoco.mj_forward(model, data)
+
+
+def an_object(name: str, role: str, shape: str, size_m: tuple, **more) -> SceneObject:
+    return SceneObject(
+        name=name, label=name, role=role, shape=shape, size_m=size_m, mass_kg=0.1, friction=0.8,
+        frames=(0,), poses_world=((0.0, 0.0, size_m[2] / 2, 1.0, 0.0, 0.0, 0.0),), **more,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> World:
+    folder: Path = tmp_path_factory.mktemp("scene")
+    trimesh.creation.icosphere(2, radius=0.04).export(folder / "ball.obj")
+    return build_world(
+        Scene(
+            title="masks", video="masks.mp4", description="lifting a box", kind="lift_up",
+            objects=(
+                an_object("box", "manipulated", "box", (0.05, 0.06, 0.08)),
+                an_object("ball", "reference", "mesh", (0.08, 0.08, 0.08), mesh="ball.obj"),
+                an_object("bowl", "container", "cylinder", (0.12, 0.12, 0.06), hollow=True),
+            ),
+            camera=Camera(width_px=64, height_px=48, K=np.eye(3), T_world_cam=np.eye(4)),
+            fps=20.0, num_frames=2, confidence=1.0, folder=folder,
+        ),
+        FINE,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def moments(world: World) -> Moments:
+    """Random arm poses and objects strewn on the table, boxes of different sizes."""
+    rng = np.random.default_rng(5)
+    count = 6
+    qpos = np.tile(world.model.qpos0, (count, 1))
+    qpos[:, :7] = np.asarray(HOME_QPOS) + rng.normal(0, 0.15, (count, 7))
+    qpos[:, 7:9] = rng.uniform(0, 0.04, (count, 1))
+    for obj in world.objects:
+        at = obj.qpos_adr
+        qpos[:, at : at + 2] = np.array((0.52, 0)) + rng.uniform(-0.12, 0.12, (count, 2))
+        qpos[:, at + 2] = rng.uniform(0.05, 0.1, count)
+        quat = rng.normal(size=(count, 4))
+        qpos[:, at + 3 : at + 7] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    sizes = np.tile(world.model.geom_size, (count, 1, 1))
+    sizes[:, world.objects[0].geom_ids[0]] *= rng.uniform(0.8, 1.2, (count, 1))
+    return Moments(qpos=qpos, geom_size=sizes)
+
+
+@pytest.fixture(scope="module")
+def gl(world: World):
+    try:
+        renderer = MaskRenderer(world, SIZE_PX, backend="gl")
+    except V2PError as error:
+        pytest.skip(str(error))
+    with renderer:
+        yield renderer
+
+
+def test_every_label_survives_the_way_to_grey_and_back():
+    labels = np.arange(len(PALETTE), dtype=np.uint8).reshape(1, 3, 3)
+
+    assert (rgb_to_labels(labels_to_rgb(labels)) == labels).all()
+
+
+def test_every_grey_survives_limited_range_luma():
+    greys = np.asarray(PALETTE)
+    luma = np.rint(16 + greys * 219 / 255)
+
+    assert (np.clip(np.rint((luma - 16) * 255 / 219), 0, 255) == greys).all()
+
+
+def test_a_label_without_a_grey_is_refused():
+    with pytest.raises(ValueError, match="no grey"):
+        labels_to_rgb(np.full((1, 1), len(PALETTE), np.uint8))
+
+
+def test_labels_are_named_in_scene_order():
+    assert label_names(("box", "bowl")) == {0: "background", 1: "robot", 2: "box", 3: "bowl"}
+
+
+def test_opengl_and_rays_draw_the_same_masks(world: World, moments: Moments, gl: MaskRenderer):
+    rays = MaskRenderer(world, SIZE_PX, backend="rays")
+    pairs = [(gl.draw(moments, k), rays.draw(moments, k)) for k in range(len(moments.qpos))]
+    drawn, cast = (np.stack(images) for images in zip(*pairs, strict=True))
+
+    assert set(np.unique(cast)) == {0, 1, 2, 3, 4}
+    for label in range(5):
+        either = ((drawn == label) | (cast == label)).sum()
+        both = ((drawn == label) & (cast == label)).sum()
+        assert both / either >= 0.995, f"label {label}"
+
+
+def test_a_moment_looks_the_same_whatever_was_drawn_before(moments: Moments, gl: MaskRenderer):
+    first = gl.draw(moments, 0)
+    gl.draw(moments, 3)
+
+    assert (gl.draw(moments, 0) == first).all()
+
+
+def test_a_larger_box_covers_more_pixels(world: World, moments: Moments, gl: MaskRenderer):
+    qpos = np.tile(world.model.qpos0, (2, 1))
+    for k, obj in enumerate(world.objects):
+        qpos[:, obj.qpos_adr : obj.qpos_adr + 3] = (0.45 + 0.1 * k, 0.15 * (k - 1), 0.05)
+    sizes = np.tile(world.model.geom_size, (2, 1, 1))
+    sizes[1, world.objects[0].geom_ids[0]] *= 1.3
+    pair = Moments(qpos=qpos, geom_size=sizes)
+
+    small, large = ((gl.draw(pair, k) == 2).sum() for k in range(2))
+
+    assert 1.3 * small < large < 2.0 * small
+
+
+def test_the_robots_left_is_the_pictures_left(world: World, gl: MaskRenderer):
+    qpos = np.tile(world.model.qpos0, (2, 1))
+    at = world.objects[0].qpos_adr
+    for obj in world.objects[1:]:
+        qpos[:, obj.qpos_adr : obj.qpos_adr + 3] = (-3, 0, 0.05)
+    qpos[0, at : at + 3] = (0.5, 0.2, 0.04)
+    qpos[1, at : at + 3] = (0.5, -0.2, 0.04)
+
+    left, right = (np.nonzero(gl.draw(Moments(qpos), k) == 2)[1].mean() for k in range(2))
+
+    assert left < SIZE_PX / 2 < right
+
+
+def test_the_callers_model_is_left_alone(world: World, moments: Moments, gl: MaskRenderer):
+    gl.draw(moments, 0)
+
+    assert world.model.geom_size[world.objects[0].geom_ids[0]] == pytest.approx(
+        (0.025, 0.03, 0.04)
+    )

@@ -1,0 +1,50 @@
+"""What a frame of our datasets holds: names, shapes and units of every column.
+
+State and action entries end in `.pos`, because `lerobot-rollout` drops other names without a word.
+"""
+
+from typing import Any
+
+FPS = 20
+ROBOT_TYPE = "v2p_franka"
+MASK_KEY = "observation.images.mask"
+STATE_KEY = "observation.state"
+ACTION_KEY = "action"
+SUCCESS_KEY = "next.success"
+METADATA_FILE = "meta/v2p.json"
+"""Palette, provenance and drawn parameters; LeRobot ignores it and uploads it."""
+
+STATE_NAMES = (
+    "eef_x.pos",
+    "eef_y.pos",
+    "eef_z.pos",
+    "eef_rx.pos",
+    "eef_ry.pos",
+    "eef_rz.pos",
+    "gripper.pos",
+)
+"""Tool position [m], rotation vector from straight down [rad], gripper opening 0 to 1; robot base frame."""
+ACTION_NAMES = (
+    "delta_x.pos",
+    "delta_y.pos",
+    "delta_z.pos",
+    "delta_rx.pos",
+    "delta_ry.pos",
+    "delta_rz.pos",
+    "gripper_close.pos",
+)
+"""Each in [-1, 1]: x 0.03 m, x 0.2 rad about the world's axes, and x 0.012 m of finger travel (+ closes)."""
+
+
+def features(size_px: int) -> dict[str, dict[str, Any]]:
+    """Return LeRobot's feature table for masks of `size_px` x `size_px`."""
+    return {
+        MASK_KEY: {
+            "dtype": "video",
+            "shape": (size_px, size_px, 3),
+            "names": ["height", "width", "channels"],
+        },
+        STATE_KEY: {"dtype": "float32", "shape": (7,), "names": list(STATE_NAMES)},
+        ACTION_KEY: {"dtype": "float32", "shape": (7,), "names": list(ACTION_NAMES)},
+        SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},
+    }

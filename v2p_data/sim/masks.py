@@ -1,0 +1,239 @@
+"""Segmentation masks of saved moments, from the camera `view`.
+
+A label image is uint8: 0 background and table, 1 robot, 2 the manipulated object, 3.. the others in scene
+order. OpenGL draws it where there is one (EGL, also in software); otherwise rays do, several times slower
+and equal but for a few border pixels. As video, labels become greys: with R = G = B the chroma is constant,
+so 4:2:0 loses nothing, and each grey below survives the way through limited-range luma unchanged.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco's classes come from a compiled module that declares none of them.
+
+import copy
+import logging
+import os
+import sys
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import mujoco
+import numpy as np
+from jaxtyping import UInt8
+from mujoco.batch import Batch
+
+from v2p_data.errors import V2PError
+from v2p_data.sim.robot import FINE
+from v2p_data.sim.world import CAMERA, World, build_world
+from v2p_data.task.task import TaskBundle
+
+logger = logging.getLogger(__name__)
+
+PALETTE = (0, 64, 128, 192, 255, 31, 95, 158, 222)
+"""Grey level of each label."""
+BACKGROUND, ROBOT, FIRST_OBJECT = 0, 1, 2
+GL_HINT = "install it with 'apt-get install libegl1 libgl1-mesa-dri'"
+
+_GREYS = np.asarray(PALETTE, np.uint8)
+_LABELS = np.abs(np.arange(256)[:, None] - np.asarray(PALETTE)[None]).argmin(1).astype(np.uint8)
+
+Backend = Literal["auto", "gl", "rays"]
+
+
+def labels_to_rgb(labels: UInt8[np.ndarray, "*batch h w"]) -> UInt8[np.ndarray, "*batch h w 3"]:
+    """Return labels as greys, R = G = B."""
+    if labels.size and labels.max() >= len(PALETTE):
+        raise ValueError(f"label {labels.max()} has no grey; labels go up to {len(PALETTE) - 1}")
+    return np.repeat(_GREYS[labels][..., None], 3, axis=-1)
+
+
+def rgb_to_labels(rgb: UInt8[np.ndarray, "*batch h w 3"]) -> UInt8[np.ndarray, "*batch h w"]:
+    """Return the label whose grey is nearest to the red channel."""
+    return _LABELS[rgb[..., 0]]
+
+
+def label_names(objects: tuple[str, ...]) -> dict[int, str]:
+    """Return the meaning of each label in a scene with these objects."""
+    return {BACKGROUND: "background", ROBOT: "robot"} | {
+        FIRST_OBJECT + k: name for k, name in enumerate(objects)
+    }
+
+
+def geom_labels(world: World) -> UInt8[np.ndarray, "geom"]:
+    """Return the label of every geom.
+
+    Raises:
+        V2PError: the scene has more objects than there are greys.
+    """
+    if len(world.objects) + FIRST_OBJECT > len(PALETTE):
+        raise V2PError(
+            f"scene '{world.scene.title}' has {len(world.objects)} objects; "
+            f"masks tell at most {len(PALETTE) - FIRST_OBJECT} apart"
+        )
+    labels = np.full(world.model.ngeom, ROBOT, np.uint8)
+    labels[world.model.geom("table").id] = BACKGROUND
+    for k, obj in enumerate(world.objects):
+        labels[list(obj.geom_ids)] = FIRST_OBJECT + k
+    return labels
+
+
+@runtime_checkable
+class Moment(Protocol):
+    """Saved states of a batch of worlds, enough to draw them (`batch_env.Snapshot`)."""
+
+    def write(self, model: mujoco.MjModel, data: mujoco.MjData, index: int) -> None:
+        """Put world `index` into a model and its data and compute positions, ready to be drawn."""
+        ...
+
+
+class MaskRenderer:
+    """Draws saved moments on a private copy of the model.
+
+    Args:
+        source: the task, or its world where it is built already.
+        size_px: width and height of the image.
+        backend: `auto` takes OpenGL where there is one.
+
+    Raises:
+        V2PError: `gl` was asked for and there is none.
+    """
+
+    def __init__(
+        self, source: TaskBundle | World, size_px: int = 256, *, backend: Backend = "auto"
+    ) -> None:
+        world = source if isinstance(source, World) else build_world(source.scene, FINE)
+        self.size_px = size_px
+        self.labels = geom_labels(world)
+        self.painter: _GLPainter | _RayPainter
+        if backend == "rays":
+            self.painter = _RayPainter(world.model, size_px)
+            return
+        try:
+            self.painter = _GLPainter(world.model, size_px)
+        except _NoGLError as error:
+            if backend == "gl":
+                raise V2PError(f"OpenGL cannot draw here ({error}); {GL_HINT}") from error
+            logger.warning(
+                "no OpenGL (%s): masks are cast with rays, which is slower; %s", error, GL_HINT
+            )
+            self.painter = _RayPainter(world.model, size_px)
+
+    def draw(self, snapshot: Moment, index: int) -> UInt8[np.ndarray, "h w"]:
+        """Return the label image of world `index` of the snapshot."""
+        geoms = self.painter.geoms(snapshot, index)
+        return np.where(geoms >= 0, self.labels[geoms], np.uint8(BACKGROUND))
+
+    def draw_rgb(self, snapshot: Moment, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Return a picture for people.
+
+        Raises:
+            V2PError: there is no OpenGL; rays give masks only.
+        """
+        if not isinstance(self.painter, _GLPainter):
+            raise V2PError(f"pictures need OpenGL and there is none; {GL_HINT}")
+        return self.painter.rgb(snapshot, index)
+
+    def close(self) -> None:
+        """Free the graphics memory."""
+        self.painter.close()
+
+    def __enter__(self) -> "MaskRenderer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _NoGLError(Exception):
+    pass
+
+
+class _GLPainter:
+    def __init__(self, model: mujoco.MjModel, size_px: int) -> None:
+        self.model = copy.copy(model)
+        self.model.vis.global_.offwidth = size_px
+        self.model.vis.global_.offheight = size_px
+        self.model.vis.quality.offsamples = 0  # blended borders would be labels that nothing has
+        self.data = mujoco.MjData(self.model)
+        self.context = _gl_context(size_px)
+        self.context.make_current()
+        self.drawer = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.drawer)
+        self.scene = mujoco.MjvScene(self.model, maxgeom=2 * self.model.ngeom + 50)
+        self.option = mujoco.MjvOption()
+        self.camera = mujoco.MjvCamera()
+        self.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self.camera.fixedcamid = self.model.camera(CAMERA).id
+        self.rect = mujoco.MjrRect(0, 0, size_px, size_px)
+        self.size_px = size_px
+
+    def geoms(self, snapshot: Moment, index: int) -> np.ndarray:
+        codes = self._pixels(snapshot, index, segmentation=True).astype(np.int32)
+        shown = codes[..., 0] + (codes[..., 1] << 8) + (codes[..., 2] << 16)
+        is_geom = int(mujoco.mjtObj.mjOBJ_GEOM)
+        ids = np.full(self.scene.ngeom + 1, -1, np.int32)
+        for k in range(self.scene.ngeom):
+            geom = self.scene.geoms[k]
+            if geom.objtype == is_geom:
+                ids[geom.segid + 1] = geom.objid
+        return ids[shown]
+
+    def rgb(self, snapshot: Moment, index: int) -> np.ndarray:
+        return self._pixels(snapshot, index, segmentation=False)
+
+    def _pixels(self, snapshot: Moment, index: int, *, segmentation: bool) -> np.ndarray:
+        self.context.make_current()
+        snapshot.write(self.model, self.data, index)
+        mujoco.mjv_updateScene(
+            self.model, self.data, self.option, None, self.camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value, self.scene,
+        )  # fmt: skip
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = segmentation
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = segmentation
+        mujoco.mjr_render(self.rect, self.scene, self.drawer)
+        pixels = np.empty((self.size_px, self.size_px, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self.rect, self.drawer)
+        return pixels[::-1].copy()
+
+    def close(self) -> None:
+        self.context.make_current()
+        self.drawer.free()
+        self.context.free()
+
+
+class _RayPainter:
+    def __init__(self, model: mujoco.MjModel, size_px: int) -> None:
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        self.batch = Batch(self.model, 1, 1)
+        self.qpos = self.batch.bind("qpos")
+        self.camera = self.model.camera(CAMERA).id
+        self.size_px = size_px
+        rows, columns = np.mgrid[0:size_px, 0:size_px] + 0.5 - size_px / 2
+        self.pixels = np.stack([columns, -rows], axis=-1).reshape(-1, 2)
+
+    def geoms(self, snapshot: Moment, index: int) -> np.ndarray:
+        snapshot.write(self.model, self.data, index)
+        self.batch.set_models(self.model)
+        self.qpos[0] = self.data.qpos
+        focal_px = self.size_px / 2 / np.tan(np.radians(self.model.cam_fovy[self.camera]) / 2)
+        beams = np.concatenate([self.pixels / focal_px, -np.ones((len(self.pixels), 1))], axis=1)
+        R_world_cam = self.data.cam_xmat[self.camera].reshape(3, 3)
+        _, geoms = self.batch.ray(self.data.cam_xpos[self.camera], beams @ R_world_cam.T)
+        return np.asarray(geoms[0]).reshape(self.size_px, self.size_px)
+
+    def close(self) -> None:
+        pass
+
+
+def _gl_context(size_px: int) -> Any:
+    """Return an OpenGL context, by EGL on Linux unless MUJOCO_GL asks for something else.
+
+    MuJoCo itself would look for a window where MUJOCO_GL is unset.
+    """
+    try:
+        if sys.platform == "linux" and os.environ.get("MUJOCO_GL", "egl").lower() in {"egl", ""}:
+            from mujoco.egl import GLContext
+        else:
+            from mujoco.rendering.classic.gl_context import GLContext
+        return GLContext(size_px, size_px)
+    except (ImportError, AttributeError, OSError, RuntimeError) as error:
+        raise _NoGLError(f"{type(error).__name__}: {error}") from error
