@@ -17,13 +17,23 @@ class Rate:
     high: float
 
     @property
-    def rate(self) -> float:
+    def value(self) -> float:
         return self.successes / self.trials
+
+    def as_dict(self) -> dict[str, float | int]:
+        """Return counts, rate and interval, for JSON."""
+        return {
+            "successes": self.successes,
+            "trials": self.trials,
+            "rate": self.value,
+            "low": self.low,
+            "high": self.high,
+        }
 
     def __str__(self) -> str:
         """Return e.g. `90.0 % [59.6, 98.2] (9 of 10)`."""
         return (
-            f"{100 * self.rate:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}] "
+            f"{100 * self.value:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}] "
             f"({self.successes} of {self.trials})"
         )
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from policies.evaluation.rate import Rate, wilson
@@ -20,8 +20,8 @@ def evaluate(
 ) -> Rate:
     """Return successes among `num_episodes` whole episodes, the same number per world up to one.
 
-    Success is `("next", "success")` at the step that ends the episode. Counting episodes in the order in
-    which they finish would favour short ones; here every world plays its episodes to the end.
+    An episode is judged by `outcome` at the step that ends it. Counting episodes in the order in which they
+    finish would favour short ones; here every world plays its episodes to the end.
 
     Args:
         env: its batch of worlds plays as many rounds as are needed.
@@ -38,6 +38,12 @@ def evaluate(
     return wilson(successes, num_episodes)
 
 
+def outcome(after: TensorDictBase) -> torch.Tensor:
+    """Return whether each world counts as a success if its episode ends here: `held`, else `success`."""
+    held = after.get("held", None)
+    return after.get("success") if held is None else held
+
+
 def _one_round(
     env: EnvBase, act: Callable[[np.ndarray], np.ndarray], max_steps: int
 ) -> torch.Tensor:
@@ -49,7 +55,7 @@ def _one_round(
         action = torch.from_numpy(act(now["observation"].numpy()))
         now = env.step(TensorDict({"action": action}, env.batch_size))["next"]
         ends = now["done"].flatten() & ~is_over
-        succeeded |= ends & now["success"].flatten()
+        succeeded |= ends & outcome(now).flatten()
         is_over |= ends
         if is_over.all():
             return succeeded

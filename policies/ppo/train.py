@@ -33,13 +33,12 @@ from torchrl.objectives.value import GAE
 
 from policies.evaluation.rate import Rate
 from policies.ppo.curve import CURVE_FILE, PICTURE_FILE, Row, append_row, cut_after, plot_curve
-from policies.ppo.evaluate import evaluate
+from policies.ppo.evaluate import evaluate, outcome
 from policies.ppo.policy import ActorConfig, ActorCritic, Expert, load_weights, weights_of
 
 log = logging.getLogger(__name__)
 
 CHECKPOINT_FILE = "checkpoint.pt"
-BEST_FOLDER = "best"
 LAST_FOLDER = "last"
 DUMP_FILE = "not_finite.pt"
 FINITE_KEYS = (("next", "observation"), ("next", "reward"), "observation", "action")
@@ -50,7 +49,6 @@ COMPONENTS_KEY = ("next", "components")
 class PPOConfig:
     """The recipe. Defaults are those that learned to lift in a minute on two cores."""
 
-    seed: int = 0
     total_steps: int = 2_000_000
     """Control steps over all worlds; the recipe's budget."""
     max_seconds: float = 600.0
@@ -154,6 +152,7 @@ def train_expert(
     cfg: PPOConfig,
     out: Path,
     *,
+    seed: int = 0,
     eval_env: EnvBase | None = None,
     warm_start: Path | None = None,
     on_progress: Callable[[int, int, float], None] | None = None,
@@ -163,7 +162,8 @@ def train_expert(
     Args:
         env: a batch of worlds (see the room's docstring) which the caller has seeded.
         cfg: the recipe.
-        out: folder of checkpoint, experts and curve.
+        out: folder of checkpoint, curve and experts; `Expert.load(out)` gives the best.
+        seed: of weights, exploration and minibatches; the environment has its own.
         eval_env: where the best expert plays fresh episodes at the end.
         warm_start: another expert's folder; its actor and normalisation are the starting point.
         on_progress: called after every batch with steps, total steps and deterministic success (NaN at first).
@@ -179,16 +179,15 @@ def train_expert(
         )
     out.mkdir(parents=True, exist_ok=True)
     with _torch_threads(cfg.num_threads):
-        learner = _Learner(env, cfg, out, warm_start)
+        learner = _Learner(env, cfg, out, seed, warm_start)
         stopped_by = learner.run(on_progress)
     progress = learner.progress
-    expert = out / BEST_FOLDER if progress.best_success >= 0 else out / LAST_FOLDER
     rate = None
     if eval_env is not None:
-        rate = evaluate(eval_env, Expert.load(expert).act, num_episodes=cfg.eval_episodes)
+        rate = evaluate(eval_env, Expert.load(out).act, num_episodes=cfg.eval_episodes)
         log.info("fresh episodes of the best expert: %s", rate)
     return ExpertResult(
-        folder=expert,
+        folder=out,
         success=max(progress.best_success, 0.0),
         steps=progress.steps,
         seconds=progress.seconds,
@@ -200,10 +199,13 @@ def train_expert(
 class _Learner:
     """The parts of one training run, so that the checkpoint can list them."""
 
-    def __init__(self, env: EnvBase, cfg: PPOConfig, out: Path, warm_start: Path | None) -> None:
+    def __init__(
+        self, env: EnvBase, cfg: PPOConfig, out: Path, seed: int, warm_start: Path | None
+    ) -> None:
         self.env, self.cfg, self.out = env, cfg, out
         self.num_envs = env.batch_size[0]
-        self.generator = torch.Generator().manual_seed(cfg.seed)
+        self.recipe = _recipe(cfg, seed)
+        self.generator = torch.Generator().manual_seed(seed)
         obs_dim = env.observation_spec["observation"].shape[-1]  # type: ignore[union-attr]
         self.model = ActorCritic(obs_dim, env.action_spec.shape[-1], cfg.actor, self.generator)
         self.progress = _Progress(
@@ -306,7 +308,7 @@ class _Learner:
         """Take note of finished episodes and of the scale of the returns."""
         cfg, progress = self.cfg, self.progress
         reward, done = batch["next", "reward"][..., 0], batch["next", "done"][..., 0]
-        success = batch["next", "success"].reshape(done.shape)
+        success = outcome(batch.get("next")).reshape(done.shape)
         squares = torch.zeros(())
         for t in range(cfg.batch_time):
             progress.discounted = cfg.gamma * progress.discounted + reward[:, t]
@@ -392,14 +394,15 @@ class _Learner:
     def _save(self) -> None:
         """Write experts and checkpoint, each atomically."""
         Expert(self.model).save(self.out / LAST_FOLDER)
-        if self.progress.best_success >= 0:
-            best = ActorCritic(
-                self.model.obs_dim, self.model.act_dim, self.cfg.actor, torch.Generator()
-            )
-            load_weights(best, self.best_weights)
-            Expert(best).save(self.out / BEST_FOLDER)
+        best = ActorCritic(
+            self.model.obs_dim, self.model.act_dim, self.cfg.actor, torch.Generator()
+        )
+        load_weights(
+            best, self.best_weights if self.progress.best_success >= 0 else weights_of(self.model)
+        )
+        Expert(best).save(self.out)
         checkpoint = {
-            "recipe": _recipe(self.cfg),
+            "recipe": self.recipe,
             "progress": vars(self.progress),
             "weights": weights_of(self.model),
             "best_weights": self.best_weights,
@@ -419,7 +422,7 @@ class _Learner:
             (self.out / CURVE_FILE).unlink(missing_ok=True)
             return
         saved: dict[str, Any] = torch.load(path, weights_only=True)
-        _check_recipe(saved["recipe"], _recipe(self.cfg), path)
+        _check_recipe(saved["recipe"], self.recipe, path)
         for name, value in saved["progress"].items():
             setattr(self.progress, name, value)
         load_weights(self.model, saved["weights"])
@@ -507,7 +510,7 @@ def _start_from(model: ActorCritic, expert: Expert, cfg: PPOConfig) -> None:
     model.actor.clamp_std()
 
 
-def _recipe(cfg: PPOConfig) -> dict[str, Any]:
+def _recipe(cfg: PPOConfig, seed: int) -> dict[str, Any]:
     """The settings that must not change between a checkpoint and its continuation."""
     free = {
         "total_steps",
@@ -518,6 +521,7 @@ def _recipe(cfg: PPOConfig) -> dict[str, Any]:
         "eval_episodes",
     }
     recipe = {k: v for k, v in asdict(cfg).items() if k not in free}
+    recipe["seed"] = seed
     recipe["actor"] = {
         k: list(v) if isinstance(v, tuple) else v for k, v in recipe["actor"].items()
     }

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from policies.ppo.evaluate import evaluate
+from policies.ppo.evaluate import evaluate, outcome
 from policies.ppo.policy import ActorConfig, Expert, weights_of
 from policies.ppo.train import NotFiniteError, PPOConfig, advantage_estimator, train_expert
 
@@ -178,7 +178,7 @@ def test_an_untrained_point_rarely_reaches_its_goal(tmp_path: Path):
 
 def test_the_same_seed_makes_the_same_weights_and_another_seed_others(tmp_path: Path):
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        train_expert(PointMass(64, seed=1), replace(steps(3), seed=seed), tmp_path / name)
+        train_expert(PointMass(64, seed=1), steps(3), tmp_path / name, seed=seed)
 
     assert are_equal(weights_in(tmp_path / "a"), weights_in(tmp_path / "b"))
     assert not are_equal(weights_in(tmp_path / "a"), weights_in(tmp_path / "c"))
@@ -299,3 +299,11 @@ def test_evaluation_counts_whole_episodes_of_a_policy_that_knows_the_way():
     assert (good.successes, good.trials) == (100, 100)
     # Only a point that starts at its goal can be there still: pi .15^2 / 4 = 1.8 %, and it moves away.
     assert bad.successes <= 2
+
+
+def test_success_that_lasted_decides_over_success_of_the_moment():
+    moment = TensorDict({"success": torch.tensor([[True], [True]])}, [2])
+    lasting = moment.clone().set("held", torch.tensor([[False], [True]]))
+
+    assert outcome(moment).flatten().tolist() == [True, True]
+    assert outcome(lasting).flatten().tolist() == [False, True]

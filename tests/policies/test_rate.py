@@ -13,7 +13,7 @@ def test_nine_of_ten_has_the_interval_computed_by_hand():
     # centre (.9 + 3.8415/20) / 1.38415 = .78899, half 1.95996 sqrt(.009 + 3.8415/400) / 1.38415 = .19314
     assert rate.low == pytest.approx(0.5958, abs=1e-4)
     assert rate.high == pytest.approx(0.9821, abs=1e-4)
-    assert rate.rate == 0.9
+    assert rate.value == 0.9
 
 
 def test_no_success_in_ten_still_leaves_room_for_28_percent():
@@ -29,7 +29,7 @@ def test_both_ends_are_z_standard_errors_of_their_own_away_from_the_rate(success
     rate = wilson(successes, trials)
 
     for end in (rate.low, rate.high):
-        assert abs(end - rate.rate) == pytest.approx(Z_95 * math.sqrt(end * (1 - end) / trials))
+        assert abs(end - rate.value) == pytest.approx(Z_95 * math.sqrt(end * (1 - end) / trials))
 
 
 def test_success_and_failure_mirror_each_other():
