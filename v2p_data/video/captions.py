@@ -1,0 +1,277 @@
+"""Which videos a folder holds, and what a person said about each.
+
+A caption comes from `captions.json` beside the videos, else from a label file of Something-Something-v2 in the
+same folder (a JSON list of `{id, label, template, placeholders}`), else from the file's own name:
+
+    {"lift.mp4": "Lifting red box up",
+     "push.mp4": {"caption": "Pushing blue box next to can", "objects": ["blue box", "can"],
+                  "hints": {"can": {"frame": 0, "box": [310, 120, 380, 240], "size_m": [0.066, 0.066, 0.12]}}}}
+"""
+
+import json
+import re
+import unicodedata
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.video.clip import Hint
+from v2p_data.video.meaning import Meaning as Meaning
+from v2p_data.video.meaning import parse_caption as parse_caption
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".webm", ".mkv", ".gif")
+CAPTIONS_FILE = "captions.json"
+MAX_SIZE_M = 3.0
+"""No object on a table is longer."""
+
+_ENTRY_KEYS = ("caption", "hints", "objects")
+_HINT_KEYS = ("box", "frame", "points", "size_m")
+_NO_WORDS = r"\d+|img|vid|video|videos|clip|mov|pxl|dsc|gopr|rec|screen|untitled|new|final|copy"
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoItem:
+    """One video file and what was said about it."""
+
+    item: str
+    """Identifier, unique in its folder: lower case letters, digits and underscores."""
+    path: Path
+    caption: str
+    objects: tuple[str, ...] = ()
+    """Phrases for the objects; taken from the caption where the person listed none."""
+    hints: Mapping[str, Hint] = field(default_factory=dict[str, Hint])
+    """By object phrase; frame numbers and pixels are those of the file as a player shows it."""
+
+
+def find_videos(folder: Path) -> list[VideoItem]:
+    """Return the videos of a folder, or the one video given, sorted by file name.
+
+    Raises:
+        V2PError: no such folder, no videos in it, or captions that cannot be used.
+    """
+    if not folder.exists():
+        raise V2PError(f"there is no folder or video {folder}; check the path")
+    home = folder if folder.is_dir() else folder.parent
+    here = [p for p in sorted(home.iterdir()) if _is_video(p)]
+    wanted = here if folder.is_dir() else [p for p in here if p.name == folder.name]
+    if not wanted:
+        raise V2PError(
+            f"{folder} {'holds no videos' if folder.is_dir() else 'is no video'}; "
+            f"known endings are {' '.join(VIDEO_SUFFIXES)}"
+        )
+    written = _read_captions(home, [p.name for p in here])
+    labelled = _read_labels(home)
+    items = dict(zip(here, unique_items([p.stem for p in here]), strict=True))
+    return [
+        _item(items[p], p, written.get(p.name) or labelled.get(p.stem) or (_from_name(p), (), {}))
+        for p in wanted
+    ]
+
+
+def unique_items(stems: list[str]) -> list[str]:
+    """Return an identifier for each file name; where two would be the same, the later gets a number."""
+    taken: set[str] = set()
+    items: list[str] = []
+    for stem in stems:
+        plain = unicodedata.normalize("NFKD", stem).encode("ascii", "ignore").decode().lower()
+        base = re.sub(r"[^a-z0-9_]+", "_", plain).strip("_")[:80] or "video"
+        item, number = base, 2
+        while item in taken:
+            item, number = f"{base}_{number}", number + 1
+        taken.add(item)
+        items.append(item)
+    return items
+
+
+_Said = tuple[str, tuple[str, ...], dict[str, Hint]]
+"""Caption, objects, hints."""
+
+
+def _is_video(path: Path) -> bool:
+    hidden = path.name.startswith(".")
+    return path.suffix.lower() in VIDEO_SUFFIXES and not hidden and path.is_file()
+
+
+def _item(item: str, path: Path, said: _Said) -> VideoItem:
+    caption, objects, hints = said
+    if not objects:
+        found = parse_caption(caption).phrases
+        objects = tuple(dict.fromkeys([*found, *hints]))
+    return VideoItem(item=item, path=path, caption=caption, objects=objects, hints=hints)
+
+
+def _read_captions(folder: Path, names: list[str]) -> dict[str, _Said]:
+    path = folder / CAPTIONS_FILE
+    if not path.is_file():
+        return {}
+    data = _read_json(path)
+    if not isinstance(data, dict):
+        raise V2PError(f"{path} must hold an object, file name -> caption, not a {_type_of(data)}")
+    for name in data:
+        if name not in names:
+            raise V2PError(
+                f"{path} has a caption for '{name}', which is not in the folder; "
+                f"rename or remove the entry.{did_you_mean(name, names)}"
+            )
+    return {name: _entry(entry, f"{path}, entry '{name}'") for name, entry in data.items()}
+
+
+def _entry(entry: Any, where: str) -> _Said:
+    if isinstance(entry, str):
+        entry = {"caption": entry}
+    if not isinstance(entry, dict):
+        raise V2PError(
+            f"{where}: give a caption, or an object with caption, objects and hints, "
+            f"not a {_type_of(entry)}"
+        )
+    _check_keys(entry, _ENTRY_KEYS, where)
+    caption = _words(entry.get("caption"), f"{where}: 'caption'")
+    objects = entry.get("objects", [])
+    if not isinstance(objects, list):
+        raise V2PError(f"{where}: 'objects' must be a list of names, not a {_type_of(objects)}")
+    objects = tuple(_words(o, f"{where}: each of 'objects'") for o in objects)
+    if len(set(objects)) < len(objects):
+        raise V2PError(f"{where}: 'objects' names one object twice; give each its own name")
+    hints = entry.get("hints", {})
+    if not isinstance(hints, dict):
+        raise V2PError(
+            f"{where}: 'hints' must be an object, name -> hint, not a {_type_of(hints)}"
+        )
+    known = objects or parse_caption(caption).phrases
+    for name in hints:
+        if name not in known:
+            raise V2PError(
+                f"{where}: there is a hint for '{name}', which is none of the objects."
+                f"{did_you_mean(name, known)}"
+            )
+    return caption, objects, {n: _hint(h, f"{where}, hint '{n}'") for n, h in hints.items()}
+
+
+def _hint(hint: Any, where: str) -> Hint:
+    if not isinstance(hint, dict):
+        raise V2PError(f"{where}: must be an object, not a {_type_of(hint)}")
+    _check_keys(hint, _HINT_KEYS, where)
+    frame = hint.get("frame", 0)
+    if not isinstance(frame, int) or isinstance(frame, bool) or frame < 0:
+        raise V2PError(f"{where}: 'frame' must be a frame number from 0, not {frame!r}")
+    checked = Hint(frame=frame)
+    if "box" in hint:
+        box = _numbers(hint["box"], 4, f"{where}: 'box' must be [x0, y0, x1, y1]")
+        if not (0 <= box[0] < box[2] and 0 <= box[1] < box[3]):
+            raise V2PError(
+                f"{where}: 'box' needs 0 <= x0 < x1 and 0 <= y0 < y1 in pixels, got {box}"
+            )
+        checked["box"] = box
+    if "points" in hint:
+        points = hint["points"]
+        if not isinstance(points, list) or not points:
+            raise V2PError(f"{where}: 'points' must be a list of [x, y], not {json.dumps(points)}")
+        checked["points"] = [_numbers(p, 2, f"{where}: a point must be [x, y]") for p in points]
+    if "size_m" in hint:
+        size = _numbers(hint["size_m"], 3, f"{where}: 'size_m' must be [length, width, height]")
+        if not all(0 < side <= MAX_SIZE_M for side in size):
+            raise V2PError(
+                f"{where}: 'size_m' is in metres, each above 0 and at most {MAX_SIZE_M}, got {size}"
+            )
+        checked["size_m"] = size
+    if len(checked) == 1:
+        raise V2PError(f"{where}: says nothing; give a box, points or size_m")
+    return checked
+
+
+def _read_labels(folder: Path) -> dict[str, _Said]:
+    """Return what the label files of Something-Something-v2 in the folder say, by video id."""
+    said: dict[str, _Said] = {}
+    for path in sorted(folder.glob("*.json")):
+        if path.name == CAPTIONS_FILE:
+            continue
+        data = _read_json(path)
+        if not (isinstance(data, list) and data and all(isinstance(d, dict) for d in data)):
+            continue
+        if not all("id" in d and ("label" in d or "template" in d) for d in data):
+            continue
+        for label in data:
+            where = f"{path}, id '{label['id']}'"
+            objects = label.get("placeholders", [])
+            if not isinstance(objects, list):
+                raise V2PError(
+                    f"{where}: 'placeholders' must be a list, not a {_type_of(objects)}"
+                )
+            objects = [_words(o, f"{where}: each of 'placeholders'") for o in objects]
+            caption = label.get("label") or _filled(str(label.get("template") or ""), objects)
+            caption = _words(caption, f"{where}: 'label'")
+            said.setdefault(str(label["id"]), (caption, tuple(dict.fromkeys(objects)), {}))
+    return said
+
+
+def _filled(template: str, objects: list[str]) -> str:
+    """Return the template with its `[something]` replaced by the objects, in order."""
+    for name in objects:
+        template = re.sub(r"\[[^\]]*\]", lambda _, name=name: name, template, count=1)
+    return template
+
+
+def _from_name(path: Path) -> str:
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", path.stem).split()
+    kept = [w for w in words if not re.fullmatch(_NO_WORDS, w.lower())]
+    return " ".join(kept) or "moving object"
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text("utf-8-sig"), object_pairs_hook=_no_duplicates)
+    except json.JSONDecodeError as error:
+        raise V2PError(
+            f"{path}, line {error.lineno}, column {error.colno}: {error.msg}; this is not valid JSON"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise V2PError(f"{path} is not UTF-8 text; save it as UTF-8") from error
+    except RecursionError as error:
+        raise V2PError(f"{path} is nested too deeply; this is no caption file") from error
+    except _DuplicateKeyError as error:
+        raise V2PError(f"{path} has two entries for '{error}'; remove one") from error
+    except OSError as error:
+        raise V2PError(f"{path} cannot be read: {error.strerror}") from error
+
+
+class _DuplicateKeyError(Exception):
+    pass
+
+
+def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    seen: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in seen:
+            raise _DuplicateKeyError(key)
+        seen[key] = value
+    return seen
+
+
+def _check_keys(data: dict[str, Any], known: tuple[str, ...], where: str) -> None:
+    for key in data:
+        if key not in known:
+            raise V2PError(f"{where}: unknown key '{key}'.{did_you_mean(key, known)}")
+
+
+def _words(value: Any, what: str) -> str:
+    if not isinstance(value, str):
+        raise V2PError(f"{what} must be text, not a {_type_of(value)}")
+    if not any(c.isalnum() for c in value):
+        raise V2PError(f"{what} is empty; say in words what happens or what it is")
+    return " ".join(value.split())
+
+
+def _numbers(value: Any, count: int, what: str) -> list[float]:
+    def fits(v: Any) -> bool:
+        return isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e6
+
+    if not (isinstance(value, list) and len(value) == count and all(fits(v) for v in value)):
+        raise V2PError(f"{what}, {count} numbers, not {json.dumps(value)}")
+    return [float(v) for v in value]
+
+
+def _type_of(value: Any) -> str:
+    names = {dict: "object", list: "list", str: "text", bool: "true/false", type(None): "null"}
+    return names.get(type(value), "number")

@@ -1,0 +1,63 @@
+"""The clip: what every later stage knows of a video, held in memory."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypedDict
+
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+
+class Hint(TypedDict, total=False):
+    """What a person marked by hand about one object, in one frame."""
+
+    frame: int
+    """Frame number from 0; 0 when not said."""
+    box: list[float]
+    """`[x0, y0, x1, y1]` [px], right and down."""
+    points: list[list[float]]
+    """Points on the object, `[x, y]` [px]."""
+    size_m: list[float]
+    """Length, width, height [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clip:
+    """One decoded video: upright RGB frames at an even spacing in time."""
+
+    item: str
+    """Identifier, unique in its folder: lower case letters, digits and underscores."""
+    path: Path
+    caption: str
+    objects: tuple[str, ...]
+    """Phrases for the objects, the manipulated one first where the person who wrote them did so."""
+    hints: Mapping[str, Hint]
+    """By object phrase. Frame numbers and pixels are those of `frames`, not of the file."""
+    frames: UInt8[ndarray, "time h w 3"] = field(repr=False)
+    fps: float
+    """Frames per second of `frames`: frame i is what was seen i / fps seconds after the first."""
+    total_frames: int
+    """Frames that the file holds, before sampling."""
+    source_fps: float
+    """Frames per second of the file; its average where the rate varies."""
+    source_frame: Int[ndarray, "time"] = field(repr=False)
+    """The file's frame number behind each frame; a number repeats where the file pauses."""
+    times_s: Float[ndarray, "time"] = field(repr=False)
+    """When each frame was shown, from the first one [s]."""
+    source_size_px: tuple[int, int]
+    """Width and height as shown, before scaling."""
+    warnings: tuple[str, ...] = ()
+    """Sentences for a person: what was odd about the file though it could be used."""
+
+    @property
+    def width_px(self) -> int:
+        return self.frames.shape[2]
+
+    @property
+    def height_px(self) -> int:
+        return self.frames.shape[1]
+
+    @property
+    def duration_s(self) -> float:
+        return len(self.frames) / self.fps

@@ -1,0 +1,405 @@
+"""A video file becomes a clip: the only place that decodes video.
+
+Reads whatever libav reads from a local file of a known container, one frame at a time. What comes out is RGB,
+turned the way a player shows it, scaled down, and evenly spaced in time. Bytes that are no usable video end in
+an `ItemRejectedError`, never in a crash or an endless loop.
+"""
+
+import logging
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import av.container
+import av.error
+import av.logging
+import numpy as np
+from av.video.frame import VideoFrame
+from av.video.reformatter import Colorspace
+from av.video.stream import VideoStream
+from jaxtyping import Int, UInt8
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.video.captions import VideoItem
+from v2p_data.video.clip import Clip, Hint
+
+log = logging.getLogger(__name__)
+
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm,gif,mpegts,mpeg,asf,flv,ogg"
+"""What may be behind a known ending. Playlists are not among them: they name further files."""
+_TRUNCATED = 0.8
+"""Below this share of the promised frames a file counts as cut off."""
+_UNEVEN = 1.5
+"""A gap longer than this many usual gaps makes a file one with varying frame rate."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoConfig:
+    """How videos are decoded."""
+
+    max_side_px: int = 640
+    """Longer sides are scaled down to this; nothing is scaled up."""
+    max_frames: int = 150
+    """A longer clip is thinned out evenly to this many frames."""
+    min_frames: int = 8
+    """With fewer frames no motion can be read."""
+    min_side_px: int = 64
+    """Smaller pictures show too little."""
+    max_side_file_px: int = 8192
+    """Larger pictures are refused before memory is asked for."""
+    max_duration_s: float = 120.0
+    """A clip shows one motion; longer recordings are to be cut."""
+    max_decode_s: float = 60.0
+    """A file that takes longer to decode is given up."""
+
+    def __post_init__(self) -> None:
+        if not 64 <= self.max_side_px <= 4096:
+            raise ValueError(f"max_side_px must lie in 64..4096, got {self.max_side_px}")
+        if not 2 <= self.min_frames <= self.max_frames:
+            raise ValueError(
+                f"need 2 <= min_frames <= max_frames, got {self.min_frames} and {self.max_frames}"
+            )
+        if not 16 <= self.min_side_px <= self.max_side_px:
+            raise ValueError(
+                f"need 16 <= min_side_px <= max_side_px, got {self.min_side_px} and {self.max_side_px}"
+            )
+        if self.max_duration_s <= 0 or self.max_decode_s <= 0:
+            raise ValueError(
+                f"max_duration_s and max_decode_s must be positive, "
+                f"got {self.max_duration_s} and {self.max_decode_s}"
+            )
+
+
+def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
+    """Decode one video.
+
+    Raises:
+        ItemRejectedError: `unreadable`, `truncated`, `no_video_stream`, `too_few_frames`, `too_small`,
+            `too_large`, `too_long` or `too_slow`.
+    """
+    film = _decode(item.path, cfg)
+    total = film.seen
+    warnings: list[str] = []
+    name = item.path.name
+    if film.promised and total < _TRUNCATED * film.promised:
+        detail = f"{name} is cut off: {total} of about {film.promised} frames can be decoded"
+        if total < cfg.min_frames:
+            raise ItemRejectedError("truncated", f"{detail}; copy it again", total)
+        warnings.append(f"{detail}; the rest of the motion is missing")
+    elif film.broken and total >= cfg.min_frames:
+        warnings.append(f"{name} has {film.broken} damaged places; frames there may be missing")
+    if total < cfg.min_frames:
+        if film.broken:
+            raise ItemRejectedError(
+                "unreadable", f"{name} is damaged: only {total} frames can be decoded", total
+            )
+        raise ItemRejectedError(
+            "too_few_frames",
+            f"{name} has {total} frames; at least {cfg.min_frames} are needed to see a motion",
+            total,
+        )
+    for warning in warnings:
+        log.warning("%s", warning)
+
+    chosen, fps = _even(film.times_s, film.duration_s, total, cfg.max_frames)
+    frames = np.stack([film.kept[i] for i in chosen])
+    source_frame = np.array([film.numbers[i] for i in chosen])
+    return Clip(
+        item=item.item,
+        path=item.path,
+        caption=item.caption,
+        objects=item.objects,
+        hints=_hints_in_clip(item.hints, frames, film.shown_px, source_frame),
+        frames=frames,
+        fps=fps,
+        total_frames=total,
+        source_fps=(total - 1) / film.duration_s,
+        source_frame=source_frame,
+        times_s=np.arange(len(frames)) / fps,
+        source_size_px=film.shown_px,
+        warnings=tuple(warnings),
+    )
+
+
+@dataclass
+class _Film:
+    """What one pass over a file gathers: at most `2 * max_frames` pictures."""
+
+    promised: int
+    """Frames the container speaks of; 0 when it does not."""
+    seen: int = 0
+    broken: int = 0
+    """Packets that could not be decoded."""
+    kept: list[UInt8[np.ndarray, "h w 3"]] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list[int])
+    times_s: list[float] = field(default_factory=list[float])
+    """When each kept picture is shown, from the first one."""
+    duration_s: float = 0.0
+    """From the first frame to the last."""
+    shown_px: tuple[int, int] = (0, 0)
+
+
+def _decode(path: Path, cfg: VideoConfig) -> _Film:
+    level = av.logging.get_level()
+    # libav would write its remarks on damaged files to the terminal; what matters is in our own sentences
+    av.logging.set_level(av.logging.PANIC)
+    try:
+        container = _opened(path, cfg)
+        try:
+            return _film_of(container, path, cfg)
+        finally:
+            container.close()
+    finally:
+        av.logging.set_level(level)
+
+
+def _opened(path: Path, cfg: VideoConfig) -> "av.container.InputContainer":
+    try:
+        return av.open(
+            f"file:{path.resolve()}",
+            mode="r",
+            container_options={
+                "format_whitelist": _CONTAINERS,
+                "protocol_whitelist": "file",
+            },
+            timeout=(cfg.max_decode_s, cfg.max_decode_s),
+            metadata_errors="ignore",
+        )
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        if _is_cut_mp4(path):
+            raise ItemRejectedError(
+                "truncated",
+                f"{path.name} is cut off: its index, which stands at the end, is missing; copy it again",
+            ) from error
+        raise ItemRejectedError(
+            "unreadable", f"{path.name} is no video that can be read ({_said(error)})"
+        ) from error
+
+
+def _film_of(container: "av.container.InputContainer", path: Path, cfg: VideoConfig) -> _Film:
+    if not container.streams.video:
+        raise ItemRejectedError("no_video_stream", f"{path.name} holds no pictures")
+    stream = container.streams.video[0]
+    _check_size(path, stream.codec_context.width, stream.codec_context.height, cfg, low=False)
+    seconds = (container.duration or 0) / av.time_base
+    _check_duration(path, seconds, cfg)
+    # threads would reorder what a damaged file gives
+    stream.codec_context.thread_count = 1
+    stream.codec_context.options = {"max_pixels": str(cfg.max_side_file_px**2)}
+    rate = stream.average_rate or stream.guessed_rate or Fraction(30)
+    promised = stream.frames or round(seconds * rate)
+    film = _Film(promised=promised if 0 < promised < 1e6 else 0)
+    step = 0.0
+    picture: _Picture | None = None
+    for seen_s, frame in _timed_frames(container, stream, float(rate) or 30.0, film, cfg, path):
+        _check_duration(path, seen_s, cfg)
+        if picture is None:
+            picture = _Picture.of(path, frame, stream, cfg)
+            film.shown_px = picture.shown_px
+        if film.times_s and seen_s - film.times_s[-1] < 0.75 * step:
+            continue
+        try:
+            pixels = picture.rgb(frame)
+        except (av.error.FFmpegError, ValueError, MemoryError):
+            film.broken += 1
+            continue
+        film.kept.append(pixels)
+        film.numbers.append(film.seen - 1)
+        film.times_s.append(seen_s)
+        if len(film.kept) >= 2 * cfg.max_frames:
+            film.kept, film.numbers = film.kept[::2], film.numbers[::2]
+            film.times_s = film.times_s[::2]
+            step = 2 * step if step else 2 * seen_s / (2 * cfg.max_frames - 1)
+    return film
+
+
+def _timed_frames(
+    container: "av.container.InputContainer",
+    stream: VideoStream,
+    rate: float,
+    film: _Film,
+    cfg: VideoConfig,
+    path: Path,
+) -> Iterator[tuple[float, VideoFrame]]:
+    """Yield every frame with its time from the first; count them, and the packets that fail, in `film`."""
+    deadline = time.monotonic() + cfg.max_decode_s
+    first: float | None = None
+    last = -1.0
+    for packet in _packets(container, stream, film):
+        if time.monotonic() > deadline:
+            raise ItemRejectedError(
+                "too_slow",
+                f"{path.name} takes longer than {cfg.max_decode_s:g} s to decode; make it smaller",
+                film.seen,
+            )
+        try:
+            frames = packet.decode()
+        except (av.error.FFmpegError, ValueError, MemoryError):
+            film.broken += 1
+            continue
+        for frame in frames:
+            if not isinstance(frame, VideoFrame):
+                continue
+            shown = frame.time
+            if shown is None or (first is not None and shown - first <= last):
+                shown = (first or 0.0) + last + 1 / rate if film.seen else 0.0
+            first = shown if first is None else first
+            last = shown - first
+            film.seen += 1
+            film.duration_s = last
+            yield last, frame
+
+
+def _packets(
+    container: "av.container.InputContainer", stream: VideoStream, film: _Film
+) -> Iterator["av.Packet"]:
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets)
+        except StopIteration:
+            return
+        except (av.error.FFmpegError, ValueError, MemoryError):
+            film.broken += 1
+            return
+        yield packet
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Picture:
+    """How the frames of one file become pictures of one size."""
+
+    width_px: int
+    height_px: int
+    turns: int
+    """Quarter turns, counter-clockwise, after scaling."""
+    shown_px: tuple[int, int]
+
+    @staticmethod
+    def of(path: Path, frame: VideoFrame, stream: VideoStream, cfg: VideoConfig) -> "_Picture":
+        aspect = float(stream.sample_aspect_ratio or 1)
+        aspect = aspect if 0.25 <= aspect <= 4 else 1.0
+        width, height = frame.width * aspect, float(frame.height)
+        _check_size(path, round(width), round(height), cfg)
+        scale = min(1.0, cfg.max_side_px / max(width, height))
+        turns = round(frame.rotation / 90) % 4
+        shown = round(width), round(height)
+        return _Picture(
+            width_px=max(2, 2 * round(width * scale / 2)),
+            height_px=max(2, 2 * round(height * scale / 2)),
+            turns=turns,
+            shown_px=(shown[1], shown[0]) if turns % 2 else shown,
+        )
+
+    def rgb(self, frame: VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the frame as a player shows it; what is transparent is white."""
+        alpha = frame.format.name == "pal8" or any(c.is_alpha for c in frame.format.components)
+        same = (frame.width, frame.height) == (self.width_px, self.height_px)
+        # without scaling, the exact values; else the mean of the pixels that fall together
+        scaled = frame.reformat(
+            width=self.width_px,
+            height=self.height_px,
+            format="rgba" if alpha else "rgb24",
+            src_colorspace=Colorspace.ITU709 if frame.colorspace == Colorspace.ITU709 else None,
+            interpolation="BICUBIC" if same else "AREA",
+        ).to_ndarray()
+        if alpha:
+            opacity = scaled[..., 3:].astype(np.uint16)
+            white = 255 * (255 - opacity)
+            scaled = ((scaled[..., :3] * opacity + white + 127) // 255).astype(np.uint8)
+        return np.ascontiguousarray(np.rot90(scaled, self.turns))
+
+
+def _even(
+    times_s: list[float], duration_s: float, total: int, max_frames: int
+) -> tuple[Int[np.ndarray, "time"], float]:
+    """Return which pictures to take, and at what rate, so that they are evenly spaced in time."""
+    times = np.asarray(times_s)
+    gaps = np.diff(times)
+    usual = float(np.median(gaps))
+    end = float(times[-1])
+    if len(times) == total and float(gaps.max()) < _UNEVEN * usual and total <= max_frames:
+        return np.arange(total), (total - 1) / end
+    count = min(max_frames, max(2, round(end / usual) + 1))
+    due = np.linspace(0.0, end, count)
+    # a player shows a picture until the next one is due
+    chosen = np.searchsorted(times, due + usual / 2, side="right") - 1
+    return chosen.clip(0, len(times) - 1), (count - 1) / end
+
+
+def _hints_in_clip(
+    hints: Mapping[str, Hint],
+    frames: UInt8[np.ndarray, "time h w 3"],
+    shown_px: tuple[int, int],
+    source_frame: Int[np.ndarray, "time"],
+) -> dict[str, Hint]:
+    """Return the hints with the clip's frame numbers and pixels."""
+    sx, sy = frames.shape[2] / shown_px[0], frames.shape[1] / shown_px[1]
+    moved: dict[str, Hint] = {}
+    for name, hint in hints.items():
+        nearest = int(np.abs(source_frame - hint.get("frame", 0)).argmin())
+        there = Hint(frame=nearest)
+        if "box" in hint:
+            x0, y0, x1, y1 = hint["box"]
+            there["box"] = [x0 * sx, y0 * sy, x1 * sx, y1 * sy]
+        if "points" in hint:
+            there["points"] = [[x * sx, y * sy] for x, y in hint["points"]]
+        if "size_m" in hint:
+            there["size_m"] = hint["size_m"]
+        moved[name] = there
+    return moved
+
+
+def _check_size(path: Path, width: int, height: int, cfg: VideoConfig, low: bool = True) -> None:
+    if low and min(width, height) < cfg.min_side_px:
+        raise ItemRejectedError(
+            "too_small",
+            f"{path.name} is {width} x {height} px; each side needs {cfg.min_side_px}",
+            min(width, height),
+        )
+    if max(width, height) > cfg.max_side_file_px:
+        raise ItemRejectedError(
+            "too_large",
+            f"{path.name} is {width} x {height} px; at most {cfg.max_side_file_px} are read",
+            max(width, height),
+        )
+
+
+def _check_duration(path: Path, seconds: float, cfg: VideoConfig) -> None:
+    if seconds > cfg.max_duration_s:
+        raise ItemRejectedError(
+            "too_long",
+            f"{path.name} is {seconds:.0f} s long; cut it to one motion of at most "
+            f"{cfg.max_duration_s:g} s",
+            seconds,
+        )
+
+
+def _is_cut_mp4(path: Path) -> bool:
+    """Tell whether the file begins like an mp4 or mov but lacks the index."""
+    try:
+        with path.open("rb") as file:
+            if file.read(8)[4:] != b"ftyp":
+                return False
+            size = path.stat().st_size
+            at, boxes = 0, 0
+            while at + 8 <= size and boxes < 1000:
+                file.seek(at)
+                head = file.read(16)
+                length, kind = int.from_bytes(head[:4], "big"), head[4:8]
+                if kind == b"moov":
+                    return at + length > size
+                length = int.from_bytes(head[8:16], "big") if length == 1 else length
+                if length < 8:
+                    return False
+                at, boxes = at + length, boxes + 1
+            return True
+    except OSError:
+        return False
+
+
+def _said(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
