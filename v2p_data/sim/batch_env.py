@@ -9,6 +9,8 @@ ended go on until `reset` is called for them. Results depend on the seed only, n
 # pyright: reportAttributeAccessIssue=false
 # mujoco's classes come from a compiled module that declares none of them.
 
+import json
+import logging
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -181,6 +183,7 @@ class BatchEnv:
         self.task = self._load_task(task)
         self.reset(np.arange(num_envs))
         self.obs_dim = self._checked_obs_dim()
+        self.component_names = self._component_names()
 
     # -- what task code may ask for
 
@@ -272,9 +275,9 @@ class BatchEnv:
 
     def snapshot(self, ids: Int[np.ndarray, "n"]) -> Snapshot:
         """Return what is needed to draw the worlds `ids` as they are now."""
+        model = self.randomizer.fields()
         fields = {
-            name: self._batch.expand(name)[ids].copy()
-            for name in ("geom_size", "geom_pos", "geom_dataid")
+            name: model[name][ids].copy() for name in ("geom_size", "geom_pos", "geom_dataid")
         }
         return Snapshot(qpos=self._qpos[ids].copy(), qvel=self._qvel[ids].copy(), **fields)
 
@@ -289,10 +292,41 @@ class BatchEnv:
             "fine": self.cfg.fine,
         }
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything the next step depends on, as tensors and text; see `load_state_dict`."""
+        tensors = {f"batch.{name}": self._batch.bind(name) for name in _BATCH_STATE}
+        tensors |= {f"model.{name}": value for name, value in self.randomizer.fields().items()}
+        tensors |= {
+            f"drawn.{name}": value for name, value in self.randomizer.drawn_arrays().items()
+        }
+        tensors |= {f"env.{name}": getattr(self, name) for name in _ENV_STATE}
+        return {
+            **{key: torch.from_numpy(np.array(value)) for key, value in tensors.items()},
+            "rng": json.dumps(self._rng.bit_generator.state),
+            "broken_count": self.broken_count,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on exactly from what `state_dict` returned."""
+        for name in _BATCH_STATE:
+            self._batch.bind(name)[:] = state[f"batch.{name}"].numpy()
+        for name, value in (self.randomizer.fields() | self.randomizer.drawn_arrays()).items():
+            value[:] = state[
+                f"model.{name}" if f"model.{name}" in state else f"drawn.{name}"
+            ].numpy()
+        for name in _ENV_STATE:
+            getattr(self, name)[:] = state[f"env.{name}"].numpy()
+        self._rng.bit_generator.state = json.loads(state["rng"])
+        self.broken_count = int(state["broken_count"])
+        self._tool = tool_state(self._qpos[:, :NUM_ARM_JOINTS], self._qvel[:, :NUM_ARM_JOINTS])
+        self._fill(slice(None), self._tool)
+
     # -- inside
 
     def _bind(self, num_threads: int) -> None:
         model = self.world.model
+        # MuJoCo would write a log file into the working folder; broken worlds are counted instead.
+        mujoco.set_mju_user_warning(_log_warning)
         self._batch = Batch(model, self.num_envs, num_threads)
         self._qpos = self._batch.bind("qpos")
         self._qvel = self._batch.bind("qvel")
@@ -336,6 +370,10 @@ class BatchEnv:
                 "correct get_observation_space or compute_observation_key in its task.py"
             )
         return said
+
+    def _component_names(self) -> tuple[str, ...]:
+        _, parts = self.task.compute_reward(torch.zeros(self.num_envs, ACT_DIM), self.states())
+        return tuple(parts)
 
     def _move_targets(self, action: np.ndarray) -> None:
         cfg, tool = self.cfg, self._tool
@@ -420,6 +458,18 @@ class BatchEnv:
         )
 
 
+_BATCH_STATE = ("time", "qpos", "qvel", "ctrl", "history", "qacc_warmstart")
+_ENV_STATE = (
+    "_target_pos",
+    "_target_quat",
+    "_target_finger",
+    "_start_pose",
+    "_touches",
+    "_steps",
+    "_held",
+    "_last_action",
+    "_broken",
+)
 _BAD_STATE_WARNINGS = [
     int(w)
     for w in (
@@ -434,6 +484,10 @@ _BAD_STATE_WARNINGS = [
 def without_randomization(cfg: SimConfig) -> SimConfig:
     """Return the same settings with the video's layout and nothing random."""
     return replace(cfg, randomization=randomize.none())
+
+
+def _log_warning(message: str) -> None:
+    logging.getLogger(__name__).debug("MuJoCo: %s", message)
 
 
 def _history_layout(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

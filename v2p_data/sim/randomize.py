@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene
 from v2p_data.sim.robot import arm_qpos_for
-from v2p_data.sim.world import MESH_SCALES, ObjectModel, World
+from v2p_data.sim.world import FLOOR_MAX_M, MESH_SCALES, WALL_MAX_M, ObjectModel, World
 
 WORKSPACE_CENTRE_M = (0.5, 0.0)
 OBJECT_LOW_M = (0.37, -0.28)
@@ -112,7 +112,6 @@ class Randomizer:
         self.world = world
         self.cfg = cfg
         n, objects = batch.nsim, world.objects
-        self.scale = np.ones((n, len(objects), 3))
         self.size_m = np.tile(np.array([o.size_m for o in objects]), (n, 1, 1))
         self.mass_kg = np.tile(np.array([o.mass_kg for o in objects]), (n, 1))
         self.friction = np.tile(np.array([o.friction for o in objects]), (n, 1))
@@ -179,7 +178,11 @@ class Randomizer:
         count = len(self.world.objects)
         radius = self._radius[ids]
         offsets = scene_offsets(self.world.scene)
-        low, high = _placement_box(self.world.scene.kind)
+        low, high = _placement_boxes(self.world.scene.kind, count)
+        centre = np.array([WORKSPACE_CENTRE_M[0], (low[0, 1] + high[0, 1]) / 2])
+        pair = self._cover_pair()
+        if pair is not None:
+            self._check_covered_fits(ids, *pair)
         xy = np.zeros((n, count, 2))
         todo = np.arange(n)
         for attempt in range(PLACEMENT_TRIES):
@@ -195,12 +198,12 @@ class Randomizer:
                 )
                 nearest = r[:, 0] + r[:, k] + 0.02
                 distance = np.clip(distance, nearest, np.maximum(nearest, 0.28))
-                if self._covers(k):
+                if pair is not None and k == max(pair):
                     distance = np.zeros(m)
                 spot[:, k] = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
             shift = rng.uniform(-cfg.object_pos_m, cfg.object_pos_m, (m, 2)) * min(loosen, 1.5)
             middle = (spot.max(1) + spot.min(1)) / 2 if count > 1 else np.zeros((m, 2))
-            spot += (np.asarray(WORKSPACE_CENTRE_M) + shift - middle)[:, None]
+            spot += (centre + shift - middle)[:, None]
             # The whole group moves back into the box where it can.
             over = np.maximum(spot - high, 0).max(1) - np.maximum(low - spot, 0).max(1)
             spot -= over[:, None]
@@ -208,7 +211,7 @@ class Randomizer:
             apart = np.ones(m, bool)
             for a in range(count):
                 for b in range(a + 1, count):
-                    if self._covers(b) and a == 0:
+                    if pair in {(a, b), (b, a)}:
                         continue
                     gap = np.linalg.norm(spot[:, a] - spot[:, b], axis=1) - r[:, a] - r[:, b]
                     apart &= gap > 0.005
@@ -233,6 +236,21 @@ class Randomizer:
         """Return joint angles, tool positions and yaws of `count` start poses."""
         k = rng.integers(0, len(self.start_qpos), count)
         return self.start_qpos[k], self.start_tool_pos[k], self.start_yaw[k]
+
+    def fields(self) -> dict[str, np.ndarray]:
+        """Return the model fields that differ between worlds; live arrays."""
+        return self._fields
+
+    def drawn_arrays(self) -> dict[str, np.ndarray]:
+        """Return all drawn values and what follows from them; live arrays."""
+        return {
+            "size_m": self.size_m,
+            "mass_kg": self.mass_kg,
+            "friction": self.friction,
+            "delay_s": self.delay_s,
+            "height_above_table": self._height_above_table,
+            "radius": self._radius,
+        }
 
     def drawn(self, env: int) -> dict[str, object]:
         """Return the values world `env` has now, for JSON."""
@@ -264,12 +282,30 @@ class Randomizer:
             )
         return poses
 
-    def _covers(self, k: int) -> bool:
-        """Whether object `k` starts under the manipulated object."""
+    def _cover_pair(self) -> tuple[int, int] | None:
+        """Return cover and covered object, where one starts under the other."""
         objects = self.world.objects
-        return (
-            self.world.scene.kind == "uncover" and k == 1 and objects[0].kind.endswith("_hollow")
-        )
+        covers = [
+            k for k, o in enumerate(objects) if o.role == "cover" and o.kind.endswith("_hollow")
+        ]
+        if self.world.scene.kind != "uncover" or not covers or len(objects) < 2:
+            return None
+        return covers[0], 1 if covers[0] == 0 else 0
+
+    def _check_covered_fits(self, ids: np.ndarray, cover: int, covered: int) -> None:
+        obj = self.world.objects[cover]
+        size = self.size_m[ids, cover]
+        room = size[:, :2].min(1) / 2 - WALL_MAX_M
+        too_big = self._radius[ids, covered] - room
+        too_tall = 2 * self._height_above_table[ids, covered] - (size[:, 2] - FLOOR_MAX_M)
+        excess = float(np.maximum(too_big, too_tall).max())
+        if excess > 0:
+            raise ItemRejectedError(
+                "does_not_fit_under_cover",
+                f"'{self.world.objects[covered].name}' does not fit under '{obj.name}' in scene "
+                f"'{self.world.scene.title}': {excess * 1000:.0f} mm too large",
+                excess,
+            )
 
     def _write(
         self,
@@ -322,7 +358,6 @@ class Randomizer:
         f["body_invweight0"][ids, body, 1] = base["body_invweight0"][body, 1] * turn
         f["dof_invweight0"][rows, dofs[:3]] = base["dof_invweight0"][dofs[:3]] / ratio[:, None]
         f["dof_invweight0"][rows, dofs[3:]] = base["dof_invweight0"][dofs[3:]] * turn[:, None]
-        self.scale[ids, k] = scale
         self.size_m[ids, k] = np.asarray(obj.size_m) * scale
         self.mass_kg[ids, k] = mass
         self.friction[ids, k] = friction
@@ -366,10 +401,13 @@ def scene_offsets(scene: Scene) -> Float[np.ndarray, "object 2"]:
     return offsets
 
 
-def _placement_box(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.array(OBJECT_LOW_M), np.array(OBJECT_HIGH_M)
+def _placement_boxes(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return per object the lowest and highest x and y of its centre [m]."""
+    low, high = np.tile(OBJECT_LOW_M, (count, 1)), np.tile(OBJECT_HIGH_M, (count, 1))
     if kind == "push_left":
-        high = high - np.array([0.0, PUSH_ROOM_M])
+        high[:, 1] -= PUSH_ROOM_M
     elif kind == "push_right":
-        low = low + np.array([0.0, PUSH_ROOM_M])
+        low[:, 1] += PUSH_ROOM_M
+    elif kind == "drop_in_front_of":
+        low[1:, 0] += 0.1  # what is in front of it must be within reach, too
     return low, high

@@ -1,13 +1,18 @@
 """The batched worlds as a TorchRL environment, for its collectors and losses.
 
-Keys: `observation` and, after a step, `reward`, `success` and `held` (see `batch_env.StepResult`),
-`terminated` (the simulation broke down), `truncated` (time is up) and `done`. Partial resets follow TorchRL's
+Keys: `observation` and, after a step, `reward`, its `components`, `success` and `held` (see
+`batch_env.StepResult`), `terminated` (the simulation broke down), `truncated` (time is up) and `done`. Its
+`state_dict` holds the worlds' whole state, so a training can go on exactly. Partial resets follow TorchRL's
 `_reset` mask. Actions are not bounded by the specification; the environment clips them.
 """
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch.nn.modules.module import _IncompatibleKeys
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
@@ -21,23 +26,28 @@ class TorchRLEnv(EnvBase):
         env: the worlds; `batch_size` is their number.
     """
 
-    batch_locked = True
-
     def __init__(self, env: BatchEnv) -> None:
         n = env.num_envs
         super().__init__(device="cpu", batch_size=torch.Size([n]))
         self.worlds = env
-        flag = Binary(1, (n, 1), dtype=torch.bool)
+        flag = Binary(1, torch.Size([n, 1]), dtype=torch.bool)
         self.observation_spec = Composite(
             observation=Unbounded(torch.Size([n, env.obs_dim])),
             success=flag.clone(),
             held=flag.clone(),
-            shape=(n,),
+            components=Composite(
+                {name: Unbounded(torch.Size([n])) for name in env.component_names},
+                shape=torch.Size([n]),
+            ),
+            shape=torch.Size([n]),
         )
         self.action_spec = Unbounded(torch.Size([n, env.act_dim]))
         self.reward_spec = Unbounded(torch.Size([n, 1]))
         self.done_spec = Composite(
-            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
+            done=flag.clone(),
+            terminated=flag.clone(),
+            truncated=flag.clone(),
+            shape=torch.Size([n]),
         )
 
     @property
@@ -53,7 +63,15 @@ class TorchRLEnv(EnvBase):
         self.worlds.reset(ids)
         no = torch.zeros(n, 1, dtype=torch.bool)
         flags = {key: no.clone() for key in ("success", "held", "done", "terminated", "truncated")}
-        return TensorDict({"observation": torch.from_numpy(self.worlds.observe()), **flags}, [n])
+        parts = {name: torch.zeros(n) for name in self.worlds.component_names}
+        return TensorDict(
+            {
+                "observation": torch.from_numpy(self.worlds.observe()),
+                "components": TensorDict(parts, [n]),
+                **flags,
+            },
+            [n],
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         result = self.worlds.step(tensordict.get("action").detach().numpy())
@@ -65,14 +83,28 @@ class TorchRLEnv(EnvBase):
             "truncated": result.truncated,
             "done": result.terminated | result.truncated,
         }
+        parts = {name: torch.from_numpy(value) for name, value in result.components.items()}
+        n = self.worlds.num_envs
         return TensorDict(
             {
                 "observation": torch.from_numpy(result.obs),
+                "components": TensorDict(parts, [n]),
                 **{key: torch.from_numpy(value)[:, None] for key, value in columns.items()},
             },
-            [self.worlds.num_envs],
+            [n],
         )
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.worlds.seed(seed)
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        del args, kwargs
+        return self.worlds.state_dict()
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any
+    ) -> _IncompatibleKeys:
+        del args, kwargs
+        self.worlds.load_state_dict(dict(state_dict))
+        return _IncompatibleKeys([], [])

@@ -37,6 +37,8 @@ MIN_THICKNESS_M = 0.01
 MESH_SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
 """Ready-made sizes of each mesh; a world picks one, because MuJoCo cannot scale a mesh per world."""
 ROUND_WALLS = 10
+FLOOR_MAX_M = 0.02
+WALL_MAX_M = 0.012
 HULL_VERTICES = 40
 CAMERA = "view"
 CAMERA_POS = (0.0, -0.6, 0.78)
@@ -138,8 +140,8 @@ def hollow_parts(
     at least 6 mm thick; through thin floors hard-pressed objects were pushed into the table.
     """
     half = np.asarray(size_m) / 2
-    floor = float(np.clip(0.2 * size_m[2], 0.006, 0.02))
-    wall = float(np.clip(0.08 * min(size_m[0], size_m[1]), 0.006, 0.012))
+    floor = float(np.clip(0.2 * size_m[2], 0.006, FLOOR_MAX_M))
+    wall = float(np.clip(0.08 * min(size_m[0], size_m[1]), 0.006, WALL_MAX_M))
     flip = -1.0 if upside_down else 1.0
     wall_half_height = half[2] - floor / 2
     wall_z = flip * floor / 2
