@@ -87,19 +87,21 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
     if film.promised and total < _TRUNCATED * film.promised:
         detail = f"{name} is cut off: {total} of about {film.promised} frames can be decoded"
         if total < cfg.min_frames:
-            raise ItemRejectedError("truncated", f"{detail}; copy it again", total)
+            raise ItemRejectedError("truncated", f"{detail}; copy it again", float(total))
         warnings.append(f"{detail}; the rest of the motion is missing")
     elif film.broken and total >= cfg.min_frames:
         warnings.append(f"{name} has {film.broken} damaged places; frames there may be missing")
     if total < cfg.min_frames:
         if film.broken:
             raise ItemRejectedError(
-                "unreadable", f"{name} is damaged: only {total} frames can be decoded", total
+                "unreadable",
+                f"{name} is damaged: only {total} frames can be decoded",
+                float(total),
             )
         raise ItemRejectedError(
             "too_few_frames",
             f"{name} has {total} frames; at least {cfg.min_frames} are needed to see a motion",
-            total,
+            float(total),
         )
     for warning in warnings:
         log.warning("%s", warning)
@@ -233,7 +235,7 @@ def _timed_frames(
             raise ItemRejectedError(
                 "too_slow",
                 f"{path.name} takes longer than {cfg.max_decode_s:g} s to decode; make it smaller",
-                film.seen,
+                float(film.seen),
             )
         try:
             frames = packet.decode()
@@ -358,13 +360,13 @@ def _check_size(path: Path, width: int, height: int, cfg: VideoConfig, low: bool
         raise ItemRejectedError(
             "too_small",
             f"{path.name} is {width} x {height} px; each side needs {cfg.min_side_px}",
-            min(width, height),
+            float(min(width, height)),
         )
     if max(width, height) > cfg.max_side_file_px:
         raise ItemRejectedError(
             "too_large",
             f"{path.name} is {width} x {height} px; at most {cfg.max_side_file_px} are read",
-            max(width, height),
+            float(max(width, height)),
         )
 
 

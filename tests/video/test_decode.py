@@ -1,0 +1,257 @@
+"""Every container that we promise to read, and what becomes of files that are no good."""
+
+import struct
+
+import av
+import numpy as np
+import pytest
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.video.captions import VideoItem
+from v2p_data.video.decode import VideoConfig, read_clip
+
+
+def item(path, **extra):
+    return VideoItem(item="clip", path=path, caption="Pushing red box", **extra)
+
+
+def reason_for(path, **cfg):
+    with pytest.raises(ItemRejectedError) as error:
+        read_clip(item(path), VideoConfig(**cfg))
+    assert path.name in error.value.detail
+    return error.value.reason
+
+
+def flat(value, count=10, height=96, width=128):
+    return [np.full((height, width, 3), value, np.uint8) for _ in range(count)]
+
+
+def squares(count, height=96, width=128):
+    frames = flat(120, count, height, width)
+    for i, pixels in enumerate(frames):
+        x = 4 * i % (width - 32)
+        pixels[32:64, x : x + 32] = (200, 30, 30)
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pix_fmt"),
+    [
+        ("a.mp4", "libx264", "yuv420p"),
+        ("a.mov", "mpeg4", "yuv420p"),
+        ("a.avi", "mjpeg", "yuvj420p"),
+        ("a.webm", "libvpx-vp9", "yuv420p"),
+        ("a.mkv", "ffv1", "yuv444p"),
+        ("a.gif", "gif", "rgb8"),
+        ("b.mp4", "libx265", "yuv420p10le"),
+        ("b.mkv", "ffv1", "gray"),
+        ("really_matroska.mp4.mkv", "ffv1", "bgra"),
+    ],
+)
+def test_every_container_gives_the_same_moving_square(film, name, codec, pix_fmt, capfd):
+    options = {"libx265": {"x265-params": "log-level=none"}}.get(codec, {})
+    path = film(name, squares(20), codec=codec, pix_fmt=pix_fmt, fps=25, options=options)
+    capfd.readouterr()
+
+    clip = read_clip(item(path))
+
+    assert clip.frames.shape == (20, 96, 128, 3)
+    assert clip.total_frames == 20
+    assert clip.fps == pytest.approx(25, rel=0.01)
+    red = clip.frames[..., 0].astype(int) - clip.frames[..., 2]
+    for i in (0, 10, 19):
+        if pix_fmt == "gray":
+            # luma of (200, 30, 30) is 81, that of the ground 120
+            columns = np.flatnonzero(clip.frames[i, 48, :, 0] < 100)
+        else:
+            columns = np.flatnonzero(red[i, 48] > 80)
+        assert abs(columns[0] - 4 * i) <= 2
+        assert abs(columns[-1] - (4 * i + 31)) <= 2
+    assert np.abs(clip.frames[:, 5, 5].astype(int) - 120).max() <= (
+        40 if codec == "gif" else 4  # rgb8 has four blues
+    )
+    assert capfd.readouterr().err == ""
+
+
+def test_a_long_clip_is_thinned_evenly_and_keeps_real_time(film):
+    frames = [np.full((96, 128, 3), i % 240, np.uint8) for i in range(400)]
+    path = film("long.mkv", frames, codec="ffv1", pix_fmt="yuv444p", fps=50)
+
+    clip = read_clip(item(path), VideoConfig(max_frames=100))
+
+    assert len(clip.frames) == 100
+    assert clip.total_frames == 400
+    # 400 frames last from 0 to 7.98 s; 100 of them stand 7.98 / 99 s apart, give or take the end that thinning may lose
+    assert clip.fps == pytest.approx(99 / 7.98, rel=0.02)
+    assert clip.source_fps == pytest.approx(50, rel=0.01)
+    assert np.abs(clip.source_frame / 50 - clip.times_s).max() < 2.01 / 50
+    shown = clip.frames[:, 48, 64, 0].astype(int)
+    assert np.abs(shown - clip.source_frame % 240).max() <= 2
+
+
+def test_where_the_rate_varies_time_decides(film):
+    # ten frames at 10 fps, a pause of a second, ten frames at 10 fps
+    pts = [100 * i for i in range(10)] + [1900 + 100 * i for i in range(10)]
+    path = film("vfr.mkv", squares(20), codec="ffv1", pix_fmt="yuv444p", pts_ms=pts)
+
+    clip = read_clip(item(path))
+
+    # 0 to 2.8 s at 10 frames per second
+    assert len(clip.frames) == 29
+    assert clip.fps == pytest.approx(10, rel=0.01)
+    assert clip.source_frame[[0, 9, 14, 18, 19, 28]].tolist() == [0, 9, 9, 9, 10, 19]
+
+
+def test_large_pictures_are_scaled_to_even_sizes(film):
+    path = film("large.mp4", squares(10, height=402, width=1000))
+
+    clip = read_clip(item(path), VideoConfig(max_side_px=320))
+
+    # 402 * 320 / 1000 = 128.6
+    assert clip.frames.shape[1:3] == (128, 320)
+    assert clip.source_size_px == (1000, 402)
+
+
+def test_pixels_that_are_not_square_are_made_square(film):
+    path = film("wide.mp4", squares(10), aspect="2/1")
+
+    assert read_clip(item(path)).frames.shape[1:3] == (96, 256)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_video_marked_as_turned_is_shown_upright(film, turns):
+    upright = np.full((96, 128, 3), 60, np.uint8)
+    upright[:32, :32] = (220, 40, 40)
+    stored = np.ascontiguousarray(np.rot90(upright, turns))
+    path = film("turned.mp4", [stored] * 10)
+    # ISO 14496-12: the track header's matrix, 16.16 fixed point, turns the picture clockwise by the angle
+    cos, sin = {1: (0, 1), 2: (-1, 0), 3: (0, -1)}[turns]
+    matrix = [cos, sin, 0, -sin, cos, 0, 0, 0]
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 4 + 40
+    data[at : at + 32] = struct.pack(">8i", *(v * 65536 for v in matrix))
+    path.write_bytes(data)
+
+    clip = read_clip(item(path))
+
+    assert clip.frames.shape[1:3] == (96, 128)
+    assert clip.source_size_px == (128, 96)
+    assert clip.frames[0, 10, 10, 0] > 180
+    assert clip.frames[0, 80, 110, 0] < 90
+
+
+def test_what_is_transparent_is_white(film):
+    rgba = np.zeros((96, 128, 4), np.uint8)
+    rgba[:, :64] = (10, 200, 10, 255)
+    rgba[:, 64:96, 3] = 128
+    path = film("alpha.mkv", [rgba] * 10, codec="ffv1", pix_fmt="bgra")
+
+    frame = read_clip(item(path)).frames[0]
+
+    assert frame[50, 20].tolist() == [10, 200, 10]
+    # black at 128 of 255 over white leaves 127
+    assert frame[50, 80].tolist() == [127, 127, 127]
+    assert frame[50, 120].tolist() == [255, 255, 255]
+
+
+def test_hints_follow_scaling_and_sampling(film):
+    path = film("large.mkv", squares(40, height=400, width=800), codec="ffv1", pix_fmt="yuv444p")
+    hints = {
+        "red box": {
+            "frame": 39,
+            "box": [80.0, 40.0, 160.0, 120.0],
+            "points": [[400.0, 200.0]],
+            "size_m": [0.1, 0.1, 0.1],
+        }
+    }
+
+    clip = read_clip(item(path, hints=hints), VideoConfig(max_side_px=400, max_frames=20))
+
+    assert clip.hints["red box"] == {
+        "frame": 19,
+        "box": [40.0, 20.0, 80.0, 60.0],
+        "points": [[200.0, 100.0]],
+        "size_m": [0.1, 0.1, 0.1],
+    }
+
+
+def test_text_named_mp4_is_unreadable(tmp_path, capfd):
+    path = tmp_path / "letter.mp4"
+    path.write_text("Dear video,\n" * 100)
+    empty = tmp_path / "empty.mp4"
+    empty.touch()
+
+    assert reason_for(path) == "unreadable"
+    assert reason_for(empty) == "unreadable"
+    assert reason_for(tmp_path / "missing.mp4") == "unreadable"
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "playlist", ["#EXTM3U\n#EXTINF:1,\nfilm.mp4\n", "ffconcat version 1.0\nfile film.mp4\n"]
+)
+def test_a_playlist_opens_no_other_file(film, tmp_path, playlist):
+    film("film.mp4")
+    path = tmp_path / "list.mp4"
+    path.write_text(playlist)
+
+    assert reason_for(path) == "unreadable"
+
+
+def test_a_file_cut_before_its_index_is_truncated(film):
+    path = film()
+    path.write_bytes(path.read_bytes()[:-200])
+
+    assert reason_for(path) == "truncated"
+
+
+def test_a_file_cut_in_the_middle_keeps_its_beginning_and_says_so(film):
+    path = film("cut.mp4", squares(60), container_options={"movflags": "faststart"})
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 7 // 10])
+
+    clip = read_clip(item(path))
+
+    assert 8 <= clip.total_frames < 48
+    assert f"{clip.total_frames} of about 60 frames" in clip.warnings[0]
+
+
+def test_a_file_cut_near_its_beginning_is_truncated(film):
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, (96, 128, 3), np.uint8) for _ in range(60)]
+    path = film("cut.mp4", noise, container_options={"movflags": "faststart"})
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 15])
+
+    assert reason_for(path) == "truncated"
+
+
+def test_sound_alone_holds_no_pictures(tmp_path):
+    path = tmp_path / "song.mp4"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("aac", rate=44100, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 44100), np.float32), "fltp", "mono")
+        frame.sample_rate = 44100
+        out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+
+    assert reason_for(path) == "no_video_stream"
+
+
+def test_too_few_too_small_too_long_and_too_large_are_told_apart(film):
+    assert reason_for(film("few.mp4", squares(7))) == "too_few_frames"
+    assert reason_for(film("small.mp4", flat(9, height=32))) == "too_small"
+    assert reason_for(film("long.mp4"), max_duration_s=0.5) == "too_long"
+    assert reason_for(film("large.mp4"), max_side_file_px=100) == "too_large"
+    assert len(read_clip(item(film("enough.mp4", squares(8)))).frames) == 8
+
+
+def test_decoding_gives_up_in_time(film):
+    assert reason_for(film(), max_decode_s=1e-6) in ("too_slow", "unreadable")
+
+
+def test_a_still_clip_is_a_clip(film):
+    clip = read_clip(item(film("still.mp4", flat(99))))
+
+    assert clip.frames.std() < 1
+    assert clip.warnings == ()
