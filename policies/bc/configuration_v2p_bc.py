@@ -1,0 +1,128 @@
+"""Settings of the `v2p_bc` policy: the paper's behaviour cloning, with sizes a laptop can train.
+
+LeRobot fills `input_features` and `output_features` from the dataset. This is a LeRobot config, hence neither
+frozen nor keyword-only: draccus parses it and LeRobot writes into it.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.types import NormalizationMode
+from lerobot.optim import AdamWConfig
+
+BACKBONE_WEIGHTS = "ResNet18_Weights.IMAGENET1K_V1"
+"""The one set of pretrained weights this policy knows."""
+CameraInput = Literal["auto", "mask", "rgb"]
+
+
+@PreTrainedConfig.register_subclass("v2p_bc")
+@dataclass
+class V2PBCConfig(PreTrainedConfig):
+    """ResNet18 on stacked frames, a state MLP, an optional task embedding, and a three-layer head."""
+
+    n_obs_steps: int = 2
+    """Frames the policy sees: the current one and the ones before it; at an episode's start the first is repeated."""
+    chunk_size: int = 1
+    """Actions predicted at once. The paper predicts one."""
+    n_action_steps: int = 1
+    """Actions of a chunk that are executed before the policy looks again."""
+
+    input_size_px: int = 256
+    """Longer side of the image the backbone sees; larger images are averaged down, smaller ones stay as they are."""
+    camera_input: CameraInput = "auto"
+    """`mask`: grey label images, split into one channel per label. `rgb`: ordinary images. `auto`: `mask` for
+    cameras with 'mask' in their name, `rgb` for the others."""
+    mask_greys: tuple[int, ...] = (0, 64, 128, 192, 255, 31, 95, 159, 223)
+    """Grey (0 to 255) of each label of a label image; a pixel belongs to the nearest."""
+    pool: Literal["average", "keypoints"] = "keypoints"
+    """How the backbone's last map becomes a vector. `average` is ResNet's own and forgets where things are;
+    `keypoints` adds the expected image coordinates of 32 learnt features (spatial softmax)."""
+
+    pretrained_backbone_weights: str | None = BACKBONE_WEIGHTS
+    """Used when the file lies in torch's cache (nothing is ever downloaded); null starts from random weights."""
+    state_dim: int = 256
+    """Width of the robot state's embedding."""
+    head_dim: int = 512
+    """Width of the head's three layers."""
+    use_task: bool = True
+    """Condition on the task's words, so that one policy can serve several tasks."""
+    task_words_dim: int = 64
+    """Length of the fixed, hashed bag of words that stands for a task."""
+    state_noise: float = 0.0
+    """Training only: Gaussian noise on the normalised state, in standard deviations, so that the policy looks."""
+
+    optimizer_lr: float = 3e-4
+    """Learning rate of everything but a pretrained backbone."""
+    optimizer_lr_backbone: float | None = None
+    """Learning rate of the backbone. Null: 3e-5 when its weights are pretrained, else `optimizer_lr`."""
+    optimizer_weight_decay: float = 1e-4
+    grad_clip_norm: float = 10.0
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            # lerobot-train replaces image statistics by ImageNet's unless told otherwise, which would spoil masks;
+            # the policy scales images itself.
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ENV": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.MEAN_STD,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n_obs_steps < 1:
+            raise ValueError(f"n_obs_steps is {self.n_obs_steps}; it must be 1 or more")
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"n_action_steps is {self.n_action_steps}; it must lie between 1 and chunk_size ({self.chunk_size})"
+            )
+        if self.input_size_px < 32:
+            raise ValueError(f"input_size_px is {self.input_size_px}; ResNet18 needs 32 or more")
+        if len(set(self.mask_greys)) < 2 or not all(0 <= grey <= 255 for grey in self.mask_greys):
+            raise ValueError(
+                f"mask_greys are {self.mask_greys}; they must be two or more levels from 0 to 255"
+            )
+        if self.pretrained_backbone_weights not in (None, BACKBONE_WEIGHTS):
+            raise ValueError(
+                f"pretrained_backbone_weights is '{self.pretrained_backbone_weights}';"
+                f" it can be null or '{BACKBONE_WEIGHTS}'"
+            )
+
+    def is_mask(self, camera_key: str) -> bool:
+        """Tell whether this camera's images are label images."""
+        if self.camera_input == "auto":
+            return "mask" in camera_key.rsplit(".", 1)[-1].lower()
+        return self.camera_input == "mask"
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> None:
+        return None
+
+    def validate_features(self) -> None:
+        if not self.image_features:
+            raise ValueError(
+                "v2p_bc looks at images, and this dataset has none: it needs a key such as"
+                " 'observation.images.mask'"
+            )
+        if self.action_feature is None:
+            raise ValueError("v2p_bc learns actions, and this dataset has no 'action'")
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        return list(range(1 - self.n_obs_steps, 1))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
