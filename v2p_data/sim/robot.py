@@ -9,6 +9,7 @@ a solution with joint 3 at 0, so the spring settles the arm's redundancy without
 Kinematics, joint limits, link masses and inertias are Franka Emika's published values.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -312,5 +313,5 @@ def _rotation_error(wanted: np.ndarray, quat: np.ndarray) -> np.ndarray:
     return 2 * np.where(w < 0, -1.0, 1.0) * vector
 
 
-def _row(values: tuple[float, ...]) -> str:
+def _row(values: Iterable[float | int]) -> str:
     return " ".join(f"{v:.9g}" for v in values)

@@ -10,6 +10,7 @@ uniform density. The manipulated object comes first, as in the scene.
 # mujoco's classes come from a compiled module that declares none of them.
 
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
@@ -420,5 +421,5 @@ def _mesh_name(name: str, scale_idx: int) -> str:
     return f"{name}_mesh_{scale_idx}"
 
 
-def _row(values: tuple[float, ...]) -> str:
+def _row(values: Iterable[float | int]) -> str:
     return " ".join(f"{v:.9g}" for v in values)
