@@ -1,0 +1,199 @@
+"""Runs unknown task code once, in a child process that cannot hurt anyone, and says whether it works.
+
+`smoke_run` starts one child (torch is imported once), which forks for every sample, so that a crash, a hang
+or a memory bomb in one sample is that sample's own result. See `sandbox` for what the child may not do.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import v2p_data
+from v2p_data.errors import V2PError
+from v2p_data.scene.scene import Scene
+from v2p_data.seeds import rng_for
+from v2p_data.task.probes import States, at_rest, concatenated, random_states
+from v2p_data.task.sandbox import TaskCodeError, check_code
+
+BATCH = 16
+MAX_ANSWER_CHARS = 20_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmokeResult:
+    """What became of one sample."""
+
+    runnable: bool
+    error: str = ""
+    """One sentence, where it is not runnable."""
+    observation_dim: int = 0
+    components: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """What works but should not be so."""
+    probe_success: tuple[bool, ...] = ()
+    """The success function's answer for each row of the probes."""
+    probe_reward: tuple[float, ...] = ()
+    seconds: float = 0.0
+
+    @staticmethod
+    def from_json(data: Any, num_probes: int) -> "SmokeResult":
+        """Read a child's answer, which is data from a stranger.
+
+        Raises:
+            TypeError, ValueError: it is not what it should be.
+        """
+        if not isinstance(data, dict) or not isinstance(data.get("runnable"), bool):
+            raise TypeError("no verdict")
+        success = [bool(x) for x in data.get("probe_success", [])]
+        reward = [float(x) for x in data.get("probe_reward", [])]
+        if data["runnable"] and not len(success) == len(reward) == num_probes:
+            raise ValueError(f"{len(success)} answers to {num_probes} probes")
+        return SmokeResult(
+            runnable=data["runnable"],
+            error=str(data.get("error", ""))[:1000],
+            observation_dim=int(data.get("observation_dim", 0)),
+            components=tuple(str(c)[:100] for c in data.get("components", [])),
+            warnings=tuple(str(w)[:300] for w in data.get("warnings", [])),
+            probe_success=tuple(success),
+            probe_reward=tuple(reward),
+            seconds=float(data.get("seconds", 0.0)),
+        )
+
+
+def smoke_run(source: str, scene: Scene, *, timeout_s: float = 60.0) -> SmokeResult:
+    """Return whether one task code runs on states of this scene."""
+    return smoke_run_all([source], scene, timeout_s=timeout_s)[0]
+
+
+def smoke_run_all(
+    sources: list[str],
+    scene: Scene,
+    *,
+    probes: States | None = None,
+    seconds_each: float = 10.0,
+    timeout_s: float = 180.0,
+) -> list[SmokeResult]:
+    """Return per source whether it runs, and what it says to the probes.
+
+    Args:
+        sources: task codes.
+        scene: whose objects the states describe.
+        probes: further moments on which success and reward are wanted.
+        seconds_each: wall-clock limit per source.
+        timeout_s: for all of them, with the child's start.
+    """
+    results: list[SmokeResult | None] = [_refused(s) for s in sources]
+    asked = [i for i, r in enumerate(results) if r is None]
+    if asked:
+        answers = _ask_child([sources[i] for i in asked], scene, probes, seconds_each, timeout_s)
+        for i, answer in zip(asked, answers, strict=True):
+            results[i] = answer
+    return [r for r in results if r is not None]
+
+
+def _refused(source: str) -> SmokeResult | None:
+    try:
+        check_code(source)
+    except TaskCodeError as error:
+        return SmokeResult(runnable=False, error=str(error))
+    return None
+
+
+def _ask_child(
+    sources: list[str],
+    scene: Scene,
+    probes: States | None,
+    seconds_each: float,
+    timeout_s: float,
+) -> list[SmokeResult]:
+    states = random_states(scene, BATCH, rng_for(0, "smoke", scene.title))
+    num_probes = len(next(iter(probes.values()))) if probes else 0
+    request = {
+        "sources": sources,
+        "object_names": [o.name for o in scene.objects],
+        "states": _as_lists(states),
+        "edge_states": _as_lists(_edge_states(scene)),
+        "probes": _as_lists(probes or {}),
+        "seconds_each": seconds_each,
+    }
+    root = str(Path(v2p_data.__file__).parents[1])
+    starter = f"import sys; sys.path.insert(0, {root!r}); from v2p_data.task.smoke_child import main; main()"
+    with tempfile.TemporaryDirectory(prefix="v2p-task-") as folder:
+        child = subprocess.Popen(
+            [sys.executable, "-I", "-c", starter],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            cwd=folder,
+            env={
+                "OMP_NUM_THREADS": "1",
+                "HOME": folder,
+                "TMPDIR": folder,
+                "PATH": "/usr/bin:/bin",
+            },
+            start_new_session=True,
+        )
+        try:
+            answer, complaint = child.communicate(json.dumps(request).encode(), timeout_s)
+        except subprocess.TimeoutExpired:
+            _end(child)
+            return [
+                SmokeResult(
+                    runnable=False, error=f"the trial run took more than {timeout_s:.0f} s"
+                )
+            ] * len(sources)
+        finally:
+            _end(child)
+    return _read(answer, complaint, len(sources), num_probes)
+
+
+def _read(answer: bytes, complaint: bytes, count: int, num_probes: int) -> list[SmokeResult]:
+    try:
+        return _results(answer, count, num_probes)
+    except (ValueError, TypeError) as error:
+        tail = complaint.decode(errors="replace").strip().splitlines()[-1:]
+        raise V2PError(
+            f"the trial run of task code gave no answer ({error}{'; ' + tail[0] if tail else ''}); "
+            "is there memory left for a Python process with torch?"
+        ) from error
+
+
+def _results(answer: bytes, count: int, num_probes: int) -> list[SmokeResult]:
+    if len(answer) > MAX_ANSWER_CHARS:
+        raise ValueError("the answer is too long")
+    data = json.loads(answer)
+    if not isinstance(data, list) or len(data) != count:
+        raise ValueError(f"{count} answers wanted")
+    return [SmokeResult.from_json(d, num_probes) for d in data]
+
+
+def _edge_states(scene: Scene) -> States:
+    """Return moments at which norms are zero: everything still, the hand at an object's very centre."""
+    batches: list[States] = []
+    for obj in scene.objects:
+        probe = at_rest(scene, 2)
+        probe.eef_pos = probe.objects[obj.name].pos.copy()
+        probe.progress = 0.0
+        batches.append(probe.states())
+    return concatenated(batches)
+
+
+def _as_lists(states: States) -> dict[str, Any]:
+    return {k: np.asarray(v, float).tolist() for k, v in states.items()}
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """End the child and everything it started; they share a process group of their own."""
+    if child.poll() is None:
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+        child.communicate()

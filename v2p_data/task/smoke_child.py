@@ -1,0 +1,309 @@
+"""The child process of `smoke`: reads task codes as JSON, tries each in a fork with nothing left to abuse.
+
+A fork may open no file and no socket, start no process, write no file, and use a bounded amount of time and
+memory; where we run as root it gives that up as well.
+"""
+
+import json
+import os
+import resource
+import select
+import signal
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from v2p_data.task.sandbox import TaskCodeError, line_in_task_code, make_task
+
+MEMORY_BYTES = 2 * 1024**3
+"""On top of what importing torch has mapped."""
+NOBODY = 65534
+MAX_COMPONENTS = 32
+MAX_REWARD = 20.0
+"""The bonus for success is 100; shaping beyond this competes with it."""
+MAX_ANSWER_BYTES = 4_000_000
+SLOW_S = 1.0
+
+_HARMLESS = """
+scene_info = {}
+class Warm(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, scene_info)
+    def compute_success(self, states):
+        return torch.norm(states["eef_pos"], dim=-1) < 0.0
+    def compute_reward(self, actions, states):
+        return reward_function(actions, states)
+def reward_function(actions, states):
+    x = 1 - torch.tanh(torch.linalg.norm(states["eef_pos"], dim=-1))
+    return x + actions.square().sum(dim=-1), {"x": torch.where(x > 0, x, -x).clamp(0, 1)}
+"""
+
+
+class BadTaskError(Exception):
+    """What a sample does wrong, as a sentence."""
+
+
+class FakePlacer:
+    """Stands in for the environment: every object is put where the states say."""
+
+    def __init__(self, states: dict[str, torch.Tensor], names: list[str]) -> None:
+        self._states = states
+        self._names = names
+
+    @property
+    def num_envs(self) -> int:
+        return len(self._states["eef_pos"])
+
+    def sample_object_poses(self, env_ids: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {
+            n: torch.cat([self._states[f"{n}_pos"], self._states[f"{n}_quat"]], dim=1)[env_ids]
+            for n in self._names
+        }
+
+
+def main() -> None:
+    """Answer one request from stdin on stdout."""
+    request: dict[str, Any] = json.load(sys.stdin)
+    _leave_the_network()
+    torch.set_num_threads(1)
+    torch.set_grad_enabled(False)
+    with suppress(
+        BadTaskError
+    ):  # loads what torch loads late, before files can no longer be opened
+        judge(_HARMLESS, request)
+    answers = [_in_a_fork(source, request) for source in request["sources"]]
+    sys.stdout.write(json.dumps(answers))
+
+
+def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
+    """Return what the code does with the request's states.
+
+    Raises:
+        BadTaskError: it does not work.
+    """
+    begin = time.monotonic()
+    states = _tensors(request["states"])
+    names: list[str] = request["object_names"]
+    task = make_task(source, FakePlacer(states, names), "")
+    n = len(states["eef_pos"])
+    _check_reset(task, names, n)
+
+    first = _outputs(task, states)
+    if not all(torch.equal(a, b) for a, b in _pairs(first, _outputs(task, states))):
+        raise BadTaskError("two calls with the same states give different results")
+    order = torch.arange(n - 1, -1, -1)
+    turned = _outputs(task, {k: v[order] for k, v in states.items()})
+    if not all(_close(a[order], b) for a, b in _pairs(first, turned)):
+        raise BadTaskError("the result depends on the order of the environments")
+    warnings: list[str] = []
+    half = _outputs(task, {k: v[: n // 2] for k, v in states.items()})
+    if not all(_close(a[: n // 2], b) for a, b in _pairs(first, half)):
+        warnings.append("the result for one environment depends on the others")
+    edge = _outputs(task, _tensors(request["edge_states"]))
+    biggest = max(float(first["reward"].abs().max()), float(edge["reward"].abs().max()))
+    if biggest > MAX_REWARD:
+        warnings.append(
+            f"the reward reaches {biggest:.3g}, which competes with the bonus for success"
+        )
+    answer = {
+        "runnable": True,
+        "observation_dim": first["observation"].shape[1],
+        "components": [k.removeprefix("part ") for k in first if k.startswith("part ")],
+        "warnings": warnings,
+        "seconds": time.monotonic() - begin,
+    }
+    if request["probes"]:
+        probes = _outputs(task, _tensors(request["probes"]))
+        answer |= {
+            "probe_success": probes["success"].int().tolist(),
+            "probe_reward": probes["reward"].tolist(),
+        }
+    return answer
+
+
+def _check_reset(task: Any, names: list[str], n: int) -> None:
+    ids = torch.arange(n)
+    poses = task.reset_objects_states(ids)
+    if not isinstance(poses, dict) or set(poses) != set(names):
+        raise BadTaskError(
+            f"reset_objects_states must return a pose per object: {', '.join(names)}"
+        )
+    for name, pose in poses.items():
+        if not isinstance(pose, torch.Tensor) or pose.shape != (n, 7):
+            raise BadTaskError(f"the reset pose of {name} must be a tensor of shape ({n}, 7)")
+        if not pose.isfinite().all() or not _close(pose[:, 3:].norm(dim=1), torch.ones(n)):
+            raise BadTaskError(
+                f"the reset pose of {name} is not finite or its quaternion is not of length 1"
+            )
+
+
+def _outputs(task: Any, given: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return observation, success, reward and its parts, checked, in the order in which the simulator asks."""
+    n = len(given["eef_pos"])
+    states = {k: v.clone() for k, v in given.items()}
+    begin = time.monotonic()
+    keys = task.compute_observation_key(states)
+    if not isinstance(keys, list) or not all(isinstance(k, str) for k in keys):
+        raise BadTaskError("compute_observation_key must return a list of keys")
+    columns: list[torch.Tensor] = []
+    for key in keys:
+        if key not in states:
+            raise BadTaskError(f"observation key '{key}' is not in states")
+        _check_tensor(f"observation '{key}'", states[key], n, max_dim=2)
+        columns.append(states[key].reshape(n, -1).float())
+    observation = torch.cat(columns, dim=1)
+    said = task.get_observation_space()
+    if not isinstance(said, int) or said != observation.shape[1]:
+        raise BadTaskError(
+            f"get_observation_space says {said}, but the observation has length {observation.shape[1]}"
+        )
+    success = task.compute_success(states)
+    _check_tensor("compute_success", success, n, kind=torch.bool)
+    result = task.compute_reward(torch.full((n, 7), 0.1), states)
+    if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
+        raise BadTaskError("compute_reward must return the reward and a dict of its components")
+    reward, parts = result
+    _check_tensor("the reward", reward, n, kind=torch.float32)
+    if not 0 < len(parts) <= MAX_COMPONENTS or not all(isinstance(k, str) for k in parts):
+        raise BadTaskError(f"the reward needs 1 to {MAX_COMPONENTS} named components")
+    for name, part in parts.items():
+        _check_tensor(f"reward component '{name}'", part, n)
+    if time.monotonic() - begin > SLOW_S:
+        raise BadTaskError(f"one step of {n} environments takes more than {SLOW_S:.0f} s")
+    for key, value in given.items():
+        if not torch.equal(states[key], value):
+            raise BadTaskError(f"it changes states['{key}'] in place; work on a copy")
+    named = {f"part {k}": v.float() for k, v in parts.items()}
+    return {"observation": observation, "success": success, "reward": reward, **named}
+
+
+def _check_tensor(
+    what: str, value: Any, n: int, *, kind: torch.dtype | None = None, max_dim: int = 1
+) -> None:
+    if not isinstance(value, torch.Tensor):
+        raise BadTaskError(f"{what} must be a tensor, not {type(value).__name__}")
+    if value.ndim < 1 or value.ndim > max_dim or value.shape[0] != n:
+        raise BadTaskError(
+            f"{what} must have one row per environment ({n}), not shape {tuple(value.shape)}"
+        )
+    if kind is not None and value.dtype != kind:
+        raise BadTaskError(f"{what} must be of type {kind}, not {value.dtype}")
+    if not value.float().isfinite().all():
+        raise BadTaskError(f"{what} is not finite")
+
+
+def _pairs(
+    a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    if a.keys() != b.keys():
+        raise BadTaskError("the names of the reward components change from call to call")
+    return [(a[k], b[k]) for k in a]
+
+
+def _close(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return a.shape == b.shape and torch.allclose(a.float(), b.float(), atol=1e-4, rtol=1e-4)
+
+
+def _tensors(lists: dict[str, Any]) -> dict[str, torch.Tensor]:
+    return {k: torch.tensor(v, dtype=torch.float32) for k, v in lists.items()}
+
+
+# --- confinement ---------------------------------------------------------------------------------------------
+
+
+def _leave_the_network() -> None:
+    flags = os.CLONE_NEWNET if os.geteuid() == 0 else os.CLONE_NEWUSER | os.CLONE_NEWNET
+    with suppress(
+        OSError
+    ):  # not every container allows it; no socket can be opened in the fork anyway
+        os.unshare(flags)
+
+
+def _confine(seconds: float) -> None:
+    """Give up everything the rest of this process does not need."""
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    for limit, value in (
+        (resource.RLIMIT_AS, mapped + MEMORY_BYTES),
+        (resource.RLIMIT_CPU, int(seconds) + 1),
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_NPROC, 0),
+        (resource.RLIMIT_NOFILE, 0),
+    ):
+        resource.setrlimit(limit, (value, value))
+    if os.geteuid() == 0:
+        os.setgroups([])
+        os.setgid(NOBODY)
+        os.setuid(NOBODY)
+
+
+def _in_a_fork(source: str, request: dict[str, Any]) -> dict[str, Any]:
+    """Return the fork's answer, or a sentence that says how it ended."""
+    read_end, write_end = os.pipe()
+    seconds = float(request["seconds_each"])
+    pid = os.fork()
+    if pid == 0:
+        os.close(read_end)
+        code = 1
+        try:
+            _confine(seconds)
+            _send(write_end, _answer(source, request))
+            code = 0
+        finally:
+            os._exit(code)
+    os.close(write_end)
+    received, is_late = _receive(read_end, seconds)
+    os.close(read_end)
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+    _, status = os.waitpid(pid, 0)
+    if is_late:
+        return _failed(f"it took more than {seconds:.0f} s")
+    try:
+        return json.loads(received)
+    except ValueError:
+        if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
+            return _failed(f"it took more than {seconds:.0f} s of computing")
+        return _failed("its process ended before it had answered; it may need too much memory")
+
+
+def _answer(source: str, request: dict[str, Any]) -> dict[str, Any]:
+    try:
+        return judge(source, request)
+    except (BadTaskError, TaskCodeError) as error:
+        return _failed(str(error))
+    except MemoryError:
+        return _failed("it needs too much memory")
+    except Exception as error:  # noqa: BLE001 - whatever strange code raises is its own result
+        line = line_in_task_code(error)
+        where = f"line {line}: " if line else ""
+        return _failed(f"{where}{type(error).__name__}: {str(error)[:300]}")
+
+
+def _failed(error: str) -> dict[str, Any]:
+    return {"runnable": False, "error": error}
+
+
+def _send(end: int, answer: dict[str, Any]) -> None:
+    data = memoryview(json.dumps(answer).encode())
+    while data:
+        data = data[os.write(end, data) :]
+
+
+def _receive(end: int, seconds: float) -> tuple[bytes, bool]:
+    """Return what came before the other end closed, and whether time ran out first."""
+    deadline = time.monotonic() + seconds
+    received = bytearray()
+    while len(received) < MAX_ANSWER_BYTES:
+        left = deadline - time.monotonic()
+        if left <= 0 or not select.select([end], [], [], left)[0]:
+            return bytes(received), True
+        chunk = os.read(end, 65536)
+        if not chunk:
+            return bytes(received), False
+        received += chunk
+    return bytes(received), False
