@@ -26,6 +26,7 @@ def scene_object(
     hollow: bool = False,
     mesh: str = "",
 ) -> SceneObject:
+    pose = tuple(float(v) for v in (*pos, *quat))
     return SceneObject(
         name=name,
         label=name,
@@ -37,7 +38,7 @@ def scene_object(
         hollow=hollow,
         mesh=mesh,
         frames=(0, 10),
-        poses_world=((*pos, *quat), (*pos, *quat)),
+        poses_world=(pose, pose),
         confidences=(1.0, 1.0),
     )
 

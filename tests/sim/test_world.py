@@ -188,7 +188,9 @@ def test_a_flat_mesh_is_rejected(
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n")
 
     with pytest.raises(ItemRejectedError, match="flat"):
-        build_world(make_scene(make_object("sheet", "mesh", mesh="flat.obj"), folder=tmp_path), COARSE)
+        build_world(
+            make_scene(make_object("sheet", "mesh", mesh="flat.obj"), folder=tmp_path), COARSE
+        )
 
 
 def test_the_camera_sees_the_workspace_with_left_on_the_left(

@@ -198,6 +198,10 @@ class BatchEnv:
         """Restart the stream of everything drawn from now on."""
         self._rng = rng_for(seed, "worlds")
 
+    def stagger(self) -> None:
+        """Put every world at a random moment of its episode, so that they do not all end at once."""
+        self._steps[:] = self._rng.integers(0, self.horizon, self.num_envs)
+
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Start new episodes in the worlds `ids`."""
         n = len(ids)
@@ -307,7 +311,7 @@ class BatchEnv:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on exactly from what `state_dict` returned."""
+        """Go on exactly from what `state_dict` of an environment made with the same arguments returned."""
         for name in _BATCH_STATE:
             self._batch.bind(name)[:] = state[f"batch.{name}"].numpy()
         for name, value in (self.randomizer.fields() | self.randomizer.drawn_arrays()).items():

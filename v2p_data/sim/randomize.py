@@ -353,7 +353,7 @@ class Randomizer:
         f["body_subtreemass"][ids, body] = mass
         f["body_inertia"][ids, body] = inertia
         f["body_ipos"][ids, body] = base["body_ipos"][body] * scale
-        turn = (base["body_inertia"][body] / inertia).mean(1)
+        turn = (1 / inertia).mean(1) / (1 / base["body_inertia"][body]).mean()
         f["body_invweight0"][ids, body, 0] = base["body_invweight0"][body, 0] / ratio
         f["body_invweight0"][ids, body, 1] = base["body_invweight0"][body, 1] * turn
         f["dof_invweight0"][rows, dofs[:3]] = base["dof_invweight0"][dofs[:3]] / ratio[:, None]

@@ -55,6 +55,10 @@ class TorchRLEnv(EnvBase):
         """Control steps per episode."""
         return self.worlds.horizon
 
+    def stagger(self) -> None:
+        """See `BatchEnv.stagger`; training calls it once, after the first reset."""
+        self.worlds.stagger()
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         del kwargs
         n = self.worlds.num_envs

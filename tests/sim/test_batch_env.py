@@ -1,0 +1,420 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from v2p_data.errors import V2PError
+from v2p_data.scene.scene import SceneObject
+from v2p_data.sim import randomize
+from v2p_data.sim.batch_env import (
+    HELD_STEPS,
+    BatchEnv,
+    SimConfig,
+    Snapshot,
+    without_randomization,
+)
+from v2p_data.sim.robot import FINGER_TRAVEL_M
+from v2p_data.task.task import BASE_OBSERVATION_DIM, OBJECT_STATES, ROBOT_STATES, Task, TaskBundle
+
+CALM = without_randomization(SimConfig(fine=True))
+
+
+@pytest.fixture
+def make_env(
+    make_bundle: Callable[..., TaskBundle], lift_task: type[Task]
+) -> Callable[..., BatchEnv]:
+    def make(
+        *objects: SceneObject,
+        cfg: SimConfig | None = None,
+        num_envs: int = 8,
+        seed: int = 0,
+        num_threads: int = 1,
+        horizon: int = 60,
+        task: type[Task] = lift_task,
+    ) -> BatchEnv:
+        return BatchEnv(
+            make_bundle(*objects, horizon=horizon),
+            cfg,
+            num_envs=num_envs,
+            seed=seed,
+            num_threads=num_threads,
+            task=task,
+        )
+
+    return make
+
+
+def scripted_lift(env: BatchEnv, steps: int = 60) -> list:
+    """Drive the gripper over the object, down, shut and up, by the states alone."""
+    results = []
+    for t in range(steps):
+        states = env.states()
+        error = (states["cube_pos"] - states["eef_pos"]).numpy()
+        action = np.zeros((env.num_envs, 7))
+        action[:, :2] = error[:, :2] / 0.03
+        if t >= 10:
+            action[:, 2] = error[:, 2] / 0.03
+        if t >= 25:
+            action[:, 6] = 1.0
+        if t >= 35:
+            action[:, 2] = 0.5
+        results.append(env.step(action))
+    return results
+
+
+def test_states_have_the_documented_keys_and_shapes(
+    make_env: Callable[..., BatchEnv], make_object: Callable[..., SceneObject]
+):
+    env = make_env(make_object("cube"), make_object("can", role="reference", pos=(0, 0.15, 0.02)))
+
+    states = env.states()
+
+    n = env.num_envs
+    documented = {k: shape for k, (shape, _, _) in ROBOT_STATES.items()}
+    for name in ("cube", "can"):
+        documented |= {f"{name}_{k}": shape for k, (shape, _, _) in OBJECT_STATES.items()}
+    assert set(states) == set(documented)
+    for key, shape in documented.items():
+        assert str(tuple(states[key].shape)).replace(str(n), "env", 1) == shape
+        assert states[key].dtype == torch.float32
+
+
+def test_the_first_states_are_those_of_the_placed_objects(
+    make_env: Callable[..., BatchEnv], make_object: Callable[..., SceneObject]
+):
+    env = make_env(make_object("cube", size_m=(0.03, 0.04, 0.05)), cfg=CALM)
+
+    states = env.states()
+
+    np.testing.assert_allclose(states["cube_pos"][0], (0.5, 0.0, 0.0255), atol=1e-6)
+    np.testing.assert_allclose(states["cube_size"][0], (0.03, 0.04, 0.05), atol=1e-6)
+    np.testing.assert_allclose(states["cube_up"], 1.0)
+    np.testing.assert_allclose(states["gripper_width"], 0.085, atol=1e-6)
+    np.testing.assert_allclose(states["cube_pos"], states["cube_start_pos"])
+    assert not states["cube_touched"].any()
+
+
+def test_velocities_are_in_the_world_frame(make_env: Callable[..., BatchEnv]):
+    env = make_env(cfg=CALM, num_envs=2)
+    obj = env.world.objects[0]
+    env._qpos[:, obj.qpos_adr : obj.qpos_adr + 3] = 0.5, 0.3, 0.4
+    env._qpos[:, obj.qpos_adr + 3 : obj.qpos_adr + 7] = 0.5, 0.5, 0.5, 0.5
+    env._qvel[:, obj.dof_adr : obj.dof_adr + 6] = 0.1, 0.2, 0.3, 1.0, 0.0, 0.0
+
+    env.step(np.zeros((2, 7)))
+
+    model, data = env.world.model, mujoco.MjData(env.world.model)
+    data.qpos[:], data.qvel[:] = env._qpos[0], env._qvel[0]
+    mujoco.mj_forward(model, data)
+    velocity = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, obj.body_id, velocity, 0)
+    np.testing.assert_allclose(env.states()["cube_vel_angular"][0], velocity[:3], atol=1e-5)
+    np.testing.assert_allclose(env.states()["cube_vel_linear"][0], velocity[3:], atol=1e-5)
+
+
+def test_observations_are_bounded_and_of_the_common_length(make_env: Callable[..., BatchEnv]):
+    env = make_env()
+    rng = np.random.default_rng(0)
+
+    for _ in range(20):
+        obs = env.step(rng.uniform(-1, 1, (8, 7))).obs
+
+    assert obs.shape == (8, BASE_OBSERVATION_DIM)
+    assert obs.dtype == np.float32
+    assert np.abs(obs).max() <= 5
+
+
+def test_results_depend_on_the_seed_and_not_on_the_number_of_threads(
+    make_env: Callable[..., BatchEnv],
+):
+    def trace(seed: int, num_threads: int) -> bytes:
+        env = make_env(seed=seed, num_threads=num_threads, num_envs=16, horizon=12)
+        rng = np.random.default_rng(7)
+        parts = []
+        for _ in range(30):
+            result = env.step(rng.uniform(-1, 1, (16, 7)))
+            env.reset(np.flatnonzero(result.truncated))
+            parts += [result.obs.tobytes(), result.reward.tobytes(), env.observe().tobytes()]
+        return b"".join(parts)
+
+    one = trace(3, 1)
+
+    assert trace(3, 2) == one
+    assert trace(3, 4) == one
+    assert trace(4, 1) != one
+
+
+def test_resetting_some_worlds_leaves_the_others_alone(make_env: Callable[..., BatchEnv]):
+    env = make_env()
+    for _ in range(5):
+        env.step(np.full((8, 7), 0.5))
+    before, obs = env._batch.state.copy(), env.observe()
+
+    env.reset(np.array([1, 6]))
+
+    others = [0, 2, 3, 4, 5, 7]
+    np.testing.assert_array_equal(env._batch.state[others], before[others])
+    np.testing.assert_array_equal(env.observe()[others], obs[others])
+    assert env.states()["progress"][1] == 0
+    assert (env.observe()[[1, 6]] != obs[[1, 6]]).any(1).all()
+
+
+def test_a_reset_starts_at_rest_whatever_the_delay(make_env: Callable[..., BatchEnv]):
+    cfg = SimConfig(fine=True, randomization=replace(randomize.none(), delay_s=(0.02, 0.02)))
+    env = make_env(cfg=cfg)
+    start = env.states()["eef_pos"].clone()
+
+    env.step(np.zeros((8, 7)))
+
+    assert (env.states()["eef_pos"] - start).abs().max() < 1e-4
+
+
+def test_delayed_worlds_answer_later_to_the_same_action(make_env: Callable[..., BatchEnv]):
+    moved = []
+    for delay in (0.0, 0.02):
+        cfg = replace(CALM, randomization=replace(randomize.none(), delay_s=(delay, delay)))
+        env = make_env(cfg=cfg)
+        start = env.states()["eef_pos"].clone()
+        action = np.zeros((8, 7))
+        action[:, 1] = 1.0
+        env.step(action)
+        moved.append(float((env.states()["eef_pos"] - start)[0, 1]))
+
+    assert 0 < moved[1] < 0.8 * moved[0]
+
+
+def test_a_scripted_grasp_lifts_the_object_and_counts_as_success(
+    make_env: Callable[..., BatchEnv],
+):
+    env = make_env(cfg=SimConfig(fine=True), num_envs=16)
+
+    results = scripted_lift(env)
+
+    states = env.states()
+    lifted = states["cube_pos"][:, 2] > 0.12
+    assert lifted.float().mean() > 0.8  # any yaw: some grasps meet a corner
+    assert (states["cube_grasped"][lifted] == 1).all()
+    assert results[-1].held[lifted.numpy()].all()
+    assert not results[20].success.any()
+    # Nothing sinks into the pads: the opening is the object's width, between its side and its diagonal.
+    width = states["gripper_width"][lifted]
+    side = states["cube_size"][lifted][:, :2]
+    assert (width > 0.98 * side.min(1).values).all()
+    assert (width < 1.02 * side.norm(dim=1)).all()
+    assert (env._target_finger >= env._qpos[:, 7:9].mean(1) - env.cfg.finger_leash_m - 0.002).all()
+
+
+def test_success_is_held_after_five_steps_on_end(make_env: Callable[..., BatchEnv]):
+    class SuccessFromHalf(Task):
+        def compute_success(self, states: dict[str, torch.Tensor]) -> torch.Tensor:
+            return states["progress"] > 0.5
+
+        def compute_reward(
+            self, actions: torch.Tensor, states: dict[str, torch.Tensor]
+        ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            return states["progress"] * 0, {}
+
+    env = make_env(horizon=20, task=SuccessFromHalf)
+
+    results = [env.step(np.zeros((8, 7))) for _ in range(20)]
+
+    assert [bool(r.success[0]) for r in results] == [False] * 10 + [True] * 10
+    assert [bool(r.held[0]) for r in results].index(True) == 10 + HELD_STEPS - 1
+
+
+def test_the_reward_is_the_tasks_plus_100_per_success_divided_by_the_scale(
+    make_env: Callable[..., BatchEnv],
+):
+    env = make_env(cfg=replace(CALM, reward_scale=10.0))
+
+    calm = env.step(np.zeros((8, 7)))
+    env._qpos[:, env.world.objects[0].qpos_adr + 2] = 0.5
+    high = env.step(np.zeros((8, 7)))
+
+    assert not calm.success.any()
+    np.testing.assert_allclose(calm.reward, (1 + calm.components["height"]) / 10, rtol=1e-5)
+    assert high.success.all()
+    np.testing.assert_allclose(high.reward, (1 + high.components["height"] + 100) / 10, rtol=1e-5)
+    np.testing.assert_allclose(high.components["alive"], 1)
+
+
+def test_an_episode_is_cut_off_at_the_horizon_and_not_before(make_env: Callable[..., BatchEnv]):
+    env = make_env(horizon=7)
+
+    truncated = [env.step(np.zeros((8, 7))).truncated.all() for _ in range(7)]
+
+    assert truncated == [False] * 6 + [True]
+
+
+def test_a_broken_world_ends_without_reward_and_can_start_anew(make_env: Callable[..., BatchEnv]):
+    env = make_env(num_threads=2)
+    env._qvel[2, 3] = 1e13
+
+    broken = env.step(np.zeros((8, 7)))
+    env.reset(np.flatnonzero(broken.terminated))
+    after = env.step(np.zeros((8, 7)))
+
+    assert broken.terminated.tolist() == [i == 2 for i in range(8)]
+    assert not broken.truncated.any()
+    assert broken.reward[2] == 0
+    assert np.isfinite(broken.obs).all()
+    assert env.broken_count == 1
+    assert not after.terminated.any()
+    assert after.reward[2] != 0
+
+
+def test_a_reward_that_is_not_a_number_is_named(
+    make_env: Callable[..., BatchEnv], lift_task: type[Task]
+):
+    class Broken(lift_task):
+        def compute_reward(
+            self, actions: torch.Tensor, states: dict[str, torch.Tensor]
+        ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            total, parts = super().compute_reward(actions, states)
+            return total / 0.0 * 0.0, parts
+
+    env = make_env(task=Broken)
+
+    with pytest.raises(V2PError, match="reward of task 'test' is nan"):
+        env.step(np.zeros((8, 7)))
+
+
+def test_a_wrong_observation_length_is_one_clear_error(
+    make_env: Callable[..., BatchEnv], lift_task: type[Task]
+):
+    class Wrong(lift_task):
+        def compute_observation_key(self, states: dict[str, torch.Tensor]) -> list[str]:
+            states["height"] = states["cube_pos"][:, 2]
+            return ["base_observation", "height"]
+
+    with pytest.raises(V2PError, match="length 81 but says 80"):
+        make_env(task=Wrong)
+
+
+def test_the_gripper_leans_no_further_than_its_limit(make_env: Callable[..., BatchEnv]):
+    env = make_env(cfg=CALM)
+    action = np.zeros((8, 7))
+    action[:, 3] = 1.0
+
+    for _ in range(30):
+        env.step(action)
+
+    tilt = np.linalg.norm(env.robot_state()[:, 3:5], axis=1)
+    assert tilt == pytest.approx(env.cfg.tilt_limit_rad, abs=0.02)
+
+
+def test_robot_state_is_pose_from_straight_down_and_opening(make_env: Callable[..., BatchEnv]):
+    env = make_env(cfg=CALM)
+    assert env.robot_state()[0, 3:] == pytest.approx([0, 0, 0, 1], abs=1e-6)
+    action = np.zeros((8, 7))
+    action[:, [0, 3, 5, 6]] = 0.3, 0.4, 0.8, 0.5
+
+    for _ in range(4):
+        env.step(action)
+
+    tool = Rotation.from_quat(env.states()["eef_quat"][0].numpy(), scalar_first=True).as_matrix()
+    down = np.diag([1.0, -1.0, -1.0])
+    state = env.robot_state()[0]
+    np.testing.assert_allclose(state[:3], env.states()["eef_pos"][0], atol=1e-6)
+    np.testing.assert_allclose(
+        state[3:6], Rotation.from_matrix(down.T @ tool).as_rotvec(), atol=1e-5
+    )
+    assert state[6] == pytest.approx(float(env.states()["gripper_width"][0]) / 0.085, abs=1e-5)
+
+
+def test_a_delta_action_moves_the_tool_by_its_metres_and_radians(
+    make_env: Callable[..., BatchEnv],
+):
+    env = make_env(cfg=CALM)
+    start = env.robot_state()[0]
+    action = np.zeros((8, 7))
+    action[:, 1], action[:, 5] = 0.5, -0.5
+    env.step(action)
+
+    for _ in range(20):
+        env.step(np.zeros((8, 7)))
+
+    moved = env.robot_state()[0] - start
+    assert moved[1] == pytest.approx(0.5 * 0.03, abs=2e-4)
+    # Turned by -0.1 rad about the world's z, which points against the gripper's own.
+    assert moved[5] == pytest.approx(0.5 * 0.2, abs=2e-3)
+
+
+def test_a_closed_gripper_begins_to_open_at_once(make_env: Callable[..., BatchEnv]):
+    env = make_env(cfg=SimConfig(fine=True), num_envs=16)
+    scripted_lift(env, steps=45)
+    grasped = env.states()["cube_grasped"].numpy() == 1
+    action = np.zeros((16, 7))
+    action[:, 6] = -1.0
+
+    for _ in range(3):
+        env.step(action)
+
+    assert grasped.any()
+    assert (env.states()["cube_grasped"].numpy()[grasped] == 0).all()
+
+
+def test_a_snapshot_survives_the_disk_and_draws_the_same_world(
+    make_env: Callable[..., BatchEnv], make_object: Callable[..., SceneObject], tmp_path
+):
+    env = make_env(
+        make_object("cube"),
+        make_object("bowl", "cylinder", (0.12, 0.12, 0.05), hollow=True, pos=(0, 0.2, 0.02)),
+    )
+    for _ in range(3):
+        env.step(np.full((8, 7), 0.3))
+
+    env.snapshot(np.array([5, 2])).save(tmp_path / "snapshot.npz")
+    loaded = Snapshot.load(tmp_path / "snapshot.npz")
+
+    expected = env._batch.get_model(2)
+    seen = mujoco.MjData(expected)
+    seen.qpos[:] = env._qpos[2]
+    mujoco.mj_kinematics(expected, seen)
+    model, data = env.world.model, mujoco.MjData(env.world.model)
+    loaded.write(model, data, 1)
+    np.testing.assert_allclose(data.geom_xpos, seen.geom_xpos, atol=1e-12)
+    np.testing.assert_array_equal(model.geom_size, expected.geom_size)
+    np.testing.assert_array_equal(loaded.rows(np.array([0])).qpos[0], env._qpos[5])
+
+
+def test_a_saved_environment_goes_on_exactly(make_env: Callable[..., BatchEnv]):
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (20, 8, 7))
+
+    def play(env: BatchEnv, part: np.ndarray) -> bytes:
+        parts = []
+        for action in part:
+            result = env.step(action)
+            env.reset(np.flatnonzero(result.truncated))
+            parts += [result.obs.tobytes(), result.reward.tobytes()]
+        return b"".join(parts)
+
+    first = make_env(horizon=8)
+    play(first, actions[:11])
+    saved = first.state_dict()
+    rest = play(first, actions[11:])
+
+    second = make_env(horizon=8)
+    play(second, actions[:5])
+    second.load_state_dict(saved)
+
+    assert play(second, actions[11:]) == rest
+
+
+def test_episode_parameters_are_those_of_the_world(make_env: Callable[..., BatchEnv]):
+    env = make_env()
+
+    params = env.episode_params(4)
+
+    assert params["objects"]["cube"]["size_m"] == pytest.approx(
+        env.states()["cube_size"][4].tolist(), abs=1e-5
+    )
+    assert params["start_poses"]["cube"][:3] == pytest.approx(
+        env.states()["cube_start_pos"][4].tolist(), abs=1e-5
+    )
+    assert env._qpos[4, 7] == FINGER_TRAVEL_M
