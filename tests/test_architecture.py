@@ -18,7 +18,7 @@ BELOW: dict[str, set[str]] = {
     "sim": {"task", "scene", "geometry", "errors", "seeds"},
     "episodes": {"sim", "task", "scene", "geometry", "pipeline", "errors", "seeds"},
     "reward": {"task", "sim", "scene", "errors", "seeds"},
-    "report": {"sim", "task", "scene", "geometry", "pipeline", "errors"},
+    "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }
 TOP = {"stages", "cli", "commands"}
 

@@ -1,0 +1,265 @@
+"""What a run's folders say: the newest result per stage and item, what failed, what was dropped, and the time.
+
+Nothing here trusts a file to be whole: a run may be young, killed or edited. What cannot be read is named.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record, read_rejects
+
+ITEM_STAGES = ("scene", "task", "expert", "episodes")
+"""Stages that each video goes through by itself."""
+JOINT_STAGES = ("dataset", "policy", "evaluation")
+STAGES = ITEM_STAGES + JOINT_STAGES
+RUN_FILE = "run.json"
+PARTIAL_SUFFIX = ".partial"
+
+Status = Literal["made", "rejected", "failed", "unfinished", "not run"]
+Key = tuple[str, str]
+"""Stage and item."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What became of one item in one stage."""
+
+    stage: str
+    item: str
+    status: Status
+    folder: Path
+    record: Record | None = None
+    reason: str = ""
+    detail: str = ""
+
+    @property
+    def seconds(self) -> float | None:
+        return None if self.record is None else number(self.record.seconds)
+
+    @property
+    def counts(self) -> dict[str, Any]:
+        return {} if self.record is None else self.record.counts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A run folder as far as it can be read."""
+
+    root: Path
+    results: dict[Key, Result]
+    unreadable: list[str] = field(default_factory=list[str])
+    """One sentence for each record that could not be read."""
+
+    @property
+    def items(self) -> list[str]:
+        """Names of the videos' items, in order."""
+        return sorted({item for stage, item in self.results if stage in ITEM_STAGES})
+
+    def get(self, stage: str, item: str) -> Result | None:
+        """Return what became of an item in a stage, None if it never got there."""
+        return self.results.get((stage, item))
+
+    def of_stage(self, stage: str) -> list[Result]:
+        """Return a stage's results, sorted by item."""
+        return [r for (s, _), r in sorted(self.results.items()) if s == stage]
+
+    def made(self, stage: str) -> list[Result]:
+        """Return a stage's usable results."""
+        return [r for r in self.of_stage(stage) if r.status == "made"]
+
+
+def read_run(root: Path) -> Run:
+    """Return a run's newest complete results, and what failed or is unfinished where there is none."""
+    results: dict[Key, Result] = {}
+    ages: dict[Key, tuple[str, float]] = {}
+    unreadable: list[str] = []
+    for stage in STAGES:
+        for folder in sorted(_folders(root / stage)):
+            if folder.name.endswith(PARTIAL_SUFFIX):
+                continue
+            try:
+                record = read_record(folder)
+            except (ValueError, TypeError, OSError) as error:
+                unreadable.append(f"{stage}/{folder.name}/{RECORD_FILE} cannot be read: {error}")
+                continue
+            if record is None:
+                continue
+            key = (stage, str(record.item))
+            age = (
+                str((record.provenance or {}).get("time", "")),
+                (folder / RECORD_FILE).stat().st_mtime,
+            )
+            if key not in ages or age > ages[key]:
+                ages[key] = age
+                results[key] = _from_record(stage, folder, record)
+    for result in (*_from_run_file(root), *_from_partials(root)):
+        results.setdefault((result.stage, result.item), result)
+    return Run(root=root, results=results, unreadable=unreadable)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dropped:
+    """Things of one kind that a stage left out for one reason."""
+
+    stage: str
+    item: str
+    what: str
+    reason: str
+    count: int
+    numbers: str
+    """The values that decided, from lowest to highest."""
+    detail: str
+    """One example in words."""
+
+
+def dropped(run: Run) -> list[Dropped]:
+    """Return everything a run rejected: whole items first, then their parts grouped by reason."""
+    rows = [
+        Dropped(
+            stage=r.stage,
+            item=r.item,
+            what="video" if r.stage == "scene" else r.stage,
+            reason=r.reason,
+            count=1,
+            numbers=span([(r.record.rejected or {}).get("value")] if r.record else []),
+            detail=r.detail,
+        )
+        for r in run.results.values()
+        if r.status in ("rejected", "failed")
+    ]
+    for result in run.results.values():
+        try:
+            rejects = read_rejects(result.folder)
+        except (ValueError, OSError):
+            continue
+        by_reason: dict[str, list[Mapping[str, Any]]] = {}
+        for reject in rejects:
+            if isinstance(reject, dict):
+                by_reason.setdefault(str(reject.get("reason", "unknown")), []).append(reject)
+        rows += [
+            Dropped(
+                stage=result.stage,
+                item=result.item,
+                what="episode" if result.stage == "episodes" else "part",
+                reason=reason,
+                count=len(group),
+                numbers=span(r.get("value") for r in group),
+                detail=str(group[0].get("detail") or ""),
+            )
+            for reason, group in by_reason.items()
+        ]
+    return rows
+
+
+def model_use(run: Run) -> dict[str, int]:
+    """Return calls of and tokens spent on language models: the sum of all such counts in all records."""
+    use = {"calls": 0, "tokens": 0}
+    for result in run.results.values():
+        for name, value in _leaves(result.counts):
+            if name == "model_calls" or name.endswith("_model_calls"):
+                use["calls"] += int(value)
+            elif name == "tokens" or name.endswith("_tokens"):
+                use["tokens"] += int(value)
+    return use
+
+
+def read_json(path: Path) -> Any:
+    """Return a JSON file's content, None if there is none that can be read."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def number(value: Any) -> float | None:
+    """Return a finite number, None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def span(values: Iterable[Any]) -> str:
+    """Return `0.12` or `0.12 to 0.4` for the numbers among the values."""
+    numbers = sorted(v for v in map(number, values) if v is not None)
+    if not numbers:
+        return ""
+    low, high = f"{numbers[0]:.3g}", f"{numbers[-1]:.3g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _from_record(stage: str, folder: Path, record: Record) -> Result:
+    rejected = record.rejected or {}
+    return Result(
+        stage=stage,
+        item=str(record.item),
+        status="rejected" if rejected else "made",
+        folder=folder,
+        record=record,
+        reason=str(rejected.get("reason", "")),
+        detail=str(rejected.get("detail", "")),
+    )
+
+
+def _from_run_file(root: Path) -> list[Result]:
+    """Return what the last command could not finish; failures leave no record."""
+    outcomes = read_json(root / RUN_FILE)
+    words: dict[str, Status] = {"failed": "failed", "blocked": "not run"}
+    return [
+        Result(
+            stage=str(o["stage"]),
+            item=str(o["item"]),
+            status=words[o["status"]],
+            folder=root / str(o["stage"]) / f"{Path(str(o.get('folder', ''))).name}{PARTIAL_SUFFIX}",
+            reason=str(o.get("reason", "")),
+            detail=str(o.get("detail", "")),
+        )
+        for o in (outcomes if isinstance(outcomes, list) else [])
+        if isinstance(o, dict) and o.get("stage") in STAGES and o.get("status") in words and "item" in o
+    ]  # fmt: skip
+
+
+def _from_partials(root: Path) -> list[Result]:
+    found: list[Result] = []
+    for stage in STAGES:
+        for folder in sorted(_folders(root / stage)):
+            name, suffix = folder.name.removesuffix(PARTIAL_SUFFIX), folder.suffix
+            if suffix != PARTIAL_SUFFIX:
+                continue
+            trace = folder / "traceback.txt"
+            last = (
+                trace.read_text(errors="replace").strip().splitlines()[-1:]
+                if trace.is_file()
+                else []
+            )
+            found.append(
+                Result(
+                    stage=stage,
+                    item=name.rpartition("-")[0] or name,
+                    status="failed" if last else "unfinished",
+                    folder=folder,
+                    reason="error" if last else "",
+                    detail=last[0] if last else "the same command goes on with it",
+                )
+            )
+    return found
+
+
+def _folders(parent: Path) -> list[Path]:
+    return [p for p in parent.iterdir() if p.is_dir()] if parent.is_dir() else []
+
+
+def _leaves(data: Any) -> Iterable[tuple[str, float]]:
+    """Yield every named number in nested JSON."""
+    if isinstance(data, dict):
+        for name, value in data.items():
+            if (leaf := number(value)) is not None:
+                yield str(name), leaf
+            else:
+                yield from _leaves(value)
+    elif isinstance(data, list):
+        for value in data:
+            yield from _leaves(value)

@@ -1,0 +1,164 @@
+"""Contact sheets: episodes as rows, moments as columns, so that one look tells what an expert does."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from v2p_data.errors import V2PError
+from v2p_data.sim.masks import MaskRenderer, Moment, labels_to_rgb
+from v2p_data.task.task import TaskBundle
+
+GROUND, INK, GOOD, BAD = (250, 249, 246), (40, 44, 50), (26, 112, 66), (176, 50, 42)
+_TEXT_SCALE, _TEXT_WIDTH = 0.42, 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class SheetConfig:
+    """How a contact sheet is laid out."""
+
+    successes: int = 5
+    """Rows of successful episodes, at most."""
+    failures: int = 5
+    """Rows of failed episodes, at most; they show what is still missing."""
+    moments: int = 8
+    """Columns."""
+    thumbnail_px: int = 160
+    label_px: int = 112
+    """Width of the words at the left."""
+    gap_px: int = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One episode of a sheet."""
+
+    label: str
+    """ASCII; the drawing font knows nothing else."""
+    succeeded: bool
+    frames: UInt8[np.ndarray, "time h w 3"]
+    seconds: tuple[float, ...]
+    """Since the start, per frame."""
+
+
+class Judged(Protocol):
+    """Finished episodes of one batch of worlds."""
+
+    @property
+    def successes(self) -> Bool[np.ndarray, "env"]: ...
+
+    @property
+    def snapshots(self) -> Sequence[Moment]:
+        """All worlds, at moments in order of time."""
+        ...
+
+    @property
+    def snapshot_seconds(self) -> Sequence[float]:
+        """When each was taken, since the episodes' start."""
+        ...
+
+
+def write_contact_sheet(
+    bundle: TaskBundle, judged: Judged, path: Path, cfg: SheetConfig | None = None
+) -> None:
+    """Draw successful and failed episodes and write them as one PNG."""
+    cfg = cfg or SheetConfig()
+    chosen = [
+        *np.flatnonzero(judged.successes)[: cfg.successes],
+        *np.flatnonzero(~judged.successes)[: cfg.failures],
+    ]
+    moments = evenly(len(judged.snapshots), cfg.moments)
+    films = draw_rollout(
+        bundle, [judged.snapshots[m] for m in moments], [int(e) for e in chosen], cfg.thumbnail_px
+    )
+    seconds = tuple(judged.snapshot_seconds[m] for m in moments)
+    rows = [
+        Row(
+            label=f"world {env}",
+            succeeded=bool(judged.successes[env]),
+            frames=film,
+            seconds=seconds,
+        )
+        for env, film in zip(chosen, films, strict=True)
+    ]
+    sheet = contact_sheet(rows, cfg)
+    done, data = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))
+    if not done:
+        raise RuntimeError("OpenCV could not encode the contact sheet")
+    path.write_bytes(data.tobytes())
+
+
+def draw_rollout(
+    bundle: TaskBundle, snapshots: Sequence[Moment], envs: Sequence[int], size_px: int
+) -> UInt8[np.ndarray, "env time h w 3"]:
+    """Return the worlds `envs` at each snapshot, seen by the camera `view`.
+
+    In colour where there is OpenGL, else as the masks that rays give.
+    """
+    frames = np.zeros((len(envs), len(snapshots), size_px, size_px, 3), np.uint8)
+    # Twice the size, then averaged: the renderer does not smooth edges, for the masks' sake.
+    with MaskRenderer(bundle, 2 * size_px) as renderer:
+        for t, snapshot in enumerate(snapshots):
+            for k, env in enumerate(envs):
+                frames[k, t] = cv2.resize(
+                    _picture(renderer, snapshot, env),
+                    (size_px, size_px),
+                    interpolation=cv2.INTER_AREA,
+                )
+    return frames
+
+
+def contact_sheet(rows: Sequence[Row], cfg: SheetConfig) -> UInt8[np.ndarray, "h w 3"]:
+    """Return rows of labelled thumbnails, with the time above each column.
+
+    Of longer films `cfg.moments` frames are shown, first and last among them.
+    """
+    side, gap, head = cfg.thumbnail_px, cfg.gap_px, 22
+    columns = max((len(evenly(len(row.frames), cfg.moments)) for row in rows), default=0)
+    width = cfg.label_px + columns * (side + gap)
+    sheet = np.full((head + max(1, len(rows)) * (side + gap), width, 3), GROUND, np.uint8)
+    if not rows:
+        _write(sheet, "no episodes", 8, head, INK)
+        return sheet
+    for k, row in enumerate(rows):
+        top = head + k * (side + gap)
+        words, colour = ("success", GOOD) if row.succeeded else ("failure", BAD)
+        cv2.rectangle(sheet, (0, top), (3, top + side - 1), colour, -1)
+        _write(sheet, words, 10, top + 20, colour)
+        _write(sheet, row.label, 10, top + 38, INK)
+        for column, moment in enumerate(evenly(len(row.frames), cfg.moments)):
+            left = cfg.label_px + column * (side + gap)
+            thumbnail = cv2.resize(row.frames[moment], (side, side), interpolation=cv2.INTER_AREA)
+            sheet[top : top + side, left : left + side] = thumbnail
+            if k == 0:
+                _write(sheet, f"{row.seconds[moment]:.1f} s", left + 2, 15, INK)
+    return sheet
+
+
+def evenly(count: int, wanted: int) -> list[int]:
+    """Return up to `wanted` positions among `count`, evenly spread, first and last included."""
+    return sorted({round(float(k)) for k in np.linspace(0, count - 1, min(count, wanted))})
+
+
+def _picture(renderer: MaskRenderer, snapshot: Moment, env: int) -> np.ndarray:
+    try:
+        return renderer.draw_rgb(snapshot, env)
+    except V2PError:
+        return labels_to_rgb(renderer.draw(snapshot, env))
+
+
+def _write(image: np.ndarray, text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:
+    cv2.putText(
+        image,
+        text,
+        (x, y),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        _TEXT_SCALE,
+        colour,
+        _TEXT_WIDTH,
+        cv2.LINE_AA,
+    )
