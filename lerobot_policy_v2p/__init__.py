@@ -1,0 +1,10 @@
+"""What LeRobot imports to find us: policy `v2p_bc`, environment `v2p`, robot `v2p_franka`.
+
+LeRobot looks for installed distributions whose name starts with `lerobot_policy_` and imports the module of
+that name; importing the modules below registers what they hold.
+"""
+
+from policies.bc import configuration_v2p_bc as _policy
+from v2p_data.sim import lerobot_env as _environment
+
+_registered = (_policy, _environment)

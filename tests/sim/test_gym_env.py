@@ -1,0 +1,190 @@
+"""The Gymnasium environment of one task, and the same as a LeRobot environment."""
+
+import warnings
+from pathlib import Path
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from v2p_data.errors import V2PError
+from v2p_data.sim import gym_env
+from v2p_data.sim.gym_env import V2PEnv
+from v2p_data.sim.masks import rgb_to_labels
+
+LIFT = """
+from factory.tasks.task import Task
+
+class LiftCube(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, {})
+        self.task_description = "lifting a cube"
+
+    def compute_success(self, states):
+        return states["cube_pos"][:, 2] > HEIGHT
+
+    def compute_reward(self, actions, states):
+        height = states["cube_pos"][:, 2]
+        return height, {"height": height}
+"""
+
+
+@pytest.fixture
+def write_task(make_bundle, tmp_path):
+    """Write a task folder whose success is the cube's centre being above some height."""
+    from dataclasses import replace
+
+    def write(folder: Path, height: float = 0.12, horizon: int = 6) -> Path:
+        scene_folder = tmp_path / "scene"
+        scene_folder.mkdir(exist_ok=True)
+        bundle = make_bundle(folder=scene_folder, horizon=horizon)
+        bundle.scene.save(scene_folder)
+        folder.mkdir(parents=True)
+        replace(bundle, code=LIFT.replace("HEIGHT", str(height)), title=folder.name).save(folder)
+        return folder
+
+    return write
+
+
+@pytest.fixture
+def env(write_task, tmp_path):
+    env = V2PEnv(str(write_task(tmp_path / "lift")))
+    yield env
+    env.close()
+
+
+def test_gymnasium_accepts_the_environment(env):
+    with warnings.catch_warnings():
+        # It was not made by gym.make; that has a test of its own.
+        warnings.filterwarnings("ignore", message=".*not initialized through.*|.*spec is None.*")
+        warnings.filterwarnings("ignore", message=".*render mode.*|.*alternative render.*")
+        check_env(env)
+
+
+def test_it_is_made_by_its_registered_name(write_task, tmp_path):
+    made = gym.make(gym_env.ENV_ID, task_folder=str(write_task(tmp_path / "lift")))
+
+    observation, info = made.reset(seed=3)
+
+    assert observation in made.observation_space
+    assert info["is_success"] is False
+    made.close()
+
+
+def test_the_same_seed_gives_the_same_episode_and_another_seed_another(env):
+    action = np.full(7, 0.5, np.float32)
+
+    def episode(seed):
+        first, _ = env.reset(seed=seed)
+        return [first, env.step(action)[0]]
+
+    once, again, other = episode(1), episode(1), episode(2)
+
+    for a, b in zip(once, again, strict=True):
+        np.testing.assert_array_equal(a["pixels"]["mask"], b["pixels"]["mask"])
+        np.testing.assert_array_equal(a["agent_pos"], b["agent_pos"])
+    assert not np.array_equal(once[0]["agent_pos"], other[0]["agent_pos"])
+
+
+def test_the_policy_sees_robot_and_cube_as_greys(env):
+    observation, _ = env.reset(seed=0)
+
+    mask = observation["pixels"]["mask"]
+    assert mask.shape == (256, 256, 3)
+    assert set(np.unique(rgb_to_labels(mask))) == {0, 1, 2}
+    assert (mask[..., 0] == mask[..., 1]).all()
+    assert (mask[..., 0] == mask[..., 2]).all()
+
+
+def test_moving_up_raises_the_tool_in_the_state(env):
+    before, _ = env.reset(seed=0)
+    for _ in range(3):
+        after, *_ = env.step(np.array([0, 0, 1, 0, 0, 0, -1], np.float32))
+
+    # three commands of 3 cm; the servo lags behind by at most 6 cm
+    assert 0.02 < after["agent_pos"][2] - before["agent_pos"][2] < 0.095
+
+
+def test_an_episode_without_success_ends_at_the_horizon(env):
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(7, np.float32))[2:4] for _ in range(6)]
+
+    assert ends == [(False, False)] * 5 + [(False, True)]
+
+
+def test_success_counts_when_held_and_ends_the_episode(write_task, tmp_path):
+    """The cube is above -1 m all the time, so success is held after five steps."""
+    env = V2PEnv(str(write_task(tmp_path / "easy", height=-1.0, horizon=20)))
+    env.reset(seed=0)
+
+    steps = [env.step(np.zeros(7, np.float32)) for _ in range(5)]
+
+    assert [info["is_success"] for *_, info in steps] == [False] * 4 + [True]
+    assert [terminated for _, _, terminated, *_ in steps] == [False] * 4 + [True]
+    env.close()
+
+
+def test_a_picture_for_people_has_the_size_of_the_mask(env):
+    env.reset(seed=0)
+
+    picture = env.render()
+
+    assert picture.shape == (256, 256, 3)
+    assert picture.dtype == np.uint8
+
+
+def test_a_folder_without_a_task_is_refused(tmp_path):
+    with pytest.raises(V2PError, match=r"holds no task\.json"):
+        V2PEnv(str(tmp_path))
+
+
+@pytest.mark.slow
+def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(write_task, tmp_path):
+    from lerobot.envs.factory import make_env_config
+
+    import lerobot_policy_v2p  # noqa: F401 - registers the environment
+
+    run = tmp_path / "run" / "task"
+    for name in ("b-push", "a-lift"):
+        write_task(run / name, height=-1.0)
+    write_task(run / "c-torn.partial")
+    config = make_env_config("v2p", tasks=str(run))
+
+    envs = config.create_envs(n_envs=2)
+
+    assert {i: e.call("task")[0] for i, e in envs["v2p"].items()} == {0: "a-lift", 1: "b-push"}
+    env = envs["v2p"][0]
+    assert env.call("task_description") == ("lifting a cube",) * 2
+    assert env.call("_max_episode_steps") == (6, 6)
+    env.reset(seed=[1, 2])
+    infos = [env.step(np.zeros((2, 7), np.float32))[4] for _ in range(7)]
+    assert "final_info" not in infos[3]
+    assert infos[4]["final_info"]["is_success"].tolist() == [True, True]
+    assert infos[6]["final_info"]["is_success"].tolist() == [True, True]
+    for env in envs["v2p"].values():
+        env.close()
+
+
+@pytest.mark.slow
+def test_environments_can_be_sent_to_processes_of_their_own(write_task, tmp_path):
+    """Starting those processes takes a minute of imports, so only what is sent to them is tried."""
+    from v2p_data.sim.lerobot_env import environment_maker
+
+    sent = cloudpickle.dumps(environment_maker(write_task(tmp_path / "lift"), {"size_px": 64}))
+
+    made = cloudpickle.loads(sent)()
+
+    assert made.reset(seed=0)[0]["pixels"]["mask"].shape == (64, 64, 3)
+    made.close()
+
+
+@pytest.mark.slow
+def test_a_folder_without_tasks_is_refused_with_the_way_out(tmp_path):
+    from v2p_data.sim.lerobot_env import V2PEnvConfig
+
+    with pytest.raises(V2PError, match="v2p task"):
+        V2PEnvConfig(tasks=str(tmp_path)).create_envs(1)
+    with pytest.raises(V2PError, match=r"--env\.tasks"):
+        V2PEnvConfig().create_envs(1)

@@ -1,0 +1,113 @@
+"""One task as a Gymnasium environment, `v2p/Task-v0`: what a policy sees, does, and is judged by.
+
+| | |
+|---|---|
+| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `agent_pos`: 7 float32, see `BatchEnv.robot_state` |
+| Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz |
+| Reward | the task's training reward |
+| Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
+| End | terminated: success held for 0.25 s, or the simulation broke down; truncated: the task's horizon |
+| Info | `is_success`: the success that ends the episode |
+
+The simulation runs at the fine time step: what the coarse one calls a success can be an object pressed
+through the table.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from v2p_data.errors import V2PError
+from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig
+from v2p_data.sim.masks import MaskRenderer, labels_to_rgb
+from v2p_data.task.task import TaskBundle
+
+ENV_ID = "v2p/Task-v0"
+CONTROL_HZ = 20
+STATE_LOW = (-1.5, -1.5, -0.5, -np.pi, -np.pi, -np.pi, 0.0)
+STATE_HIGH = (1.5, 1.5, 1.5, np.pi, np.pi, np.pi, 1.0)
+
+
+class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
+    """A single world of one task.
+
+    Args:
+        task_folder: folder with `task.json`, as `v2p task` writes it.
+        size_px: width and height of the mask.
+        render_mode: `rgb_array`, or None.
+
+    Raises:
+        V2PError: the folder holds no task.
+        ItemRejectedError: the task cannot be simulated.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 - Gymnasium's attribute
+
+    def __init__(
+        self, task_folder: str, size_px: int = 256, render_mode: str | None = "rgb_array"
+    ) -> None:
+        bundle = TaskBundle.load(Path(task_folder))
+        self.render_mode = render_mode
+        self.task = bundle.title
+        self.task_description = bundle.description
+        self._max_episode_steps = bundle.horizon_steps
+        self._world = BatchEnv(bundle, SimConfig(fine=True), num_envs=1, seed=0, num_threads=1)
+        self._masks = MaskRenderer(self._world.world, size_px)
+        self.observation_space = spaces.Dict(
+            {
+                "pixels": spaces.Dict(
+                    {"mask": spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)}
+                ),
+                "agent_pos": spaces.Box(
+                    np.array(STATE_LOW, np.float32), np.array(STATE_HIGH, np.float32)
+                ),
+            }
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (ACT_DIM,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode; with a seed, always the same one."""
+        super().reset(seed=seed)
+        self._world.seed(int(self.np_random.integers(2**62)))
+        self._world.reset(np.array([0]))
+        return self._observe(), {"is_success": False}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Carry out one action; it is clipped to [-1, 1]."""
+        result = self._world.step(np.asarray(action, float)[None])
+        success = bool(result.held[0]) and not bool(result.terminated[0])
+        terminated = success or bool(result.terminated[0])
+        return (
+            self._observe(),
+            float(result.reward[0]),
+            terminated,
+            bool(result.truncated[0]) and not terminated,
+            {"is_success": success},
+        )
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return a picture for people; the mask where there is no OpenGL."""
+        if self.render_mode is None:
+            return None
+        snapshot = self._world.snapshot(np.array([0]))
+        try:
+            return self._masks.draw_rgb(snapshot, 0)
+        except V2PError:  # no OpenGL
+            return labels_to_rgb(self._masks.draw(snapshot, 0))
+
+    def close(self) -> None:
+        """Free the graphics memory."""
+        self._masks.close()
+
+    def _observe(self) -> dict[str, Any]:
+        labels = self._masks.draw(self._world.snapshot(np.array([0])), 0)
+        state = np.clip(self._world.robot_state()[0], STATE_LOW, STATE_HIGH).astype(np.float32)
+        return {"pixels": {"mask": labels_to_rgb(labels)}, "agent_pos": state}
+
+
+gym.register(id=ENV_ID, entry_point=V2PEnv)  # pyright: ignore[reportArgumentType]
