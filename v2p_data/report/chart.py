@@ -75,7 +75,7 @@ def line_chart(
             f'<text x="{x:.1f}" y="{height_px - _BOTTOM + 15}" text-anchor="middle">{_number(tick)}</text>'
         )
     parts.append(
-        f'<text x="{width_px - _RIGHT}" y="{height_px - 2}" text-anchor="end">{escape(x_label)}</text>'
+        f'<text x="{width_px - _RIGHT}" y="{height_px - 5}" text-anchor="end">{escape(x_label)}</text>'
     )
     for index, line in enumerate(lines):
         step = max(1, math.ceil(len(line.x) / MAX_POINTS))

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Bool, UInt8
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.masks import MaskRenderer, Moment, labels_to_rgb
+from v2p_data.sim.world import World
 from v2p_data.task.task import TaskBundle
 
 GROUND, INK, GOOD, BAD = (250, 249, 246), (40, 44, 50), (26, 112, 66), (176, 50, 42)
@@ -45,6 +46,7 @@ class Row:
     """Since the start, per frame."""
 
 
+@runtime_checkable
 class Judged(Protocol):
     """Finished episodes of one batch of worlds."""
 
@@ -63,7 +65,7 @@ class Judged(Protocol):
 
 
 def write_contact_sheet(
-    bundle: TaskBundle, judged: Judged, path: Path, cfg: SheetConfig | None = None
+    source: TaskBundle | World, judged: Judged, path: Path, cfg: SheetConfig | None = None
 ) -> None:
     """Draw successful and failed episodes and write them as one PNG."""
     cfg = cfg or SheetConfig()
@@ -73,7 +75,7 @@ def write_contact_sheet(
     ]
     moments = evenly(len(judged.snapshots), cfg.moments)
     films = draw_rollout(
-        bundle, [judged.snapshots[m] for m in moments], [int(e) for e in chosen], cfg.thumbnail_px
+        source, [judged.snapshots[m] for m in moments], [int(e) for e in chosen], cfg.thumbnail_px
     )
     seconds = tuple(judged.snapshot_seconds[m] for m in moments)
     rows = [
@@ -93,23 +95,28 @@ def write_contact_sheet(
 
 
 def draw_rollout(
-    bundle: TaskBundle, snapshots: Sequence[Moment], envs: Sequence[int], size_px: int
+    source: TaskBundle | World, snapshots: Sequence[Moment], envs: Sequence[int], size_px: int
 ) -> UInt8[np.ndarray, "env time h w 3"]:
-    """Return the worlds `envs` at each snapshot, seen by the camera `view`.
-
-    In colour where there is OpenGL, else as the masks that rays give.
-    """
+    """Return the worlds `envs` at each snapshot, seen by the camera `view`."""
     frames = np.zeros((len(envs), len(snapshots), size_px, size_px, 3), np.uint8)
     # Twice the size, then averaged: the renderer does not smooth edges, for the masks' sake.
-    with MaskRenderer(bundle, 2 * size_px) as renderer:
+    with MaskRenderer(source, 2 * size_px) as renderer:
         for t, snapshot in enumerate(snapshots):
             for k, env in enumerate(envs):
                 frames[k, t] = cv2.resize(
-                    _picture(renderer, snapshot, env),
+                    draw_moment(renderer, snapshot, env),
                     (size_px, size_px),
                     interpolation=cv2.INTER_AREA,
                 )
     return frames
+
+
+def draw_moment(renderer: MaskRenderer, snapshot: Moment, env: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Return one world in colour, or as its mask where there is no OpenGL."""
+    try:
+        return renderer.draw_rgb(snapshot, env)
+    except V2PError:
+        return labels_to_rgb(renderer.draw(snapshot, env))
 
 
 def contact_sheet(rows: Sequence[Row], cfg: SheetConfig) -> UInt8[np.ndarray, "h w 3"]:
@@ -142,13 +149,6 @@ def contact_sheet(rows: Sequence[Row], cfg: SheetConfig) -> UInt8[np.ndarray, "h
 def evenly(count: int, wanted: int) -> list[int]:
     """Return up to `wanted` positions among `count`, evenly spread, first and last included."""
     return sorted({round(float(k)) for k in np.linspace(0, count - 1, min(count, wanted))})
-
-
-def _picture(renderer: MaskRenderer, snapshot: Moment, env: int) -> np.ndarray:
-    try:
-        return renderer.draw_rgb(snapshot, env)
-    except V2PError:
-        return labels_to_rgb(renderer.draw(snapshot, env))
 
 
 def _write(image: np.ndarray, text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:

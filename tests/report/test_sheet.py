@@ -1,0 +1,164 @@
+"""Contact sheets: where each thumbnail lies, which episodes are chosen, and that a rollout is really drawn."""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import pytest
+
+from v2p_data.geometry.camera import Camera
+from v2p_data.report.sheet import (
+    BAD,
+    GOOD,
+    GROUND,
+    Row,
+    SheetConfig,
+    contact_sheet,
+    draw_moment,
+    draw_rollout,
+    evenly,
+    write_contact_sheet,
+)
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.sim.masks import MaskRenderer
+from v2p_data.sim.robot import FINE
+from v2p_data.sim.world import World, build_world
+
+CFG = SheetConfig(thumbnail_px=40, label_px=60, gap_px=4, moments=3, successes=2, failures=1)
+
+
+def a_row(value: int, *, succeeded: bool, count=3) -> Row:
+    frames = np.zeros((count, 80, 80, 3), np.uint8)
+    frames[:] = (value + np.arange(count) * 10)[:, None, None, None]
+    return Row(
+        label=f"world {value}", succeeded=succeeded, frames=frames, seconds=tuple(0.5 * k for k in range(count)),
+    )  # fmt: skip
+
+
+def thumbnail(sheet: np.ndarray, row: int, column: int) -> np.ndarray:
+    top, left = 22 + row * 44, 60 + column * 44
+    return sheet[top : top + 40, left : left + 40]
+
+
+def test_rows_are_episodes_and_columns_are_moments():
+    sheet = contact_sheet([a_row(50, succeeded=True), a_row(150, succeeded=False)], CFG)
+
+    assert sheet.shape == (22 + 2 * 44, 60 + 3 * 44, 3)
+    for row, value in ((0, 50), (1, 150)):
+        for column in range(3):
+            assert (thumbnail(sheet, row, column) == value + 10 * column).all()
+
+
+def test_success_and_failure_are_marked_at_the_left():
+    sheet = contact_sheet([a_row(50, succeeded=True), a_row(150, succeeded=False)], CFG)
+
+    assert tuple(sheet[30, 1]) == GOOD
+    assert tuple(sheet[74, 1]) == BAD
+
+
+def test_words_and_times_are_written():
+    sheet = contact_sheet([a_row(50, succeeded=True)], CFG)
+
+    assert (sheet[22:62, 4:60] != GROUND).any()  # label
+    assert all((sheet[:22, left : left + 40] != GROUND).any() for left in (60, 104, 148))
+
+
+def test_a_longer_film_shows_its_first_and_last_moment():
+    sheet = contact_sheet([a_row(0, succeeded=True, count=21)], CFG)
+
+    assert [int(thumbnail(sheet, 0, c)[20, 20, 0]) for c in range(3)] == [0, 100, 200]
+
+
+def test_no_episodes_give_a_sheet_that_says_so():
+    sheet = contact_sheet([], CFG)
+
+    assert (sheet != GROUND).any()
+
+
+@pytest.mark.parametrize(
+    ("count", "wanted", "expected"),
+    [(101, 3, [0, 50, 100]), (2, 8, [0, 1]), (1, 8, [0]), (0, 8, [])],
+)
+def test_moments_are_evenly_spread(count, wanted, expected):
+    assert evenly(count, wanted) == expected
+
+
+@dataclass
+class Moments:
+    """What `BatchEnv.snapshot` gives, made by hand."""
+
+    qpos: np.ndarray
+
+    def write(self, model, data, index):
+        import mujoco
+
+        data.qpos[:] = self.qpos[index]
+        mujoco.mj_forward(model, data)
+
+
+@dataclass
+class Judged:
+    successes: np.ndarray
+    snapshots: list[Moments]
+    snapshot_seconds: list[float] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> World:
+    box = SceneObject(
+        name="box", label="a box", role="manipulated", shape="box", size_m=(0.08, 0.08, 0.08), mass_kg=0.1,
+        friction=0.8, rgba=(0.9, 0.1, 0.1, 1.0), frames=(0,), poses_world=((0.0, 0.0, 0.04, 1.0, 0.0, 0.0, 0.0),),
+    )  # fmt: skip
+    scene = Scene(
+        title="sheet", video="a.mp4", description="lifting a box", kind="lift_up", objects=(box,), fps=20.0,
+        num_frames=2, confidence=1.0, folder=tmp_path_factory.mktemp("scene"),
+        camera=Camera(width_px=64, height_px=48, K=np.eye(3), T_world_cam=np.eye(4)),
+    )  # fmt: skip
+    return build_world(scene, FINE)
+
+
+@pytest.fixture(scope="module")
+def snapshots(world) -> list[Moments]:
+    """Four worlds whose boxes go to the left by a different distance each, at three moments."""
+    start = np.tile(world.model.qpos0, (4, 1))
+    moments = []
+    for t in range(3):
+        qpos = start.copy()
+        qpos[:, world.objects[0].qpos_adr + 1] += 0.05 * t * np.arange(4)
+        moments.append(Moments(qpos))
+    return moments
+
+
+def red_column(image: np.ndarray) -> float:
+    """Mean column of the red pixels; of the brightest label where there is no colour."""
+    is_grey = (np.ptp(image.astype(int), axis=-1) == 0).all()
+    red = image[..., 0] == 128 if is_grey else image[..., 0] > image[..., 1].astype(int) + 60
+    return float(np.nonzero(red)[1].mean())
+
+
+def test_a_rollout_shows_the_object_where_it_is(world, snapshots):
+    films = draw_rollout(world, snapshots, [0, 3], 96)
+
+    assert films.shape == (2, 3, 96, 96, 3)
+    np.testing.assert_array_equal(films[0, 0], films[0, 2])  # world 0 rests
+    columns = [red_column(image) for image in films[1]]
+    assert columns[0] > columns[1] + 3 > columns[2] + 6  # world 3 goes to +y: the image's left
+
+
+def test_the_sheet_of_a_batch_shows_successes_then_failures(world, snapshots, tmp_path):
+    judged = Judged(np.array([False, True, True, True]), snapshots, [0.0, 1.0, 2.0])
+
+    write_contact_sheet(world, judged, tmp_path / "sheet.png", CFG)
+
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))[..., ::-1]
+    assert sheet.shape == (22 + 3 * 44, 60 + 3 * 44, 3)
+    assert [tuple(sheet[30 + 44 * k, 1]) for k in range(3)] == [GOOD, GOOD, BAD]
+    expected = draw_rollout(world, snapshots, [1, 2, 0], 40)
+    np.testing.assert_array_equal(thumbnail(sheet, 1, 2), expected[1, 2])
+
+
+def test_without_opengl_a_moment_is_drawn_as_its_mask(world, snapshots):
+    with MaskRenderer(world, 48, backend="rays") as renderer:
+        image = draw_moment(renderer, snapshots[0], 0)
+
+    assert set(np.unique(image)) == {0, 64, 128}
