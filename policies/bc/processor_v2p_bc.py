@@ -6,7 +6,6 @@ the policy. The task's words pass through untouched.
 
 from typing import Any
 
-import torch
 from lerobot.processor import (
     PolicyAction,
     PolicyProcessorPipeline,
@@ -17,7 +16,7 @@ from policies.bc.configuration_v2p_bc import V2PBCConfig
 
 
 def make_v2p_bc_pre_post_processors(
-    config: V2PBCConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
+    config: V2PBCConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],

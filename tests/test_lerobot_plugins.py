@@ -1,0 +1,238 @@
+"""LeRobot's own tools find our policy, environment and robot, and run them."""
+
+import json
+import logging
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from v2p_data.geometry.camera import Camera
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.task.task import TaskBundle
+
+pytestmark = pytest.mark.slow
+
+STATE_NAMES = [f"eef_{k}.pos" for k in ("x", "y", "z", "rx", "ry", "rz")] + ["gripper.pos"]
+ACTION_NAMES = [f"delta_{k}.pos" for k in ("x", "y", "z", "rx", "ry", "rz")] + [
+    "gripper_close.pos"
+]
+ALWAYS_DONE = """
+from factory.tasks.task import Task
+
+class Rest(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, {})
+
+    def compute_success(self, states):
+        return states["cube_pos"][:, 2] > -1.0
+
+    def compute_reward(self, actions, states):
+        height = states["cube_pos"][:, 2]
+        return height, {"height": height}
+"""
+
+
+@pytest.fixture(scope="session")
+def task_folder(tmp_path_factory) -> Path:
+    """Return a task whose success is certain: it is the plumbing that is tried."""
+    folder = tmp_path_factory.mktemp("task")
+    pose = (0.0, 0.0, 0.02, 1.0, 0.0, 0.0, 0.0)
+    cube = SceneObject(
+        name="cube",
+        label="cube",
+        role="manipulated",
+        shape="box",
+        size_m=(0.04, 0.04, 0.04),
+        mass_kg=0.1,
+        friction=0.8,
+        frames=(0, 1),
+        poses_world=(pose, pose),
+        confidences=(1.0, 1.0),
+    )
+    camera = Camera(
+        width_px=64,
+        height_px=48,
+        K=np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]),
+        T_world_cam=np.eye(4),
+    )
+    scene = Scene(
+        title="rest",
+        video="rest.mp4",
+        description="leaving the cube alone",
+        kind="generic",
+        objects=(cube,),
+        camera=camera,
+        fps=20.0,
+        num_frames=2,
+        confidence=1.0,
+        folder=folder / "scene",
+    )
+    scene.folder.mkdir()
+    scene.save(scene.folder)
+    TaskBundle(
+        title="rest",
+        description=scene.description,
+        kind="generic",
+        class_name="Rest",
+        code=ALWAYS_DONE,
+        scene=scene,
+        horizon_steps=8,
+    ).save(folder / "rest")
+    return folder / "rest"
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory) -> Path:
+    """Return a dataset of two short episodes with lossless 64 x 64 masks."""
+    from lerobot.configs import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = tmp_path_factory.mktemp("data") / "dummy"
+    shape = {"dtype": "float32", "shape": (7,)}
+    writer = LeRobotDataset.create(
+        "v2p/dummy",
+        fps=20,
+        root=root,
+        robot_type="v2p_franka",
+        features={
+            "observation.images.mask": {
+                "dtype": "video",
+                "shape": (64, 64, 3),
+                "names": ["height", "width", "channels"],
+            },
+            "observation.state": {**shape, "names": STATE_NAMES},
+            "action": {**shape, "names": ACTION_NAMES},
+        },
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=0, pix_fmt="yuv420p"),
+    )
+    rng = np.random.default_rng(0)
+    greys = np.array([0, 64, 128], np.uint8)
+    for _ in range(2):
+        for _ in range(6):
+            writer.add_frame(
+                {
+                    "observation.images.mask": greys[rng.integers(0, 3, (64, 64, 1))].repeat(3, 2),
+                    "observation.state": rng.normal(size=7).astype(np.float32),
+                    "action": rng.uniform(-1, 1, 7).astype(np.float32),
+                    "task": "leaving the cube alone",
+                }
+            )
+        writer.save_episode()
+    writer.finalize()
+    return root
+
+
+@pytest.fixture
+def run_tool(monkeypatch):
+    """Run one of LeRobot's tools in this process: importing LeRobot anew costs half a minute."""
+    root, level, handlers = (
+        logging.getLogger(),
+        logging.getLogger().level,
+        logging.getLogger().handlers[:],
+    )
+
+    def run(main, *arguments: str) -> None:
+        monkeypatch.setattr("sys.argv", ["lerobot", *arguments])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            main()
+
+    yield run
+    root.handlers[:] = handlers
+    root.setLevel(level)
+
+
+def trained(run_tool, dataset, out, *arguments) -> Path:
+    from lerobot.scripts.lerobot_train import main
+
+    run_tool(
+        main,
+        f"--dataset.repo_id=v2p/{dataset.name}",
+        f"--dataset.root={dataset}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--env_eval_freq=0",
+        f"--output_dir={out}",
+        *arguments,
+    )
+    return out / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_lerobot_discovers_policy_environment_and_robot():
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.envs import EnvConfig
+    from lerobot.robots import RobotConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+
+    assert "v2p_bc" in PreTrainedConfig.get_known_choices()
+    assert "v2p" in EnvConfig.get_known_choices()
+    assert "v2p_franka" in RobotConfig.get_known_choices()
+
+
+def test_training_resuming_and_evaluating_with_lerobots_own_tools(
+    run_tool, dataset, task_folder, tmp_path
+):
+    from lerobot.scripts.lerobot_eval import main as lerobot_eval
+    from lerobot.scripts.lerobot_train import main as lerobot_train
+
+    from policies.evaluation.rollout import evaluate_policy
+
+    checkpoint = trained(
+        run_tool,
+        dataset,
+        tmp_path / "run",
+        "--policy.type=v2p_bc",
+        "--policy.input_size_px=32",
+        "--policy.pretrained_backbone_weights=null",
+        "--steps=2",
+        "--save_freq=1",
+    )
+    assert checkpoint.resolve().parent.name == "000002"
+    run_tool(
+        lerobot_train,
+        f"--config_path={checkpoint / 'train_config.json'}",
+        "--resume=true",
+        "--steps=3",
+    )
+    assert checkpoint.resolve().parent.name == "000003"
+
+    run_tool(
+        lerobot_eval,
+        f"--policy.path={checkpoint}",
+        "--policy.device=cpu",
+        "--env.type=v2p",
+        f"--env.tasks={task_folder}",
+        "--env.size_px=64",
+        "--eval.n_episodes=3",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+
+    info = json.loads((tmp_path / "eval" / "eval_info.json").read_text())
+    assert info["overall"]["pc_success"] == 100.0
+    assert info["overall"]["n_episodes"] == 3
+    assert (tmp_path / "eval" / "videos" / "v2p_0" / "eval_episode_0.mp4").stat().st_size > 1000
+    assert evaluate_policy(checkpoint, task_folder, episodes=3, batch_size=2) == [True] * 3
+
+
+def test_lerobots_act_trains_on_the_same_dataset(run_tool, dataset, tmp_path):
+    small = ["dim_model=32", "dim_feedforward=32", "n_heads=2", "chunk_size=2", "n_action_steps=2"]
+
+    checkpoint = trained(
+        run_tool,
+        dataset,
+        tmp_path / "run",
+        "--policy.type=act",
+        "--policy.pretrained_backbone_weights=null",
+        *[f"--policy.{setting}" for setting in small],
+        "--steps=2",
+    )
+
+    assert (checkpoint / "model.safetensors").is_file()
