@@ -12,11 +12,12 @@ import json
 import logging
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from policies.evaluation.rate import Rate, wilson
 from policies.ppo.train import PPOConfig
 
 from v2p_data.episodes.collect import EpisodesConfig
@@ -211,7 +212,6 @@ def make_expert(
     """Train with PPO at the coarse time step, judge at the fine one with the independent referee."""
     from policies.ppo.train import train_expert
 
-    from policies.evaluation.rate import wilson
     from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.report.sheet import write_contact_sheet
@@ -251,16 +251,16 @@ def make_expert(
     counts = {
         "steps": result.steps,
         "train_seconds": round(result.seconds, 1),
-        "success": rate.as_dict(),
+        "success": rate_json(rate),
         "task_success": float(judged.task_successes.mean()),
     }
     write_json_atomically(out / EVALUATION_FILE, counts)
-    if rate.value < expert_cfg.min_success:
+    if rate.rate < expert_cfg.min_success:
         raise ItemRejectedError(
             "expert_not_learned",
             f"after {result.steps} steps the expert succeeds in {rate} of episodes, "
             f"below the {expert_cfg.min_success:.0%} that are worth collecting",
-            rate.value,
+            rate.rate,
         )
     return counts
 
@@ -471,7 +471,6 @@ def make_evaluation(
     """Roll the policy out and write success rates with their intervals."""
     from policies.evaluation.rollout import evaluate_policy
 
-    from policies.evaluation.rate import wilson
 
     del inputs
     rows: list[dict[str, Any]] = []
@@ -491,11 +490,16 @@ def make_evaluation(
                 "task": name,
                 "seen": name in seen,
                 "first_seed": first_seed,
-                **wilson(int(sum(successes)), len(successes)).as_dict(),
+                **rate_json(wilson(sum(successes), len(successes))),
             }
         )
     (out / EVALUATION_FILE).write_text(json.dumps(rows, indent=1))
     return {"tasks": len(rows), "rows": rows}
+
+
+def rate_json(rate: Rate) -> dict[str, float]:
+    """Return successes, trials, the rate and its interval for JSON."""
+    return {**asdict(rate), "value": rate.rate}
 
 
 # --- all of it -----------------------------------------------------------------------------------------------

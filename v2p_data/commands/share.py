@@ -21,7 +21,7 @@ class Push:
     path: tyro.conf.Positional[Path]
     """Folder of a dataset or of a policy."""
     repo_id: str
-    """Where to: USER/NAME. The token comes from `hf auth login` or HF_TOKEN."""
+    """Where to: USER/NAME. The token comes from the environment variable HF_TOKEN."""
     private: bool = False
     """Make the repository private."""
 
@@ -33,7 +33,7 @@ def verify_command(argv: list[str]) -> int:
     if not (args.dataset / "meta" / "info.json").is_file():
         raise V2PError(f"{args.dataset} holds no meta/info.json: it is no LeRobot dataset")
     report = verify(args.dataset)
-    print(json.dumps(report.as_dict(), indent=1))  # noqa: T201
+    print(json.dumps(report.as_json(), indent=1))  # noqa: T201
     return 0 if report.is_good else 1
 
 
@@ -42,10 +42,10 @@ def push_command(argv: list[str]) -> int:
 
     args = parse(Push, argv, "push")
     if (args.path / "meta" / "info.json").is_file():
-        url = push_dataset(args.path, args.repo_id, private=args.private)
+        url = push_dataset(args.path, args.repo_id, private=args.private).url
         then = f"LeRobotDataset('{args.repo_id}')"
     elif (args.path / "model.safetensors").is_file():
-        url = push_policy(args.path, args.repo_id, private=args.private)
+        url = push_policy(args.path, args.repo_id, private=args.private).url
         then = f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS"
     else:
         raise V2PError(

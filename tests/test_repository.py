@@ -1,0 +1,63 @@
+"""What may not be committed, and what the README promises."""
+
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from v2p_data.cli import COMMANDS
+
+ROOT = Path(__file__).parents[1]
+LARGEST = 5_000_000
+
+
+def tracked_files() -> list[Path]:
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    return [ROOT / name for name in listed.stdout.decode().split("\0") if name]
+
+
+def readme_commands() -> list[str]:
+    blocks = re.findall(r"```(?:bash|sh)\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    return [line.split("#")[0].strip() for line in lines if line.split("#")[0].strip()]
+
+
+def test_no_file_is_larger_than_five_megabytes():
+    assert [p for p in tracked_files() if p.is_file() and p.stat().st_size > LARGEST] == []
+
+
+def test_no_text_names_a_package_index_or_a_machine_of_ours():
+    hosts = re.compile(rb"pypi\.or" rb"g|pythonhost" rb"ed|(?<![\w.])/(?:wor" rb"k|far" rb"m)/")
+    assert [p for p in tracked_files() if p.is_file() and hosts.search(p.read_bytes())] == []
+
+
+def test_the_readme_shows_its_two_commands():
+    assert {"make demo", "make test"} <= set(readme_commands())
+
+
+def test_every_v2p_command_in_the_readme_exists():
+    ours = [shlex.split(line) for line in readme_commands() if line.startswith("v2p ")]
+
+    assert ours
+    assert {words[1] for words in ours} <= set(COMMANDS)
+
+
+@pytest.mark.slow
+def test_every_v2p_command_in_the_readme_parses(tmp_path):
+    from v2p_data.cli import parse
+    from v2p_data.commands import run, share, show
+
+    kinds = {
+        "generate": run.Generate, "train": run.Train, "eval": run.Evaluate, "demo": run.Demo,
+        "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
+        "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify,
+        "status": show.Shown, "report": show.Shown,
+    }  # fmt: skip
+    assert set(kinds) == set(COMMANDS)
+    for words in map(shlex.split, readme_commands()):
+        if words[0] == "v2p":
+            parse(kinds[words[1]], words[2:], words[1])
