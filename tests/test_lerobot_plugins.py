@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.task import TaskBundle
@@ -236,3 +237,108 @@ def test_lerobots_act_trains_on_the_same_dataset(run_tool, dataset, tmp_path):
     )
 
     assert (checkpoint / "model.safetensors").is_file()
+
+
+def test_lerobot_rolls_the_policy_out_on_the_simulated_robot(
+    run_tool, dataset, task_folder, tmp_path, caplog
+):
+    from lerobot.scripts.lerobot_rollout import main
+
+    checkpoint = trained(
+        run_tool,
+        dataset,
+        tmp_path / "run",
+        "--policy.type=v2p_bc",
+        "--policy.input_size_px=32",
+        "--policy.pretrained_backbone_weights=null",
+        "--steps=1",
+    )
+
+    # LeRobot replaces the root logger's handlers, so the robot's own logger is listened to.
+    log = logging.getLogger("lerobot_policy_v2p.robot.v2p_franka")
+    log.addHandler(caplog.handler)
+    try:
+        run_tool(
+            main,
+            "--strategy.type=base",
+            f"--policy.path={checkpoint}",
+            "--robot.type=v2p_franka",
+            "--robot.backend=sim",
+            f"--robot.task_folder={task_folder}",
+            f"--robot.calibration_dir={tmp_path}",
+            "--task=leaving the cube alone",
+            "--duration=2",
+            "--fps=20",
+            "--device=cpu",
+            "--play_sounds=false",
+            "--return_to_initial_position=false",
+        )
+    finally:
+        log.removeHandler(caplog.handler)
+
+    assert "task 'rest' succeeded after 5 steps" in caplog.text
+
+
+def test_the_robots_entries_are_the_datasets_in_the_same_order(task_folder, tmp_path):
+    from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
+    from lerobot_policy_v2p.robot.v2p_franka import V2PFranka
+
+    robot = V2PFranka(V2PFrankaConfig(task_folder=str(task_folder), calibration_dir=tmp_path))
+
+    robot.connect()
+    before = robot.get_observation()
+    sent = [robot.send_action(dict.fromkeys(ACTION_NAMES, 0.0) | {"delta_z.pos": 7.0})]
+    sent += [robot.send_action(sent[0]) for _ in range(2)]
+    after = robot.get_observation()
+    robot.disconnect()
+
+    assert [*robot.observation_features] == [*STATE_NAMES, "mask"] == [*before]
+    assert [*robot.action_features] == ACTION_NAMES
+    assert sent[0]["delta_z.pos"] == 1.0
+    assert after["eef_z.pos"] > before["eef_z.pos"] + 0.02
+    assert after["mask"].shape == robot.observation_features["mask"]
+    assert not robot.is_connected
+
+
+def test_a_robot_that_lacks_something_says_what(task_folder, tmp_path):
+    from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
+    from lerobot_policy_v2p.robot.v2p_franka import V2PFranka
+
+    with pytest.raises(ValueError, match="task_folder"):
+        V2PFrankaConfig(backend="sim")
+    with pytest.raises(ValueError, match=r"robot\.masks"):
+        V2PFrankaConfig(backend="franky", ip="10.0.0.1")
+    real = V2PFrankaConfig(
+        backend="franky", ip="10.0.0.1", masks="os:getcwd", calibration_dir=tmp_path
+    )
+    with pytest.raises(V2PError, match="franky-control"):
+        V2PFranka(real).connect()
+
+
+def test_targets_move_by_the_action_scale_and_stay_on_their_leashes():
+    from scipy.spatial.transform import Rotation
+
+    from lerobot_policy_v2p.robot.targets import DOWN, ToolPose, next_target
+    from v2p_data.sim.batch_env import SimConfig
+
+    measured = ToolPose(pos=np.array([0.5, 0.0, 0.2]), rotation=DOWN, opening=1.0)
+
+    def after(action, times):
+        target = measured
+        for _ in range(times):
+            target = next_target(target, measured, np.array(action, float), SimConfig(), 0.04)
+        return target
+
+    np.testing.assert_allclose(after([1, 0, -0.5, 0, 0, 0, 0], 1).pos, [0.53, 0, 0.185])
+    np.testing.assert_allclose(after([1, 0, 0, 0, 0, 0, 0], 9).pos, [0.56, 0, 0.2])  # 6 cm
+    yaw = [(DOWN.inv() * after([0, 0, 0, 0, 0, 1, 0], n).rotation).magnitude() for n in (1, 9)]
+    np.testing.assert_allclose(yaw, [0.2, 0.5])
+    lean = after([0, 0, 0, 1, 0, 0, 0], 9).rotation.apply([0, 0, 1])
+    np.testing.assert_allclose(np.arccos(-lean[2]), 0.35)
+    # 12 mm of 40 mm a step, at most 8 mm ahead of fingers that do not move
+    np.testing.assert_allclose(after([0, 0, 0, 0, 0, 0, 1], 1).opening, 0.8)
+    np.testing.assert_allclose(after([0, 0, 0, 0, 0, 0, 1 / 3], 1).opening, 0.9)
+    turned = ToolPose(
+        pos=measured.pos, rotation=Rotation.from_rotvec([0, 0, 0.3]) * DOWN, opening=0
+    )
+    np.testing.assert_allclose(turned.state()[3:], [0, 0, -0.3, 0], atol=1e-12)
