@@ -18,6 +18,7 @@ from v2p_data.sim.batch_env import (
     without_randomization,
 )
 from v2p_data.sim.robot import FINGER_TRAVEL_M
+from v2p_data.task.sandbox import TaskCodeError
 from v2p_data.task.task import BASE_OBSERVATION_DIM, OBJECT_STATES, ROBOT_STATES, Task, TaskBundle
 
 CALM = without_randomization(SimConfig(fine=True))
@@ -248,6 +249,49 @@ def test_an_episode_is_cut_off_at_the_horizon_and_not_before(make_env: Callable[
     truncated = [env.step(np.zeros((8, 7))).truncated.all() for _ in range(7)]
 
     assert truncated == [False] * 6 + [True]
+
+
+def test_staggered_worlds_end_at_different_times(make_env: Callable[..., BatchEnv]):
+    env = make_env(horizon=20, num_envs=32)
+    env.stagger()
+
+    ended = [int(env.step(np.zeros((32, 7))).truncated.sum()) for _ in range(20)]
+
+    assert ended[-1] == 32
+    assert len(set(ended)) > 5
+
+
+def test_task_code_is_run_through_the_guard(make_bundle: Callable[..., TaskBundle]):
+    code = """
+import torch
+from factory.tasks.task import Task
+
+class Height(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, {})
+
+    def compute_observation_key(self, states):
+        states["height"] = states["cube_pos"][:, 2]
+        return ["base_observation", "height"]
+
+    def get_observation_space(self):
+        return 81
+
+    def compute_success(self, states):
+        return states["height"] > 0.1
+
+    def compute_reward(self, actions, states):
+        return states["cube_pos"][:, 2], {"height": states["cube_pos"][:, 2]}
+"""
+    bundle = replace(make_bundle(), code=code)
+    env = BatchEnv(bundle, num_envs=4, seed=0, num_threads=1)
+
+    result = env.step(np.zeros((4, 7)))
+
+    assert env.obs_dim == 81
+    np.testing.assert_allclose(result.obs[:, 80], env.states()["cube_pos"][:, 2])
+    with pytest.raises(TaskCodeError, match="os"):
+        BatchEnv(replace(bundle, code=code + "\nimport os\n"), num_envs=4, seed=0)
 
 
 def test_a_broken_world_ends_without_reward_and_can_start_anew(make_env: Callable[..., BatchEnv]):

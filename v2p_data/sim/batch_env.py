@@ -218,6 +218,11 @@ class BatchEnv:
         self._target_finger[ids] = FINGER_TRAVEL_M
         poses = self.task.reset_objects_states(torch.from_numpy(ids))
         for k, name in enumerate(self.object_names):
+            if name not in poses or tuple(poses[name].shape) != (n, 7):
+                raise V2PError(
+                    f"reset_objects_states of task '{self.bundle.title}' must give '{name}' poses of shape "
+                    f"({n}, 7); it gave { {key: tuple(pose.shape) for key, pose in poses.items()} }"
+                )
             self._object_qpos[ids, k] = poses[name].numpy()
         self._start_pose[ids] = self._object_qpos[ids]
         self._steps[ids] = 0
@@ -235,7 +240,9 @@ class BatchEnv:
 
     def observe(self) -> Float32[np.ndarray, "env obs"]:
         """Return the observation of all worlds as they are."""
-        states = self.states()
+        return self._observation(self.states())
+
+    def _observation(self, states: dict[str, torch.Tensor]) -> Float32[np.ndarray, "env obs"]:
         columns = [states[key] for key in self.task.compute_observation_key(states)]
         parts = [c if c.ndim == 2 else c[:, None] for c in columns]
         obs = parts[0].clone() if len(parts) == 1 else torch.cat(parts, dim=1)
@@ -432,6 +439,9 @@ class BatchEnv:
 
     def _judge(self, action: np.ndarray) -> StepResult:
         states = self.states()
+        obs = self._observation(
+            states
+        )  # first: a reward may use what the observation adds to the states
         ok = ~self._broken
         success = self.task.compute_success(states).numpy().astype(bool) & ok
         total, parts = self.task.compute_reward(
@@ -448,7 +458,7 @@ class BatchEnv:
         self._held = np.where(success, self._held + 1, 0)
         reward = (task_reward + self.cfg.success_bonus * success) / self.cfg.reward_scale
         return StepResult(
-            obs=self.observe(),
+            obs=obs,
             reward=reward.astype(np.float32),
             success=success,
             held=self._held >= HELD_STEPS,
