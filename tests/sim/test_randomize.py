@@ -183,12 +183,18 @@ def test_without_randomisation_the_layout_is_the_videos(
     np.testing.assert_allclose(randomizer.size_m[5, 0], (0.04, 0.04, 0.04))
 
 
+@pytest.mark.parametrize("cover_first", [False, True])
 def test_a_covered_object_starts_under_its_cover(
-    make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
+    cover_first: bool, make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
 ):
-    cup = make_object("cup", "cylinder", (0.11, 0.11, 0.1), role="cover", hollow=True)
+    if (
+        cover_first
+    ):  # the manipulated object of an uncovering is the cover, even where nobody said so
+        things = (make_object("cup", "box", (0.11, 0.11, 0.1)), make_object(role="reference"))
+    else:
+        things = (make_object(), make_object("cup", "box", (0.11, 0.11, 0.1), role="cover"))
 
-    randomizer, batch, poses = worlds_of(make_scene(make_object("cube"), cup, kind="uncover"))
+    randomizer, batch, poses = worlds_of(make_scene(*things, kind="uncover"))
     batch.step(nstep=100)
 
     np.testing.assert_allclose(poses[:, 0, :2], poses[:, 1, :2])

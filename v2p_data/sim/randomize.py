@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene
 from v2p_data.sim.robot import arm_qpos_for
-from v2p_data.sim.world import FLOOR_MAX_M, MESH_SCALES, WALL_MAX_M, ObjectModel, World
+from v2p_data.sim.world import FLOOR_MAX_M, MESH_SCALES, WALL_MAX_M, ObjectModel, World, cover_of
 
 WORKSPACE_CENTRE_M = (0.5, 0.0)
 OBJECT_LOW_M = (0.37, -0.28)
@@ -183,6 +183,7 @@ class Randomizer:
         pair = self._cover_pair()
         if pair is not None:
             self._check_covered_fits(ids, *pair)
+            pair = pair if self.world.scene.kind == "uncover" else None  # else they start apart
         xy = np.zeros((n, count, 2))
         todo = np.arange(n)
         for attempt in range(PLACEMENT_TRIES):
@@ -283,14 +284,12 @@ class Randomizer:
         return poses
 
     def _cover_pair(self) -> tuple[int, int] | None:
-        """Return cover and covered object, where one starts under the other."""
-        objects = self.world.objects
-        covers = [
-            k for k, o in enumerate(objects) if o.role == "cover" and o.kind.endswith("_hollow")
-        ]
-        if self.world.scene.kind != "uncover" or not covers or len(objects) < 2:
+        """Return cover and what it covers, in tasks about covering."""
+        scene = self.world.scene
+        cover = cover_of(scene)
+        if scene.kind not in {"cover", "uncover"} or cover is None:
             return None
-        return covers[0], 1 if covers[0] == 0 else 0
+        return cover, 1 if cover == 0 else 0
 
     def _check_covered_fits(self, ids: np.ndarray, cover: int, covered: int) -> None:
         obj = self.world.objects[cover]

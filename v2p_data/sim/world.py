@@ -132,6 +132,14 @@ def build_world(scene: Scene, physics: PhysicsConfig, servo: ServoConfig | None 
     )
 
 
+def cover_of(scene: Scene) -> int | None:
+    """Return which object is a cover, open below: one with that role, else what a cover task manipulates."""
+    for k, obj in enumerate(scene.objects):
+        if obj.role == "cover":
+            return k
+    return 0 if scene.kind in {"cover", "uncover"} and len(scene.objects) > 1 else None
+
+
 def hollow_parts(
     size_m: tuple[float, float, float], *, is_round: bool, upside_down: bool = False
 ) -> list[Part]:
@@ -277,7 +285,10 @@ def _draft(obj: SceneObject, scene: Scene) -> _Draft:
         )
     hull = np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)]) / 2
     asset, com, inertia = "", np.zeros(3), np.zeros((3, 3))
-    if obj.hollow:
+    cover = cover_of(scene)
+    is_cover = cover is not None and scene.objects[cover] is obj
+    is_hollow = obj.hollow or is_cover
+    if is_hollow:
         is_round = obj.shape in {"cylinder", "sphere"} or (
             obj.shape == "mesh" and abs(x - y) < 0.12 * max(x, y)
         )
@@ -286,7 +297,7 @@ def _draft(obj: SceneObject, scene: Scene) -> _Draft:
             thick = (x, y, z)
             hull = _disc(x / 2, z / 2)
         kind = "round_hollow" if is_round else "box_hollow"
-        parts = hollow_parts(thick, is_round=is_round, upside_down=obj.role == "cover")
+        parts = hollow_parts(thick, is_round=is_round, upside_down=is_cover)
         com, inertia = _mass_properties(parts, obj.mass_kg)
     elif obj.shape == "mesh":
         kind = "mesh"
@@ -330,7 +341,7 @@ def _rest_quat(obj: SceneObject, kind: str) -> tuple[float, float, float, float]
     Hollow things stand on their floors (covers on their walls) whatever the estimate says. A mesh further
     than 30 degrees from an axis keeps the tilt it had.
     """
-    if obj.hollow or kind == "sphere" or not obj.poses_world:
+    if kind.endswith("_hollow") or kind == "sphere" or not obj.poses_world:
         return (1.0, 0.0, 0.0, 0.0)
     R = Rotation.from_quat(obj.first_pose[3:], scalar_first=True).as_matrix()
     axis = int(np.argmax(np.abs(R[2])))
