@@ -5,7 +5,9 @@ from html.parser import HTMLParser
 
 import pytest
 
-from v2p_data.report.page import NO_BREAK, PageConfig, duration, percent, rate_of, write_page
+from v2p_data.report.media import PageConfig
+from v2p_data.report.page import NO_BREAK, duration, percent, write_page
+from v2p_data.report.reading import rate_of
 
 HOSTILE = (
     "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&{{ 7*7 }}{% raw %}\u202e</title>"

@@ -20,6 +20,32 @@ H264_CRF = "26"
 """Constant rate factor: 18 looks lossless, 28 is visibly soft."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class PageConfig:
+    """How much goes into a page."""
+
+    max_media_bytes: int = 22_000_000
+    """Pictures and films together; with its text the page stays below 25 MB and opens on a phone."""
+    max_shown_items: int = 40
+    """Videos shown at length; the table lists all."""
+    episodes_per_task: int = 2
+    """Sample episodes; the first and the last are the most different random draws at hand."""
+    max_rollouts_per_task: int = 2
+    film_width_px: int = 480
+    sheet_width_px: int = 1400
+    max_film_frames: int = 160
+    mesh_size_px: int = 150
+
+
+@dataclass(frozen=True, kw_only=True)
+class Medium:
+    """A picture or a film with the words that stand for it."""
+
+    uri: str
+    alt: str
+    is_film: bool = False
+
+
 @dataclass(kw_only=True)
 class MediaBudget:
     """Counts what has been embedded and refuses what would make the page too large to open."""

@@ -4,148 +4,39 @@ Text from users (captions, file names, code) reaches the page only through the t
 content policy in its head forbids the browser to load anything that is not inside the file.
 """
 
-import csv
-import json
 import math
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jinja2
-import numpy as np
 from markupsafe import Markup
 
-from v2p_data.episodes.features import ACTION_NAMES, FPS
-from v2p_data.episodes.staging import Episode, staged_episodes
-from v2p_data.errors import V2PError
-from v2p_data.report.chart import NUM_STYLES, Line, line_chart
-from v2p_data.report.media import (
-    MediaBudget,
-    draw_mesh,
-    film_uri,
-    frames_uri,
-    picture_uri,
-    png_uri,
-)
+from v2p_data.report.chart import Line, line_chart
+from v2p_data.report.items import ItemView, item_view
+from v2p_data.report.media import MediaBudget, Medium, PageConfig, film_uri
 from v2p_data.report.reading import (
     ITEM_STAGES,
     JOINT_STAGES,
     STAGES,
     Dropped,
-    Result,
+    Rate,
     Run,
     dropped,
     model_use,
     number,
+    rate_of,
+    read_curve,
     read_json,
     read_run,
 )
-from v2p_data.scene.scene import Scene, SceneObject
 
 PAGE_FILE = "report.html"
 TEMPLATE_FILE = "page.html"
-STRIP_MOMENTS = 6
 NO_BREAK = "\u00a0"
 FILM_SUFFIXES = (".mp4", ".webm", ".mkv", ".avi", ".mov", ".gif")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PageConfig:
-    """How much goes into a page."""
-
-    max_media_bytes: int = 22_000_000
-    """Pictures and films together; with its text the page stays below 25 MB and opens on a phone."""
-    max_shown_items: int = 40
-    """Videos shown at length; the table lists all."""
-    episodes_per_task: int = 2
-    """Sample episodes; the first and the last are the most different random draws at hand."""
-    max_rollouts_per_task: int = 2
-    film_width_px: int = 480
-    sheet_width_px: int = 1400
-    max_film_frames: int = 160
-    mesh_size_px: int = 150
-
-
-@dataclass(frozen=True, kw_only=True)
-class Medium:
-    """A picture or a film with the words that stand for it."""
-
-    uri: str
-    alt: str
-    is_film: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rate:
-    """A success rate as the records keep it."""
-
-    successes: int
-    trials: int
-    low: float
-    high: float
-
-    @property
-    def value(self) -> float:
-        return self.successes / self.trials
-
-
-@dataclass(frozen=True, kw_only=True)
-class ObjectView:
-    obj: SceneObject
-    picture: Medium | None
-    confidence: float | None
-    """The lowest over the frames that have a pose."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EpisodeView:
-    """One demonstration: what the policy sees and what the expert did."""
-
-    name: str
-    film: Medium | None
-    strip: Medium | None
-    """Moments from the first frame to the last, side by side."""
-    charts: list[Markup]
-    num_frames: int
-    greys: str
-    referee: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """Any flat JSON as rows under a head."""
-
-    head: list[str]
-    rows: list[list[str]]
-
-
-@dataclass(kw_only=True)
-class ItemView:
-    """One video, from its caption to its episodes."""
-
-    anchor: str
-    item: str
-    caption: str
-    video: str
-    kind: str = ""
-    is_held_out: bool = False
-    """Its task is only there to judge the policy."""
-    is_shown: bool = True
-    results: dict[str, Result | None] = field(default_factory=dict[str, Result | None])
-    scene: Scene | None = None
-    overlay: list[Medium] = field(default_factory=list[Medium])
-    objects: list[ObjectView] = field(default_factory=list[ObjectView])
-    code: str = ""
-    task: dict[str, Any] = field(default_factory=dict[str, Any])
-    tables: list[tuple[str, Table]] = field(default_factory=list[tuple[str, Table]])
-    rate: Rate | None = None
-    charts: list[Markup] = field(default_factory=list[Markup])
-    sheet: Medium | None = None
-    episodes: list[EpisodeView] = field(default_factory=list[EpisodeView])
-    notes: list[str] = field(default_factory=list[str])
-    """What could not be read, one sentence each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,9 +77,7 @@ def render_page(root: Path, cfg: PageConfig) -> str:
     evaluation = _evaluation_rows(run, cfg, budget)
     held_out = {row.task for row in evaluation if not row.is_seen}
     items = [
-        _item_view(
-            run, item, f"video-{k}", item in held_out, k <= cfg.max_shown_items, cfg, budget
-        )
+        item_view(run, item, f"video-{k}", item in held_out, k <= cfg.max_shown_items, cfg, budget)
         for k, item in enumerate(run.items, 1)
     ]
     environment = jinja2.Environment(
@@ -319,277 +208,6 @@ def _key_figures(
 def _is_made(view: ItemView, stage: str) -> bool:
     result = view.results[stage]
     return result is not None and result.status == "made"
-
-
-# --- one video -----------------------------------------------------------------------------------------------
-
-
-def _item_view(
-    run: Run, item: str, anchor: str, is_held_out: bool, is_shown: bool, cfg: PageConfig, budget: MediaBudget
-) -> ItemView:  # fmt: skip
-    view = ItemView(
-        anchor=anchor,
-        item=item,
-        caption=item,
-        video="",
-        is_held_out=is_held_out,
-        is_shown=is_shown,
-        results={stage: run.get(stage, item) for stage in ITEM_STAGES},
-    )
-    scene, task = view.results["scene"], view.results["task"]
-    if scene is not None:
-        _add_scene(view, scene, cfg, budget)
-    if task is not None and is_shown:
-        _add_task(view, task)
-    expert, episodes = view.results["expert"], view.results["episodes"]
-    if expert is not None and is_shown:
-        _add_expert(view, expert, cfg, budget)
-    if episodes is not None and is_shown:
-        _add_episodes(view, episodes, cfg, budget)
-    _note_older_inputs(view)
-    return view
-
-
-def _add_scene(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
-    recipe = (result.record.recipe if result.record else {}).get("config") or {}
-    view.caption = str(recipe.get("caption") or view.item)
-    view.kind = str(result.counts.get("kind", ""))
-    if result.status != "made":
-        return
-    try:
-        scene = Scene.load(result.folder)
-    except (V2PError, OSError, KeyError, TypeError, ValueError) as error:
-        view.notes.append(f"The scene's file cannot be read: {error}")
-        return
-    view.scene, view.kind, view.video = scene, scene.kind, scene.video
-    view.caption = scene.description or view.caption
-    if not view.is_shown:
-        return
-    film = film_uri(result.folder / "overlay.mp4", cfg.film_width_px, cfg.max_film_frames)
-    about = f"The video '{scene.video}' with outlines of what was understood"
-    if uri := budget.admit(film, f"overlay of {view.item}"):
-        view.overlay.append(Medium(uri=uri, alt=about, is_film=True))
-    else:
-        for name, when in (("overlay_first.png", "first"), ("overlay_last.png", "last")):
-            picture = picture_uri(result.folder / name, cfg.film_width_px)
-            if uri := budget.admit(picture, f"{when} overlay of {view.item}"):
-                view.overlay.append(Medium(uri=uri, alt=f"{about}, {when} frame"))
-    for obj in scene.objects:
-        picture = budget.admit(
-            _mesh_picture(result.folder, obj, cfg.mesh_size_px), f"mesh of {obj.name}"
-        )
-        view.objects.append(
-            ObjectView(
-                obj=obj,
-                picture=Medium(uri=picture, alt=f"Mesh of {obj.label or obj.name}")
-                if picture
-                else None,
-                confidence=min(obj.confidences) if obj.confidences else None,
-            )
-        )
-
-
-def _mesh_picture(folder: Path, obj: SceneObject, size_px: int) -> str | None:
-    """Return a drawing of the object's mesh, or None if its file is missing, foreign or broken."""
-    import trimesh
-
-    path = (folder / obj.mesh).resolve()
-    if not obj.mesh or not path.is_relative_to(folder.resolve()) or not path.is_file():
-        return None
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)  # pyright: ignore[reportAttributeAccessIssue]
-    except (ValueError, IndexError, KeyError, AttributeError, TypeError):
-        return None
-    if not len(faces) or not np.isfinite(vertices).all():
-        return None
-    r, g, b = (float(np.clip(c, 0, 1)) for c in obj.rgba[:3])
-    return png_uri(draw_mesh(vertices, faces, (r, g, b), size_px))
-
-
-def _add_task(view: ItemView, result: Result) -> None:
-    code = result.folder / "task.py"
-    view.code = code.read_text(errors="replace") if code.is_file() else ""
-    task = read_json(result.folder / "task.json")
-    view.task = task if isinstance(task, dict) else {}
-    view.kind = str(view.task.get("kind") or view.kind)
-    audit = read_json(result.folder / "audit.json") or view.task.get("audit")
-    view.tables += tables_of(audit, "Audit against the video")
-
-
-def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
-    counts = result.counts or read_json(result.folder / "evaluation.json") or {}
-    view.rate = rate_of(counts.get("success"))
-    view.charts = expert_charts(read_curve(result.folder / "curve.csv"))
-    uri = budget.admit(
-        picture_uri(result.folder / "sheet.png", cfg.sheet_width_px),
-        f"contact sheet of {view.item}",
-    )
-    if uri:
-        view.sheet = Medium(
-            uri=uri, alt="Contact sheet of the expert's episodes: a row each, eight moments from left to right"
-        )  # fmt: skip
-
-
-def _add_episodes(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
-    staged = staged_episodes(result.folder)
-    count = min(cfg.episodes_per_task, len(staged))
-    for index in sorted({round(k) for k in np.linspace(0, len(staged) - 1, count)}):
-        try:
-            view.episodes.append(_episode_view(Episode.load(staged[index]), cfg, budget))
-        except V2PError as error:
-            view.notes.append(str(error))
-
-
-def _episode_view(episode: Episode, cfg: PageConfig, budget: MediaBudget) -> EpisodeView:
-    from v2p_data.sim.masks import label_names, labels_to_rgb
-
-    names = label_names(episode.objects)
-    greys = labels_to_rgb(np.arange(len(names), dtype=np.uint8)[None])[0, :, 0]
-    uri = budget.admit(
-        frames_uri(labels_to_rgb(episode.labels), float(FPS)), f"masks of episode {episode.id}"
-    )
-    moments = np.linspace(0, episode.num_frames - 1, STRIP_MOMENTS).round().astype(int)
-    strip = budget.admit(
-        png_uri(labels_to_rgb(np.concatenate([*episode.labels[moments, ::2, ::2]], axis=1))),
-        f"moments of episode {episode.id}",
-    )
-    seconds = np.arange(episode.num_frames) / FPS
-    lines = [
-        Line(name=name.split(".")[0].replace("_", " "), x=seconds, y=episode.action[:, k].astype(float))
-        for k, name in enumerate(ACTION_NAMES)
-    ]  # fmt: skip
-    return EpisodeView(
-        name=episode.id,
-        film=Medium(uri=uri, alt=f"Segmentation masks of episode {episode.id}", is_film=True)
-        if uri
-        else None,
-        strip=Medium(uri=strip, alt=f"Masks of episode {episode.id} at {STRIP_MOMENTS} moments")
-        if strip
-        else None,
-        charts=[
-            line_chart(
-                group,
-                title=title,
-                x_label="time [s]",
-                y_range=(-1.0, 1.0),
-                width_px=320,
-                height_px=100,
-            )
-            for title, group in (
-                ("Action: position", lines[:3]),
-                ("Action: rotation", lines[3:6]),
-                ("Action: gripper", lines[6:]),
-            )
-        ],
-        num_frames=episode.num_frames,
-        greys=", ".join(f"{names[k].replace('_', ' ')} {greys[k]}" for k in sorted(names)),
-        referee=episode.referee,
-    )
-
-
-def _note_older_inputs(view: ItemView) -> None:
-    """Say so where a result was not made from the newest result before it."""
-    for result in view.results.values():
-        if result is None or result.record is None:
-            continue
-        for name, folder in result.record.inputs.items():
-            newest = view.results.get(name)
-            if newest is not None and newest.record is not None and newest.folder.name != folder:
-                view.notes.append(
-                    f"The {result.stage} shown here was made from {name} {folder}, "
-                    f"while the newest {name} is {newest.folder.name}."
-                )
-
-
-# --- pieces --------------------------------------------------------------------------------------------------
-
-
-def rate_of(data: Any) -> Rate | None:
-    """Return a success rate from a record, None if it is not one."""
-    if not isinstance(data, Mapping):
-        return None
-    values = [number(data.get(k)) for k in ("successes", "trials", "low", "high")]
-    if any(v is None for v in values) or not values[1]:
-        return None
-    successes, trials, low, high = (float(v) for v in values if v is not None)
-    return Rate(successes=int(successes), trials=int(trials), low=low, high=high)
-
-
-def tables_of(data: Any, title: str) -> list[tuple[str, Table]]:
-    """Return JSON as titled tables: a list of objects as rows, anything else as name and value."""
-    if isinstance(data, list) and data and all(isinstance(row, dict) for row in data):
-        head = list(dict.fromkeys(str(k) for row in data for k in row))
-        rows = [[_cell(row.get(k)) for k in head] for row in data]
-        return [(title, Table(head=head, rows=rows))]
-    if not isinstance(data, dict) or not data:
-        return []
-    flat = {k: v for k, v in data.items() if not isinstance(v, dict | list) or not v}
-    nested = {k: v for k, v in data.items() if k not in flat}
-    tables: list[tuple[str, Table]] = []
-    if flat:
-        rows = [[str(k), _cell(v)] for k, v in flat.items()]
-        tables.append((title, Table(head=["check", "result"], rows=rows)))
-    for key, value in nested.items():
-        inner = tables_of(value, f"{title}: {key}")
-        tables += inner or [(f"{title}: {key}", Table(head=["value"], rows=[[_cell(value)]]))]
-    return tables
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, dict | list):
-        return json.dumps(value, ensure_ascii=False)
-    return str(value)
-
-
-def read_curve(path: Path) -> dict[str, np.ndarray]:
-    """Return a CSV's columns; what is no number is NaN, and a last line that a kill cut short is left out."""
-    if not path.is_file():
-        return {}
-    with path.open(newline="", errors="replace") as stream:
-        head, *rows = [*csv.reader(stream)] or [[]]
-    whole = [row for row in rows if len(row) == len(head)]
-    return {name: np.array([_float(row[k]) for row in whole]) for k, name in enumerate(head)}
-
-
-def expert_charts(curve: Mapping[str, np.ndarray]) -> list[Markup]:
-    """Return success, return and reward parts over control steps."""
-    steps = curve.get("steps")
-    if steps is None or not len(steps):
-        return []
-
-    def lines(names: Mapping[str, str]) -> list[Line]:
-        return [Line(name=words, x=steps, y=curve[k]) for k, words in names.items() if k in curve]
-
-    parts = {
-        k: k.removeprefix("reward_").replace("_", " ") for k in curve if k.startswith("reward_")
-    }
-    charts = [
-        line_chart(
-            lines({"success_deterministic": "deterministic", "success_stochastic": "exploring"}),
-            title="Success while training", x_label="control steps", y_range=(0.0, 1.0),
-        ),
-        line_chart(
-            lines({"return": "mean return"}), title="Return per episode", x_label="control steps"
-        ),
-        line_chart(
-            lines(parts)[:NUM_STYLES], title="Reward parts, mean per step", x_label="control steps"
-        ),
-    ]  # fmt: skip
-    return [chart for chart in charts if chart]
-
-
-def _float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
 
 
 # --- the policy ----------------------------------------------------------------------------------------------

@@ -3,12 +3,15 @@
 Nothing here trusts a file to be whole: a run may be young, killed or edited. What cannot be read is named.
 """
 
+import csv
 import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record, read_rejects
 
@@ -167,6 +170,41 @@ def model_use(run: Run) -> dict[str, int]:
     return use
 
 
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """A success rate as the records keep it."""
+
+    successes: int
+    trials: int
+    low: float
+    high: float
+
+    @property
+    def value(self) -> float:
+        return self.successes / self.trials
+
+
+def rate_of(data: Any) -> Rate | None:
+    """Return a success rate from a record, None if it is not one."""
+    if not isinstance(data, Mapping):
+        return None
+    values = [number(data.get(k)) for k in ("successes", "trials", "low", "high")]
+    if any(v is None for v in values) or not values[1]:
+        return None
+    successes, trials, low, high = (float(v) for v in values if v is not None)
+    return Rate(successes=int(successes), trials=int(trials), low=low, high=high)
+
+
+def read_curve(path: Path) -> dict[str, np.ndarray]:
+    """Return a CSV's columns; what is no number is NaN, and a last line that a kill cut short is left out."""
+    if not path.is_file():
+        return {}
+    with path.open(newline="", errors="replace") as stream:
+        head, *rows = [*csv.reader(stream)] or [[]]
+    whole = [row for row in rows if len(row) == len(head)]
+    return {name: np.array([_float(row[k]) for row in whole]) for k, name in enumerate(head)}
+
+
 def read_json(path: Path) -> Any:
     """Return a JSON file's content, None if there is none that can be read."""
     try:
@@ -246,6 +284,13 @@ def _from_partials(root: Path) -> list[Result]:
                 )
             )
     return found
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _folders(parent: Path) -> list[Path]:
