@@ -64,16 +64,16 @@ class PPOConfig:
     batch_time: int = 16
     """Control steps per world between two updates."""
     epochs: int = 4
-    minibatch: int = 2048
+    minibatch: int = 1024
     learning_rate: float = 1e-3
     """At the start; from then on it follows the KL divergence."""
     min_learning_rate: float = 1e-4
     max_learning_rate: float = 3e-3
-    kl_low: float = 0.01
+    kl_low: float = 0.015
     """Below, the learning rate grows by a half."""
-    kl_high: float = 0.02
+    kl_high: float = 0.03
     """Above, it shrinks by a third."""
-    kl_stop: float = 0.045
+    kl_stop: float = 0.06
     """Above, the remaining epochs of this batch are skipped."""
     gamma: float = 0.97
     """A horizon of about 1.7 s at 20 Hz."""
