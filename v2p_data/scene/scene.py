@@ -127,7 +127,9 @@ class Scene:
         """
         path = folder / SCENE_FILE
         if not path.is_file():
-            raise V2PError(f"{folder} holds no {SCENE_FILE}: it is no scene; make one with 'v2p scene'")
+            raise V2PError(
+                f"{folder} holds no {SCENE_FILE}: it is no scene; make one with 'v2p scene'"
+            )
         data: dict[str, Any] = json.loads(path.read_text())
         if data.pop("schema", None) != SCHEMA:
             raise V2PError(f"{path} was written by another version; remake it with 'v2p scene'")

@@ -1,0 +1,144 @@
+"""The clip as the scene room looks at it: small frames, stills without passers-by, and the moving hand's colour.
+
+Everything that looks at pixels works at 320 px width: the hand-written measures are tuned there, and a
+five-second clip then takes seconds.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from v2p_data.scene.colour import histogram, lab_of, likelihood, skin_prior
+from v2p_data.video.clip import Clip
+
+WIDTH_PX = 320
+MAX_FRAMES = 150
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footage:
+    """Frames at working size with what follows from them directly."""
+
+    rgb: UInt8[np.ndarray, "time h w 3"]
+    lab: Float32[np.ndarray, "time h w 3"]
+    frame_idx: Int[np.ndarray, "time"]
+    """Each working frame's index in the clip."""
+    px_scale: float
+    """Working pixels per clip pixel."""
+    early: UInt8[np.ndarray, "h w 3"]
+    """What stands still during the first quarter."""
+    late: UInt8[np.ndarray, "h w 3"]
+    """What stands still during the last quarter."""
+    always: UInt8[np.ndarray, "h w 3"]
+    """What stands still most of the time."""
+    moving: UInt8[np.ndarray, "n 3"] = field(repr=False)
+    """Sample of the colours that move: arm, sleeve and object."""
+    hand_hist: Float[np.ndarray, "l a b"] = field(repr=False)
+    """Colour histogram of the hand; zeros when little moves."""
+    rest_hist: Float[np.ndarray, "l a b"] = field(repr=False)
+    """Colour histogram of what does not move."""
+    skin_only: bool = True
+    """Whether only skin-like pixels can be hand: so until the object's look is known."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.rgb.shape[1], self.rgb.shape[2]
+
+    def hand(self, image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+        """Return pixels that look like the moving hand and not like what stands still here."""
+        moving, still = likelihood(self.hand_hist, image), likelihood(self.rest_hist, image)
+        passing = np.linalg.norm(lab_of(image) - lab_of(self.always), axis=-1) > 9
+        hand = (moving > 2 * still + 1e-7) & passing
+        return hand & skin_prior(image) if self.skin_only else hand
+
+    def knowing(self, look: Float[np.ndarray, "l a b"]) -> "Footage":
+        """Return the footage with a hand that is everything that moves but does not look like the object."""
+        typical = float((look * look).sum())
+        alien = likelihood(look, self.moving[None])[0] < 0.03 * typical
+        pixels = self.moving[alien]
+        if len(pixels) < 300:
+            return self
+        return replace(self, hand_hist=histogram(pixels), skin_only=False)
+
+
+def footage_of(clip: Clip) -> Footage:
+    """Return at most 150 evenly spaced frames of the clip at working size, with their stills."""
+    n = len(clip.frames)
+    frame_idx = np.unique(np.linspace(0, n - 1, min(n, MAX_FRAMES)).round().astype(int))
+    h, w = clip.frames.shape[1:3]
+    size = (WIDTH_PX, max(8, round(h * WIDTH_PX / w)))
+    how = cv2.INTER_AREA if w > WIDTH_PX else cv2.INTER_LINEAR
+    rgb = np.stack([cv2.resize(clip.frames[i], size, interpolation=how) for i in frame_idx])
+    lab = lab_of(rgb)
+    quarter = max(3, len(rgb) // 4)
+    moving, rest = _moving_and_resting(rgb)
+    skin = moving[skin_prior(moving[None])[0]]
+    return Footage(
+        rgb=rgb,
+        lab=lab,
+        frame_idx=frame_idx,
+        px_scale=WIDTH_PX / w,
+        early=still_of(rgb[:quarter], lab[:quarter]),
+        late=still_of(rgb[-quarter:], lab[-quarter:]),
+        always=still_of(rgb, lab),
+        moving=moving,
+        hand_hist=histogram(skin if len(skin) > 300 else skin[:0]),
+        rest_hist=histogram(rest),
+    )
+
+
+def still_of(
+    rgb: UInt8[np.ndarray, "time h w 3"], lab: Float32[np.ndarray, "time h w 3"], most: int = 24
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return per pixel the colour that is there most of the time (mode seeking from the median)."""
+    pick = np.unique(np.linspace(0, len(rgb) - 1, min(most, len(rgb))).astype(int))
+    colours, lab = rgb[pick].astype(np.float32), lab[pick]
+    centre = np.median(lab, axis=0)
+    weight = np.ones(lab.shape[:3], np.float32)
+    for _ in range(3):
+        distance = np.linalg.norm(lab - centre, axis=-1)
+        weight = np.exp(-((distance / 8) ** 2)) + 1e-4
+        centre = (weight[..., None] * lab).sum(0) / weight.sum(0)[..., None]
+    mean = (weight[..., None] * colours).sum(0) / weight.sum(0)[..., None]
+    return np.clip(mean.round(), 0, 255).astype(np.uint8)
+
+
+def camera_shift_px(footage: Footage) -> float:
+    """Return how far the picture moved as a whole, at working size.
+
+    Six tiles are phase-correlated against the first frame; the median of the tiles with texture counts, so that a
+    moving hand in two of them decides nothing. The largest shift over nine frames is returned.
+    """
+    h, w = footage.shape
+    grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY).astype(np.float32) for f in footage.rgb]
+    tiles = [(r, c) for r in range(2) for c in range(3)]
+    th, tw = h // 2, w // 3
+    window = cv2.createHanningWindow((tw, th), cv2.CV_32F)
+    worst = 0.0
+    for i in np.unique(np.linspace(0, len(grey) - 1, 9).astype(int))[1:]:
+        shifts = []
+        for r, c in tiles:
+            a = grey[0][r * th : (r + 1) * th, c * tw : (c + 1) * tw]
+            b = grey[i][r * th : (r + 1) * th, c * tw : (c + 1) * tw]
+            if a.std() < 4:
+                continue
+            (dx, dy), response = cv2.phaseCorrelate(a, b, window)
+            if response > 0.05:
+                shifts.append(float(np.hypot(dx, dy)))
+        if shifts:
+            worst = max(worst, float(np.median(shifts)))
+    return worst
+
+
+def _moving_and_resting(
+    rgb: UInt8[np.ndarray, "time h w 3"],
+) -> tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "m 3"]]:
+    step = max(1, len(rgb) // 25)
+    moving, still = [np.zeros((0, 3), np.uint8)], [np.zeros((0, 3), np.uint8)]
+    for i in range(step, len(rgb), step):
+        difference = np.abs(rgb[i].astype(np.int16) - rgb[i - step]).max(-1)
+        moving.append(rgb[i][difference > 25])
+        still.append(rgb[i][difference < 8][::7])
+    return np.concatenate(moving), np.concatenate(still)

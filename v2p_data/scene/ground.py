@@ -1,0 +1,399 @@
+"""Which pixels are the thing that moved, where it was first and last, and which are the other thing in the caption.
+
+What moved leaves two marks in a static picture: at its origin, edges that vanish; at its destination, edges that
+appear. Candidate blobs come from several views of that change and are scored by hand-set weights; colour words are the
+strongest cue, the vanishing edge second. The best score is also the gate: below about 4.5 most findings were wrong.
+"""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from v2p_data.scene.colour import (
+    balance,
+    colour_match,
+    colour_words,
+    histogram,
+    lab_of,
+    likelihood,
+    similarity,
+    skin_prior,
+)
+from v2p_data.scene.footage import Footage
+from v2p_data.scene.segment import (
+    bounding_box,
+    convex_hull,
+    edge_contrast,
+    grow,
+    main_parts,
+    refine,
+    shrink,
+    solidity,
+    tidy,
+)
+from v2p_data.scene.table import Table
+
+_MIN_SHARE, _MAX_SHARE = 0.0015, 0.16
+"""An object's share of the picture; smaller is noise, larger is a person."""
+_NEAR_KINDS = {"push_next_to", "drop_in_front_of", "push_with", "slide_to"}
+_TOUCH_KINDS = {"cover", "insert", "throw_into", "place_onto"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moved:
+    """The manipulated object's two outlines at working size."""
+
+    first: Bool[np.ndarray, "h w"]
+    last: Bool[np.ndarray, "h w"]
+    score: float
+    """Sum of the cues; above about 4.5 it was nearly always right."""
+    look: Float[np.ndarray, "l a b"] = field(repr=False)
+    """Colour histogram of the object."""
+    cues: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """A thing that stands still, at working size."""
+
+    mask: Bool[np.ndarray, "h w"]
+    score: float
+    """Above about 2 it was nearly always right."""
+
+
+@dataclass
+class _Blob:
+    mask: np.ndarray
+    area: int
+    box: tuple[int, int, int, int]
+    hist: np.ndarray
+    score: float
+    cues: dict[str, float]
+    whole: np.ndarray | None = None
+    """The mask with the rest of the object, once `_complete` has looked for it."""
+
+
+def find_moved(
+    footage: Footage,
+    table: Table,
+    phrase: str,
+    kind: str,
+    *,
+    first: Bool[np.ndarray, "h w"] | None = None,
+    last: Bool[np.ndarray, "h w"] | None = None,
+) -> Moved | None:
+    """Return the manipulated object at the first and at the last frame; None where nothing moves.
+
+    A mask given by the user for either end is taken as it is.
+    """
+    words = colour_words(phrase)
+    pair = _best_pair(footage, table, words, kind, first, last)
+    if pair is None:
+        return None
+    # Now that the object's look is known, the hand is everything else that moves, sleeves and dark skin as well.
+    look = _look(footage, pair[1], words)
+    footage = footage.knowing(look)
+    pair = _best_pair(footage, table, words, kind, first, last, look) or pair
+    score, a, b, cues = pair
+    look = _look(footage, a, words)
+    return Moved(
+        first=first if first is not None else outline(footage, footage.rgb[0], _whole(a), look),
+        last=last if last is not None else outline(footage, footage.rgb[-1], _whole(b), look),
+        score=score,
+        look=look,
+        cues={
+            **{f"first {k}": v for k, v in a.cues.items()},
+            **{f"last {k}": 0.6 * v for k, v in b.cues.items()},
+            **cues,
+        },
+    )
+
+
+def outline(
+    footage: Footage,
+    image: UInt8[np.ndarray, "h w 3"],
+    blob: Bool[np.ndarray, "h w"],
+    look: Float[np.ndarray, "l a b"],
+) -> Bool[np.ndarray, "h w"]:
+    """Return the object's outline around a blob in any frame, the hand cut away.
+
+    Hand is what looks more like the moving hand than like the object (`look`).
+    """
+    never = tidy(
+        footage.hand(image) & (likelihood(footage.hand_hist, image) > likelihood(look, image))
+    )
+    rest = blob & ~never
+    if rest.sum() < 0.35 * blob.sum():
+        rest, never = blob, np.zeros_like(never)
+    rest = tidy(rest) if tidy(rest).any() else rest
+    return refine(image, main_parts(rest), never)
+
+
+def find_other(
+    footage: Footage, table: Table, phrase: str, kind: str, moved: Moved
+) -> Found | None:
+    """Return the thing that stays, or None where the still shows no candidate.
+
+    For `uncover` the late still is searched, for all others the early one.
+    """
+    late = kind == "uncover"
+    still = footage.late if late else footage.early
+    h, w = footage.shape
+    words = colour_words(phrase)
+    goal = moved.first if late else moved.last
+    goal_zone = grow(goal, 6)
+    distance = cv2.distanceTransform((~goal).astype(np.uint8), cv2.DIST_L2, 5)
+    colour = _colour(still, words)
+    quarter = max(3, len(footage.lab) // 5)
+    stack = footage.lab[-quarter:] if late else footage.lab[:quarter]
+    steps = np.linalg.norm(np.diff(stack[:: max(1, quarter // 8)], axis=0), axis=-1)
+    restless = (steps > 12).mean(0) > 0.15
+    inner_hull = shrink(table.hull, 1)
+    stands_out = table.stands_out(still) & inner_hull & ~restless
+    hand = footage.hand(still) & ~colour
+    sets = [stands_out, stands_out & ~hand] + ([colour & ~restless] if words else [])
+    lab = lab_of(still)
+    occupied = grow(moved.first, 3)
+    best: Found | None = None
+    for pixels in sets:
+        free = pixels if late else pixels & ~occupied
+        for mask in _parts(tidy(free, 5), h * w, 0.0025, 0.2):
+            x, y, bw, bh = bounding_box(mask)
+            area = int(mask.sum())
+            score = -_border_sides((x, y, bw, bh), w, h) * 0.8
+            if kind in _TOUCH_KINDS or late:
+                score += 3 * min(0.6, float((mask & goal_zone).sum() / goal_zone.sum()))
+            gap = float(distance[mask].min())
+            near = 20 if kind in _NEAR_KINDS | _TOUCH_KINDS or late else 60
+            score -= min(gap / near, 4.0)
+            ring = grow(mask, 3) & ~mask
+            score += float(table.seen[ring].mean()) if ring.any() else 0.0
+            score += 1.6 * float(colour[mask].mean()) if words else 0.0
+            score += 0.8 * area / (bw * bh)
+            score += 0.02 * min(40.0, edge_contrast(lab, mask))
+            score -= 0.5 * max(0.0, float(np.log(0.008 * h * w / area)))
+            if best is None or score > best.score:
+                best = Found(mask=mask, score=score)
+    if best is None:
+        return None
+    refined = refine(still, best.mask, never=None if late else moved.first)
+    grew = refined.sum() / best.mask.sum()
+    return Found(mask=refined if 0.5 <= grew <= 1.8 else best.mask, score=best.score)
+
+
+def _best_pair(
+    footage: Footage,
+    table: Table,
+    words: tuple[str, ...],
+    kind: str,
+    first: np.ndarray | None,
+    last: np.ndarray | None,
+    look: np.ndarray | None = None,
+) -> tuple[float, _Blob, _Blob, dict[str, float]] | None:
+    def found(given: np.ndarray | None, at_end: bool) -> list[_Blob]:
+        if given is not None:
+            return [_given(footage.rgb[-1 if at_end else 0], given)]
+        return _blobs(footage, table, words, kind, at_end=at_end, look=look)
+
+    best = None
+    ends = found(last, at_end=True)
+    for a in found(first, at_end=False):
+        for b in ends:
+            cues = _pair_cues(a, b, kind, footage.shape)
+            score = a.score + 0.6 * b.score + sum(cues.values())
+            if best is None or score > best[0]:
+                best = score, a, b, cues
+    return best
+
+
+def _whole(blob: _Blob) -> np.ndarray:
+    return blob.mask if blob.whole is None else blob.whole
+
+
+def _look(footage: Footage, blob: _Blob, words: tuple[str, ...]) -> np.ndarray:
+    image = footage.rgb[0]
+    return histogram(image[_typical(footage, image, _whole(blob), words)])
+
+
+def _given(image: np.ndarray, mask: np.ndarray) -> _Blob:
+    return _Blob(
+        mask, int(mask.sum()), bounding_box(mask), histogram(image[mask]), 3.5, {"given": 3.5}
+    )
+
+
+def _typical(
+    footage: Footage, image: np.ndarray, mask: np.ndarray, words: tuple[str, ...]
+) -> np.ndarray:
+    """Return the pixels of a blob that are surely the object: of the named colour, else not hand-like."""
+    named = _colour(image, words)
+    # A box's white letters belong to it, the fingers on it do not.
+    coloured = named | (tidy(named, 9) & ~skin_prior(image))
+    for sure in (mask & coloured, mask & ~footage.hand(image)):
+        if sure.sum() > 0.2 * mask.sum():
+            return sure
+    return mask
+
+
+def _blobs(
+    footage: Footage,
+    table: Table,
+    words: tuple[str, ...],
+    kind: str,
+    *,
+    at_end: bool,
+    look: np.ndarray | None,
+) -> list[_Blob]:
+    h, w = footage.shape
+    n = len(footage.rgb)
+    image = footage.rgb[-1 if at_end else 0]
+    gone = footage.early if at_end else footage.late
+    lab, gone_lab = lab_of(image), lab_of(gone)
+    smooth = cv2.GaussianBlur(lab, (0, 0), 1.0)
+    difference = np.linalg.norm(smooth - cv2.GaussianBlur(gone_lab, (0, 0), 1.0), axis=-1)
+    changed = difference > max(7.0, 2.5 * float(np.median(difference)) + 3)
+    hand = footage.hand(image)
+    match = colour_match(balance(image), words) if words else np.full((h, w), 0.5, np.float32)
+    # A colour that the table has as well says nothing ("white" on a white table).
+    telling = 1 - float(match[table.seen].mean()) if table.seen.any() else 1.0
+    colour = (match > 0.5) if words else np.zeros((h, w), bool)
+    # How long a pixel keeps the look it has here: an arm leaves at once, an object when it is moved.
+    moved = np.linalg.norm(footage.lab - lab, axis=-1) > 11
+    order = moved[::-1] if at_end else moved
+    stays = np.where(order.any(0), order.argmax(0), n) / n
+    fleeting = stays < 0.05
+    stands_out = table.stands_out(image)
+    views = [
+        (tidy(changed), 0.0),
+        (tidy(changed & colour), 0.0),
+        (tidy(changed & colour, 9), 0.0),
+        (tidy(changed & ~(hand & ~colour)), 0.0),
+        (tidy(changed & ~fleeting), 0.0),
+        (tidy(stands_out & ~(hand & ~colour)), 0.8),
+        (tidy(stands_out & ~(hand & ~colour) & ~fleeting), 0.8),
+        (tidy(stands_out & colour), 0.8),
+    ]
+    if look is not None:
+        others = np.maximum(
+            likelihood(footage.hand_hist, image), likelihood(footage.rest_hist, image)
+        )
+        alike = changed & (likelihood(look, image) > others)
+        views += [(tidy(alike), 0.0), (tidy(alike, 9), 0.0)]
+    blobs: list[_Blob] = []
+    for pixels, whole in views:
+        for mask in _parts(pixels, h * w, _MIN_SHARE, _MAX_SHARE):
+            share = float(changed[mask].mean())
+            if share < 0.3 or any(_iou(mask, other.mask) > 0.92 for other in blobs):
+                continue
+            x, y, bw, bh = bounding_box(mask)
+            area = int(mask.sum())
+            here, after = edge_contrast(lab, mask), edge_contrast(gone_lab, mask)
+            ring = grow(mask, 3) & ~mask
+            on_table = float((mask & table.hull).sum() / area)
+            cues = {
+                "edge": 1.2 * (here - after) / (here + after + 4),
+                # Few things are one colour all over: six tenths are as good as all.
+                "colour": 1.6 * telling * min(1.0, float(match[mask].mean()) / 0.6)
+                if words
+                else 0.0,
+                "border": -0.9 * _border_sides((x, y, bw, bh), w, h),
+                "hand": -0.8 * float(hand[mask].mean() - (colour & hand)[mask].mean()),
+                "fill": 0.5 * area / (bw * bh) + 0.4 * (solidity(mask) - 0.8),
+                "change": 0.02 * min(40.0, float(difference[mask].mean())),
+                "fleeting": 0.0 if words else -0.8 * float(fleeting[mask].mean()),
+                "ragged": -float(np.std(stays[mask])),
+                "small": -0.4 * max(0.0, float(np.log(0.004 * h * w / area))),
+                "ring": 0.5 if at_end and kind in _TOUCH_KINDS else float(table.seen[ring].mean()),
+                "whole": (whole * share - 0.4) if whole else 0.0,
+                "off table": -1.2 if on_table < 0.5 and not at_end else 0.0,
+            }
+            blobs.append(
+                _Blob(mask, area, (x, y, bw, bh), histogram(image[mask]), sum(cues.values()), cues)
+            )
+    best = sorted(blobs, key=lambda blob: -blob.score)[:40]
+    for blob in best[:12]:
+        blob.whole = _completed(blob, best, changed, hand, colour if words else None)
+        if look is None and not words and at_end:
+            blob.whole = blob.mask  # nothing tells the object from the arm yet
+        elif look is not None and (blob.whole & ~blob.mask).any():
+            surplus = histogram(image[blob.whole & ~blob.mask])
+            blob.whole = blob.whole if similarity(look, surplus) > 0.5 else blob.mask
+    return best
+
+
+def _completed(
+    blob: _Blob,
+    others: list[_Blob],
+    changed: np.ndarray,
+    hand: np.ndarray,
+    colour: np.ndarray | None,
+) -> np.ndarray:
+    """Return the blob joined with a larger one around it whose surplus changed as well: the rest of the object.
+
+    Where the object's colour is known, the rest lies within the convex hull of that colour: an arm does not.
+    """
+    for other in others:
+        if not blob.area < other.area < 8 * blob.area:
+            continue
+        if (other.mask & blob.mask).sum() < 0.6 * blob.area:
+            continue
+        whole = other.mask | blob.mask
+        if colour is not None:
+            whole &= grow(convex_hull(tidy(colour & whole) | blob.mask), 2)
+        surplus = whole & ~blob.mask
+        if (
+            surplus.any()
+            and changed[surplus].mean() > 0.7
+            and hand[surplus].mean() < 0.2
+            and solidity(whole) > 0.8
+            and other.cues["border"] > -0.5
+        ):
+            return whole
+    return blob.mask
+
+
+def _pair_cues(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[str, float]:
+    h, w = shape
+    overlap = float((a.mask & b.mask).sum() / min(a.area, b.area))
+    ax, ay = a.box[0] + a.box[2] / 2, a.box[1] + a.box[3] / 2
+    bx, by = b.box[0] + b.box[2] / 2, b.box[1] + b.box[3] / 2
+    cues = {
+        "alike": 1.2 * similarity(a.hist, b.hist),
+        "same size": -0.5 * abs(float(np.log(a.area / b.area))),
+        "pair": -0.3 - (1.0 if overlap > 0.9 else 0.0),
+    }
+    move_x, move_up = (bx - ax) / w, (ay - by) / h
+    if kind in ("push_left", "push_right"):
+        along = move_x if kind == "push_right" else -move_x
+        cues["direction"] = 0.8 * float(np.clip(along / 0.06, -1.5, 1))
+    elif kind == "lift_up":
+        cues["direction"] = 0.5 * float(np.clip(move_up / 0.08, -1, 1))
+    return cues
+
+
+def _parts(
+    pixels: Bool[np.ndarray, "h w"], total: int, min_share: float, max_share: float
+) -> list[Bool[np.ndarray, "h w"]]:
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(pixels.astype(np.uint8))
+    return [
+        parts == i
+        for i in range(1, count)
+        if min_share * total <= stats[i, cv2.CC_STAT_AREA] <= max_share * total
+    ]
+
+
+def _colour(image: UInt8[np.ndarray, "h w 3"], words: tuple[str, ...]) -> Bool[np.ndarray, "h w"]:
+    if not words:
+        return np.zeros(image.shape[:2], bool)
+    match: Float32[np.ndarray, "h w"] = colour_match(balance(image), words)
+    return match > 0.5
+
+
+def _border_sides(box: tuple[int, int, int, int], w: int, h: int) -> float:
+    x, y, bw, bh = box
+    return float(x <= 1) + float(x + bw >= w - 1) + float(y <= 1) + 0.3 * float(y + bh >= h - 1)
+
+
+def _iou(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / max(1, (a | b).sum()))

@@ -1,0 +1,309 @@
+"""Silhouettes become shapes on the table: fit position, yaw and proportions so that the outline matches the mask.
+
+Everything here is in camera heights (the camera stands 1 above the table); `scale.py` turns that into metres. A matching
+outline alone is ambiguous (faces swap, flat things thicken), so the noun's proportions hold the fit.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from v2p_data.geometry.camera import Camera, intrinsics
+from v2p_data.geometry.mesh import outline_points
+from v2p_data.geometry.pose import transform
+from v2p_data.scene.nouns import Noun
+from v2p_data.scene.segment import bounding_box
+
+_WORK_PX = 110
+"""Longer side of the crop in which silhouettes are compared."""
+_PRIOR_WEIGHT = 0.03
+"""Cost of proportions one sigma off the noun's, in units of IoU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """A shape whose silhouette matches a mask, in camera heights."""
+
+    size: tuple[float, float, float]
+    T_world_obj: Float[np.ndarray, "4 4"]
+    iou: float
+    cost: float
+    """1 - IoU plus what the proportions cost: comparable between fits of one mask."""
+
+
+def camera_above(
+    shape: tuple[int, int], pitch_rad: float, fov_rad: float, height: float = 1.0
+) -> Camera:
+    """Return the camera at (0, 0, height) that looks along +x, `pitch_rad` below the horizon.
+
+    `fov_rad` is the horizontal field of view; roll is zero.
+    """
+    h, w = shape
+    fovy = 2 * np.arctan(np.tan(fov_rad / 2) * h / w)
+    c, s = np.cos(pitch_rad), np.sin(pitch_rad)
+    forward, right = np.array([c, 0.0, -s]), np.array([0.0, -1.0, 0.0])
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return Camera(
+        width_px=w,
+        height_px=h,
+        K=intrinsics(w, h, float(fovy)),
+        T_world_cam=transform(rotation, np.array([0.0, 0.0, height])),
+    )
+
+
+class Silhouette:
+    """One mask, cropped and scaled so that comparing outlines is cheap."""
+
+    def __init__(
+        self,
+        mask: Bool[np.ndarray, "h w"],
+        unknown: Bool[np.ndarray, "h w"] | None,
+        camera: Camera,
+    ) -> None:
+        x, y, w, h = bounding_box(mask)
+        pad = int(0.35 * max(w, h)) + 3
+        self.camera, self.box = camera, (x, y, w, h)
+        self._offset = np.array([x - pad, y - pad], float)
+        size = (w + 2 * pad, h + 2 * pad)
+        self._zoom = _WORK_PX / max(size)
+        move = np.array(
+            [
+                [self._zoom, 0, -self._zoom * self._offset[0]],
+                [0, self._zoom, -self._zoom * self._offset[1]],
+            ]
+        )
+        self._size = (max(8, round(size[0] * self._zoom)), max(8, round(size[1] * self._zoom)))
+        warped = cv2.warpAffine(mask.astype(np.float32), move, self._size, flags=cv2.INTER_LINEAR)
+        inside = cv2.warpAffine(np.ones(mask.shape, np.float32), move, self._size) > 0.5
+        known = inside
+        if unknown is not None:
+            hidden = cv2.warpAffine((unknown & ~mask).astype(np.float32), move, self._size) > 0.5
+            known = inside & ~hidden
+        self._known = known
+        self._mask = (warped > 0.5) & known
+        self._area = int(self._mask.sum())
+
+    @property
+    def at_border(self) -> bool:
+        """Whether the picture's edge cuts the mask."""
+        x, y, w, h = self.box
+        return (
+            x <= 1
+            or y <= 1
+            or x + w >= self.camera.width_px - 1
+            or y + h >= self.camera.height_px - 1
+        )
+
+    def iou(self, points_world: Float[np.ndarray, "n 3"]) -> float:
+        """Return how well the convex hull of the projected points covers the mask."""
+        pixels = (self.camera.project(points_world) - self._offset) * self._zoom
+        if not np.isfinite(pixels).all() or np.abs(pixels).max() > 4000:
+            return -1.0
+        drawn = np.zeros(self._mask.shape, np.uint8)
+        # Pixel centres lie at one half, OpenCV counts them as whole numbers.
+        hull = cv2.convexHull(((pixels - 0.5) * 16).astype(np.int32))
+        cv2.fillConvexPoly(drawn, hull, 1, cv2.LINE_8, 4)
+        shape = (drawn > 0) & self._known
+        common = int((shape & self._mask).sum())
+        return common / max(1, int(shape.sum()) + self._area - common)
+
+
+def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
+    """Return the ways a noun's shape can rest, as rotations with what each costs: upright first, then lying."""
+    upright = np.eye(3)
+    if noun.form == "sphere":
+        return [(upright, 0.0)]
+    lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    if noun.form == "cylinder":
+        slender = noun.size_m[2] / noun.size_m[0]
+        return [(upright, 0.0)] + ([(lying, 0.04)] if slender > 0.9 else [])
+    on_side = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    smallest, largest = min(noun.size_m), max(noun.size_m)
+    return [(upright, 0.0)] + (
+        [(lying, 0.03), (on_side, 0.03)] if largest > 1.3 * smallest else []
+    )
+
+
+def fit_shape(
+    silhouette: Silhouette, noun: Noun, rest: Float[np.ndarray, "3 3"], *, thorough: bool = True
+) -> Fit:
+    """Return the noun's shape resting on the table in orientation `rest`, proportions free within the noun's spread."""
+    prior = np.array(noun.size_m)
+    spread = max(0.1, noun.spread * 0.8)
+    scale0, ground = _start(silhouette, prior)
+    free = {"box": [0, 1, 2], "cylinder": [0, 2], "sphere": [0]}[noun.form]
+
+    def size_of(v: np.ndarray) -> np.ndarray:
+        logs = np.zeros(3)
+        logs[free] = v[3:]
+        if noun.form != "box":
+            logs[1] = logs[0]
+        if noun.form == "sphere":
+            logs[2] = logs[0]
+        return prior * scale0 * np.exp(logs)
+
+    def cost(v: np.ndarray) -> float:
+        size = size_of(v)
+        T = _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
+        points = outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
+        off = (v[3:] - v[3:].mean()) / spread
+        return 1 - silhouette.iou(points) + _PRIOR_WEIGHT * float((off**2).sum())
+
+    turns = _yaw_starts(noun, rest, thorough)
+    starts = [np.array([0.0, 0.0, yaw, *np.zeros(len(free))]) for yaw in turns]
+    best = _search(cost, starts, np.array([0.25, 0.25, 0.3, *[0.25] * len(free)]))
+    size = size_of(best)
+    T = _resting(ground + best[:2] * scale0 * prior.max(), best[2], rest, size)
+    points = outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
+    sizes = (float(size[0]), float(size[1]), float(size[2]))
+    return Fit(size=sizes, T_world_obj=T, iou=silhouette.iou(points), cost=cost(best))
+
+
+def fit_pose(
+    silhouette: Silhouette,
+    noun: Noun,
+    size: tuple[float, float, float],
+    rest: Float[np.ndarray, "3 3"],
+    *,
+    yaw_near: float | None = None,
+    support: float = 0.0,
+) -> Fit:
+    """Return where a shape of known size rests in orientation `rest`, `support` above the table.
+
+    `yaw_near` holds the yaw where the outline does not decide it.
+    """
+    extents = np.array(size)
+    points0 = outline_points(noun.form, size, noun.taper)
+    _, ground = _start(silhouette, extents)
+
+    def place(v: np.ndarray) -> np.ndarray:
+        T = _resting(ground + v[:2] * extents.max(), v[2], rest, extents)
+        T[2, 3] += support
+        return T
+
+    def cost(v: np.ndarray) -> float:
+        T = place(v)
+        turn = 0.0
+        if yaw_near is not None:
+            turn = 0.01 * (1 - np.cos(2 * (v[2] - yaw_near)))
+        return 1 - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3]) + turn
+
+    turns = _yaw_starts(noun, rest, thorough=True)
+    if yaw_near is not None:
+        turns = [*turns, yaw_near]
+    starts = [np.array([0.0, 0.0, yaw]) for yaw in turns]
+    best = _search(cost, starts, np.array([0.25, 0.25, 0.3]))
+    T = place(best)
+    iou = silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3])
+    return Fit(size=size, T_world_obj=T, iou=iou, cost=cost(best))
+
+
+def fit_lifted(
+    silhouette: Silhouette,
+    noun: Noun,
+    size: tuple[float, float, float],
+    T_first: Float[np.ndarray, "4 4"],
+) -> Fit:
+    """Return where a shape of known size is in the air, as far from the camera along the table as at first.
+
+    One view does not show the depth of something in mid-air; lifted straight up is the assumption.
+    """
+    points0 = outline_points(noun.form, size, noun.taper)
+    reach = max(size)
+    x, y, w, h = silhouette.box
+    start = on_wall(silhouette.camera, np.array([x + w / 2, y + h / 2]), T_first[0, 3])
+    yaw0 = Rotation.from_matrix(T_first[:3, :3])
+
+    def place(v: np.ndarray) -> np.ndarray:
+        turned = (Rotation.from_rotvec([0, 0, v[2]]) * yaw0).as_matrix()
+        height = max(start[2] + v[1] * reach, lowest(size, noun.form, turned))
+        return transform(turned, np.array([T_first[0, 3], start[1] + v[0] * reach, height]))
+
+    def cost(v: np.ndarray) -> float:
+        T = place(v)
+        return 1 - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3]) + 0.01 * (1 - np.cos(v[2]))
+
+    best = _search(
+        cost,
+        [np.zeros(3), np.array([0, 0, 0.5]), np.array([0, 0, -0.5])],
+        np.array([0.2, 0.2, 0.2]),
+    )
+    T = place(best)
+    iou = silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3])
+    return Fit(size=size, T_world_obj=T, iou=iou, cost=cost(best))
+
+
+def on_wall(camera: Camera, pixel: Float[np.ndarray, "2"], x: float) -> Float[np.ndarray, "3"]:
+    """Return where the pixel's ray meets the upright plane at distance `x` along the table."""
+    ray = camera.rays_world(pixel[None])[0]
+    origin = camera.T_world_cam[:3, 3]
+    return origin + ray * (x - origin[0]) / max(ray[0], 1e-6)
+
+
+def lowest(
+    size: tuple[float, float, float], form: str, rotation: Float[np.ndarray, "3 3"]
+) -> float:
+    """Return how far the centre is above the lowest point of the turned shape."""
+    if form == "sphere":
+        return size[0] / 2
+    if form == "cylinder":
+        axis_z = abs(float(rotation[2, 2]))
+        return size[2] / 2 * axis_z + size[0] / 2 * float(np.sqrt(max(0.0, 1 - axis_z**2)))
+    return float(np.abs(rotation[2]) @ np.array(size) / 2)
+
+
+def yaw_of(rotation: Float[np.ndarray, "3 3"], rest: Float[np.ndarray, "3 3"]) -> float:
+    """Return the yaw that takes the resting orientation `rest` to `rotation`."""
+    turn = rotation @ rest.T
+    return float(np.arctan2(turn[1, 0], turn[0, 0]))
+
+
+def _resting(
+    xy: np.ndarray, yaw: float, rest: np.ndarray, size: np.ndarray
+) -> Float[np.ndarray, "4 4"]:
+    c, s = np.cos(yaw), np.sin(yaw)
+    turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ rest
+    height = float(np.abs(rest[2]) @ size / 2)
+    return transform(turned, np.array([xy[0], xy[1], height]))
+
+
+def _start(silhouette: Silhouette, prior: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return camera heights per prior unit, and the table point under the mask."""
+    x, y, w, h = silhouette.box
+    camera = silhouette.camera
+    foot = camera.on_plane(np.array([[x + w / 2, y + 0.8 * h]]))[0]
+    if not np.isfinite(foot).all() or foot[0] > 12:
+        foot = np.array([12.0, 0.0, 0.0])
+    depth = float(camera.T_world_cam[:3, 2] @ (foot - camera.T_world_cam[:3, 3]))
+    seen = np.sqrt(w * h) * max(depth, 0.2) / camera.K[0, 0]
+    usual = float(np.cbrt(np.prod(np.maximum(prior, 0.25 * prior.max()))))
+    return seen / usual, foot[:2]
+
+
+def _yaw_starts(noun: Noun, rest: np.ndarray, thorough: bool) -> list[float]:
+    lying_round = noun.form == "cylinder" and abs(rest[2, 2]) < 0.5
+    if noun.form == "box" or lying_round:
+        return [np.radians(a) for a in (range(0, 180, 30) if thorough else range(0, 180, 45))]
+    return [0.0]
+
+
+def _search(cost, starts: list[np.ndarray], step: np.ndarray) -> np.ndarray:  # noqa: ANN001
+    """Return the best of short Nelder-Mead runs, the best two of them carried to the end."""
+
+    def run(start: np.ndarray, iterations: int, reach: float) -> tuple[float, np.ndarray]:
+        simplex = np.array([start, *(start + np.diag(step * reach))])
+        options = {
+            "maxiter": iterations,
+            "xatol": 0.003,
+            "fatol": 0.0005,
+            "initial_simplex": simplex,
+        }
+        found = minimize(cost, start, method="Nelder-Mead", options=options)
+        return float(found.fun), found.x
+
+    short = sorted((run(start, 40, 1.0) for start in starts), key=lambda r: r[0])[:2]
+    return min((run(x, 220, 0.5) for _, x in short), key=lambda r: r[0])[1]

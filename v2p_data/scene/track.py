@@ -1,0 +1,155 @@
+"""The object's mask in the frames between the first and the last.
+
+Optical flow carries the mask on; colour decides what of it is object. The decisive rule: a pixel outside the first mask
+that still looks as in the first frame is not the object. A track that got lost says so by a low quality.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from v2p_data.scene.colour import histogram, likelihood, similarity
+from v2p_data.scene.footage import Footage
+from v2p_data.scene.ground import Moved
+from v2p_data.scene.segment import bounding_box, grow, tidy
+
+_SAME_LAB = 6.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """Masks at working size, one per footage frame, and how far to believe each (0 to 1)."""
+
+    masks: Bool[np.ndarray, "time h w"]
+    quality: Float[np.ndarray, "time"]
+
+
+def track(footage: Footage, moved: Moved, *, every: int = 1) -> Track:
+    """Return the object's mask over time: forwards from the first and backwards from the last outline.
+
+    At each frame the direction is taken whose mask looks more like the object. `every` skips frames for speed; the
+    skipped ones repeat their neighbour with no quality.
+    """
+    n = len(footage.rgb)
+    steps = sorted({*range(0, n, every), n - 1})
+    forward = _follow(footage, steps, moved.first, moved.look, anchor=0)
+    backward = _follow(footage, steps[::-1], moved.last, moved.look, anchor=n - 1)[::-1]
+    area_first, area_last = moved.first.sum(), moved.last.sum()
+    masks = np.zeros((n, *footage.shape), bool)
+    quality = np.zeros(n)
+    for k, i in enumerate(steps):
+        share = i / max(1, n - 1)
+        area = float(area_first ** (1 - share) * area_last**share)
+        marks = [
+            _likeness(footage, i, mask, moved.look, area) - 0.15 * away
+            for mask, away in ((forward[k], share), (backward[k], 1 - share))
+        ]
+        best = int(marks[1] > marks[0])
+        masks[i] = (forward[k], backward[k])[best]
+        quality[i] = max(0.0, marks[best])
+    masks[0], masks[-1] = moved.first, moved.last
+    quality[0] = quality[-1] = 1.0
+    for i in range(1, n):
+        if not masks[i].any():
+            masks[i] = masks[i - 1]
+    return Track(masks=masks, quality=quality)
+
+
+def _follow(
+    footage: Footage,
+    steps: list[int],
+    start: Bool[np.ndarray, "h w"],
+    look: Float[np.ndarray, "l a b"],
+    anchor: int,
+) -> list[Bool[np.ndarray, "h w"]]:
+    h, w = footage.shape
+    flow_of = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    grid_y, grid_x = np.mgrid[:h, :w].astype(np.float32)
+    before = cv2.GaussianBlur(footage.lab[anchor], (0, 0), 1)
+    home, area = grow(start, 2), int(start.sum())
+    mask, out = start, [start]
+    grey = cv2.cvtColor(footage.rgb[anchor], cv2.COLOR_RGB2GRAY)
+    for i in steps[1:]:
+        image = footage.rgb[i]
+        now = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        x, y, bw, bh = bounding_box(mask)
+        reach = int(max(24, 0.8 * max(bw, bh)))
+        rows = slice(max(0, y - reach), min(h, y + bh + reach))
+        cols = slice(max(0, x - reach), min(w, x + bw + reach))
+        crop_now, crop_old = (
+            np.ascontiguousarray(now[rows, cols]),
+            np.ascontiguousarray(grey[rows, cols]),
+        )
+        back = flow_of.calc(crop_now, crop_old, None)  # type: ignore[call-overload]
+        ch, cw = crop_now.shape
+        carried = cv2.remap(
+            mask[rows, cols].astype(np.float32),
+            grid_x[:ch, :cw] + back[..., 0],
+            grid_y[:ch, :cw] + back[..., 1],
+            cv2.INTER_LINEAR,
+        )
+        prior = cv2.GaussianBlur(carried, (0, 0), 2)
+        part = image[rows, cols]
+        around = part[prior < 0.05]
+        local = histogram(around) if len(around) > 100 else footage.rest_hist
+        others = np.maximum(likelihood(local, part), likelihood(footage.hand_hist, part))
+        others = np.maximum(others, 0.7 * likelihood(footage.rest_hist, part))
+        ratio = np.log(likelihood(look, part) + 1e-6) - np.log(others + 1e-6)
+        vote = cv2.GaussianBlur((ratio + 3 * (prior - 0.35)).astype(np.float32), (0, 0), 1)
+        smooth = cv2.GaussianBlur(footage.lab[i][rows, cols], (0, 0), 1)
+        still = np.linalg.norm(smooth - before[rows, cols], axis=-1) < _SAME_LAB
+        floor = 0.03 if mask.sum() < 1.3 * area else 0.3
+        found = tidy((vote > 0) & (prior > floor) & ~(still & ~home[rows, cols]))
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
+        mask = np.zeros((h, w), bool)
+        if count > 1:
+            big = stats[1:, 4] > 0.15 * stats[1:, 4].max()
+            mask[rows, cols] = np.isin(parts, 1 + np.flatnonzero(big))
+        else:
+            mask[rows, cols] = prior > 0.5
+        if mask.sum() < 0.45 * area:
+            mask = _find_again(footage, i, look, before, home, area, mask)
+        if mask.sum() < 15:
+            mask = out[-1]
+        out.append(mask)
+        grey = now
+    return out
+
+
+def _find_again(
+    footage: Footage,
+    i: int,
+    look: Float[np.ndarray, "l a b"],
+    before: np.ndarray,
+    home: Bool[np.ndarray, "h w"],
+    area: int,
+    mask: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    """Return the changed region that looks most like the object, or the given mask where none is better."""
+    image = footage.rgb[i]
+    others = np.maximum(
+        likelihood(footage.hand_hist, image), 0.7 * likelihood(footage.rest_hist, image)
+    )
+    ratio = np.log(likelihood(look, image) + 1e-6) - np.log(others + 1e-6)
+    changed = np.linalg.norm(cv2.GaussianBlur(footage.lab[i], (0, 0), 1) - before, axis=-1) > 7
+    pixels = (cv2.GaussianBlur(ratio.astype(np.float32), (0, 0), 1.5) > 0.3) & (changed | home)
+    count, parts = cv2.connectedComponents(tidy(pixels, 7).astype(np.uint8))
+    best, value = mask, _likeness(footage, i, mask, look, area) + 0.05
+    for c in range(1, min(count, 40)):
+        part = parts == c
+        likeness = _likeness(footage, i, part, look, area)
+        if likeness > value:
+            best, value = part, likeness
+    return best
+
+
+def _likeness(
+    footage: Footage, i: int, mask: Bool[np.ndarray, "h w"], look: np.ndarray, area: float
+) -> float:
+    size = int(mask.sum())
+    if size < 15:
+        return 0.0
+    alike = similarity(look, histogram(footage.rgb[i][mask]))
+    return alike * float(np.exp(-0.5 * np.log(size / area) ** 2))
