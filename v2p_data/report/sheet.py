@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int, UInt8
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.masks import MaskRenderer, Moment, labels_to_rgb
@@ -54,6 +54,11 @@ class Judged(Protocol):
     def successes(self) -> Bool[np.ndarray, "env"]: ...
 
     @property
+    def num_frames(self) -> Int[np.ndarray, "env"]:
+        """How many of the snapshots belong to each world's episode."""
+        ...
+
+    @property
     def snapshots(self) -> Sequence[Moment]:
         """All worlds, at moments in order of time."""
         ...
@@ -67,26 +72,26 @@ class Judged(Protocol):
 def write_contact_sheet(
     source: TaskBundle | World, judged: Judged, path: Path, cfg: SheetConfig | None = None
 ) -> None:
-    """Draw successful and failed episodes and write them as one PNG."""
+    """Draw successful and failed episodes, each from its own start to its own end, and write them as one PNG."""
     cfg = cfg or SheetConfig()
     chosen = [
         *np.flatnonzero(judged.successes)[: cfg.successes],
         *np.flatnonzero(~judged.successes)[: cfg.failures],
     ]
-    moments = evenly(len(judged.snapshots), cfg.moments)
-    films = draw_rollout(
-        source, [judged.snapshots[m] for m in moments], [int(e) for e in chosen], cfg.thumbnail_px
-    )
-    seconds = tuple(judged.snapshot_seconds[m] for m in moments)
-    rows = [
-        Row(
-            label=f"world {env}",
-            succeeded=bool(judged.successes[env]),
-            frames=film,
-            seconds=seconds,
-        )
-        for env, film in zip(chosen, films, strict=True)
-    ]
+    rows: list[Row] = []
+    # Twice the size, then averaged: the renderer does not smooth edges, for the masks' sake.
+    with MaskRenderer(source, 2 * cfg.thumbnail_px) as renderer:
+        for env in map(int, chosen):
+            moments = evenly(int(judged.num_frames[env]), cfg.moments)
+            film = draw_rollout(renderer, [judged.snapshots[m] for m in moments], env)
+            rows.append(
+                Row(
+                    label=f"world {env}",
+                    succeeded=bool(judged.successes[env]),
+                    frames=film,
+                    seconds=tuple(judged.snapshot_seconds[m] for m in moments),
+                )
+            )
     sheet = contact_sheet(rows, cfg)
     done, data = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))
     if not done:
@@ -95,20 +100,10 @@ def write_contact_sheet(
 
 
 def draw_rollout(
-    source: TaskBundle | World, snapshots: Sequence[Moment], envs: Sequence[int], size_px: int
-) -> UInt8[np.ndarray, "env time h w 3"]:
-    """Return the worlds `envs` at each snapshot, seen by the camera `view`."""
-    frames = np.zeros((len(envs), len(snapshots), size_px, size_px, 3), np.uint8)
-    # Twice the size, then averaged: the renderer does not smooth edges, for the masks' sake.
-    with MaskRenderer(source, 2 * size_px) as renderer:
-        for t, snapshot in enumerate(snapshots):
-            for k, env in enumerate(envs):
-                frames[k, t] = cv2.resize(
-                    draw_moment(renderer, snapshot, env),
-                    (size_px, size_px),
-                    interpolation=cv2.INTER_AREA,
-                )
-    return frames
+    renderer: MaskRenderer, snapshots: Sequence[Moment], env: int
+) -> UInt8[np.ndarray, "time h w 3"]:
+    """Return one world at each snapshot, seen by the camera `view`."""
+    return np.stack([draw_moment(renderer, snapshot, env) for snapshot in snapshots])
 
 
 def draw_moment(renderer: MaskRenderer, snapshot: Moment, env: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -120,19 +115,18 @@ def draw_moment(renderer: MaskRenderer, snapshot: Moment, env: int) -> UInt8[np.
 
 
 def contact_sheet(rows: Sequence[Row], cfg: SheetConfig) -> UInt8[np.ndarray, "h w 3"]:
-    """Return rows of labelled thumbnails, with the time above each column.
+    """Return rows of labelled thumbnails, each with the seconds since its episode's start.
 
     Of longer films `cfg.moments` frames are shown, first and last among them.
     """
-    side, gap, head = cfg.thumbnail_px, cfg.gap_px, 22
+    side, gap = cfg.thumbnail_px, cfg.gap_px
     columns = max((len(evenly(len(row.frames), cfg.moments)) for row in rows), default=0)
     width = cfg.label_px + columns * (side + gap)
-    sheet = np.full((head + max(1, len(rows)) * (side + gap), width, 3), GROUND, np.uint8)
+    sheet = np.full((max(1, len(rows)) * (side + gap), width, 3), GROUND, np.uint8)
     if not rows:
-        _write(sheet, "no episodes", 8, head, INK)
-        return sheet
+        _write(sheet, "no episodes", 8, 20, INK)
     for k, row in enumerate(rows):
-        top = head + k * (side + gap)
+        top = k * (side + gap)
         words, colour = ("success", GOOD) if row.succeeded else ("failure", BAD)
         cv2.rectangle(sheet, (0, top), (3, top + side - 1), colour, -1)
         _write(sheet, words, 10, top + 20, colour)
@@ -141,8 +135,9 @@ def contact_sheet(rows: Sequence[Row], cfg: SheetConfig) -> UInt8[np.ndarray, "h
             left = cfg.label_px + column * (side + gap)
             thumbnail = cv2.resize(row.frames[moment], (side, side), interpolation=cv2.INTER_AREA)
             sheet[top : top + side, left : left + side] = thumbnail
-            if k == 0:
-                _write(sheet, f"{row.seconds[moment]:.1f} s", left + 2, 15, INK)
+            time = f"{row.seconds[moment]:.1f} s"
+            _write(sheet, time, left + 5, top + 15, (0, 0, 0))
+            _write(sheet, time, left + 4, top + 14, (255, 255, 255))
     return sheet
 
 
