@@ -1,0 +1,170 @@
+import numpy as np
+import pytest
+
+from v2p_data.errors import V2PError
+from v2p_data.geometry.camera import Camera, intrinsics, look_at
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.task.referee import RULES, ObjectTrack, Trajectory, referee_success
+
+STEPS = 20
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+LYING = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)
+
+
+def thing(name: str, size=(0.04, 0.04, 0.04), role="manipulated", shape="box") -> SceneObject:
+    return SceneObject(
+        name=name, label=name, role=role, shape=shape, size_m=size, mass_kg=0.1, friction=0.8,
+        frames=(0, 1), poses_world=((0.0, 0.0, 0.02, *UPRIGHT), (0.0, 0.12, 0.02, *UPRIGHT)),
+        confidences=(1.0, 1.0),
+    )  # fmt: skip
+
+
+def scene(kind: str, *objects: SceneObject) -> Scene:
+    camera = Camera(
+        width_px=64, height_px=48, K=intrinsics(64, 48, 1.0),
+        T_world_cam=look_at(np.array([-0.5, 0.0, 0.5]), np.zeros(3)),
+    )  # fmt: skip
+    return Scene(
+        title="clip", video="clip.mp4", description="", kind=kind, objects=objects, camera=camera,
+        fps=20.0, num_frames=2, confidence=1.0,
+    )  # fmt: skip
+
+
+def track(
+    start, end, *, quat_end=UPRIGHT, touched_last=False, touched_before=True, size=(0.04,) * 3
+):
+    """Ten steps of moving in a straight line, then ten steps of rest, in one world."""
+    share = np.clip(np.arange(STEPS) / 10, 0, 1)[:, None]
+    pos = np.array(start) + share * (np.array(end) - np.array(start))
+    quat = np.where(share < 1, np.array(UPRIGHT), np.array(quat_end))
+    touched = np.zeros((STEPS, 1, 2), bool)
+    touched[3:10] = touched_before
+    touched[10:] = touched_last
+    return ObjectTrack(
+        pos=pos[:, None], quat_wxyz=quat[:, None], size_m=np.array([size], float), touched=touched
+    )
+
+
+def verdict(kind, tracks, *objects) -> bool:
+    trajectory = Trajectory(
+        objects=dict(zip([o.name for o in objects], tracks, strict=True)),
+        eef_pos=np.zeros((STEPS, 1, 3)),
+    )
+    return bool(referee_success(kind, scene(kind, *objects), trajectory)[0])
+
+
+BOX = thing("box")
+REF = thing("ref", role="reference")
+BOWL = thing("bowl", size=(0.12, 0.12, 0.05), role="container")
+HERE = (0.5, 0.0, 0.02)
+STILL = track((0.5, 0.2, 0.02), (0.5, 0.2, 0.02), touched_before=False)
+
+
+def test_a_lift_is_high_and_held_at_the_end():
+    up = (0.5, 0.0, 0.12)
+    assert verdict("lift_up", [track(HERE, up, touched_last=True)], BOX)
+    assert not verdict("lift_up", [track(HERE, up)], BOX)
+    assert not verdict("lift_up", [track(HERE, (0.5, 0.0, 0.07), touched_last=True)], BOX)
+
+
+def test_left_is_plus_y():
+    left = [track(HERE, (0.5, 0.1, 0.02))]
+    assert verdict("push_left", left, BOX)
+    assert not verdict("push_right", left, BOX)
+    assert verdict("push_right", [track(HERE, (0.5, -0.1, 0.02))], BOX)
+
+
+@pytest.mark.parametrize(
+    "cheat",
+    [
+        track(HERE, (0.5, 0.05, 0.02)),
+        track(HERE, (0.6, 0.1, 0.02)),
+        track(HERE, (0.5, 0.1, 0.02), quat_end=LYING),
+        track(HERE, (0.5, 0.1, 0.10), touched_last=True),
+        track(HERE, (0.5, 0.1, -0.01)),
+    ],
+    ids=["too short", "mostly forward", "toppled", "carried", "pressed through the table"],
+)
+def test_a_push_that_cheats_does_not_count(cheat):
+    assert not verdict("push_left", [cheat], BOX)
+
+
+def test_a_thing_tipped_over_lies_on_the_table():
+    tall = thing("box", size=(0.04, 0.04, 0.12))
+    size = (0.04, 0.04, 0.12)
+    start, lies, floats = (0.5, 0, 0.06), (0.5, 0.08, 0.02), (0.5, 0.08, 0.1)
+    assert verdict("tip_over", [track(start, lies, quat_end=LYING, size=size)], tall)
+    assert not verdict("tip_over", [track(start, (0.5, 0.1, 0.06), size=size)], tall)
+    assert not verdict("tip_over", [track(start, floats, quat_end=LYING, size=size)], tall)
+
+
+def test_next_to_means_a_small_gap_to_a_thing_that_stayed():
+    # Outlines of 4 cm boxes touch at 4 cm between centres; 6 cm leaves a gap of 2 cm.
+    assert verdict("push_next_to", [track(HERE, (0.5, 0.14, 0.02)), STILL], BOX, REF)
+    assert not verdict("push_next_to", [track(HERE, (0.5, 0.12, 0.02)), STILL], BOX, REF)
+    fled = track((0.5, 0.2, 0.02), (0.5, 0.24, 0.02))
+    assert not verdict("push_next_to", [track(HERE, (0.5, 0.18, 0.02)), fled], BOX, REF)
+
+
+def carried(end, *, touched_last=False) -> ObjectTrack:
+    path = track(HERE, end, touched_last=touched_last)
+    pos = path.pos.copy()
+    pos[5, 0, 2] = 0.15
+    return ObjectTrack(pos=pos, quat_wxyz=path.quat_wxyz, size_m=path.size_m, touched=path.touched)
+
+
+def bowl_track() -> ObjectTrack:
+    at = (0.5, 0.2, 0.025)
+    return track(at, at, touched_before=False, size=(0.12, 0.12, 0.05))
+
+
+def test_inserted_means_carried_in_let_go_and_above_the_floor():
+    inside = (0.5, 0.21, 0.03)
+    assert verdict("insert", [carried(inside), bowl_track()], BOX, BOWL)
+    assert not verdict("insert", [carried(inside, touched_last=True), bowl_track()], BOX, BOWL)
+    assert not verdict("insert", [carried((0.5, 0.21, 0.0)), bowl_track()], BOX, BOWL)
+    assert not verdict("insert", [track(HERE, (0.5, 0.12, 0.02)), bowl_track()], BOX, BOWL)
+
+
+def test_a_thing_lowered_into_a_bowl_was_not_thrown():
+    assert not verdict("throw_into", [carried((0.5, 0.2, 0.03)), bowl_track()], BOX, BOWL)
+    far = carried((0.5, 0.2, 0.03))
+    far.touched[5:] = False  # let go 10 cm before the bowl's middle ...
+    assert not verdict("throw_into", [far, bowl_track()], BOX, BOWL)
+    far.touched[1:] = False
+    far.touched[0] = True  # ... and here 20 cm before it, 14 cm before its rim
+    assert verdict("throw_into", [far, bowl_track()], BOX, BOWL)
+
+
+def test_in_front_of_is_the_robots_side():
+    near, far = (0.44, 0.2, 0.02), (0.56, 0.2, 0.02)
+    assert verdict("drop_in_front_of", [carried(near), STILL], BOX, REF)
+    assert not verdict("drop_in_front_of", [carried(far), STILL], BOX, REF)
+
+
+def test_a_lid_toppled_is_not_uncovered():
+    lid = thing("lid", size=(0.08, 0.08, 0.04), role="cover")
+    under = track(HERE, HERE, touched_before=False)
+    lifted = track(HERE, (0.5, 0.2, 0.02), size=(0.08, 0.08, 0.04))
+    toppled = track(HERE, (0.5, 0.2, 0.04), quat_end=LYING, size=(0.08, 0.08, 0.04))
+    assert verdict("uncover", [lifted, under], lid, REF)
+    assert not verdict("uncover", [toppled, under], lid, REF)
+
+
+def test_the_tool_must_do_the_pushing():
+    tool = track((0.5, -0.1, 0.02), (0.5, 0.0, 0.02), touched_last=True)
+    by_tool = track(HERE, (0.5, 0.1, 0.02), touched_before=False)
+    by_hand = track(HERE, (0.5, 0.1, 0.02))
+    assert verdict("push_with", [by_tool, tool], BOX, REF)
+    assert not verdict("push_with", [by_hand, tool], BOX, REF)
+
+
+@pytest.mark.parametrize("kind", sorted(RULES))
+def test_doing_nothing_is_no_success(kind):
+    still = track(HERE, HERE, touched_before=False)
+    assert not verdict(kind, [still, STILL], BOX, REF)
+
+
+def test_an_unknown_kind_is_named():
+    with pytest.raises(V2PError, match="Did you mean 'lift_up'"):
+        verdict("lift_upp", [STILL], BOX)
