@@ -134,7 +134,8 @@ class Case:
         between = self.other.pos[time] - self.thing.pos[time]
         between[:, 2] = 0.0
         distance = np.linalg.norm(between, axis=-1)
-        u = between / np.maximum(distance, 1e-9)[:, None]
+        u = np.where(distance[:, None] > 1e-6, between, [1.0, 0.0, 0.0])
+        u = u / np.linalg.norm(u, axis=-1, keepdims=True)
         return distance - self.reach(self.thing, u, time) - self.reach(self.other, -u, time)
 
     def within(self) -> Bool[np.ndarray, "env"]:
