@@ -77,15 +77,25 @@ class FakeRun:
         counts = {"kind": "lift_up", "objects": 1}
         return self.record(folder, counts=counts, recipe={"config": {"caption": caption}})
 
-    def task(self, item: str, code="class LiftMug(Task):\n    ...\n", audit=None) -> Path:
+    def task(self, item: str, code="class LiftMug(Task):\n    ...\n", text="") -> Path:
+        """`text` is put wherever a task's files hold free text."""
         folder = self.folder("task", item)
         (folder / "task.py").write_text(code)
-        audit = audit or {
-            "passed": True,
-            "checks": [{"check": "false at reset", "passed": True, "value": 0.0}],
-        }
+        audit = {
+            "score": 0.85,
+            "checks": [
+                {"name": "reset", "asks": text or "false at every reset?", "passed": True, "share": 0.0},
+                {"name": "becomes_true", "asks": "true after a plausible displacement?", "passed": True, "share": 0.071},
+                {"name": "flung", "asks": "false when it flies past?", "passed": False, "share": 0.25},
+            ],
+        }  # fmt: skip
+        samples = [
+            {"runnable": False, "error": text or "NameError: mug", "score": 0.0, "audit": {}},
+            {"runnable": True, "error": "", "score": 0.85, "audit": audit},
+        ]
         (folder / "task.json").write_text(json.dumps({"kind": "lift_up", "audit": audit}))
-        return self.record(folder, counts={"kind": "lift_up", "picked": 3}, seconds=3.0)
+        (folder / "audit.json").write_text(json.dumps({"picked": 1, "samples": samples}))
+        return self.record(folder, counts={"kind": "lift_up", "picked": 1}, seconds=3.0)
 
     def expert(self, item: str, rejected=None) -> Path:
         folder = self.folder("expert", item)
@@ -115,7 +125,9 @@ class FakeRun:
                 {"id": "b", "reason": "not_successful", "detail": "out of time", "value": 0.5},
             ],
         )
-        return self.record(folder, counts={"episodes": count, "frames": 60 * count}, seconds=42.0)
+        return self.record(
+            folder, counts={"episodes": count, "frames": 60 * count, "rollouts": 5}, seconds=42.0
+        )
 
     def dataset(self, item="demo") -> Path:
         counts = {"episodes": 3, "frames": 180, "repo_id": f"anna/{item}"}

@@ -80,8 +80,9 @@ def test_the_summary_holds_the_numbers_that_matter(whole):
 def test_each_video_has_its_caption_objects_task_expert_and_episodes(whole):
     for words in (
         "Lifting a mug", "8.0 \u00d7 8.0 \u00d7 10.0", "noun table: mug", "250 g", "volume and density", "a weak shadow",
-        "class LiftMug(Task):", "false at reset", "60 of 64, 95 % interval 85 % to 98 %", "Success while training",
-        "lift_mug_0000", "lift_mug_0002", "background 0, robot 64, mug 128", "gripper",
+        "class LiftMug(Task):", "false at every reset?", "after 7.1 cm", "true in 25 % of moments",
+        "2 task codes were tried", "1, picked", "NameError: mug", "60 of 64, 95 % interval 85 % to 98 %", "Success while training",
+        "lift_mug_0000", "lift_mug_0002", "3 episodes were kept from 5 rollouts", "background 0, robot 64, mug 128", "gripper",
     ):  # fmt: skip
         assert words in whole.text
     alts = [a["alt"] for a in whole.of("img")] + [a["aria-label"] for a in whole.of("video")]
@@ -145,7 +146,7 @@ def test_the_page_is_one_file_that_loads_nothing(run):
 
 def test_hostile_text_is_shown_and_never_run(run):
     run.scene("evil", HOSTILE, video=HOSTILE)
-    run.task("evil", code=HOSTILE, audit={HOSTILE: HOSTILE, "rows": [{HOSTILE: HOSTILE}]})
+    run.task("evil", code=HOSTILE, text=HOSTILE)
     run.rejected("expert", "evil", HOSTILE, HOSTILE)
     run.rejected("scene", "evil2", "reason", HOSTILE, recipe={"config": {"caption": HOSTILE}})
     run.record(run.folder("dataset", "d"), counts={"episodes": 1, "frames": 1, "repo_id": HOSTILE})
@@ -219,7 +220,10 @@ def test_a_page_is_safe_from_broken_files(run):
     (scene / "scene.json").write_text('{"schema": 1, "objects": 3}')
     (scene / "overlay.mp4").write_bytes(b"no film")
     (run.folder("scene", "lift_mug") / "mug.obj").write_text("v 1 2\nf 1 2 9\n")
-    (run.folder("task", "lift_mug") / "task.json").write_text("[1, 2]")
+    (run.folder("task", "lift_mug") / "task.json").write_text(
+        '{"audit": {"checks": [3, {"share": "x"}], "score": "high"}}'
+    )
+    (run.folder("task", "lift_mug") / "audit.json").write_text("[1, 2]")
     (run.folder("expert", "lift_mug") / "curve.csv").write_bytes(b"\xff\xfe steps\n1,2,3")
     (run.folder("expert", "lift_mug") / "sheet.png").write_bytes(b"no picture")
     (run.folder("episodes", "lift_mug") / "episodes" / "lift_mug_0000.npz").write_bytes(

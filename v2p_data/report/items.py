@@ -1,6 +1,5 @@
 """One video's part of the page: what was understood, which task it became, how it was learned, sample episodes."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +22,16 @@ from v2p_data.report.media import (
     picture_uri,
     png_uri,
 )
-from v2p_data.report.reading import ITEM_STAGES, Rate, Result, Run, rate_of, read_curve, read_json
+from v2p_data.report.reading import (
+    ITEM_STAGES,
+    Rate,
+    Result,
+    Run,
+    number,
+    rate_of,
+    read_curve,
+    read_json,
+)
 from v2p_data.scene.scene import Scene, SceneObject
 
 STRIP_MOMENTS = 6
@@ -53,11 +61,23 @@ class EpisodeView:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
-    """Any flat JSON as rows under a head."""
+class CheckView:
+    """One question of the audit."""
 
-    head: list[str]
-    rows: list[list[str]]
+    asks: str
+    passed: bool
+    measured: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleView:
+    """One of the task codes that were written."""
+
+    is_picked: bool
+    runnable: bool
+    score: float | None
+    trouble: str
+    """Why it was not better: an error, a veto, the checks that failed."""
 
 
 @dataclass(kw_only=True)
@@ -78,7 +98,9 @@ class ItemView:
     objects: list[ObjectView] = field(default_factory=list[ObjectView])
     code: str = ""
     task: dict[str, Any] = field(default_factory=dict[str, Any])
-    tables: list[tuple[str, Table]] = field(default_factory=list[tuple[str, Table]])
+    audit_score: float | None = None
+    checks: list[CheckView] = field(default_factory=list[CheckView])
+    samples: list[SampleView] = field(default_factory=list[SampleView])
     rate: Rate | None = None
     charts: list[Markup] = field(default_factory=list[Markup])
     sheet: Medium | None = None
@@ -173,11 +195,16 @@ def _mesh_picture(folder: Path, obj: SceneObject, size_px: int) -> str | None:
 def _add_task(view: ItemView, result: Result) -> None:
     code = result.folder / "task.py"
     view.code = code.read_text(errors="replace") if code.is_file() else ""
-    task = read_json(result.folder / "task.json")
-    view.task = task if isinstance(task, dict) else {}
+    view.task = _dict(read_json(result.folder / "task.json"))
     view.kind = str(view.task.get("kind") or view.kind)
-    audit = read_json(result.folder / "audit.json") or view.task.get("audit")
-    view.tables += tables_of(audit, "Audit against the video")
+    audit = _dict(view.task.get("audit"))
+    view.audit_score = number(audit.get("score"))
+    view.checks = [check_view(check) for check in _dicts(audit.get("checks"))]
+    table = _dict(read_json(result.folder / "audit.json"))
+    view.samples = [
+        _sample_view(sample, k == table.get("picked"))
+        for k, sample in enumerate(_dicts(table.get("samples")))
+    ]
 
 
 def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
@@ -265,39 +292,48 @@ def _note_older_inputs(view: ItemView) -> None:
                 )
 
 
-# --- pieces ------------------------------------------------------------------------------------------------
+# --- pieces --------------------------------------------------------------------------------------------------
 
 
-def tables_of(data: Any, title: str) -> list[tuple[str, Table]]:
-    """Return JSON as titled tables: a list of objects as rows, anything else as name and value."""
-    if isinstance(data, list) and data and all(isinstance(row, dict) for row in data):
-        head = list(dict.fromkeys(str(k) for row in data for k in row))
-        rows = [[_cell(row.get(k)) for k in head] for row in data]
-        return [(title, Table(head=head, rows=rows))]
-    if not isinstance(data, dict) or not data:
-        return []
-    flat = {k: v for k, v in data.items() if not isinstance(v, dict | list) or not v}
-    nested = {k: v for k, v in data.items() if k not in flat}
-    tables: list[tuple[str, Table]] = []
-    if flat:
-        rows = [[str(k), _cell(v)] for k, v in flat.items()]
-        tables.append((title, Table(head=["check", "result"], rows=rows)))
-    for key, value in nested.items():
-        inner = tables_of(value, f"{title}: {key}")
-        tables += inner or [(f"{title}: {key}", Table(head=["value"], rows=[[_cell(value)]]))]
-    return tables
+def check_view(check: Mapping[str, Any]) -> CheckView:
+    """Return a line of the audit with what was measured in words."""
+    name, share = check.get("name"), number(check.get("share"))
+    if share is None:
+        measured = ""
+    elif name == "becomes_true":
+        measured = f"after {100 * share:.1f} cm" if share >= 0 else "never"
+    elif name == "reward_rises":
+        measured = f"by {share:.3g}"
+    elif name == "no_warnings":
+        measured = f"{share:.0f} warnings" if share != 1 else "1 warning"
+    else:
+        measured = f"true in {100 * share:.0f} % of moments"
+    return CheckView(
+        asks=str(check.get("asks") or name or ""),
+        passed=check.get("passed") is True,
+        measured=measured,
+    )
 
 
-def _cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, dict | list):
-        return json.dumps(value, ensure_ascii=False)
-    return str(value)
+def _sample_view(sample: Mapping[str, Any], is_picked: bool) -> SampleView:
+    audit = _dict(sample.get("audit"))
+    failed = [
+        str(c.get("asks")) for c in _dicts(audit.get("checks")) if c.get("passed") is not True
+    ]
+    return SampleView(
+        is_picked=is_picked,
+        runnable=sample.get("runnable") is True,
+        score=number(sample.get("score")),
+        trouble=str(sample.get("error") or audit.get("vetoed") or " ".join(failed)),
+    )
+
+
+def _dict(data: Any) -> dict[str, Any]:
+    return data if isinstance(data, dict) else {}
+
+
+def _dicts(data: Any) -> list[dict[str, Any]]:
+    return [row for row in data if isinstance(row, dict)] if isinstance(data, list) else []
 
 
 def expert_charts(curve: Mapping[str, np.ndarray]) -> list[Markup]:
