@@ -9,10 +9,12 @@ from typing import Literal
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
-from lerobot.optim import AdamWConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 BACKBONE_WEIGHTS = "ResNet18_Weights.IMAGENET1K_V1"
 """The one set of pretrained weights this policy knows."""
+LONGEST_TRAINING = 1_000_000_000
+"""Steps, more than anyone trains for: LeRobot shortens a schedule to fit, but never stretches one."""
 CameraInput = Literal["auto", "mask", "rgb"]
 
 
@@ -35,9 +37,6 @@ class V2PBCConfig(PreTrainedConfig):
     cameras with 'mask' in their name, `rgb` for the others."""
     mask_greys: tuple[int, ...] = (0, 64, 128, 192, 255, 31, 95, 159, 223)
     """Grey (0 to 255) of each label of a label image; a pixel belongs to the nearest."""
-    pool: Literal["average", "keypoints"] = "keypoints"
-    """How the backbone's last map becomes a vector. `average` is ResNet's own and forgets where things are;
-    `keypoints` adds the expected image coordinates of 32 learnt features (spatial softmax)."""
 
     pretrained_backbone_weights: str | None = BACKBONE_WEIGHTS
     """Used when the file lies in torch's cache (nothing is ever downloaded); null starts from random weights."""
@@ -56,6 +55,9 @@ class V2PBCConfig(PreTrainedConfig):
     """Learning rate of everything but a pretrained backbone."""
     optimizer_lr_backbone: float | None = None
     """Learning rate of the backbone. Null: 3e-5 when its weights are pretrained, else `optimizer_lr`."""
+    lr_schedule: Literal["cosine", "constant"] = "cosine"
+    """`cosine`: from full down to a hundredth over the training, after a warm-up of a fiftieth; better for short
+    trainings. `constant` is the paper's."""
     optimizer_weight_decay: float = 1e-4
     grad_clip_norm: float = 10.0
 
@@ -103,8 +105,15 @@ class V2PBCConfig(PreTrainedConfig):
             grad_clip_norm=self.grad_clip_norm,
         )
 
-    def get_scheduler_preset(self) -> None:
-        return None
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig | None:
+        if self.lr_schedule == "constant":
+            return None
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=LONGEST_TRAINING // 50,
+            num_decay_steps=LONGEST_TRAINING,
+            peak_lr=1.0,
+            decay_lr=0.01,
+        )
 
     def validate_features(self) -> None:
         if not self.image_features:

@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 BACKBONE_DIM = 512
-NUM_KEYPOINTS = 32
 PRETRAINED_BACKBONE_LR = 3e-5
 
 
@@ -89,22 +88,6 @@ def mask_stem(
     return torch.einsum("ockl,nc->onkl", rgb_weight, as_seen)
 
 
-class SpatialSoftmax(nn.Module):
-    """Where each of a few learnt features is, in image coordinates from -1 to 1."""
-
-    def __init__(self, in_channels: int, num_keypoints: int) -> None:
-        super().__init__()
-        self.features = nn.Conv2d(in_channels, num_keypoints, 1)
-
-    def forward(self, maps: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch xy"]:
-        heat = self.features(maps)
-        height, width = heat.shape[-2:]
-        share = heat.flatten(2).softmax(-1).unflatten(2, (height, width))
-        x = torch.linspace(-1, 1, width, device=heat.device, dtype=heat.dtype)
-        y = torch.linspace(-1, 1, height, device=heat.device, dtype=heat.dtype)
-        return torch.cat([(share.sum(2) * x).sum(-1), (share.sum(3) * y).sum(-1)], 1)
-
-
 class CameraEncoder(nn.Module):
     """One camera's frames become a vector: ResNet18 on all frames at once.
 
@@ -146,10 +129,6 @@ class CameraEncoder(nn.Module):
             net.layer3,
             net.layer4,
         )
-        self.keypoints = (
-            SpatialSoftmax(BACKBONE_DIM, NUM_KEYPOINTS) if cfg.pool == "keypoints" else None
-        )
-        self.out_dim = BACKBONE_DIM + (2 * NUM_KEYPOINTS if self.keypoints else 0)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
@@ -158,9 +137,7 @@ class CameraEncoder(nn.Module):
             small = label_channels(frames, self.greys, self.input_size_px).flatten(1, 2)
         else:
             small = shrink(((frames - self.mean) / self.std).flatten(1, 2), self.input_size_px)
-        maps = self.backbone(small)
-        average = maps.mean((2, 3))
-        return average if self.keypoints is None else torch.cat([average, self.keypoints(maps)], 1)
+        return self.backbone(small).mean((2, 3))
 
 
 class BCNet(nn.Module):
@@ -180,7 +157,7 @@ class BCNet(nn.Module):
             for key in self.camera_keys
         ]
         self.cameras = nn.ModuleList(cameras)
-        width = sum(camera.out_dim for camera in cameras)
+        width = BACKBONE_DIM * len(cameras)
         self.state = None
         if self.vector_keys:
             features = cfg.input_features or {}

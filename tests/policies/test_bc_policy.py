@@ -11,7 +11,6 @@ from policies.bc.configuration_v2p_bc import BACKBONE_WEIGHTS, V2PBCConfig
 from policies.bc.modeling_v2p_bc import (
     IMAGENET_MEAN,
     IMAGENET_STD,
-    SpatialSoftmax,
     V2PBCPolicy,
     label_channels,
     mask_stem,
@@ -102,19 +101,6 @@ def test_the_mask_stem_sees_labels_as_the_pretrained_one_sees_the_grey_picture()
 
     expected = nn.functional.conv2d(normalised, weight, padding=3)
     torch.testing.assert_close(from_labels, expected, rtol=1e-4, atol=1e-4)
-
-
-def test_a_keypoint_lies_where_its_feature_fires():
-    layer = SpatialSoftmax(1, 1)
-    with torch.no_grad():
-        layer.features.weight.fill_(50.0)
-        layer.features.bias.zero_()
-    maps = torch.zeros(1, 1, 5, 5)
-    maps[0, 0, 1, 4] = 1.0  # second row of five: y = -0.5; last column: x = 1
-
-    xy = layer(maps)
-
-    torch.testing.assert_close(xy, torch.tensor([[1.0, -0.5]]), rtol=0, atol=1e-4)
 
 
 def test_the_same_words_give_the_same_vector_and_other_words_another():
@@ -211,6 +197,23 @@ def test_one_gradient_step_on_a_batch_lowers_its_loss():
         optimizer.step()
 
     assert net(batch)[0].item() < before.item()
+
+
+def test_the_learning_rate_falls_to_a_hundredth_whatever_the_trainings_length():
+    net = policy()
+    for steps in (100, 1000):
+        optimizer = net.config.get_optimizer_preset().build(net.get_optim_params())
+        schedule = net.config.get_scheduler_preset().build(optimizer, steps)
+        rates = []
+        for _ in range(steps):
+            rates.append(schedule.get_last_lr()[0])
+            optimizer.step()
+            schedule.step()
+
+        assert max(rates) == pytest.approx(3e-4, rel=0.01)
+        assert rates[steps // 2] == pytest.approx(3e-4 * 0.505, rel=0.05)
+        assert rates[-1] == pytest.approx(3e-6, rel=0.1)
+    assert V2PBCConfig(device="cpu", lr_schedule="constant").get_scheduler_preset() is None
 
 
 def test_without_pretrained_weights_at_hand_the_policy_starts_anyway_and_says_so(
