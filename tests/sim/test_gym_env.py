@@ -36,10 +36,10 @@ def write_task(make_bundle, tmp_path):
     """Write a task folder whose success is the cube's centre being above some height."""
     from dataclasses import replace
 
-    def write(folder: Path, height: float = 0.12, horizon: int = 6) -> Path:
+    def write(folder: Path, height: float = 0.12, horizon: int = 6, kind: str = "lift_up") -> Path:
         scene_folder = tmp_path / "scene"
         scene_folder.mkdir(exist_ok=True)
-        bundle = make_bundle(folder=scene_folder, horizon=horizon)
+        bundle = make_bundle(folder=scene_folder, horizon=horizon, kind=kind)
         bundle.scene.save(scene_folder)
         folder.mkdir(parents=True)
         replace(bundle, code=LIFT.replace("HEIGHT", str(height)), title=folder.name).save(folder)
@@ -115,14 +115,27 @@ def test_an_episode_without_success_ends_at_the_horizon(env):
 
 
 def test_success_counts_when_held_and_ends_the_episode(write_task, tmp_path):
-    """The cube is above -1 m all the time, so success is held after five steps."""
-    env = V2PEnv(str(write_task(tmp_path / "easy", height=-1.0, horizon=20)))
+    """The cube is above -1 m all the time, and it rests, which is all the video shows."""
+    folder = write_task(tmp_path / "easy", height=-1.0, horizon=20, kind="generic")
+    env = V2PEnv(str(folder))
     env.reset(seed=0)
 
     steps = [env.step(np.zeros(7, np.float32)) for _ in range(5)]
 
     assert [info["is_success"] for *_, info in steps] == [False] * 4 + [True]
     assert [terminated for _, _, terminated, *_ in steps] == [False] * 4 + [True]
+    env.close()
+
+
+def test_what_the_referee_denies_is_no_success(write_task, tmp_path):
+    """The task's code calls a cube on the table lifted."""
+    env = V2PEnv(str(write_task(tmp_path / "wrong", height=-1.0, horizon=8, kind="lift_up")))
+    env.reset(seed=0)
+
+    steps = [env.step(np.zeros(7, np.float32)) for _ in range(8)]
+
+    assert not any(info["is_success"] for *_, info in steps)
+    assert [terminated for _, _, terminated, *_ in steps] == [False] * 8
     env.close()
 
 
@@ -148,7 +161,7 @@ def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(wri
 
     run = tmp_path / "run" / "task"
     for name in ("b-push", "a-lift"):
-        write_task(run / name, height=-1.0)
+        write_task(run / name, height=-1.0, kind="generic")
     write_task(run / "c-torn.partial")
     config = make_env_config("v2p", tasks=str(run))
 

@@ -6,8 +6,8 @@
 | Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz |
 | Reward | the task's training reward |
 | Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
-| End | terminated: success held for 0.25 s, or the simulation broke down; truncated: the task's horizon |
-| Info | `is_success`: the success that ends the episode |
+| End | terminated: success, or the simulation broke down; truncated: the task's horizon |
+| Info | `is_success`: the task's own success has held for 0.25 s and the independent referee agrees |
 
 The simulation runs at the fine time step: what the coarse one calls a success can be an object pressed
 through the table.
@@ -23,6 +23,7 @@ from gymnasium import spaces
 from v2p_data.errors import V2PError
 from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig
 from v2p_data.sim.masks import MaskRenderer, labels_to_rgb
+from v2p_data.sim.verdict import Witness
 from v2p_data.task.task import TaskBundle
 
 ENV_ID = "v2p/Task-v0"
@@ -55,6 +56,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         self.task_description = bundle.description
         self._max_episode_steps = bundle.horizon_steps
         self._world = BatchEnv(bundle, SimConfig(fine=True), num_envs=1, seed=0, num_threads=1)
+        self._witness = Witness(self._world)
         self._masks = MaskRenderer(self._world.world, size_px)
         self.observation_space = spaces.Dict(
             {
@@ -75,13 +77,16 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         super().reset(seed=seed)
         self._world.seed(int(self.np_random.integers(2**62)))
         self._world.reset(np.array([0]))
+        self._witness.restart()
         return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Carry out one action; it is clipped to [-1, 1]."""
         result = self._world.step(np.asarray(action, float)[None])
-        success = bool(result.held[0]) and not bool(result.terminated[0])
-        terminated = success or bool(result.terminated[0])
+        self._witness.note()
+        broke = bool(result.terminated[0])
+        success = not broke and bool(result.held[0]) and bool(self._witness.verdict()[0])
+        terminated = success or broke
         return (
             self._observe(),
             float(result.reward[0]),

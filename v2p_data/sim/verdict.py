@@ -1,0 +1,48 @@
+"""The independent referee on episodes that a `BatchEnv` is running: what happened so far, and is it success?"""
+
+import numpy as np
+from jaxtyping import Bool
+
+from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.task.referee import ObjectTrack, Trajectory, referee_success
+
+
+class Witness:
+    """Remembers the courses of all worlds of an environment, which start and end together."""
+
+    def __init__(self, env: BatchEnv) -> None:
+        self.env = env
+        self.moments: list[dict[str, np.ndarray]] = []
+
+    def restart(self) -> None:
+        """Forget everything and note the start of new episodes; call after a reset."""
+        self.moments = []
+        self.note()
+
+    def note(self) -> None:
+        """Note the present moment; call after each step."""
+        states = self.env.states()
+        keys = ["eef_pos"] + [
+            f"{name}_{key}"
+            for name in self.env.object_names
+            for key in ("pos", "quat", "size", "touched", "grasped")
+        ]
+        self.moments.append({key: states[key].numpy().astype(float) for key in keys})
+
+    def verdict(self) -> Bool[np.ndarray, "env"]:
+        """Return what the referee says of the episodes so far."""
+        course = {key: np.stack([m[key] for m in self.moments]) for key in self.moments[0]}
+        objects = {
+            name: ObjectTrack(
+                pos=course[f"{name}_pos"],
+                quat_wxyz=course[f"{name}_quat"],
+                size_m=course[f"{name}_size"][0],
+                # "any pad" and "both pads" stand for the two pads: all rules ask for one or the other.
+                touched=np.stack(
+                    [course[f"{name}_touched"] > 0, course[f"{name}_grasped"] > 0], axis=-1
+                ),
+            )
+            for name in self.env.object_names
+        }
+        trajectory = Trajectory(objects=objects, eef_pos=course["eef_pos"])
+        return referee_success(self.env.bundle.kind, self.env.bundle.scene, trajectory)
