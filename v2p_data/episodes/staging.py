@@ -35,7 +35,7 @@ class Episode:
     state: Float32[np.ndarray, "time 7"]
     action: Float32[np.ndarray, "time 7"]
     success: Bool[np.ndarray, "time"]
-    """Whether the task counts as done after the row's action."""
+    """Whether success has held (0.25 s on end) by the end of the row's action; never falls back."""
     referee: bool
     """The verdict of the independent success function, which no training saw."""
     objects: tuple[str, ...]

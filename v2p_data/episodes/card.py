@@ -1,0 +1,173 @@
+"""The dataset card: what is in a dataset and how it was made, for people and for the Hub's search."""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from v2p_data.episodes.features import ACTION_NAMES, METADATA_FILE, STATE_NAMES
+from v2p_data.errors import V2PError
+
+CARD_FILE = "README.md"
+TAGS = ("LeRobot", "robotics", "segmentation", "simulation", "mujoco", "video2policy")
+LICENSE = "apache-2.0"
+STATE_UNITS = ("m", "m", "m", "rad", "rad", "rad", "0 closed to 1 open")
+ACTION_UNITS = (
+    *("x 0.03 m",) * 3,
+    *("x 0.2 rad",) * 3,
+    "x 0.012 m of finger travel, + closes",
+)
+
+
+def write_card(root: Path, repo_id: str) -> Path:
+    """Write `README.md` into a dataset that `writer.pack` made, and return it.
+
+    Raises:
+        V2PError: the dataset was not made by this engine.
+    """
+    try:
+        about: dict[str, Any] = json.loads((root / METADATA_FILE).read_text())
+        info: dict[str, Any] = json.loads((root / "meta/info.json").read_text())
+    except FileNotFoundError as error:
+        raise V2PError(
+            f"{root} was not written by v2p ({error.filename} is missing); its card must be written by hand"
+        ) from error
+    path = root / CARD_FILE
+    path.write_text(dataset_card(about, info, repo_id))
+    return path
+
+
+def dataset_card(about: dict[str, Any], info: dict[str, Any], repo_id: str) -> str:
+    """Return the card's Markdown with its YAML head."""
+    episodes: list[dict[str, Any]] = about["episodes"]
+    seconds = info["total_frames"] / info["fps"]
+    sections = [
+        _head(),
+        f"# {repo_id}",
+        "Demonstrations of a simulated Franka-like arm, made from ordinary videos: each video was rebuilt as a "
+        "simulated task, an expert learned the task, and its successful episodes were recorded under "
+        f"randomisation. {len(episodes)} episodes, {info['total_frames']} frames, {seconds:.0f} s at "
+        f"{info['fps']} frames a second.",
+        "```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
+        f'dataset = LeRobotDataset("{repo_id}")\n```',
+        "## Tasks",
+        _tasks(episodes),
+        "## What a frame holds",
+        _frame(info),
+        "## Masks",
+        _palette(about, episodes),
+        "## Randomisation",
+        _randomisation(episodes),
+        "## How it was made",
+        _making(about),
+        "## Limits",
+        "Everything is simulated, and sizes, masses and frictions of the objects are estimates from one video "
+        "each. Only episodes that succeeded by the task's own measure and by an independent one are included.",
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _head() -> str:
+    tags = "\n".join(f"- {tag}" for tag in TAGS)
+    return (
+        f"---\nlicense: {LICENSE}\ntask_categories:\n- robotics\ntags:\n{tags}\n"
+        "configs:\n- config_name: default\n  data_files: data/*/*.parquet\n---"
+    )
+
+
+def _tasks(episodes: list[dict[str, Any]]) -> str:
+    count = Counter((e["item"], e["task"]) for e in episodes)
+    frames: Counter[tuple[str, str]] = Counter()
+    for e in episodes:
+        frames[e["item"], e["task"]] += e["length"]
+    lines = ["| task | made from | episodes | frames |", "|---|---|---|---|"]
+    lines += [
+        f"| {_cell(task)} | {_cell(item)} | {number} | {frames[item, task]} |"
+        for (item, task), number in count.items()
+    ]
+    return "\n".join(lines)
+
+
+def _frame(info: dict[str, Any]) -> str:
+    lines = ["| column | shape | meaning |", "|---|---|---|"]
+    for key, feature in info["features"].items():
+        if key.startswith("observation.images"):
+            meaning = "segmentation mask as grey video, lossless"
+        elif key == "observation.state":
+            meaning = _named(STATE_NAMES, STATE_UNITS)
+        elif key == "action":
+            meaning = "each in [-1, 1]: " + _named(ACTION_NAMES, ACTION_UNITS)
+        elif key == "next.success":
+            meaning = "the task's success has held for 0.25 s by the end of this action"
+        else:
+            continue
+        lines.append(f"| `{key}` | {list(feature['shape'])} | {meaning} |")
+    return "\n".join(lines)
+
+
+def _palette(about: dict[str, Any], episodes: list[dict[str, Any]]) -> str:
+    names: dict[str, list[str]] = {}
+    for e in episodes:
+        for label, name in e["labels"].items():
+            if name not in names.setdefault(label, []):
+                names[label].append(name)
+    lines = ["| label | grey (R = G = B) | meaning |", "|---|---|---|"]
+    lines += [
+        f"| {label} | {about['palette'][label]} | {_cell(', '.join(found))} |"
+        for label, found in sorted(names.items(), key=lambda pair: int(pair[0]))
+    ]
+    lines.append("")
+    lines.append(
+        "Every decoded pixel is one of these greys exactly; `meta/v2p.json` names the objects per episode."
+    )
+    return "\n".join(lines)
+
+
+def _randomisation(episodes: list[dict[str, Any]]) -> str:
+    """Return the ranges that the drawn values span, by name."""
+    spans: dict[str, list[float]] = {}
+    for e in episodes:
+        for name, value in _numbers(e["params"]):
+            spans.setdefault(name, []).append(value)
+    if not spans:
+        return "None was recorded."
+    lines = ["| drawn per episode | lowest | highest |", "|---|---|---|"]
+    lines += [
+        f"| {_cell(name)} | {min(values):.4g} | {max(values):.4g} |"
+        for name, values in sorted(spans.items())
+    ]
+    return "\n".join(lines)
+
+
+def _numbers(value: Any, name: str = "") -> list[tuple[str, float]]:
+    if isinstance(value, bool):
+        return []
+    if isinstance(value, int | float):
+        return [(name, float(value))]
+    if isinstance(value, dict):
+        return [pair for k, v in value.items() for pair in _numbers(v, f"{name} {k}".strip())]
+    if isinstance(value, list):
+        return [pair for k, v in enumerate(value) for pair in _numbers(v, f"{name}[{k}]")]
+    return []
+
+
+def _making(about: dict[str, Any]) -> str:
+    provenance = about["provenance"]
+    packages = ", ".join(f"{k} {v}" for k, v in sorted(provenance.get("packages", {}).items()))
+    lines = [
+        "`v2p generate VIDEOS`: video, scene, task code, expert (PPO), episodes, dataset. Recipes, seeds and "
+        "counts of every stage are in `meta/v2p.json`.",
+    ]
+    if provenance.get("commit"):
+        lines.append(f"Commit {provenance['commit']}.")
+    if packages:
+        lines.append(f"Versions: {packages}.")
+    return "\n".join(lines)
+
+
+def _named(names: tuple[str, ...], units: tuple[str, ...]) -> str:
+    return ", ".join(f"{name} ({unit})" for name, unit in zip(names, units, strict=True))
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
