@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 _BINS = np.array([12, 24, 24])
 _HUES_DEG = {
-    "red": (26.0, 20.0),
+    "red": (26.0, 22.0),
     "orange": (66.0, 24.0),
     "yellow": (92.0, 26.0),
     "green": (150.0, 42.0),
@@ -118,6 +118,16 @@ def likelihood(
 def similarity(a: Float[np.ndarray, "l a b"], b: Float[np.ndarray, "l a b"]) -> float:
     """Return the Bhattacharyya coefficient of two histograms, 0 to 1."""
     return float(np.sqrt(a * b).sum())
+
+
+def shadow(
+    lab: Float32[np.ndarray, "h w 3"], bare: Float32[np.ndarray, "h w 3"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return where `lab` is `bare` with less light: darker in proportion, of the same hue."""
+    lab, bare = cv2.GaussianBlur(lab, (0, 0), 1.0), cv2.GaussianBlur(bare, (0, 0), 1.0)
+    ratio = lab[..., 0] / np.maximum(bare[..., 0], 1)
+    tint = np.linalg.norm(lab[..., 1:] - bare[..., 1:] * ratio[..., None], axis=-1)
+    return (ratio > 0.22) & (ratio < 0.96) & (tint < 6)
 
 
 def skin_prior(image: UInt8[np.ndarray, "*time h w 3"]) -> Bool[np.ndarray, "*time h w"]:

@@ -5,6 +5,7 @@ five-second clip then takes seconds.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -42,6 +43,13 @@ class Footage:
     skin_only: bool = True
     """Whether only skin-like pixels can be hand: so until the object's look is known."""
 
+    @cached_property
+    def lit(self) -> Float32[np.ndarray, "h w 3"]:
+        """Lab of the brightest that stands still at each pixel: what lies there when no shadow falls on it."""
+        stills = np.stack([lab_of(image) for image in (self.early, self.late, self.always)])
+        brightest = stills[..., 0].argmax(0)
+        return np.take_along_axis(stills, brightest[None, ..., None], 0)[0]
+
     @property
     def shape(self) -> tuple[int, int]:
         return self.rgb.shape[1], self.rgb.shape[2]
@@ -54,13 +62,21 @@ class Footage:
         return hand & skin_prior(image) if self.skin_only else hand
 
     def knowing(self, look: Float[np.ndarray, "l a b"]) -> "Footage":
-        """Return the footage with a hand that is everything that moves but does not look like the object."""
-        typical = float((look * look).sum())
-        alien = likelihood(look, self.moving[None])[0] < 0.03 * typical
-        pixels = self.moving[alien]
-        if len(pixels) < 300:
+        """Return the footage with a hand that is everything that passes, less the object.
+
+        How much of what passes is object follows from the object's own colours (their weighted median ratio).
+        """
+        if len(self.moving) < 300:
             return self
-        return replace(self, hand_hist=histogram(pixels), skin_only=False)
+        passing = histogram(self.moving)
+        cells = look > 0.02 * look.max()
+        ratio, weight = passing[cells] / look[cells], look[cells]
+        order = np.argsort(ratio)
+        middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
+        hand = np.maximum(passing - 1.3 * float(ratio[order][middle]) * look, 0)
+        if hand.sum() < 0.05:
+            return self
+        return replace(self, hand_hist=hand / hand.sum(), skin_only=False)
 
 
 def footage_of(clip: Clip) -> Footage:
@@ -73,7 +89,8 @@ def footage_of(clip: Clip) -> Footage:
     rgb = np.stack([cv2.resize(clip.frames[i], size, interpolation=how) for i in frame_idx])
     lab = lab_of(rgb)
     quarter = max(3, len(rgb) // 4)
-    moving, rest = _moving_and_resting(rgb)
+    always = still_of(rgb, lab)
+    moving = _passing(rgb, lab, always)
     skin = moving[skin_prior(moving[None])[0]]
     return Footage(
         rgb=rgb,
@@ -82,10 +99,10 @@ def footage_of(clip: Clip) -> Footage:
         px_scale=WIDTH_PX / w,
         early=still_of(rgb[:quarter], lab[:quarter]),
         late=still_of(rgb[-quarter:], lab[-quarter:]),
-        always=still_of(rgb, lab),
+        always=always,
         moving=moving,
         hand_hist=histogram(skin if len(skin) > 300 else skin[:0]),
-        rest_hist=histogram(rest),
+        rest_hist=histogram(always.reshape(-1, 3)),
     )
 
 
@@ -132,13 +149,13 @@ def camera_shift_px(footage: Footage) -> float:
     return worst
 
 
-def _moving_and_resting(
+def _passing(
     rgb: UInt8[np.ndarray, "time h w 3"],
-) -> tuple[UInt8[np.ndarray, "n 3"], UInt8[np.ndarray, "m 3"]]:
-    step = max(1, len(rgb) // 25)
-    moving, still = [np.zeros((0, 3), np.uint8)], [np.zeros((0, 3), np.uint8)]
-    for i in range(step, len(rgb), step):
-        difference = np.abs(rgb[i].astype(np.int16) - rgb[i - step]).max(-1)
-        moving.append(rgb[i][difference > 25])
-        still.append(rgb[i][difference < 8][::7])
-    return np.concatenate(moving), np.concatenate(still)
+    lab: Float32[np.ndarray, "time h w 3"],
+    always: UInt8[np.ndarray, "h w 3"],
+) -> UInt8[np.ndarray, "n 3"]:
+    """Return a sample of the colours that are there for a while only, where something usually is not."""
+    usual = lab_of(always)
+    pick = np.unique(np.linspace(0, len(rgb) - 1, 24).astype(int))
+    away = [np.linalg.norm(lab[i] - usual, axis=-1) > 15 for i in pick]
+    return np.concatenate([rgb[i][there] for i, there in zip(pick, away, strict=True)])

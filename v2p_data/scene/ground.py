@@ -18,6 +18,7 @@ from v2p_data.scene.colour import (
     histogram,
     lab_of,
     likelihood,
+    shadow,
     similarity,
     skin_prior,
 )
@@ -99,8 +100,12 @@ def find_moved(
     score, a, b, cues = pair
     look = _look(footage, a, words)
     return Moved(
-        first=first if first is not None else outline(footage, footage.rgb[0], _whole(a), look),
-        last=last if last is not None else outline(footage, footage.rgb[-1], _whole(b), look),
+        first=first
+        if first is not None
+        else outline(footage, footage.rgb[0], _whole(a), words, look),
+        last=last
+        if last is not None
+        else outline(footage, footage.rgb[-1], _whole(b), words, look),
         score=score,
         look=look,
         cues={
@@ -115,24 +120,39 @@ def outline(
     footage: Footage,
     image: UInt8[np.ndarray, "h w 3"],
     blob: Bool[np.ndarray, "h w"],
+    words: tuple[str, ...],
     look: Float[np.ndarray, "l a b"],
 ) -> Bool[np.ndarray, "h w"]:
     """Return the object's outline around a blob in any frame, the hand cut away.
 
     Hand is what looks more like the moving hand than like the object (`look`).
     """
-    never = tidy(
-        footage.hand(image) & (likelihood(footage.hand_hist, image) > likelihood(look, image))
-    )
+    likelier = likelihood(footage.hand_hist, image) > likelihood(look, image)
+    never = tidy(footage.hand(image) & likelier)
+    shade = shadow(lab_of(image), footage.lit) & blob & ~_colour(image, words)
+    if shade.sum() < 0.4 * blob.sum():
+        blob = blob & ~shade
     rest = blob & ~never
-    if rest.sum() < 0.35 * blob.sum():
+    if rest.sum() < 0.25 * blob.sum():
         rest, never = blob, np.zeros_like(never)
-    rest = tidy(rest) if tidy(rest).any() else rest
-    return refine(image, main_parts(rest), never)
+    # Print on a box may look like a hand, but a hand comes from outside.
+    hull = convex_hull(main_parts(tidy(rest)))
+    count, parts = cv2.connectedComponents(never.astype(np.uint8))
+    for i in range(1, count):
+        part = parts == i
+        if (part & hull).sum() > 0.7 * part.sum():
+            never &= ~part
+    rest = blob & ~never
+    return refine(image, main_parts(tidy(rest)) if tidy(rest).any() else rest, never)
 
 
 def find_other(
-    footage: Footage, table: Table, phrase: str, kind: str, moved: Moved
+    footage: Footage,
+    table: Table,
+    phrase: str,
+    kind: str,
+    moved: Moved,
+    taken: Bool[np.ndarray, "h w"] | None = None,
 ) -> Found | None:
     """Return the thing that stays, or None where the still shows no candidate.
 
@@ -159,6 +179,7 @@ def find_other(
     best: Found | None = None
     for pixels in sets:
         free = pixels if late else pixels & ~occupied
+        free = free if taken is None else free & ~taken
         for mask in _parts(tidy(free, 5), h * w, 0.0025, 0.2):
             x, y, bw, bh = bounding_box(mask)
             area = int(mask.sum())
@@ -213,8 +234,7 @@ def _whole(blob: _Blob) -> np.ndarray:
 
 
 def _look(footage: Footage, blob: _Blob, words: tuple[str, ...]) -> np.ndarray:
-    image = footage.rgb[0]
-    return histogram(image[_typical(footage, image, _whole(blob), words)])
+    return histogram(footage.rgb[0][_typical(footage, _whole(blob), words)])
 
 
 def _given(image: np.ndarray, mask: np.ndarray) -> _Blob:
@@ -223,17 +243,25 @@ def _given(image: np.ndarray, mask: np.ndarray) -> _Blob:
     )
 
 
-def _typical(
-    footage: Footage, image: np.ndarray, mask: np.ndarray, words: tuple[str, ...]
-) -> np.ndarray:
-    """Return the pixels of a blob that are surely the object: of the named colour, else not hand-like."""
-    named = _colour(image, words)
-    # A box's white letters belong to it, the fingers on it do not.
-    coloured = named | (tidy(named, 9) & ~skin_prior(image))
-    for sure in (mask & coloured, mask & ~footage.hand(image)):
-        if sure.sum() > 0.2 * mask.sum():
-            return sure
-    return mask
+def _typical(footage: Footage, mask: np.ndarray, words: tuple[str, ...]) -> np.ndarray:
+    """Return the pixels of a blob that are surely the object: its named colour and what is printed between.
+
+    Skin-coloured parts that hang together with something passing outside are fingers.
+    """
+    image = footage.rgb[0]
+    named = mask & _colour(image, words)
+    if named.sum() < 0.15 * mask.sum():
+        sure = mask & ~footage.hand(image)
+        return sure if sure.sum() > 0.2 * mask.sum() else mask
+    passing = np.linalg.norm(lab_of(image) - lab_of(footage.late), axis=-1) > 12
+    outside, skin = tidy(passing & ~mask), skin_prior(image)
+    sure = mask & convex_hull(tidy(named) | shrink(named, 1))
+    count, parts = cv2.connectedComponents((sure & ~named).astype(np.uint8))
+    for i in range(1, count):
+        part = parts == i
+        if skin[part].mean() > 0.5 and (grow(part, 2) & outside).sum() > 8:
+            sure &= ~part
+    return sure
 
 
 def _blobs(
@@ -258,18 +286,21 @@ def _blobs(
     # A colour that the table has as well says nothing ("white" on a white table).
     telling = 1 - float(match[table.seen].mean()) if table.seen.any() else 1.0
     colour = (match > 0.5) if words else np.zeros((h, w), bool)
+    shade = shadow(lab, footage.lit) & ~colour
+    changed &= ~shade
     # How long a pixel keeps the look it has here: an arm leaves at once, an object when it is moved.
     moved = np.linalg.norm(footage.lab - lab, axis=-1) > 11
     order = moved[::-1] if at_end else moved
     stays = np.where(order.any(0), order.argmax(0), n) / n
     fleeting = stays < 0.05
-    stands_out = table.stands_out(image)
+    stands_out = table.stands_out(image) & ~shade
     views = [
         (tidy(changed), 0.0),
         (tidy(changed & colour), 0.0),
         (tidy(changed & colour, 9), 0.0),
         (tidy(changed & ~(hand & ~colour)), 0.0),
         (tidy(changed & ~fleeting), 0.0),
+        (tidy(stands_out), 0.8),
         (tidy(stands_out & ~(hand & ~colour)), 0.8),
         (tidy(stands_out & ~(hand & ~colour) & ~fleeting), 0.8),
         (tidy(stands_out & colour), 0.8),
@@ -293,8 +324,8 @@ def _blobs(
             on_table = float((mask & table.hull).sum() / area)
             cues = {
                 "edge": 1.2 * (here - after) / (here + after + 4),
-                # Few things are one colour all over: six tenths are as good as all.
-                "colour": 1.6 * telling * min(1.0, float(match[mask].mean()) / 0.6)
+                # Few things are one colour all over: four tenths are as good as all.
+                "colour": 1.6 * telling * min(1.0, float(match[mask].mean()) / 0.4)
                 if words
                 else 0.0,
                 "border": -0.9 * _border_sides((x, y, bw, bh), w, h),
@@ -313,7 +344,9 @@ def _blobs(
             )
     best = sorted(blobs, key=lambda blob: -blob.score)[:40]
     for blob in best[:12]:
-        blob.whole = _completed(blob, best, changed, hand, colour if words else None)
+        blob.whole = _completed(
+            blob, best, changed, hand, skin_prior(image), colour if words else None
+        )
         if look is None and not words and at_end:
             blob.whole = blob.mask  # nothing tells the object from the arm yet
         elif look is not None and (blob.whole & ~blob.mask).any():
@@ -327,11 +360,13 @@ def _completed(
     others: list[_Blob],
     changed: np.ndarray,
     hand: np.ndarray,
+    skin: np.ndarray,
     colour: np.ndarray | None,
 ) -> np.ndarray:
     """Return the blob joined with a larger one around it whose surplus changed as well: the rest of the object.
 
-    Where the object's colour is known, the rest lies within the convex hull of that colour: an arm does not.
+    Where the object's colour is known, the rest lies within the convex hull of that colour or adjoins it without being
+    skin: an arm does not.
     """
     for other in others:
         if not blob.area < other.area < 8 * blob.area:
@@ -340,7 +375,8 @@ def _completed(
             continue
         whole = other.mask | blob.mask
         if colour is not None:
-            whole &= grow(convex_hull(tidy(colour & whole) | blob.mask), 2)
+            hull = grow(convex_hull(tidy(colour & whole) | blob.mask), 2)
+            whole &= hull | _joined(whole & ~hull & ~skin, hull)
         surplus = whole & ~blob.mask
         if (
             surplus.any()
@@ -351,6 +387,18 @@ def _completed(
         ):
             return whole
     return blob.mask
+
+
+def _joined(pieces: np.ndarray, core: np.ndarray) -> np.ndarray:
+    """Return the pieces that lie along the core for a good part of their outline."""
+    near = grow(core, 2)
+    count, parts = cv2.connectedComponents(pieces.astype(np.uint8))
+    keep = np.zeros_like(pieces)
+    for i in range(1, count):
+        part = parts == i
+        if (part & near).sum() > 1.2 * np.sqrt(part.sum()):
+            keep |= part
+    return keep
 
 
 def _pair_cues(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[str, float]:

@@ -64,10 +64,10 @@ _VAGUE = {"spread": 0.35}
 # Lengths in centimetres here, for reading; mass in kg.
 _TABLE: dict[str, dict[str, object]] = {
     # boxes and books
-    "box": _box(16, 11, 8, 0.3, **_VAGUE), "cracker box": _box(16, 6, 21, 0.41, spread=0.08),
+    "box": _box(9, 6.5, 5, 0.2, **_VAGUE), "cracker box": _box(16, 6, 21, 0.41, spread=0.08),
     "cereal box": _box(19, 6, 28, 0.4, spread=0.12), "snack box": _box(21, 16, 6, 0.4, spread=0.15),
     "tea box": _box(14, 8, 8, 0.15), "cardboard box": _box(30, 22, 18, 0.4, **_VAGUE),
-    "brown box": _box(30, 20, 12, 0.4, **_VAGUE), "carton": _box(25, 18, 15, 0.4, **_VAGUE),
+    "brown box": _box(30, 20, 12, 0.4, **_VAGUE), "carton": _box(6, 6, 14.5, 0.4, spread=0.25),
     "milk carton": _box(9, 9, 20, 1.0), "juice box": _box(6, 4, 11, 0.25), "package": _box(22, 15, 7, 0.3, **_SOFT),
     "parcel": _box(25, 18, 10, 0.5, **_VAGUE), "matchbox": _box(11, 6.5, 2, 0.05, **_VAGUE), "gift": _box(15, 15, 10, 0.4, **_VAGUE),
     "book": _box(23.5, 15.5, 3.0, 0.6, 0.4), "notebook": _box(21, 15, 1.2, 0.3, 0.4), "magazine": _box(27, 20, 0.5, 0.2, 0.4),

@@ -124,8 +124,6 @@ def _mask_at(scene: Reconstruction, thing: Estimate, frame: int) -> np.ndarray |
         return thing.masks[frame]
     if thing is not scene.objects[0]:
         return thing.masks[0]
-    if scene.track is None:
-        return None
     i = int(np.abs(np.array(scene.footage_frames) - frame).argmin())
     return scene.track.masks[i] if scene.track.quality[i] > 0.4 else None
 

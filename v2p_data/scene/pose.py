@@ -4,6 +4,7 @@ Everything here is in camera heights (the camera stands 1 above the table); `sca
 outline alone is ambiguous (faces swap, flat things thicken), so the noun's proportions hold the fit.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -20,6 +21,7 @@ from v2p_data.scene.segment import bounding_box
 
 _WORK_PX = 110
 """Longer side of the crop in which silhouettes are compared."""
+_HIDDEN_WEIGHT = 0.15
 _PRIOR_WEIGHT = 0.03
 """Cost of proportions one sigma off the noun's, in units of IoU."""
 
@@ -107,20 +109,30 @@ class Silhouette:
         # Pixel centres lie at one half, OpenCV counts them as whole numbers.
         hull = cv2.convexHull(((pixels - 0.5) * 16).astype(np.int32))
         cv2.fillConvexPoly(drawn, hull, 1, cv2.LINE_8, 4)
-        shape = (drawn > 0) & self._known
+        covered = drawn > 0
+        shape = covered & self._known
         common = int((shape & self._mask).sum())
-        return common / max(1, int(shape.sum()) + self._area - common)
+        beyond = 0.0 if self.at_border else max(0.0, cv2.contourArea(hull) / 256 - covered.sum())
+        # What may be hidden costs little, not nothing: else a shape grows behind the hand for ever.
+        hidden = _HIDDEN_WEIGHT * float((covered & ~self._known).sum())
+        return common / max(1.0, float(shape.sum()) + self._area - common + beyond + hidden)
+
+    @property
+    def centre(self) -> Float[np.ndarray, "2"]:
+        """Return the middle of the mask's bounding box [px]."""
+        x, y, w, h = self.box
+        return np.array([x + w / 2, y + h / 2])
 
 
 def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
     """Return the ways a noun's shape can rest, as rotations with what each costs: upright first, then lying."""
-    upright = np.eye(3)
+    upright, cost = np.eye(3), 0.06 if noun.spread < 0.3 else 0.0
     if noun.form == "sphere":
         return [(upright, 0.0)]
     lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     if noun.form == "cylinder":
         slender = noun.size_m[2] / noun.size_m[0]
-        return [(upright, 0.0)] + ([(lying, 0.04)] if slender > 0.9 else [])
+        return [(upright, 0.0)] + ([(lying, cost)] if slender > 0.9 else [])
     on_side = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     smallest, largest = min(noun.size_m), max(noun.size_m)
     return [(upright, 0.0)] + (
@@ -147,14 +159,26 @@ def fit_shape(
         return prior * scale0 * np.exp(logs)
 
     def cost(v: np.ndarray) -> float:
-        size = size_of(v)
-        T = _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
-        points = outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
+        points = place(v)
         off = (v[3:] - v[3:].mean()) / spread
         return 1 - silhouette.iou(points) + _PRIOR_WEIGHT * float((off**2).sum())
 
+    def place(v: np.ndarray) -> np.ndarray:
+        size = size_of(v)
+        T = _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
+        return outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
+
     turns = _yaw_starts(noun, rest, thorough)
-    starts = [np.array([0.0, 0.0, yaw, *np.zeros(len(free))]) for yaw in turns]
+    starts = [
+        _aligned(
+            silhouette,
+            np.array([0.0, 0.0, yaw, *np.full(len(free), grow)]),
+            place,
+            scale0 * prior.max(),
+        )
+        for yaw in turns
+        for grow in ((0.0, 0.25) if thorough else (0.1,))
+    ]
     best = _search(cost, starts, np.array([0.25, 0.25, 0.3, *[0.25] * len(free)]))
     size = size_of(best)
     T = _resting(ground + best[:2] * scale0 * prior.max(), best[2], rest, size)
@@ -195,8 +219,16 @@ def fit_pose(
     turns = _yaw_starts(noun, rest, thorough=True)
     if yaw_near is not None:
         turns = [*turns, yaw_near]
-    starts = [np.array([0.0, 0.0, yaw]) for yaw in turns]
-    best = _search(cost, starts, np.array([0.25, 0.25, 0.3]))
+
+    def outline(v: np.ndarray) -> np.ndarray:
+        T = place(v)
+        return points0 @ T[:3, :3].T + T[:3, 3]
+
+    starts = [
+        _aligned(silhouette, np.array([0.0, 0.0, yaw]), outline, float(extents.max()))
+        for yaw in turns
+    ]
+    best = _search(cost, starts, np.array([0.15, 0.15, 0.3]))
     T = place(best)
     iou = silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3])
     return Fit(size=size, T_world_obj=T, iou=iou, cost=cost(best))
@@ -291,7 +323,31 @@ def _yaw_starts(noun: Noun, rest: np.ndarray, thorough: bool) -> list[float]:
     return [0.0]
 
 
-def _search(cost, starts: list[np.ndarray], step: np.ndarray) -> np.ndarray:  # noqa: ANN001
+def _aligned(
+    silhouette: Silhouette,
+    start: np.ndarray,
+    place: Callable[[np.ndarray], np.ndarray],
+    unit: float,
+) -> np.ndarray:
+    """Return the start moved along the table so that its outline lies over the mask."""
+    v, camera = start.copy(), silhouette.camera
+    for _ in range(2):
+        points = place(v)
+        pixels = camera.project(points)
+        if not np.isfinite(pixels).all():
+            return start
+        middle = (pixels.min(0) + pixels.max(0)) / 2
+        height = float(points[:, 2].mean())
+        spots = camera.on_plane(np.stack([silhouette.centre, middle]), height)
+        if not np.isfinite(spots).all():
+            return start
+        v[:2] += np.clip((spots[0] - spots[1])[:2] / unit, -3, 3)
+    return v
+
+
+def _search(
+    cost: Callable[[np.ndarray], float], starts: list[np.ndarray], step: np.ndarray
+) -> np.ndarray:
     """Return the best of short Nelder-Mead runs, the best two of them carried to the end."""
 
     def run(start: np.ndarray, iterations: int, reach: float) -> tuple[float, np.ndarray]:

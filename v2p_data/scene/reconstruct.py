@@ -7,7 +7,7 @@ footage -> camera still? -> what moved, what stayed -> outlines -> camera pitch 
 import keyword
 import logging
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
+from v2p_data.scene.colour import lab_of
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
 from v2p_data.scene.ground import Found, Moved, find_moved, find_other
 from v2p_data.scene.nouns import Noun, is_clear, noun_for
@@ -29,9 +30,9 @@ from v2p_data.scene.pose import (
     on_wall,
     orientations,
 )
-from v2p_data.scene.scale import SizeVote, camera_height_m
+from v2p_data.scene.scale import SizeVote, camera_height_m, disagreement
 from v2p_data.scene.scene import Role
-from v2p_data.scene.segment import bounding_box, from_box, from_points, grow
+from v2p_data.scene.segment import bounding_box, from_box, from_points, grow, tidy
 from v2p_data.scene.table import Table, find_table
 from v2p_data.scene.track import Track, track
 from v2p_data.video.captions import parse_caption
@@ -62,8 +63,6 @@ class SceneConfig:
     """Horizontal field of view; 58 degrees is usual for web cameras and phones filming wide."""
     max_poses: int = 14
     """Poses kept per object, the first and last among them."""
-    track: bool = True
-    """Follow the object between its first and last frame."""
 
     def __post_init__(self) -> None:
         if not 0 < self.min_confidence < 1:
@@ -111,7 +110,7 @@ class Reconstruction:
     cues: dict[str, float]
     """What the confidence is the product of."""
     warnings: tuple[str, ...]
-    track: Track | None = field(repr=False)
+    track: Track = field(repr=False)
     footage_frames: tuple[int, ...]
     """Clip frame behind each mask of the track."""
 
@@ -142,6 +141,7 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     _check_still(footage, cfg)
     table = find_table(footage.always)
     moved, hinted = _find_manipulated(clip, footage, table, meaning.manipulated, meaning.kind, cfg)
+    footage = footage.knowing(moved.look)
     warnings: list[str] = []
     seen = [
         _Seen(
@@ -154,8 +154,9 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
             score=moved.score,
         )
     ]
+    taken = np.zeros(footage.shape, bool)
     for phrase, role in meaning.others:
-        found, other_hinted = _find_other(clip, footage, table, phrase, meaning.kind, moved)
+        found, other_hinted = _find_other(clip, footage, table, phrase, meaning.kind, moved, taken)
         named = phrase.lower() in clip.caption.lower()
         if found is None or (not other_hinted and found.score < cfg.min_reference_score):
             score = found.score if found else None
@@ -167,6 +168,7 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
                 )
             warnings.append(f"the '{phrase}' was not found and is left out")
             continue
+        taken |= grow(found.mask, 2)
         seen.append(
             _Seen(
                 phrase=phrase,
@@ -178,9 +180,8 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
                 score=found.score,
             )
         )
-    followed = (
-        track(footage, moved, every=1 if len(footage.rgb) < 80 else 2) if cfg.track else None
-    )
+    followed = track(footage, moved, every=1 if len(footage.rgb) < 80 else 2)
+    moved = replace(moved, last=followed.masks[-1])
     geometry = _Geometry(footage, seen, moved, meaning.kind, cfg, followed)
     return _assemble(clip, footage, meaning.kind, seen, moved, geometry, followed, warnings, cfg)
 
@@ -241,12 +242,18 @@ def _find_manipulated(
 
 
 def _find_other(
-    clip: Clip, footage: Footage, table: Table, phrase: str, kind: str, moved: Moved
+    clip: Clip,
+    footage: Footage,
+    table: Table,
+    phrase: str,
+    kind: str,
+    moved: Moved,
+    taken: Bool[np.ndarray, "h w"],
 ) -> tuple[Found | None, bool]:
     mask, _ = _hinted_mask(clip, footage, phrase)
     if mask is not None:
         return Found(mask=mask, score=5.0), True
-    return find_other(footage, table, phrase, kind, moved), False
+    return find_other(footage, table, phrase, kind, moved, taken), False
 
 
 def _hinted_mask(
@@ -284,24 +291,26 @@ class _Geometry:
         moved: Moved,
         kind: str,
         cfg: SceneConfig,
-        followed: Track | None,
+        followed: Track,
     ) -> None:
         self.seen, self.kind, self.cfg, self.footage = seen, kind, cfg, footage
-        self._unknown = _hidden_by_hand(footage, 0, moved.first)
+        self._unknown = _hidden(footage, 0, moved.first, moved.last)
         self.pitch_rad, self.fits = self._best_pitch()
         self.camera = camera_above(footage.shape, self.pitch_rad, cfg.fov_rad)
-        self.height_m, self.scale_spread = camera_height_m(
-            [
-                SizeVote(size=fit.size, noun=s.noun, trust=max(0.1, fit.iou), known_m=s.known_m)
-                for s, fit in zip(seen, self.fits, strict=True)
-            ]
-        )
         self.last_i = len(footage.rgb) - 1
-        self.last_mask = moved.last
-        if kind == "lift_up" and followed is not None:
+        self.last_mask, self._first_mask = moved.last, moved.first
+        if kind == "lift_up":
             self.last_i = _peak(followed, moved.first)
             self.last_mask = followed.masks[self.last_i]
-        self.last, self.upright_cost = self._fit_last()
+        # One outline often fits a standing and a lying box alike; both ends together seldom do.
+        options = self._options(0, self.camera, thorough=True)
+        ends = [self._fit_last(first) for first in options]
+        best = min(range(len(options)), key=lambda k: options[k].cost + ends[k][0].cost)
+        self.fits[0] = options[best]
+        self.last, self.upright_cost = ends[best]
+        self.height_m, self.scale_spread = camera_height_m(
+            [_vote(s, fit) for s, fit in zip(seen, self.fits, strict=True)]
+        )
 
     def _best_pitch(self) -> tuple[float, list[Fit]]:
         """Try pitches around the usual one; the silhouettes decide, as far as the prior lets them."""
@@ -321,33 +330,31 @@ class _Geometry:
                 if best is None or cost < best[0]:
                     best = cost, pitch, fits
         assert best is not None
-        return best[1], self._fit_all(best[1], thorough=True)
+        return best[1], self._fit_all(best[1], thorough=len(self.seen) > 1)
 
     def _fit_all(self, pitch_rad: float, *, thorough: bool) -> list[Fit]:
         camera = camera_above(self.footage.shape, pitch_rad, self.cfg.fov_rad)
+        return [
+            min(self._options(i, camera, thorough=thorough), key=lambda fit: fit.cost)
+            for i in range(len(self.seen))
+        ]
+
+    def _options(self, i: int, camera: Camera, *, thorough: bool) -> list[Fit]:
+        """Return the best fit for every way in which the object may rest."""
+        s = self.seen[i]
+        silhouette = Silhouette(s.first, self._unknown if i == 0 else None, camera)
+        rests = orientations(s.noun)
         fits = []
-        for i, s in enumerate(self.seen):
-            silhouette = Silhouette(s.first, self._unknown if i == 0 else None, camera)
-            options = orientations(s.noun)
-            options = options if thorough or i == 0 else options[:1]
-            best: Fit | None = None
-            for rest, extra in options:
-                fit = fit_shape(silhouette, s.noun, rest, thorough=thorough)
-                if best is None or fit.cost + extra < best.cost:
-                    best = Fit(
-                        size=fit.size,
-                        T_world_obj=fit.T_world_obj,
-                        iou=fit.iou,
-                        cost=fit.cost + extra,
-                    )
-            assert best is not None
-            fits.append(_upright_axes(best) if s.noun.form == "box" else best)
+        for rest, extra in rests if thorough or i == 0 else rests[:1]:
+            fit = fit_shape(silhouette, s.noun, rest, thorough=thorough)
+            fit = replace(fit, cost=fit.cost + extra)
+            fits.append(_upright_axes(fit) if s.noun.form == "box" else fit)
         return fits
 
-    def _fit_last(self) -> tuple[Fit, float]:
+    def _fit_last(self, first: Fit) -> tuple[Fit, float]:
         """Return the manipulated object's pose at the end, and what standing as at first would have cost."""
-        noun, first = self.seen[0].noun, self.fits[0]
-        unknown = _hidden_by_hand(self.footage, self.last_i, self.last_mask)
+        noun = self.seen[0].noun
+        unknown = _hidden(self.footage, self.last_i, self.last_mask, self._first_mask)
         silhouette = Silhouette(self.last_mask, unknown, self.camera)
         if self.kind == "lift_up":
             return fit_lifted(silhouette, noun, first.size, first.T_world_obj), 0.0
@@ -381,7 +388,7 @@ def _assemble(
     seen: list[_Seen],
     moved: Moved,
     geometry: _Geometry,
-    followed: Track | None,
+    followed: Track,
     warnings: list[str],
     cfg: SceneConfig,
 ) -> Reconstruction:
@@ -401,7 +408,7 @@ def _assemble(
         T_first = metric(fit.T_world_obj)
         if i == 0:
             T_last = metric(geometry.last.T_world_obj)
-            between = _between(footage, geometry, followed, cfg, metric) if followed else []
+            between = _between(footage, geometry, followed, cfg, metric)
             frames = [0, *(f for f, _, _ in between), last_frame]
             poses = [T_first, *(T for _, T, _ in between), T_last]
             sure = [fit.iou, *(c for _, _, c in between), geometry.last.iou]
@@ -426,7 +433,7 @@ def _assemble(
             )
         )
     _check_motion(kind, objects, geometry, moved)
-    cues = _cues(kind, seen, moved, geometry)
+    cues = _cues(kind, seen, geometry, moved, followed)
     confidence = float(np.prod(list(cues.values())))
     if confidence < cfg.min_confidence:
         weakest = min(cues, key=lambda cue: cues[cue])
@@ -490,18 +497,23 @@ def _check_motion(kind: str, objects: list[Estimate], geometry: _Geometry, moved
         )
 
 
-def _cues(kind: str, seen: list[_Seen], moved: Moved, geometry: _Geometry) -> dict[str, float]:
+def _cues(
+    kind: str, seen: list[_Seen], geometry: _Geometry, moved: Moved, followed: Track
+) -> dict[str, float]:
     cues: dict[str, float] = {}
     for i, s in enumerate(seen):
         which = "object" if i == 0 else f"the {s.phrase}"
         middle, width = (3.6, 0.8) if i == 0 else (1.0, 0.5)
         cues[f"finding {which}"] = 0.97 if s.hinted else _rise(s.score, middle, width)
         iou = geometry.fits[i].iou
+        off = abs(disagreement(_vote(s, geometry.fits[i]), geometry.height_m))
+        cues[f"size of {which}"] = float(np.exp(-0.5 * (max(0.0, off - 1.5) / 1.5) ** 2))
         cues[f"shape of {which}"] = float(np.clip(0.5 + (iou - 0.6) / 0.3 * 0.5, 0.1, 1))
     cues["pose at the end"] = float(np.clip(0.6 + (geometry.last.iou - 0.5) / 0.35 * 0.4, 0.1, 1))
     cues["same size at both ends"] = float(
         np.exp(-0.5 * (np.log(geometry.last_mask.sum() / moved.first.sum()) / 1.0) ** 2)
     )
+    cues["track from start to end"] = float(np.clip(0.65 + 0.7 * followed.meets, 0, 1))
     noun = seen[0].noun
     cues["noun"] = 1.0 if noun.known or seen[0].known_m else 0.9
     cues["matter"] = {"rigid": 1.0, "soft": 0.8, "clear": 0.7}[
@@ -589,16 +601,18 @@ def _peak(followed: Track, first: Bool[np.ndarray, "h w"]) -> int:
     return int(near[-1]) if len(near) and top > 0 else n - 1
 
 
-def _hidden_by_hand(
-    footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]
+def _hidden(
+    footage: Footage, i: int, mask: Bool[np.ndarray, "h w"], other_end: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return pixels near the mask where the hand may hide the object."""
-    hand = grow(footage.hand(footage.rgb[i]) & ~mask, 2) & ~mask
+    """Return pixels near the mask that say nothing: what passes there (the hand, a shadow) may hide the object."""
+    background = footage.late if i < len(footage.rgb) / 2 else footage.early
+    passing = np.linalg.norm(footage.lab[i] - lab_of(background), axis=-1) > 12
+    hidden = tidy(passing) & ~grow(other_end, 2) & ~mask
     x, y, w, h = bounding_box(mask)
     near = np.zeros_like(mask)
     pad = max(4, int(0.3 * max(w, h)))
     near[max(0, y - pad) : y + h + pad, max(0, x - pad) : x + w + pad] = True
-    return hand & near
+    return hidden & near
 
 
 def _upright_axes(fit: Fit) -> Fit:
@@ -664,6 +678,10 @@ def _mass(noun: Noun, size: tuple[float, float, float]) -> float:
 def _centre(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
     y, x = np.nonzero(mask)
     return np.array([x.mean() + 0.5, y.mean() + 0.5]) if len(x) else np.array([np.nan, np.nan])
+
+
+def _vote(s: _Seen, fit: Fit) -> SizeVote:
+    return SizeVote(size=fit.size, noun=s.noun, trust=max(0.1, fit.iou), known_m=s.known_m)
 
 
 def _tuple3(values: np.ndarray) -> tuple[float, float, float]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from v2p_data.scene.colour import histogram, likelihood, similarity
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Moved
-from v2p_data.scene.segment import bounding_box, grow, tidy
+from v2p_data.scene.segment import bounding_box, convex_hull, grow, tidy
 
 _SAME_LAB = 6.0
 
@@ -24,6 +24,8 @@ class Track:
 
     masks: Bool[np.ndarray, "time h w"]
     quality: Float[np.ndarray, "time"]
+    meets: float
+    """Overlap of the mask carried forwards with the one found at the end, or backwards at the start; 0 to 1."""
 
 
 def track(footage: Footage, moved: Moved, *, every: int = 1) -> Track:
@@ -35,8 +37,19 @@ def track(footage: Footage, moved: Moved, *, every: int = 1) -> Track:
     n = len(footage.rgb)
     steps = sorted({*range(0, n, every), n - 1})
     forward = _follow(footage, steps, moved.first, moved.look, anchor=0)
-    backward = _follow(footage, steps[::-1], moved.last, moved.look, anchor=n - 1)[::-1]
-    area_first, area_last = moved.first.sum(), moved.last.sum()
+    area_first = float(moved.first.sum())
+    found, carried = (
+        _likeness(footage, n - 1, mask, moved.look, area_first)
+        for mask in (moved.last, forward[-1])
+    )
+    # The hand often breaks the object into pieces at the end; the mask carried there may be the better one.
+    end = (
+        forward[-1]
+        if carried > found + 0.05 and _iou(forward[-1], moved.last) > 0.05
+        else moved.last
+    )
+    backward = _follow(footage, steps[::-1], end, moved.look, anchor=n - 1)[::-1]
+    area_last = float(end.sum())
     masks = np.zeros((n, *footage.shape), bool)
     quality = np.zeros(n)
     for k, i in enumerate(steps):
@@ -49,12 +62,13 @@ def track(footage: Footage, moved: Moved, *, every: int = 1) -> Track:
         best = int(marks[1] > marks[0])
         masks[i] = (forward[k], backward[k])[best]
         quality[i] = max(0.0, marks[best])
-    masks[0], masks[-1] = moved.first, moved.last
+    masks[0], masks[-1] = moved.first, end
     quality[0] = quality[-1] = 1.0
     for i in range(1, n):
         if not masks[i].any():
             masks[i] = masks[i - 1]
-    return Track(masks=masks, quality=quality)
+    meets = max(_iou(forward[-1], moved.last), _iou(backward[0], moved.first))
+    return Track(masks=masks, quality=quality, meets=meets)
 
 
 def _follow(
@@ -101,7 +115,10 @@ def _follow(
         smooth = cv2.GaussianBlur(footage.lab[i][rows, cols], (0, 0), 1)
         still = np.linalg.norm(smooth - before[rows, cols], axis=-1) < _SAME_LAB
         floor = 0.03 if mask.sum() < 1.3 * area else 0.3
-        found = tidy((vote > 0) & (prior > floor) & ~(still & ~home[rows, cols]))
+        allowed = (prior > floor) & ~(still & ~home[rows, cols])
+        found = tidy((vote > 0) & allowed, 2 * int(0.1 * np.sqrt(area)) + 1)
+        # The shapes we fit are convex: a gap within the hull that the flow carried along is print, not background.
+        found |= convex_hull(found) & (prior > 0.5) & allowed
         count, parts, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
         mask = np.zeros((h, w), bool)
         if count > 1:
@@ -153,3 +170,7 @@ def _likeness(
         return 0.0
     alike = similarity(look, histogram(footage.rgb[i][mask]))
     return alike * float(np.exp(-0.5 * np.log(size / area) ** 2))
+
+
+def _iou(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
+    return float((a & b).sum() / max(1, (a | b).sum()))
