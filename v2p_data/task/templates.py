@@ -187,13 +187,16 @@ def write_task(scene: Scene, variant: Variant) -> str:
 
 # --- recipes -------------------------------------------------------------------------------------------------
 
-_LOW = "(obj_pos[:, 2] < obj_start[:, 2] + 0.02)"
+_LOW = "((obj_pos[:, 2] - obj_start[:, 2]).abs() < 0.02)"
 _REF_STILL = "(ref_moved < 0.03)"
 _REF_MOVED = "ref_moved = torch.norm((ref_pos - ref_start)[:, :2], dim=-1)"
 _LEAVE_REF = ("leave_reference", "-1.0 * (ref_moved - 0.01).clamp(0.0, 0.3)")
 _TOP = "grasp_point[:, 2] = obj_pos[:, 2] + (half_height - 0.035).clamp(min=0.0)"
 _GRASP_SETUP = ["grasp_point = obj_pos.clone()", _TOP]
 _STILL_UPRIGHT = "(upright(obj_quat, obj_start_quat) > 0.9)"
+# Withholds what pushing earns once the object topples. A penalty instead teaches not to touch tall objects at all:
+# 0 % for a 5 x 8 cm cylinder.
+_STANDING = "upright(obj_quat, obj_start_quat).clamp(0.0, 1.0)"
 
 
 def _lift(m: Measured, v: Variant) -> Draft:
@@ -221,7 +224,14 @@ def _lift(m: Measured, v: Variant) -> Draft:
         remaining=f"({height} - height).clamp(min=0.0)",
         goal=_shifted("obj_start", z=height + 0.03),
         direction=_shifted("torch.zeros_like(obj_pos)", z=1.0),
-        extras=[("not_too_high", "-2.0 * (height - 0.2).clamp(0.0, 0.3) * near")],
+        extras=[
+            ("not_too_high", "-2.0 * (height - 0.2).clamp(0.0, 0.3) * near"),
+            # Without it, a lifted object is carried off to the side until the arm leaves the picture.
+            (
+                "stay_above",
+                "-1.0 * (torch.norm((obj_pos - obj_start)[:, :2], dim=-1) - 0.04).clamp(0.0, 0.3)",
+            ),
+        ],
     )
 
 
@@ -248,13 +258,12 @@ def _push(m: Measured, v: Variant) -> Draft:
         ],
         reward_setup=_push_point(clearance_m=0.02),
         target="push_point",
-        progress=f"(moved / {way + 0.02:.3f}).clamp(-1.0, 1.0) * {_LOW}.float()",
+        progress=f"(moved / {way + 0.02:.3f}).clamp(-1.0, 1.0) * {_LOW}.float() * {_STANDING}",
         remaining=f"({way} - moved).clamp(min=0.0)",
         goal=_shifted("obj_start", y=sign * (way + 0.02)),
         extras=[
             ("straight", "-0.5 * (sideways - 0.02).clamp(0.0, 0.2)"),
             ("not_too_far", f"-0.3 * (moved - {way + 0.07:.3f}).clamp(0.0, 1.0)"),
-            ("upright", "-0.5 * (1 - upright(obj_quat, obj_start_quat)).clamp(0.0, 1.0)"),
         ],
     )
 
@@ -323,13 +332,12 @@ def _push_next_to(m: Measured, v: Variant) -> Draft:
             "wanted_height = torch.where(distance_xy < 0.04, push_point[:, 2], torch.where(ahead > 0, push_point[:, 2] + 0.07, push_point[:, 2] + 0.02))",
         ],
         target="push_point",
-        progress=f"(0.5 * (1 - gap / 0.15).clamp(-1.0, 1.0) + 0.5 * torch.exp(-gap.clamp(min=0.0) / 0.025)) * {_LOW}.float()",
+        progress=f"(0.5 * (1 - gap / 0.15).clamp(-1.0, 1.0) + 0.5 * torch.exp(-gap.clamp(min=0.0) / 0.025)) * {_LOW}.float() * {_STANDING}",
         remaining="gap.clamp(min=0.0)",
         goal="ref_pos",
         extras=[
             ("go_around", "0.1 * (1 - torch.tanh(10.0 * (eef_pos[:, 2] - wanted_height).abs()))"),
             ("leave_reference", "-3.0 * (ref_moved - 0.01).clamp(0.0, 0.3)"),
-            ("upright", "-0.5 * (1 - upright(obj_quat, obj_start_quat)).clamp(0.0, 1.0)"),
         ],
     )
 
@@ -497,7 +505,7 @@ def _uncover(m: Measured, v: Variant) -> Draft:
         success=[
             (
                 "is_off",
-                f"((height > {height}) & (obj_grasped > 0.5)) | ((aside > room + 0.02) & (height < 0.02))",
+                f"((height > {height}) & (obj_grasped > 0.5)) | ((aside > room + 0.02) & (height.abs() < 0.02))",
             ),
             ("is_left_alone", _REF_STILL),
             ("is_upright", "standing > 0.9"),
@@ -876,7 +884,9 @@ def _reward_lines(v: Variant, d: Draft) -> list[str]:
         *([f"direction = {d.direction}"] if v.speed else []),
         "reward_components = {}",
         *[f'reward_components["{name}"] = {expression}' for name, expression in components],
-        "total = " + " + ".join(f'reward_components["{name}"]' for name, _ in components),
+        "total = 100.0 * ("
+        + " + ".join(f'reward_components["{name}"]' for name, _ in components)
+        + ")",
         "return total, reward_components",
     ]
 
