@@ -2,10 +2,7 @@
 
 import argparse
 import json
-import os
 from pathlib import Path
-
-os.environ.setdefault("MUJOCO_GL", "egl")
 
 from v2p_data.video.synthetic import COLOURS, VideoSpec, View, render, write
 from v2p_data.video.synthetic_scene import Hand, Room, Thing

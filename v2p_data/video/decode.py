@@ -185,6 +185,8 @@ def _film_of(container: "av.container.InputContainer", path: Path, cfg: VideoCon
     if not container.streams.video:
         raise ItemRejectedError("no_video_stream", f"{path.name} holds no pictures")
     stream = container.streams.video[0]
+    if stream.codec_context is None:  # not what the types say, but what a damaged file gives
+        raise ItemRejectedError("unreadable", f"{path.name} holds pictures of an unknown kind")
     _check_size(path, stream.codec_context.width, stream.codec_context.height, cfg, low=False)
     seconds = (container.duration or 0) / av.time_base
     _check_duration(path, seconds, cfg)

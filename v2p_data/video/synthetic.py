@@ -5,6 +5,9 @@ frame is that of a scene from video (origin under the object's first position, +
 and reconstruction compare number by number. `random_spec` varies camera, light, colours, sizes and motion.
 """
 
+# mujoco's classes come from a compiled module that declares none of them.
+# pyright: reportAttributeAccessIssue=false
+
 import json
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
@@ -17,7 +20,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import CV_FROM_GL, Camera, intrinsics
 from v2p_data.geometry.pose import (
     apply,
@@ -30,14 +32,15 @@ from v2p_data.video.synthetic_scene import (
     LABEL_HAND,
     LABEL_OBJECT,
     PALM_HALF_M,
+    Drawer,
     Hand,
     Placed,
     Rgb,
     Room,
+    Side,
     Thing,
     build,
     knuckles_past_centre_m,
-    labels_of,
 )
 
 MotionKind = Literal["lift_up", "push_left", "push_right", "tip_over"]
@@ -205,7 +208,11 @@ def animate(spec: VideoSpec) -> Motion:
 
 
 def render(spec: VideoSpec) -> SyntheticVideo:
-    """Draw the clip."""
+    """Draw the clip.
+
+    Raises:
+        V2PError: there is no OpenGL.
+    """
     view, camera, motion = spec.view, spec.view.camera(), animate(spec)
     model = build(
         spec.thing,
@@ -218,30 +225,17 @@ def render(spec: VideoSpec) -> SyntheticVideo:
     )
     data = mujoco.MjData(model)
     noise = rng_for(spec.seed, "noise")
-    labels = labels_of(model)
     frames, masks, seen = [], [], []
-    try:
-        renderer = mujoco.Renderer(model, view.height_px, view.width_px)
-    except (RuntimeError, ImportError, AttributeError) as error:
-        raise V2PError(
-            "drawing needs OpenGL without a screen; install libegl1 and set MUJOCO_GL=egl"
-        ) from error
-    with renderer:
+    with Drawer(model) as drawer:
         for i in range(len(motion.grip)):
             _pose(model, data, motion, i, camera)
-            renderer.update_scene(data, "view")
-            image = renderer.render().astype(np.float32)
+            image = drawer.picture(data).astype(np.float32)
             if spec.noise:
                 image += noise.normal(0, spec.noise, image.shape).astype(np.float32)
             frames.append(image.round().clip(0, 255).astype(np.uint8))
-            renderer.enable_segmentation_rendering()
-            renderer.update_scene(data, "view")
-            ids = renderer.render()
-            renderer.disable_segmentation_rendering()
-            is_geom = ids[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
-            masks.append(np.where(is_geom, labels[ids[..., 0].clip(0)], 0).astype(np.uint8))
-            seen.append(bool((masks[-1] == LABEL_HAND).any()))
-            masks = [masks[0], masks[-1]]
+            mask = drawer.mask(data)
+            seen.append(bool((mask == LABEL_HAND).any()))
+            masks = [*masks[:1], mask]
     return SyntheticVideo(
         spec=spec,
         frames=np.stack(frames),
@@ -285,9 +279,14 @@ def random_spec(
         rng: where the draws come from.
         others: objects that stand around, up to four.
     """
-    side = {"push_left": "right", "push_right": "left"}.get(kind) or rng.choice(["left", "right"])
+    side: Side = "right" if kind == "push_left" or rng.random() < 0.5 else "left"
+    if kind == "push_right":
+        side = "left"
     shape = "box" if kind == "tip_over" else str(rng.choice(["box", "cylinder"]))
-    thing = _random_thing(shape, rng, tall=kind == "tip_over", flat=kind.startswith("push"))
+    colours = [str(c) for c in rng.permutation(list(COLOURS))]
+    thing = _random_thing(
+        shape, colours.pop(), rng, tall=kind == "tip_over", flat=kind.startswith("push")
+    )
     sign = 1 if side == "right" else -1
     moves = sign if kind.startswith("push") else 0
     distance = float(rng.uniform(0.10, 0.18))
@@ -296,7 +295,7 @@ def random_spec(
         spots[1] = (0.21, -0.20)
     placed = tuple(
         Placed(
-            thing=_random_thing(str(rng.choice(["box", "cylinder"])), rng),
+            thing=_random_thing(str(rng.choice(["box", "cylinder"])), colours.pop(), rng),
             xy_m=(spots[i][0] + float(rng.uniform(0, 0.04)), sign * spots[i][1]),
             yaw_rad=float(rng.uniform(-0.6, 0.6)),
         )
@@ -332,7 +331,11 @@ def random_spec(
         hand=Hand(
             side=side,
             skin=_times((0.82, 0.60, 0.48), tone),
-            sleeve=tuple(float(v) for v in rng.uniform(0.12, 0.75, 3)),
+            sleeve=(
+                float(rng.uniform(0.12, 0.75)),
+                float(rng.uniform(0.12, 0.75)),
+                float(rng.uniform(0.12, 0.75)),
+            ),
             arm=(-0.8, -float(rng.uniform(0.35, 0.8)), float(rng.uniform(0.08, 0.22))),
         ),
         seconds=float(rng.uniform(3.0, 4.2)),
@@ -354,9 +357,13 @@ COLOURS: dict[str, Rgb] = {
 
 
 def _random_thing(
-    shape: str, rng: np.random.Generator, tall: bool = False, flat: bool = False
+    shape: str,
+    colour: str,
+    rng: np.random.Generator,
+    tall: bool = False,
+    flat: bool = False,
 ) -> Thing:
-    colour, printed = rng.choice(list(COLOURS), 2, replace=False)
+    printed = rng.choice([name for name in COLOURS if name != colour])
     if shape == "cylinder":
         across = float(rng.uniform(0.05, 0.08))
         size = (
@@ -373,7 +380,7 @@ def _random_thing(
         label=f"{colour} {noun}",
         shape="box" if shape == "box" else "cylinder",
         size_m=size,
-        base=COLOURS[str(colour)],
+        base=COLOURS[colour],
         accent=COLOURS[str(printed)],
         print=rng.choice(["label", "stripes", "checker", "speckle"]).item(),
     )

@@ -5,12 +5,20 @@ is drawn after forward kinematics. World frame as in a scene from video: origin 
 first position, +x away from the camera, +y to the left of the picture, +z up, metres.
 """
 
+# mujoco's classes come from a compiled module that declares none of them.
+# pyright: reportAttributeAccessIssue=false
+
+import itertools
+import os
+import sys
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
+
+from v2p_data.errors import V2PError
 
 Rgb = tuple[float, float, float]
 Side = Literal["left", "right"]
@@ -140,6 +148,75 @@ def labels_of(model: mujoco.MjModel) -> UInt8[np.ndarray, "geom"]:
     return labels
 
 
+class Drawer:
+    """Draws camera `view` of a model without a window."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        width, height = model.vis.global_.offwidth, model.vis.global_.offheight
+        self._model, self._labels = model, labels_of(model)
+        self._context = _gl_context(width, height)
+        self._context.make_current()
+        self._drawer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawer)
+        self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + 50)
+        self._option = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = model.camera("view").id
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+
+    def picture(self, data: mujoco.MjData) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the picture."""
+        return self._draw(data, segmentation=False)
+
+    def mask(self, data: mujoco.MjData) -> UInt8[np.ndarray, "h w"]:
+        """Return labels."""
+        codes = self._draw(data, segmentation=True).astype(np.int32)
+        shown = codes[..., 0] + (codes[..., 1] << 8) + (codes[..., 2] << 16)
+        labels = np.zeros(self._scene.ngeom + 1, np.uint8)
+        for k in range(self._scene.ngeom):
+            geom = self._scene.geoms[k]
+            if geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM):
+                labels[geom.segid + 1] = self._labels[geom.objid]
+        return labels[shown]
+
+    def _draw(self, data: mujoco.MjData, *, segmentation: bool) -> UInt8[np.ndarray, "h w 3"]:
+        self._context.make_current()
+        mujoco.mjv_updateScene(
+            self._model, data, self._option, None, self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value, self._scene,
+        )  # fmt: skip
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = segmentation
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = segmentation
+        mujoco.mjr_render(self._rect, self._scene, self._drawer)
+        pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._rect, self._drawer)
+        return pixels[::-1].copy()
+
+    def __enter__(self) -> "Drawer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.make_current()
+        self._drawer.free()
+        self._context.free()
+
+
+def _gl_context(width: int, height: int) -> Any:
+    """Return an OpenGL context: EGL on Linux, for MuJoCo would look for a window where MUJOCO_GL is unset."""
+    try:
+        if sys.platform == "linux" and os.environ.get("MUJOCO_GL", "egl").lower() in {"egl", ""}:
+            from mujoco.egl import GLContext
+        else:
+            from mujoco.rendering.classic.gl_context import GLContext
+        return GLContext(width, height)
+    except (ImportError, AttributeError, OSError, RuntimeError) as error:
+        raise V2PError(
+            "drawing clips needs OpenGL without a screen and there is none; on Debian or Ubuntu: "
+            f"apt-get install -y libegl1 libgl1 ({type(error).__name__}: {error})"
+        ) from error
+
+
 def thumb_at_m(thing: Thing) -> float:
     """Return the thumb's place along the hand's x so that it closes on the near face."""
     return PALM_HALF_M[0] - thing.size_m[0] - 3 * FINGER_R_M
@@ -179,8 +256,10 @@ def _add_lights(spec: mujoco.MjSpec, room: Room) -> None:
 
 def _add_room(spec: mujoco.MjSpec, room: Room, rng: np.random.Generator) -> None:
     _add_material(spec, "wood", _wood(room, rng), repeat=(1.0, 1.0))
-    _add_material(spec, "carpet", _noise_texture((0.36, 0.36, 0.38), 0.18, 1, rng), repeat=(6, 6))
-    _add_material(spec, "plaster", _noise_texture(room.wall, 0.03, 5, rng), repeat=(1, 1))
+    _add_material(
+        spec, "carpet", _noise_texture((0.36, 0.36, 0.38), 0.18, 1, rng), repeat=(6.0, 6.0)
+    )
+    _add_material(spec, "plaster", _noise_texture(room.wall, 0.03, 5, rng), repeat=(1.0, 1.0))
     far, near, half_wide = room.table_far_m, -1.1, 1.1
     middle, half = (far + near) / 2, (far - near) / 2
     # The plane carries the texture; a thin slab gives the table its edge.
@@ -192,8 +271,8 @@ def _add_room(spec: mujoco.MjSpec, room: Room, rng: np.random.Generator) -> None
     )
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[half, half_wide, 0.014],
-        pos=[middle, 0, -0.015],
+        size=[half, half_wide, 0.012],
+        pos=[middle, 0, -0.020],
         rgba=[*(0.7 * np.array(room.wood)), 1],
     )
     spec.worldbody.add_geom(
@@ -220,7 +299,7 @@ def _add_thing(
         userfacetexcoord=faces.ravel().tolist(),
         smoothnormal=False,
     )
-    _add_material(spec, name, _printed(thing, rng), repeat=(1, 1), specular=0.25)
+    _add_material(spec, name, _printed(thing, rng), repeat=(1.0, 1.0), specular=0.25)
     body = spec.worldbody.add_body(name=name)
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_MESH,
@@ -351,16 +430,16 @@ def _wood(room: Room, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     """Return planks along the picture's width, each with its own tone and fine, long grain."""
     size, planks = 1024, 9
     image = np.zeros((size, size))
-    edges = np.linspace(0, size, planks + 1).round().astype(int)
-    for top, bottom in zip(edges[:-1], edges[1:], strict=True):
+    edges = [round(e) for e in np.linspace(0, size, planks + 1)]
+    for top, bottom in itertools.pairwise(edges):
         shape = (bottom - top, size)
-        bend = _smooth_noise(shape, (2, 3), rng)
+        bend = _smooth_noise(shape, (2.0, 3.0), rng)
         rings = np.sin(
             2 * np.pi * (4.0 * np.linspace(0, 1, shape[0])[:, None] + 1.4 * bend)
             + rng.uniform(0, 6.28)
         )
-        fine = _smooth_noise(shape, (shape[0] / 2, 10), rng)
-        finer = _smooth_noise(shape, (shape[0] / 1.5, 60), rng)
+        fine = _smooth_noise(shape, (shape[0] / 2, 10.0), rng)
+        finer = _smooth_noise(shape, (shape[0] / 1.5, 60.0), rng)
         tone = 0.5 * rng.uniform(-1, 1)
         image[top:bottom] = 0.45 * rings + 0.7 * fine + 0.35 * finer + tone
         image[top : top + 2] -= 1.6
@@ -392,7 +471,7 @@ def _tile(
     elif thing.print == "checker":
         printed = ((y * 5).astype(int) + (x * 5).astype(int)) % 2 == 0
     elif thing.print == "speckle":
-        printed = _smooth_noise((h, w), (14, 14 * w / h), rng) > 0.45
+        printed = _smooth_noise((h, w), (14.0, 14 * w / h), rng) > 0.45
     else:
         printed |= (np.abs(y - 0.5) < 0.17) & (x > 0.1) & (x < w / h - 0.1)
         printed |= np.abs(y - 0.9) < 0.025
@@ -403,7 +482,9 @@ def _tile(
                 length = rng.uniform(0.12, 0.26)
                 printed &= ~((np.abs(y - row) < 0.014) & (x > start) & (x < start + length))
     image = np.where(printed[..., None], accent, base)
-    wear = 0.05 * _smooth_noise((h, w), (5, 5), rng) + 0.04 * _smooth_noise((h, w), (60, 60), rng)
+    wear = 0.05 * _smooth_noise((h, w), (5.0, 5.0), rng) + 0.04 * _smooth_noise(
+        (h, w), (60.0, 60.0), rng
+    )
     edge = np.minimum(np.minimum(y, 1 - y), np.minimum(x, w / h - x)) < 0.012
     image = image * (1 + wear[..., None]) * np.where(edge, 0.72, 1.0)[..., None]
     return _pixels(image)
