@@ -42,6 +42,10 @@ _OBJECT_COLUMNS = {
 }
 
 
+HOLDS_BELOW_M = 0.084
+"""Both pads also touch what is wedged between fully open fingers; without this bound that pays as a grasp."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Observed:
     """The simulation's state from which a block is filled; rows are worlds."""
@@ -97,6 +101,7 @@ class StateBlock:
         )
         spin = np.matmul(rotation, seen.object_qvel[:, :, 3:, None])[..., 0]
         touching = seen.touches.sum(2, keepdims=True)
+        has_closed = seen.fingers.sum(1)[:, None, None] < HOLDS_BELOW_M
         up = rotation[:, :, 2, 2, None]
         self._objects[rows] = np.concatenate(
             [
@@ -106,7 +111,7 @@ class StateBlock:
                 seen.object_size,
                 seen.start_pose,
                 up,
-                touching > 1.5,
+                (touching > 1.5) & has_closed,
                 touching > 0.5,
             ],
             axis=2,

@@ -41,8 +41,12 @@ OBJECT_STATES = {
     "size": ("(env, 3)", "m", "full extents along the object's own axes"),
     "start_pos": ("(env, 3)", "m", "`pos` at the start of the episode"),
     "start_quat": ("(env, 4)", "wxyz", "`quat` at the start of the episode"),
-    "up": ("(env,)", "1", "cosine between the object's own z axis and world up: 1 upright, 0 on its side"),
-    "grasped": ("(env,)", "0 or 1", "both pads touch the object"),
+    "up": (
+        "(env,)",
+        "1",
+        "cosine between the object's own z axis and world up: 1 upright, 0 on its side",
+    ),
+    "grasped": ("(env,)", "0 or 1", "both pads touch the object, and the gripper is not fully open"),
     "touched": ("(env,)", "0 or 1", "at least one pad touches the object"),
 }
 
@@ -146,7 +150,9 @@ class TaskBundle:
         """
         path = folder / TASK_FILE
         if not path.is_file():
-            raise V2PError(f"{folder} holds no {TASK_FILE}: it is no task; make one with 'v2p task'")
+            raise V2PError(
+                f"{folder} holds no {TASK_FILE}: it is no task; make one with 'v2p task'"
+            )
         return TaskBundle(
             **json.loads(path.read_text()),
             code=(folder / CODE_FILE).read_text(),
