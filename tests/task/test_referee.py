@@ -67,6 +67,21 @@ def test_a_lift_is_high_and_held_at_the_end():
     assert not verdict("lift_up", [track(HERE, (0.5, 0.0, 0.07), touched_last=True)], BOX)
 
 
+def test_a_thing_on_its_way_through_the_air_is_not_held_up():
+    still, waved = (track(HERE, (0.5, 0.0, 0.14), touched_last=True) for _ in range(2))
+    waved.pos[-5:, 0, 1] = [0.0, 0.02, 0.04, 0.06, 0.08]
+    assert verdict("lift_up", [still], BOX)
+    assert not verdict("lift_up", [waved], BOX)
+
+
+def test_a_box_leaning_into_the_table_was_pressed_through_it():
+    # Standing on an edge, a 4 cm box reaches 28 mm below its centre: at 20 mm it is 8 mm deep in the table.
+    edge = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0)
+    far = dict(end=(0.5, 0.1, 0.02), quat_end=edge)
+    assert not verdict("generic", [track(HERE, **far)], BOX)
+    assert verdict("generic", [track(HERE, (0.5, 0.1, 0.029), quat_end=edge)], BOX)
+
+
 def test_left_is_plus_y():
     left = [track(HERE, (0.5, 0.1, 0.02))]
     assert verdict("push_left", left, BOX)

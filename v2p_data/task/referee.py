@@ -28,6 +28,8 @@ REST_M = 0.01
 """Movement over the last samples of a thing at rest."""
 BELOW_M = 0.005
 """A thing this far below its support was pressed through it."""
+STEADY_M = 0.05
+"""Movement over the last samples (0.2 m/s) of a thing that is held up."""
 FALLEN_RAD = np.deg2rad(60)
 STANDS_RAD = np.deg2rad(25)
 
@@ -146,10 +148,19 @@ class Case:
         return (np.abs(local[:, :2]) < self.other.size_m[:, :2] / 2).all(axis=-1)
 
     def is_above_table(self) -> Bool[np.ndarray, "env"]:
-        """Tell whether the manipulated object is not pressed into the table at the end."""
-        # The smallest half extent is a bound for every pose of every shape.
-        least = self.thing.size_m.min(axis=-1) / 2
-        return self.thing.pos[-1, :, 2] > least - BELOW_M
+        """Tell whether no object is pressed into the table over the last samples."""
+        objects = [(self.scene.manipulated, self.thing)]
+        if self.scene.others:
+            objects.append((self._other, self.other))
+        above = np.ones(len(self.thing.size_m), bool)
+        for obj, track in objects:
+            if obj.shape == "mesh":
+                # Its box reaches lower than it does; the smallest half extent is a bound for every pose.
+                low = track.pos[-LAST:, :, 2].min(axis=0) - track.size_m.min(axis=-1) / 2
+            else:
+                low = np.min([self.lowest(track, t) for t in range(-LAST, 0)], axis=0)
+            above &= low > -BELOW_M
+        return above
 
 
 Verdict = Bool[np.ndarray, "env"]
@@ -170,7 +181,8 @@ def referee_success(kind: str, scene: Scene, trajectory: Trajectory) -> Bool[np.
 
 def _lifted(case: Case) -> Verdict:
     lows = np.min([case.lowest(case.thing, t) for t in range(-LAST, 0)], axis=0)
-    return (lows > CLEAR_M) & case.thing.is_held
+    way = np.linalg.norm(np.ptp(case.thing.pos[-LAST:], axis=0), axis=-1)
+    return (lows > CLEAR_M) & (way < STEADY_M) & case.thing.is_held
 
 
 def _pushed(side: int) -> Callable[[Case], Verdict]:

@@ -99,6 +99,11 @@ def make_task(source: str, envs: Placer, urdf_assets_root: str) -> Task:
         ) from error
 
 
+def class_name(source: str) -> str:
+    """Return the name of the one task class in checked code."""
+    return next(n.name for n in _checked_tree(source).body if isinstance(n, ast.ClassDef))
+
+
 def line_in_task_code(error: BaseException) -> int | None:
     """Return the line of the loaded task code at which an exception was raised."""
     line, at = None, error.__traceback__
