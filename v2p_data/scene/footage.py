@@ -46,9 +46,13 @@ class Footage:
     @cached_property
     def lit(self) -> Float32[np.ndarray, "h w 3"]:
         """Lab of the brightest that stands still at each pixel: what lies there when no shadow falls on it."""
-        stills = np.stack([lab_of(image) for image in (self.early, self.late, self.always)])
+        stills = np.stack([lab_of(image) for image in self._stills])
         brightest = stills[..., 0].argmax(0)
         return np.take_along_axis(stills, brightest[None, ..., None], 0)[0]
+
+    @property
+    def _stills(self) -> tuple[UInt8[np.ndarray, "h w 3"], ...]:
+        return self.early, self.late, self.always
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -57,9 +61,28 @@ class Footage:
     def hand(self, image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
         """Return pixels that look like the moving hand and not like what stands still here."""
         moving, still = likelihood(self.hand_hist, image), likelihood(self.rest_hist, image)
-        passing = np.linalg.norm(lab_of(image) - lab_of(self.always), axis=-1) > 9
-        hand = (moving > 2 * still + 1e-7) & passing
+        hand = (moving > 2 * still + 1e-7) & self.arm(image)
         return hand & skin_prior(image) if self.skin_only else hand
+
+    def arm(self, image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+        """Return what is not always there and reaches in from the picture's edge: arms, with what they hold.
+
+        What stands free may have a hand's colours and is none, unless nearly all of it does.
+        """
+        here = lab_of(image)
+        passing = np.any(
+            [np.linalg.norm(here - lab_of(still), axis=-1) > 9 for still in self._stills], axis=0
+        )
+        moving, still = likelihood(self.hand_hist, image), likelihood(self.rest_hist, image)
+        count, parts = cv2.connectedComponents(passing.astype(np.uint8))
+        likely = (moving > 2 * still + 1e-7) & passing
+        area = np.bincount(parts.ravel(), minlength=count)
+        share = np.bincount(parts[likely], minlength=count) / area
+        skin_share = np.bincount(parts[likely & skin_prior(image)], minlength=count) / area
+        touches = np.zeros(count, bool)
+        touches[np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])] = True
+        # Where an arm rests most of the time, the bare table "passes": it has no colour of an arm.
+        return passing & ((touches & (share > 0.05)) | (skin_share > 0.6))[parts]
 
     def knowing(self, look: Float[np.ndarray, "l a b"]) -> "Footage":
         """Return the footage with a hand that is everything that passes, less the object.

@@ -5,6 +5,7 @@ appear. Candidate blobs come from several views of that change and are scored by
 strongest cue, the vanishing edge second. The best score is also the gate: below about 4.5 most findings were wrong.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import cv2
@@ -287,6 +288,7 @@ def _blobs(
     telling = 1 - float(match[table.seen].mean()) if table.seen.any() else 1.0
     colour = (match > 0.5) if words else np.zeros((h, w), bool)
     shade = shadow(lab, footage.lit) & ~colour
+    skin = skin_prior(image) & grow(footage.arm(image), 2)
     changed &= ~shade
     # How long a pixel keeps the look it has here: an arm leaves at once, an object when it is moved.
     moved = np.linalg.norm(footage.lab - lab, axis=-1) > 11
@@ -311,6 +313,11 @@ def _blobs(
         )
         alike = changed & (likelihood(look, image) > others)
         views += [(tidy(alike), 0.0), (tidy(alike, 9), 0.0)]
+
+    def vanishing(mask: np.ndarray) -> float:
+        here, after = edge_contrast(lab, mask), edge_contrast(gone_lab, mask)
+        return (here - after) / (here + after + 4)
+
     blobs: list[_Blob] = []
     for pixels, whole in views:
         for mask in _parts(pixels, h * w, _MIN_SHARE, _MAX_SHARE):
@@ -319,11 +326,10 @@ def _blobs(
                 continue
             x, y, bw, bh = bounding_box(mask)
             area = int(mask.sum())
-            here, after = edge_contrast(lab, mask), edge_contrast(gone_lab, mask)
             ring = grow(mask, 3) & ~mask
             on_table = float((mask & table.hull).sum() / area)
             cues = {
-                "edge": 1.2 * (here - after) / (here + after + 4),
+                "edge": 1.2 * vanishing(mask),
                 # Few things are one colour all over: four tenths are as good as all.
                 "colour": 1.6 * telling * min(1.0, float(match[mask].mean()) / 0.4)
                 if words
@@ -345,7 +351,7 @@ def _blobs(
     best = sorted(blobs, key=lambda blob: -blob.score)[:40]
     for blob in best[:12]:
         blob.whole = _completed(
-            blob, best, changed, hand, skin_prior(image), colour if words else None
+            blob, best, changed, hand, skin, colour if words else None, vanishing
         )
         if look is None and not words and at_end:
             blob.whole = blob.mask  # nothing tells the object from the arm yet
@@ -362,14 +368,16 @@ def _completed(
     hand: np.ndarray,
     skin: np.ndarray,
     colour: np.ndarray | None,
+    vanishing: Callable[[np.ndarray], float],
 ) -> np.ndarray:
     """Return the blob joined with a larger one around it whose surplus changed as well: the rest of the object.
 
     Where the object's colour is known, the rest lies within the convex hull of that colour or adjoins it without being
-    skin: an arm does not.
+    skin: an arm does not. Of several, the most solid with the clearest outline is taken.
     """
+    best, value = blob.mask, -np.inf
     for other in others:
-        if not blob.area < other.area < 8 * blob.area:
+        if not blob.area < other.area < 8 * blob.area or other.cues["border"] < -0.5:
             continue
         if (other.mask & blob.mask).sum() < 0.6 * blob.area:
             continue
@@ -378,15 +386,15 @@ def _completed(
             hull = grow(convex_hull(tidy(colour & whole) | blob.mask), 2)
             whole &= hull | _joined(whole & ~hull & ~skin, hull)
         surplus = whole & ~blob.mask
-        if (
-            surplus.any()
-            and changed[surplus].mean() > 0.7
-            and hand[surplus].mean() < 0.2
-            and solidity(whole) > 0.8
-            and other.cues["border"] > -0.5
-        ):
-            return whole
-    return blob.mask
+        if not surplus.any() or changed[surplus].mean() < 0.7:
+            continue
+        if hand[surplus].mean() > 0.2 or (colour is None and skin[surplus].mean() > 0.3):
+            continue
+        firm = solidity(whole)
+        if firm > 0.8:
+            worth = 3 * firm + vanishing(whole) + 0.3 * float(np.log(whole.sum() / blob.area))
+            best, value = (whole, worth) if worth > value else (best, value)
+    return best
 
 
 def _joined(pieces: np.ndarray, core: np.ndarray) -> np.ndarray:

@@ -33,6 +33,8 @@ class Fit:
     size: tuple[float, float, float]
     T_world_obj: Float[np.ndarray, "4 4"]
     iou: float
+    visible: float
+    """Share of the silhouette that the mask confirms; the rest is hidden or wrong."""
     cost: float
     """1 - IoU plus what the proportions cost: comparable between fits of one mask."""
 
@@ -100,22 +102,39 @@ class Silhouette:
             or y + h >= self.camera.height_px - 1
         )
 
-    def iou(self, points_world: Float[np.ndarray, "n 3"]) -> float:
-        """Return how well the convex hull of the projected points covers the mask."""
+    def iou(self, points_world: Float[np.ndarray, "n 3"], hidden_weight: float = 0.0) -> float:
+        """Return how well the convex hull of the projected points covers the mask, where it could be seen.
+
+        With a `hidden_weight`, pixels that may be hidden count that much: else a shape grows behind the hand for ever.
+        """
+        overlap = self._overlap(points_world)
+        if overlap is None:
+            return -1.0
+        common, wrong, hidden, _ = overlap
+        return common / max(1.0, self._area + wrong + hidden_weight * hidden)
+
+    def visible(self, points_world: Float[np.ndarray, "n 3"]) -> float:
+        """Return the share of the projected hull that the mask confirms."""
+        overlap = self._overlap(points_world)
+        return 0.0 if overlap is None else overlap[0] / max(1.0, overlap[3])
+
+    def _overlap(
+        self, points_world: Float[np.ndarray, "n 3"]
+    ) -> tuple[float, float, float, float] | None:
+        """Return the hull's area on the mask, off it, on hidden pixels, and in all."""
         pixels = (self.camera.project(points_world) - self._offset) * self._zoom
         if not np.isfinite(pixels).all() or np.abs(pixels).max() > 4000:
-            return -1.0
+            return None
         drawn = np.zeros(self._mask.shape, np.uint8)
         # Pixel centres lie at one half, OpenCV counts them as whole numbers.
         hull = cv2.convexHull(((pixels - 0.5) * 16).astype(np.int32))
         cv2.fillConvexPoly(drawn, hull, 1, cv2.LINE_8, 4)
         covered = drawn > 0
-        shape = covered & self._known
-        common = int((shape & self._mask).sum())
-        beyond = 0.0 if self.at_border else max(0.0, cv2.contourArea(hull) / 256 - covered.sum())
-        # What may be hidden costs little, not nothing: else a shape grows behind the hand for ever.
-        hidden = _HIDDEN_WEIGHT * float((covered & ~self._known).sum())
-        return common / max(1.0, float(shape.sum()) + self._area - common + beyond + hidden)
+        total = float(covered.sum())
+        seen = covered & self._known
+        common, hidden = float((seen & self._mask).sum()), total - float(seen.sum())
+        beyond = 0.0 if self.at_border else max(0.0, cv2.contourArea(hull) / 256 - total)
+        return common, float(seen.sum()) - common + beyond, hidden, total + beyond
 
     @property
     def centre(self) -> Float[np.ndarray, "2"]:
@@ -126,7 +145,7 @@ class Silhouette:
 
 def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
     """Return the ways a noun's shape can rest, as rotations with what each costs: upright first, then lying."""
-    upright, cost = np.eye(3), 0.06 if noun.spread < 0.3 else 0.0
+    upright, cost = np.eye(3), 0.12 if noun.spread < 0.3 else 0.0
     if noun.form == "sphere":
         return [(upright, 0.0)]
     lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
@@ -161,7 +180,7 @@ def fit_shape(
     def cost(v: np.ndarray) -> float:
         points = place(v)
         off = (v[3:] - v[3:].mean()) / spread
-        return 1 - silhouette.iou(points) + _PRIOR_WEIGHT * float((off**2).sum())
+        return 1 - silhouette.iou(points, _HIDDEN_WEIGHT) + _PRIOR_WEIGHT * float((off**2).sum())
 
     def place(v: np.ndarray) -> np.ndarray:
         size = size_of(v)
@@ -184,7 +203,13 @@ def fit_shape(
     T = _resting(ground + best[:2] * scale0 * prior.max(), best[2], rest, size)
     points = outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
     sizes = (float(size[0]), float(size[1]), float(size[2]))
-    return Fit(size=sizes, T_world_obj=T, iou=silhouette.iou(points), cost=cost(best))
+    return Fit(
+        size=sizes,
+        T_world_obj=T,
+        iou=silhouette.iou(points),
+        visible=silhouette.visible(points),
+        cost=cost(best),
+    )
 
 
 def fit_pose(
@@ -214,7 +239,7 @@ def fit_pose(
         turn = 0.0
         if yaw_near is not None:
             turn = 0.01 * (1 - np.cos(2 * (v[2] - yaw_near)))
-        return 1 - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3]) + turn
+        return 1 - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3], _HIDDEN_WEIGHT) + turn
 
     turns = _yaw_starts(noun, rest, thorough=True)
     if yaw_near is not None:
@@ -230,8 +255,14 @@ def fit_pose(
     ]
     best = _search(cost, starts, np.array([0.15, 0.15, 0.3]))
     T = place(best)
-    iou = silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3])
-    return Fit(size=size, T_world_obj=T, iou=iou, cost=cost(best))
+    points = points0 @ T[:3, :3].T + T[:3, 3]
+    return Fit(
+        size=size,
+        T_world_obj=T,
+        iou=silhouette.iou(points),
+        visible=silhouette.visible(points),
+        cost=cost(best),
+    )
 
 
 def fit_lifted(
@@ -257,7 +288,11 @@ def fit_lifted(
 
     def cost(v: np.ndarray) -> float:
         T = place(v)
-        return 1 - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3]) + 0.01 * (1 - np.cos(v[2]))
+        return (
+            1
+            - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3], _HIDDEN_WEIGHT)
+            + 0.01 * (1 - np.cos(v[2]))
+        )
 
     best = _search(
         cost,
@@ -265,8 +300,14 @@ def fit_lifted(
         np.array([0.2, 0.2, 0.2]),
     )
     T = place(best)
-    iou = silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3])
-    return Fit(size=size, T_world_obj=T, iou=iou, cost=cost(best))
+    points = points0 @ T[:3, :3].T + T[:3, 3]
+    return Fit(
+        size=size,
+        T_world_obj=T,
+        iou=silhouette.iou(points),
+        visible=silhouette.visible(points),
+        cost=cost(best),
+    )
 
 
 def on_wall(camera: Camera, pixel: Float[np.ndarray, "2"], x: float) -> Float[np.ndarray, "3"]:

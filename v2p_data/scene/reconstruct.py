@@ -433,7 +433,7 @@ def _assemble(
             )
         )
     _check_motion(kind, objects, geometry, moved)
-    cues = _cues(kind, seen, geometry, moved, followed)
+    cues = _cues(kind, seen, geometry, followed)
     confidence = float(np.prod(list(cues.values())))
     if confidence < cfg.min_confidence:
         weakest = min(cues, key=lambda cue: cues[cue])
@@ -497,9 +497,7 @@ def _check_motion(kind: str, objects: list[Estimate], geometry: _Geometry, moved
         )
 
 
-def _cues(
-    kind: str, seen: list[_Seen], geometry: _Geometry, moved: Moved, followed: Track
-) -> dict[str, float]:
+def _cues(kind: str, seen: list[_Seen], geometry: _Geometry, followed: Track) -> dict[str, float]:
     cues: dict[str, float] = {}
     for i, s in enumerate(seen):
         which = "object" if i == 0 else f"the {s.phrase}"
@@ -510,9 +508,8 @@ def _cues(
         cues[f"size of {which}"] = float(np.exp(-0.5 * (max(0.0, off - 1.5) / 1.5) ** 2))
         cues[f"shape of {which}"] = float(np.clip(0.5 + (iou - 0.6) / 0.3 * 0.5, 0.1, 1))
     cues["pose at the end"] = float(np.clip(0.6 + (geometry.last.iou - 0.5) / 0.35 * 0.4, 0.1, 1))
-    cues["same size at both ends"] = float(
-        np.exp(-0.5 * (np.log(geometry.last_mask.sum() / moved.first.sum()) / 1.0) ** 2)
-    )
+    seen_at_end = geometry.last.visible / max(0.2, geometry.fits[0].visible)
+    cues["seen at the end"] = float(np.clip(0.4 + 0.6 * seen_at_end / 0.5, 0.1, 1))
     cues["track from start to end"] = float(np.clip(0.65 + 0.7 * followed.meets, 0, 1))
     noun = seen[0].noun
     cues["noun"] = 1.0 if noun.known or seen[0].known_m else 0.9
@@ -621,7 +618,7 @@ def _upright_axes(fit: Fit) -> Fit:
     size = np.abs(rest) @ np.array(fit.size)
     yawed = fit.T_world_obj[:3, :3] @ rest.T
     T = transform(yawed, fit.T_world_obj[:3, 3])
-    return Fit(size=_tuple3(size), T_world_obj=T, iou=fit.iou, cost=fit.cost)
+    return replace(fit, size=_tuple3(size), T_world_obj=T)
 
 
 def _rest_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -645,7 +642,7 @@ def _tipped_along(fit: Fit, T_first: Float[np.ndarray, "4 4"]) -> Fit:
         return fit
     T = fit.T_world_obj.copy()
     T[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ T[:3, :3]
-    return Fit(size=fit.size, T_world_obj=T, iou=fit.iou, cost=fit.cost)
+    return replace(fit, T_world_obj=T)
 
 
 def _clip_camera(clip: Clip, geometry: _Geometry, origin: Float[np.ndarray, "3"]) -> Camera:
