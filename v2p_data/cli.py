@@ -54,8 +54,6 @@ def run(argv: Sequence[str]) -> int:
         return 0
     name = argv[0]
     try:
-        if name not in COMMANDS:
-            raise V2PError(f"there is no command '{name}'.{did_you_mean(name, COMMANDS)}")
         return _command(name)(list(argv[1:]))
     except V2PError as error:
         print(f"v2p {name}: {error}" if name in COMMANDS else f"v2p: {error}", file=sys.stderr)
@@ -103,6 +101,8 @@ def _one_sentence(box: str, command: str) -> str:
 
 
 def _command(name: str) -> Callable[[list[str]], int]:
+    if name not in COMMANDS:
+        raise V2PError(f"there is no command '{name}'.{did_you_mean(name, COMMANDS)}")
     from importlib import import_module
 
     module = import_module(f"v2p_data.commands.{COMMANDS[name][0]}")

@@ -12,14 +12,13 @@ import json
 import logging
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from policies.evaluation.rate import Rate, wilson
+from policies.evaluation.rate import wilson
 from policies.ppo.train import PPOConfig
-
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
@@ -210,9 +209,8 @@ def make_expert(
     cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
 ) -> dict[str, Any]:
     """Train with PPO at the coarse time step, judge at the fine one with the independent referee."""
-    from policies.ppo.train import train_expert
-
     from policies.ppo.policy import Expert
+    from policies.ppo.train import train_expert
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.batch_env import BatchEnv, SimConfig
@@ -251,16 +249,16 @@ def make_expert(
     counts = {
         "steps": result.steps,
         "train_seconds": round(result.seconds, 1),
-        "success": rate_json(rate),
+        "success": rate.as_dict(),
         "task_success": float(judged.task_successes.mean()),
     }
     write_json_atomically(out / EVALUATION_FILE, counts)
-    if rate.rate < expert_cfg.min_success:
+    if rate.value < expert_cfg.min_success:
         raise ItemRejectedError(
             "expert_not_learned",
             f"after {result.steps} steps the expert succeeds in {rate} of episodes, "
             f"below the {expert_cfg.min_success:.0%} that are worth collecting",
-            rate.rate,
+            rate.value,
         )
     return counts
 
@@ -471,7 +469,6 @@ def make_evaluation(
     """Roll the policy out and write success rates with their intervals."""
     from policies.evaluation.rollout import evaluate_policy
 
-
     del inputs
     rows: list[dict[str, Any]] = []
     for index, (name, folder) in enumerate(tasks.items()):
@@ -490,16 +487,11 @@ def make_evaluation(
                 "task": name,
                 "seen": name in seen,
                 "first_seed": first_seed,
-                **rate_json(wilson(sum(successes), len(successes))),
+                **wilson(sum(successes), len(successes)).as_dict(),
             }
         )
     (out / EVALUATION_FILE).write_text(json.dumps(rows, indent=1))
     return {"tasks": len(rows), "rows": rows}
-
-
-def rate_json(rate: Rate) -> dict[str, float]:
-    """Return successes, trials, the rate and its interval for JSON."""
-    return {**asdict(rate), "value": rate.rate}
 
 
 # --- all of it -----------------------------------------------------------------------------------------------
@@ -511,4 +503,3 @@ def chain(video: VideoItem, cfg: EngineConfig) -> Stage:
     task = task_stage(scene, cfg)
     expert = expert_stage(task, cfg)
     return episodes_stage(task, expert, cfg)
-

@@ -284,7 +284,7 @@ def rate_lines(rows: Sequence[dict[str, object]]) -> list[str]:
     width = max(len(str(r["task"])) for r in rows)
     return [
         f"  {r['task']!s:<{width}}  {'seen  ' if r['seen'] else 'unseen'}  {r['successes']}/{r['trials']}"
-        f" = {r['value']:.0%}, 95 % interval {r['low']:.0%} to {r['high']:.0%}"
+        f" = {r['rate']:.0%}, 95 % interval {r['low']:.0%} to {r['high']:.0%}"
         for r in rows
     ]
 
