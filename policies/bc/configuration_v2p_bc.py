@@ -48,8 +48,6 @@ class V2PBCConfig(PreTrainedConfig):
     """Condition on the task's words, so that one policy can serve several tasks."""
     task_words_dim: int = 64
     """Length of the fixed, hashed bag of words that stands for a task."""
-    state_noise: float = 0.0
-    """Training only: Gaussian noise on the normalised state, in standard deviations, so that the policy looks."""
 
     optimizer_lr: float = 3e-4
     """Learning rate of everything but a pretrained backbone."""

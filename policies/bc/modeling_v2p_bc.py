@@ -194,8 +194,6 @@ class BCNet(nn.Module):
         ]
         if self.state is not None:
             vector = torch.cat([batch[key].flatten(1) for key in self.vector_keys], 1)
-            if self.training and self.cfg.state_noise:
-                vector = vector + self.cfg.state_noise * torch.randn_like(vector)
             parts.append(self.state(vector))
         if self.task is not None:
             tasks = batch.get("task") or [""] * len(parts[0])
