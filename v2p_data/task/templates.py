@@ -192,11 +192,23 @@ _REF_STILL = "(ref_moved < 0.03)"
 _REF_MOVED = "ref_moved = torch.norm((ref_pos - ref_start)[:, :2], dim=-1)"
 _LEAVE_REF = ("leave_reference", "-1.0 * (ref_moved - 0.01).clamp(0.0, 0.3)")
 _TOP = "grasp_point[:, 2] = obj_pos[:, 2] + (half_height - 0.035).clamp(min=0.0)"
-_GRASP_SETUP = ["grasp_point = obj_pos.clone()", _TOP]
+_GRASP_SETUP = [
+    "grasp_point = obj_pos.clone()",
+    _TOP,
+    # The pads close along the gripper's own y axis.
+    "closing = torch.zeros_like(eef_pos)",
+    "closing[:, 1] = 1",
+    "closing = in_world_frame(eef_quat, closing)",
+    "pads_apart = 2 * obj_half(obj_quat, obj_size, closing)",
+]
+_TURN = ("turn", "0.15 * (1 - (pads_apart - 0.07) / 0.03).clamp(0.0, 1.0)")
+"""Without it, open fingers get wedged over the diagonal of a wide box, and closing them achieves nothing."""
 _STILL_UPRIGHT = "(upright(obj_quat, obj_start_quat) > 0.9)"
 # Withholds what pushing earns once the object topples. A penalty instead teaches not to touch tall objects at all:
 # 0 % for a 5 x 8 cm cylinder.
 _STANDING = "upright(obj_quat, obj_start_quat).clamp(0.0, 1.0)"
+# A leaning finger pushes at the object's upper edge and rolls it over: 4 cm cubes in one episode out of seven.
+_LEVEL = ("level", "-0.4 * lean")
 
 
 def _lift(m: Measured, v: Variant) -> Draft:
@@ -264,6 +276,7 @@ def _push(m: Measured, v: Variant) -> Draft:
         extras=[
             ("straight", "-0.5 * (sideways - 0.02).clamp(0.0, 0.2)"),
             ("not_too_far", f"-0.3 * (moved - {way + 0.07:.3f}).clamp(0.0, 1.0)"),
+            _LEVEL,
         ],
     )
 
@@ -338,6 +351,7 @@ def _push_next_to(m: Measured, v: Variant) -> Draft:
         extras=[
             ("go_around", "0.1 * (1 - torch.tanh(10.0 * (eef_pos[:, 2] - wanted_height).abs()))"),
             ("leave_reference", "-3.0 * (ref_moved - 0.01).clamp(0.0, 0.3)"),
+            _LEVEL,
         ],
     )
 
@@ -620,8 +634,11 @@ def _push_point(clearance_m: float) -> list[str]:
     return [
         "behind = obj_half(obj_quat, obj_size, goal_direction)",
         f"push_point = obj_pos - goal_direction * (behind + {clearance_m}).unsqueeze(-1)",
-        "push_point[:, 2] = table_height + half_height.clamp(0.02, 0.03)",
+        "push_point[:, 2] = table_height + half_height.clamp(0.02, 0.025)",
         "distance_xy = torch.norm((push_point - eef_pos)[:, :2], dim=-1)",
+        "vertical = torch.zeros_like(obj_pos)",
+        "vertical[:, 2] = 1",
+        "lean = torch.norm(in_world_frame(eef_quat, vertical)[:, :2], dim=-1)",
     ]
 
 
@@ -754,6 +771,7 @@ def _state_lines(m: Measured) -> list[str]:
     """Lines that give the states short names."""
     lines = [
         'eef_pos = states["eef_pos"]',
+        'eef_quat = states["eef_quat"]',
         'gripper_width = states["gripper_width"]',
         'table_height = states["table_height"]',
     ]
@@ -859,7 +877,7 @@ def _components(v: Variant, d: Draft) -> list[tuple[str, str]]:
         progress = f"{v.progress} * progress * (0.3 + 0.7 * reach)"
     parts.append(("reach", reach))
     if v.contact and d.pays_contact:
-        parts.append(("contact", f"{v.contact} * contact"))
+        parts += [_TURN, ("contact", f"{v.contact} * contact")]
     parts.append(("progress", progress))
     if v.speed:
         parts.append(
