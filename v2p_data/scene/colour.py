@@ -79,19 +79,19 @@ def colour_match(
         if word in _HUES_DEG:
             centre, width = _HUES_DEG[word]
             off = np.abs((hue_deg - centre + 180) % 360 - 180)
-            strong = _rise(chroma, 21 if word in ("red", "orange", "yellow") else 9, 2) * _rise(
-                chroma / (light + 5), _SATURATION[word], 0.05
-            )
+            strong = _rise(
+                chroma, 21.0 if word in ("red", "orange", "yellow") else 9.0, 2.0
+            ) * _rise(chroma / (light + 5), _SATURATION[word], 0.05)
             fit = _rise(-off, -width, width / 6) * strong
         elif word == "brown":
             off = np.abs((hue_deg - 70 + 180) % 360 - 180)
-            fit = _rise(-off, -25, 4) * _rise(chroma, 10, 2) * _rise(-light, -66, 4)
+            fit = _rise(-off, -25.0, 4.0) * _rise(chroma, 10.0, 2.0) * _rise(-light, -66.0, 4.0)
         elif word == "black":
-            fit = _rise(-light, -30, 4) * _rise(-chroma, -18, 4)
+            fit = _rise(-light, -30.0, 4.0) * _rise(-chroma, -18.0, 4.0)
         elif word == "white":
-            fit = _rise(light, 72, 4) * _rise(-chroma, -14, 3)
+            fit = _rise(light, 72.0, 4.0) * _rise(-chroma, -14.0, 3.0)
         else:
-            fit = _rise(light, 28, 4) * _rise(-light, -80, 4) * _rise(-chroma, -12, 3)
+            fit = _rise(light, 28.0, 4.0) * _rise(-light, -80.0, 4.0) * _rise(-chroma, -12.0, 3.0)
         best = np.maximum(best, fit.astype(np.float32))
     return best
 

@@ -16,6 +16,8 @@ from v2p_data.video.clip import Clip
 
 WIDTH_PX = 320
 MAX_FRAMES = 150
+_FEW_CORNERS = 12
+"""With fewer corners to follow nothing is said about the camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +116,7 @@ def footage_of(clip: Clip) -> Footage:
     quarter = max(3, len(rgb) // 4)
     always = still_of(rgb, lab)
     moving = _passing(rgb, lab, always)
-    skin = moving[skin_prior(moving[None])[0]]
+    skin = moving[skin_prior(moving[None])[0]] if len(moving) else moving
     return Footage(
         rgb=rgb,
         lab=lab,
@@ -146,29 +148,52 @@ def still_of(
 
 
 def camera_shift_px(footage: Footage) -> float:
-    """Return how far the picture moved as a whole, at working size.
+    """Return how far the picture moved as a whole, at working size: the largest over nine frames.
 
-    Six tiles are phase-correlated against the first frame; the median of the tiles with texture counts, so that a
-    moving hand in two of them decides nothing. The largest shift over nine frames is returned.
+    Two measures look at it and the smaller one counts, since a camera that moves shows in both: corners fail where
+    most of them lie on what is moved, tiles where the picture is plain.
     """
-    h, w = footage.shape
-    grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY).astype(np.float32) for f in footage.rgb]
-    tiles = [(r, c) for r in range(2) for c in range(3)]
+    grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in footage.rgb]
+    pick = np.unique(np.linspace(0, len(grey) - 1, 9).astype(int))
+    chosen = [grey[i] for i in pick]
+    shifts = [shift for shift in (_corner_shift(chosen), _tile_shift(chosen)) if shift is not None]
+    return min(shifts) if shifts else 0.0
+
+
+def _corner_shift(grey: list[UInt8[np.ndarray, "h w"]]) -> float | None:
+    """Return the distance that a third of the corners stays below: if the camera moved, hardly any stays."""
+    corners = cv2.goodFeaturesToTrack(grey[0], 250, 0.01, 6)
+    if corners is None or len(corners) < _FEW_CORNERS:
+        return None
+    worst = None
+    for image in grey[1:]:
+        there, found, _ = cv2.calcOpticalFlowPyrLK(grey[0], image, corners, np.empty(0))
+        back, found_back, _ = cv2.calcOpticalFlowPyrLK(image, grey[0], there, np.empty(0))
+        sure = (found[:, 0] > 0) & (found_back[:, 0] > 0)
+        sure &= np.linalg.norm((back - corners)[:, 0], axis=-1) < 0.7
+        if sure.sum() >= _FEW_CORNERS:
+            shifts = np.linalg.norm((there - corners)[sure, 0], axis=-1)
+            worst = max(worst or 0.0, float(np.percentile(shifts, 33)))
+    return worst
+
+
+def _tile_shift(grey: list[UInt8[np.ndarray, "h w"]]) -> float | None:
+    """Return the median shift of six phase-correlated tiles, of those with texture."""
+    h, w = grey[0].shape
     th, tw = h // 2, w // 3
     window = cv2.createHanningWindow((tw, th), cv2.CV_32F)
-    worst = 0.0
-    for i in np.unique(np.linspace(0, len(grey) - 1, 9).astype(int))[1:]:
+    worst = None
+    for image in grey[1:]:
         shifts = []
-        for r, c in tiles:
-            a = grey[0][r * th : (r + 1) * th, c * tw : (c + 1) * tw]
-            b = grey[i][r * th : (r + 1) * th, c * tw : (c + 1) * tw]
+        for y, x in ((r * th, c * tw) for r in range(2) for c in range(3)):
+            a, b = (g[y : y + th, x : x + tw].astype(np.float32) for g in (grey[0], image))
             if a.std() < 4:
                 continue
             (dx, dy), response = cv2.phaseCorrelate(a, b, window)
             if response > 0.05:
                 shifts.append(float(np.hypot(dx, dy)))
         if shifts:
-            worst = max(worst, float(np.median(shifts)))
+            worst = max(worst or 0.0, float(np.median(shifts)))
     return worst
 
 

@@ -30,30 +30,41 @@ class Noun:
     known: bool = True
 
 
+Number = int | float
+
+
 def _box(
-    d: float, w: float, h: float, mass: float, mu: float = 0.5, **more: object
+    d: Number, w: Number, h: Number, mass: Number, mu: Number = 0.5, **more: object
 ) -> dict[str, object]:
     return {
         "form": "box",
         "size_m": (d / 100, w / 100, h / 100),
-        "mass_kg": mass,
-        "friction": mu,
+        "mass_kg": float(mass),
+        "friction": float(mu),
         **more,
     }
 
 
-def _round(d: float, h: float, mass: float, mu: float = 0.5, **more: object) -> dict[str, object]:
+def _round(
+    d: Number, h: Number, mass: Number, mu: Number = 0.5, **more: object
+) -> dict[str, object]:
     return {
         "form": "cylinder",
         "size_m": (d / 100, d / 100, h / 100),
-        "mass_kg": mass,
-        "friction": mu,
+        "mass_kg": float(mass),
+        "friction": float(mu),
         **more,
     }
 
 
-def _ball(d: float, mass: float, mu: float = 0.6, **more: object) -> dict[str, object]:
-    return {"form": "sphere", "size_m": (d / 100,) * 3, "mass_kg": mass, "friction": mu, **more}
+def _ball(d: Number, mass: Number, mu: Number = 0.6, **more: object) -> dict[str, object]:
+    return {
+        "form": "sphere",
+        "size_m": (d / 100,) * 3,
+        "mass_kg": float(mass),
+        "friction": float(mu),
+        **more,
+    }
 
 
 _CUP = {"hollow": True, "taper": 0.75}
@@ -61,7 +72,7 @@ _BOWL = {"hollow": True, "taper": 0.5}
 _SOFT = {"matter": "soft", "spread": 0.35}
 _VAGUE = {"spread": 0.35}
 
-# Lengths in centimetres here, for reading; mass in kg.
+# Numbers in centimetres here, for reading; mass in kg.
 _TABLE: dict[str, dict[str, object]] = {
     # boxes and books
     "box": _box(9, 6.5, 5, 0.2, **_VAGUE), "cracker box": _box(16, 6, 21, 0.41, spread=0.08),

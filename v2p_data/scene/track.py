@@ -153,10 +153,10 @@ def _find_again(
     changed = np.linalg.norm(cv2.GaussianBlur(footage.lab[i], (0, 0), 1) - before, axis=-1) > 7
     pixels = (cv2.GaussianBlur(ratio.astype(np.float32), (0, 0), 1.5) > 0.3) & (changed | home)
     count, parts = cv2.connectedComponents(tidy(pixels, 7).astype(np.uint8))
-    best, value = mask, _likeness(footage, i, mask, look, area) + 0.05
+    best, value = mask, _likeness(footage, i, mask, look, float(area)) + 0.05
     for c in range(1, min(count, 40)):
         part = parts == c
-        likeness = _likeness(footage, i, part, look, area)
+        likeness = _likeness(footage, i, part, look, float(area))
         if likeness > value:
             best, value = part, likeness
     return best

@@ -1,0 +1,79 @@
+"""A clip drawn with OpenCV: a coloured box on a plain table, a skin-coloured arm that moves it, known camera."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from v2p_data.geometry.mesh import outline_points
+from v2p_data.scene.pose import camera_above
+from v2p_data.video.clip import Clip
+
+SIZE_M = (0.09, 0.07, 0.05)
+HEIGHT_M = 0.5
+START_XY = (0.72, -0.06)
+"""From the point under the camera."""
+FACES = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (1, 3, 7, 5)]
+
+
+def make_clip(
+    move_left_m: float = 0.16,
+    lift_m: float = 0.0,
+    caption: str = "Pushing blue box from right to left",
+    objects: tuple[str, ...] = ("blue box",),
+    shake_px: float = 0.0,
+    hints: dict | None = None,
+    num_frames: int = 36,
+) -> Clip:
+    camera = camera_above((240, 320), 0.61, 1.01, HEIGHT_M)
+    rng = np.random.default_rng(0)
+    grain = cv2.GaussianBlur(rng.normal(0, 40, (240, 320)), (0, 0), 2)[..., None]
+    frames = []
+    for i in range(num_frames):
+        t = i / (num_frames - 1)
+        share = float(np.clip((t - 0.35) / 0.3, 0, 1))
+        x, y = START_XY[0], START_XY[1] + move_left_m * share
+        image = np.full((240, 320, 3), (188, 182, 170), np.uint8)
+        image = np.clip(image + grain, 0, 255).astype(np.uint8)
+        centre = np.array([x, y, SIZE_M[2] / 2 + lift_m * share])
+        corners = camera.project(outline_points("box", SIZE_M) + centre)
+        order = sorted(range(5), key=lambda k: k == 4)
+        for k, face in zip(order, [FACES[k] for k in order], strict=True):
+            shade = (0.75, 1.0, 0.85, 0.8, 1.1)[k]
+            colour = tuple(min(255.0, shade * c) for c in (25, 60, 190))
+            cv2.fillPoly(image, [corners[list(face)].astype(np.int32)], colour, cv2.LINE_AA)
+        if 0.15 < t < 0.85 or (lift_m and t > 0.15):
+            reach = min(1.0, (t - 0.15) / 0.2, (0.85 - t) / 0.2 if not lift_m else 1.0)
+            hand = np.array([x, y - 0.06, centre[2]]) + (1 - reach) * np.array([0, -0.5, 0])
+            tip = camera.project(hand[None])[0]
+            for a, b, width, colour in (
+                (tip + np.array([9, 2]), tip + np.array([150, 70]), 24, (60, 110, 90)),
+                (tip, tip + np.array([60, 28]), 16, (205, 150, 125)),
+            ):
+                cv2.line(image, a.astype(int).tolist(), b.astype(int).tolist(), colour, width)
+        if shake_px:
+            shift = np.array([[1, 0, shake_px * t], [0, 1, 0.5 * shake_px * t]])
+            image = cv2.warpAffine(image, shift, (320, 240), borderMode=cv2.BORDER_REPLICATE)
+        frames.append(np.clip(image + rng.normal(0, 1, image.shape), 0, 255).astype(np.uint8))
+    n = len(frames)
+    return Clip(
+        item="drawn",
+        path=Path("drawn.mp4"),
+        caption=caption,
+        objects=objects,
+        hints=hints or {},
+        frames=np.stack(frames),
+        fps=12.0,
+        total_frames=n,
+        source_fps=12.0,
+        source_frame=np.arange(n),
+        times_s=np.arange(n) / 12.0,
+        source_size_px=(320, 240),
+    )
+
+
+@pytest.fixture(scope="session")
+def draw() -> Callable[..., Clip]:
+    return make_clip

@@ -1,0 +1,128 @@
+import cv2
+import numpy as np
+import pytest
+
+from v2p_data.geometry.mesh import outline_points
+from v2p_data.geometry.pose import quat_from_yaw, transform, transform_from_pose
+from v2p_data.scene.nouns import noun_for
+from v2p_data.scene.pose import (
+    Silhouette,
+    camera_above,
+    fit_lifted,
+    fit_pose,
+    fit_shape,
+    lowest,
+    on_wall,
+)
+from v2p_data.scene.scale import SizeVote, camera_height_m, disagreement
+
+PITCH, FOV = 0.61, 1.01
+
+
+def silhouette_of(points, camera):
+    """Return the mask that the points' hull casts, drawn by OpenCV at eight times the size."""
+    mask = np.zeros((camera.height_px * 8, camera.width_px * 8), np.uint8)
+    hull = cv2.convexHull((camera.project(points) * 8).astype(np.int32))
+    cv2.fillConvexPoly(mask, hull, 1)
+    return cv2.resize(mask, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA) > 0
+
+
+def test_the_middle_pixel_meets_the_table_where_trigonometry_says():
+    camera = camera_above((240, 320), PITCH, FOV, height=0.5)
+
+    spot = camera.on_plane(np.array([[160.0, 120.0]]))[0]
+
+    np.testing.assert_allclose(spot, [0.5 / np.tan(PITCH), 0, 0], atol=1e-9)
+
+
+def test_left_in_the_picture_is_plus_y():
+    camera = camera_above((240, 320), PITCH, FOV)
+
+    left, right = camera.on_plane(np.array([[20.0, 150.0], [300.0, 150.0]]))
+
+    assert left[1] > 0 > right[1]
+    assert on_wall(camera, np.array([160.0, 50.0]), 1.2)[0] == pytest.approx(1.2)
+
+
+def test_a_box_is_found_again_from_its_silhouette():
+    camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("book")
+    size = np.array(noun.size_m) * 1.7  # camera heights: any unit will do
+    T = transform_from_pose(np.r_[1.2, 0.2, size[2] / 2, quat_from_yaw(0.5)])
+    points = outline_points("box", tuple(size)) @ T[:3, :3].T + T[:3, 3]
+    silhouette = Silhouette(silhouette_of(points, camera), None, camera)
+
+    fit = fit_shape(silhouette, noun, np.eye(3))
+
+    assert fit.iou > 0.95
+    np.testing.assert_allclose(fit.T_world_obj[:2, 3], [1.2, 0.2], atol=0.04)
+    np.testing.assert_allclose(np.sort(fit.size)[1:], np.sort(size)[1:], rtol=0.12)
+
+
+def test_a_known_shape_is_placed_to_a_hundredth_of_the_camera_height():
+    camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("can")
+    size = (0.14, 0.14, 0.25)
+    points = outline_points("cylinder", size) + np.array([1.3, -0.3, 0.125])
+    silhouette = Silhouette(silhouette_of(points, camera), None, camera)
+
+    fit = fit_pose(silhouette, noun, size, np.eye(3))
+
+    np.testing.assert_allclose(fit.T_world_obj[:3, 3], [1.3, -0.3, 0.125], atol=0.01)
+
+
+def test_what_a_hand_hides_does_not_shift_the_pose():
+    camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("can")
+    size = (0.14, 0.14, 0.25)
+    points = outline_points("cylinder", size) + np.array([1.3, -0.3, 0.125])
+    whole = silhouette_of(points, camera)
+    hand = np.zeros_like(whole)
+    x, y, _, h = cv2.boundingRect(whole.astype(np.uint8))
+    hand[y - 4 : y + h // 3, x - 10 :] = True
+
+    fit = fit_pose(Silhouette(whole & ~hand, hand, camera), noun, size, np.eye(3))
+
+    np.testing.assert_allclose(fit.T_world_obj[:2, 3], [1.3, -0.3], atol=0.05)
+
+
+def test_a_thing_lifted_straight_up_is_found_at_its_height():
+    camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("apple")
+    size = (0.16, 0.16, 0.16)
+    T_first = transform(np.eye(3), np.array([1.4, 0.1, 0.08]))
+    points = outline_points("sphere", size) + np.array([1.4, 0.1, 0.42])
+    silhouette = Silhouette(silhouette_of(points, camera), None, camera)
+
+    fit = fit_lifted(silhouette, noun, size, T_first)
+
+    np.testing.assert_allclose(fit.T_world_obj[:3, 3], [1.4, 0.1, 0.42], atol=0.02)
+
+
+def test_a_turned_box_rests_on_its_lowest_corner():
+    c = np.sqrt(0.5)
+    on_edge = np.array([[1, 0, 0], [0, c, -c], [0, c, c]])
+
+    assert lowest((0.2, 0.1, 0.1), "box", np.eye(3)) == pytest.approx(0.05)
+    assert lowest((0.2, 0.1, 0.1), "box", on_edge) == pytest.approx(0.1 * c)
+    assert lowest((0.06, 0.06, 0.2), "cylinder", np.eye(3)[[2, 0, 1]].T) == pytest.approx(0.03)
+
+
+def test_a_size_that_the_user_gives_decides_the_scale():
+    noun = noun_for("box")
+    known = SizeVote(size=(0.1, 0.2, 0.3), noun=noun, known_m=(0.06, 0.04, 0.02))
+
+    height, spread = camera_height_m([known])
+
+    assert height == pytest.approx(0.2, rel=0.02)
+    assert spread < 0.05
+
+
+def test_two_objects_meet_in_between_and_the_surer_one_pulls_harder():
+    can, vague = noun_for("can"), noun_for("box")
+    votes = [
+        SizeVote(size=tuple(s / 0.5 for s in can.size_m), noun=can),
+        SizeVote(size=tuple(s / 0.9 for s in vague.size_m), noun=vague),
+    ]
+
+    height, _ = camera_height_m(votes)
+
+    assert 0.5 < height < 0.6
+    assert disagreement(votes[0], 0.5) == pytest.approx(0, abs=1e-9)
+    assert disagreement(votes[0], 1.0) == pytest.approx(np.log(2) / can.spread)
