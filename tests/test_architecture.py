@@ -43,7 +43,7 @@ MODULES = sorted((ROOT / "v2p_data").rglob("*.py"))
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_a_room_imports_only_rooms_below_it(path):
     room = room_of(path)
-    if room in TOP or path.name == "__init__.py" and path.parent.name == "v2p_data":
+    if room in TOP or (path.name == "__init__.py" and path.parent.name == "v2p_data"):
         return
     ours = {n.split(".")[1] for n in imported_modules(path) if n.startswith("v2p_data.")}
 
@@ -59,14 +59,19 @@ def test_policies_know_nothing_of_the_engine(path):
 
 def test_the_engine_knows_policies_only_at_the_top():
     users = {
-        room_of(p) for p in MODULES if any(n.split(".")[0] == "policies" for n in imported_modules(p))
+        room_of(p)
+        for p in MODULES
+        if any(n.split(".")[0] == "policies" for n in imported_modules(p))
     }
 
     assert users <= TOP
 
 
 def test_one_heavy_library_has_one_file():
-    homes = {"av": {"v2p_data/video", "v2p_data/scene", "v2p_data/report"}, "openai": {"v2p_data/task"}}
+    homes = {
+        "av": {"v2p_data/video", "v2p_data/scene", "v2p_data/report"},
+        "openai": {"v2p_data/task"},
+    }
     for library, allowed in homes.items():
         users = {
             str(p.parent.relative_to(ROOT))

@@ -46,7 +46,11 @@ OBJECT_STATES = {
         "1",
         "cosine between the object's own z axis and world up: 1 upright, 0 on its side",
     ),
-    "grasped": ("(env,)", "0 or 1", "both pads touch the object, and the gripper is not fully open"),
+    "grasped": (
+        "(env,)",
+        "0 or 1",
+        "both pads touch the object, and the gripper is not fully open",
+    ),
     "touched": ("(env,)", "0 or 1", "at least one pad touches the object"),
 }
 
