@@ -14,7 +14,12 @@ from v2p_data.scene.pose import (
     lowest,
     on_wall,
 )
-from v2p_data.scene.scale import SizeVote, camera_height_m, disagreement
+from v2p_data.scene.scale import (
+    SizeVote,
+    camera_height_m,
+    disagreement,
+    height_plausibility,
+)
 
 PITCH, FOV = 0.61, 1.01
 
@@ -126,3 +131,10 @@ def test_two_objects_meet_in_between_and_the_surer_one_pulls_harder():
     assert 0.5 < height < 0.6
     assert disagreement(votes[0], 0.5) == pytest.approx(0, abs=1e-9)
     assert disagreement(votes[0], 1.0) == pytest.approx(np.log(2) / can.spread)
+
+
+def test_nobody_films_a_table_from_the_ceiling():
+    assert height_plausibility(0.5) == 1
+    assert height_plausibility(1.0) == 1
+    assert height_plausibility(2.5) < 0.3
+    assert height_plausibility(0.08) < 0.3

@@ -144,14 +144,18 @@ class Silhouette:
 
 
 def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
-    """Return the ways a noun's shape can rest, as rotations with what each costs: upright first, then lying."""
+    """Return the ways a noun's shape can rest, as rotations with what each costs: upright first."""
     upright, cost = np.eye(3), 0.12 if noun.spread < 0.3 else 0.0
     if noun.form == "sphere":
         return [(upright, 0.0)]
     lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     if noun.form == "cylinder":
-        slender = noun.size_m[2] / noun.size_m[0]
-        return [(upright, 0.0)] + ([(lying, cost)] if slender > 0.9 else [])
+        ways = [(upright, 0.0)]
+        if noun.hollow and noun.taper < 0.9:
+            ways.append((np.diag([1.0, -1.0, -1.0]), cost))
+        if noun.size_m[2] > 0.9 * noun.size_m[0]:
+            ways.append((lying, cost))
+        return ways
     on_side = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     smallest, largest = min(noun.size_m), max(noun.size_m)
     return [(upright, 0.0)] + (

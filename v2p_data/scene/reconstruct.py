@@ -30,7 +30,12 @@ from v2p_data.scene.pose import (
     on_wall,
     orientations,
 )
-from v2p_data.scene.scale import SizeVote, camera_height_m, disagreement
+from v2p_data.scene.scale import (
+    SizeVote,
+    camera_height_m,
+    disagreement,
+    height_plausibility,
+)
 from v2p_data.scene.scene import Role
 from v2p_data.scene.segment import bounding_box, from_box, from_points, grow, tidy
 from v2p_data.scene.table import Table, find_table
@@ -41,6 +46,7 @@ from v2p_data.video.clip import Clip
 log = logging.getLogger(__name__)
 
 _INSIDE_KINDS = ("insert", "throw_into", "place_onto")
+_CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,8 +188,11 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
         )
     followed = track(footage, moved, every=1 if len(footage.rgb) < 80 else 2)
     moved = replace(moved, last=followed.masks[-1])
+    on_table = _stands_on(table, moved.first)
     geometry = _Geometry(footage, seen, moved, meaning.kind, cfg, followed)
-    return _assemble(clip, footage, meaning.kind, seen, moved, geometry, followed, warnings, cfg)
+    return _assemble(
+        clip, footage, meaning.kind, seen, moved, geometry, followed, on_table, warnings, cfg
+    )
 
 
 def slug_for(phrase: str, taken: set[str]) -> str:
@@ -254,6 +263,15 @@ def _find_other(
     if mask is not None:
         return Found(mask=mask, score=5.0), True
     return find_other(footage, table, phrase, kind, moved, taken), False
+
+
+def _stands_on(table: Table, mask: Bool[np.ndarray, "h w"]) -> bool:
+    """Return whether the mask's foot lies on the table's part of the picture."""
+    x, y, w, h = bounding_box(mask)
+    foot = np.zeros_like(mask)
+    foot[y + int(0.75 * h) : y + h, x : x + w] = True
+    foot &= mask
+    return float((foot & grow(table.hull, 6)).sum()) > 0.3 * float(foot.sum())
 
 
 def _hinted_mask(
@@ -362,6 +380,10 @@ class _Geometry:
         yaw = _yaw_between(first.T_world_obj[:3, :3], rest)
         support = self._support()
         same = fit_pose(silhouette, noun, first.size, rest, yaw_near=yaw, support=support)
+        if self.kind in _CARRY_KINDS:
+            held = fit_lifted(silhouette, noun, first.size, first.T_world_obj)
+            if held.cost + 0.1 < same.cost:  # the clip ends before it is put down
+                return held, same.cost
         if self.kind != "tip_over" or noun.form == "sphere":
             return same, same.cost
         turned = []
@@ -389,6 +411,7 @@ def _assemble(
     moved: Moved,
     geometry: _Geometry,
     followed: Track,
+    on_table: bool,
     warnings: list[str],
     cfg: SceneConfig,
 ) -> Reconstruction:
@@ -434,6 +457,8 @@ def _assemble(
         )
     _check_motion(kind, objects, geometry, moved)
     cues = _cues(kind, seen, geometry, followed)
+    if not on_table:
+        cues["stands on the table at first"] = 0.6
     confidence = float(np.prod(list(cues.values())))
     if confidence < cfg.min_confidence:
         weakest = min(cues, key=lambda cue: cues[cue])
@@ -507,10 +532,11 @@ def _cues(kind: str, seen: list[_Seen], geometry: _Geometry, followed: Track) ->
         off = abs(disagreement(_vote(s, geometry.fits[i]), geometry.height_m))
         cues[f"size of {which}"] = float(np.exp(-0.5 * (max(0.0, off - 1.5) / 1.5) ** 2))
         cues[f"shape of {which}"] = float(np.clip(0.5 + (iou - 0.6) / 0.3 * 0.5, 0.1, 1))
-    cues["pose at the end"] = float(np.clip(0.6 + (geometry.last.iou - 0.5) / 0.35 * 0.4, 0.1, 1))
+    cues["pose at the end"] = float(np.clip(0.6 + (geometry.last.iou - 0.45) / 0.35 * 0.4, 0.1, 1))
     seen_at_end = geometry.last.visible / max(0.2, geometry.fits[0].visible)
-    cues["seen at the end"] = float(np.clip(0.4 + 0.6 * seen_at_end / 0.5, 0.1, 1))
+    cues["seen at the end"] = float(np.clip(0.5 + 0.5 * seen_at_end / 0.5, 0.1, 1))
     cues["track from start to end"] = float(np.clip(0.65 + 0.7 * followed.meets, 0, 1))
+    cues["camera height"] = height_plausibility(geometry.height_m)
     noun = seen[0].noun
     cues["noun"] = 1.0 if noun.known or seen[0].known_m else 0.9
     cues["matter"] = {"rigid": 1.0, "soft": 0.8, "clear": 0.7}[
@@ -623,8 +649,10 @@ def _upright_axes(fit: Fit) -> Fit:
 
 def _rest_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """Return the resting orientation of a pose without its yaw: identity for upright things."""
-    if abs(rotation[2, 2]) > 0.7:
+    if rotation[2, 2] > 0.7:
         return np.eye(3)
+    if rotation[2, 2] < -0.7:
+        return np.diag([1.0, -1.0, -1.0])
     axis = "y" if abs(rotation[2, 0]) > 0.7 else "x"
     return Rotation.from_euler(axis, 90, degrees=True).as_matrix()
 

@@ -45,6 +45,12 @@ def disagreement(vote: SizeVote, height_m: float) -> float:
     return (float(np.log(height_m)) - mean) / spread
 
 
+def height_plausibility(height_m: float) -> float:
+    """Return 1 for a height at which people film tables, less outside 0.25 to 1.2 m."""
+    off = max(0.0, abs(float(np.log(height_m / _USUAL_HEIGHT_M))) - 0.8) / 0.4
+    return float(np.exp(-0.5 * off**2))
+
+
 def _implied(vote: SizeVote) -> tuple[float, float]:
     usual, seen = np.array(vote.known_m or vote.noun.size_m), np.array(vote.size)
     if vote.noun.form == "box":  # which side is up is not the noun's to say
