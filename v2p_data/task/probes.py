@@ -19,7 +19,7 @@ GRIPPER_OPENING_M = 0.085
 HAND_HEIGHT_M = 0.2
 EEF_DOWN_WXYZ = (0.0, 1.0, 0.0, 0.0)
 
-States = dict[str, Float32[np.ndarray, "env ..."]]
+States = dict[str, Float32[np.ndarray, "..."]]
 
 
 @dataclass(kw_only=True)

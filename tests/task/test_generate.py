@@ -1,0 +1,148 @@
+import json
+
+import numpy as np
+import pytest
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.task.audit import audit, build_probes
+from v2p_data.task.generate import TaskConfig, generate_task
+from v2p_data.task.probes import rest_height
+from v2p_data.task.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.task import TaskBundle
+
+pytestmark = pytest.mark.slow
+
+LIFT = """
+import torch
+scene_info = {"task_class_name": "Lift"}
+class Lift(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, scene_info)
+    def compute_success(self, states):
+        height = states["box_pos"][:, 2] - states["box_start_pos"][:, 2]
+        speed = torch.norm(states["box_vel_linear"], dim=-1)
+        return SUCCESS
+    def compute_reward(self, actions, states):
+        r = states["box_pos"][:, 2]
+        return r, {"height": r}
+"""
+
+
+def lift(success):
+    return LIFT.replace("SUCCESS", success)
+
+
+def audits(scene, codes):
+    probes = build_probes(scene, np.random.default_rng(0))
+    results = smoke_run_all(codes, scene, probes=probes.states)
+    return [audit(scene, probes, r) for r in results]
+
+
+def failed(verdict):
+    return {c.name for c in verdict.checks if not c.passed}
+
+
+def test_cheats_are_found_out(scene_of):
+    good, at_start, touch, fling, never, tiny = audits(
+        scene_of("lift_up"),
+        [
+            lift("(height > 0.1) & (states['box_grasped'] > 0.5) & (speed < 0.1)"),
+            lift("height > -0.5"),
+            lift("states['box_touched'] > 0.5"),
+            lift("height > 0.1"),
+            lift("height > 3.0"),
+            lift("(height > 0.004) & (states['box_grasped'] > 0.5) & (speed < 0.1)"),
+        ],
+    )
+
+    assert good.score == 1.0
+    assert good.is_acceptable
+    assert "first pose" in at_start.vetoed
+    assert "first_pose" in failed(touch)  # held at the first pose is a touch
+    assert not touch.is_acceptable
+    assert failed(fling) == {"flung"}
+    assert "workspace" in never.vetoed
+    assert failed(tiny) == {"becomes_true", "in_the_air"}
+
+
+def test_it_says_from_which_pose_on_the_video_succeeds(scene_of):
+    (verdict,) = audits(scene_of("lift_up"), [lift("height > 0.1")])
+
+    # Twelve poses rise evenly by 17.5 cm: pose 7 is 11.1 cm up, pose 6 is 9.5 cm up.
+    assert verdict.true_from_pose == 7
+    # The way is 17.6 cm long, because the box also moves 2 cm forward: 10 cm up are 10.06 cm of way.
+    assert verdict.threshold_m == pytest.approx(0.1006, abs=0.01)
+
+
+def test_noise_at_the_end_costs_points_but_is_no_veto(scene_of):
+    (verdict,) = audits(scene_of("lift_up"), [lift("(height > 0.2) & (speed < 0.1)")])
+
+    assert failed(verdict) == {"last_pose"}
+    assert 0.5 < verdict.score < 1.0
+    assert verdict.is_acceptable
+
+
+def test_what_does_not_run_is_vetoed(scene_of):
+    scene = scene_of("lift_up")
+    probes = build_probes(scene, np.random.default_rng(0))
+
+    verdict = audit(scene, probes, SmokeResult(runnable=False, error="it hangs"))
+
+    assert verdict.vetoed == "it does not run: it hangs"
+    assert not verdict.is_acceptable
+
+
+@pytest.mark.parametrize("kind", ["lift_up", "push_left", "tip_over", "push_next_to"])
+def test_a_scene_becomes_a_task_that_can_be_loaded_again(kind, scene_of, tmp_path):
+    scene = scene_of(kind)
+    scene_folder = tmp_path / "scene"
+    scene_folder.mkdir()
+    scene.save(scene_folder)
+    scene = type(scene).load(scene_folder)
+
+    made = generate_task(scene, TaskConfig(), 7)
+    made.save(tmp_path / "task")
+
+    loaded = TaskBundle.load(tmp_path / "task")
+    table = json.loads((tmp_path / "task" / "audit.json").read_text())
+    assert loaded.code == made.samples[made.picked].code == made.bundle.code
+    assert loaded.kind == kind
+    assert loaded.class_name in loaded.code
+    assert len(list((tmp_path / "task" / "samples").glob("*.py"))) == len(table["samples"]) == 8
+    assert made.samples[made.picked].score == max(s.score for s in made.samples) == 1.0
+    assert all(s.runnable for s in made.samples)
+    assert made.samples[6].score < 1.0  # the naive success
+
+
+def test_the_seed_decides_the_probes(scene_of):
+    first, again, other = (
+        build_probes(scene_of("push_left"), np.random.default_rng(seed)).states
+        for seed in (3, 3, 4)
+    )
+
+    assert all(np.array_equal(first[k], again[k]) for k in first)
+    assert not np.array_equal(first["book_pos"], other["book_pos"])
+
+
+def test_a_scene_without_an_acceptable_task_is_rejected_with_its_reason(scene_of):
+    with pytest.raises(ItemRejectedError, match="first pose") as rejection:
+        generate_task(
+            scene_of("lift_up"), TaskConfig(), 0, sources=[lift("height > -1"), "nonsense("]
+        )
+
+    assert rejection.value.reason == "no_acceptable_task"
+
+
+def test_things_rest_on_the_table_as_geometry_says(make_thing):
+    half = np.sqrt(0.5)
+    lying = np.array([half, half, 0.0, 0.0])
+    tilted = np.array([np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0])
+    box = make_thing("box", (0.1, 0.2, 0.3), (0, 0, 0))
+    can = make_thing("can", (0.1, 0.1, 0.3), (0, 0, 0), shape="cylinder")
+    ball = make_thing("ball", (0.1, 0.1, 0.1), (0, 0, 0), shape="sphere")
+
+    assert rest_height(box, np.array([1.0, 0, 0, 0])) == pytest.approx(0.15)
+    assert rest_height(box, lying) == pytest.approx(0.1)
+    assert rest_height(can, lying) == pytest.approx(0.05)
+    assert rest_height(can, tilted) == pytest.approx((0.05 + 0.15) * half)
+    assert rest_height(ball, tilted) == pytest.approx(0.05)
