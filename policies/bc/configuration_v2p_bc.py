@@ -38,6 +38,8 @@ class V2PBCConfig(PreTrainedConfig):
     mask_greys: tuple[int, ...] = (0, 64, 128, 192, 255, 31, 95, 159, 223)
     """Grey (0 to 255) of each label of a label image; a pixel belongs to the nearest."""
 
+    random_shift: float = 0.05
+    """Training only: images are shifted at random by up to this share of their size, all frames of a sample alike."""
     pretrained_backbone_weights: str | None = BACKBONE_WEIGHTS
     """Used when the file lies in torch's cache (nothing is ever downloaded); null starts from random weights."""
     state_dim: int = 256
@@ -80,6 +82,8 @@ class V2PBCConfig(PreTrainedConfig):
             )
         if self.input_size_px < 32:
             raise ValueError(f"input_size_px is {self.input_size_px}; ResNet18 needs 32 or more")
+        if not 0 <= self.random_shift < 0.5:
+            raise ValueError(f"random_shift is {self.random_shift}; it lies between 0 and 0.5")
         if len(set(self.mask_greys)) < 2 or not all(0 <= grey <= 255 for grey in self.mask_greys):
             raise ValueError(
                 f"mask_greys are {self.mask_greys}; they must be two or more levels from 0 to 255"

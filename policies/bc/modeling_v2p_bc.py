@@ -59,6 +59,17 @@ def label_channels(
     return F.pad(torch.stack(seen, 2), (0, 0, 0, 0, 0, len(greys) - len(seen)))
 
 
+def shifted(images: Float[Tensor, "batch c h w"], reach_px: int) -> Float[Tensor, "batch c h w"]:
+    """Return each image moved by up to `reach_px` along both axes; its border fills the gap."""
+    batch, _, height, width = images.shape
+    padded = F.pad(images, [reach_px] * 4, mode="replicate")
+    by = torch.randint(0, 2 * reach_px + 1, (2, batch, 1), device=images.device)
+    rows = (by[0] + torch.arange(height, device=images.device))[:, :, None]
+    columns = (by[1] + torch.arange(width, device=images.device))[:, None, :]
+    sample = torch.arange(batch, device=images.device)[:, None, None]
+    return padded[sample, :, rows, columns].permute(0, 3, 1, 2)
+
+
 @lru_cache(maxsize=4096)
 def task_words(task: str, dim: int) -> Float[Tensor, " dim"]:
     """Return the task's bag of words as a unit vector: each word adds +1 or -1 at a place its hash names."""
@@ -107,6 +118,7 @@ class CameraEncoder(nn.Module):
         self.is_mask = is_mask
         self.greys = tuple(cfg.mask_greys)
         self.input_size_px = cfg.input_size_px
+        self.random_shift = cfg.random_shift
         net = resnet18(weights=None)
         if weights is not None:
             net.load_state_dict(weights)
@@ -137,6 +149,9 @@ class CameraEncoder(nn.Module):
             small = label_channels(frames, self.greys, self.input_size_px).flatten(1, 2)
         else:
             small = shrink(((frames - self.mean) / self.std).flatten(1, 2), self.input_size_px)
+        reach_px = round(self.random_shift * max(small.shape[-2:]))
+        if self.training and reach_px:
+            small = shifted(small, reach_px)
         return self.backbone(small).mean((2, 3))
 
 

@@ -14,6 +14,7 @@ from policies.bc.modeling_v2p_bc import (
     V2PBCPolicy,
     label_channels,
     mask_stem,
+    shifted,
     shrink,
     task_words,
 )
@@ -86,6 +87,23 @@ def test_a_grey_slightly_off_after_compression_keeps_its_label():
 def test_small_images_are_never_enlarged_and_large_ones_keep_their_aspect():
     assert shrink(torch.zeros(1, 3, 20, 30), 64).shape == (1, 3, 20, 30)
     assert shrink(torch.zeros(1, 3, 480, 640), 64).shape == (1, 3, 48, 64)
+
+
+def test_shifting_moves_each_image_as_a_whole_and_fills_the_gap_with_its_border():
+    image = torch.arange(12.0).view(1, 1, 3, 4)
+    channels = torch.cat([image, image + 100], 1).expand(50, -1, -1, -1)
+
+    moved = shifted(channels, 1)
+
+    rows, columns = torch.arange(3), torch.arange(4)
+    possible = [
+        image[0, 0][(rows + dy).clamp(0, 2)][:, (columns + dx).clamp(0, 3)]
+        for dy in (-1, 0, 1)
+        for dx in (-1, 0, 1)
+    ]
+    seen = {next(i for i, p in enumerate(possible) if torch.equal(p, m[0])) for m in moved}
+    assert len(seen) > 4
+    assert torch.equal(moved[:, 0] + 100, moved[:, 1])
 
 
 def test_the_mask_stem_sees_labels_as_the_pretrained_one_sees_the_grey_picture():
@@ -187,7 +205,7 @@ def test_any_mix_of_cameras_works_and_only_masks_are_split_into_labels():
 
 
 def test_one_gradient_step_on_a_batch_lowers_its_loss():
-    net = policy().train()
+    net = policy(random_shift=0.0).train()
     optimizer = net.config.get_optimizer_preset().build(net.get_optim_params())
     batch = training_batch()
     before, _ = net(batch)
@@ -273,6 +291,7 @@ def test_a_saved_policy_loads_without_looking_for_pretrained_weights(
         ({"mask_greys": (0,)}, "mask_greys"),
         ({"pretrained_backbone_weights": "resnet50"}, "IMAGENET1K_V1"),
         ({"n_obs_steps": 0}, "n_obs_steps"),
+        ({"random_shift": 0.7}, "random_shift"),
     ],
 )
 def test_impossible_settings_are_refused_by_name(settings, word):
