@@ -136,8 +136,7 @@ def generate_command(argv: list[str]) -> int:
         dataset = generate(args.videos, root, args.repo_id, args.engine, args.how.runtime(root))
         page = write_page(root)
     if dataset is None:
-        print(f"\nNo task came as far as episodes, so there is no dataset. See {page}")  # noqa: T201
-        return 1
+        raise V2PError(f"no video came as far as episodes, so there is no dataset; see {page}")
     counts = _record(dataset).counts
     _say(
         f"Made {dataset}",
@@ -319,7 +318,7 @@ def _up_to(
         f"{then} {shlex.quote(str(args.videos))} --out {shlex.quote(str(args.out))}"
         + (" --repo-id USER/NAME" if then == "v2p generate" else ""),
     )
-    return 0 if counts["usable"] else 1
+    return 0 if counts["usable"] else 2
 
 
 def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:

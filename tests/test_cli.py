@@ -1,0 +1,146 @@
+"""What a user gets for bad input: one sentence, exit code 2, and nothing made before is harmed."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from v2p_data.cli import run
+
+SAMPLES = Path(__file__).parents[1] / "datasets" / "sample_videos"
+
+
+def test_help_names_every_command_and_is_there_at_once():
+    started = time.monotonic()
+    shown = subprocess.run(
+        [sys.executable, "-m", "v2p_data.cli", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    assert (
+        time.monotonic() - started < 5
+    )  # 0.03 s on a quiet machine; this only bans heavy imports
+    assert all(word in shown.stdout for word in ("generate", "train", "eval", "push", "demo"))
+
+
+def test_help_imports_no_heavy_library():
+    code = (
+        "import sys; from v2p_data.cli import run; run(['--help']);"
+        "assert not {'torch', 'mujoco', 'lerobot', 'cv2', 'tyro'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@pytest.fixture
+def videos(tmp_path) -> Path:
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    shutil.copy(SAMPLES / "tip_green_carton.mp4", folder / "tip_over__green_carton.mp4")
+    return folder
+
+
+def said(capsys, *argv: object) -> str:
+    """Return the one sentence on stderr; the command must end with code 2."""
+    assert run([str(a) for a in argv]) == 2
+    return capsys.readouterr().err
+
+
+def generate(videos: Path, out: Path, *flags: str) -> tuple[object, ...]:
+    return ("generate", videos, "--out", out, "--repo-id", "me/toys", *flags)
+
+
+def test_an_unknown_command_gets_a_suggestion(capsys):
+    assert "Did you mean 'generate'" in said(capsys, "generat")
+
+
+def test_an_unknown_option_gets_a_suggestion(capsys, videos, tmp_path):
+    message = said(capsys, *generate(videos, tmp_path / "out", "--expert.num-evs", "3"))
+
+    assert "--expert.num-evs" in message
+    assert "--expert.num-envs" in message
+    assert len(message.strip().splitlines()) == 1
+
+
+def test_a_value_out_of_range_is_named(capsys, videos, tmp_path):
+    assert "min_success" in said(
+        capsys, *generate(videos, tmp_path / "out", "--expert.min-success", "3")
+    )
+
+
+def test_a_missing_folder_is_named(capsys, tmp_path):
+    assert str(tmp_path / "nowhere") in said(
+        capsys, *generate(tmp_path / "nowhere", tmp_path / "o")
+    )
+
+
+def test_an_empty_folder_says_which_endings_are_known(capsys, tmp_path):
+    (tmp_path / "empty").mkdir()
+    assert "mp4" in said(capsys, *generate(tmp_path / "empty", tmp_path / "out"))
+
+
+def test_a_caption_for_a_missing_file_is_named(capsys, videos, tmp_path):
+    (videos / "captions.json").write_text(json.dumps({"tip_ovr__green_carton.mp4": "Tipping"}))
+    assert "tip_ovr__green_carton.mp4" in said(capsys, *generate(videos, tmp_path / "out"))
+
+
+def test_a_bad_repo_id_is_refused_before_any_work(capsys, videos, tmp_path):
+    assert "USER/NAME" in said(
+        capsys, "generate", videos, "--out", tmp_path / "out", "--repo-id", "toys"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(capsys, videos, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    assert "cannot write" in said(capsys, *generate(videos, tmp_path / "file" / "out"))
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_dataset_is_never_written_into(capsys, videos, tmp_path):
+    (tmp_path / "set" / "meta").mkdir(parents=True)
+    (tmp_path / "set" / "meta" / "info.json").write_text("{}")
+    assert "is a LeRobot dataset" in said(capsys, *generate(videos, tmp_path / "set"))
+    assert [p.name for p in (tmp_path / "set").iterdir()] == ["meta"]
+
+
+def test_a_settings_file_with_a_mistake_is_named(capsys, videos, tmp_path):
+    path = tmp_path / "my.yaml"
+    path.write_text("epsiodes: {}")
+    message = said(capsys, *generate(videos, tmp_path / "out", "--config", str(path)))
+    assert "Did you mean 'episodes'" in message
+
+
+@pytest.mark.slow
+def test_bad_videos_are_listed_with_their_reason_and_stop_no_other(capsys, videos, tmp_path):
+    (videos / "lift_up__text.mp4").write_text("I am no video")
+    whole = (SAMPLES / "lift_red_box.mp4").read_bytes()
+    (videos / "lift_up__cut.mp4").write_bytes(whole[: len(whole) // 3])
+
+    assert run(["scene", str(videos), "--out", str(tmp_path / "out")]) == 0
+    words = capsys.readouterr().err
+    assert "lift_up__text" in words
+    assert "unreadable" in words
+    assert any((tmp_path / "out" / "scene").glob("tip_over__green_carton-*/scene.json"))
+
+    for name in ("tip_over__green_carton.mp4",):
+        (videos / name).unlink()
+    assert run(["scene", str(videos), "--out", str(tmp_path / "out")]) == 2
+    assert any((tmp_path / "out" / "scene").glob("tip_over__green_carton-*/scene.json"))
+
+
+@pytest.mark.parametrize("command", ["status", "report"])
+def test_a_folder_that_is_no_run_is_named(capsys, tmp_path, command):
+    assert "is no run folder" in said(capsys, command, tmp_path)
+
+
+def test_only_datasets_and_policies_can_be_pushed(capsys, tmp_path):
+    assert "neither" in said(capsys, "push", tmp_path, "--repo-id", "me/toys")
+    assert "no LeRobot dataset" in said(capsys, "verify", tmp_path)
+    assert "is no dataset of v2p generate" in said(capsys, "train", tmp_path)
+    assert "no LeRobot policy" in said(capsys, "eval", tmp_path)
