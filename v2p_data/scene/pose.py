@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.geometry.mesh import outline_points
-from v2p_data.geometry.pose import transform
+from v2p_data.geometry.pose import inverse, transform
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.segment import bounding_box
 
@@ -71,22 +71,16 @@ class Silhouette:
         x, y, w, h = bounding_box(mask)
         pad = int(0.35 * max(w, h)) + 3
         self.camera, self.box = camera, (x, y, w, h)
-        self._offset = np.array([x - pad, y - pad], float)
         size = (w + 2 * pad, h + 2 * pad)
-        self._zoom = _WORK_PX / max(size)
-        move = np.array(
-            [
-                [self._zoom, 0, -self._zoom * self._offset[0]],
-                [0, self._zoom, -self._zoom * self._offset[1]],
-            ]
-        )
-        self._size = (max(8, round(size[0] * self._zoom)), max(8, round(size[1] * self._zoom)))
-        warped = cv2.warpAffine(mask.astype(np.float32), move, self._size, flags=cv2.INTER_LINEAR)
-        inside = cv2.warpAffine(np.ones(mask.shape, np.float32), move, self._size) > 0.5
-        known = inside
+        zoom = _WORK_PX / max(size)
+        crop = np.array([[zoom, 0, zoom * (pad - x)], [0, zoom, zoom * (pad - y)], [0, 0, 1.0]])
+        # World to crop pixels in one matrix: a fit asks ten thousand times.
+        self._matrix = crop @ camera.K @ inverse(camera.T_world_cam)[:3]
+        move, canvas = crop[:2], (max(8, round(size[0] * zoom)), max(8, round(size[1] * zoom)))
+        warped = cv2.warpAffine(mask.astype(np.float32), move, canvas, flags=cv2.INTER_LINEAR)
+        known = cv2.warpAffine(np.ones(mask.shape, np.float32), move, canvas) > 0.5
         if unknown is not None:
-            hidden = cv2.warpAffine((unknown & ~mask).astype(np.float32), move, self._size) > 0.5
-            known = inside & ~hidden
+            known &= ~(cv2.warpAffine((unknown & ~mask).astype(np.float32), move, canvas) > 0.5)
         self._known = known
         self._mask = (warped > 0.5) & known
         self._area = int(self._mask.sum())
@@ -122,7 +116,10 @@ class Silhouette:
         self, points_world: Float[np.ndarray, "n 3"]
     ) -> tuple[float, float, float, float] | None:
         """Return the hull's area on the mask, off it, on hidden pixels, and in all."""
-        pixels = (self.camera.project(points_world) - self._offset) * self._zoom
+        homogeneous = points_world @ self._matrix[:, :3].T + self._matrix[:, 3]
+        if homogeneous[:, 2].min() < 1e-6:
+            return None
+        pixels = homogeneous[:, :2] / homogeneous[:, 2:]
         if not np.isfinite(pixels).all() or np.abs(pixels).max() > 4000:
             return None
         drawn = np.zeros(self._mask.shape, np.uint8)
@@ -186,10 +183,12 @@ def fit_shape(
         off = (v[3:] - v[3:].mean()) / spread
         return 1 - silhouette.iou(points, _HIDDEN_WEIGHT) + _PRIOR_WEIGHT * float((off**2).sum())
 
+    unit = outline_points(noun.form, (1.0, 1.0, 1.0), noun.taper)
+
     def place(v: np.ndarray) -> np.ndarray:
         size = size_of(v)
         T = _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
-        return outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
+        return (unit * size) @ T[:3, :3].T + T[:3, 3]
 
     turns = _yaw_starts(noun, rest, thorough)
     starts = [
