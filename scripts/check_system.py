@@ -1,25 +1,33 @@
 """Name the system libraries that are missing, with the command that installs them."""
 
 import ctypes.util
-import os
 import sys
 
-LIBRARIES = {"EGL": "libegl1", "GL": "libgl1"}
+NEEDED_TO_DRAW = {"EGL": "libegl1", "GL": "libgl1"}
 
 
 def main() -> int:
-    """Print what is missing; never fail, because masks can be drawn without GL as well."""
+    """Print what is missing; never fail, because there is a slower way without each of them."""
     if sys.platform != "linux":
         return 0
-    missing = [package for name, package in LIBRARIES.items() if ctypes.util.find_library(name) is None]
+    missing = [
+        package
+        for name, package in NEEDED_TO_DRAW.items()
+        if ctypes.util.find_library(name) is None
+    ]
     if missing:
         print(
-            "setup: off-screen rendering needs system libraries that are not here. Install them with\n"
-            f"    apt-get install -y {' '.join(missing)}\n"
-            "  (as root, after 'apt-get update'). Until then, drawing falls back to slower ray casting.",
+            "setup: off-screen drawing needs system libraries that are not here. As root:\n"
+            f"    apt-get update && apt-get install -y {' '.join(missing)}\n"
+            "  Until then masks are drawn by slower ray casting, and the sample clips cannot be drawn anew.",
             file=sys.stderr,
         )
-    os.environ.setdefault("MUJOCO_GL", "egl")
+    if ctypes.util.find_library("avcodec") is None:
+        print(
+            "setup: FFmpeg is not here, so LeRobot says at length that torchcodec cannot be loaded and decodes"
+            " with PyAV instead. That is fine; 'apt-get install -y ffmpeg' silences it.",
+            file=sys.stderr,
+        )
     return 0
 
 
