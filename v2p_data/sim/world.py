@@ -30,6 +30,8 @@ from v2p_data.sim.robot import (
     robot_rest_xml,
 )
 
+MAX_STANDING_SIZE_M = 0.45
+"""Of objects that stay where they are: trays, boxes beside the motion."""
 MAX_SIZE_M = 0.35
 MIN_SIZE_M = 0.015
 MAX_MASS_KG = 3.0
@@ -259,10 +261,11 @@ class _Draft:
 def _draft(obj: SceneObject, scene: Scene) -> _Draft:
     where = f"'{obj.name}' of scene '{scene.title}'"
     largest = max(obj.size_m)
-    if largest > MAX_SIZE_M:
+    limit = MAX_SIZE_M if obj is scene.manipulated else MAX_STANDING_SIZE_M
+    if largest > limit:
         raise ItemRejectedError(
             "object_too_large",
-            f"{where} is {largest:.2f} m large; at most {MAX_SIZE_M} m fits into the robot's workspace",
+            f"{where} is {largest:.2f} m large; at most {limit} m fits into the robot's workspace",
             largest,
         )
     if largest < MIN_SIZE_M:
