@@ -250,6 +250,10 @@ def _lift(m: Measured, v: Variant) -> Draft:
 def _push(m: Measured, v: Variant) -> Draft:
     sign = 1.0 if m.kind == "push_left" else -1.0
     way = round(float(np.clip(0.6 * abs(m.move_m[1]), 0.08, 0.15)) * v.strictness, 3)
+    # Hands push at a slant; the words allow some of it.
+    slant = round(
+        float(np.clip(1.15 * abs(m.move_m[0]) / max(abs(m.move_m[1]), 1e-3), 0.5, 1.0)), 2
+    )
     return Draft(
         thoughts=[
             f"Go behind the object, on its {'right' if sign > 0 else 'left'}.",
@@ -263,7 +267,7 @@ def _push(m: Measured, v: Variant) -> Draft:
         ],
         success=[
             ("is_there", f"moved > {way}"),
-            ("is_straight", "sideways < 0.05"),
+            ("is_straight", f"sideways < ({slant} * moved).clamp(min=0.05)"),
             ("is_down", _LOW),
             ("is_upright", _STILL_UPRIGHT),
             ("is_still", _still(v)),
