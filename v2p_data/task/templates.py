@@ -192,7 +192,13 @@ _REF_STILL = "(ref_moved < 0.03)"
 _REF_MOVED = "ref_moved = torch.norm((ref_pos - ref_start)[:, :2], dim=-1)"
 _LEAVE_REF = ("leave_reference", "-1.0 * (ref_moved - 0.01).clamp(0.0, 0.3)")
 _TOP = "grasp_point[:, 2] = obj_pos[:, 2] + (half_height - 0.035).clamp(min=0.0)"
+_LEAN_SETUP = [
+    "vertical = torch.zeros_like(eef_pos)",
+    "vertical[:, 2] = 1",
+    "lean = torch.norm(in_world_frame(eef_quat, vertical)[:, :2], dim=-1)",
+]
 _GRASP_SETUP = [
+    *_LEAN_SETUP,
     "grasp_point = obj_pos.clone()",
     _TOP,
     # The pads close along the gripper's own y axis.
@@ -201,7 +207,10 @@ _GRASP_SETUP = [
     "closing = in_world_frame(eef_quat, closing)",
     "pads_apart = 2 * obj_half(obj_quat, obj_size, closing)",
 ]
-_TURN = ("turn", "0.15 * (1 - (pads_apart - 0.07) / 0.03).clamp(0.0, 1.0)")
+_TURN = (
+    "turn",
+    "0.15 * (1 - (pads_apart - 0.07) / (torch.norm(obj_size[:, :2], dim=-1) - 0.07).clamp(min=0.03)).clamp(0.0, 1.0)",
+)
 """Without it, open fingers get wedged over the diagonal of a wide box, and closing them achieves nothing."""
 _STILL_UPRIGHT = "(upright(obj_quat, obj_start_quat) > 0.9)"
 # Withholds what pushing earns once the object topples. A penalty instead teaches not to touch tall objects at all:
@@ -640,9 +649,7 @@ def _push_point(clearance_m: float) -> list[str]:
         f"push_point = obj_pos - goal_direction * (behind + {clearance_m}).unsqueeze(-1)",
         "push_point[:, 2] = table_height + half_height.clamp(0.02, 0.025)",
         "distance_xy = torch.norm((push_point - eef_pos)[:, :2], dim=-1)",
-        "vertical = torch.zeros_like(obj_pos)",
-        "vertical[:, 2] = 1",
-        "lean = torch.norm(in_world_frame(eef_quat, vertical)[:, :2], dim=-1)",
+        *_LEAN_SETUP,
     ]
 
 
