@@ -21,7 +21,9 @@ def inverse(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     return transform(R.T, -R.T @ T[:3, 3])
 
 
-def apply(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def apply(
+    T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
     """Return `points` taken through `T`."""
     return points @ T[:3, :3].T + T[:3, 3]
 
@@ -51,8 +53,6 @@ def transform_from_pose(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "4 4"
     return transform(matrix_from_quat(pose[3:]), pose[:3])
 
 
-def angle_between(
-    a: Float[np.ndarray, "3 3"], b: Float[np.ndarray, "3 3"]
-) -> float:
+def angle_between(a: Float[np.ndarray, "3 3"], b: Float[np.ndarray, "3 3"]) -> float:
     """Return the geodesic angle between two rotations [rad]."""
     return float(Rotation.from_matrix(a.T @ b).magnitude())
