@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
 from lerobot_policy_v2p.robot.targets import ToolPose, next_target
+from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.sim.batch_env import SimConfig
 from v2p_data.sim.gym_env import V2PEnv
@@ -24,24 +25,6 @@ from v2p_data.sim.masks import labels_to_rgb
 
 logger = logging.getLogger(__name__)
 
-STATE_NAMES = (
-    "eef_x.pos",
-    "eef_y.pos",
-    "eef_z.pos",
-    "eef_rx.pos",
-    "eef_ry.pos",
-    "eef_rz.pos",
-    "gripper.pos",
-)
-ACTION_NAMES = (
-    "delta_x.pos",
-    "delta_y.pos",
-    "delta_z.pos",
-    "delta_rx.pos",
-    "delta_ry.pos",
-    "delta_rz.pos",
-    "gripper_close.pos",
-)
 MASK_PX = 256
 GRIPPER_TOLERANCE = 0.05
 """The real gripper takes a new command when the wanted opening has changed by this share of its width."""

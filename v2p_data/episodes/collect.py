@@ -27,6 +27,7 @@ from v2p_data.sim import randomize
 from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.masks import MaskRenderer
 from v2p_data.sim.randomize import RandomizationConfig
+from v2p_data.sim.verdict import referee_verdict
 from v2p_data.task.task import Task, TaskBundle
 
 logger = logging.getLogger(__name__)
@@ -272,7 +273,7 @@ def roll_out(
         if (t + 1 >= end).all():
             break
     held &= ~broke
-    judge = referee or _independent_referee
+    judge = referee or referee_verdict
     verdict = judge(bundle, _as_cut(trajectory, end)) & held if held.any() else held
     return Rollouts(
         seed=seed,
@@ -287,23 +288,6 @@ def roll_out(
         broke=broke,
         params=params,
     )
-
-
-def _independent_referee(bundle: TaskBundle, course: Course) -> Bool[np.ndarray, "env"]:
-    from v2p_data.task.referee import ObjectTrack, Trajectory, referee_success
-
-    tracks = {}
-    for obj in bundle.scene.objects:
-        # "any pad" and "both pads" stand for the two pads: all rules ask for one or the other.
-        touched = [course[f"{obj.name}_{key}"] > 0 for key in ("touched", "grasped")]
-        tracks[obj.name] = ObjectTrack(
-            pos=course[f"{obj.name}_pos"].astype(float),
-            quat_wxyz=course[f"{obj.name}_quat"].astype(float),
-            size_m=course[f"{obj.name}_size"][0].astype(float),
-            touched=np.stack(touched, axis=-1),
-        )
-    trajectory = Trajectory(objects=tracks, eef_pos=course["eef_pos"].astype(float))
-    return referee_success(bundle.kind, bundle.scene, trajectory)
 
 
 def _copied(env: BatchEnv) -> dict[str, np.ndarray]:

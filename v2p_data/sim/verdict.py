@@ -1,10 +1,33 @@
 """The independent referee on episodes that a `BatchEnv` is running: what happened so far, and is it success?"""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Bool
 
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.task.referee import ObjectTrack, Trajectory, referee_success
+from v2p_data.task.task import TaskBundle
+
+
+def referee_verdict(
+    bundle: TaskBundle, course: Mapping[str, np.ndarray]
+) -> Bool[np.ndarray, "env"]:
+    """Return what the referee says of episodes, given per key of `states` an array `(time, env, ...)`."""
+    objects = {
+        obj.name: ObjectTrack(
+            pos=course[f"{obj.name}_pos"].astype(float),
+            quat_wxyz=course[f"{obj.name}_quat"].astype(float),
+            size_m=course[f"{obj.name}_size"][0].astype(float),
+            # "any pad" and "both pads" stand for the two pads: all rules ask for one or the other.
+            touched=np.stack(
+                [course[f"{obj.name}_{key}"] > 0 for key in ("touched", "grasped")], axis=-1
+            ),
+        )
+        for obj in bundle.scene.objects
+    }
+    trajectory = Trajectory(objects=objects, eef_pos=course["eef_pos"].astype(float))
+    return referee_success(bundle.kind, bundle.scene, trajectory)
 
 
 class Witness:
@@ -32,17 +55,4 @@ class Witness:
     def verdict(self) -> Bool[np.ndarray, "env"]:
         """Return what the referee says of the episodes so far."""
         course = {key: np.stack([m[key] for m in self.moments]) for key in self.moments[0]}
-        objects = {
-            name: ObjectTrack(
-                pos=course[f"{name}_pos"],
-                quat_wxyz=course[f"{name}_quat"],
-                size_m=course[f"{name}_size"][0],
-                # "any pad" and "both pads" stand for the two pads: all rules ask for one or the other.
-                touched=np.stack(
-                    [course[f"{name}_touched"] > 0, course[f"{name}_grasped"] > 0], axis=-1
-                ),
-            )
-            for name in self.env.object_names
-        }
-        trajectory = Trajectory(objects=objects, eef_pos=course["eef_pos"])
-        return referee_success(self.env.bundle.kind, self.env.bundle.scene, trajectory)
+        return referee_verdict(self.env.bundle, course)
