@@ -209,9 +209,11 @@ _GRASP_SETUP = [
 ]
 _TURN = (
     "turn",
-    "0.15 * (1 - (pads_apart - 0.07) / (torch.norm(obj_size[:, :2], dim=-1) - 0.07).clamp(min=0.03)).clamp(0.0, 1.0)",
+    "0.15 * reach * (1 - (pads_apart - 0.07) / (torch.norm(obj_size[:, :2], dim=-1) - 0.07).clamp(min=0.03)).clamp(0.0, 1.0)",
 )
-"""Without it, open fingers get wedged over the diagonal of a wide box, and closing them achieves nothing."""
+"""Without it, open fingers get wedged over the diagonal of a wide box, and closing them achieves nothing. It counts near
+the object only: paid everywhere, turning is learned instead of reaching, and after 0.1 million steps the object is in
+the gripper a tenth as often."""
 _STILL_UPRIGHT = "(upright(obj_quat, obj_start_quat) > 0.9)"
 # Withholds what pushing earns once the object topples. A penalty instead teaches not to touch tall objects at all:
 # 0 % for a 5 x 8 cm cylinder.
@@ -247,10 +249,11 @@ def _lift(m: Measured, v: Variant) -> Draft:
         direction=_shifted("torch.zeros_like(obj_pos)", z=1.0),
         extras=[
             ("not_too_high", "-2.0 * (height - 0.2).clamp(0.0, 0.3) * near"),
-            # Without it, a lifted object is carried off to the side until the arm leaves the picture.
+            # Without it, a lifted object is carried off to the side until the arm leaves the picture. It counts in
+            # the gripper only: a fine for knocking the object away teaches to keep off.
             (
                 "stay_above",
-                "-1.0 * (torch.norm((obj_pos - obj_start)[:, :2], dim=-1) - 0.04).clamp(0.0, 0.3)",
+                "-1.0 * (torch.norm((obj_pos - obj_start)[:, :2], dim=-1) - 0.04).clamp(0.0, 0.3) * contact",
             ),
         ],
     )
