@@ -388,8 +388,10 @@ class BatchEnv:
 
     def _move_targets(self, action: np.ndarray) -> None:
         cfg, tool = self.cfg, self._tool
-        pos = self._target_pos + action[:, :3] * cfg.position_step_m
-        pos = np.clip(pos, tool.pos - cfg.position_leash_m, tool.pos + cfg.position_leash_m)
+        scale = self.bundle.motion_scale
+        pos = self._target_pos + action[:, :3] * (cfg.position_step_m * scale)
+        leash = cfg.position_leash_m * scale
+        pos = np.clip(pos, tool.pos - leash, tool.pos + leash)
         self._target_pos = np.clip(pos, TARGET_LOW_M, TARGET_HIGH_M)
         quat = _product(_exp(action[:, 3:6] * cfg.rotation_step_rad), self._target_quat)
         quat = _leashed(quat, tool.quat_wxyz, cfg.rotation_leash_rad)

@@ -22,6 +22,9 @@ OBJECT_HIGH_M = (0.66, 0.28)
 """Objects' centres lie in this part of the table, which the gripper reaches pointing down."""
 PUSH_ROOM_M = 0.15
 """Free way that push tasks get on the side they push to."""
+BEYOND_LOW_M = (0.90, -0.12)
+BEYOND_HIGH_M = (1.0, 0.12)
+"""Where a container stands that things are thrown into: beyond the gripper's reach (0.72 m)."""
 PLACEMENT_TRIES = 100
 START_BANK = 256
 
@@ -208,6 +211,9 @@ class Randomizer:
             # The whole group moves back into the box where it can.
             over = np.maximum(spot - high, 0).max(1) - np.maximum(low - spot, 0).max(1)
             spot -= over[:, None]
+            if self.world.scene.kind == "throw_into" and count > 1:
+                spot[:, 0] = centre + shift
+                spot[:, 1:] = rng.uniform(BEYOND_LOW_M, BEYOND_HIGH_M, (m, 1, 2))
             inside = ((spot >= low - 1e-9) & (spot <= high + 1e-9)).all((1, 2))
             apart = np.ones(m, bool)
             for a in range(count):
@@ -407,6 +413,8 @@ def _placement_boxes(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
         high[:, 1] -= PUSH_ROOM_M
     elif kind == "push_right":
         low[:, 1] += PUSH_ROOM_M
+    elif kind == "throw_into":
+        low[1:], high[1:] = BEYOND_LOW_M, BEYOND_HIGH_M
     elif kind == "drop_in_front_of":
         low[1:, 0] += 0.1  # what is in front of it must be within reach, too
     return low, high

@@ -22,6 +22,8 @@ AUDIT_FILE = "audit.json"
 SAMPLES_FOLDER = "samples"
 HORIZON_STEPS = {"lift_up": 60, "push_left": 60, "push_right": 60, "tip_over": 60}
 """Control steps (20 Hz) per episode, by kind; `TaskConfig.horizon_steps` for the others."""
+MOTION_SCALE = {"throw_into": 2.0}
+"""Of kinds in which the gripper must be faster than 0.6 m/s."""
 
 logger = logging.getLogger(__name__)
 
@@ -121,6 +123,7 @@ def generate_task(
             code=chosen.code,
             scene=scene,
             horizon_steps=HORIZON_STEPS.get(scene.kind, cfg.horizon_steps),
+            motion_scale=MOTION_SCALE.get(scene.kind, 1.0),
             audit=chosen.audit.as_dict(),
         ),
         samples=samples,

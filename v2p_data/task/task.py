@@ -127,6 +127,8 @@ class TaskBundle:
     scene: Scene
     horizon_steps: int = 100
     """Control steps (20 Hz) until an episode is cut off."""
+    motion_scale: float = 1.0
+    """How much further than usual an action moves the gripper's target: throwing needs speed."""
     audit: dict[str, Any] = field(default_factory=dict[str, Any])
     folder: Path = Path()
 
