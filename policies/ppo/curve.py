@@ -62,19 +62,21 @@ def plot_curve(path: Path, picture: Path) -> None:
 class EventMirror:
     """The rows of the CSV as TensorBoard scalars over control steps: `tensorboard --logdir <any parent folder>`.
 
-    The CSV is the truth. Opening the mirror writes all its rows into one new event file, so that a resumed
-    training (cut to its checkpoint, with rows a kill kept from the old file) has every step once. A TensorBoard
-    that is watching drops what it read before.
+    The CSV is the truth. Opening the mirror writes all its rows into a new event file and empties the old ones,
+    so that a resumed training, whose CSV was cut to the checkpoint, shows every step once.
     """
 
     def __init__(self, curve: Path) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         for old in curve.parent.glob(EVENT_FILES):
-            old.unlink()
+            old.write_bytes(
+                b""
+            )  # not deleted: a TensorBoard that is watching would wait for it forever
         rows = read_rows(curve)
         # Times as if all of it had been trained in one go: "relative" in TensorBoard is seconds of training.
         self.began = time.time() - (rows[-1]["seconds"] if rows else 0.0)
+        # Whoever is watching drops what it has read so far.
         self.writer = SummaryWriter(str(curve.parent), purge_step=0)
         for row in rows:
             self.add(row)

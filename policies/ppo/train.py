@@ -32,7 +32,15 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from policies.evaluation.rate import Rate
-from policies.ppo.curve import CURVE_FILE, PICTURE_FILE, Row, append_row, cut_after, plot_curve
+from policies.ppo.curve import (
+    CURVE_FILE,
+    PICTURE_FILE,
+    EventMirror,
+    Row,
+    append_row,
+    cut_after,
+    plot_curve,
+)
 from policies.ppo.evaluate import evaluate, outcome
 from policies.ppo.policy import ActorConfig, ActorCritic, Expert, load_weights, weights_of
 
@@ -240,18 +248,20 @@ class _Learner:
         before, started = progress.seconds, time.monotonic()
         last_save = started
         batches = iter(self.collector)
+        events = EventMirror(self.out / CURVE_FILE)
         while (reason := self._reason_to_stop()) is None:
             row = self._iterate(next(batches))
             progress.seconds = before + time.monotonic() - started
-            append_row(
-                self.out / CURVE_FILE, {"steps": progress.steps, "seconds": progress.seconds} | row
-            )
+            row = {"steps": progress.steps, "seconds": progress.seconds} | row
+            append_row(self.out / CURVE_FILE, row)
+            events.add(row)
             if on_progress is not None:
                 on_progress(progress.steps, cfg.total_steps, progress.success(cfg))
             if time.monotonic() - last_save > cfg.checkpoint_seconds:
                 self._save()
                 last_save = time.monotonic()
         self._save()
+        events.close()
         self.collector.shutdown(close_env=False)
         if (self.out / CURVE_FILE).is_file():
             plot_curve(self.out / CURVE_FILE, self.out / PICTURE_FILE)

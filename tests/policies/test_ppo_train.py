@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -284,6 +285,24 @@ def test_the_curve_holds_every_reward_component_by_name(tmp_path: Path):
     near = [float(row["reward_near"]) for row in rows_of(tmp_path)]
     # Two points drawn evenly in a square of side 2 are 1.04 apart on average.
     assert -1.5 < near[0] < -0.7
+
+
+def test_tensorboard_shows_the_csv_of_a_training_that_was_killed_and_went_on(tmp_path: Path):
+    def kill(done: int, total: int, success: float) -> None:
+        if done == 3 * BATCH:
+            raise KilledError
+
+    train_expert(PointMass(64, seed=1), steps(2), tmp_path)
+    with pytest.raises(KilledError):
+        train_expert(PointMass(64, seed=1), steps(5), tmp_path, on_progress=kill)
+    train_expert(PointMass(64, seed=1), steps(5), tmp_path)
+
+    shown = EventAccumulator(str(tmp_path)).Reload().Scalars("reward/near")
+    assert [(e.step, e.value) for e in shown] == [
+        (int(row["steps"]), pytest.approx(float(row["reward_near"]), rel=1e-5))
+        for row in rows_of(tmp_path)
+    ]
+    assert len(shown) == 5
 
 
 def test_evaluation_counts_whole_episodes_of_a_policy_that_knows_the_way():
