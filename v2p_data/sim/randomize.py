@@ -341,7 +341,7 @@ class Randomizer:
             )
         f["geom_friction"][rows, geoms, 0] = friction[:, None]
         if obj.kind == "mesh":
-            f["geom_dataid"][rows, geoms] = np.asarray(obj.mesh_ids)[mesh_idx][:, None]
+            f["geom_dataid"][rows, geoms] = np.asarray(obj.mesh_ids).T[mesh_idx]
         start, count = model.body_bvhadr[obj.body_id], model.body_bvhnum[obj.body_id]
         nodes = np.arange(start, start + count)
         f["bvh_aabb"][rows, nodes] = base["bvh_aabb"][nodes] * np.tile(g, (1, 1, 2))

@@ -1,7 +1,7 @@
 """A scene becomes one MuJoCo model: table, robot, a camera `view`, and every object on a free joint.
 
-Boxes, cylinders and spheres stay primitives; a mesh collides (and is drawn) as its convex hull; a hollow
-object becomes a solid floor with walls, so that things can go in. Body `<object>`, geoms `<object>_<k>`, free
+Boxes, cylinders and spheres stay primitives; a mesh collides (and is drawn) as its convex hull or, where it is
+concave, as a few convex parts (`solids`); a hollow object becomes a solid floor with walls, so that things can go in. Body `<object>`, geoms `<object>_<k>`, free
 joint `<object>`; the body's origin is the centre of the object's bounding box. Inertias are those of
 uniform density. The manipulated object comes first, as in the scene.
 """
@@ -29,6 +29,7 @@ from v2p_data.sim.robot import (
     robot_body_xml,
     robot_rest_xml,
 )
+from v2p_data.sim.solids import solids_of
 
 MAX_STANDING_SIZE_M = 0.45
 """Of objects that stay where they are: trays, boxes beside the motion."""
@@ -42,7 +43,6 @@ MESH_SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
 ROUND_WALLS = 10
 FLOOR_MAX_M = 0.02
 WALL_MAX_M = 0.012
-HULL_VERTICES = 40
 CAMERA = "view"
 CAMERA_POS = (0.0, -0.6, 0.78)
 CAMERA_TARGET = (0.54, -0.02, 0.10)
@@ -76,8 +76,8 @@ class ObjectModel:
     qpos_adr: int
     dof_adr: int
     geom_ids: tuple[int, ...]
-    mesh_ids: tuple[int, ...]
-    """One per entry of `MESH_SCALES`, for meshes."""
+    mesh_ids: tuple[tuple[int, ...], ...]
+    """Of meshes: per geom one for each entry of `MESH_SCALES`."""
     rest_quat: tuple[float, float, float, float]
     """Orientation in which it stands on the table, at zero yaw; from its first pose in the video."""
     hull: Float[np.ndarray, "h 3"]
@@ -219,7 +219,7 @@ class _Draft:
         for k, part in enumerate(self.parts):
             h = part.half_size
             if part.kind == "mesh":
-                form = f'type="mesh" mesh="{_mesh_name(o.name, MESH_SCALES.index(1.0))}"'
+                form = f'type="mesh" mesh="{_mesh_name(o.name, k, MESH_SCALES.index(1.0))}"'
             else:
                 size = {"box": h, "cylinder": (h[0], h[2]), "sphere": (h[0],)}[part.kind]
                 form = f'type="{part.kind}" size="{_row(size)}" pos="{_row(part.pos)}" euler="0 0 {part.yaw_rad:.9g}"'
@@ -249,10 +249,13 @@ class _Draft:
             dof_adr=int(model.jnt_dofadr[joint]),
             geom_ids=tuple(range(first, first + len(self.parts))),
             mesh_ids=tuple(
-                int(model.mesh(_mesh_name(self.obj.name, k)).id) for k in range(len(MESH_SCALES))
-            )
-            if is_mesh
-            else (),
+                tuple(
+                    int(model.mesh(_mesh_name(self.obj.name, part, k)).id)
+                    for k in range(len(MESH_SCALES))
+                )
+                for part in range(len(self.parts))
+                if is_mesh
+            ),
             rest_quat=self.rest_quat,
             hull=self.hull,
         )
@@ -304,13 +307,15 @@ def _draft(obj: SceneObject, scene: Scene) -> _Draft:
         com, inertia = _mass_properties(parts, obj.mass_kg)
     elif obj.shape == "mesh":
         kind = "mesh"
-        parts = [Part(kind="mesh", half_size=(x / 2, y / 2, z / 2))]
-        solid = _hull_mesh(obj, scene, thick)
-        hull = np.asarray(solid.vertices)
-        com = np.asarray(solid.center_mass)
-        inertia = np.asarray(solid.moment_inertia) * obj.mass_kg / solid.mass
+        solids = solids_of(scene.folder / obj.mesh, obj.name, thick)
+        parts = [
+            Part(kind="mesh", half_size=_half(np.ptp(p.vertices, axis=0))) for p in solids.parts
+        ]
+        hull = solids.hull
+        com, inertia = solids.mass_properties(obj.mass_kg)
         asset = "".join(
-            f'<mesh name="{_mesh_name(obj.name, k)}" vertex="{_row(tuple((hull * s).ravel()))}"/>'
+            f'<mesh name="{_mesh_name(obj.name, part, k)}" vertex="{_row((_uneven(p) * s).ravel())}"/>'
+            for part, p in enumerate(solids.parts)
             for k, s in enumerate(MESH_SCALES)
         )
     else:
@@ -361,35 +366,19 @@ def _rest_quat(obj: SceneObject, kind: str) -> tuple[float, float, float, float]
     return (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3]))
 
 
-def _hull_mesh(
-    obj: SceneObject, scene: Scene, size_m: tuple[float, float, float]
-) -> trimesh.Trimesh:
-    path = scene.folder / obj.mesh
-    if not obj.mesh or not path.is_file():
-        raise ItemRejectedError("mesh_missing", f"mesh of '{obj.name}' is missing: {path}")
-    loaded = trimesh.load(path, force="mesh", process=False)
-    vertices = np.asarray(loaded.vertices, float)
-    extents = np.ptp(vertices, axis=0)
-    if extents.min() < 1e-4:
-        raise ItemRejectedError(
-            "flat_mesh", f"mesh of '{obj.name}' in {path} is flat", float(extents.min())
-        )
-    centred = (vertices - (vertices.max(0) + vertices.min(0)) / 2) * (np.asarray(size_m) / extents)
-    hull = trimesh.convex.convex_hull(centred)
-    if len(hull.vertices) > HULL_VERTICES:
-        hull = trimesh.convex.convex_hull(_spread(np.asarray(hull.vertices), HULL_VERTICES))
-    return hull
+def _uneven(solid: trimesh.Trimesh) -> np.ndarray:
+    """Return its vertices, pulled apart by 0.1 % where its principal axes are ambiguous.
+
+    MuJoCo turns meshes into their principal axes, and all sizes of one mesh must be turned alike.
+    """
+    moments = np.asarray(solid.principal_inertia_components)
+    is_clear = np.diff(np.sort(moments)).min() > 1e-3 * moments.max()
+    return np.asarray(solid.vertices) * (1.0 if is_clear else np.array([1.0, 1.001, 1.002]))
 
 
-def _spread(points: np.ndarray, count: int) -> np.ndarray:
-    """Return the extreme points along the axes, then those farthest from the ones chosen already."""
-    chosen = sorted({int(f(points[:, k])) for f in (np.argmin, np.argmax) for k in range(3)})
-    distance = np.min([np.linalg.norm(points - points[i], axis=1) for i in chosen], axis=0)
-    while len(chosen) < count:
-        far = int(np.argmax(distance))
-        chosen.append(far)
-        distance = np.minimum(distance, np.linalg.norm(points - points[far], axis=1))
-    return points[chosen]
+def _half(extents: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(e) / 2 for e in extents)
+    return x, y, z
 
 
 def _disc(radius: float, half_height: float) -> np.ndarray:
@@ -431,8 +420,8 @@ def _camera_xml() -> str:
     return f'<camera name="{CAMERA}" pos="{_row(CAMERA_POS)}" xyaxes="{_row((*right, *up))}" fovy="{CAMERA_FOVY_DEG}"/>'
 
 
-def _mesh_name(name: str, scale_idx: int) -> str:
-    return f"{name}_mesh_{scale_idx}"
+def _mesh_name(name: str, part_idx: int, scale_idx: int) -> str:
+    return f"{name}_mesh_{part_idx}_{scale_idx}"
 
 
 def _row(values: Iterable[float | int]) -> str:
