@@ -99,7 +99,7 @@ def test_constants_that_depend_on_mass_agree_with_mujocos_own(
     hollow: bool, make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
 ):
     thing = make_object("thing", "box", (0.09, 0.12, 0.06), hollow=hollow)
-    randomizer, batch, _ = worlds_of(make_scene(thing))
+    randomizer, batch, _ = worlds_of(make_scene(thing, kind="generic"))
     obj = randomizer.world.objects[0]
 
     model = batch.get_model(3)
@@ -190,7 +190,10 @@ def test_a_covered_object_starts_under_its_cover(
     if (
         cover_first
     ):  # the manipulated object of an uncovering is the cover, even where nobody said so
-        things = (make_object("cup", "box", (0.11, 0.11, 0.1)), make_object(role="reference"))
+        things = (
+            make_object("cup", "box", (0.08, 0.08, 0.1)),
+            make_object(size_m=(0.025, 0.025, 0.04), role="reference"),
+        )
     else:
         things = (make_object(), make_object("cup", "box", (0.11, 0.11, 0.1), role="cover"))
 
@@ -223,7 +226,7 @@ def test_objects_without_room_are_rejected_by_name(
     ]
 
     with pytest.raises(ItemRejectedError, match="plate3") as caught:
-        worlds_of(make_scene(*plates))
+        worlds_of(make_scene(*plates, kind="generic"))
 
     assert caught.value.reason == "no_room"
 

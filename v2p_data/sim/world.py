@@ -9,9 +9,9 @@ uniform density. The manipulated object comes first, as in the scene.
 # pyright: reportAttributeAccessIssue=false
 # mujoco's classes come from a compiled module that declares none of them.
 
-import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
+from xml.sax.saxutils import quoteattr
 
 import mujoco
 import numpy as np
@@ -19,7 +19,6 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.sim.robot import (
     PADS,
@@ -30,19 +29,24 @@ from v2p_data.sim.robot import (
     robot_rest_xml,
 )
 from v2p_data.sim.solids import solids_of
+from v2p_data.sim.suitability import check_grasp, check_names, checked_size
 
-MAX_STANDING_SIZE_M = 0.45
-"""Of objects that stay where they are: trays, boxes beside the motion."""
-MAX_SIZE_M = 0.35
-MIN_SIZE_M = 0.015
-MAX_MASS_KG = 3.0
-MIN_THICKNESS_M = 0.01
-"""Thinner extents are thickened to this: the coarse time step cannot hold them apart."""
 MESH_SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
 """Ready-made sizes of each mesh; a world picks one, because MuJoCo cannot scale a mesh per world."""
 ROUND_WALLS = 10
 FLOOR_MAX_M = 0.02
 WALL_MAX_M = 0.012
+RESERVED_NAMES = (
+    "table",
+    "hand",
+    "palm",
+    "world",
+    "base",
+    "robot",
+    "finger_left",
+    "finger_right",
+    *PADS,
+)
 CAMERA = "view"
 CAMERA_POS = (0.0, -0.6, 0.78)
 CAMERA_TARGET = (0.54, -0.02, 0.10)
@@ -104,9 +108,11 @@ def build_world(scene: Scene, physics: PhysicsConfig, servo: ServoConfig | None 
     """Return the scene as a model.
 
     Raises:
-        ItemRejectedError: an object is too large, too small or too heavy for this robot, or its mesh is flat.
+        ItemRejectedError: an object is too large, too small, too heavy or too wide for this robot, or its mesh
+            is no solid.
     """
     servo = servo or ServoConfig()
+    check_names(scene, RESERVED_NAMES)
     drafts = [_draft(o, scene) for o in scene.objects]
     sensors = "".join(
         f'<contact name="{pad}_{o.name}" geom1="{pad}" body2="{o.name}" num="1" reduce="netforce" data="found"/>'
@@ -114,7 +120,7 @@ def build_world(scene: Scene, physics: PhysicsConfig, servo: ServoConfig | None 
         for pad in PADS
     )
     xml = (
-        f'<mujoco model="{scene.title}"><compiler angle="radian" autolimits="true"/>{option_xml(physics)}'
+        f'<mujoco model={quoteattr(scene.title)}><compiler angle="radian" autolimits="true"/>{option_xml(physics)}'
         '<visual><global offwidth="640" offheight="640"/><quality offsamples="0" shadowsize="1024"/>'
         '<headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>'
         f"<asset>{''.join(d.asset_xml for d in drafts)}</asset>"
@@ -262,35 +268,9 @@ class _Draft:
 
 
 def _draft(obj: SceneObject, scene: Scene) -> _Draft:
-    where = f"'{obj.name}' of scene '{scene.title}'"
-    largest = max(obj.size_m)
-    limit = MAX_SIZE_M if obj is scene.manipulated else MAX_STANDING_SIZE_M
-    if largest > limit:
-        raise ItemRejectedError(
-            "object_too_large",
-            f"{where} is {largest:.2f} m large; at most {limit} m fits into the robot's workspace",
-            largest,
-        )
-    if largest < MIN_SIZE_M:
-        raise ItemRejectedError(
-            "object_too_small",
-            f"{where} is {largest * 1000:.0f} mm large; below {MIN_SIZE_M * 1000:.0f} mm it cannot be simulated",
-            largest,
-        )
-    if obj.mass_kg > MAX_MASS_KG:
-        raise ItemRejectedError(
-            "object_too_heavy",
-            f"{where} weighs {obj.mass_kg:.1f} kg; the robot carries at most {MAX_MASS_KG} kg",
-            obj.mass_kg,
-        )
-    x, y, z = (max(float(s), MIN_THICKNESS_M) for s in obj.size_m)
-    thick = (x, y, z)
-    if thick != tuple(obj.size_m):
-        logging.getLogger(__name__).warning(
-            "%s is thickened to %.0f mm", where, MIN_THICKNESS_M * 1000
-        )
+    x, y, z = thick = checked_size(obj, scene)
     hull = np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)]) / 2
-    asset, com, inertia = "", np.zeros(3), np.zeros((3, 3))
+    asset, com, inertia, solids = "", np.zeros(3), np.zeros((3, 3)), None
     cover = cover_of(scene)
     is_cover = cover is not None and scene.objects[cover] is obj
     is_hollow = obj.hollow or is_cover
@@ -330,12 +310,20 @@ def _draft(obj: SceneObject, scene: Scene) -> _Draft:
             hull = np.concatenate([np.eye(3), -np.eye(3)]) * x / 2
         parts = [Part(kind=kind, half_size=(x / 2, y / 2, z / 2))]
         com, inertia = _mass_properties(parts, obj.mass_kg)
+    rest_quat = _rest_quat(obj, kind)
+    if not is_hollow or is_cover:  # other hollow things are taken by the wall
+        corners = (
+            [np.asarray(p.vertices) for p in solids.parts]
+            if solids
+            else [_outline(kind, hull, thick)]
+        )
+        check_grasp(obj, scene, corners, rest_quat)
     return _Draft(
         obj=obj,
         kind=kind,
         size_m=thick,
         parts=tuple(parts),
-        rest_quat=_rest_quat(obj, kind),
+        rest_quat=rest_quat,
         hull=hull,
         com=com,
         inertia=inertia,
@@ -379,6 +367,13 @@ def _uneven(solid: trimesh.Trimesh) -> np.ndarray:
 def _half(extents: np.ndarray) -> tuple[float, float, float]:
     x, y, z = (float(e) / 2 for e in extents)
     return x, y, z
+
+
+def _outline(kind: str, hull: np.ndarray, size_m: tuple[float, float, float]) -> np.ndarray:
+    """Return points on the surface of a primitive, dense enough to be measured."""
+    if kind == "sphere":
+        return np.asarray(trimesh.creation.icosphere(2, size_m[0] / 2).vertices)
+    return hull
 
 
 def _disc(radius: float, half_height: float) -> np.ndarray:
