@@ -172,11 +172,14 @@ def make_task(
 ) -> dict[str, Any]:
     """Write eight task codes, audit them, keep the best."""
     from v2p_data.scene.scene import Scene
+    from v2p_data.sim.task_check import check_task
     from v2p_data.task.generate import generate_task
 
     scene = Scene.load(inputs["scene"])
     runtime.progress(0.1, "writing task code")
     generated = generate_task(scene, cfg.config, seed_for(cfg.seed, "task", scene.title))
+    runtime.progress(0.9, "asking the simulator")
+    check_task(generated.bundle, num_threads=runtime.num_threads)
     generated.save(out)
     return {
         "kind": generated.bundle.kind,
@@ -214,11 +217,13 @@ def make_expert(
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.batch_env import BatchEnv, SimConfig
+    from v2p_data.sim.task_check import check_task
     from v2p_data.sim.torchrl_env import TorchRLEnv
     from v2p_data.task.task import TaskBundle
 
     expert_cfg: ExpertConfig = cfg.config
     bundle = TaskBundle.load(inputs["task"])
+    check_task(bundle, num_threads=runtime.num_threads)
     env = BatchEnv(
         bundle,
         SimConfig(),

@@ -37,6 +37,7 @@ from v2p_data.sim.robot import (
     ToolState,
     tool_state,
 )
+from v2p_data.sim.start_check import check_start
 from v2p_data.sim.states import Observed, StateBlock
 from v2p_data.sim.world import World, build_world
 from v2p_data.task.task import Task, TaskBundle
@@ -44,6 +45,9 @@ from v2p_data.task.task import Task, TaskBundle
 ACT_DIM = 7
 HELD_STEPS = 5
 """Success counts when it is true for this many steps on end (0.25 s)."""
+
+STARTS_LOOKED_AT = 8
+"""Worlds whose first poses are checked when an environment is made."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,6 +186,9 @@ class BatchEnv:
         self._allocate()
         self.task = self._load_task(task)
         self.reset(np.arange(num_envs))
+        looked_at = slice(0, STARTS_LOOKED_AT)
+        fields = {name: array[looked_at] for name, array in self.randomizer.fields().items()}
+        check_start(self.world, fields, self._qpos[looked_at], bundle.title)
         self.obs_dim = self._checked_obs_dim()
         self.component_names = self._component_names()
 

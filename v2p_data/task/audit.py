@@ -44,6 +44,12 @@ SMALLEST_M = 0.02
 HANDS = ("held", "let go", "touching")
 """What the robot may be doing at a pose of the video, which shows a hand instead; any of them may count."""
 ACCEPTABLE_SCORE = 0.5
+VETO_WORDS = {
+    "first_pose": "its success is true at the video's first pose already",
+    "reset": "its success is true at a reset already",
+    "reachable": "its success is true in none of the states that were tried all over the workspace",
+}
+ALWAYS_TRUE = "its success is always true"
 CARRIED_KINDS = {"lift_up", "uncover", "generic"}
 """Kinds in which success may be high above the table."""
 
@@ -397,12 +403,14 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
             weight=0.05,
         ),
     )  # fmt: skip
-    failed = [c for c in checks if c.is_veto and not c.passed]
+    failed = [VETO_WORDS[c.name] for c in checks if c.is_veto and not c.passed]
+    if success.all():
+        failed = [ALWAYS_TRUE]
     total = sum(c.weight for c in checks)
     return Audit(
         checks=checks,
         score=round(sum(c.weight for c in checks if c.passed) / total, 4),
-        vetoed=f"not so: {failed[0].asks}" if failed else "",
+        vetoed=failed[0] if failed else "",
         true_from_pose=_true_from(tracked),
         threshold_m=threshold,
         notes=result.warnings,

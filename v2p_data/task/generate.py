@@ -147,10 +147,11 @@ def _pick(scene: Scene, samples: tuple[Sample, ...]) -> int:
     if acceptable:
         return max(acceptable, key=lambda i: (samples[i].score, -i))
     best = max(samples, key=lambda s: (s.runnable, s.audit.score))
-    why = best.audit.vetoed or ", ".join(c.asks for c in best.audit.checks if not c.passed)
+    asked = ", ".join(f"'{c.asks}'" for c in best.audit.checks if not c.passed)
+    why = best.audit.vetoed or f"the answer is no to {asked}"
     raise ItemRejectedError(
         "no_acceptable_task",
         f"none of {len(samples)} task codes for '{scene.description}' ({scene.kind}) is acceptable; "
-        f"the best fails at: {why}. Look at the scene's overlay: was the motion understood?",
+        f"the best one's fault is that {why}. Look at the scene's overlay: was the motion understood?",
         best.score,
     )
