@@ -405,7 +405,10 @@ def learn_with_torchrl(worlds: BatchEnv, settings: Settings, watch: Watch, seed:
 
     @torch.no_grad()
     def act(obs: np.ndarray) -> np.ndarray:
-        normal = (torch.from_numpy(obs) - norm.loc["observation"]) / norm.scale["observation"]
+        loc, scale = norm.loc, norm.scale
+        assert loc is not None  # there has been a batch
+        assert scale is not None
+        normal = (torch.from_numpy(obs) - loc["observation"]) / scale["observation"]
         mean, _ = net(normal.clamp(-10, 10))
         return torch.tanh(mean).numpy()
 
