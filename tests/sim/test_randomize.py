@@ -247,3 +247,19 @@ def test_what_was_drawn_can_be_written_as_json_and_differs_between_worlds(
 def test_a_delay_longer_than_the_delay_line_is_refused():
     with pytest.raises(ValueError, match="20 ms"):
         RandomizationConfig(delay_s=(0.0, 0.05))
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder", "sphere"])
+def test_things_fall_equally_fast_whatever_their_drawn_mass(
+    shape: str, make_scene: Callable[..., Scene], make_object: Callable[..., SceneObject]
+):
+    randomizer, batch, _ = worlds_of(make_scene(make_object("thing", shape)))
+    obj = randomizer.world.objects[0]
+    qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+    qpos[:, obj.qpos_adr : obj.qpos_adr + 7] = 0.5, 0.5, 0.5, 1, 0, 0, 0
+
+    batch.step(nstep=4)
+
+    assert np.ptp(randomizer.mass_kg) > 0.05
+    fallen = qvel[:, obj.dof_adr : obj.dof_adr + 3]
+    np.testing.assert_allclose(fallen, np.tile([0, 0, -9.81 * 0.02], (NUM_ENVS, 1)), atol=1e-9)

@@ -137,6 +137,7 @@ class Randomizer:
                 "body_subtreemass",
                 "body_invweight0",
                 "dof_invweight0",
+                "dof_M0",
                 "actuator_delay",
             ]
         }
@@ -363,6 +364,10 @@ class Randomizer:
         f["body_invweight0"][ids, body, 1] = base["body_invweight0"][body, 1] * turn
         f["dof_invweight0"][rows, dofs[:3]] = base["dof_invweight0"][dofs[:3]] / ratio[:, None]
         f["dof_invweight0"][rows, dofs[3:]] = base["dof_invweight0"][dofs[3:]] * turn[:, None]
+        if model.body_simple[body]:
+            # MuJoCo takes a simple body's inertia from here; else a heavier one would fall faster.
+            f["dof_M0"][rows, dofs[:3]] = mass[:, None]
+            f["dof_M0"][rows, dofs[3:]] = inertia
         self.size_m[ids, k] = np.asarray(obj.size_m) * scale
         self.mass_kg[ids, k] = mass
         self.friction[ids, k] = friction
