@@ -119,7 +119,7 @@ def checked_size(obj: SceneObject, scene: Scene) -> tuple[float, float, float]:
 def check_grasp(
     obj: SceneObject,
     scene: Scene,
-    corners: Sequence[Float[np.ndarray, "n 3"]],
+    corners: Sequence[Float[np.ndarray, "_ 3"]],
     rest_quat: tuple[float, float, float, float],
     opening_m: float = 2 * FINGER_TRAVEL_M,
 ) -> None:

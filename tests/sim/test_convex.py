@@ -1,0 +1,184 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from mujoco.batch import Batch
+
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.seeds import rng_for
+from v2p_data.sim import convex, randomize
+from v2p_data.sim.batch_env import Snapshot
+from v2p_data.sim.convex import ConvexConfig, cache_folder
+from v2p_data.sim.masks import FIRST_OBJECT, MaskRenderer
+from v2p_data.sim.randomize import Randomizer
+from v2p_data.sim.robot import COARSE
+from v2p_data.sim.solids import solids_of
+from v2p_data.sim.world import MESH_SCALES, build_world
+
+SIZE = (0.08, 0.08, 0.04)
+NOTCH = np.array([0.02, 0.02, 0.0])
+"""Inside the hull of the angle, outside the angle."""
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("V2P_CACHE_DIR", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def angle_file(tmp_path: Path) -> Path:
+    """An angle of two legs, 8 cm long, 2 cm thick and 4 cm high, in its file four times smaller."""
+    outline = np.array([(0, 0), (4, 0), (4, 1), (1, 1), (1, 4), (0, 4)], float) * 0.005
+    n = len(outline)
+    vertices = np.concatenate([np.c_[outline, np.zeros(n)], np.c_[outline, np.full(n, 0.01)]])
+    sides = [
+        f for i in range(n) for j in [(i + 1) % n] for f in [(i, j, j + n), (i, j + n, i + n)]
+    ]
+    lid = [(0, 1, 2), (0, 2, 3), (0, 3, 5), (3, 4, 5)]
+    lids = [(a + n, b + n, c + n) for a, b, c in lid] + [(c, b, a) for a, b, c in lid]
+    path = tmp_path / "angle.obj"
+    trimesh.Trimesh(vertices, sides + lids, process=False).export(path)
+    return path
+
+
+@pytest.fixture
+def angle_scene(
+    angle_file: Path, make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
+) -> Scene:
+    angle = make_object("angle", "mesh", SIZE, mesh=angle_file.name)
+    return make_scene(angle, folder=angle_file.parent)
+
+
+def contains(part: trimesh.Trimesh, point: np.ndarray) -> bool:
+    """Whether a convex solid holds a point: it is behind every face."""
+    centre = part.vertices.mean(0)
+    out = part.triangles_center - centre
+    normals = part.face_normals * np.sign((part.face_normals * out).sum(1))[:, None]
+    return bool(((point - part.triangles_center) * normals).sum(1).max() < 0)
+
+
+def test_a_concave_mesh_becomes_parts_that_leave_its_notch_free(angle_file: Path):
+    solids = solids_of(angle_file, "angle", SIZE)
+
+    assert 2 <= len(solids.parts) <= 8
+    assert max(len(p.vertices) for p in solids.parts) <= 32
+    assert sum(p.volume for p in solids.parts) == pytest.approx(7 * 0.02 * 0.02 * 0.04, rel=0.05)
+    assert not any(contains(p, NOTCH) for p in solids.parts)
+    assert any(contains(p, np.array([-0.03, -0.03, 0.0])) for p in solids.parts)
+    np.testing.assert_allclose(np.ptp(solids.hull, axis=0), SIZE, rtol=1e-6)
+
+
+def test_a_split_mesh_has_the_inertia_of_the_mesh(angle_scene: Scene):
+    # Two boxes: 8 x 2 x 4 cm, and 2 x 6 x 4 cm on its end; by hand, about the common centre of mass.
+    boxes = [((0.08, 0.02, 0.04), (0.0, -0.03)), ((0.02, 0.06, 0.04), (-0.03, 0.01))]
+    mass = np.array([np.prod(size) for size, _ in boxes])
+    mass *= 0.12 / mass.sum()
+    com = mass @ np.array([c for _, c in boxes]) / 0.12
+    around_z = sum(
+        m * ((s[0] ** 2 + s[1] ** 2) / 12 + ((np.array(c) - com) ** 2).sum())
+        for m, (s, c) in zip(mass, boxes, strict=True)
+    )
+
+    body = build_world(angle_scene, COARSE).model.body("angle")
+
+    np.testing.assert_allclose(body.ipos, [*com, 0.0], atol=1e-6)
+    assert body.inertia.max() == pytest.approx(around_z, rel=1e-4)
+
+
+def test_a_convex_mesh_stays_one_hull_and_is_not_cached(tmp_path: Path):
+    path = tmp_path / "ball.obj"
+    trimesh.creation.icosphere(subdivisions=2, radius=0.03).export(path)
+
+    assert len(solids_of(path, "ball", SIZE).parts) == 1
+    assert not cache_folder().exists()
+
+
+def test_parts_are_found_once_per_mesh_and_settings_whatever_the_size(
+    angle_file: Path, monkeypatch: pytest.MonkeyPatch
+):
+    first = solids_of(angle_file, "angle", SIZE)
+    monkeypatch.setattr(convex, "_split", lambda *_: pytest.fail("it is split again"))
+
+    again = solids_of(angle_file, "angle", (0.16, 0.08, 0.04))
+
+    for a, b in zip(first.parts, again.parts, strict=True):
+        np.testing.assert_allclose(b.vertices, a.vertices * [2, 1, 1], atol=1e-9)
+    with pytest.raises(pytest.fail.Exception):
+        solids_of(angle_file, "angle", SIZE, ConvexConfig(max_parts=4))
+
+
+def test_a_damaged_cache_entry_is_made_again(angle_file: Path):
+    solids_of(angle_file, "angle", SIZE)
+    (entry,) = cache_folder().glob("*.npz")
+    entry.write_bytes(b"half a file")
+
+    assert len(solids_of(angle_file, "angle", SIZE).parts) >= 2
+
+
+def test_a_mesh_that_takes_too_long_collides_as_its_hull_and_says_so(angle_file: Path, caplog):
+    solids = solids_of(angle_file, "angle", SIZE, ConvexConfig(time_limit_s=0.01))
+
+    assert len(solids.parts) == 1
+    assert contains(solids.parts[0], NOTCH - 0.012 * np.array([1, 1, 0]))
+    assert "cannot be split (not done after 0 s): it collides as its hull" in caplog.text
+    assert "remove that file to try again" in caplog.text
+
+
+def test_the_parts_of_one_object_change_size_together(angle_scene: Scene):
+    world = build_world(angle_scene, COARSE)
+    batch = Batch(world.model, 32, 1)
+    randomizer = Randomizer(world, batch, randomize.training(), rng_for(0, "bank"))
+
+    randomizer.draw(np.arange(32), rng_for(0, "draw"))
+
+    obj, model = world.objects[0], world.model
+    fields = randomizer.fields()
+    seen = set()
+    for env in range(32):
+        scale = randomizer.size_m[env, 0, 0] / SIZE[0]
+        seen.add(round(scale, 2))
+        for part, geom in enumerate(obj.geom_ids):
+            mesh = int(fields["geom_dataid"][env, geom])
+            assert mesh == obj.mesh_ids[part][MESH_SCALES.index(round(scale, 2))]
+            np.testing.assert_allclose(
+                fields["geom_pos"][env, geom], model.mesh_pos[mesh], atol=1e-7
+            )
+    assert len(seen) > 2
+
+
+@pytest.mark.parametrize("name", ["angle", "cube", "ball"])
+def test_all_sizes_of_a_mesh_are_turned_alike(
+    name: str, angle_scene: Scene, make_object, make_scene, tmp_path: Path
+):
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.obj")
+    trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.obj")
+    thing = make_object("thing", "mesh", (0.06, 0.06, 0.06), mesh=f"{name}.obj")
+
+    world = build_world(make_scene(thing, folder=tmp_path), COARSE)
+
+    for ids in world.objects[0].mesh_ids:
+        quats = world.model.mesh_quat[list(ids)]
+        np.testing.assert_allclose(np.abs(quats @ quats[0]), 1.0, atol=1e-6)
+
+
+def test_masks_show_the_notch(angle_scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    def pixels() -> int:
+        world = build_world(angle_scene, COARSE)
+        qpos = world.model.qpos0[None].copy()
+        fields = ("geom_size", "geom_pos", "geom_dataid")
+        still = Snapshot(
+            qpos=qpos,
+            qvel=np.zeros((1, world.model.nv)),
+            **{name: getattr(world.model, name)[None].copy() for name in fields},
+        )
+        with MaskRenderer(world, 128, backend="rays") as renderer:
+            return int((renderer.draw(still, 0) == FIRST_OBJECT).sum())
+
+    with_notch = pixels()
+    monkeypatch.setattr(convex, "_split", lambda *_: ([], "because the test wants the hull"))
+    monkeypatch.setattr(convex, "VERSION", -1)  # another cache entry
+    filled = pixels()
+
+    assert 50 < with_notch < 0.95 * filled
