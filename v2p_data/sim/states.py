@@ -2,7 +2,7 @@
 
 One block of float32 arrays per control step; the tensors are views into it, so building the dict copies
 nothing. Rows of worlds that start anew are overwritten in place, hence a dict is valid until the next step
-or reset.
+or reset. In memory the worlds come last: numpy is fastest along the last axis.
 """
 
 from dataclasses import dataclass
@@ -76,114 +76,140 @@ class StateBlock:
 
     def __init__(self, world: World, num_envs: int) -> None:
         self._names = [o.name for o in world.objects]
-        self._robot = np.zeros((num_envs, 16), np.float32)
-        self._objects = np.zeros((num_envs, len(self._names), 26), np.float32)
-        self._base = np.zeros((num_envs, BASE_OBSERVATION_DIM), np.float32)
+        self._robot = np.zeros((16, num_envs), np.float32)
+        self._objects = np.zeros((len(self._names), 26, num_envs), np.float32)
+        self._base = np.zeros((BASE_OBSERVATION_DIM, num_envs), np.float32)
+        self._tensors = self._views()
 
     def fill(self, rows: slice | np.ndarray, seen: Observed) -> None:
-        """Overwrite `rows` with what was seen of them."""
-        tool, pose = seen.tool, seen.object_qpos
-        count = pose.shape[1]
-        rotation = matrices(pose[:, :, 3:])
-        # Written in one go: a robot block and an object block per world.
-        self._robot[rows] = np.concatenate(
-            [
-                tool.pos,
-                tool.quat_wxyz,
-                tool.vel_linear,
-                tool.vel_angular,
-                seen.fingers.sum(1, keepdims=True),
-                np.zeros((len(pose), 1)),
-                seen.progress[:, None],
-            ],
-            axis=1,
-            dtype=np.float32,
-        )
-        spin = np.matmul(rotation, seen.object_qvel[:, :, 3:, None])[..., 0]
-        touching = seen.touches.sum(2, keepdims=True)
-        has_closed = seen.fingers.sum(1)[:, None, None] < HOLDS_BELOW_M
-        up = rotation[:, :, 2, 2, None]
-        self._objects[rows] = np.concatenate(
-            [
-                pose,
-                seen.object_qvel[:, :, :3],
-                spin,
-                seen.object_size,
-                seen.start_pose,
-                up,
-                (touching > 1.5) & has_closed,
-                touching > 0.5,
-            ],
-            axis=2,
-            dtype=np.float32,
-        )
-        self._base[rows] = _base_observation(seen, rotation[:, : min(count, OBJECT_SLOTS)])
+        """Overwrite `rows`, all or listed ones, with what was seen of them."""
+        blocks = [self._robot, self._objects, self._base]
+        if not isinstance(rows, slice):
+            blocks = [np.zeros((*b.shape[:-1], len(rows)), np.float32) for b in blocks]
+        with np.errstate(over="ignore", invalid="ignore"):  # of worlds that broke down
+            _fill(blocks[0], blocks[1], blocks[2], seen)
+        if not isinstance(rows, slice):
+            self._robot[:, rows], self._objects[..., rows], self._base[:, rows] = blocks
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the states as views; new dict, shared memory."""
-        robot = torch.from_numpy(self._robot)
-        objects = torch.from_numpy(self._objects)
+        return dict(self._tensors)
+
+    def _views(self) -> dict[str, torch.Tensor]:
+        robot = torch.from_numpy(self._robot.T)
         states = {key: robot[:, columns] for key, columns in _ROBOT_COLUMNS.items()}
-        states["base_observation"] = torch.from_numpy(self._base)
+        states["base_observation"] = torch.from_numpy(self._base.T)
         for k, name in enumerate(self._names):
-            block = objects[:, k]
+            block = torch.from_numpy(self._objects[k].T)
             for key, columns in _OBJECT_COLUMNS.items():
                 states[f"{name}_{key}"] = block[:, columns]
         return states
 
 
-def _base_observation(
-    seen: Observed, rotation: Float[np.ndarray, "env slot 3 3"]
-) -> Float[np.ndarray, "env obs"]:
-    """Return the 80 numbers every policy sees, each of order one, clipped to +-5.
+def _fill(
+    robot: Float[np.ndarray, "16 env"],
+    objects: Float[np.ndarray, "object 26 env"],
+    base: Float[np.ndarray, "80 env"],
+    seen: Observed,
+) -> None:
+    """Write all numbers of some worlds."""
+    tool = seen.tool
+    fingers = seen.fingers.T.astype(np.float32)
+    opening = fingers[0] + fingers[1]
+    robot[0:3] = tool.pos.T
+    robot[3:7] = tool.quat_wxyz.T
+    robot[7:10] = tool.vel_linear.T
+    robot[10:13] = tool.vel_angular.T
+    robot[13] = opening
+    robot[14] = 0.0
+    robot[15] = seen.progress
+
+    touches = seen.touches.transpose(1, 2, 0).astype(np.float32)
+    touching = touches[:, 0] + touches[:, 1]
+    velocity = seen.object_qvel.transpose(1, 2, 0).astype(np.float32)
+    objects[:, 0:7] = seen.object_qpos.transpose(1, 2, 0)
+    rotation = _matrices(objects[:, 3:7])
+    objects[:, 7:10] = velocity[:, :3]
+    np.sum(rotation * velocity[:, None, 3:], axis=2, out=objects[:, 10:13])
+    objects[:, 13:16] = seen.object_size.transpose(1, 2, 0)
+    objects[:, 16:23] = seen.start_pose.transpose(1, 2, 0)
+    objects[:, 23] = rotation[:, 2, 2]
+    objects[:, 24] = (touching > 1.5) & (opening < HOLDS_BELOW_M)
+    objects[:, 25] = touching > 0.5
+    _fill_base(base, robot, objects[:OBJECT_SLOTS], rotation[:OBJECT_SLOTS], seen)
+    base[9:11] = fingers
+    base[70:72] = touches[0]
+    base *= _SCALES
+    np.clip(base, -OBSERVATION_LIMIT, OBSERVATION_LIMIT, out=base)
+
+
+def _fill_base(
+    base: Float[np.ndarray, "80 env"],
+    robot: Float[np.ndarray, "16 env"],
+    objects: Float[np.ndarray, "slot 26 env"],
+    rotation: Float[np.ndarray, "slot 3 3 env"],
+    seen: Observed,
+) -> None:
+    """Write the 80 numbers every policy sees; scaled by `_SCALES` they are of order one, clipped to +-5.
 
     22 of the robot (tool position, two axes of its rotation, fingers, how far its target is ahead, last
     action); 21 of each of two objects (position from the tool in world and gripper axes, relative rotation,
     up axis, position on the table, velocity); then sizes (6), touches of the manipulated object (2),
     progress (1), displacement from the start of both objects (6), and whether there is a second object (1).
     """
-    n, slots = rotation.shape[:2]
-    tool = seen.tool
-    out = np.zeros((n, BASE_OBSERVATION_DIM), np.float32)
-    out[:, 0:3] = (tool.pos - (0.5, 0.0, 0.15)) * 5
-    out[:, 3:6] = tool.rotation[:, :, 0]
-    out[:, 6:9] = tool.rotation[:, :, 1]
-    out[:, 9:11] = seen.fingers / FINGER_TRAVEL_M
-    out[:, 11:14] = (seen.target_pos - tool.pos) * 20
-    out[:, 14] = seen.target_finger / FINGER_TRAVEL_M
-    out[:, 15:22] = seen.last_action * 0.5
-    gripper_axes = tool.rotation.transpose(0, 2, 1)
-    for k in range(slots):
-        pos = seen.object_qpos[:, k, :3]
-        rel = pos - tool.pos
-        relative = np.matmul(gripper_axes, rotation[:, k])
-        column = 22 + 21 * k
-        out[:, column : column + 3] = rel * 10
-        out[:, column + 3 : column + 6] = np.matmul(gripper_axes, rel[:, :, None])[:, :, 0] * 10
-        out[:, column + 6 : column + 9] = relative[:, :, 0]
-        out[:, column + 9 : column + 12] = relative[:, :, 1]
-        out[:, column + 12 : column + 15] = rotation[:, k, :, 2]
-        out[:, column + 15 : column + 18] = (pos - (0.5, 0.0, 0.05)) * 5
-        out[:, column + 18 : column + 21] = seen.object_qvel[:, k, :3]
-        out[:, 64 + 3 * k : 67 + 3 * k] = seen.object_size[:, k] * 15
-        out[:, 73 + 3 * k : 76 + 3 * k] = (pos - seen.start_pose[:, k, :3]) * 5
-    out[:, 70:72] = seen.touches[:, 0]
-    out[:, 72] = seen.progress
-    out[:, 79] = float(slots > 1)
-    return np.clip(out, -OBSERVATION_LIMIT, OBSERVATION_LIMIT, out=out)
+    slots, n = len(objects), base.shape[-1]
+    axes = seen.tool.rotation.transpose(2, 1, 0).astype(np.float32)
+    pos = objects[:, 0:3]
+    np.subtract(robot[0:3], _TOOL_CENTRE, out=base[0:3])
+    base[3:9] = axes[:2].reshape(6, n)
+    base[11:14] = (seen.target_pos - seen.tool.pos).T
+    base[14] = seen.target_finger
+    base[15:22] = seen.last_action.T
+    slot = base[22:64].reshape(OBJECT_SLOTS, 21, n)[:slots]
+    away = pos - robot[0:3]
+    slot[:, 0:3] = away
+    np.sum(axes * away[:, None], axis=2, out=slot[:, 3:6])
+    relative = np.sum(axes[:, :, None] * rotation[:, None, :, :2], axis=2)
+    slot[:, 6:9] = relative[:, :, 0]
+    slot[:, 9:12] = relative[:, :, 1]
+    slot[:, 12:15] = rotation[:, :, 2]
+    np.subtract(pos, _OBJECT_CENTRE, out=slot[:, 15:18])
+    slot[:, 18:21] = objects[:, 7:10]
+    base[64:70].reshape(OBJECT_SLOTS, 3, n)[:slots] = objects[:, 13:16]
+    base[72] = seen.progress
+    np.subtract(pos, objects[:, 16:19], out=base[73:79].reshape(OBJECT_SLOTS, 3, n)[:slots])
+    base[79] = float(slots > 1)
+
+
+_TOOL_CENTRE = np.array([[0.5], [0.0], [0.15]], np.float32)
+_OBJECT_CENTRE = np.array([[0.5], [0.0], [0.05]], np.float32)
+_SLOT_SCALES = [10.0] * 6 + [1.0] * 9 + [5.0] * 3 + [1.0] * 3
+_SCALES = np.array(
+    [5.0] * 3 + [1.0] * 6 + [1 / FINGER_TRAVEL_M] * 2 + [20.0] * 3 + [1 / FINGER_TRAVEL_M] + [0.5] * 7
+    + _SLOT_SCALES * OBJECT_SLOTS + [15.0] * 6 + [1.0] * 3 + [5.0] * 6 + [1.0],
+    np.float32,
+)[:, None]  # fmt: skip
 
 
 def matrices(quat_wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Return rotation matrices of unit quaternions."""
-    w, x, y, z = np.moveaxis(quat_wxyz, -1, 0)
-    out = np.empty((*quat_wxyz.shape[:-1], 3, 3))
-    out[..., 0, 0] = 1 - 2 * (y * y + z * z)
-    out[..., 0, 1] = 2 * (x * y - w * z)
-    out[..., 0, 2] = 2 * (x * z + w * y)
-    out[..., 1, 0] = 2 * (x * y + w * z)
-    out[..., 1, 1] = 1 - 2 * (x * x + z * z)
-    out[..., 1, 2] = 2 * (y * z - w * x)
-    out[..., 2, 0] = 2 * (x * z - w * y)
-    out[..., 2, 1] = 2 * (y * z + w * x)
-    out[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return _matrices(quat_wxyz[..., None])[..., 0]
+
+
+def _matrices(quat_wxyz: Float[np.ndarray, "*batch 4 n"]) -> Float[np.ndarray, "*batch 3 3 n"]:
+    twice = 2 * quat_wxyz
+    wx, wy, wz = np.moveaxis(quat_wxyz[..., :1, :] * twice[..., 1:, :], -2, 0)
+    xx, xy, xz = np.moveaxis(quat_wxyz[..., 1:2, :] * twice[..., 1:, :], -2, 0)
+    yy, yz = np.moveaxis(quat_wxyz[..., 2:3, :] * twice[..., 2:, :], -2, 0)
+    zz = quat_wxyz[..., 3, :] * twice[..., 3, :]
+    out = np.empty((*quat_wxyz.shape[:-2], 3, 3, quat_wxyz.shape[-1]), quat_wxyz.dtype)
+    out[..., 0, 0, :] = 1 - (yy + zz)
+    out[..., 0, 1, :] = xy - wz
+    out[..., 0, 2, :] = xz + wy
+    out[..., 1, 0, :] = xy + wz
+    out[..., 1, 1, :] = 1 - (xx + zz)
+    out[..., 1, 2, :] = yz - wx
+    out[..., 2, 0, :] = xz - wy
+    out[..., 2, 1, :] = yz + wx
+    out[..., 2, 2, :] = 1 - (xx + yy)
     return out
