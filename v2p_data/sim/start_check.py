@@ -61,7 +61,9 @@ def check_start(
     data = mujoco.MjData(model)
     for env in range(len(qpos)):
         for name, value in fields.items():
-            getattr(model, name)[:] = value[env].reshape(getattr(model, name).shape)
+            own = getattr(model, name)
+            rows = value[env].reshape(-1, *own.shape[1:])
+            own[: len(rows)] = rows  # of bvh_aabb, the bodies' come before the meshes'
         data.qpos[:] = qpos[env]
         mujoco.mj_fwdPosition(model, data)
         for contact in data.contact:
