@@ -1,0 +1,151 @@
+"""Learn from a teacher who says what to do anywhere: DAgger (Ross, Gordon, Bagnell 2011) over a batch of worlds.
+
+At first the teacher moves all worlds, later more and more of them follow the learner; the teacher only says
+what it would do there. So the learner is corrected in the states into which its own mistakes lead. What comes
+out is an expert's folder, from which PPO goes on.
+"""
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs import EnvBase
+
+from policies.ppo.policy import ActorConfig, ActorCritic, Expert
+
+log = logging.getLogger(__name__)
+
+Teacher = Callable[[], Float[np.ndarray, "env act"]]
+"""What to do in the worlds as they are now."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImitationConfig:
+    """How long, and how much is left to the learner."""
+
+    rounds: int = 10
+    """The teacher moves all worlds in the first and a tenth of them in the last."""
+    round_steps: int = 32
+    """Control steps per world and round."""
+    epochs: int = 6
+    """Passes over everything seen so far, after each round."""
+    last_epochs: int = 12
+    minibatch: int = 1024
+    learning_rate: float = 1e-3
+    noise: float = 0.2
+    """Standard deviation added to actions, so that the teacher is seen recovering."""
+    least_teacher: float = 0.1
+    """Share of the worlds that the teacher always keeps: who fails early never sees how a task ends."""
+    num_threads: int = 1
+    actor: ActorConfig = field(default_factory=ActorConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImitationResult:
+    """What came of it."""
+
+    folder: Path
+    steps: int
+    seconds: float
+    loss: float
+    """Error of the actions at the end, smooth L1."""
+
+
+def imitate(
+    env: EnvBase,
+    teacher: Teacher,
+    cfg: ImitationConfig,
+    out: Path,
+    *,
+    seed: int,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> ImitationResult:
+    """Write an expert that does as the teacher does into `out`.
+
+    Args:
+        env: a batch of worlds, seeded by the caller.
+        teacher: looks at the same worlds.
+        cfg: the recipe.
+        out: folder of the expert.
+        seed: of weights, noise and minibatches.
+        on_progress: told the share that is done.
+    """
+    started = time.monotonic()
+    threads = torch.get_num_threads()
+    torch.set_num_threads(cfg.num_threads)
+    generator = torch.Generator().manual_seed(seed)
+    num_envs = env.batch_size[0]
+    obs_dim = env.observation_spec["observation"].shape[-1]  # type: ignore[union-attr]
+    model = ActorCritic(obs_dim, env.action_spec.shape[-1], cfg.actor, generator)
+    optimiser = torch.optim.Adam(model.actor.parameters(), lr=cfg.learning_rate, fused=True)
+    seen: list[torch.Tensor] = []
+    said: list[torch.Tensor] = []
+    now = env.reset()
+    if (stagger := getattr(env, "stagger", None)) is not None:
+        stagger()
+    loss = float("nan")
+    for k in range(cfg.rounds):
+        share = max(1 - k / max(cfg.rounds - 1, 1), cfg.least_teacher)
+        follows = torch.rand(num_envs, generator=generator) >= share
+        start = len(seen)
+        for _ in range(cfg.round_steps):
+            obs = now["observation"].clone()
+            advice = torch.from_numpy(teacher()).float()
+            seen.append(obs)
+            said.append(advice)
+            action = advice
+            if bool(follows.any()):
+                with torch.no_grad():
+                    mean, _ = model.actor(obs)
+                action = torch.where(follows[:, None], mean, advice)
+            noise = cfg.noise * torch.randn(action.shape, generator=generator)
+            _, now = env.step_and_maybe_reset(
+                TensorDict({"action": action + noise}, env.batch_size)
+            )
+        model.normaliser.update(torch.cat(seen[start:]))
+        epochs = cfg.last_epochs if k == cfg.rounds - 1 else cfg.epochs
+        loss = _fit(model, optimiser, torch.cat(seen), torch.cat(said), epochs, cfg, generator)
+        on_progress((k + 1) / cfg.rounds)
+        log.info("round %d: loss %.4f", k, loss)
+    Expert(model).save(out)
+    torch.set_num_threads(threads)
+    return ImitationResult(
+        folder=out,
+        steps=cfg.rounds * cfg.round_steps * num_envs,
+        seconds=time.monotonic() - started,
+        loss=loss,
+    )
+
+
+def _fit(
+    model: ActorCritic,
+    optimiser: torch.optim.Optimizer,
+    obs: torch.Tensor,
+    advice: torch.Tensor,
+    epochs: int,
+    cfg: ImitationConfig,
+    generator: torch.Generator,
+) -> float:
+    """Descend on the error for some passes and return the last one's mean."""
+    bound = model.actor.bound
+    wanted = torch.minimum(torch.maximum(advice, -0.95 * bound), 0.95 * bound)
+    total = 0.0
+    for _ in range(epochs):
+        order = torch.randperm(len(obs), generator=generator)
+        chunks = order.chunk(max(1, len(obs) // cfg.minibatch))
+        total = 0.0
+        for idx in chunks:
+            mean, _ = model.actor(obs[idx])
+            loss = nn.functional.smooth_l1_loss(mean, wanted[idx], beta=0.2)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            total += float(loss.detach()) / len(chunks)
+    return total
