@@ -166,8 +166,8 @@ def _tell_scale(
     factors = extents / size_m
     factor = float(np.median(factors))
     if not 0.2 < factor < 5:
-        units = {10: "decimetres", 100: "centimetres", 1000: "millimetres", 39.37: "inches"}
-        near = [word for times, word in units.items() if 0.7 < factor / times < 1.4]
+        units = {100: "centimetres", 1000: "millimetres"}
+        near = [word for times, word in units.items() if 0.5 < factor / times < 2]
         logger.warning(
             "mesh of '%s' in %s is %.3g m large and the object %.3g m%s; it is brought to size",
             name, path, extents.max(), size_m.max(), f": taken to be in {near[0]}" if near else "",

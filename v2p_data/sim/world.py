@@ -294,7 +294,7 @@ def _draft(obj: SceneObject, scene: Scene) -> _Draft:
         hull = solids.hull
         com, inertia = solids.mass_properties(obj.mass_kg)
         asset = "".join(
-            f'<mesh name="{_mesh_name(obj.name, part, k)}" vertex="{_row((_uneven(p) * s).ravel())}"/>'
+            f'<mesh name="{_mesh_name(obj.name, part, k)}" vertex="{_row((np.asarray(p.vertices) * s).ravel())}"/>'
             for part, p in enumerate(solids.parts)
             for k, s in enumerate(MESH_SCALES)
         )
@@ -352,16 +352,6 @@ def _rest_quat(obj: SceneObject, kind: str) -> tuple[float, float, float, float]
         upright[1] = np.cross(upright[2], upright[0])
     quat = Rotation.from_matrix(upright).as_quat(canonical=True, scalar_first=True)
     return (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3]))
-
-
-def _uneven(solid: trimesh.Trimesh) -> np.ndarray:
-    """Return its vertices, pulled apart by 0.1 % where its principal axes are ambiguous.
-
-    MuJoCo turns meshes into their principal axes, and all sizes of one mesh must be turned alike.
-    """
-    moments = np.asarray(solid.principal_inertia_components)
-    is_clear = np.diff(np.sort(moments)).min() > 1e-3 * moments.max()
-    return np.asarray(solid.vertices) * (1.0 if is_clear else np.array([1.0, 1.001, 1.002]))
 
 
 def _half(extents: np.ndarray) -> tuple[float, float, float]:
