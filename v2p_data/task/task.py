@@ -20,7 +20,7 @@ from v2p_data.scene.scene import Scene
 TASK_FILE = "task.json"
 CODE_FILE = "task.py"
 SCENE_FOLDER = "scene"
-BASE_OBSERVATION_DIM = 80
+BASE_OBSERVATION_DIM = 90
 """Length of `states['base_observation']`, the same for every task so that experts can warm-start each other."""
 
 ROBOT_STATES = {
