@@ -44,8 +44,8 @@ def turn_to_grip(
         + _NARROW_IS_BETTER * size
         + _NOT_LEVEL * (np.abs(rotation[2]) > LEVEL)
     )
-    best = costs.argmin(0)
-    return np.take_along_axis(turns, best[None], 0)[0]
+    turn = np.where(costs[1] < costs[0], turns[1], turns[0])
+    return np.where(costs[2] < np.minimum(costs[0], costs[1]), turns[2], turn)
 
 
 def grip_features(
@@ -63,4 +63,4 @@ def grip_features(
 
 
 def _within(angle: np.ndarray) -> np.ndarray:
-    return (angle + np.pi / 2) % np.pi - np.pi / 2
+    return angle - np.pi * np.round(angle / np.pi)
