@@ -7,9 +7,8 @@ Keys: `observation` and, after a step, `reward`, its `components`, `success` and
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch.nn.modules.module import _IncompatibleKeys
@@ -18,17 +17,21 @@ from torchrl.envs import EnvBase
 
 from v2p_data.sim.batch_env import BatchEnv
 
+if TYPE_CHECKING:
+    from v2p_data.sim.warp_env import WarpBatchEnv
+
 
 class TorchRLEnv(EnvBase):
-    """TorchRL's view of a `BatchEnv`.
+    """TorchRL's view of a `BatchEnv`, or of a `WarpBatchEnv`, whose device it has.
 
     Args:
         env: the worlds; `batch_size` is their number.
     """
 
-    def __init__(self, env: BatchEnv) -> None:
+    def __init__(self, env: "BatchEnv | WarpBatchEnv") -> None:
         n = env.num_envs
-        super().__init__(device="cpu", batch_size=torch.Size([n]))
+        device = torch.device("cpu") if isinstance(env, BatchEnv) else env.device
+        super().__init__(device=device, batch_size=torch.Size([n]))
         self.worlds = env
         flag = Binary(1, torch.Size([n, 1]), dtype=torch.bool)
         self.observation_spec = Composite(
@@ -63,22 +66,30 @@ class TorchRLEnv(EnvBase):
         del kwargs
         n = self.worlds.num_envs
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        ids = np.arange(n) if mask is None else np.flatnonzero(mask.reshape(n, -1).any(1).numpy())
-        self.worlds.reset(ids)
-        no = torch.zeros(n, 1, dtype=torch.bool)
+        ids = torch.arange(n) if mask is None else mask.reshape(n, -1).any(1).nonzero()[:, 0]
+        if isinstance(self.worlds, BatchEnv):
+            self.worlds.reset(ids.numpy())
+        else:
+            self.worlds.reset(ids)
+        no = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
         flags = {key: no.clone() for key in ("success", "held", "done", "terminated", "truncated")}
-        parts = {name: torch.zeros(n) for name in self.worlds.component_names}
+        parts = {name: torch.zeros(n, device=self.device) for name in self.worlds.component_names}
         return TensorDict(
             {
-                "observation": torch.from_numpy(self.worlds.observe()),
+                "observation": torch.as_tensor(self.worlds.observe()),
                 "components": TensorDict(parts, [n]),
                 **flags,
             },
             [n],
+            device=self.device,
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        result = self.worlds.step(tensordict.get("action").detach().numpy())
+        action = tensordict.get("action").detach()
+        if isinstance(self.worlds, BatchEnv):
+            result = self.worlds.step(action.numpy())
+        else:
+            result = self.worlds.step(action)
         columns = {
             "reward": result.reward,
             "success": result.success,
@@ -87,15 +98,16 @@ class TorchRLEnv(EnvBase):
             "truncated": result.truncated,
             "done": result.terminated | result.truncated,
         }
-        parts = {name: torch.from_numpy(value) for name, value in result.components.items()}
+        parts = {name: torch.as_tensor(value) for name, value in result.components.items()}
         n = self.worlds.num_envs
         return TensorDict(
             {
-                "observation": torch.from_numpy(result.obs),
+                "observation": torch.as_tensor(result.obs),
                 "components": TensorDict(parts, [n]),
-                **{key: torch.from_numpy(value)[:, None] for key, value in columns.items()},
+                **{key: torch.as_tensor(value)[:, None] for key, value in columns.items()},
             },
             [n],
+            device=self.device,
         )
 
     def _set_seed(self, seed: int | None) -> None:
