@@ -24,18 +24,16 @@ from mujoco.batch import Batch
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 from v2p_data.sim import randomize
+from v2p_data.sim.arms import RobotConfig
 from v2p_data.sim.randomize import RandomizationConfig, Randomizer
 from v2p_data.sim.robot import (
     COARSE,
     FINE,
-    FINGER_TRAVEL_M,
-    NUM_ARM_JOINTS,
     NUM_CONTROLS,
     QUAT_DOWN,
     TARGET_HIGH_M,
     TARGET_LOW_M,
     ToolState,
-    tool_state,
 )
 from v2p_data.sim.start_check import check_start
 from v2p_data.sim.states import Observed, StateBlock
@@ -56,6 +54,7 @@ class SimConfig:
 
     fine: bool = False
     """Small time steps, for evaluation and recording; else large ones, for training."""
+    robot: RobotConfig = field(default_factory=RobotConfig)
     randomization: RandomizationConfig = field(default_factory=randomize.training)
     position_step_m: float = 0.03
     """Target displacement at action 1, per control step."""
@@ -174,7 +173,8 @@ class BatchEnv:
         self.num_envs = num_envs
         self.horizon = bundle.horizon_steps
         self.physics = FINE if self.cfg.fine else COARSE
-        self.world: World = build_world(bundle.scene, self.physics)
+        self.world: World = build_world(bundle.scene, self.physics, robot=self.cfg.robot)
+        self._robot = self.world.robot
         self.object_names = [o.name for o in self.world.objects]
         self.broken_count = 0
         """Worlds whose simulation broke down since the environment was made."""
@@ -215,14 +215,16 @@ class BatchEnv:
         if n == 0:
             return
         ids = np.asarray(ids, np.int64)
-        self._batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        # What `Batch.reset` would do, without waking its threads.
+        self._batch.state[ids] = self._fresh_state
+        self._batch.warning[ids] = 0
         self.randomizer.draw(ids, self._rng)
         arm, tool_pos, yaw = self.randomizer.start_arm(n, self._rng)
-        self._qpos[ids, :NUM_ARM_JOINTS] = arm
-        self._qpos[ids, NUM_ARM_JOINTS : NUM_ARM_JOINTS + 2] = FINGER_TRAVEL_M
+        self._qpos[ids, self._robot.arm] = arm
+        self._qpos[ids, self._robot.fingers] = self._robot.finger_travel_m
         self._target_pos[ids] = tool_pos
         self._target_quat[ids] = _turned_down(yaw)
-        self._target_finger[ids] = FINGER_TRAVEL_M
+        self._target_finger[ids] = self._robot.finger_travel_m
         poses = self.task.reset_objects_states(torch.from_numpy(ids))
         for k, name in enumerate(self.object_names):
             if name not in poses or tuple(poses[name].shape) != (n, 7):
@@ -240,7 +242,7 @@ class BatchEnv:
         self._write_controls(ids)
         # The delay line starts at the controls, not at zero, else the arm is pulled to the origin at first.
         self._history[ids[:, None], self._history_values] = self._ctrl[ids][:, self._history_ctrl]
-        tool = tool_state(self._qpos[ids, :NUM_ARM_JOINTS], self._qvel[ids, :NUM_ARM_JOINTS])
+        tool = self._tool_of(ids)
         for name in ("pos", "rotation", "quat_wxyz", "vel_linear", "vel_angular"):
             getattr(self._tool, name)[ids] = getattr(tool, name)
         self._fill(ids, tool)
@@ -274,7 +276,7 @@ class BatchEnv:
         self._steps += 1
         self._touches[:] = self._sensordata.reshape(self.num_envs, -1, 2) > 0
         self._find_broken()
-        self._tool = tool_state(self._qpos[:, :NUM_ARM_JOINTS], self._qvel[:, :NUM_ARM_JOINTS])
+        self._tool = self._tool_of(slice(None))
         self._fill(slice(None), self._tool)
         return self._judge(torch.from_numpy(clipped.astype(np.float32).T))
 
@@ -284,12 +286,12 @@ class BatchEnv:
 
     def robot_state(self) -> Float32[np.ndarray, "env 7"]:
         """Return `observation.state`: tool position [m], its rotation from straight down [rad], opening 0 to 1."""
-        fingers = self._qpos[:, NUM_ARM_JOINTS : NUM_ARM_JOINTS + 2].sum(1, keepdims=True)
+        fingers = self._qpos[:, self._robot.fingers].sum(1, keepdims=True)
         return np.concatenate(
             [
                 self._tool.pos,
                 _rotvec_from_down(self._tool.quat_wxyz),
-                np.clip(fingers / (2 * FINGER_TRAVEL_M), 0.0, 1.0),
+                np.clip(fingers / (2 * self._robot.finger_travel_m), 0.0, 1.0),
             ],
             axis=1,
             dtype=np.float32,
@@ -340,7 +342,7 @@ class BatchEnv:
             getattr(self, name)[:] = state[f"env.{name}"].numpy()
         self._rng.bit_generator.state = json.loads(state["rng"])
         self.broken_count = int(state["broken_count"])
-        self._tool = tool_state(self._qpos[:, :NUM_ARM_JOINTS], self._qvel[:, :NUM_ARM_JOINTS])
+        self._tool = self._tool_of(slice(None))
         self._fill(slice(None), self._tool)
 
     # -- inside
@@ -350,6 +352,7 @@ class BatchEnv:
         # MuJoCo would write a log file into the working folder; broken worlds are counted instead.
         mujoco.set_mju_user_warning(_log_warning)
         self._batch = Batch(model, self.num_envs, num_threads)
+        self._fresh_state = self._batch.state[0].copy()
         self._qpos = self._batch.bind("qpos")
         self._qvel = self._batch.bind("qvel")
         self._ctrl = self._batch.bind("ctrl")
@@ -375,7 +378,7 @@ class BatchEnv:
         self._held = np.zeros(n, np.int64)
         self._last_action = np.zeros((ACT_DIM, n)).T
         self._broken = np.zeros(n, bool)
-        self._tool = tool_state(np.zeros((n, NUM_ARM_JOINTS)), np.zeros((n, NUM_ARM_JOINTS)))
+        self._tool = self._tool_of(slice(None))
 
     def _load_task(self, task: type[Task] | None) -> Task:
         if task is not None:
@@ -409,16 +412,21 @@ class BatchEnv:
         quat = _product(turn, self._target_quat.T)
         quat = _leashed(quat, tool.quat_wxyz.T, cfg.rotation_leash_rad)
         quat = _limit_tilt(quat, cfg.tilt_limit_rad)
-        travel = 0.5 * (self._qpos[:, NUM_ARM_JOINTS] + self._qpos[:, NUM_ARM_JOINTS + 1])
+        left, right = self._qpos[:, self._robot.fingers].T
+        travel = 0.5 * (left + right)
         finger = self._target_finger - action[6] * cfg.finger_step_m
         finger = np.maximum(finger, travel - cfg.finger_leash_m)
-        finger = np.minimum(np.maximum(finger, 0.0), FINGER_TRAVEL_M)
+        finger = np.minimum(np.maximum(finger, 0.0), self._robot.finger_travel_m)
         for target, safe in ((pos, [[0.5], [0.0], [0.2]]), (quat, np.array([QUAT_DOWN]).T)):
             if not np.isfinite(target).all():  # broken worlds wait for their reset
                 target[:, ~np.isfinite(target).all(0)] = safe
         if not np.isfinite(finger).all():
-            finger[~np.isfinite(finger)] = FINGER_TRAVEL_M
+            finger[~np.isfinite(finger)] = self._robot.finger_travel_m
         self._target_pos, self._target_quat, self._target_finger = pos.T, quat.T, finger
+
+    def _tool_of(self, rows: slice | np.ndarray) -> ToolState:
+        robot = self._robot
+        return robot.tool_state(self._qpos[rows, robot.arm], self._qvel[rows, robot.arm_dofs])
 
     def _write_controls(self, rows: slice | np.ndarray) -> None:
         self._ctrl[rows, 0:3] = self._target_pos[rows]
@@ -440,7 +448,7 @@ class BatchEnv:
             rows,
             Observed(
                 tool=tool,
-                fingers=self._qpos[rows, NUM_ARM_JOINTS : NUM_ARM_JOINTS + 2],
+                fingers=self._qpos[rows, self._robot.fingers],
                 object_qpos=self._object_qpos[rows],
                 object_qvel=self._object_qvel[rows],
                 object_size=self.randomizer.size_m[rows],
@@ -455,12 +463,12 @@ class BatchEnv:
 
     def _judge(self, action: Float32[torch.Tensor, "env 7"]) -> StepResult:
         states = self.states()
-        obs = self._observation(
-            states
-        )  # first: a reward may use what the observation adds to the states
         ok = ~self._broken
-        success = self.task.compute_success(states).numpy().astype(bool) & ok
-        total, parts = self.task.compute_reward(action, states)
+        with torch.inference_mode():
+            # First: a reward may use what the observation adds to the states.
+            obs = self._observation(states)
+            success = self.task.compute_success(states).numpy().astype(bool) & ok
+            total, parts = self.task.compute_reward(action, states)
         task_reward = self._of_sound_worlds(total)
         if not np.isfinite(task_reward).all():
             env = int(np.flatnonzero(~np.isfinite(task_reward))[0])
@@ -572,7 +580,7 @@ def _leashed(
     dot = _dot(quat, anchor)
     far = np.flatnonzero(np.abs(dot) < np.cos(limit_rad / 2))
     if len(far):
-        a, b = anchor[:, far], quat[:, far] * np.sign(dot[far])
+        a, b = np.take(anchor, far, axis=1), np.take(quat, far, axis=1) * np.sign(dot[far])
         half = np.arccos(np.clip(np.abs(dot[far]), 0, 1))
         part = limit_rad / 2
         quat[:, far] = (np.sin(half - part) * a + np.sin(part) * b) / np.sin(half)
@@ -585,12 +593,14 @@ def _limit_tilt(quat: Float[np.ndarray, "4 n"], limit_rad: float) -> Float[np.nd
     axis_z = 1 - 2 * (x * x + y * y)
     far = np.flatnonzero(-axis_z < np.cos(limit_rad))
     if len(far):
-        w, x, y, z = leaning = quat[:, far]
-        # The axis crossed with (0, 0, -1).
-        back = np.stack([2 * (w * x - y * z), 2 * (x * z + w * y), np.zeros(len(far))])
-        back /= np.maximum(np.sqrt(_dot(back, back)), 1e-12)
+        w, x, y, z = leaning = np.take(quat, far, axis=1)
+        # The axis crossed with (0, 0, -1), its length the sine of how far it leans.
+        back = np.zeros((3, len(far)))
+        back[0] = 2 * (w * x - y * z)
+        back[1] = 2 * (x * z + w * y)
         over = np.arccos(np.clip(-axis_z[far], -1, 1)) - limit_rad
-        quat[:, far] = _product(_exp(back * over), leaning)
+        back *= over / np.maximum(np.sqrt(_dot(back, back)), 1e-12)
+        quat[:, far] = _product(_exp(back), leaning)
     return quat
 
 

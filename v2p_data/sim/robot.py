@@ -24,6 +24,8 @@ TCP_BELOW_FLANGE_M = 0.107 + 0.145
 FINGERTIP_BELOW_TCP_M = 0.015
 QUAT_DOWN = (0.0, 1.0, 0.0, 0.0)
 """`quat_wxyz` of the gripper pointing straight down with zero yaw."""
+BASE_SITE_XML = '<site name="base" size="0.001" group="4"/>'
+"""The world's origin, in which the servos' targets are given."""
 PADS = ("pad_left", "pad_right")
 NUM_CONTROLS = 8
 
@@ -137,7 +139,7 @@ def robot_body_xml(physics: PhysicsConfig, servo: ServoConfig) -> str:
             )
         closing += "</body>"
     base = (
-        '<site name="base" size="0.001" group="4"/>'
+        f"{BASE_SITE_XML}"
         '<geom name="link0_0" type="cylinder" fromto="0 0 0 0 0 0.14" size="0.07" contype="0" conaffinity="0" '
         'rgba="0.93 0.93 0.95 1"/>'
     )
@@ -167,24 +169,30 @@ def _gripper_xml(physics: PhysicsConfig, servo: ServoConfig) -> str:
 
 def robot_rest_xml(servo: ServoConfig) -> str:
     """Return contact exclusions, the finger coupling and the servos, for the root of the model."""
+    exclusion = '<contact><exclude body1="link7" body2="hand"/></contact>'
+    return exclusion + servo_xml(servo, "tcp", ("finger_left", "finger_right"), FINGER_TRAVEL_M)
+
+
+def servo_xml(servo: ServoConfig, site: str, fingers: tuple[str, str], travel_m: float) -> str:
+    """Return the finger coupling and the servos of any arm with a tool site and two sliding fingers."""
     history = f'nsample="{servo.history_samples}" delay="0"'
     force = f'forcerange="-{servo.force_limit_n} {servo.force_limit_n}"'
+    left, right = fingers
     axes = "".join(
-        f'<position name="servo_{name}" site="tcp" refsite="base" gear="{gear} 0 0 0" '
+        f'<position name="servo_{name}" site="{site}" refsite="base" gear="{gear} 0 0 0" '
         f'kp="{servo.position_kp}" kv="{servo.position_kv}" {force} {history}/>'
         for name, gear in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1"))
     )
     return (
-        '<contact><exclude body1="link7" body2="hand"/></contact>'
-        '<tendon><fixed name="opening"><joint joint="finger_left" coef="0.5"/>'
-        '<joint joint="finger_right" coef="0.5"/></fixed></tendon>'
-        '<equality><joint joint1="finger_left" joint2="finger_right" polycoef="0 1 0 0 0" '
+        f'<tendon><fixed name="opening"><joint joint="{left}" coef="0.5"/>'
+        f'<joint joint="{right}" coef="0.5"/></fixed></tendon>'
+        f'<equality><joint joint1="{left}" joint2="{right}" polycoef="0 1 0 0 0" '
         'solimp="0.95 0.99 0.001" solref="0.01 1"/></equality>'
         f"<actuator>{axes}"
-        f'<orientation name="servo_rotation" site="tcp" refsite="base" input="quat" kp="{servo.rotation_kp}" '
+        f'<orientation name="servo_rotation" site="{site}" refsite="base" input="quat" kp="{servo.rotation_kp}" '
         f'kv="{servo.rotation_kv}" forcerange="0 {servo.torque_limit_nm}" {history}/>'
         f'<position name="servo_gripper" tendon="opening" kp="{servo.finger_kp}" kv="{servo.finger_kv}" '
-        f'forcerange="-{servo.grip_force_n} {servo.grip_force_n}" ctrlrange="0 {FINGER_TRAVEL_M}" {history}/>'
+        f'forcerange="-{servo.grip_force_n} {servo.grip_force_n}" ctrlrange="0 {travel_m}" {history}/>'
         "</actuator>"
     )
 

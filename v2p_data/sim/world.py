@@ -20,13 +20,17 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.sim.arms import BUILT_IN, Robot, RobotConfig, read_arm, sensor_ends
 from v2p_data.sim.robot import (
+    BASE_SITE_XML,
+    FINGER_TRAVEL_M,
     PADS,
     PhysicsConfig,
     ServoConfig,
     option_xml,
     robot_body_xml,
     robot_rest_xml,
+    servo_xml,
 )
 from v2p_data.sim.solids import solids_of
 from v2p_data.sim.suitability import check_grasp, check_names, checked_size
@@ -98,27 +102,41 @@ class World:
     """The compiled model with the addresses of its objects."""
 
     xml: str
+    """Its text; of another arm than the built-in one it lacks the bodies."""
     model: mujoco.MjModel
+    robot: Robot
     physics: PhysicsConfig
     objects: tuple[ObjectModel, ...]
     scene: Scene
 
 
-def build_world(scene: Scene, physics: PhysicsConfig, servo: ServoConfig | None = None) -> World:
-    """Return the scene as a model.
+def build_world(
+    scene: Scene,
+    physics: PhysicsConfig,
+    servo: ServoConfig | None = None,
+    robot: RobotConfig | None = None,
+) -> World:
+    """Return the scene as a model; the built-in arm's joints come first in it, another arm's last.
 
     Raises:
+        V2PError: the robot's file is not what it should be.
         ItemRejectedError: an object is too large, too small, too heavy or too wide for this robot, or its mesh
             is no solid.
     """
     servo = servo or ServoConfig()
     check_names(scene, RESERVED_NAMES)
-    drafts = [_draft(o, scene) for o in scene.objects]
+    arm = read_arm(robot, physics, servo) if robot and robot.path else None
+    opening_m = 2 * (arm.finger_travel_m if arm else FINGER_TRAVEL_M)
+    drafts = [_draft(o, scene, opening_m) for o in scene.objects]
     sensors = "".join(
-        f'<contact name="{pad}_{o.name}" geom1="{pad}" body2="{o.name}" num="1" reduce="netforce" data="found"/>'
+        f'<contact name="{pad}_{o.name}" {end} body2="{o.name}" num="1" reduce="netforce" data="found"/>'
         for o in scene.objects
-        for pad in PADS
+        for pad, end in zip(PADS, sensor_ends(arm, PADS), strict=True)
     )
+    if arm is None:
+        bodies, driven = robot_body_xml(physics, servo), robot_rest_xml(servo)
+    else:
+        bodies, driven = BASE_SITE_XML, servo_xml(servo, *arm.driven, arm.finger_travel_m)
     xml = (
         f'<mujoco model={quoteattr(scene.title)}><compiler angle="radian" autolimits="true"/>{option_xml(physics)}'
         '<visual><global offwidth="640" offheight="640"/><quality offsamples="0" shadowsize="1024"/>'
@@ -127,11 +145,17 @@ def build_world(scene: Scene, physics: PhysicsConfig, servo: ServoConfig | None 
         f'<worldbody><light pos="0.5 -0.5 2" dir="0 0.2 -1" castshadow="false"/>{_camera_xml()}'
         '<geom name="table" type="plane" size="1.5 1.5 0.1" contype="1" conaffinity="3" condim="4" '
         f'friction="0.8 0.005 0.0001" solref="{physics.solref_s} 1" rgba="0.55 0.5 0.45 1"/>'
-        f"{robot_body_xml(physics, servo)}{''.join(d.body_xml(physics) for d in drafts)}</worldbody>"
-        f"{robot_rest_xml(servo)}<sensor>{sensors}</sensor></mujoco>"
+        f"{bodies}{''.join(d.body_xml(physics) for d in drafts)}</worldbody>"
+        f"{driven}<sensor>{sensors}</sensor></mujoco>"
     )
-    model = mujoco.MjModel.from_xml_string(xml)
+    if arm is None:
+        model = mujoco.MjModel.from_xml_string(xml)
+    else:
+        spec = mujoco.MjSpec.from_string(xml)
+        arm.put_into(spec)
+        model = spec.compile()
     return World(
+        robot=arm.robot(model) if arm else BUILT_IN,
         xml=xml,
         model=model,
         physics=physics,
@@ -267,7 +291,7 @@ class _Draft:
         )
 
 
-def _draft(obj: SceneObject, scene: Scene) -> _Draft:
+def _draft(obj: SceneObject, scene: Scene, opening_m: float) -> _Draft:
     x, y, z = thick = checked_size(obj, scene)
     hull = np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)]) / 2
     asset, com, inertia, solids = "", np.zeros(3), np.zeros((3, 3)), None
@@ -317,7 +341,7 @@ def _draft(obj: SceneObject, scene: Scene) -> _Draft:
             if solids
             else [_outline(kind, hull, thick)]
         )
-        check_grasp(obj, scene, corners, rest_quat)
+        check_grasp(obj, scene, corners, rest_quat, opening_m)
     return _Draft(
         obj=obj,
         kind=kind,
