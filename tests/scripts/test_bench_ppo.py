@@ -36,6 +36,13 @@ def test_the_ratio_is_the_best_peers_median_over_ours(bench):
     assert bench.speed_over_best_peer(runs) == 2.0
 
 
+def test_a_control_does_not_count(bench):
+    times = {"ours": 50, "sb3-our-settings": 25, "torchrl": 100}
+    runs = [run_of(bench, name, 0, seconds, 0.95) for name, seconds in times.items()]
+
+    assert bench.speed_over_best_peer(runs) == 2.0
+
+
 def test_a_stopped_peer_counts_with_the_time_it_had(bench):
     runs = [run_of(bench, "ours", 0, 50, 0.95), run_of(bench, "torchrl", 0, 150, 0.1)]
 
