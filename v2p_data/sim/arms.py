@@ -36,6 +36,7 @@ COLLIDING_LINKS = 3
 REDUNDANT_JOINT = 2
 """Of an arm with more than six joints, the one that a weak spring holds at its home angle."""
 IK_STEPS = 150
+HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +223,7 @@ class Kinematics:
         self._axis = {j: model.jnt_axis[j].copy() for j in ids}
         self._anchor = {j: model.jnt_pos[j].copy() for j in ids}
         self._zero = {j: float(model.qpos0[model.jnt_qposadr[j]]) for j in ids}
-        self._is_hinge = {j: model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE for j in ids}
+        self._is_hinge = {j: int(model.jnt_type[j]) == HINGE for j in ids}
         limited = np.asarray(model.jnt_limited)[ids].astype(bool)[:, None]
         self._range = np.where(limited, model.jnt_range[ids], [[-np.inf, np.inf]])
 
@@ -340,7 +341,7 @@ def _joints_of(model: mujoco.MjModel, body: int) -> list[int]:
 def _check_joints(
     cfg: RobotConfig, model: mujoco.MjModel, joints: list[int], fingers: list[int]
 ) -> None:
-    simple = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    simple = (HINGE, SLIDE)
     for j in joints:
         if model.jnt_type[j] not in simple:
             raise V2PError(
@@ -359,7 +360,7 @@ def _check_joints(
         )
     for j in fingers:
         low, high = model.jnt_range[j]
-        if model.jnt_type[j] != simple[1] or abs(low) > 2e-3 or high < 0.01:
+        if model.jnt_type[j] != SLIDE or abs(low) > 2e-3 or high < 0.01:
             raise V2PError(
                 f"finger joint '{model.joint(j).name}' of robot {cfg.path} moves from {low:.3g} to {high:.3g}; slides "
                 "are wanted that are 0 closed and at least 0.01 m at their upper limit"

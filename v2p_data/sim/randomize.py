@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene
-from v2p_data.sim.robot import arm_qpos_for
 from v2p_data.sim.world import FLOOR_MAX_M, MESH_SCALES, WALL_MAX_M, ObjectModel, World, cover_of
 
 WORKSPACE_CENTRE_M = (0.5, 0.0)
@@ -240,7 +239,7 @@ class Randomizer:
 
     def start_arm(
         self, count: int, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "n 7"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    ) -> tuple[Float[np.ndarray, "n joint"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
         """Return joint angles, tool positions and yaws of `count` start poses."""
         k = rng.integers(0, len(self.start_qpos), count)
         return self.start_qpos[k], self.start_tool_pos[k], self.start_yaw[k]
@@ -398,7 +397,7 @@ class Randomizer:
         home = np.array([0.51, 0.0, min(lowest, 0.42)])
         pos = home + rng.uniform(-1, 1, (START_BANK, 3)) * reach
         yaw = rng.uniform(-self.cfg.arm_yaw_rad, self.cfg.arm_yaw_rad, START_BANK)
-        return pos, yaw, arm_qpos_for(pos, yaw)
+        return pos, yaw, self.world.robot.qpos_for(pos, yaw)
 
 
 def scene_offsets(scene: Scene) -> Float[np.ndarray, "object 2"]:
