@@ -5,10 +5,10 @@ under. Values are written into the batch's per-simulation model fields; nothing 
 """
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
-from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
@@ -93,6 +93,18 @@ def none() -> RandomizationConfig:
     )
 
 
+@runtime_checkable
+class PerWorldFields(Protocol):
+    """Who keeps the model's fields per world: `mujoco.batch.Batch`, or a host copy of a GPU's."""
+
+    @property
+    def nsim(self) -> int: ...
+
+    def expand(self, name: str, /) -> np.ndarray:
+        """Return a model field with a leading axis of worlds, to be written to."""
+        ...
+
+
 class Randomizer:
     """Draws values for worlds and writes them into a batch.
 
@@ -109,7 +121,11 @@ class Randomizer:
     """
 
     def __init__(
-        self, world: World, batch: Batch, cfg: RandomizationConfig, rng: np.random.Generator
+        self,
+        world: World,
+        batch: PerWorldFields,
+        cfg: RandomizationConfig,
+        rng: np.random.Generator,
     ) -> None:
         self.world = world
         self.cfg = cfg

@@ -95,7 +95,7 @@ class WarpBatchEnv:
         self.object_names = [o.name for o in self.world.objects]
         self.randomizer = Randomizer(
             self.world,
-            _HostFields(self.world.model, num_envs),  # pyright: ignore[reportArgumentType]
+            _HostFields(self.world.model, num_envs),
             self.cfg.randomization,
             rng_for(seed, "start-poses"),
         )
@@ -393,6 +393,6 @@ class _HostFields:
         self._model = model
         self.nsim = num_envs
 
-    def expand(self, name: str) -> np.ndarray:
+    def expand(self, name: str, /) -> np.ndarray:
         value = np.asarray(getattr(self._model, name))
         return np.repeat(value[None], self.nsim, axis=0)

@@ -45,6 +45,8 @@ except ImportError as error:
         "(pip install 'lerobot_policy_v2p[gpu]') or use the backend 'cpu'"
     ) from error
 
+wp.config.log_level = wp.LOG_WARNING  # else every kernel that is loaded prints a line
+
 CONTACTS_PER_WORLD = 64
 """Room for contacts, on average over all worlds, and for each world's constraints (4 rows a contact)."""
 PER_WORLD_FIELDS = (
