@@ -216,10 +216,13 @@ class _Learner:
         self.generator = torch.Generator().manual_seed(seed)
         obs_dim = env.observation_spec["observation"].shape[-1]  # type: ignore[union-attr]
         self.model = ActorCritic(obs_dim, env.action_spec.shape[-1], cfg.actor, self.generator)
+        # All randomness is drawn on the CPU, so that a checkpoint means the same on every device.
+        device = env.device or torch.device("cpu")
+        self.model.to(device)
         self.progress = _Progress(
             learning_rate=cfg.learning_rate,
-            discounted=torch.zeros(self.num_envs),
-            episode_return=torch.zeros(self.num_envs),
+            discounted=torch.zeros(self.num_envs, device=device),
+            episode_return=torch.zeros(self.num_envs, device=device),
         )
         if warm_start is not None:
             _start_from(self.model, Expert.load(warm_start), cfg)
@@ -320,7 +323,7 @@ class _Learner:
         cfg, progress = self.cfg, self.progress
         reward, done = batch["next", "reward"][..., 0], batch["next", "done"][..., 0]
         success = outcome(batch.get("next")).reshape(done.shape)
-        squares = torch.zeros(())
+        squares = reward.new_zeros(())
         for t in range(cfg.batch_time):
             progress.discounted = cfg.gamma * progress.discounted + reward[:, t]
             progress.episode_return = progress.episode_return + reward[:, t]
@@ -358,6 +361,7 @@ class _Learner:
         kl = 0.0
         for _ in range(cfg.epochs):
             order = torch.randperm(flat.numel(), generator=self.generator)
+            order = order.to(flat["action"].device)
             kls = [self._descend(flat[idx]) for idx in order.chunk(num_chunks)]
             kl = float(np.mean(kls))
             if kl > cfg.kl_stop:
@@ -474,7 +478,7 @@ class _Explorer(nn.Module):
 
     def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean, std = self.actor(obs)
-        noise = torch.randn(mean.shape, generator=self.generator)
+        noise = torch.randn(mean.shape, generator=self.generator).to(mean.device)
         noise[: self.num_deterministic] = 0.0
         action = mean + std * noise
         return action, _Gaussian(mean, std).log_prob(action)
