@@ -17,7 +17,9 @@ adds up the medians. The last line, `env_over_limit: X`, is the best time of the
 time of the environment, for lifting a box with random actions.
 """
 
+import json
 import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -46,6 +48,9 @@ from v2p_data.task.templates import write_samples
 
 PEERS = ("gym-hil", "robosuite")
 PEER_SCRIPT = Path(__file__).parent / "peer_steps.py"
+QUICK_SECONDS = 10.0
+"""With --quick, no further row is begun after this time."""
+SCALING_WORLDS = (64, 128, 256, 512, 1024, 2048, 4096)
 MESH_FILE = "pebble.obj"
 
 
@@ -61,6 +66,10 @@ class BenchConfig:
     """Compare with other projects' lifting environments."""
     peer_python: Path = Path(sys.executable)
     """The interpreter in which the other projects are installed."""
+    peer_seconds: float = 20.0
+    """For how long each of them runs."""
+    one_size: bool = False
+    """One row of `--scaling`, as JSON."""
     worlds: int = 512
     threads: int = 0
     """0 for all cores."""
@@ -106,6 +115,11 @@ class Turns:
     def torchrl_over_limit(self) -> float:
         return float(self.limit.min(0).sum() / self.torchrl.min(0).sum())
 
+    def microseconds(self, seconds: Float[np.ndarray, "turn step"]) -> str:
+        per_world = 1e6 / (self.num_worlds * seconds.shape[1])
+        best, median = seconds.min(0).sum(), np.median(seconds, axis=0).sum()
+        return f"{best * per_world:.1f} ({median * per_world:.1f})"
+
     def row(self, name: str) -> str:
         total = self.num_worlds * self.env.shape[1]
         env, wrapped, limit = (
@@ -134,6 +148,8 @@ def main(cfg: BenchConfig) -> None:
     with tempfile.TemporaryDirectory() as name:
         if cfg.scaling:
             show_scaling(cfg)
+        elif cfg.one_size:
+            show_one_size(cfg)
         elif cfg.peers:
             show_peers(cfg)
         else:
@@ -355,12 +371,13 @@ class BarePhysics:
 
 def show_table(cfg: BenchConfig, folder: Path) -> None:
     """Print a row per task, the rows with a policy, and the last line."""
+    started = time.perf_counter()
     if cfg.quick:
         cfg = replace(
             cfg,
-            steps=min(cfg.steps, 12),
-            turns=min(cfg.turns, 6),
-            warmup_steps=min(cfg.warmup_steps, 30),
+            steps=min(cfg.steps, 8),
+            turns=min(cfg.turns, 12),
+            warmup_steps=min(cfg.warmup_steps, 20),
             row_seconds=min(cfg.row_seconds, 4.0),
         )
     print(HEADER)
@@ -371,6 +388,9 @@ def show_table(cfg: BenchConfig, folder: Path) -> None:
         ("lift a mesh, random actions", lift_mesh(folder)),
     )
     for name, bundle in rows:
+        if cfg.quick and time.perf_counter() - started > QUICK_SECONDS:
+            print(f"{name:34s} left out: the machine is too busy for --quick")
+            continue
         turns = measure(_env(bundle, cfg), random_policy(cfg.worlds), cfg)
         print(turns.row(name), flush=True)
         ratio = turns.env_over_limit() if np.isnan(ratio) else ratio
@@ -381,10 +401,11 @@ def show_table(cfg: BenchConfig, folder: Path) -> None:
 
 def show_training(cfg: BenchConfig, folder: Path) -> None:
     """Train on lifting the box, then measure with the policy in the states that it brings about."""
-    env = TimedEnv(_env(lift_box(), cfg))
+    worlds = _env(lift_box(), cfg)
+    env = TimedEnv(worlds)
     recipe = PPOConfig(total_steps=cfg.training_steps, target_success=1.0)
     result = train_expert(env, recipe, folder / "expert", seed=0)
-    print(measure_acting(env.worlds, result.folder, cfg).row("lift a box, policy in training"))
+    print(measure_acting(worlds, result.folder, cfg).row("lift a box, policy in training"))
     print(
         f"in {result.seconds:.0f} s of training ({result.steps / result.seconds:,.0f} steps/s, success "
         f"{result.success:.2f}) {env.seconds / result.seconds:.0%} of the time went to the environment: "
@@ -415,6 +436,112 @@ class TimedEnv(TorchRLEnv):
         after = super()._reset(tensordict, **kwargs)
         self.seconds += time.perf_counter() - started
         return after
+
+
+def show_scaling(cfg: BenchConfig) -> None:
+    """Print time and memory per world for 64 to 4096 worlds, each in a process of its own."""
+    threads = cfg.threads or os.cpu_count() or 1
+    print("lift a box, random actions; microseconds per control step of one world, best (median)")
+    print(
+        f"{'worlds':>7s} {'1 thread':>15s} {f'{threads} threads':>15s} {'bare physics':>15s} {'MB per world':>14s}"
+    )
+    for worlds in SCALING_WORLDS:
+        one, many = (_sized(worlds, n) for n in (1, threads))
+        print(
+            f"{worlds:7d} {one['env']:>15s} {many['env']:>15s} {many['limit']:>15s} "
+            f"{many['mb_per_world']:14.3f}",
+            flush=True,
+        )
+
+
+def _sized(worlds: int, threads: int) -> dict[str, Any]:
+    """Return one row of the scaling table, measured by a process of its own: memory is never given back."""
+    command = [
+        sys.executable,
+        __file__,
+        "--one-size",
+        f"--worlds={worlds}",
+        f"--threads={threads}",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def show_one_size(cfg: BenchConfig) -> None:
+    """Print one row of the scaling table as JSON."""
+    BatchEnv(
+        lift_box(), num_envs=1, seed=0, num_threads=1
+    )  # what is needed whatever the number of worlds
+    before = _resident_bytes()
+    env = _env(lift_box(), cfg)
+    policy = random_policy(cfg.worlds)
+    for _ in range(3):
+        env.reset(np.flatnonzero(env.step(policy(env.observe())).truncated))
+    grown = _resident_bytes() - before
+    turns = measure(env, policy, replace(cfg, steps=8, turns=6, warmup_steps=12, row_seconds=10.0))
+    print(
+        json.dumps(
+            {
+                "env": turns.microseconds(turns.env),
+                "limit": turns.microseconds(turns.limit),
+                "mb_per_world": grown / cfg.worlds / 1e6,
+            }
+        )
+    )
+
+
+def _resident_bytes() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def show_peers(cfg: BenchConfig) -> None:
+    """Print control steps and simulated seconds per second and core, beside other projects' environments."""
+    cores = os.cpu_count() or 1
+    ours = measure(_env(lift_box(), cfg), random_policy(cfg.worlds), cfg)
+    rate = ours.num_worlds * ours.env.shape[1] / np.median(ours.env, axis=0).sum() / cores
+    dt = 0.05
+    print(
+        f"{'per second and core, median':28s} {'control steps':>14s} {'simulated s':>12s}  ours is faster by"
+    )
+    print(f"{'this environment':28s} {rate:14,.0f} {rate * dt:12,.0f}")
+    for name in PEERS:
+        found = _peer_rates(cfg, name, cores)
+        if found is None:
+            print(
+                f"{name:28s} is not installed in {cfg.peer_python}: make a virtual environment, install {name} there "
+                "('uv pip install gym-hil robosuite'), and pass --peer-python=ITS/bin/python"
+            )
+            continue
+        theirs, their_dt = found
+        print(
+            f"{name:28s} {theirs:14,.0f} {theirs * their_dt:12,.1f}  {rate / theirs:,.0f} times in control steps, "
+            f"{rate * dt / (theirs * their_dt):,.0f} times in simulated time"
+        )
+
+
+def _peer_rates(cfg: BenchConfig, name: str, cores: int) -> tuple[float, float] | None:
+    """Return control steps per second and core, and the control period [s]; nothing if it is not installed."""
+    module = name.replace("-", "_")
+    probe = f"import importlib.util, sys; sys.exit(importlib.util.find_spec('{module}') is None)"
+    if subprocess.run([cfg.peer_python, "-c", probe], check=False).returncode:
+        return None
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    running = [
+        subprocess.Popen(
+            [cfg.peer_python, PEER_SCRIPT, name, str(cfg.peer_seconds)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=one_thread,
+        )
+        for _ in range(cores)
+    ]
+    answers = [process.communicate()[0] for process in running]
+    if any(process.returncode for process in running):
+        raise RuntimeError(f"{name} failed; see '{cfg.peer_python} {PEER_SCRIPT} {name} 1'")
+    rows = [next(json.loads(x) for x in a.splitlines() if x.startswith("{")) for a in answers]
+    return sum(r["steps_per_s"] for r in rows) / cores, rows[0]["control_dt_s"]
 
 
 def _env(bundle: TaskBundle, cfg: BenchConfig) -> BatchEnv:

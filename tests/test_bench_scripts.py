@@ -1,0 +1,20 @@
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.slow
+def test_the_simulators_benchmark_ends_with_the_share_of_the_physics_speed():
+    tiny = ["--worlds=8", "--threads=1", "--steps=2", "--turns=3", "--warmup-steps=2"]
+    command = [sys.executable, "scripts/bench_sim.py", "--quick", *tiny]
+
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+
+    found = re.fullmatch(r"env_over_limit: (\d\.\d\d)", done.stdout.splitlines()[-1])
+    assert found is not None
+    assert 0 < float(found[1]) < 1  # Python costs something, and with eight worlds a lot
