@@ -26,6 +26,7 @@ from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.scene.reconstruct import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
+from v2p_data.sim.backends import Backend
 from v2p_data.task.generate import TaskConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
@@ -45,6 +46,8 @@ class ExpertConfig:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     num_envs: int = 512
     """Worlds that learn at the same time; the flat optimum on two cores is 256 to 1024."""
+    backend: Backend = "cpu"
+    """Where they are simulated: `warp` is for the GPU of `--device` and 8192 worlds; judging stays on the CPU."""
     eval_episodes: int = 64
     """Episodes at the fine time step that judge the finished expert, on seeds of their own."""
     min_success: float = 0.3
@@ -216,7 +219,7 @@ def make_expert(
     from policies.ppo.train import train_expert
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.report.sheet import write_contact_sheet
-    from v2p_data.sim.batch_env import BatchEnv, SimConfig
+    from v2p_data.sim.backends import make_batch_env
     from v2p_data.sim.task_check import check_task
     from v2p_data.sim.torchrl_env import TorchRLEnv
     from v2p_data.task.task import TaskBundle
@@ -224,12 +227,13 @@ def make_expert(
     expert_cfg: ExpertConfig = cfg.config
     bundle = TaskBundle.load(inputs["task"])
     check_task(bundle, num_threads=runtime.num_threads)
-    env = BatchEnv(
+    env = make_batch_env(
         bundle,
-        SimConfig(),
         num_envs=expert_cfg.num_envs,
         seed=seed_for(cfg.seed, "expert", bundle.title),
         num_threads=runtime.num_threads,
+        backend=expert_cfg.backend,
+        device=runtime.device,
     )
     result = train_expert(
         TorchRLEnv(env),

@@ -80,13 +80,17 @@ class WarpBatchEnv:
         device: str = "cuda:0",
         task: type[Task] | None = None,
     ) -> None:
-        self.device = torch.device(device)
+        self.device = torch.device("cuda:0" if device == "cuda" else device)
         if self.device.type == "cuda" and not torch.cuda.is_available():
             raise V2PError(
                 f"the backend 'warp' was asked for {device}, but this machine has no CUDA device; use the "
                 "backend 'cpu', or device 'cpu' to try the GPU's model slowly"
             )
         self.cfg = cfg or SimConfig()
+        if self.cfg.robot.path is not None:
+            raise V2PError(
+                f"the backend 'warp' has the built-in arm only; simulate {self.cfg.robot.path} with the backend 'cpu'"
+            )
         self.bundle = bundle
         self.num_envs = num_envs
         self.horizon = bundle.horizon_steps
