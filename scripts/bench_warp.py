@@ -1,0 +1,148 @@
+"""Measure the GPU backend: control steps per second at several numbers of worlds, then how long lifting takes to learn.
+
+    python scripts/bench_warp.py                          # on a CUDA device; about ten minutes
+    python scripts/bench_warp.py --num-worlds 8192 --learn-worlds 0
+    python scripts/bench_warp.py --device cpu --num-worlds 16 --steps 3 --learn-worlds 24 --learn-steps 384
+
+Speed: the full environment (actions, physics, states, reward, resets) under random actions, after a warm-up;
+`physics` is the same worlds with nothing but the captured control step. Learning: `policies/ppo/train.py` on the
+benchmark task `lift_up`, then fresh episodes on the CPU backend at the fine time step. With thousands of worlds a
+batch is thousands of times 16 steps, so minibatches grow with it; everything else is the CPU's recipe.
+
+The last line is `warp_steps_per_second: X`, of the full environment, the best of all numbers of worlds.
+"""
+
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import tyro
+
+from policies.ppo.evaluate import evaluate
+from policies.ppo.policy import Expert
+from policies.ppo.train import PPOConfig, train_expert
+from v2p_data.errors import V2PError
+from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.task.benchmark import load_benchmark
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What is measured."""
+
+    device: str = "cuda:0"
+    """`cpu` tries the same code without a GPU; its speed means nothing."""
+    num_worlds: tuple[int, ...] = (1024, 2048, 4096, 8192)
+    steps: int = 100
+    """Timed control steps per number of worlds."""
+    learn_worlds: int = 8192
+    """Worlds that learn to lift; 0 leaves that out."""
+    learn_steps: int = 20_000_000
+    """Control steps at most."""
+    eval_episodes: int = 256
+    """Episodes at the fine step that judge what was learned."""
+    seed: int = 0
+
+
+def speed(num_envs: int, settings: Settings) -> tuple[float, float]:
+    """Return control steps per second of the environment and of its physics alone."""
+    from v2p_data.sim.warp_env import WarpBatchEnv
+
+    env = WarpBatchEnv(
+        load_benchmark("lift_up"), num_envs=num_envs, seed=settings.seed, device=settings.device
+    )
+    env.stagger()
+    generator = torch.Generator(env.device).manual_seed(settings.seed)
+
+    def step() -> None:
+        action = torch.rand(num_envs, env.act_dim, generator=generator, device=env.device) * 2 - 1
+        result = env.step(action)
+        env.reset((result.truncated | result.terminated).nonzero()[:, 0])
+
+    rates = []
+    for work in (step, env._sim.step):
+        for _ in range(3):
+            work()
+        _wait(env.device)
+        started = time.perf_counter()
+        for _ in range(settings.steps):
+            work()
+        _wait(env.device)
+        rates.append(num_envs * settings.steps / (time.perf_counter() - started))
+    return rates[0], rates[1]
+
+
+def learn(settings: Settings) -> None:
+    """Train lifting and print steps, seconds and success in fresh episodes at the fine time step."""
+    from v2p_data.sim.warp_env import WarpBatchEnv
+
+    bundle, n = load_benchmark("lift_up"), settings.learn_worlds
+    env = WarpBatchEnv(bundle, num_envs=n, seed=settings.seed, device=settings.device)
+    cfg = PPOConfig()
+    cfg = replace(
+        cfg,
+        total_steps=settings.learn_steps,
+        minibatch=max(cfg.minibatch, n * cfg.batch_time // 8),
+        num_deterministic=min(cfg.num_deterministic, n // 4),
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        result = train_expert(TorchRLEnv(env), cfg, Path(folder), seed=settings.seed)
+        expert = Expert.load(Path(folder))
+    print(
+        f"lift with {n} worlds: {result.steps} steps in {result.seconds:.1f} s, stopped by {result.stopped_by}, "
+        f"success in training {result.success:.0%}, worlds that broke down {env.broken_count}"
+    )
+    judge = TorchRLEnv(
+        BatchEnv(
+            bundle,
+            SimConfig(fine=True),
+            num_envs=min(64, settings.eval_episodes),
+            seed=settings.seed + 1,
+        )
+    )
+    print(
+        f"fresh episodes on the CPU backend at the fine step: "
+        f"{evaluate(judge, expert.act, num_episodes=settings.eval_episodes)}"
+    )
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def main(settings: Settings) -> int:
+    """Print one line per measurement."""
+    if settings.device != "cpu" and not torch.cuda.is_available():
+        print(
+            "bench_warp needs a CUDA device and found none; --device cpu tries the code without one",
+            file=sys.stderr,
+        )
+        return 2
+    name = torch.cuda.get_device_name() if settings.device != "cpu" else "Warp's CPU device"
+    print(f"device: {name}")
+    best = 0.0
+    try:
+        for num_envs in settings.num_worlds:
+            full, physics = speed(num_envs, settings)
+            best = max(best, full)
+            print(
+                f"{num_envs:6d} worlds: {full:12,.0f} steps/s, physics {physics:12,.0f} steps/s, "
+                f"share {full / physics:.2f}",
+                flush=True,
+            )
+        if settings.learn_worlds:
+            learn(settings)
+    except V2PError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(f"warp_steps_per_second: {best:.0f}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Settings)))
