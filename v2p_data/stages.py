@@ -12,7 +12,7 @@ import json
 import logging
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,11 @@ from policies.ppo.train import PPOConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
-from v2p_data.pipeline.fingerprint import file_digest
+from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.scene.reconstruct import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
+from v2p_data.sim.arms import RobotConfig, robot_to_json
 from v2p_data.sim.backends import Backend
 from v2p_data.task.generate import TaskConfig
 from v2p_data.video.captions import VideoItem
@@ -83,12 +84,20 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SimulatorConfig:
+    """What all tasks are simulated with."""
+
+    robot: RobotConfig = field(default_factory=RobotConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
 class EngineConfig:
     """Everything that decides what the engine makes."""
 
     video: VideoConfig = field(default_factory=VideoConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     task: TaskConfig = field(default_factory=TaskConfig)
+    sim: SimulatorConfig = field(default_factory=SimulatorConfig)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     episodes: EpisodesConfig = field(default_factory=EpisodesConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -159,19 +168,36 @@ def make_scene(
 
 
 def task_stage(scene: Stage, cfg: EngineConfig) -> Stage:
-    """Return the stage that writes and audits one scene's task code."""
+    """Return the stage that writes and audits one scene's task code, for the robot that is to do it."""
+    robot = cfg.sim.robot
     return Stage(
         name="task",
         item=scene.item,
         config=Seeded(config=cfg.task, seed=cfg.seed),
         inputs={"scene": scene},
+        sources=_robot_digests(robot),
         version=1,
-        make=make_task,
+        make=partial(make_task, robot=robot),
     )
 
 
+def _robot_digests(robot: RobotConfig) -> dict[str, str]:
+    """Return what identifies another arm than the built-in one."""
+    if robot.path is None:
+        return {}
+    if not robot.path.is_file():
+        raise V2PError(f"there is no robot file {robot.path}; --sim.robot.path names an MJCF file")
+    settings = fingerprint({**robot_to_json(robot), "path": ""})
+    return {"robot": settings, "robot file": file_digest(robot.path)}
+
+
 def make_task(
-    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
+    cfg: Seeded,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    robot: RobotConfig,
 ) -> dict[str, Any]:
     """Write eight task codes, audit them, keep the best."""
     from v2p_data.scene.scene import Scene
@@ -181,8 +207,10 @@ def make_task(
     scene = Scene.load(inputs["scene"])
     runtime.progress(0.1, "writing task code")
     generated = generate_task(scene, cfg.config, seed_for(cfg.seed, "task", scene.title))
+    bundle = replace(generated.bundle, robot=robot_to_json(robot))
+    generated = replace(generated, bundle=bundle)
     runtime.progress(0.9, "asking the simulator")
-    check_task(generated.bundle, num_threads=runtime.num_threads)
+    check_task(bundle, num_threads=runtime.num_threads)
     generated.save(out)
     return {
         "kind": generated.bundle.kind,

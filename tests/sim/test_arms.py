@@ -1,5 +1,6 @@
 """Another arm than the built-in one: a small one with six joints, written here, its angles in degrees."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
+from v2p_data.pipeline.runner import Stage
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.arms import RobotConfig
+from v2p_data.sim.arms import RobotConfig, robot_from_json, robot_to_json
 from v2p_data.sim.batch_env import BatchEnv, SimConfig, without_randomization
+from v2p_data.sim.masks import FIRST_OBJECT, ROBOT, MaskRenderer
 from v2p_data.sim.robot import COARSE, FINE, HOME_QPOS, ServoConfig, robot_body_xml, tool_state
 from v2p_data.sim.world import World, build_world
+from v2p_data.stages import EngineConfig, SimulatorConfig, task_stage
 from v2p_data.task.task import Task, TaskBundle
 
 ARM = """
@@ -326,3 +330,45 @@ def test_an_object_wider_than_this_arms_gripper_is_refused(
     build_world(make_scene(box), COARSE)
     with pytest.raises(V2PError, match="gripper opens by 80 mm"):
         build_world(make_scene(box), COARSE, robot=six)
+
+
+# --- as part of a task -------------------------------------------------------------------------------------------
+
+
+def test_a_task_remembers_its_robot_in_its_json(six: RobotConfig):
+    text = json.dumps(robot_to_json(six))
+
+    assert robot_from_json(json.loads(text)) == six
+    assert robot_to_json(RobotConfig()) == {}
+    assert robot_from_json({}) == RobotConfig()
+
+
+def test_a_task_for_another_robot_is_simulated_and_drawn_with_it(
+    six: RobotConfig, make_bundle: Callable[..., TaskBundle], lift_task: type[Task]
+):
+    bundle = replace(make_bundle(), robot=robot_to_json(six))
+
+    env = BatchEnv(bundle, CALM, num_envs=1, seed=0, num_threads=1, task=lift_task)
+    with MaskRenderer(bundle, 64, backend="rays") as renderer:
+        image = renderer.draw(env.snapshot(np.arange(1)), 0)
+
+    assert env.world.robot.finger_travel_m == 0.04
+    assert (image == ROBOT).sum() > 100
+    assert (image == FIRST_OBJECT).sum() > 5
+
+
+def test_the_robots_file_and_settings_are_part_of_the_tasks_recipe(
+    six: RobotConfig, tmp_path: Path
+):
+    def recipe(robot: RobotConfig) -> dict:
+        video = Stage(name="scene", item="clip", config={}, make=lambda *_: {})
+        return task_stage(video, EngineConfig(sim=SimulatorConfig(robot=robot))).recipe
+
+    assert recipe(RobotConfig())["sources"] == {}
+    before = recipe(six)
+    assert recipe(replace(six, base_yaw_rad=0.1)) != before
+    copy = tmp_path / "copy.xml"
+    copy.write_text(ARM)
+    assert recipe(replace(six, path=copy)) == before
+    copy.write_text(ARM.replace("0.4", "0.5"))
+    assert recipe(replace(six, path=copy)) != before

@@ -9,7 +9,7 @@ links and the gripper collide, with objects and the table, as of the built-in ar
 # mujoco's classes come from a compiled module that declares none of them.
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,19 @@ class RobotConfig:
     base_pos_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Where the file's origin stands; the tool works at x 0.33 to 0.72, y -0.32 to 0.32, z 0.017 to 0.45."""
     base_yaw_rad: float = 0.0
+
+
+def robot_to_json(cfg: RobotConfig) -> dict[str, Any]:
+    """Return the config for a task bundle; nothing for the built-in arm."""
+    if cfg.path is None:
+        return {}
+    return {**asdict(cfg), "path": str(cfg.path.resolve())}
+
+
+def robot_from_json(data: dict[str, Any]) -> RobotConfig:
+    """Return what `robot_to_json` wrote down."""
+    fields = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+    return RobotConfig(**{**fields, "path": Path(data["path"])}) if data else RobotConfig()
 
 
 def menagerie_panda() -> RobotConfig:

@@ -24,7 +24,7 @@ from mujoco.batch import Batch
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 from v2p_data.sim import randomize
-from v2p_data.sim.arms import RobotConfig
+from v2p_data.sim.arms import RobotConfig, robot_from_json
 from v2p_data.sim.randomize import RandomizationConfig, Randomizer
 from v2p_data.sim.robot import (
     COARSE,
@@ -55,6 +55,7 @@ class SimConfig:
     fine: bool = False
     """Small time steps, for evaluation and recording; else large ones, for training."""
     robot: RobotConfig = field(default_factory=RobotConfig)
+    """Without a path, the task's own, which is the built-in arm unless the task says otherwise."""
     randomization: RandomizationConfig = field(default_factory=randomize.training)
     position_step_m: float = 0.03
     """Target displacement at action 1, per control step."""
@@ -173,7 +174,8 @@ class BatchEnv:
         self.num_envs = num_envs
         self.horizon = bundle.horizon_steps
         self.physics = FINE if self.cfg.fine else COARSE
-        self.world: World = build_world(bundle.scene, self.physics, robot=self.cfg.robot)
+        robot = self.cfg.robot if self.cfg.robot.path else robot_from_json(bundle.robot)
+        self.world: World = build_world(bundle.scene, self.physics, robot=robot)
         self._robot = self.world.robot
         self.object_names = [o.name for o in self.world.objects]
         self.broken_count = 0

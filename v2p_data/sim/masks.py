@@ -21,6 +21,7 @@ from jaxtyping import UInt8
 from mujoco.batch import Batch
 
 from v2p_data.errors import V2PError
+from v2p_data.sim.arms import robot_from_json
 from v2p_data.sim.robot import FINE
 from v2p_data.sim.world import CAMERA, World, build_world
 from v2p_data.task.task import TaskBundle
@@ -99,7 +100,7 @@ class MaskRenderer:
     def __init__(
         self, source: TaskBundle | World, size_px: int = 256, *, backend: Backend = "auto"
     ) -> None:
-        world = source if isinstance(source, World) else build_world(source.scene, FINE)
+        world = source if isinstance(source, World) else _world_of(source)
         self.size_px = size_px
         self.labels = geom_labels(world)
         self.painter: _GLPainter | _RayPainter
@@ -140,6 +141,10 @@ class MaskRenderer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _world_of(bundle: TaskBundle) -> World:
+    return build_world(bundle.scene, FINE, robot=robot_from_json(bundle.robot))
 
 
 class _NoGLError(Exception):

@@ -129,6 +129,8 @@ class TaskBundle:
     """Control steps (20 Hz) until an episode is cut off."""
     motion_scale: float = 1.0
     """How much further than usual an action moves the gripper's target: throwing needs speed."""
+    robot: dict[str, Any] = field(default_factory=dict[str, Any])
+    """Another arm than the built-in one: the fields of `sim.arms.RobotConfig`."""
     audit: dict[str, Any] = field(default_factory=dict[str, Any])
     folder: Path = Path()
 
