@@ -164,6 +164,38 @@ def test_resetting_some_worlds_leaves_the_others_alone(make_env: Callable[..., B
     assert (env.observe()[[1, 6]] != obs[[1, 6]]).any(1).all()
 
 
+def test_a_reset_world_is_in_the_state_that_mujocos_own_reset_gives(
+    make_env: Callable[..., BatchEnv],
+):
+    env = make_env(num_envs=4)
+    env._qvel[1, 0] = 1e13
+    assert env.step(np.zeros((4, 7))).terminated[1]
+
+    env.reset(np.array([1, 2]))
+
+    untouched = ("time", "qacc_warmstart", "qvel")
+    own = {name: env._batch.bind(name)[1:3].copy() for name in untouched}
+    env._batch.reset(np.array([1, 2]), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+    for name, value in own.items():
+        np.testing.assert_array_equal(value, env._batch.bind(name)[1:3])
+    assert not env._batch.warning[1:3].any()
+    assert not env.step(np.zeros((4, 7))).terminated.any()
+
+
+def test_a_restarted_stream_draws_the_same_whatever_was_drawn_before(
+    make_env: Callable[..., BatchEnv],
+):
+    def drawn(resets_before: int) -> tuple[bytes, bytes]:
+        env = make_env()
+        for k in range(resets_before):
+            env.reset(np.arange(k % 3 + 1))
+        env.seed(5)
+        env.reset(np.arange(8))
+        return env.observe().tobytes(), env.randomizer.mass_kg.tobytes()
+
+    assert drawn(0) == drawn(7)
+
+
 def test_a_reset_starts_at_rest_whatever_the_delay(make_env: Callable[..., BatchEnv]):
     cfg = SimConfig(fine=True, randomization=replace(randomize.none(), delay_s=(0.02, 0.02)))
     env = make_env(cfg=cfg)
@@ -275,7 +307,7 @@ class Height(Task):
         return ["base_observation", "height"]
 
     def get_observation_space(self):
-        return 81
+        return 91
 
     def compute_success(self, states):
         return states["height"] > 0.1
@@ -288,8 +320,8 @@ class Height(Task):
 
     result = env.step(np.zeros((4, 7)))
 
-    assert env.obs_dim == 81
-    np.testing.assert_allclose(result.obs[:, 80], env.states()["cube_pos"][:, 2])
+    assert env.obs_dim == BASE_OBSERVATION_DIM + 1
+    np.testing.assert_allclose(result.obs[:, -1], env.states()["cube_pos"][:, 2])
     with pytest.raises(TaskCodeError, match="os"):
         BatchEnv(replace(bundle, code=code + "\nimport os\n"), num_envs=4, seed=0)
 
@@ -335,7 +367,7 @@ def test_a_wrong_observation_length_is_one_clear_error(
             states["height"] = states["cube_pos"][:, 2]
             return ["base_observation", "height"]
 
-    with pytest.raises(V2PError, match="length 81 but says 80"):
+    with pytest.raises(V2PError, match="length 91 but says 90"):
         make_env(task=Wrong)
 
 

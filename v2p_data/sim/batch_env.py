@@ -206,6 +206,7 @@ class BatchEnv:
     def seed(self, seed: int) -> None:
         """Restart the stream of everything drawn from now on."""
         self._rng = rng_for(seed, "worlds")
+        self.randomizer.forget_prepared()
 
     def stagger(self) -> None:
         """Put every world at a random moment of its episode, so that they do not all end at once."""

@@ -26,6 +26,8 @@ BEYOND_HIGH_M = (1.0, 0.12)
 """Where a container stands that things are thrown into: beyond the gripper's reach (0.72 m)."""
 PLACEMENT_TRIES = 100
 START_BANK = 256
+PREPARED = 128
+"""Draws made at once: a few worlds start anew at most steps, and drawing for a few costs as much as for many."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,10 +163,34 @@ class Randomizer:
             Rotation.from_quat(o.rest_quat, scalar_first=True).as_matrix() for o in objects
         ]
         self.start_tool_pos, self.start_yaw, self.start_qpos = self._start_bank(rng)
+        self._live = {**self._fields, **self._drawn}
+        self._prepared = {
+            name: np.repeat(array[:1], PREPARED, axis=0) for name, array in self._live.items()
+        }
+        self._num_used = np.array([PREPARED])
 
     def draw(self, ids: Int[np.ndarray, "n"], rng: np.random.Generator) -> None:
         """Draw sizes, masses, friction and delay for the worlds `ids`."""
-        cfg, n = self.cfg, len(ids)
+        n = len(ids)
+        if n > PREPARED:
+            self._draw_into(self._live, ids, rng)
+            return
+        if self._num_used[0] + n > PREPARED:
+            self._draw_into(self._prepared, np.arange(PREPARED), rng)
+            self._num_used[0] = 0
+        rows = slice(int(self._num_used[0]), int(self._num_used[0]) + n)
+        self._num_used[0] += n
+        for name, array in self._live.items():
+            array[ids] = self._prepared[name][rows]
+
+    def forget_prepared(self) -> None:
+        """Let the next draw come from the generator it is given, whatever was prepared with another one."""
+        self._num_used[0] = PREPARED
+
+    def _draw_into(
+        self, into: dict[str, np.ndarray], rows: np.ndarray, rng: np.random.Generator
+    ) -> None:
+        cfg, n = self.cfg, len(rows)
         for k, obj in enumerate(self.world.objects):
             scale = rng.uniform(*cfg.size_scale, (n, 3))
             mesh_idx = np.full(n, MESH_SCALES.index(1.0))
@@ -178,9 +204,9 @@ class Randomizer:
                 scale = np.repeat(library[mesh_idx, None], 3, axis=1)
             mass = obj.mass_kg * rng.uniform(*cfg.mass_scale, n)
             friction = obj.friction * rng.uniform(*cfg.friction_scale, n)
-            self._write(ids, k, obj, scale, mass, friction, mesh_idx)
-        self.delay_s[ids] = rng.uniform(*cfg.delay_s, n)
-        self._fields["actuator_delay"][ids] = self.delay_s[ids, None]
+            self._write(into, rows, k, obj, scale, mass, friction, mesh_idx)
+        into["delay_s"][rows] = rng.uniform(*cfg.delay_s, n)
+        into["actuator_delay"][rows] = into["delay_s"][rows, None]
 
     def place(
         self, ids: Int[np.ndarray, "n"], rng: np.random.Generator
@@ -265,7 +291,12 @@ class Randomizer:
         return self._fields
 
     def drawn_arrays(self) -> dict[str, np.ndarray]:
-        """Return all drawn values and what follows from them; live arrays."""
+        """Return all drawn values, what follows from them, and what is drawn already; live arrays."""
+        prepared = {f"prepared_{name}": array for name, array in self._prepared.items()}
+        return {**self._drawn, **prepared, "num_used": self._num_used}
+
+    @property
+    def _drawn(self) -> dict[str, np.ndarray]:
         return {
             "size_m": self.size_m,
             "mass_kg": self.mass_kg,
@@ -330,6 +361,7 @@ class Randomizer:
 
     def _write(
         self,
+        into: dict[str, np.ndarray],
         ids: np.ndarray,
         k: int,
         obj: ObjectModel,
@@ -338,7 +370,7 @@ class Randomizer:
         friction: np.ndarray,
         mesh_idx: np.ndarray,
     ) -> None:
-        f, base, model = self._fields, self._base, self.world.model
+        f, base, model = into, self._base, self.world.model
         geoms = np.asarray(obj.geom_ids)
         rows = ids[:, None]
         g = scale[
@@ -383,12 +415,12 @@ class Randomizer:
             # MuJoCo takes a simple body's inertia from here; else a heavier one would fall faster.
             f["dof_M0"][rows, dofs[:3]] = mass[:, None]
             f["dof_M0"][rows, dofs[3:]] = inertia
-        self.size_m[ids, k] = np.asarray(obj.size_m) * scale
-        self.mass_kg[ids, k] = mass
-        self.friction[ids, k] = friction
+        f["size_m"][ids, k] = np.asarray(obj.size_m) * scale
+        f["mass_kg"][ids, k] = mass
+        f["friction"][ids, k] = friction
         corners = obj.hull * g @ self._rest[k].T
-        self._height_above_table[ids, k] = -corners[:, :, 2].min(1)
-        self._radius[ids, k] = np.linalg.norm(corners[:, :, :2], axis=2).max(1)
+        f["height_above_table"][ids, k] = -corners[:, :, 2].min(1)
+        f["radius"][ids, k] = np.linalg.norm(corners[:, :, :2], axis=2).max(1)
 
     def _size_scale(self, obj: ObjectModel, scale: np.ndarray) -> np.ndarray:
         """Return factors of `geom_size`, whose meaning depends on the geom's type."""

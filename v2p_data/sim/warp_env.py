@@ -129,6 +129,7 @@ class WarpBatchEnv:
     def seed(self, seed: int) -> None:
         """Restart the streams of everything drawn from now on."""
         self._rng = rng_for(seed, "worlds")
+        self.randomizer.forget_prepared()
         self._noise = torch_rng_for(seed, "action-noise", device=str(self.device))
 
     def stagger(self) -> None:
