@@ -44,7 +44,10 @@ class ImitationConfig:
     least_teacher: float = 0.1
     """Share of the worlds that the teacher always keeps: who fails early never sees how a task ends."""
     num_threads: int = 1
-    actor: ActorConfig = field(default_factory=ActorConfig)
+    actor: ActorConfig = field(
+        default_factory=lambda: ActorConfig(min_std=0.05, gripper_min_std=0.3)
+    )
+    """With less noise than from scratch: what releases and what grasps is known already."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -88,8 +88,12 @@ class PPOConfig:
     gae_lambda: float = 0.9
     clip: float = 0.2
     max_grad_norm: float = 1.0
-    warm_start_std: float = 0.5
+    warm_start_std: float = 0.15
     """Exploration of a policy that starts from another expert's weights."""
+    warm_start_learning_rate: float = 2e-4
+    """At the start of such a training."""
+    warm_start_critic_batches: int = 6
+    """So many batches teach only the value after a warm start: a value that knows nothing spoils a good policy."""
     checkpoint_seconds: float = 10.0
     """A kill loses at most about this much work."""
     num_threads: int = 1
@@ -224,8 +228,11 @@ class _Learner:
             discounted=torch.zeros(self.num_envs, device=device),
             episode_return=torch.zeros(self.num_envs, device=device),
         )
+        self.critic_batches = 0
         if warm_start is not None:
             _start_from(self.model, Expert.load(warm_start), cfg)
+            self.critic_batches = cfg.warm_start_critic_batches
+            self.progress.learning_rate = cfg.warm_start_learning_rate
         explore = _Explorer(self.model.actor, cfg.num_deterministic, self.generator)
         self.loss, self.gae = _losses(self.model, cfg)
         self.optimiser = torch.optim.Adam(
@@ -295,7 +302,8 @@ class _Learner:
         is_first = float(self.model.normaliser.count) == 0
         if not is_first:
             kl = self._update(learning)
-        self.model.normaliser.update(batch["observation"].flatten(0, 1))
+        if self.critic_batches == 0:  # a policy that can do something already keeps the eyes it has
+            self.model.normaliser.update(batch["observation"].flatten(0, 1))
         progress.iteration += 1
         progress.steps += batch.numel()
         components: Any = batch.get(COMPONENTS_KEY, None)
@@ -362,10 +370,16 @@ class _Learner:
         for _ in range(cfg.epochs):
             order = torch.randperm(flat.numel(), generator=self.generator)
             order = order.to(flat["action"].device)
-            kls = [self._descend(flat[idx]) for idx in order.chunk(num_chunks)]
+            kls: list[float] = []
+            for idx in order.chunk(num_chunks):
+                kls.append(self._descend(flat[idx]))
+                if kls[-1] > 2 * cfg.kl_stop:
+                    break
             kl = float(np.mean(kls))
             if kl > cfg.kl_stop:
                 break
+        if progress.iteration < self.critic_batches:
+            return kl
         if kl > cfg.kl_high:
             progress.learning_rate = max(progress.learning_rate / 1.5, cfg.min_learning_rate)
         elif kl < cfg.kl_low:
@@ -379,6 +393,8 @@ class _Learner:
         self.optimiser.zero_grad()
         (losses["loss_objective"] + losses["loss_critic"]).backward()
         # Apart, so that a large value error does not silence the actor.
+        if self.progress.iteration < self.critic_batches:
+            self.model.actor.zero_grad(set_to_none=True)
         norms = [
             nn.utils.clip_grad_norm_(part.parameters(), self.cfg.max_grad_norm)
             for part in (self.model.actor, self.model.critic)

@@ -27,6 +27,8 @@ FINGER_DEPTH_M = 0.035
 """How deep fingers reach down an object that is taller than this."""
 FINGER_HALF_M = 0.012
 """Half the width of the closed gripper, along and across."""
+PALM_HALF_M = 0.045
+PALM_ABOVE_TCP_M = 0.055
 HOVER_M = 0.03
 """Room under the fingertips on the way."""
 OPEN, CLOSE = -1.0, 1.0
@@ -156,6 +158,8 @@ def grasp(m: Moment, body: Body) -> Actions:
     off = np.linalg.norm((point - m.tool)[:, :2], axis=1)
     tips = m.tool[:, 2] - FINGERTIP_BELOW_TCP_M
     above = body.top + FINGERTIP_BELOW_TCP_M + HOVER_M
+    others = np.max([b.top for b in m.bodies], axis=0) + FINGERTIP_BELOW_TCP_M + 0.02
+    above = above + _ramp(off, 0.05, 0.1) * np.maximum(others - above, 0)
     misfit = np.maximum(_ramp(off, 0.008, 0.03), _ramp(np.abs(yaw), 0.08, 0.3))
     is_at_depth = (off < 0.02) & (m.tool[:, 2] < point[:, 2] + 0.012)
     misfit = np.where(is_at_depth, misfit, np.maximum(misfit, _ramp(-m.width, -0.078, -0.06)))
@@ -257,12 +261,17 @@ def push(
         height_m: of the tool's centre while pushing; low by default.
         avoid: another object to stay above on the way.
     """
-    low = np.clip(body.half[:, 2], TARGET_LOW_M[2], 0.025) if height_m is None else height_m
+    if height_m is None:
+        # Low, but with the palm above it, unless that would topple it.
+        under_palm = np.minimum(body.top - PALM_ABOVE_TCP_M + 0.008, 0.55 * body.top)
+        height_m = np.maximum(np.clip(body.half[:, 2], TARGET_LOW_M[2], 0.025), under_palm)
+    low = height_m
     offset = (m.tool - body.pos)[:, :2]
     along = (offset * direction).sum(1)
     across = offset - along[:, None] * direction
     aside = np.linalg.norm(across, axis=1)
-    behind = body.reach(direction) + FINGER_HALF_M
+    is_palm = low + PALM_ABOVE_TCP_M < body.top
+    behind = body.reach(direction) + np.where(is_palm, PALM_HALF_M, FINGER_HALF_M)
     tips = m.tool[:, 2] - FINGERTIP_BELOW_TCP_M
     top = body.top if avoid is None else np.maximum(body.top, avoid.top)
     is_behind = (along < -behind + 0.012) & (aside < 0.02)
@@ -273,15 +282,17 @@ def push(
     off = np.linalg.norm(spot - m.tool[:, :2], axis=1)
     above = top + FINGERTIP_BELOW_TCP_M + 0.02
     is_beside = (avoid is None) & (np.maximum(aside - behind, -along - behind) > 0.005)
-    misfit = _ramp(off, 0.008, 0.022)
+    misfit = np.maximum(
+        _ramp(aside, 0.008, 0.022), _ramp(np.abs(along + behind + 0.014), 0.014, 0.03)
+    )
     free = np.maximum(_ramp(tips - top, 0.0, 0.015), 1 - misfit)
     to = m.tool.copy()
     to[:, :2] += (spot - m.tool[:, :2]) * np.where(is_beside, 1.0, free)[:, None]
     to[:, 2] = low + misfit * (np.where(off > 0.15, np.maximum(above, m.tool[:, 2]), above) - low)
-    pace = np.clip(remaining_m / 0.06, 0.15, 1.0)[:, None]
+    pace = np.clip(remaining_m / 0.04, 0.3, 1.0)[:, None]
     forward = m.tool.copy()
     # Ahead, and back onto the line through the object.
-    forward[:, :2] += direction * 0.05 * pace - across * 0.8
+    forward[:, :2] += direction * 0.03 * pace - across * 0.8
     forward[:, 2] = low
     away = m.tool.copy()
     away[:, :2] -= direction * 0.04

@@ -33,6 +33,25 @@ logger = logging.getLogger(__name__)
 
 Program = Callable[[Moment], Actions]
 
+MEANT: dict[str, tuple[str, ...]] = {
+    "lift_up": ("lift",),
+    "uncover": ("lift",),
+    "push_left": ("push as",),
+    "push_right": ("push as",),
+    "tip_over": ("tip",),
+    "push_next_to": ("push next",),
+    "slide_to": ("drag next", "push next"),
+    "push_with": ("push with",),
+    "drop_in_front_of": ("put in front",),
+    "insert": ("put into",),
+    "place_onto": ("put onto",),
+    "cover": ("put over",),
+    "throw_into": ("throw",),
+}
+"""How the programs begin that do what the words of a kind say."""
+GOOD_ENOUGH = 0.4
+"""A program that is meant and succeeds this often is not compared with others."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
@@ -70,21 +89,36 @@ class Teacher:
             turn_rad=env.cfg.rotation_step_rad,
         )
 
-    def choose(self) -> Trial:
-        """Play one episode of each program in every world and keep the one that succeeds most often."""
-        trials = []
-        for name, program in self.programs.items():
-            env = self.env
-            env.reset(np.arange(env.num_envs))
-            held = np.zeros(env.num_envs, bool)
-            for _ in range(env.horizon):
-                held = env.step(program(self.moment())).held
-            trials.append(Trial(name=name, success=float(held.mean())))
+    def choose(self, env: BatchEnv) -> Trial:
+        """Play one episode of each program in every world of another environment and keep the best one.
+
+        What the task's words name is tried first and kept if it succeeds well: the task's own success sees only
+        how an episode ends, and an object may also have been carried to where it should be pushed.
+        """
+        meant = MEANT.get(self.env.bundle.kind, ())
+        names = sorted(self.programs, key=lambda name: not name.startswith(meant))
+        player = Teacher(env)
+        trials: list[Trial] = []
+        for name in names:
+            is_meant = name.startswith(meant)
+            if not is_meant and any(t.success >= GOOD_ENOUGH for t in trials):
+                break
+            player.name = name
+            trials.append(Trial(name=name, success=player.play()))
             logger.info("program '%s': %.0f %%", name, 100 * trials[-1].success)
         self.trials = tuple(trials)
-        best = max(trials, key=lambda t: t.success)
+        best = max(trials, key=lambda t: t.success + 0.2 * t.name.startswith(meant))
         self.name = best.name
         return best
+
+    def play(self) -> float:
+        """Play one episode in every world and return the share whose success was held at the end."""
+        env = self.env
+        env.reset(np.arange(env.num_envs))
+        held = np.zeros(env.num_envs, bool)
+        for _ in range(env.horizon):
+            held = env.step(self.act()).held
+        return float(held.mean())
 
 
 def programs_for(env: BatchEnv) -> dict[str, Program]:
@@ -113,6 +147,7 @@ def programs_for(env: BatchEnv) -> dict[str, Program]:
         far = np.linalg.norm(first_pose(objects[k])[:2] - first_pose(objects[0])[:2])
         label = objects[k].name
         programs[f"push next to {label}"] = lambda m, k=k: _push_next_to(m, k)
+        programs[f"drag next to {label}"] = lambda m, k=k: _drag_next_to(m, k)
         programs[f"put into {label}"] = lambda m, k=k: _put_into(m, k)
         programs[f"put over {label}"] = lambda m, k=k: _put_over(m, k)
         programs[f"put in front of {label}"] = lambda m, k=k: _put_in_front(m, k)
@@ -155,6 +190,28 @@ def _push_next_to(m: Moment, k: int) -> Actions:
     d = _unit((ref.pos - obj.pos)[:, :2])
     gap = np.linalg.norm((ref.pos - obj.pos)[:, :2], axis=1) - obj.reach(d) - ref.reach(d)
     return push(m, obj, d, gap - 0.009, avoid=ref)
+
+
+def _drag_next_to(m: Moment, k: int) -> Actions:
+    """Grasp the object, slide it with its end first, let go."""
+    obj, ref = m.bodies[0], m.bodies[k]
+    d = _unit((ref.pos - obj.pos)[:, :2])
+    gap = np.linalg.norm((ref.pos - obj.pos)[:, :2], axis=1) - obj.reach(d) - ref.reach(d)
+    turn = _turn_along(obj, d)
+    to = m.tool.copy()
+    pace = np.clip((gap - 0.008) / 0.03, 0.1, 1.0) * np.clip(1.2 - 2 * np.abs(turn), 0.1, 1.0)
+    to[:, :2] += d * 0.03 * pace[:, None]
+    to[:, 2] += obj.start[:, 2] + 0.001 - obj.pos[:, 2]
+    carried = m.go(to, CLOSE, turn)
+    return choose(gap < 0.012, release(m, obj), choose(m.holds(obj), carried, grasp(m, obj)))
+
+
+def _turn_along(body: Body, direction: np.ndarray) -> np.ndarray:
+    """Return by how much to turn an object [rad] so that its longer side points along a direction."""
+    long = int(np.argmax(body.model.size_m[:2]))
+    axis = body.rotation[:, :2, long]
+    turn = np.arctan2(direction[:, 1], direction[:, 0]) - np.arctan2(axis[:, 1], axis[:, 0])
+    return (turn + np.pi / 2) % np.pi - np.pi / 2
 
 
 def _put(
@@ -209,9 +266,10 @@ def _put_in_front(m: Moment, k: int) -> Actions:
     obj, ref = m.bodies[0], m.bodies[k]
     goal = ref.pos.copy()
     room = obj.size[:, :2].max(1) / 2 + ref.size[:, :2].max(1) / 2
-    goal[:, 0] -= room + 0.02
+    goal[:, 0] -= room + 0.03
     goal[:, 2] = obj.start[:, 2] + 0.002
-    return _put(m, goal, over_m=np.full(len(m.tool), 0.06))
+    # Let go a little above the table: beside something tall the palm cannot go lower.
+    return _put(m, goal, over_m=np.full(len(m.tool), 0.06), down_m=0.02)
 
 
 def _push_with(m: Moment, k: int) -> Actions:
@@ -220,9 +278,8 @@ def _push_with(m: Moment, k: int) -> Actions:
     d = _unit((obj.start - tool.start)[:, :2])
     moved = ((obj.pos - obj.start)[:, :2] * d).sum(1)
     long = np.argmax(tool.model.size_m[:2])
-    axis = tool.rotation[:, :2, long]
     half = tool.size[:, long] / 2
-    turn = (np.arctan2(d[:, 1], d[:, 0]) - np.arctan2(axis[:, 1], axis[:, 0]) + np.pi / 2) % np.pi - np.pi / 2
+    turn = _turn_along(tool, d)
     low = tool.start[:, 2] + 0.006
     offset = (tool.pos - obj.pos)[:, :2]
     along = (offset * d).sum(1)
