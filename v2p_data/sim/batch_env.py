@@ -13,7 +13,7 @@ import json
 import logging
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -39,6 +39,9 @@ from v2p_data.sim.start_check import check_start
 from v2p_data.sim.states import Observed, StateBlock
 from v2p_data.sim.world import World, build_world
 from v2p_data.task.task import Task, TaskBundle
+
+if TYPE_CHECKING:
+    from v2p_data.sim.bank import Starts
 
 ACT_DIM = 7
 HELD_STEPS = 5
@@ -180,6 +183,8 @@ class BatchEnv:
         self.object_names = [o.name for o in self.world.objects]
         self.broken_count = 0
         """Worlds whose simulation broke down since the environment was made."""
+        self.starts: Starts | None = None
+        """Where some episodes begin in the middle; set by `bank.use_bank`, for training only."""
         self._bind(num_threads)
         self.randomizer = Randomizer(
             self.world, self._batch, self.cfg.randomization, rng_for(seed, "start-poses")
@@ -209,15 +214,19 @@ class BatchEnv:
         self.randomizer.forget_prepared()
 
     def stagger(self) -> None:
-        """Put every world at a random moment of its episode, so that they do not all end at once."""
-        self._steps[:] = self._rng.integers(0, self.horizon, self.num_envs)
+        """Put every world at a random moment of its episode, so that they do not all end at once.
+
+        Those that began from a bank are in the middle of theirs already.
+        """
+        steps = self._rng.integers(0, self.horizon, self.num_envs)
+        self._steps[:] = np.where(self._from_bank, self._steps, steps)
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Start new episodes in the worlds `ids`."""
+        ids = self._start_from_bank(np.asarray(ids, np.int64))
         n = len(ids)
         if n == 0:
             return
-        ids = np.asarray(ids, np.int64)
         # What `Batch.reset` would do, without waking its threads.
         self._batch.state[ids] = self._fresh_state
         self._batch.warning[ids] = 0
@@ -245,6 +254,48 @@ class BatchEnv:
         self._write_controls(ids)
         # The delay line starts at the controls, not at zero, else the arm is pulled to the origin at first.
         self._history[ids[:, None], self._history_values] = self._ctrl[ids][:, self._history_ctrl]
+        self._show(ids)
+
+    def rows(self, ids: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
+        """Return copies of all that the worlds `ids` depend on, to `restore` into any worlds of the same task."""
+        return {name: array[ids] for name, array in self._per_world().items()}
+
+    def restore(self, ids: Int[np.ndarray, "n"], rows: dict[str, np.ndarray]) -> None:
+        """Let the worlds `ids` go on where others were when `rows` was called for them."""
+        self._batch.state[ids] = self._fresh_state
+        self._batch.warning[ids] = 0
+        for name, array in self._per_world().items():
+            array[ids] = rows[name]
+        self._show(ids)
+
+    @property
+    def is_broken(self) -> Bool[np.ndarray, "env"]:
+        """Which worlds broke down at the last step."""
+        return self._broken
+
+    def _start_from_bank(self, ids: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
+        """Start some of the worlds from the bank, if there is one, and return the others."""
+        if self.starts is None:
+            return ids
+        was_banked = self._from_bank[ids] & (
+            (self._steps[ids] >= self.horizon) | self._broken[ids]
+        )
+        self.starts.note(self._held[ids[was_banked]] >= HELD_STEPS)
+        is_banked, rows = self.starts.draw(ids, self._rng)
+        if is_banked.any():
+            self.restore(ids[is_banked], rows)
+        self._from_bank[ids] = is_banked
+        return ids[~is_banked]
+
+    def _per_world(self) -> dict[str, np.ndarray]:
+        """Return all that worlds depend on, as live arrays with a row per world."""
+        arrays = {f"batch.{name}": self._batch.bind(name) for name in _BATCH_STATE}
+        arrays |= {f"model.{name}": array for name, array in self.randomizer.fields().items()}
+        arrays |= {f"drawn.{name}": a for name, a in self.randomizer.per_world_arrays().items()}
+        return arrays | {f"env.{name}": getattr(self, name) for name in _ENV_STATE}
+
+    def _show(self, ids: Int[np.ndarray, "n"]) -> None:
+        """Bring what is seen of the worlds `ids` up to date after their state was written."""
         tool = self._tool_of(ids)
         for name in ("pos", "rotation", "quat_wxyz", "vel_linear", "vel_angular"):
             getattr(self._tool, name)[ids] = getattr(tool, name)
@@ -331,6 +382,7 @@ class BatchEnv:
             **{key: torch.from_numpy(np.array(value)) for key, value in tensors.items()},
             "rng": json.dumps(self._rng.bit_generator.state),
             "broken_count": self.broken_count,
+            "starts": self.starts.state() if self.starts is not None else "",
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -345,6 +397,8 @@ class BatchEnv:
             getattr(self, name)[:] = state[f"env.{name}"].numpy()
         self._rng.bit_generator.state = json.loads(state["rng"])
         self.broken_count = int(state["broken_count"])
+        if self.starts is not None:
+            self.starts.load_state(state["starts"])
         self._tool = self._tool_of(slice(None))
         self._fill(slice(None), self._tool)
 
@@ -381,6 +435,7 @@ class BatchEnv:
         self._held = np.zeros(n, np.int64)
         self._last_action = np.zeros((ACT_DIM, n)).T
         self._broken = np.zeros(n, bool)
+        self._from_bank = np.zeros(n, bool)
         self._tool = self._tool_of(slice(None))
 
     def _load_task(self, task: type[Task] | None) -> Task:
@@ -510,6 +565,7 @@ _ENV_STATE = (
     "_held",
     "_last_action",
     "_broken",
+    "_from_bank",
 )
 _BAD_STATE_WARNINGS = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADCTRL) + 1

@@ -163,7 +163,7 @@ class Randomizer:
             Rotation.from_quat(o.rest_quat, scalar_first=True).as_matrix() for o in objects
         ]
         self.start_tool_pos, self.start_yaw, self.start_qpos = self._start_bank(rng)
-        self._live = {**self._fields, **self._drawn}
+        self._live = {**self._fields, **self.per_world_arrays()}
         self._prepared = {
             name: np.repeat(array[:1], PREPARED, axis=0) for name, array in self._live.items()
         }
@@ -293,10 +293,10 @@ class Randomizer:
     def drawn_arrays(self) -> dict[str, np.ndarray]:
         """Return all drawn values, what follows from them, and what is drawn already; live arrays."""
         prepared = {f"prepared_{name}": array for name, array in self._prepared.items()}
-        return {**self._drawn, **prepared, "num_used": self._num_used}
+        return {**self.per_world_arrays(), **prepared, "num_used": self._num_used}
 
-    @property
-    def _drawn(self) -> dict[str, np.ndarray]:
+    def per_world_arrays(self) -> dict[str, np.ndarray]:
+        """Return drawn values and what follows from them, each with a row per world; live arrays."""
         return {
             "size_m": self.size_m,
             "mass_kg": self.mass_kg,
