@@ -18,16 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from policies.evaluation.rate import wilson
-from policies.ppo.train import PPOConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.learning import ExpertConfig, learn
 from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.scene.reconstruct import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
-from v2p_data.sim.backends import Backend
 from v2p_data.task.generate import TaskConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
@@ -38,25 +37,6 @@ ROOT_OF_TASKS = "v2p/tasks"
 """Where a dataset carries the tasks that its episodes were made in."""
 EVALUATION_FILE = "evaluation.json"
 POLICY_FOLDER = "policy"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExpertConfig:
-    """How an expert is trained and judged."""
-
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    num_envs: int = 512
-    """Worlds that learn at the same time; the flat optimum on two cores is 256 to 1024."""
-    backend: Backend = "cpu"
-    """Where they are simulated: `warp` is for the GPU of `--device` and 8192 worlds; judging stays on the CPU."""
-    eval_episodes: int = 64
-    """Episodes at the fine time step that judge the finished expert, on seeds of their own."""
-    min_success: float = 0.3
-    """Experts below this make too few demonstrations to be worth the wait."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.min_success <= 1:
-            raise ValueError(f"min_success must be between 0 and 1, got {self.min_success}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,7 +214,7 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
         item=task.item,
         config=Seeded(config=cfg.expert, seed=cfg.seed),
         inputs={"task": task},
-        version=1,
+        version=2,
         make=make_expert,
     )
 
@@ -242,35 +222,24 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
 def make_expert(
     cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
 ) -> dict[str, Any]:
-    """Train with PPO at the coarse time step, judge at the fine one with the independent referee."""
+    """Find a teacher, imitate it, go on with PPO, all at the coarse time step; judge at the fine one with the independent referee."""
     from policies.ppo.policy import Expert
-    from policies.ppo.train import train_expert
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.report.sheet import write_contact_sheet
-    from v2p_data.sim.backends import make_batch_env
     from v2p_data.sim.task_check import check_task
-    from v2p_data.sim.torchrl_env import TorchRLEnv
     from v2p_data.task.task import TaskBundle
 
     expert_cfg: ExpertConfig = cfg.config
     bundle = TaskBundle.load(inputs["task"])
     check_task(bundle, num_threads=runtime.num_threads)
-    env = make_batch_env(
+    learned = learn(
         bundle,
-        num_envs=expert_cfg.num_envs,
+        expert_cfg,
+        out,
         seed=seed_for(cfg.seed, "expert", bundle.title),
         num_threads=runtime.num_threads,
-        backend=expert_cfg.backend,
         device=runtime.device,
-    )
-    result = train_expert(
-        TorchRLEnv(env),
-        expert_cfg.ppo,
-        out,
-        seed=seed_for(cfg.seed, "ppo", bundle.title),
-        on_progress=lambda done, total, success: runtime.progress(
-            0.95 * done / total, f"success {success:.0%}"
-        ),
+        on_progress=lambda share, words: runtime.progress(0.95 * share, words),
     )
     expert = Expert.load(out)
     runtime.progress(0.95, "judging at the fine step")
@@ -284,8 +253,9 @@ def make_expert(
     rate = wilson(int(judged.successes.sum()), len(judged.successes))
     write_contact_sheet(bundle, judged, out / "sheet.png")
     counts = {
-        "steps": result.steps,
-        "train_seconds": round(result.seconds, 1),
+        "steps": learned.steps,
+        "train_seconds": round(learned.seconds, 1),
+        "learning": learned.as_dict(),
         "success": rate.as_dict(),
         "task_success": float(judged.task_successes.mean()),
     }
@@ -293,7 +263,7 @@ def make_expert(
     if rate.value < expert_cfg.min_success:
         raise ItemRejectedError(
             "expert_not_learned",
-            f"after {result.steps} steps the expert succeeds in {rate} of episodes, "
+            f"after {learned.steps} steps the expert succeeds in {rate} of episodes, "
             f"below the {expert_cfg.min_success:.0%} that are worth collecting",
             rate.value,
         )

@@ -32,6 +32,10 @@ class ImitationConfig:
 
     rounds: int = 10
     """The teacher moves all worlds in the first and a tenth of them in the last."""
+    least_rounds: int = 5
+    """From then on the learner is tried after each round."""
+    target_success: float = 0.97
+    """A learner that succeeds this often has learned enough."""
     round_steps: int = 32
     """Control steps per world and round."""
     epochs: int = 6
@@ -68,6 +72,7 @@ def imitate(
     out: Path,
     *,
     seed: int,
+    check: Callable[[Expert], float] | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> ImitationResult:
     """Write an expert that does as the teacher does into `out`.
@@ -78,6 +83,7 @@ def imitate(
         cfg: the recipe.
         out: folder of the expert.
         seed: of weights, noise and minibatches.
+        check: how often an expert succeeds in worlds of its own; imitation ends once that is `target_success`.
         on_progress: told the share that is done.
     """
     started = time.monotonic()
@@ -93,7 +99,7 @@ def imitate(
     now = env.reset()
     if (stagger := getattr(env, "stagger", None)) is not None:
         stagger()
-    loss = float("nan")
+    loss, rounds = float("nan"), 0
     for k in range(cfg.rounds):
         share = max(1 - k / max(cfg.rounds - 1, 1), cfg.least_teacher)
         follows = torch.rand(num_envs, generator=generator) >= share
@@ -115,13 +121,19 @@ def imitate(
         model.normaliser.update(torch.cat(seen[start:]))
         epochs = cfg.last_epochs if k == cfg.rounds - 1 else cfg.epochs
         loss = _fit(model, optimiser, torch.cat(seen), torch.cat(said), epochs, cfg, generator)
-        on_progress((k + 1) / cfg.rounds)
+        rounds = k + 1
+        on_progress(rounds / cfg.rounds)
         log.info("round %d: loss %.4f", k, loss)
+        if check is not None and cfg.rounds > rounds >= cfg.least_rounds:
+            rate = check(Expert(model))
+            log.info("the learner succeeds in %.0f %%", 100 * rate)
+            if rate >= cfg.target_success:
+                break
     Expert(model).save(out)
     torch.set_num_threads(threads)
     return ImitationResult(
         folder=out,
-        steps=cfg.rounds * cfg.round_steps * num_envs,
+        steps=rounds * cfg.round_steps * num_envs,
         seconds=time.monotonic() - started,
         loss=loss,
     )

@@ -302,7 +302,9 @@ class _Learner:
         is_first = float(self.model.normaliser.count) == 0
         if not is_first:
             kl = self._update(learning)
-        if self.critic_batches == 0:  # a policy that can do something already keeps the eyes it has
+        if (
+            self.critic_batches == 0
+        ):  # a policy that can do something already keeps the eyes it has
             self.model.normaliser.update(batch["observation"].flatten(0, 1))
         progress.iteration += 1
         progress.steps += batch.numel()
@@ -331,11 +333,11 @@ class _Learner:
         cfg, progress = self.cfg, self.progress
         reward, done = batch["next", "reward"][..., 0], batch["next", "done"][..., 0]
         success = outcome(batch.get("next")).reshape(done.shape)
-        squares = reward.new_zeros(())
+        squares = torch.zeros((), device=reward.device)
         for t in range(cfg.batch_time):
             progress.discounted = cfg.gamma * progress.discounted + reward[:, t]
             progress.episode_return = progress.episode_return + reward[:, t]
-            squares += progress.discounted.square().mean() / cfg.batch_time
+            squares = squares + progress.discounted.square().mean() / cfg.batch_time
             ended = done[:, t].nonzero()[:, 0]
             for world in ended.tolist():
                 outcomes = (

@@ -1,0 +1,186 @@
+"""How a task becomes an expert: a teacher is found, imitated, and then surpassed or confirmed by PPO.
+
+Scripted programs are tried on the task; the one that its own success function likes best teaches a policy
+(DAgger), and PPO goes on from there until the deterministic policy succeeds. Without a program that succeeds at
+all, PPO starts from nothing. Of the taught policy and the one that PPO made of it the better one is kept, by
+episodes at the fine time step. What is kept is a neural network in any case; scripts never make a dataset.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from policies.ppo.imitate import ImitationConfig, imitate
+from policies.ppo.policy import Expert
+from policies.ppo.train import PPOConfig, train_expert
+from v2p_data.seeds import seed_for
+from v2p_data.sim.backends import Backend, make_batch_env
+from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.teacher import Teacher, Trial
+from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.task.task import TaskBundle
+
+logger = logging.getLogger(__name__)
+
+TAUGHT_FOLDER = "taught"
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpertConfig:
+    """How an expert is trained and judged."""
+
+    teacher: Literal["programs", "none"] = "programs"
+    """`none`: PPO from nothing, as in the paper; ten times slower where it works at all."""
+    least_teacher_success: float = 0.1
+    """A program that succeeds less often teaches nothing."""
+    trial_worlds: int = 64
+    """Worlds in which programs and taught policies are tried."""
+    imitation: ImitationConfig = field(default_factory=ImitationConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    num_envs: int = 512
+    """Worlds that learn at the same time; the flat optimum on two cores is 256 to 1024."""
+    backend: Backend = "cpu"
+    """Where PPO's worlds are simulated: `warp` is for the GPU of `--device` and 8192 worlds; all else stays on
+    the CPU."""
+    eval_episodes: int = 64
+    """Episodes at the fine time step that judge the finished expert, on seeds of their own."""
+    min_success: float = 0.3
+    """Experts below this make too few demonstrations to be worth the wait."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_success <= 1:
+            raise ValueError(f"min_success must be between 0 and 1, got {self.min_success}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learned:
+    """What came of it; the expert itself lies in the folder."""
+
+    steps: int
+    """Control steps in all, trials of programs included."""
+    seconds: float
+    kept: Literal["taught", "ppo"]
+    teacher: str
+    """The program's name, or nothing."""
+    trials: tuple[Trial, ...]
+    taught_success: float | None
+    """At the fine step, on worlds that decide which policy is kept; so is `ppo_success`."""
+    ppo_success: float | None
+    stopped_by: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return asdict(self)
+
+
+def learn(
+    bundle: TaskBundle,
+    cfg: ExpertConfig,
+    out: Path,
+    *,
+    seed: int,
+    num_threads: int = 1,
+    device: str = "cuda:0",
+    on_progress: Progress = lambda share, words: None,
+) -> Learned:
+    """Write the task's expert into `out`, with the curve of its training.
+
+    Args:
+        bundle: the task.
+        cfg: the recipe.
+        out: folder; `taught/` in it is what imitation gave.
+        seed: of everything that is drawn.
+        num_threads: for the physics; changes no result.
+        device: of the backend `warp`.
+        on_progress: told the share that is done and a few words.
+    """
+
+    def worlds(num_envs: int, what: str, *, fine: bool = False) -> BatchEnv:
+        return BatchEnv(
+            bundle,
+            SimConfig(fine=fine),
+            num_envs=num_envs,
+            seed=seed_for(seed, what),
+            num_threads=num_threads,
+        )
+
+    teacher_name, trials, taught, steps, seconds = "", (), None, 0, 0.0
+    if cfg.teacher == "programs":
+        trial_env = worlds(cfg.trial_worlds, "trials")
+        env = worlds(cfg.num_envs, "taught")
+        teacher = Teacher(env)
+        on_progress(0.0, "trying programs")
+        best = teacher.choose(trial_env)
+        trials = teacher.trials
+        steps += len(trials) * cfg.trial_worlds * bundle.horizon_steps
+        if best.success >= cfg.least_teacher_success:
+            teacher_name = best.name
+            imitated = imitate(
+                TorchRLEnv(env),
+                teacher.act,
+                cfg.imitation,
+                out / TAUGHT_FOLDER,
+                seed=seed_for(seed, "imitation") % 2**63,
+                check=lambda expert: success_of(trial_env, expert),
+                on_progress=lambda share: on_progress(
+                    0.4 * share,
+                    f"imitating '{teacher_name}', which succeeds in {best.success:.0%}",
+                ),
+            )
+            taught = imitated.folder
+            steps, seconds = steps + imitated.steps, seconds + imitated.seconds
+        else:
+            logger.info("no program succeeds at '%s'; PPO starts from nothing", bundle.title)
+        del env, trial_env
+    start = 0.4 if taught else 0.0
+    result = train_expert(
+        TorchRLEnv(
+            make_batch_env(
+                bundle,
+                num_envs=cfg.num_envs,
+                seed=seed_for(seed, "worlds"),
+                num_threads=num_threads,
+                backend=cfg.backend,
+                device=device,
+            )
+        ),
+        cfg.ppo,
+        out,
+        seed=seed_for(seed, "ppo") % 2**63,
+        warm_start=taught,
+        on_progress=lambda done, total, success: on_progress(
+            start + (1 - start) * min(done / total, 1), f"success {success:.0%}"
+        ),
+    )
+    kept, of_taught, of_ppo = "ppo", None, None
+    if taught is not None:
+        judge_env = worlds(2 * cfg.trial_worlds, "which is better", fine=True)
+        of_taught = success_of(judge_env, Expert.load(taught))
+        of_ppo = success_of(judge_env, Expert.load(out))
+        if of_taught > of_ppo:
+            kept = "taught"
+            Expert.load(taught).save(out)
+    return Learned(
+        steps=steps + result.steps,
+        seconds=seconds + result.seconds,
+        kept=kept,
+        teacher=teacher_name,
+        trials=tuple(trials),
+        taught_success=of_taught,
+        ppo_success=of_ppo,
+        stopped_by=result.stopped_by,
+    )
+
+
+def success_of(env: BatchEnv, expert: Expert) -> float:
+    """Play one episode in every world and return the share that the task's success held at some time."""
+    env.reset(np.arange(env.num_envs))
+    ever = np.zeros(env.num_envs, bool)
+    for _ in range(env.horizon):
+        ever = ever | env.step(expert.act(env.observe())).held
+    return float(ever.mean())
