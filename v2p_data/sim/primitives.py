@@ -238,7 +238,9 @@ def carry(
 def release(m: Moment, body: Body) -> Actions:
     """Open, and leave upwards once nothing is touched any more."""
     to = m.tool.copy()
-    to[:, 2] = np.where(body.touched, m.tool[:, 2], np.maximum(m.tool[:, 2] + 0.05, body.top + 0.06))
+    to[:, 2] = np.where(
+        body.touched, m.tool[:, 2], np.maximum(m.tool[:, 2] + 0.05, body.top + 0.06)
+    )
     return m.go(to, OPEN)
 
 

@@ -230,9 +230,7 @@ def _put(
     is_there = (off < 2 * near_m) & is_down
     lets_go = is_there & ((off < 1.4 * near_m) | ~m.holds(obj) | (m.width > 0.08))
     carried = carry(m, obj, goal, clearance_m=over_m, near_m=near_m, turn=turn)
-    return choose(
-        lets_go, release(m, obj), choose(m.holds(obj), carried, grasp(m, obj))
-    )
+    return choose(lets_go, release(m, obj), choose(m.holds(obj), carried, grasp(m, obj)))
 
 
 def _put_into(m: Moment, k: int) -> Actions:
@@ -241,9 +239,9 @@ def _put_into(m: Moment, k: int) -> Actions:
     goal = ref.pos.copy()
     goal[:, 2] = ref.top + obj.half[:, 2] + 0.008
     over = ref.top + 0.02
-    inside = (np.linalg.norm((obj.pos - ref.pos)[:, :2], axis=1) < 0.5 * ref.size[:, :2].min(1)) & (
-        obj.pos[:, 2] < goal[:, 2]
-    )
+    inside = (
+        np.linalg.norm((obj.pos - ref.pos)[:, :2], axis=1) < 0.5 * ref.size[:, :2].min(1)
+    ) & (obj.pos[:, 2] < goal[:, 2])
     put = _put(m, goal, over_m=over, near_m=0.02, down_m=0.02)
     return choose(inside, release(m, obj), put)
 
@@ -320,4 +318,3 @@ def _throw(m: Moment, k: int) -> Actions:
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)
-
