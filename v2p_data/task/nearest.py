@@ -1,0 +1,79 @@
+"""Which solved task is most like a new one: where PPO may start from another expert's weights.
+
+Likeness is counted in points, by what decides how the arm moves: the family of the kind (carrying, pushing,
+tipping, throwing), the kind itself, the number of objects, and their shapes and sizes.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.task.task import TaskBundle
+
+FAMILIES: dict[str, str] = {
+    "lift_up": "carry",
+    "uncover": "carry",
+    "cover": "carry",
+    "insert": "carry",
+    "place_onto": "carry",
+    "drop_in_front_of": "carry",
+    "push_left": "push",
+    "push_right": "push",
+    "push_next_to": "push",
+    "push_with": "push",
+    "slide_to": "push",
+    "tip_over": "tip",
+    "throw_into": "throw",
+}
+FAMILY_POINTS = 4.0
+KIND_POINTS = 2.0
+COUNT_POINTS = 1.0
+"""For the same number of objects: then their observations lie in the same places."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solved:
+    """An expert that exists, and its task."""
+
+    bundle: TaskBundle
+    folder: Path
+    obs_dim: int
+    """Length of the observation it was trained on."""
+
+
+def rank_solved(bundle: TaskBundle, obs_dim: int, solved: Iterable[Solved]) -> list[Solved]:
+    """Return the experts whose weights fit a task, the most alike first; equals in the order of their folders' names.
+
+    Experts for another arm, with another observation or another size of motion do not fit: in them the same
+    number means something else.
+    """
+    fitting = [
+        s
+        for s in solved
+        if s.obs_dim == obs_dim
+        and s.bundle.robot == bundle.robot
+        and s.bundle.motion_scale == bundle.motion_scale
+    ]
+    return sorted(fitting, key=lambda s: (-likeness(bundle, s.bundle), s.folder.name))
+
+
+def likeness(a: TaskBundle, b: TaskBundle) -> float:
+    """Return how alike two tasks are, in points: 0 for nothing in common, about 9 for the same task."""
+    points = FAMILY_POINTS * (FAMILIES.get(a.kind, a.kind) == FAMILIES.get(b.kind, b.kind))
+    points += KIND_POINTS * (a.kind == b.kind)
+    points += COUNT_POINTS * (len(a.scene.objects) == len(b.scene.objects))
+    return points + _alike(a.scene, b.scene)
+
+
+def _alike(a: Scene, b: Scene) -> float:
+    """Return the mean likeness of the scenes' objects in order, 0 to 2."""
+    pairs = list(zip(a.objects, b.objects, strict=False))
+    return sum(_alike_objects(x, y) for x, y in pairs) / max(len(a.objects), len(b.objects), 1)
+
+
+def _alike_objects(a: SceneObject, b: SceneObject) -> float:
+    """Return 1 for the same shape, and up to 1 for the same size."""
+    apart = sum(abs(math.log(x / y)) for x, y in zip(a.size_m, b.size_m, strict=True)) / 3
+    return float((a.shape, a.hollow) == (b.shape, b.hollow)) + math.exp(-apart)
