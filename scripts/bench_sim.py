@@ -493,13 +493,13 @@ def show_scaling(cfg: BenchConfig) -> None:
     threads = cfg.threads or os.cpu_count() or 1
     print("lift a box, random actions; microseconds per control step of one world, best (median)")
     print(
-        f"{'worlds':>7s} {'1 thread':>15s} {f'{threads} threads':>15s} {'bare physics':>15s} {'MB per world':>14s}"
+        f"{'worlds':>7s} {'1 thread':>15s} {f'{threads} threads':>15s} {'bare physics':>15s} {'kB per world':>14s}"
     )
     for worlds in SCALING_WORLDS:
         one, many = (_sized(worlds, n) for n in (1, threads))
         print(
             f"{worlds:7d} {one['env']:>15s} {many['env']:>15s} {many['limit']:>15s} "
-            f"{many['mb_per_world']:14.3f}",
+            f"{many['kb_per_world']:14.1f}",
             flush=True,
         )
 
@@ -534,7 +534,7 @@ def show_one_size(cfg: BenchConfig) -> None:
             {
                 "env": turns.microseconds(turns.env),
                 "limit": turns.microseconds(turns.limit),
-                "mb_per_world": grown / cfg.worlds / 1e6,
+                "kb_per_world": grown / cfg.worlds / 1e3,
             }
         )
     )
