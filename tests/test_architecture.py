@@ -20,7 +20,7 @@ BELOW: dict[str, set[str]] = {
     "reward": {"task", "sim", "scene", "errors", "seeds"},
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }
-TOP = {"stages", "learning", "cli", "commands"}
+TOP = {"stages", "learning", "solved", "cli", "commands"}
 
 
 def imported_modules(path: Path) -> set[str]:

@@ -7,8 +7,8 @@ episodes at the fine time step. What is kept is a neural network in any case; sc
 """
 
 import logging
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,9 +19,11 @@ from policies.ppo.policy import Expert
 from policies.ppo.train import PPOConfig, train_expert
 from v2p_data.seeds import seed_for
 from v2p_data.sim.backends import Backend, make_batch_env
+from v2p_data.sim.bank import Bank, BankConfig, record_bank, use_bank
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.teacher import Teacher, Trial
 from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.task.nearest import Solved, rank_solved
 from v2p_data.task.task import TaskBundle
 
 logger = logging.getLogger(__name__)
@@ -42,6 +44,11 @@ class ExpertConfig:
     """Worlds in which programs and taught policies are tried."""
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    bank: BankConfig = field(default_factory=lambda: BankConfig(share=0.0))
+    """With a share above 0, PPO begins some episodes where the best program was; on the CPU only."""
+    warm_start: Path | None = None
+    """A folder of finished runs: if no program succeeds, PPO starts from the expert of the most similar task there.
+    All its experts are part of the recipe, so name another folder than the one that is written to."""
     num_envs: int = 512
     """Worlds that learn at the same time; the flat optimum on two cores is 256 to 1024."""
     backend: Backend = "cpu"
@@ -55,6 +62,11 @@ class ExpertConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.min_success <= 1:
             raise ValueError(f"min_success must be between 0 and 1, got {self.min_success}")
+        if self.bank.share and (self.backend != "cpu" or self.teacher == "none"):
+            raise ValueError(
+                "bank.share needs a teacher whose moments are kept, and worlds on the CPU; "
+                f"got teacher '{self.teacher}' and backend '{self.backend}'"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +84,8 @@ class Learned:
     """At the fine step, on worlds that decide which policy is kept; so is `ppo_success`."""
     ppo_success: float | None
     stopped_by: str
+    started_from: str = ""
+    """Folder of another task's expert, if PPO started from one."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON."""
@@ -86,6 +100,7 @@ def learn(
     seed: int,
     num_threads: int = 1,
     device: str = "cuda:0",
+    solved: Sequence[Solved] = (),
     on_progress: Progress = lambda share, words: None,
 ) -> Learned:
     """Write the task's expert into `out`, with the curve of its training.
@@ -97,6 +112,7 @@ def learn(
         seed: of everything that is drawn.
         num_threads: for the physics; changes no result.
         device: of the backend `warp`.
+        solved: experts of other tasks, see `ExpertConfig.warm_start`.
         on_progress: told the share that is done and a few words.
     """
 
@@ -110,6 +126,8 @@ def learn(
         )
 
     teacher_name, trials, taught, steps, seconds = "", (), None, 0, 0.0
+    bank: Bank | None = None
+    other: Path | None = None
     if cfg.teacher == "programs":
         trial_env = worlds(cfg.trial_worlds, "trials")
         env = worlds(cfg.num_envs, "taught")
@@ -120,13 +138,14 @@ def learn(
         steps += len(trials) * cfg.trial_worlds * bundle.horizon_steps
         if best.success >= cfg.least_teacher_success:
             teacher_name = best.name
+            exam_env = worlds(cfg.trial_worlds, "exams", fine=True)
             imitated = imitate(
                 TorchRLEnv(env),
                 teacher.act,
                 cfg.imitation,
                 out / TAUGHT_FOLDER,
                 seed=seed_for(seed, "imitation") % 2**63,
-                check=lambda expert: success_of(trial_env, expert),
+                check=lambda expert: success_of(exam_env, expert),
                 on_progress=lambda share: on_progress(
                     0.4 * share,
                     f"imitating '{teacher_name}', which succeeds in {best.success:.0%}",
@@ -135,24 +154,33 @@ def learn(
             taught = imitated.folder
             steps, seconds = steps + imitated.steps, seconds + imitated.seconds
         else:
-            logger.info("no program succeeds at '%s'; PPO starts from nothing", bundle.title)
+            logger.info("no program succeeds at '%s'", bundle.title)
+        if cfg.bank.share:
+            player = Teacher(trial_env)
+            player.name = best.name
+            bank = record_bank(trial_env, player.act)
+            steps += cfg.trial_worlds * bundle.horizon_steps
         del env, trial_env
     start = 0.4 if taught else 0.0
+    env = make_batch_env(
+        bundle,
+        num_envs=cfg.num_envs,
+        seed=seed_for(seed, "worlds"),
+        num_threads=num_threads,
+        backend=cfg.backend,
+        device=device,
+    )
+    if bank is not None and len(bank) and isinstance(env, BatchEnv):
+        use_bank(env, bank, replace(cfg.bank, num_plain=cfg.ppo.num_deterministic))
+    if taught is None and (ranked := rank_solved(bundle, env.obs_dim, solved)):
+        other = ranked[0].folder
+        logger.info("PPO starts from %s", other)
     result = train_expert(
-        TorchRLEnv(
-            make_batch_env(
-                bundle,
-                num_envs=cfg.num_envs,
-                seed=seed_for(seed, "worlds"),
-                num_threads=num_threads,
-                backend=cfg.backend,
-                device=device,
-            )
-        ),
+        TorchRLEnv(env),
         cfg.ppo,
         out,
         seed=seed_for(seed, "ppo") % 2**63,
-        warm_start=taught,
+        warm_start=taught or other,
         on_progress=lambda done, total, success: on_progress(
             start + (1 - start) * min(done / total, 1), f"success {success:.0%}"
         ),
@@ -174,6 +202,7 @@ def learn(
         taught_success=of_taught,
         ppo_success=of_ppo,
         stopped_by=result.stopped_by,
+        started_from=other.name if other is not None else "",
     )
 
 

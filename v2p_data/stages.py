@@ -27,6 +27,7 @@ from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.scene.reconstruct import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
+from v2p_data.solved import find_solved, solved_digests
 from v2p_data.task.generate import TaskConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
@@ -212,15 +213,21 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
     return Stage(
         name="expert",
         item=task.item,
-        config=Seeded(config=cfg.expert, seed=cfg.seed),
+        config=Seeded(config=replace(cfg.expert, warm_start=None), seed=cfg.seed),
         inputs={"task": task},
+        sources=solved_digests(cfg.expert.warm_start),
         version=2,
-        make=make_expert,
+        make=partial(make_expert, warm_start=cfg.expert.warm_start),
     )
 
 
 def make_expert(
-    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
+    cfg: Seeded,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    warm_start: Path | None,
 ) -> dict[str, Any]:
     """Find a teacher, imitate it, go on with PPO, all at the coarse time step; judge at the fine one with the independent referee."""
     from policies.ppo.policy import Expert
@@ -239,6 +246,7 @@ def make_expert(
         seed=seed_for(cfg.seed, "expert", bundle.title),
         num_threads=runtime.num_threads,
         device=runtime.device,
+        solved=find_solved(warm_start) if warm_start else (),
         on_progress=lambda share, words: runtime.progress(0.95 * share, words),
     )
     expert = Expert.load(out)

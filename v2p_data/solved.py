@@ -1,0 +1,48 @@
+"""Experts that earlier runs finished, as starting points for tasks that no program solves.
+
+A folder of runs holds `expert/<item>-<fingerprint>` with a record that names its task, and the task beside it in
+`task/`. What is there is part of the recipe of an expert that may start from it: see `solved_digests`.
+"""
+
+import json
+from pathlib import Path
+
+from policies.ppo.policy import EXPERT_FILE, WEIGHTS_FILE
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import read_record
+from v2p_data.pipeline.fingerprint import file_digest
+from v2p_data.task.nearest import Solved
+from v2p_data.task.task import TaskBundle
+
+
+def find_solved(runs: Path) -> list[Solved]:
+    """Return the experts in a folder of runs that were finished and not rejected.
+
+    Raises:
+        V2PError: there is none.
+    """
+    found: list[Solved] = []
+    for folder in sorted(runs.glob("expert/*")):
+        record = read_record(folder)
+        if record is None or record.rejected is not None:
+            continue
+        task = runs / "task" / record.inputs["task"]
+        if not task.is_dir():
+            continue  # cleared away: what the expert can do is not known any more
+        about = json.loads((folder / EXPERT_FILE).read_text())
+        found.append(Solved(bundle=TaskBundle.load(task), folder=folder, obs_dim=about["obs_dim"]))
+    if not found:
+        raise V2PError(
+            f"there is no finished expert in {runs}; --expert.warm-start names a folder of runs, "
+            "with experts in `expert/` and their tasks in `task/`"
+        )
+    return found
+
+
+def solved_digests(runs: Path | None) -> dict[str, str]:
+    """Return what identifies all experts that might be started from, by folder: another one is another recipe."""
+    if runs is None:
+        return {}
+    return {
+        f"solved {s.folder.name}": file_digest(s.folder / WEIGHTS_FILE) for s in find_solved(runs)
+    }
