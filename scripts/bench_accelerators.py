@@ -38,6 +38,7 @@ from policies.ppo.policy import Expert
 from policies.ppo.train import PPOConfig, train_expert
 from v2p_data.episodes.collect import judge_expert
 from v2p_data.errors import V2PError
+from v2p_data.learning import success_of
 from v2p_data.seeds import seed_for
 from v2p_data.sim.bank import Bank, BankConfig, record_bank, use_bank
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
@@ -186,14 +187,23 @@ class Lesson:
         rounds = min(cfg.rounds, affordable)
         watch = Watch()
         env = self.worlds(self.cfg.num_envs, "taught")
+        trial_env = self.worlds(self.cfg.trial_worlds, "trials")
+        tried = 0
+
+        def check(expert: Expert) -> float:
+            nonlocal tried
+            tried += self.cfg.trial_worlds * env.horizon
+            return success_of(trial_env, expert)
+
         result = imitate(
             TorchRLEnv(env),
             self.teacher(env).act,
             replace(cfg, rounds=rounds),
             self.root / "taught",
             seed=seed_for(self.seed, "imitation") % 2**63,
+            check=check,
         )
-        return result.folder, watch.cost(result.steps)
+        return result.folder, watch.cost(result.steps + tried)
 
     def successes(self, folder: Path) -> int:
         """How many of the judging episodes an expert wins; the same ones for each."""
@@ -327,7 +337,7 @@ def main(cfg: BenchConfig) -> None:
             trial_worlds=16,
             bank_worlds=16,
             episodes=8,
-            imitation=replace(cfg.imitation, rounds=2, epochs=1, last_epochs=1),
+            imitation=replace(cfg.imitation, rounds=2, epochs=1),
         )
     runs: list[Run] = []
     with tempfile.TemporaryDirectory() as folder:
