@@ -18,7 +18,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import EnvBase
 
-from policies.ppo.policy import ActorConfig, ActorCritic, Expert
+from policies.ppo.policy import ActorConfig, ActorCritic, Expert, load_weights, weights_of
 
 log = logging.getLogger(__name__)
 
@@ -30,17 +30,18 @@ Teacher = Callable[[], Float[np.ndarray, "env act"]]
 class ImitationConfig:
     """How long, and how much is left to the learner."""
 
-    rounds: int = 10
-    """The teacher moves all worlds in the first and a tenth of them in the last."""
+    rounds: int = 14
+    """At most; the teacher moves all worlds in the first and ever fewer in the later ones."""
     least_rounds: int = 5
     """From then on the learner is tried after each round."""
-    target_success: float = 0.97
-    """A learner that succeeds this often has learned enough."""
+    target_success: float = 0.98
+    """A learner that succeeds this often has learned enough; else the round with the highest success counts."""
     round_steps: int = 32
     """Control steps per world and round."""
+    teacher_rounds: int = 8
+    """Until this round the teacher's share falls to its least."""
     epochs: int = 6
     """Passes over everything seen so far, after each round."""
-    last_epochs: int = 12
     minibatch: int = 1024
     learning_rate: float = 1e-3
     noise: float = 0.2
@@ -100,8 +101,9 @@ def imitate(
     if (stagger := getattr(env, "stagger", None)) is not None:
         stagger()
     loss, rounds = float("nan"), 0
+    best_rate, best = -1.0, None
     for k in range(cfg.rounds):
-        share = max(1 - k / max(cfg.rounds - 1, 1), cfg.least_teacher)
+        share = max(1 - k / cfg.teacher_rounds, cfg.least_teacher)
         follows = torch.rand(num_envs, generator=generator) >= share
         start = len(seen)
         for _ in range(cfg.round_steps):
@@ -119,16 +121,19 @@ def imitate(
                 TensorDict({"action": action + noise}, env.batch_size)
             )
         model.normaliser.update(torch.cat(seen[start:]))
-        epochs = cfg.last_epochs if k == cfg.rounds - 1 else cfg.epochs
-        loss = _fit(model, optimiser, torch.cat(seen), torch.cat(said), epochs, cfg, generator)
+        loss = _fit(model, optimiser, torch.cat(seen), torch.cat(said), cfg, generator)
         rounds = k + 1
         on_progress(rounds / cfg.rounds)
         log.info("round %d: loss %.4f", k, loss)
-        if check is not None and cfg.rounds > rounds >= cfg.least_rounds:
+        if check is not None and rounds >= cfg.least_rounds:
             rate = check(Expert(model))
             log.info("the learner succeeds in %.0f %%", 100 * rate)
+            if rate > best_rate:
+                best_rate, best = rate, weights_of(model)
             if rate >= cfg.target_success:
                 break
+    if best is not None:
+        load_weights(model, best)
     Expert(model).save(out)
     torch.set_num_threads(threads)
     return ImitationResult(
@@ -144,7 +149,6 @@ def _fit(
     optimiser: torch.optim.Optimizer,
     obs: torch.Tensor,
     advice: torch.Tensor,
-    epochs: int,
     cfg: ImitationConfig,
     generator: torch.Generator,
 ) -> float:
@@ -152,7 +156,7 @@ def _fit(
     bound = model.actor.bound
     wanted = torch.minimum(torch.maximum(advice, -0.95 * bound), 0.95 * bound)
     total = 0.0
-    for _ in range(epochs):
+    for _ in range(cfg.epochs):
         order = torch.randperm(len(obs), generator=generator)
         chunks = order.chunk(max(1, len(obs) // cfg.minibatch))
         total = 0.0

@@ -64,8 +64,8 @@ class PPOConfig:
     target_success: float = 0.95
     """Training stops once the deterministic worlds reach this."""
     window_episodes: int = 128
-    """The success rates are taken over this many last episodes (one and a half to two rounds of the worlds)."""
-    min_window_episodes: int = 96
+    """The success rates are taken over this many last episodes (two rounds of the deterministic worlds)."""
+    min_window_episodes: int = 64
     """With fewer episodes there is no rate yet."""
     num_deterministic: int = 64
     """Worlds that act without exploration and never enter the loss."""
@@ -81,6 +81,8 @@ class PPOConfig:
     """Below, the learning rate grows by a half."""
     kl_high: float = 0.03
     """Above, it shrinks by a third."""
+    decline: float = 0.25
+    """A policy that started warm and has fallen this far below its best success is not trained any further."""
     kl_stop: float = 0.06
     """Above, the remaining epochs of this batch are skipped."""
     gamma: float = 0.97
@@ -125,7 +127,7 @@ class ExpertResult:
     """Deterministic success of the best window in training: chosen as the best of many, hence a little flattering."""
     steps: int
     seconds: float
-    stopped_by: Literal["target", "steps", "seconds"]
+    stopped_by: Literal["target", "steps", "seconds", "decline"]
     evaluation: Rate | None = None
     """Fresh episodes of the best expert in `eval_env`."""
 
@@ -252,7 +254,7 @@ class _Learner:
 
     def run(
         self, on_progress: Callable[[int, int, float], None] | None
-    ) -> Literal["target", "steps", "seconds"]:
+    ) -> Literal["target", "steps", "seconds", "decline"]:
         """Go on until something stops it, and leave everything on disk."""
         cfg, progress = self.cfg, self.progress
         before, started = progress.seconds, time.monotonic()
@@ -277,12 +279,14 @@ class _Learner:
             plot_curve(self.out / CURVE_FILE, self.out / PICTURE_FILE)
         return reason
 
-    def _reason_to_stop(self) -> Literal["target", "steps", "seconds"] | None:
+    def _reason_to_stop(self) -> Literal["target", "steps", "seconds", "decline"] | None:
         cfg, progress = self.cfg, self.progress
         if progress.best_success >= cfg.target_success:
             return "target"
         if progress.steps >= cfg.total_steps:
             return "steps"
+        if self.critic_batches and progress.success(cfg) < progress.best_success - cfg.decline:
+            return "decline"
         if progress.seconds >= cfg.max_seconds:
             return "seconds"
         return None
@@ -413,11 +417,12 @@ class _Learner:
     def _stagger(self) -> None:
         """Have the worlds end at different times: a batch of 16 steps would else see one phase of the task only.
 
-        Learning to lift took half the steps with it (57 % against 11 % after 0.33 million).
+        Learning to lift took half the steps with it (57 % against 11 % after 0.33 million). Deterministic worlds
+        start at the start: their first episodes count.
         """
         stagger = getattr(self.env, "stagger", None)
         if stagger is not None:
-            stagger()
+            stagger(self.cfg.num_deterministic)
 
     def _check_finite(self, batch: TensorDictBase) -> None:
         for key in FINITE_KEYS:

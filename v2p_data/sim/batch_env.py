@@ -213,13 +213,14 @@ class BatchEnv:
         self._rng = rng_for(seed, "worlds")
         self.randomizer.forget_prepared()
 
-    def stagger(self) -> None:
-        """Put every world at a random moment of its episode, so that they do not all end at once.
+    def stagger(self, first: int = 0) -> None:
+        """Put the worlds from `first` on at random moments of their episodes, so that they do not all end at once.
 
         Those that began from a bank are in the middle of theirs already.
         """
         steps = self._rng.integers(0, self.horizon, self.num_envs)
-        self._steps[:] = np.where(self._from_bank, self._steps, steps)
+        stays = self._from_bank | (np.arange(self.num_envs) < first)
+        self._steps[:] = np.where(stays, self._steps, steps)
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Start new episodes in the worlds `ids`."""

@@ -58,9 +58,9 @@ class TorchRLEnv(EnvBase):
         """Control steps per episode."""
         return self.worlds.horizon
 
-    def stagger(self) -> None:
+    def stagger(self, first: int = 0) -> None:
         """See `BatchEnv.stagger`; training calls it once, after the first reset."""
-        self.worlds.stagger()
+        self.worlds.stagger(first)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         del kwargs

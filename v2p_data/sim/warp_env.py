@@ -132,10 +132,10 @@ class WarpBatchEnv:
         self.randomizer.forget_prepared()
         self._noise = torch_rng_for(seed, "action-noise", device=str(self.device))
 
-    def stagger(self) -> None:
-        """Put every world at a random moment of its episode, so that they do not all end at once."""
+    def stagger(self, first: int = 0) -> None:
+        """Put the worlds from `first` on at random moments of their episodes, so that they do not all end at once."""
         steps = self._rng.integers(0, self.horizon, self.num_envs)
-        self._steps.copy_(torch.from_numpy(steps))
+        self._steps[first:].copy_(torch.from_numpy(steps[first:]))
 
     def reset(self, ids: Int[torch.Tensor, "n"]) -> None:
         """Start new episodes in the worlds `ids`."""
