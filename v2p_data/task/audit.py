@@ -113,11 +113,13 @@ def build_probes(scene: Scene, rng: np.random.Generator) -> AuditProbes:
         "tracked": lambda: _hands(scene, _tracked(scene)),
         "path": lambda: _hands(scene, path),
         "reset": lambda: [_resets(scene, rng)],
-        "touched": lambda: [_at_pose(scene, _tracked(scene)[:1], hand) for hand in HANDS],
+        "touched": lambda: [
+            _at_pose(scene, _tracked(scene)[:1], hand) for hand in hands_of(scene)
+        ],
         "flung": lambda: [_flung(scene, path[AT_END : AT_END + 1])],
         "in_the_air": lambda: [_in_the_air(scene)],
         "off_the_table": lambda: [_off_the_table(scene)],
-        "reachable": lambda: [_anywhere(scene, rng, hand) for hand in HANDS],
+        "reachable": lambda: [_anywhere(scene, rng, hand) for hand in hands_of(scene)],
     }
     batches: list[States] = []
     rows: dict[str, list[int]] = {}
@@ -183,8 +185,13 @@ def _path(scene: Scene) -> tuple[list[Poses], tuple[float, ...]]:
     return out, tuple(float(t * length) for t in np.linspace(0, PATH_END, PATH_ROWS))
 
 
+def hands_of(scene: Scene) -> tuple[str, ...]:
+    """Return what the robot may be doing at a pose of the video: where there is a tool, also holding that."""
+    return (*HANDS, "by tool") if any(o.role == "tool" for o in scene.others) else HANDS
+
+
 def _hands(scene: Scene, moments: list[Poses]) -> list[Probe]:
-    return [_at_pose(scene, moments, hand) for hand in HANDS]
+    return [_at_pose(scene, moments, hand) for hand in hands_of(scene)]
 
 
 def _at_pose(scene: Scene, moments: list[Poses], hand: str) -> Probe:
@@ -223,6 +230,20 @@ def _put_hand(probe: Probe, scene: Scene, hand: str) -> None:
         probe.gripper_width = np.full(n, min(min(obj.size_m), GRIPPER_OPENING_M))
         o.grasped = np.ones(n)
         o.touched = np.ones(n)
+    elif hand == "by tool":
+        tool = next(t for t in scene.others if t.role == "tool")
+        t = probe.objects[tool.name]
+        way = (o.start_pos - t.start_pos)[:, :2]
+        way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6)
+        behind = (max(obj.size_m[:2]) + max(tool.size_m[:2])) / 2
+        t.pos = t.start_pos.copy()
+        t.pos[:, :2] = o.pos[:, :2] - way * behind
+        t.grasped = np.ones(n)
+        t.touched = np.ones(n)
+        probe.eef_pos = t.pos.copy()
+        probe.gripper_width = np.full(n, min(min(tool.size_m), GRIPPER_OPENING_M))
+        o.grasped = np.zeros(n)
+        o.touched = np.zeros(n)
     elif hand == "touching":
         probe.eef_pos = grip
         probe.gripper_width = np.zeros(n)
@@ -287,7 +308,7 @@ def _anywhere(scene: Scene, rng: np.random.Generator, hand: str) -> Probe:
     first = _tracked(scene)[0]
     low, high = np.array(WORKSPACE_M)
     moments: list[Poses] = []
-    for k in range(REACH_ROWS // len(HANDS)):
+    for k in range(REACH_ROWS // len(hands_of(scene))):
         quat = first[main.name][3:]
         if k % 4 == 0:
             axis = rng.normal(size=3) * [1, 1, 0]
@@ -341,9 +362,10 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
     success = np.array(result.probe_success, bool)
     reward = np.array(result.probe_reward)
     answers = {name: success[rows] for name, rows in probes.rows.items()}
+    num_hands = len(hands_of(scene))
 
     def any_hand(name: str) -> Any:
-        return np.any(answers[name].reshape(len(HANDS), -1), axis=0)
+        return np.any(answers[name].reshape(num_hands, -1), axis=0)
 
     path = any_hand("path")
     begins = int(np.argmax(path)) if path.any() else None
@@ -354,7 +376,7 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
     if scene.kind == "lift_up":  # true at the highest pose will do: the clip may set it down again
         last = last or bool(tracked.any())
 
-    rises = _reward_rises(probes, reward)
+    rises = _reward_rises(probes, reward, num_hands)
     turns = scene.kind == "tip_over"
     threshold_good = threshold is not None and (
         turns or SMALLEST_M <= threshold <= max(1.3 * length, 0.15)
@@ -437,7 +459,7 @@ def _true_from(answers: np.ndarray) -> int | None:
     return first if first < len(answers) else None
 
 
-def _reward_rises(probes: AuditProbes, reward: np.ndarray) -> float:
+def _reward_rises(probes: AuditProbes, reward: np.ndarray, num_hands: int) -> float:
     """Return by how much the best reward over the hands is higher at the video's end than at its start."""
-    path = reward[probes.rows["path"]].reshape(len(HANDS), -1).max(0)
+    path = reward[probes.rows["path"]].reshape(num_hands, -1).max(0)
     return float(path[AT_END] - path[0])

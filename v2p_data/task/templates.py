@@ -158,6 +158,8 @@ class Draft:
     """Float expression: 1 while the gripper has the object."""
     pays_contact: bool = False
     """Whether contact is worth something by itself: where the object must be grasped."""
+    turn: bool = True
+    """Whether grasping pays for turning the gripper to the manipulated object's narrow side."""
     progress: str = "obj_pos[:, 2] * 0"
     """Float expression, 0 at the start and 1 when done."""
     remaining: str = "obj_pos[:, 2] * 0"
@@ -571,6 +573,48 @@ def _throw_into(m: Measured, v: Variant) -> Draft:
     return draft
 
 
+def _push_with(m: Measured, v: Variant) -> Draft:
+    """The tool is grasped and pushes; the gripper never touches the object."""
+    way = round(float(np.clip(0.6 * np.hypot(m.move_m[0], m.move_m[1]), 0.07, 0.12)), 3)
+    way = round(way * v.strictness, 3)
+    return Draft(
+        thoughts=[
+            "Grasp the tool.",
+            "Bring its end behind the object, on the side where the tool lay.",
+            "Push the object with it, away from where the tool lay.",
+        ],
+        setup=[
+            "goal_direction = obj_start - ref_start",
+            "goal_direction[:, 2] = 0",
+            "goal_direction = torch.nn.functional.normalize(goal_direction, dim=-1)",
+            "moved = ((obj_pos - obj_start) * goal_direction).sum(dim=-1)",
+            "between = obj_pos - ref_pos",
+            "between[:, 2] = 0",
+            "line = torch.nn.functional.normalize(between, dim=-1)",
+            "gap = torch.norm(between, dim=-1) - obj_half(obj_quat, obj_size, line) - ref_half(ref_quat, ref_size, line)",
+        ],
+        success=[
+            ("is_there", f"moved > {way}"),
+            ("is_by_tool", "(ref_touched > 0.5) & (obj_touched < 0.5) & (gap < 0.1)"),
+            ("is_down", _LOW),
+            ("is_upright", _STILL_UPRIGHT),
+            ("is_still", _still(v)),
+        ],
+        reward_setup=["tool_low = 1 - torch.tanh(10.0 * (ref_pos[:, 2] - ref_start[:, 2]).abs())"],
+        target="ref_pos",
+        contact="ref_grasped * near",
+        pays_contact=True,
+        turn=False,
+        progress=f"(moved / {way + 0.02:.3f}).clamp(-1.0, 1.0) * contact * {_LOW}.float() * {_STANDING}",
+        remaining=f"({way} - moved).clamp(min=0.0)",
+        goal=_shifted("obj_start", z=0.0) + f" + goal_direction * {way + 0.02:.3f}",
+        extras=[
+            ("tool_near", "0.2 * contact * tool_low * (1 - torch.tanh(5.0 * gap.clamp(min=0.0)))"),
+            ("hands_off", "-0.3 * obj_touched"),
+        ],
+    )
+
+
 def _generic(m: Measured, v: Variant) -> Draft:
     """The object must come as far from its start as it did in the video."""
     move = np.array(m.move_m)
@@ -623,7 +667,7 @@ _RECIPES: dict[str, Callable[[Measured, Variant], Draft]] = {
     "cover": _cover,
     "uncover": _uncover,
     "throw_into": _throw_into,
-    "push_with": _generic,
+    "push_with": _push_with,
     "generic": _generic,
 }
 _NEEDS_REFERENCE = (
@@ -634,6 +678,7 @@ _NEEDS_REFERENCE = (
     _cover,
     _uncover,
     _throw_into,
+    _push_with,
 )
 
 
@@ -798,14 +843,14 @@ def _state_lines(m: Measured) -> list[str]:
             f'{short}_quat = states["{n}_quat"]',
             f'{short}_size = states["{n}_size"]',
             f'{short}_start = states["{n}_start_pos"]',
+            f'{short}_grasped = states["{n}_grasped"]',
+            f'{short}_touched = states["{n}_touched"]',
         ]
     n = m.obj.name
     return [
         *lines,
         f'obj_start_quat = states["{n}_start_quat"]',
         f'obj_vel = states["{n}_vel_linear"]',
-        f'obj_grasped = states["{n}_grasped"]',
-        f'obj_touched = states["{n}_touched"]',
         "half_height = obj_start[:, 2] - table_height",
         "reach_limit = 0.05 + half_height",
     ]
@@ -891,7 +936,8 @@ def _components(v: Variant, d: Draft) -> list[tuple[str, str]]:
         progress = f"{v.progress} * progress * (0.3 + 0.7 * reach)"
     parts.append(("reach", reach))
     if v.contact and d.pays_contact:
-        parts += [_TURN, ("contact", f"{v.contact} * contact")]
+        parts += [_TURN] if d.turn else []
+        parts.append(("contact", f"{v.contact} * contact"))
     parts.append(("progress", progress))
     if v.speed:
         parts.append(
