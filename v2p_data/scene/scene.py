@@ -20,6 +20,9 @@ Role = Literal["manipulated", "reference", "tool", "container", "cover"]
 Shape = Literal["box", "cylinder", "sphere", "mesh"]
 SCENE_FILE = "scene.json"
 SCHEMA = 1
+FLOOR_MIN_M = 0.006
+"""Through thinner floors hard-pressed objects were pushed into the table."""
+FLOOR_MAX_M = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +63,11 @@ class SceneObject:
     @property
     def last_pose(self) -> Float[np.ndarray, "7"]:
         return np.asarray(self.poses_world[-1], float)
+
+
+def hollow_floor_m(height_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return how thick the floor of a hollow object is simulated, given its height [m]."""
+    return np.clip(0.2 * height_m, FLOOR_MIN_M, FLOOR_MAX_M)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.scene import Scene
-from v2p_data.sim.world import FLOOR_MAX_M, MESH_SCALES, WALL_MAX_M, ObjectModel, World, cover_of
+from v2p_data.scene.scene import FLOOR_MAX_M, Scene
+from v2p_data.sim.world import MESH_SCALES, WALL_MAX_M, ObjectModel, World, cover_of
 
 WORKSPACE_CENTRE_M = (0.5, 0.0)
 OBJECT_LOW_M = (0.37, -0.28)

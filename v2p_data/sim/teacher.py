@@ -299,11 +299,9 @@ def _push_with(m: Moment, k: int) -> Actions:
     forward = m.tool.copy()
     forward[:, :2] += d * 0.05 * pace - across * 0.8
     forward[:, 2] += low - tool.pos[:, 2]
-    done = m.tool.copy()
-    done[:, :2] -= d * 0.03
     pushes = is_ready & is_low
     to = np.where((pushes & (remaining > 0))[:, None], forward, approach)
-    to = np.where((remaining <= 0)[:, None], done, to)
+    to = np.where((remaining <= 0)[:, None], m.target, to)
     return choose(m.holds(tool), m.go(to, CLOSE, turn), grasp(m, tool))
 
 

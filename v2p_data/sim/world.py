@@ -19,7 +19,7 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.scene.scene import Scene, SceneObject, hollow_floor_m
 from v2p_data.sim.arms import BUILT_IN, Robot, RobotConfig, read_arm, sensor_ends
 from v2p_data.sim.robot import (
     BASE_SITE_XML,
@@ -38,7 +38,6 @@ from v2p_data.sim.suitability import check_grasp, check_names, checked_size
 MESH_SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
 """Ready-made sizes of each mesh; a world picks one, because MuJoCo cannot scale a mesh per world."""
 ROUND_WALLS = 10
-FLOOR_MAX_M = 0.02
 WALL_MAX_M = 0.012
 RESERVED_NAMES = (
     "table",
@@ -181,7 +180,7 @@ def hollow_parts(
     at least 6 mm thick; through thin floors hard-pressed objects were pushed into the table.
     """
     half = np.asarray(size_m) / 2
-    floor = float(np.clip(0.2 * size_m[2], 0.006, FLOOR_MAX_M))
+    floor = float(hollow_floor_m(np.array(size_m[2])))
     wall = float(np.clip(0.08 * min(size_m[0], size_m[1]), 0.006, WALL_MAX_M))
     flip = -1.0 if upside_down else 1.0
     wall_half_height = half[2] - floor / 2

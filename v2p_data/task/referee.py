@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError, did_you_mean
-from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.scene.scene import Scene, SceneObject, hollow_floor_m
 
 LAST = 5
 """Samples at the end (0.25 s) over which a final state must hold."""
@@ -107,6 +107,10 @@ class Case:
                 f"task '{self.scene.kind}' of '{self.scene.title}' needs a second object, and the scene has one"
             )
         return self.scene.others[0]
+
+    @property
+    def container_is_hollow(self) -> bool:
+        return self._other.hollow
 
     def reach(
         self, track: ObjectTrack, direction: Float[np.ndarray, "env 3"], time: int
@@ -231,7 +235,12 @@ def _dropped_in_front(case: Case) -> Verdict:
 
 def _inside(case: Case) -> Verdict:
     rim = case.other.pos[-1, :, 2] + case.other.size_m[:, 2] / 2
-    return case.within() & (case.lowest(case.thing) < rim) & (case.other.moved < 2 * STAYS_M)
+    low = case.lowest(case.thing)
+    # Pressed through the container's floor is not inside. A mesh reaches less deep than its box.
+    floor = case.other.pos[-1, :, 2] - case.other.size_m[:, 2] / 2
+    if case.scene.manipulated.shape != "mesh" and case.container_is_hollow:
+        floor = floor + hollow_floor_m(case.other.size_m[:, 2])
+    return case.within() & (low < rim) & (low > floor - BELOW_M) & (case.other.moved < 2 * STAYS_M)
 
 
 def _inserted(case: Case) -> Verdict:
