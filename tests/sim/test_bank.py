@@ -252,10 +252,11 @@ def test_a_bank_survives_the_disk(make_env: Callable[..., BatchEnv], tmp_path):
 def test_the_curriculum_opens_what_is_near_success_first():
     starts = Starts(fake_bank(1000), BankConfig(reverse=True, share=1.0, num_plain=0))
 
-    _, rows = starts.draw(np.arange(5000), np.random.default_rng(0))
+    rows = starts.draw(np.arange(5000), np.random.default_rng(0))
 
     assert starts.level == 0.0
-    assert rows["number"].max() == 149  # 15 % of the bank
+    assert rows.min() == 0
+    assert rows.max() == 149  # 15 % of the bank
 
 
 def test_the_curriculum_goes_back_as_success_rises_and_stays_at_the_end():
@@ -264,7 +265,7 @@ def test_the_curriculum_goes_back_as_success_rises_and_stays_at_the_end():
     seen = [(starts.level, starts.num_open)]
 
     for _ in range(6):
-        starts.note(np.array([True] * 6 + [False] * 4))
+        starts.note(np.full(10, starts.num_open - 1), np.array([True] * 6 + [False] * 4))
         seen.append((starts.level, starts.num_open))
 
     levels = [level for level, _ in seen]
@@ -276,7 +277,19 @@ def test_the_curriculum_waits_while_success_is_rare():
     starts = Starts(fake_bank(100), BankConfig(reverse=True, window_episodes=10))
 
     for _ in range(50):
-        starts.note(np.array([True, False]))
+        starts.note(np.array([31, 31]), np.array([True, False]))
+
+    assert starts.level == 0.0
+
+
+def test_success_from_late_moments_opens_nothing():
+    starts = Starts(fake_bank(100), BankConfig(reverse=True, window_episodes=10, first_part=0.6))
+
+    for _ in range(50):
+        starts.note(
+            np.arange(40), np.full(40, True)
+        )  # 60 are open, the earliest third is 40 to 59
+        starts.note(np.arange(40, 60), np.full(20, False))
 
     assert starts.level == 0.0
 
@@ -286,7 +299,7 @@ def test_only_finished_episodes_from_the_bank_count_for_the_curriculum(
 ):
     env = make_env(num_envs=20)
     bank = record_bank(env, lifting(env))
-    cfg = BankConfig(share=1.0, num_plain=10, reverse=True, window_episodes=10, raise_by=0.5)
+    cfg = BankConfig(share=1.0, num_plain=10, reverse=True, window_episodes=2, raise_by=0.5)
     starts = use_bank(env, bank, cfg)
     env.reset(np.arange(20))
     env.reset(np.arange(20))  # given up at once: no outcome

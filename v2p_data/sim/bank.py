@@ -3,7 +3,7 @@
 A task that is rarely finished from its beginning is finished sooner from a moment at which somebody - a teacher, or
 an expert of the same task - had done most of it. A bank holds such moments, each the whole state of one world, and
 how many steps later success came. In reverse order (Florensa et al. 2017) the moments just before success come
-first and earlier ones follow as the learner masters them. The first worlds always start plainly, so that what PPO
+first and earlier ones follow as the learner masters the earliest of those that are open. The first worlds always start plainly, so that what PPO
 measures there stays honest; evaluating and recording use no bank.
 """
 
@@ -26,7 +26,10 @@ LIFTED_M = 0.03
 """An object this far above its start is lifted."""
 MIN_OPEN_ROWS = 32
 """So many moments are drawn from at least, however early it is in the curriculum."""
+EARLIEST = 1 / 3
+"""So much of what is open decides whether more is opened."""
 UNKNOWN = -1
+PLAIN = -1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +45,11 @@ class BankConfig:
     first_part: float = 0.15
     """Of the bank that is open at level 0."""
     raise_at: float = 0.6
-    """Success from the bank at which earlier moments are opened."""
+    """Success from the earliest open moments at which still earlier ones are opened."""
     raise_by: float = 0.1
     window_episodes: int = 64
-    """Over which that success is taken."""
+    """Begun at the earliest third of the open moments, over which that success is taken. The later ones would hide
+    that the learner comes no further: with all counted, everything was open while plain episodes never succeeded."""
 
     def __post_init__(self) -> None:
         for name in ("share", "first_part", "raise_at", "raise_by"):
@@ -73,6 +77,10 @@ class Bank:
     def is_solved(self) -> bool:
         """Whether success followed; otherwise the moments are merely the furthest that were reached."""
         return len(self) > 0 and bool((self.steps_left != UNKNOWN).all())
+
+    def take(self, index: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
+        """Return some moments, for `BatchEnv.restore`."""
+        return {name: rows[index] for name, rows in self.rows.items()}
 
     def save(self, path: Path) -> None:
         """Write it as `.npz`."""
@@ -193,20 +201,20 @@ class Starts:
         part = self.cfg.first_part + (1 - self.cfg.first_part) * self.level
         return min(len(self.bank), max(MIN_OPEN_ROWS, round(part * len(self.bank))))
 
-    def draw(
-        self, ids: Int[np.ndarray, "n"], rng: np.random.Generator
-    ) -> tuple[Bool[np.ndarray, "n"], dict[str, np.ndarray]]:
-        """Return which of the worlds start from the bank, and the rows they get."""
+    def draw(self, ids: Int[np.ndarray, "n"], rng: np.random.Generator) -> Int[np.ndarray, "n"]:
+        """Return the bank's row that each of the worlds starts from; -1 for a plain start."""
         is_banked = (rng.random(len(ids)) < self.cfg.share) & (ids >= self.cfg.num_plain)
-        drawn = rng.integers(0, self.num_open, int(is_banked.sum()))
-        return is_banked, {name: rows[drawn] for name, rows in self.bank.rows.items()}
+        return np.where(is_banked, rng.integers(0, self.num_open, len(ids)), PLAIN)
 
-    def note(self, succeeded: Bool[np.ndarray, "n"]) -> None:
-        """Take in how episodes that began from the bank ended."""
-        self._outcomes += succeeded.tolist()
+    def note(self, rows: Int[np.ndarray, "n"], succeeded: Bool[np.ndarray, "n"]) -> None:
+        """Take in how episodes that began at some rows ended."""
+        if self.level >= 1:
+            return
+        is_early = rows >= (1 - EARLIEST) * self.num_open
+        self._outcomes += succeeded[is_early].tolist()
         del self._outcomes[: -self.cfg.window_episodes]
         is_full = len(self._outcomes) == self.cfg.window_episodes
-        if self.level < 1 and is_full and np.mean(self._outcomes) >= self.cfg.raise_at:
+        if is_full and np.mean(self._outcomes) >= self.cfg.raise_at:
             self.level = min(1.0, self.level + self.cfg.raise_by)
             self._outcomes.clear()
             logger.info("curriculum: level %.2f, %d moments open", self.level, self.num_open)

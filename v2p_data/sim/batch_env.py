@@ -219,7 +219,7 @@ class BatchEnv:
         Those that began from a bank are in the middle of theirs already.
         """
         steps = self._rng.integers(0, self.horizon, self.num_envs)
-        stays = self._from_bank | (np.arange(self.num_envs) < first)
+        stays = (self._bank_row >= 0) | (np.arange(self.num_envs) < first)
         self._steps[:] = np.where(stays, self._steps, steps)
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
@@ -278,14 +278,14 @@ class BatchEnv:
         """Start some of the worlds from the bank, if there is one, and return the others."""
         if self.starts is None:
             return ids
-        was_banked = self._from_bank[ids] & (
-            (self._steps[ids] >= self.horizon) | self._broken[ids]
-        )
-        self.starts.note(self._held[ids[was_banked]] >= HELD_STEPS)
-        is_banked, rows = self.starts.draw(ids, self._rng)
+        row = self._bank_row[ids]
+        is_over = (row >= 0) & ((self._steps[ids] >= self.horizon) | self._broken[ids])
+        self.starts.note(row[is_over], self._held[ids[is_over]] >= HELD_STEPS)
+        row = self.starts.draw(ids, self._rng)
+        is_banked = row >= 0
         if is_banked.any():
-            self.restore(ids[is_banked], rows)
-        self._from_bank[ids] = is_banked
+            self.restore(ids[is_banked], self.starts.bank.take(row[is_banked]))
+        self._bank_row[ids] = row
         return ids[~is_banked]
 
     def _per_world(self) -> dict[str, np.ndarray]:
@@ -436,7 +436,7 @@ class BatchEnv:
         self._held = np.zeros(n, np.int64)
         self._last_action = np.zeros((ACT_DIM, n)).T
         self._broken = np.zeros(n, bool)
-        self._from_bank = np.zeros(n, bool)
+        self._bank_row = np.full(n, -1)
         self._tool = self._tool_of(slice(None))
 
     def _load_task(self, task: type[Task] | None) -> Task:
@@ -566,7 +566,7 @@ _ENV_STATE = (
     "_held",
     "_last_action",
     "_broken",
-    "_from_bank",
+    "_bank_row",
 )
 _BAD_STATE_WARNINGS = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADCTRL) + 1
