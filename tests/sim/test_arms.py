@@ -250,6 +250,19 @@ def test_the_gripper_reports_its_own_opening(six: RobotConfig, env_with: Callabl
     assert env.robot_state()[:, 6] == pytest.approx(1.0)
 
 
+def test_what_is_wedged_between_this_grippers_open_fingers_is_not_grasped(
+    six: RobotConfig, env_with: Callable[..., BatchEnv]
+):
+    env = env_with(six, num_envs=3)
+    opening = np.array([0.08, 0.0794, 0.0786])  # it opens by 80 mm; the built-in one by 85 mm
+    env._qpos[:, env.world.robot.fingers] = opening[:, None] / 2
+    env._touches[:] = 1.0
+
+    env._show(np.arange(3))
+
+    assert env.states()["cube_grasped"].tolist() == [0.0, 0.0, 1.0]
+
+
 def test_only_wrist_and_gripper_collide_and_nothing_of_the_files_own_drives(
     six: RobotConfig, world_of: Callable[..., World]
 ):

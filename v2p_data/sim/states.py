@@ -46,8 +46,8 @@ _OBJECT_COLUMNS = {
 }
 
 
-HOLDS_BELOW_M = 0.084
-"""Both pads also touch what is wedged between fully open fingers; without this bound that pays as a grasp."""
+NEARLY_OPEN_M = 0.001
+"""Both pads also touch what is wedged between fully open fingers; without this margin that pays as a grasp."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +81,7 @@ class StateBlock:
     def __init__(self, world: World, num_envs: int) -> None:
         self._names = [o.name for o in world.objects]
         self._is_round = [o.is_round or o.kind == "sphere" for o in world.objects]
+        self._holds_below_m = 2 * world.robot.finger_travel_m - NEARLY_OPEN_M
         width = NUM_ROBOT_COLUMNS + NUM_OBJECT_COLUMNS * len(self._names)
         self._columns = np.zeros((width, num_envs), np.float32)
         self._base = np.zeros((BASE_OBSERVATION_DIM, num_envs), np.float32)
@@ -96,7 +97,7 @@ class StateBlock:
         robot = columns[:NUM_ROBOT_COLUMNS]
         objects = columns[NUM_ROBOT_COLUMNS:].reshape(len(self._names), NUM_OBJECT_COLUMNS, -1)
         with np.errstate(over="ignore", invalid="ignore"):  # of worlds that broke down
-            _fill(robot, objects, base, seen, self._is_round)
+            _fill(robot, objects, base, seen, self._is_round, self._holds_below_m)
         if isinstance(rows, slice):
             self._rows.copy_(torch.from_numpy(columns.T))
         else:
@@ -124,6 +125,7 @@ def _fill(
     base: Float[np.ndarray, "90 env"],
     seen: Observed,
     is_round: list[bool],
+    holds_below_m: float,
 ) -> None:
     """Write all numbers of some worlds."""
     tool = seen.tool
@@ -147,7 +149,7 @@ def _fill(
     objects[:, 13:16] = seen.object_size.transpose(1, 2, 0)
     objects[:, 16:23] = seen.start_pose.transpose(1, 2, 0)
     objects[:, 23] = rotation[:, 2, 2]
-    objects[:, 24] = (touching > 1.5) & (opening < HOLDS_BELOW_M)
+    objects[:, 24] = (touching > 1.5) & (opening < holds_below_m)
     objects[:, 25] = touching > 0.5
     _fill_base(base, robot, objects[:OBJECT_SLOTS], rotation[:OBJECT_SLOTS], seen)
     base[9:11] = fingers

@@ -16,7 +16,7 @@ from v2p_data.sim.robot import FINGER_TRAVEL_M, TARGET_HIGH_M, TARGET_LOW_M
 from v2p_data.sim.states import (
     _OBJECT_COLUMNS,
     _ROBOT_COLUMNS,
-    HOLDS_BELOW_M,
+    NEARLY_OPEN_M,
     OBJECT_SLOTS,
     OBSERVATION_LIMIT,
 )
@@ -80,7 +80,7 @@ def object_block(seen: SeenTensors) -> Float[torch.Tensor, "env object 26"]:
     rotation = matrices(seen.object_qpos[..., 3:])
     spin = (rotation @ seen.object_qvel[..., 3:, None])[..., 0]
     touching = seen.touches.sum(2, keepdim=True)
-    has_closed = seen.fingers.sum(1)[:, None, None] < HOLDS_BELOW_M
+    has_closed = seen.fingers.sum(1)[:, None, None] < 2 * FINGER_TRAVEL_M - NEARLY_OPEN_M
     return torch.cat(
         [
             seen.object_qpos,
