@@ -339,6 +339,8 @@ class WarpPhysics:
                 work()
                 with wp.ScopedCapture() as capture:
                     work()
+            if capture.graph is None:
+                raise RuntimeError(f"Warp captured no graph of '{name}'")
             self._graphs[name] = capture.graph
 
     def _run(self, name: str, work) -> None:  # noqa: ANN001
