@@ -19,7 +19,7 @@ from v2p_data.sim.randomize import (
     RandomizationConfig,
     Randomizer,
 )
-from v2p_data.sim.robot import FINE, FINGER_TRAVEL_M, QUAT_DOWN
+from v2p_data.sim.robot import FINE, FINGER_TRAVEL_M, QUAT_DOWN, ServoConfig
 from v2p_data.sim.world import build_world
 
 NUM_ENVS = 48
@@ -263,3 +263,57 @@ def test_things_fall_equally_fast_whatever_their_drawn_mass(
     assert np.ptp(randomizer.mass_kg) > 0.05
     fallen = qvel[:, obj.dof_adr : obj.dof_adr + 3]
     np.testing.assert_allclose(fallen, np.tile([0, 0, -9.81 * 0.02], (NUM_ENVS, 1)), atol=1e-9)
+
+
+def tool_y(randomizer: Randomizer, batch: Batch) -> np.ndarray:
+    robot = randomizer.world.robot
+    qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+    return robot.tool_state(qpos[:, robot.arm], qvel[:, robot.arm_dofs]).pos[:, 1].copy()
+
+
+def test_the_tool_lags_by_damping_over_stiffness(
+    make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
+):
+    cfg = RandomizationConfig(delay_s=(0.0, 0.0), servo_gain_scale=(0.8, 1.2))
+    randomizer, batch, _ = worlds_of(make_scene(make_object("cube")), cfg)
+    ctrl, speed = batch.bind("ctrl"), 0.1
+
+    for _ in range(120):
+        ctrl[:, 1] += speed * FINE.timestep_s
+        batch.step(nstep=1)
+
+    stiffness, damping = randomizer.servo_gain.T
+    expected_s = damping * ServoConfig().position_kv / (stiffness * ServoConfig().position_kp)
+    assert np.ptp(expected_s) > 0.015
+    lag_s = (ctrl[:, 1] - tool_y(randomizer, batch)) / speed
+    # The joints' own damping, 1 N m s, adds 1 to 2 ms.
+    np.testing.assert_allclose(lag_s - 0.00125, expected_s, atol=0.00125)
+    assert (lag_s > expected_s).all()
+
+
+def test_a_pushed_tool_gives_way_by_force_over_stiffness(
+    make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
+):
+    cfg = RandomizationConfig(servo_gain_scale=(0.8, 1.2))
+    randomizer, batch, _ = worlds_of(make_scene(make_object("cube")), cfg)
+    before = tool_y(randomizer, batch)
+    batch.bind("xfrc_applied").reshape(NUM_ENVS, -1, 6)[
+        :, randomizer.world.model.body("hand").id, 1
+    ] = 30.0
+
+    batch.step(nstep=150)
+
+    moved = tool_y(randomizer, batch) - before
+    expected = 30.0 / (ServoConfig().position_kp * randomizer.servo_gain[:, 0])
+    np.testing.assert_allclose(moved, expected, rtol=0.03)
+
+
+def test_without_randomisation_the_servos_have_their_own_gains(
+    make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
+):
+    randomizer, batch, _ = worlds_of(make_scene(make_object("cube")), randomize.none())
+
+    model = randomizer.world.model
+    for name in ("actuator_gainprm", "actuator_biasprm"):
+        assert (batch.expand(name) == getattr(model, name)).all()
+    assert randomizer.drawn(0)["servo_stiffness_scale"] == 1.0

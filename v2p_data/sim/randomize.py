@@ -1,4 +1,4 @@
-"""What differs from world to world and from episode to episode: sizes, masses, friction, delay, poses.
+"""What differs from world to world and from episode to episode: sizes, masses, friction, servo gains, delay, poses.
 
 Every value drawn is kept per world (`Randomizer.drawn`), so that an episode can say what it was recorded
 under. Values are written into the batch's per-simulation model fields; nothing is recompiled.
@@ -53,6 +53,8 @@ class RandomizationConfig:
     """Standard deviation added to actions in [-1, 1] before they are carried out."""
     delay_s: tuple[float, float] = (0.010, 0.020)
     """From command to servo, constant during an episode."""
+    servo_gain_scale: tuple[float, float] = (0.9, 1.1)
+    """Of stiffness and of damping, drawn one by one for all servos; the tool lags by damping / stiffness."""
 
     def __post_init__(self) -> None:
         for low, high in (
@@ -60,6 +62,7 @@ class RandomizationConfig:
             self.mass_scale,
             self.friction_scale,
             self.layout_distance_scale,
+            self.servo_gain_scale,
         ):
             if not 0 < low <= high:
                 raise ValueError(f"need 0 < lowest <= highest, got {low} and {high}")
@@ -92,6 +95,7 @@ def none() -> RandomizationConfig:
         arm_yaw_rad=0.0,
         action_noise=0.0,
         delay_s=(0.0, 0.0),
+        servo_gain_scale=one,
     )
 
 
@@ -120,6 +124,7 @@ class Randomizer:
         size_m: full extents, `(env, object, 3)`.
         mass_kg, friction: `(env, object)`.
         delay_s: `(env,)`.
+        servo_gain: factors of the servos' stiffness and damping, `(env, 2)`.
     """
 
     def __init__(
@@ -136,6 +141,7 @@ class Randomizer:
         self.mass_kg = np.tile(np.array([o.mass_kg for o in objects]), (n, 1))
         self.friction = np.tile(np.array([o.friction for o in objects]), (n, 1))
         self.delay_s = np.zeros(n)
+        self.servo_gain = np.ones((n, 2))
         self._height_above_table = np.zeros((n, len(objects)))
         self._radius = np.zeros((n, len(objects)))
         self._fields = {
@@ -156,6 +162,8 @@ class Randomizer:
                 "dof_invweight0",
                 "dof_M0",
                 "actuator_delay",
+                "actuator_gainprm",
+                "actuator_biasprm",
             ]
         }
         self._base = {name: array[0].copy() for name, array in self._fields.items()}
@@ -170,7 +178,7 @@ class Randomizer:
         self._num_used = np.array([PREPARED])
 
     def draw(self, ids: Int[np.ndarray, "n"], rng: np.random.Generator) -> None:
-        """Draw sizes, masses, friction and delay for the worlds `ids`."""
+        """Draw sizes, masses, friction, delay and servo gains for the worlds `ids`."""
         n = len(ids)
         if n > PREPARED:
             self._draw_into(self._live, ids, rng)
@@ -207,6 +215,14 @@ class Randomizer:
             self._write(into, rows, k, obj, scale, mass, friction, mesh_idx)
         into["delay_s"][rows] = rng.uniform(*cfg.delay_s, n)
         into["actuator_delay"][rows] = into["delay_s"][rows, None]
+        gain = into["servo_gain"][rows] = rng.uniform(*cfg.servo_gain_scale, (n, 2))
+        # A servo's force is gain[0] * control + bias[1] * position + bias[2] * speed.
+        for name, first, factor in (
+            ("actuator_gainprm", 0, gain[:, :1]),
+            ("actuator_biasprm", 1, gain[:, :1]),
+            ("actuator_biasprm", 2, gain[:, 1:]),
+        ):
+            into[name][rows, :, first] = self._base[name][:, first] * factor
 
     def place(
         self, ids: Int[np.ndarray, "n"], rng: np.random.Generator
@@ -302,6 +318,7 @@ class Randomizer:
             "mass_kg": self.mass_kg,
             "friction": self.friction,
             "delay_s": self.delay_s,
+            "servo_gain": self.servo_gain,
             "height_above_table": self._height_above_table,
             "radius": self._radius,
         }
@@ -320,6 +337,8 @@ class Randomizer:
             "objects": objects,
             "action_delay_ms": round(float(self.delay_s[env]) * 1e3, 3),
             "action_noise": self.cfg.action_noise,
+            "servo_stiffness_scale": round(float(self.servo_gain[env, 0]), 4),
+            "servo_damping_scale": round(float(self.servo_gain[env, 1]), 4),
         }
 
     def _poses(self, ids: np.ndarray, xy: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -10,7 +10,7 @@ What our model uses, and what becomes of it here:
 | integrator `discrete`, elliptic cones, impratio, joint equality, tendon | yes | as it is |
 | position servos with `refsite` | yes | as they are |
 | contact sensors `reduce="netforce"`, `data="found"` | yes | as they are |
-| sizes, masses, friction, meshes (`geom_dataid`) per world | yes | as they are |
+| sizes, masses, friction, meshes (`geom_dataid`), servo gains per world | yes | as they are |
 | `orientation` servo | no (`mjTRN_SO3`) | three rotational position servos, see `_control` |
 | delayed controls | yes, in float32 time | the command of the control step before, until the delay is over: the same time steps |
 | reset of a world that diverges | no | `WarpBatchEnv` ends it |
@@ -80,8 +80,12 @@ PER_WORLD_FIELDS = (
     "body_subtreemass",
     "body_invweight0",
     "dof_invweight0",
+    "actuator_gainprm",
+    "actuator_biasprm",
 )
 """The fields of `randomize.Randomizer` that MuJoCo Warp's collisions and dynamics read."""
+SERVOS = ("servo_x", "servo_y", "servo_z", "servo_gripper", *["servo_rotation"] * 3)
+"""Whose gains each servo of the model here has."""
 DIVERGED = 1e10
 """Positions and speeds beyond this count as broken (MuJoCo's `mjMAXVAL`)."""
 
@@ -106,9 +110,9 @@ def _control(
     substep: int,
     hand: int,
     turn: int,
-    kp: float,
-    kv: float,
     limit: float,
+    gain: wp.array3d(dtype=float),
+    bias: wp.array3d(dtype=float),
     xquat: wp.array2d(dtype=wp.quat),
     length: wp.array2d(dtype=float),
     velocity: wp.array2d(dtype=float),
@@ -132,6 +136,8 @@ def _control(
             wanted[k - 3] = value
         else:
             ctrl[world, 3] = value
+    kp = gain[world, turn, 0]
+    kv = -bias[world, turn, 2]
     raw = xquat[world, hand]
     error = _product(wanted, wp.vec4(raw[0], -raw[1], -raw[2], -raw[3]))
     if error[0] < 0.0:
@@ -195,6 +201,7 @@ class WarpPhysics:
         self._command_before = torch.zeros_like(self.command)
         self._first_substep = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in PER_WORLD_FIELDS}
+        self._servo_ids = np.array([world.model.actuator(name).id for name in SERVOS])
         self._reset_mask = wp.to_torch(self._to_reset)
         self._xpos, self._xmat = wp.to_torch(d.site_xpos), wp.to_torch(d.site_xmat)
         self._xquat, self._cvel = wp.to_torch(d.xquat), wp.to_torch(d.cvel)
@@ -237,7 +244,10 @@ class WarpPhysics:
     ) -> None:
         """Copy `rows` of the host's model fields into the worlds `ids`, which are the same."""
         for name, shared in self._fields.items():
-            values = torch.from_numpy(fields[name][rows]).to(self.device, shared.dtype)
+            values = fields[name][rows]
+            if name.startswith("actuator_"):
+                values = values[:, self._servo_ids]
+            values = torch.from_numpy(values).to(self.device, shared.dtype)
             shared[ids] = values.reshape(len(ids), *shared.shape[1:])
 
     @property
@@ -295,9 +305,9 @@ class WarpPhysics:
         constants = (
             self._hand,
             int(self.model.actuator("servo_turn_0").id),
-            float(original.actuator_gainprm[servo, 0]),
-            float(-original.actuator_biasprm[servo, 2]),
             float(original.actuator_forcerange[servo, 1]),
+            wp.from_torch(self._fields["actuator_gainprm"]),
+            wp.from_torch(self._fields["actuator_biasprm"]),
         )
         self._substep = 0
         before, now = wp.from_torch(self._command_before), wp.from_torch(self.command)
@@ -375,6 +385,6 @@ def _without_orientation_servo(world: World) -> mujoco.MjModel:
         turn.forcelimited, turn.forcerange = True, (-1.0, 1.0)  # overwritten in every time step
     model = spec.compile()
     names = [model.actuator(k).name for k in range(model.nu)]
-    if names[:5] != ["servo_x", "servo_y", "servo_z", "servo_gripper", "servo_turn_0"]:
+    if names != [*SERVOS[:4], "servo_turn_0", "servo_turn_1", "servo_turn_2"]:
         raise RuntimeError(f"unexpected order of servos: {names}")
     return model
