@@ -6,7 +6,8 @@
 
 Learners: `ours` (`policies/ppo/train.py` with its defaults, no teacher and no reset bank), Stable-Baselines3 with
 three published sets of settings, and the settings of TorchRL's own example; see `LEARNERS` for where they are from.
-Stable-Baselines3 with our settings is a control and does not count.
+Stable-Baselines3 with our settings is a control and does not count. `engine` is what the engine does by default:
+the best scripted program, imitated until the target.
 All of them act in the same `BatchEnv` with the same randomisation, seeds and reward; how many worlds is part of
 the settings. Seeds are the outer loop, so that learners take turns and a noise of the machine hits all of them.
 
@@ -45,15 +46,18 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from policies.ppo.evaluate import evaluate
+from policies.ppo.imitate import ImitationConfig, imitate
 from policies.ppo.policy import EXPERT_FILE, Expert
 from policies.ppo.train import LAST_FOLDER, PPOConfig, train_expert
 from v2p_data.seeds import seed_for, torch_rng_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.teacher import Teacher
 from v2p_data.sim.torchrl_env import TorchRLEnv
 from v2p_data.task.benchmark import load_benchmark
 
 Act = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
 OURS = "ours"
+ENGINE = "engine"
 ENDLESS = 10**9
 """Steps: what stops a learner is the target or the clock."""
 
@@ -66,6 +70,7 @@ class BenchConfig:
     """Prove that everything runs: one seed, a few seconds per learner."""
     learners: tuple[str, ...] = (
         "ours",
+        "engine",
         "sb3-many-worlds",
         "sb3-lift",
         "sb3-default",
@@ -109,6 +114,9 @@ class Settings:
 
 LEARNERS = {
     OURS: Settings(num_envs=512, source="policies/ppo/train.py, PPOConfig()"),
+    ENGINE: Settings(
+        num_envs=512, source="v2p_data/learning.py: program, then imitation", is_control=True
+    ),
     # Isaac Lab's settings for thousands of worlds are used with as many worlds as ours, since two cores saturate there.
     "sb3-many-worlds": Settings(
         num_envs=512,
@@ -316,6 +324,33 @@ def learn_with_ours(worlds: BatchEnv, settings: Settings, watch: Watch, seed: in
 
         with suppress(_OverError):
             train_expert(TorchRLEnv(worlds), cfg, Path(folder), seed=seed, on_progress=follow)
+
+
+def learn_with_engine(worlds: BatchEnv, settings: Settings, watch: Watch, seed: int) -> None:
+    """Find a program, imitate it; the policy is judged after every round. PPO would only go on from there."""
+    del settings
+    trials = BatchEnv(
+        worlds.bundle,
+        SimConfig(),
+        num_envs=64,
+        seed=seed_for(seed, "trials"),
+        num_threads=watch.cfg.threads,
+    )
+    teacher = Teacher(worlds)
+    teacher.choose(trials)
+    steps = len(teacher.trials) * trials.num_envs * worlds.horizon
+    cfg = replace(ImitationConfig(), rounds=1000, least_rounds=1, target_success=watch.cfg.target)
+
+    def judged(expert: Expert) -> float:
+        nonlocal steps
+        steps += cfg.round_steps * worlds.num_envs
+        watch.note(expert.act, steps)
+        if watch.is_over:
+            raise _OverError
+        return watch.moments[-1].success
+
+    with tempfile.TemporaryDirectory() as folder, suppress(_OverError):
+        imitate(TorchRLEnv(worlds), teacher.act, cfg, Path(folder), seed=seed, check=judged)
 
 
 # --- Stable-Baselines3 ---------------------------------------------------------------------------------------
@@ -538,7 +573,8 @@ def train(name: str, cfg: BenchConfig, judge: Judge, seed: int) -> Run:
         num_threads=cfg.threads,
     )
     torch.set_num_threads(cfg.threads)
-    learn = {OURS: learn_with_ours, "torchrl": learn_with_torchrl}.get(name, learn_with_sb3)
+    own = {OURS: learn_with_ours, ENGINE: learn_with_engine, "torchrl": learn_with_torchrl}
+    learn = own.get(name, learn_with_sb3)
     watch = Watch(judge, cfg)
     learn(worlds, settings, watch, seed_for(seed, "bench-ppo", "learner"))
     return Run(learner=name, seed=seed, moments=tuple(watch.moments), arrived=watch.has_arrived)
@@ -586,7 +622,9 @@ def spread(values: list[float], digits: int) -> str:
 
 
 def speed_over_best_peer(
-    runs: Sequence[Run], clock: Callable[[Moment], float] = lambda moment: moment.wall_s
+    runs: Sequence[Run],
+    clock: Callable[[Moment], float] = lambda moment: moment.wall_s,
+    ours: str = OURS,
 ) -> float:
     """Return the median time of the fastest peer over ours; NaN without a peer, or if nobody arrived."""
     times: dict[str, float] = {}
@@ -595,11 +633,11 @@ def speed_over_best_peer(
     peers = [
         seconds
         for name, seconds in times.items()
-        if name != OURS and not LEARNERS[name].is_control
+        if name != ours and not LEARNERS[name].is_control
     ]
-    if OURS not in times or not peers or not any(run.arrived for run in runs):
+    if ours not in times or not peers or not any(run.arrived for run in runs):
         return math.nan
-    return min(peers) / times[OURS]
+    return min(peers) / times[ours]
 
 
 def quickened(cfg: BenchConfig) -> BenchConfig:
@@ -643,6 +681,7 @@ def main(cfg: BenchConfig) -> None:
         }
         cfg.json.write_text(json.dumps(result, indent=1))
     print(f"the same in CPU time: {speed_over_best_peer(runs, lambda moment: moment.cpu_s):.2f}")
+    print(f"engine_over_best_peer_speed: {speed_over_best_peer(runs, ours=ENGINE):.2f}")
     print(f"ours_over_best_peer_speed: {speed:.2f}")
 
 
