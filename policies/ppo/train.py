@@ -372,6 +372,8 @@ class _Learner:
             "observation", "action", "action_log_prob", "advantage", "value_target"
         ).reshape(-1)
         num_chunks = max(1, round(flat.numel() / cfg.minibatch))
+        if progress.iteration == self.critic_batches:  # the value alone learned at the full rate
+            self._take_learning_rate()
         kl = 0.0
         for _ in range(cfg.epochs):
             order = torch.randperm(flat.numel(), generator=self.generator)
@@ -390,9 +392,12 @@ class _Learner:
             progress.learning_rate = max(progress.learning_rate / 1.5, cfg.min_learning_rate)
         elif kl < cfg.kl_low:
             progress.learning_rate = min(progress.learning_rate * 1.5, cfg.max_learning_rate)
-        for group in self.optimiser.param_groups:
-            group["lr"] = progress.learning_rate
+        self._take_learning_rate()
         return kl
+
+    def _take_learning_rate(self) -> None:
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.progress.learning_rate
 
     def _descend(self, minibatch: TensorDictBase) -> float:
         losses = self.loss(minibatch)
