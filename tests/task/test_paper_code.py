@@ -236,7 +236,7 @@ def test_it_runs_in_the_child(scenes, scene_of):
     results = smoke_run_all(list(CODES.values()), scene)
 
     assert [r.error for r in results] == [""] * 4
-    assert [r.observation_dim for r in results] == [82, 81, 80, 81]
+    assert [r.observation_dim for r in results] == [92, 91, 90, 91]
 
 
 def states_of(scene, **objects):

@@ -214,7 +214,7 @@ def test_what_cannot_be_read_off_is_contained_by_the_child(scene_of):
         "depends on order": (code("x = x * torch.arange(len(x)).reshape(-1, 1)"), "order"),
         "wrong length": (
             code().replace("    def compute_reward", "    def get_observation_space(self):\n        return 7\n    def compute_reward"),
-            "says 7, but the observation has length 80",
+            "says 7, but the observation has length 90",
         ),
         "long range": (code("for i in range(999999):\n    pass"), "range of 999999 steps"),
         "remembers": (
