@@ -40,11 +40,11 @@ def load_benchmark(name: str, folder: Path = FOLDER) -> TaskBundle:
         raise V2PError(
             f"there is no benchmark task '{name}' in {folder}.{did_you_mean(name, known)}"
         )
-    data: dict[str, Any] = yaml.safe_load(path.read_text())
     try:
-        scene = _scene(name, data)
-    except (KeyError, TypeError, ValueError) as error:
-        raise V2PError(f"{path} is no benchmark task: {error!r}") from error
+        scene = _scene(name, yaml.safe_load(path.read_text()))
+    except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+        words = " ".join(str(error).split())
+        raise V2PError(f"{path} is no benchmark task: {type(error).__name__}: {words}") from error
     reference = path.with_suffix(".py")
     code = reference.read_text() if reference.is_file() else write_samples(scene, 1)[0]
     return TaskBundle(
@@ -59,8 +59,12 @@ def load_benchmark(name: str, folder: Path = FOLDER) -> TaskBundle:
     )
 
 
-def _scene(name: str, data: dict[str, Any]) -> Scene:
+def _scene(name: str, data: Any) -> Scene:
+    if not isinstance(data, dict):
+        raise TypeError(f"need a mapping with description, kind and objects, got {data!r}")
     objects = tuple(_object(**entry) for entry in data["objects"])
+    if not objects:
+        raise ValueError("objects is empty; name at least the manipulated one")
     return Scene(
         title=name,
         video=f"{name}.mp4",
@@ -91,6 +95,12 @@ def _object(
     hollow: bool = False,
     ends_on_side: bool = False,
 ) -> SceneObject:
+    if len(size_m) != 3 or isinstance(size_m, str):
+        raise ValueError(f"size_m of '{name}' must be three lengths, got {size_m!r}")
+    if not path or any(not 2 <= len(point) <= 4 for point in path):
+        raise ValueError(
+            f"path of '{name}' must list points [x, y, z, yaw] (the last two may be left out), got {path!r}"
+        )
     poses = [_pose(point, size_m[2]) for point in path]
     if ends_on_side:
         poses[-1] = (*poses[-1][:3], *_quat(Rotation.from_euler("x", -np.pi / 2)))
@@ -100,8 +110,8 @@ def _object(
         role=role,  # pyright: ignore[reportArgumentType]
         shape=shape,  # pyright: ignore[reportArgumentType]
         size_m=(float(size_m[0]), float(size_m[1]), float(size_m[2])),
-        mass_kg=mass_kg,
-        friction=friction,
+        mass_kg=float(mass_kg),
+        friction=float(friction),
         hollow=hollow,
         frames=tuple(range(len(poses))),
         poses_world=tuple(poses),
