@@ -180,7 +180,7 @@ def hollow_parts(
     at least 6 mm thick; through thin floors hard-pressed objects were pushed into the table.
     """
     half = np.asarray(size_m) / 2
-    floor = float(hollow_floor_m(np.array(size_m[2])))
+    floor = float(hollow_floor_m(np.array([size_m[2]]))[0])
     wall = float(np.clip(0.08 * min(size_m[0], size_m[1]), 0.006, WALL_MAX_M))
     flip = -1.0 if upside_down else 1.0
     wall_half_height = half[2] - floor / 2
