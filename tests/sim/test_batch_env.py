@@ -17,7 +17,10 @@ from v2p_data.sim.batch_env import (
     Snapshot,
     without_randomization,
 )
+from v2p_data.sim.masks import FIRST_OBJECT, MaskRenderer
+from v2p_data.sim.randomize import RandomizationConfig
 from v2p_data.sim.robot import FINGER_TRAVEL_M
+from v2p_data.sim.world import CAMERA
 from v2p_data.task.sandbox import TaskCodeError
 from v2p_data.task.task import BASE_OBSERVATION_DIM, OBJECT_STATES, ROBOT_STATES, Task, TaskBundle
 
@@ -456,6 +459,57 @@ def test_a_snapshot_survives_the_disk_and_draws_the_same_world(
     np.testing.assert_allclose(data.geom_xpos, seen.geom_xpos, atol=1e-12)
     np.testing.assert_array_equal(model.geom_size, expected.geom_size)
     np.testing.assert_array_equal(loaded.rows(np.array([0])).qpos[0], env._qpos[5])
+
+
+def ball_at(env: BatchEnv, pos: tuple[float, float, float], size_px: int) -> list[np.ndarray]:
+    """Return label images of all worlds, a ball where it hides behind nothing."""
+    env._object_qpos[:, 0, :3] = pos
+    snapshot = env.snapshot(np.arange(env.num_envs))
+    with MaskRenderer(env.world, size_px, backend="rays") as renderer:
+        return [renderer.draw(snapshot, k) for k in range(env.num_envs)]
+
+
+def test_a_moved_camera_shows_the_ball_where_a_pinhole_projects_it(
+    make_env: Callable[..., BatchEnv], make_object: Callable[..., SceneObject]
+):
+    moved = RandomizationConfig(camera_pos_m=0.05, camera_angle_rad=0.05, camera_fovy_deg=5.0)
+    env = make_env(make_object("cube", "sphere"), cfg=SimConfig(fine=True, randomization=moved))
+    ball, size_px = np.array([0.5, -0.25, 0.02]), 160
+
+    masks = ball_at(env, tuple(ball), size_px)
+
+    expected, seen = [], []
+    for k, labels in enumerate(masks):
+        view = env.episode_params(k)["camera"]
+        R_world_cam = Rotation.from_quat(view["quat_wxyz"], scalar_first=True)
+        x, y, z = R_world_cam.inv().apply(ball - view["pos_m"])  # looks along -z, y is up
+        focal_px = size_px / 2 / np.tan(np.radians(view["fovy_deg"]) / 2)
+        expected.append([size_px / 2 - focal_px * x / z, size_px / 2 + focal_px * y / z])
+        rows, columns = np.nonzero(labels == FIRST_OBJECT)
+        seen.append([columns.mean() + 0.5, rows.mean() + 0.5])
+    assert np.ptp(expected, axis=0).min() > 10
+    np.testing.assert_allclose(seen, expected, atol=0.7)
+
+
+def test_a_camera_that_is_not_moved_is_the_models_to_the_pixel_and_moving_it_moves_nothing_else(
+    make_env: Callable[..., BatchEnv], make_object: Callable[..., SceneObject]
+):
+    ball = make_object("cube", "sphere")
+    fixed = make_env(ball)
+    moved = make_env(ball, cfg=SimConfig(randomization=RandomizationConfig(camera_pos_m=0.05)))
+    pos = (0.5, -0.25, 0.02)
+
+    masks, others = ball_at(fixed, pos, 96), ball_at(moved, pos, 96)
+
+    np.testing.assert_array_equal(moved._qpos, fixed._qpos)
+    snapshot, view = fixed.snapshot(np.arange(8)), fixed.world.model.camera(CAMERA)
+    assert (snapshot.camera_pos == view.pos).all()
+    assert (snapshot.camera_quat == view.quat).all()
+    assert (snapshot.camera_fovy_deg == view.fovy).all()
+    assert all((a != b).any() for a, b in zip(masks, others, strict=True))
+    with MaskRenderer(fixed.world, 96, backend="rays") as renderer:
+        renderer.draw(moved.snapshot(np.arange(1)), 0)
+        np.testing.assert_array_equal(renderer.draw(snapshot, 0), masks[0])
 
 
 def test_a_saved_environment_goes_on_exactly(make_env: Callable[..., BatchEnv]):

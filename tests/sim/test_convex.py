@@ -15,7 +15,7 @@ from v2p_data.sim.masks import FIRST_OBJECT, MaskRenderer
 from v2p_data.sim.randomize import Randomizer
 from v2p_data.sim.robot import COARSE
 from v2p_data.sim.solids import solids_of
-from v2p_data.sim.world import MESH_SCALES, build_world
+from v2p_data.sim.world import CAMERA, MESH_SCALES, build_world
 
 SIZE = (0.08, 0.08, 0.04)
 NOTCH = np.array([0.02, 0.02, 0.0])
@@ -168,9 +168,13 @@ def test_masks_show_the_notch(angle_scene: Scene, monkeypatch: pytest.MonkeyPatc
         world = build_world(angle_scene, COARSE)
         qpos = world.model.qpos0[None].copy()
         fields = ("geom_size", "geom_pos", "geom_dataid")
+        view = world.model.camera(CAMERA)
         still = Snapshot(
             qpos=qpos,
             qvel=np.zeros((1, world.model.nv)),
+            camera_pos=view.pos[None],
+            camera_quat=view.quat[None],
+            camera_fovy_deg=view.fovy,
             **{name: getattr(world.model, name)[None].copy() for name in fields},
         )
         with MaskRenderer(world, 128, backend="rays") as renderer:

@@ -98,6 +98,20 @@ def test_the_policy_sees_robot_and_cube_as_greys(env):
     assert (mask[..., 0] == mask[..., 2]).all()
 
 
+def test_the_policy_sees_through_a_camera_that_is_moved_at_each_reset(write_task, tmp_path, env):
+    moved = V2PEnv(str(write_task(tmp_path / "moved")), camera_angle_rad=0.05)
+
+    seen = [moved.reset(seed=seed)[0] for seed in (3, 3, 4)]
+    fixed, _ = env.reset(seed=3)
+
+    masks = [s["pixels"]["mask"] for s in seen]
+    assert (masks[0] == masks[1]).all()
+    assert (masks[0] != masks[2]).any()
+    assert (masks[0] != fixed["pixels"]["mask"]).any()
+    np.testing.assert_array_equal(seen[0]["agent_pos"], fixed["agent_pos"])
+    moved.close()
+
+
 def test_moving_up_raises_the_tool_in_the_state(env):
     before, _ = env.reset(seed=0)
     for _ in range(3):

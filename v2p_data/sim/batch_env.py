@@ -37,7 +37,7 @@ from v2p_data.sim.robot import (
 )
 from v2p_data.sim.start_check import check_start
 from v2p_data.sim.states import Observed, StateBlock
-from v2p_data.sim.world import World, build_world
+from v2p_data.sim.world import CAMERA, World, build_world
 from v2p_data.task.task import Task, TaskBundle
 
 if TYPE_CHECKING:
@@ -106,12 +106,20 @@ class Snapshot:
     geom_size: Float[np.ndarray, "n geom 3"]
     geom_pos: Float[np.ndarray, "n geom 3"]
     geom_dataid: Int[np.ndarray, "n geom"]
+    camera_pos: Float[np.ndarray, "n 3"]
+    """Of the camera `view`, in the world frame."""
+    camera_quat: Float[np.ndarray, "n 4"]
+    camera_fovy_deg: Float[np.ndarray, "n"]
 
     def write(self, model: mujoco.MjModel, data: mujoco.MjData, index: int) -> None:
         """Put world `index` into a model and its data and compute positions, ready to be drawn."""
         model.geom_size[:] = self.geom_size[index]
         model.geom_pos[:] = self.geom_pos[index]
         model.geom_dataid[:] = self.geom_dataid[index]
+        camera = model.camera(CAMERA).id
+        model.cam_pos[camera] = self.camera_pos[index]
+        model.cam_quat[camera] = self.camera_quat[index]
+        model.cam_fovy[camera] = self.camera_fovy_deg[index]
         data.qpos[:] = self.qpos[index]
         data.qvel[:] = self.qvel[index]
         mujoco.mj_kinematics(model, data)
@@ -354,10 +362,10 @@ class BatchEnv:
 
     def snapshot(self, ids: Int[np.ndarray, "n"]) -> Snapshot:
         """Return what is needed to draw the worlds `ids` as they are now."""
-        model = self.randomizer.fields()
-        fields = {
-            name: model[name][ids].copy() for name in ("geom_size", "geom_pos", "geom_dataid")
-        }
+        drawn = self.randomizer.fields() | self.randomizer.per_world_arrays()
+        looks = ("geom_size", "geom_pos", "geom_dataid")
+        view = ("camera_pos", "camera_quat", "camera_fovy_deg")
+        fields = {name: drawn[name][ids].copy() for name in looks + view}
         return Snapshot(qpos=self._qpos[ids].copy(), qvel=self._qvel[ids].copy(), **fields)
 
     def episode_params(self, env: int) -> dict[str, Any]:

@@ -13,6 +13,7 @@ The simulation runs at the fine time step: what the coarse one calls a success c
 through the table.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 from gymnasium import spaces
 
 from v2p_data.errors import V2PError
+from v2p_data.sim import randomize
 from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig
 from v2p_data.sim.masks import MaskRenderer, labels_to_rgb
 from v2p_data.sim.verdict import Witness
@@ -39,6 +41,8 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         task_folder: folder with `task.json`, as `v2p task` writes it.
         size_px: width and height of the mask.
         render_mode: `rgb_array`, or None.
+        camera_pos_m, camera_angle_rad, camera_fovy_deg: how far the camera is moved at each reset, as in
+            `RandomizationConfig`; a policy is evaluated under what its dataset was recorded under.
 
     Raises:
         V2PError: the folder holds no task.
@@ -48,14 +52,28 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 - Gymnasium's attribute
 
     def __init__(
-        self, task_folder: str, size_px: int = 256, render_mode: str | None = "rgb_array"
+        self,
+        task_folder: str,
+        size_px: int = 256,
+        render_mode: str | None = "rgb_array",
+        *,
+        camera_pos_m: float = 0.0,
+        camera_angle_rad: float = 0.0,
+        camera_fovy_deg: float = 0.0,
     ) -> None:
         bundle = TaskBundle.load(Path(task_folder))
         self.render_mode = render_mode
         self.task = bundle.title
         self.task_description = bundle.description
         self._max_episode_steps = bundle.horizon_steps
-        self._world = BatchEnv(bundle, SimConfig(fine=True), num_envs=1, seed=0, num_threads=1)
+        randomization = replace(
+            randomize.recording(),
+            camera_pos_m=camera_pos_m,
+            camera_angle_rad=camera_angle_rad,
+            camera_fovy_deg=camera_fovy_deg,
+        )
+        sim = SimConfig(fine=True, randomization=randomization)
+        self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
         self._witness = Witness(self._world)
         self._masks = MaskRenderer(self._world.world, size_px)
         self.observation_space = spaces.Dict(

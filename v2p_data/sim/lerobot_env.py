@@ -55,6 +55,10 @@ class V2PEnvConfig(EnvConfig):
     fps: int = CONTROL_HZ
     size_px: int = 256
     """Width and height of the mask."""
+    camera_pos_m: float = 0.0
+    """How far the camera is moved at each reset; see `RandomizationConfig`, as the next two."""
+    camera_angle_rad: float = 0.0
+    camera_fovy_deg: float = 0.0
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {
@@ -73,7 +77,12 @@ class V2PEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        return {"size_px": self.size_px}
+        return {
+            "size_px": self.size_px,
+            "camera_pos_m": self.camera_pos_m,
+            "camera_angle_rad": self.camera_angle_rad,
+            "camera_fovy_deg": self.camera_fovy_deg,
+        }
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False

@@ -1,4 +1,4 @@
-"""What differs from world to world and from episode to episode: sizes, masses, friction, servo gains, delay, poses.
+"""What differs from world to world and from episode to episode: sizes, masses, friction, servo gains, delay, poses, view.
 
 Every value drawn is kept per world (`Randomizer.drawn`), so that an episode can say what it was recorded
 under. Values are written into the batch's per-simulation model fields; nothing is recompiled.
@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import FLOOR_MAX_M, Scene
-from v2p_data.sim.world import MESH_SCALES, WALL_MAX_M, ObjectModel, World, cover_of
+from v2p_data.sim.world import (
+    CAMERA,
+    CAMERA_FOVY_DEG,
+    MESH_SCALES,
+    WALL_MAX_M,
+    ObjectModel,
+    World,
+    cover_of,
+)
 
 WORKSPACE_CENTRE_M = (0.5, 0.0)
 OBJECT_LOW_M = (0.37, -0.28)
@@ -55,6 +63,13 @@ class RandomizationConfig:
     """From command to servo, constant during an episode."""
     servo_gain_scale: tuple[float, float] = (0.9, 1.1)
     """Of stiffness and of damping, drawn one by one for all servos; the tool lags by damping / stiffness."""
+    camera_pos_m: float = 0.0
+    """The camera is shifted by up to this much, per axis. 0 is the fixed camera that policies of earlier datasets know;
+    a policy that shall stand a moved camera is recorded, and then evaluated, with more."""
+    camera_angle_rad: float = 0.0
+    """The camera is turned by up to this much about each of its own axes."""
+    camera_fovy_deg: float = 0.0
+    """The camera's vertical field of view changes by up to this much."""
 
     def __post_init__(self) -> None:
         for low, high in (
@@ -68,6 +83,12 @@ class RandomizationConfig:
                 raise ValueError(f"need 0 < lowest <= highest, got {low} and {high}")
         if not 0 <= self.delay_s[0] <= self.delay_s[1] <= 0.02:
             raise ValueError(f"delays of 0 to 20 ms can be simulated, got {self.delay_s} s")
+        moved = (self.camera_pos_m, self.camera_angle_rad, self.camera_fovy_deg)
+        if min(moved) < 0 or self.camera_fovy_deg >= CAMERA_FOVY_DEG:
+            raise ValueError(
+                f"camera_pos_m, camera_angle_rad and camera_fovy_deg must be 0 or more, the last below "
+                f"{CAMERA_FOVY_DEG}, got {moved}"
+            )
 
 
 def training() -> RandomizationConfig:
@@ -125,6 +146,7 @@ class Randomizer:
         mass_kg, friction: `(env, object)`.
         delay_s: `(env,)`.
         servo_gain: factors of the servos' stiffness and damping, `(env, 2)`.
+        camera_pos, camera_quat, camera_fovy_deg: of the camera `view`, `(env, 3)`, `(env, 4)`, `(env,)`.
     """
 
     def __init__(
@@ -142,6 +164,15 @@ class Randomizer:
         self.friction = np.tile(np.array([o.friction for o in objects]), (n, 1))
         self.delay_s = np.zeros(n)
         self.servo_gain = np.ones((n, 2))
+        view = world.model.camera(CAMERA)
+        self.camera_pos = np.tile(view.pos, (n, 1))
+        self.camera_quat = np.tile(view.quat, (n, 1))
+        self.camera_fovy_deg = np.full(n, float(view.fovy[0]))
+        self._view = (
+            self.camera_pos[0].copy(),
+            self.camera_quat[0].copy(),
+            self.camera_fovy_deg[0],
+        )
         self._height_above_table = np.zeros((n, len(objects)))
         self._radius = np.zeros((n, len(objects)))
         self._fields = {
@@ -178,7 +209,7 @@ class Randomizer:
         self._num_used = np.array([PREPARED])
 
     def draw(self, ids: Int[np.ndarray, "n"], rng: np.random.Generator) -> None:
-        """Draw sizes, masses, friction, delay and servo gains for the worlds `ids`."""
+        """Draw sizes, masses, friction, delay, servo gains and cameras for the worlds `ids`."""
         n = len(ids)
         if n > PREPARED:
             self._draw_into(self._live, ids, rng)
@@ -223,6 +254,14 @@ class Randomizer:
             ("actuator_biasprm", 2, gain[:, 1:]),
         ):
             into[name][rows, :, first] = self._base[name][:, first] * factor
+        shift = rng.uniform(-1.0, 1.0, (n, 7))  # in any case: a moved camera changes nothing else
+        pos, quat, fovy_deg = self._view
+        into["camera_pos"][rows] = pos + cfg.camera_pos_m * shift[:, :3]
+        into["camera_fovy_deg"][rows] = fovy_deg + cfg.camera_fovy_deg * shift[:, 6]
+        if cfg.camera_angle_rad:
+            turn = Rotation.from_rotvec(cfg.camera_angle_rad * shift[:, 3:6])
+            turned = Rotation.from_quat(quat, scalar_first=True) * turn
+            into["camera_quat"][rows] = turned.as_quat(scalar_first=True)
 
     def place(
         self, ids: Int[np.ndarray, "n"], rng: np.random.Generator
@@ -319,6 +358,9 @@ class Randomizer:
             "friction": self.friction,
             "delay_s": self.delay_s,
             "servo_gain": self.servo_gain,
+            "camera_pos": self.camera_pos,
+            "camera_quat": self.camera_quat,
+            "camera_fovy_deg": self.camera_fovy_deg,
             "height_above_table": self._height_above_table,
             "radius": self._radius,
         }
@@ -339,6 +381,11 @@ class Randomizer:
             "action_noise": self.cfg.action_noise,
             "servo_stiffness_scale": round(float(self.servo_gain[env, 0]), 4),
             "servo_damping_scale": round(float(self.servo_gain[env, 1]), 4),
+            "camera": {
+                "pos_m": np.round(self.camera_pos[env], 5).tolist(),
+                "quat_wxyz": np.round(self.camera_quat[env], 6).tolist(),
+                "fovy_deg": round(float(self.camera_fovy_deg[env]), 4),
+            },
         }
 
     def _poses(self, ids: np.ndarray, xy: np.ndarray, rng: np.random.Generator) -> np.ndarray:
