@@ -319,7 +319,7 @@ def test_a_saved_environment_with_a_bank_goes_on_exactly(make_env: Callable[...,
     noisy = SimConfig()
     source = make_env()
     bank = record_bank(source, lifting(source))
-    cfg = BankConfig(share=0.6, num_plain=2, reverse=True, window_episodes=4, raise_at=0.2)
+    cfg = BankConfig(share=0.6, num_plain=2, reverse=True, window_episodes=1, raise_at=0.2)
 
     def make() -> BatchEnv:
         env = make_env(cfg=noisy, num_envs=10, seed=1)
