@@ -1,0 +1,139 @@
+"""A task becomes an expert: by a teacher and PPO, or by PPO alone."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from policies.ppo.imitate import ImitationConfig
+from policies.ppo.policy import Expert, weights_of
+from policies.ppo.train import PPOConfig
+from v2p_data.learning import TAUGHT_FOLDER, ExpertConfig, Learned, learn, success_of
+from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.task.benchmark import load_benchmark
+from v2p_data.task.task import TaskBundle
+
+TINY = ExpertConfig(
+    trial_worlds=8,
+    num_envs=48,
+    imitation=ImitationConfig(rounds=2, least_rounds=2, round_steps=30, epochs=2, minibatch=256),
+    ppo=PPOConfig(
+        total_steps=48 * 16 * 2,
+        target_success=2.0,
+        num_deterministic=8,
+        window_episodes=16,
+        min_window_episodes=8,
+        warm_start_critic_batches=1,
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def bundle() -> TaskBundle:
+    return load_benchmark("lift_up")
+
+
+@pytest.fixture(scope="module")
+def learned(bundle: TaskBundle, tmp_path_factory) -> tuple[Learned, Path]:
+    out = tmp_path_factory.mktemp("learned")
+    return learn(bundle, TINY, out, seed=3, num_threads=1), out
+
+
+def weights_in(folder: Path) -> dict[str, torch.Tensor]:
+    return weights_of(Expert.load(folder).model)
+
+
+def are_equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_a_task_becomes_an_expert_by_way_of_a_teacher(learned: tuple[Learned, Path]):
+    result, out = learned
+
+    assert result.teacher == "lift"
+    assert Expert.load(out).model.act_dim == Expert.load(out / TAUGHT_FOLDER).model.act_dim == 7
+    assert (out / "curve.csv").is_file()
+
+
+def test_every_step_of_every_world_is_counted(learned: tuple[Learned, Path]):
+    result, _ = learned
+
+    trials = len(result.trials) * 8 * 60  # worlds, steps of an episode of lifting
+    imitation = 2 * 30 * 48
+    ppo = 2 * 16 * 48
+    assert result.steps == trials + imitation + ppo
+    assert result.stopped_by == "steps"
+
+
+def test_the_better_one_of_pupil_and_ppo_is_kept(learned: tuple[Learned, Path]):
+    result, out = learned
+
+    assert result.taught_success is not None
+    assert result.ppo_success is not None
+    is_taught_better = result.taught_success > result.ppo_success
+    assert result.kept == ("taught" if is_taught_better else "ppo")
+    assert are_equal(weights_in(out), weights_in(out / TAUGHT_FOLDER)) or result.kept == "ppo"
+
+
+@pytest.mark.slow
+def test_the_same_seed_learns_the_same_weights_and_another_seed_others(
+    bundle: TaskBundle, learned: tuple[Learned, Path], tmp_path: Path
+):
+    first, out = learned
+
+    again = learn(bundle, TINY, tmp_path / "again", seed=3, num_threads=2)
+    learn(bundle, TINY, tmp_path / "other", seed=4, num_threads=1)
+
+    assert are_equal(weights_in(out / "last"), weights_in(tmp_path / "again" / "last"))
+    assert not are_equal(weights_in(out / "last"), weights_in(tmp_path / "other" / "last"))
+    assert replace(again, seconds=0.0) == replace(first, seconds=0.0)
+
+
+def test_without_a_teacher_ppo_learns_from_nothing(bundle: TaskBundle, tmp_path: Path):
+    told: list[float] = []
+
+    result = learn(
+        bundle,
+        replace(TINY, teacher="none"),
+        tmp_path,
+        seed=3,
+        on_progress=lambda share, words: told.append(share),
+    )
+
+    assert (result.teacher, result.trials, result.kept) == ("", (), "ppo")
+    assert result.taught_success is None
+    assert result.steps == 2 * 16 * 48
+    assert not (tmp_path / TAUGHT_FOLDER).exists()
+    assert told == [0.5, 1.0]
+
+
+def test_a_program_that_hardly_succeeds_teaches_nothing(bundle: TaskBundle, tmp_path: Path):
+    unreachable = replace(TINY, least_teacher_success=1.01)
+
+    result = learn(bundle, unreachable, tmp_path, seed=3)
+
+    assert result.teacher == ""
+    assert len(result.trials) >= 1
+    assert result.steps == len(result.trials) * 8 * 60 + 2 * 16 * 48
+    assert not (tmp_path / TAUGHT_FOLDER).exists()
+
+
+@pytest.mark.slow
+def test_a_taught_expert_lifts_the_box_at_the_fine_time_step(bundle: TaskBundle, tmp_path: Path):
+    cfg = replace(
+        TINY,
+        num_envs=128,
+        imitation=ImitationConfig(rounds=6, least_rounds=5, target_success=0.9),
+        ppo=replace(TINY.ppo, total_steps=0),
+    )
+
+    learn(bundle, cfg, tmp_path, seed=3)
+
+    worlds = BatchEnv(bundle, SimConfig(fine=True), num_envs=32, seed=99, num_threads=1)
+    assert success_of(worlds, Expert.load(tmp_path)) >= 0.7
+
+
+def test_a_bank_without_a_teacher_is_refused():
+    with pytest.raises(ValueError, match=r"bank\.share needs a teacher"):
+        ExpertConfig(teacher="none", bank=replace(TINY.bank, share=0.5))
