@@ -182,7 +182,8 @@ def learn(
         seed=seed_for(seed, "ppo") % 2**63,
         warm_start=taught or other,
         on_progress=lambda done, total, success: on_progress(
-            start + (1 - start) * min(done / total, 1), "PPO" if np.isnan(success) else f"PPO, success {success:.0%}"
+            start + (1 - start) * min(done / total, 1),
+            "PPO" if np.isnan(success) else f"PPO, success {success:.0%}",
         ),
     )
     kept, of_taught, of_ppo = "ppo", None, None

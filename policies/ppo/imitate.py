@@ -19,6 +19,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from policies.ppo.policy import ActorConfig, ActorCritic, Expert, load_weights, weights_of
+from policies.ppo.train import torch_threads
 
 log = logging.getLogger(__name__)
 
@@ -87,9 +88,20 @@ def imitate(
         check: how often an expert succeeds in worlds of its own; imitation ends once that is `target_success`.
         on_progress: told the share that is done.
     """
+    with torch_threads(cfg.num_threads):
+        return _imitate(env, teacher, cfg, out, seed, check, on_progress)
+
+
+def _imitate(
+    env: EnvBase,
+    teacher: Teacher,
+    cfg: ImitationConfig,
+    out: Path,
+    seed: int,
+    check: Callable[[Expert], float] | None,
+    on_progress: Callable[[float], None],
+) -> ImitationResult:
     started = time.monotonic()
-    threads = torch.get_num_threads()
-    torch.set_num_threads(cfg.num_threads)
     generator = torch.Generator().manual_seed(seed)
     num_envs = env.batch_size[0]
     obs_dim = env.observation_spec["observation"].shape[-1]  # type: ignore[union-attr]
@@ -135,7 +147,6 @@ def imitate(
     if best is not None:
         load_weights(model, best)
     Expert(model).save(out)
-    torch.set_num_threads(threads)
     return ImitationResult(
         folder=out,
         steps=rounds * cfg.round_steps * num_envs,

@@ -192,7 +192,7 @@ def train_expert(
             f"{num_envs} worlds leave none to learn from: num_deterministic is {cfg.num_deterministic}"
         )
     out.mkdir(parents=True, exist_ok=True)
-    with _torch_threads(cfg.num_threads):
+    with torch_threads(cfg.num_threads):
         learner = _Learner(env, cfg, out, seed, warm_start)
         stopped_by = learner.run(on_progress)
     progress = learner.progress
@@ -591,7 +591,8 @@ def _check_recipe(saved: dict[str, Any], asked: dict[str, Any], path: Path) -> N
 
 
 @contextmanager
-def _torch_threads(num_threads: int) -> Iterator[None]:
+def torch_threads(num_threads: int) -> Iterator[None]:
+    """Let torch use so many threads within."""
     before = torch.get_num_threads()
     torch.set_num_threads(num_threads)
     try:

@@ -65,7 +65,9 @@ def test_every_sample_of_every_kind_with_two_objects_runs(scene_of):
     results = smoke_run_all(codes, scene_of("insert"))
 
     assert {r.error for r in results} == {""}
-    assert {r.observation_dim for r in results} >= {BASE_OBSERVATION_DIM + more for more in (0, 1, 3)}
+    assert {r.observation_dim for r in results} >= {
+        BASE_OBSERVATION_DIM + more for more in (0, 1, 3)
+    }
 
 
 def test_thresholds_follow_the_videos_motion(scene_of, make_thing):
