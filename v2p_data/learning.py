@@ -21,7 +21,7 @@ from v2p_data.seeds import seed_for
 from v2p_data.sim.backends import Backend, make_batch_env
 from v2p_data.sim.bank import Bank, BankConfig, record_bank, use_bank
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.teacher import Teacher, Trial
+from v2p_data.sim.teacher import Teacher, Trial, play
 from v2p_data.sim.torchrl_env import TorchRLEnv
 from v2p_data.task.nearest import Solved, rank_solved
 from v2p_data.task.task import TaskBundle
@@ -209,8 +209,4 @@ def learn(
 
 def success_of(env: BatchEnv, expert: Expert) -> float:
     """Play one episode in every world and return the share that the task's success held at some time."""
-    env.reset(np.arange(env.num_envs))
-    ever = np.zeros(env.num_envs, bool)
-    for _ in range(env.horizon):
-        ever = ever | env.step(expert.act(env.observe())).held
-    return float(ever.mean())
+    return float(play(env, expert.act)[1].mean())

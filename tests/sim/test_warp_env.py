@@ -109,6 +109,14 @@ def test_without_a_cuda_device_one_sentence_says_what_to_do(
 
 
 @needs_warp
+def test_a_task_made_for_another_arm_is_refused(make_bundle: Callable[..., TaskBundle]):
+    bundle = replace(make_bundle(), robot={"path": "other_arm.xml"})
+
+    with pytest.raises(V2PError, match="built-in arm only"):
+        WarpBatchEnv(bundle, num_envs=2, seed=0, device="cpu")
+
+
+@needs_warp
 def test_a_seed_gives_the_same_first_worlds(
     make_pair: Callable[..., Pair], make_object: Callable[..., SceneObject]
 ):

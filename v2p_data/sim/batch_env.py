@@ -23,7 +23,7 @@ from mujoco.batch import Batch
 
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
-from v2p_data.sim import randomize
+from v2p_data.sim import randomize, task_code
 from v2p_data.sim.arms import RobotConfig, robot_from_json
 from v2p_data.sim.randomize import RandomizationConfig, Randomizer
 from v2p_data.sim.robot import (
@@ -185,7 +185,7 @@ class BatchEnv:
         self.num_envs = num_envs
         self.horizon = bundle.horizon_steps
         self.physics = FINE if self.cfg.fine else COARSE
-        robot = self.cfg.robot if self.cfg.robot.path else robot_from_json(bundle.robot)
+        robot = robot_of(bundle, self.cfg)
         self.world: World = build_world(bundle.scene, self.physics, robot=robot)
         self._robot = self.world.robot
         self.object_names = [o.name for o in self.world.objects]
@@ -199,13 +199,15 @@ class BatchEnv:
         )
         self._rng = rng_for(seed, "worlds")
         self._allocate()
-        self.task = self._load_task(task)
+        self.task = task_code.load(bundle, self, task)
         self.reset(np.arange(num_envs))
         looked_at = slice(0, STARTS_LOOKED_AT)
         fields = {name: array[looked_at] for name, array in self.randomizer.fields().items()}
         check_start(self.world, fields, self._qpos[looked_at], bundle.title)
-        self.obs_dim = self._checked_obs_dim()
-        self.component_names = self._component_names()
+        self.obs_dim = task_code.checked_obs_dim(self.task, bundle.title, self.observe().shape[1])
+        self.component_names = task_code.component_names(
+            self.task, torch.zeros(num_envs, ACT_DIM), self.states()
+        )
 
     # -- what task code may ask for
 
@@ -315,9 +317,7 @@ class BatchEnv:
         return self._observation(self.states())
 
     def _observation(self, states: dict[str, torch.Tensor]) -> Float32[np.ndarray, "env obs"]:
-        columns = [states[key] for key in self.task.compute_observation_key(states)]
-        parts = [c if c.ndim == 2 else c[:, None] for c in columns]
-        obs = parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+        obs = task_code.observation(self.task, states)
         array = obs.clone(memory_format=torch.contiguous_format).numpy()
         if not np.isfinite(array).all():
             np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
@@ -447,26 +447,6 @@ class BatchEnv:
         self._bank_row = np.full(n, -1)
         self._tool = self._tool_of(slice(None))
 
-    def _load_task(self, task: type[Task] | None) -> Task:
-        if task is not None:
-            return task(self, str(self.bundle.scene.folder), {})
-        from v2p_data.task.sandbox import load_task
-
-        return load_task(self.bundle.code, envs=self, scene=self.bundle.scene)
-
-    def _checked_obs_dim(self) -> int:
-        made, said = self.observe().shape[1], int(self.task.get_observation_space())
-        if made != said:
-            raise V2PError(
-                f"task '{self.bundle.title}' makes observations of length {made} but says {said}; "
-                "correct get_observation_space or compute_observation_key in its task.py"
-            )
-        return said
-
-    def _component_names(self) -> tuple[str, ...]:
-        _, parts = self.task.compute_reward(torch.zeros(self.num_envs, ACT_DIM), self.states())
-        return tuple(parts)
-
     def _move_targets(self, action: Float[np.ndarray, "7 env"]) -> None:
         cfg, tool = self.cfg, self._tool
         scale = self.bundle.motion_scale
@@ -582,6 +562,11 @@ _BAD_STATE_WARNINGS = slice(
 """Of positions, velocities, accelerations and controls."""
 _TARGET_LOW_M = np.array([TARGET_LOW_M]).T
 _TARGET_HIGH_M = np.array([TARGET_HIGH_M]).T
+
+
+def robot_of(bundle: TaskBundle, cfg: SimConfig) -> RobotConfig:
+    """Return the arm to simulate: the one in the settings, else the one that the task was made for."""
+    return cfg.robot if cfg.robot.path else robot_from_json(bundle.robot)
 
 
 def without_randomization(cfg: SimConfig) -> SimConfig:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.sim.primitives import (
@@ -113,12 +113,21 @@ class Teacher:
 
     def play(self) -> float:
         """Play one episode in every world and return the share whose success was held at the end."""
-        env = self.env
-        env.reset(np.arange(env.num_envs))
-        held = np.zeros(env.num_envs, bool)
-        for _ in range(env.horizon):
-            held = env.step(self.act()).held
-        return float(held.mean())
+        return float(play(self.env, lambda _: self.act())[0].mean())
+
+
+def play(
+    env: BatchEnv, act: Callable[[Float[np.ndarray, "env obs"]], Float[np.ndarray, "env 7"]]
+) -> tuple[Bool[np.ndarray, "env"], Bool[np.ndarray, "env"]]:
+    """Play one episode in every world; return where success was held at the end, and where at any time."""
+    env.reset(np.arange(env.num_envs))
+    obs, at_end = env.observe(), np.zeros(env.num_envs, bool)
+    ever = at_end
+    for _ in range(env.horizon):
+        result = env.step(act(obs))
+        obs, at_end = result.obs, result.held
+        ever = ever | at_end
+    return at_end, ever
 
 
 def programs_for(env: BatchEnv) -> dict[str, Program]:
@@ -307,10 +316,8 @@ def _push_with(m: Moment, k: int) -> Actions:
 
 def _throw(m: Moment, k: int) -> Actions:
     obj, ref = m.bodies[0], m.bodies[k]
-    goal = ref.pos.copy()
-    goal[:, 2] = ref.pos[:, 2]
     return choose(
-        m.holds(obj), swing(m, obj, goal, elevation_rad=0.45, lead_s=0.05), grasp(m, obj)
+        m.holds(obj), swing(m, obj, ref.pos, elevation_rad=0.45, lead_s=0.05), grasp(m, obj)
     )
 
 

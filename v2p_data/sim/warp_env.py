@@ -21,7 +21,8 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for, torch_rng_for
-from v2p_data.sim.batch_env import ACT_DIM, HELD_STEPS, SimConfig
+from v2p_data.sim import task_code
+from v2p_data.sim.batch_env import ACT_DIM, HELD_STEPS, SimConfig, robot_of
 from v2p_data.sim.randomize import Randomizer
 from v2p_data.sim.robot import COARSE, FINE, FINGER_TRAVEL_M, NUM_ARM_JOINTS
 from v2p_data.sim.tensor_states import (
@@ -87,9 +88,10 @@ class WarpBatchEnv:
                 "backend 'cpu', or device 'cpu' to try the GPU's model slowly"
             )
         self.cfg = cfg or SimConfig()
-        if self.cfg.robot.path is not None:
+        robot = robot_of(bundle, self.cfg)
+        if robot.path is not None:
             raise V2PError(
-                f"the backend 'warp' has the built-in arm only; simulate {self.cfg.robot.path} with the backend 'cpu'"
+                f"the backend 'warp' has the built-in arm only; simulate {robot.path} with the backend 'cpu'"
             )
         self.bundle = bundle
         self.num_envs = num_envs
@@ -106,10 +108,12 @@ class WarpBatchEnv:
         self.seed(seed)
         self._sim = WarpPhysics(self.world, num_envs, self.device)
         self._allocate()
-        self.task = self._load_task(task)
+        self.task = task_code.load(bundle, self, task)
         self.reset(torch.arange(num_envs, device=self.device))
-        self.obs_dim = self._checked_obs_dim()
-        self.component_names = self._component_names()
+        self.obs_dim = task_code.checked_obs_dim(self.task, bundle.title, self.observe().shape[1])
+        self.component_names = task_code.component_names(
+            self.task, self._zeros(num_envs, ACT_DIM), self.states()
+        )
 
     @property
     def broken_count(self) -> int:
@@ -271,30 +275,9 @@ class WarpBatchEnv:
             **{f"env.{name}": getattr(self, name) for name in names},
         }
 
-    def _load_task(self, task: type[Task] | None) -> Task:
-        if task is not None:
-            return task(self, str(self.bundle.scene.folder), {})
-        from v2p_data.task.sandbox import load_task
-
-        return load_task(self.bundle.code, envs=self, scene=self.bundle.scene)
-
-    def _checked_obs_dim(self) -> int:
-        made, said = self.observe().shape[1], int(self.task.get_observation_space())
-        if made != said:
-            raise V2PError(
-                f"task '{self.bundle.title}' makes observations of length {made} but says {said}; "
-                "correct get_observation_space or compute_observation_key in its task.py"
-            )
-        return said
-
-    def _component_names(self) -> tuple[str, ...]:
-        _, parts = self.task.compute_reward(self._zeros(self.num_envs, ACT_DIM), self.states())
-        return tuple(parts)
-
     def _observation(self, states: dict[str, torch.Tensor]) -> Float32[torch.Tensor, "env obs"]:
-        columns = [states[key] for key in self.task.compute_observation_key(states)]
-        parts = [c if c.ndim == 2 else c[:, None] for c in columns]
-        return torch.nan_to_num(torch.cat(parts, dim=1), nan=0.0, posinf=0.0, neginf=0.0)
+        obs = task_code.observation(self.task, states)
+        return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0)
 
     def _move_targets(self, action: torch.Tensor) -> None:
         cfg, sim, scale = self.cfg, self._sim, self.bundle.motion_scale
