@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
@@ -36,7 +37,7 @@ from v2p_data.scene.scale import (
     disagreement,
     height_plausibility,
 )
-from v2p_data.scene.scene import Role
+from v2p_data.scene.scene import Observed, Role, Symmetry
 from v2p_data.scene.segment import bounding_box, from_box, from_points, grow, tidy
 from v2p_data.scene.table import Table, find_table
 from v2p_data.scene.track import Track, track
@@ -100,6 +101,13 @@ class Estimate:
     source: dict[str, str]
     """Where size, mass and friction come from, in words."""
     mass_kg: float
+    mesh: trimesh.Trimesh | None = field(default=None, repr=False)
+    """Best mesh, own frame, centred on its bounding box [m]; None means the noun's primitive of this size."""
+    parts: tuple[trimesh.Trimesh, ...] = field(default=(), repr=False)
+    """Convex solids that collide for `mesh`, in the same frame; empty where only the hull is known."""
+    symmetry: Symmetry = "none"
+    observed: tuple[Observed, ...] = ()
+    """Per pose whether one view shows its depth; empty means that all are fully observed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +127,8 @@ class Reconstruction:
     track: Track = field(repr=False)
     footage_frames: tuple[int, ...]
     """Clip frame behind each mask of the track."""
+    stages: dict[str, tuple[float, str]] = field(default_factory=dict[str, tuple[float, str]])
+    """Per stage how sure it is, 0 to 1, and why it is not surer."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,8 @@ from v2p_data.geometry.camera import Camera
 
 Role = Literal["manipulated", "reference", "tool", "container", "cover"]
 Shape = Literal["box", "cylinder", "sphere", "mesh"]
+Symmetry = Literal["none", "box", "round", "sphere"]
+Observed = Literal["full", "no_depth"]
 SCENE_FILE = "scene.json"
 SCHEMA = 1
 FLOOR_MIN_M = 0.006
