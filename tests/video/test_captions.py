@@ -5,7 +5,13 @@ import json
 import pytest
 
 from v2p_data.errors import V2PError
-from v2p_data.video.captions import find_videos, unique_items
+from v2p_data.video.captions import (
+    check_hints,
+    find_videos,
+    merge_captions,
+    unique_items,
+    write_captions,
+)
 
 
 @pytest.fixture
@@ -51,7 +57,13 @@ def test_a_camera_file_name_says_only_that_something_moves(tmp_path):
 
 
 def test_captions_json_gives_caption_objects_and_hints(folder):
-    hint = {"frame": 3, "box": [10, 20, 30, 40], "points": [[15, 25]], "size_m": [0.1, 0.1, 0.2]}
+    hint = {
+        "frame": 3,
+        "box": [10, 20, 30, 40],
+        "points": [[15, 25]],
+        "size_m": [0.1, 0.1, 0.2],
+        "name": "mug",
+    }
     entry = {
         "caption": "Pushing cup next to can",
         "objects": ["cup", "red can"],
@@ -128,6 +140,11 @@ def test_captions_that_cannot_be_used_are_named(folder, captions, said):
         ({"cup": {"points": []}}, "list of [x, y]"),
         ({"cup": {"points": [[1, 2, 3]]}}, "2 numbers"),
         ({"cup": {"size_m": [80, 80, 95]}}, "in metres"),
+        ({"cup": {"size_m": [0.08, 0.08, 0.001]}}, "from 0.002 to 1.5"),
+        ({"cup": {"size_m": [0.08, 0.08, 1.6]}}, "from 0.002 to 1.5"),
+        ({"cup": {"name": ""}}, "'name' is empty"),
+        ({"cup": {"name": 3}}, "'name' must be text"),
+        ({"cup": {"name": "mug " * 16}}, "in a word or two"),
         ({"cup": {"frame": -1, "box": [0, 0, 9, 9]}}, "from 0"),
         ({"cup": {"frame": 2}}, "says nothing"),
         ({"cup": {"bbox": [0, 0, 9, 9]}}, "Did you mean 'box'"),
@@ -168,3 +185,120 @@ def test_identifiers_are_plain_and_never_the_same_twice():
     assert items[:3] == ["cafe_au_lait", "cafe_au_lait_2", "cafe_au_lait_2_2"]
     assert items[3:5] == ["video", "video_2"]
     assert len(items[5]) == 80
+
+
+@pytest.mark.parametrize(
+    ("hint", "said"),
+    [
+        ({"frame": 12, "box": [0, 0, 9, 9]}, "no frame 12; the video's frames are 0 to 11"),
+        ({"frame": 0, "box": [60, 0, 66, 9]}, "outside of the picture, which is 64 x 48 px"),
+        ({"frame": 0, "box": [0, 0, 9, 50]}, "outside of the picture, which is 64 x 48 px"),
+        ({"frame": 0, "points": [[3, 3], [-1, 3]]}, "the point [-1, 3] lies outside"),
+    ],
+)
+def test_marks_outside_of_the_video_are_named(hint, said):
+    with pytest.raises(V2PError) as error:
+        check_hints({"cup": hint}, (64, 48), 12, "b.mp4")
+
+    assert said in str(error.value)
+    assert str(error.value).startswith("b.mp4, hint 'cup'")
+
+
+def test_marks_at_the_border_of_the_picture_are_in_it():
+    hints = {"cup": {"frame": 11, "box": [0, 0, 64.4, 48], "points": [[64, 48]]}}
+    check_hints(hints, (64, 48), 12, "b.mp4")
+
+
+def merged(folder, addition):
+    """Write another caption file, merge it, and return what the folder says then."""
+    write(folder, addition, "downloaded.txt")
+    result = merge_captions(folder, folder / "downloaded.txt")
+    write_captions(result)
+    return result
+
+
+CUP = {"caption": "Pushing cup next to can", "objects": ["cup", "red can"]}
+
+
+def test_hints_are_added_and_nothing_else_changes(folder):
+    can = {"frame": 2, "box": [1, 2, 3, 4]}
+    write(folder, {"a.MOV": "Lifting   box up", "b.mp4": {**CUP, "hints": {"red can": can}}})
+
+    result = merged(folder, {"b.mp4": {**CUP, "hints": {"cup": {"name": "mug"}}}})
+
+    assert json.loads((folder / "captions.json").read_text()) == {
+        "a.MOV": "Lifting   box up",
+        "b.mp4": {**CUP, "hints": {"red can": can, "cup": {"name": "mug"}}},
+    }
+    assert result.added == ("b.mp4, 'cup': name",)
+    assert find_videos(folder)[1].hints["red can"] == can
+
+
+def test_a_new_box_replaces_the_marks_of_its_object_and_keeps_its_size(folder):
+    old = {"frame": 2, "points": [[5, 5]], "size_m": [0.1, 0.1, 0.1]}
+    write(folder, {"b.mp4": {**CUP, "hints": {"cup": old}}})
+
+    new = {"frame": 7, "box": [1, 2, 3, 4]}
+    merged(folder, {"clips": [{"item": "b", "video": "b.mp4", "hints": {"cup": new}}]})
+
+    hint = find_videos(folder)[1].hints["cup"]
+    assert hint == {"frame": 7, "box": [1, 2, 3, 4], "size_m": [0.1, 0.1, 0.1]}
+
+
+def test_the_first_hint_of_a_folder_without_captions_keeps_what_the_file_names_say(folder):
+    before = find_videos(folder)
+    hint = {"frame": 0, "box": [1, 2, 3, 4]}
+
+    name = "push_left_to_right__red_box.webm"
+    merged(folder, {name: {"caption": before[2].caption, "hints": {"red box": hint}}})
+
+    after = find_videos(folder)
+    assert [(v.caption, v.objects) for v in after] == [(v.caption, v.objects) for v in before]
+    assert after[2].hints == {"red box": hint}
+    assert not list(folder.glob("*.bak*"))
+
+
+def test_the_old_caption_file_is_kept_beside_the_new_one_each_time(folder):
+    write(folder, {"b.mp4": CUP})
+    first = (folder / "captions.json").read_bytes()
+
+    for name in ("mug", "beaker"):
+        merged(folder, {"b.mp4": {**CUP, "hints": {"cup": {"name": name}}}})
+
+    assert (folder / "captions.json.bak").read_bytes() == first
+    assert "mug" in (folder / "captions.json.bak2").read_text()
+    assert find_videos(folder)[1].hints["cup"]["name"] == "beaker"
+
+
+def test_another_caption_in_the_added_file_is_reported_and_not_taken(folder):
+    write(folder, {"b.mp4": CUP})
+
+    result = merged(folder, {"b.mp4": {**CUP, "caption": "Throwing cup"}})
+
+    assert (result.added, result.hints) == ((), {})
+    assert "caption stays 'Pushing cup next to can'" in result.kept[0]
+
+
+@pytest.mark.parametrize(
+    ("addition", "said"),
+    [
+        ({"c.mp4": "x"}, "no such video"),
+        ({"B.mp4": "x"}, "Did you mean 'b.mp4'"),
+        ({"b.mp4": {"hints": {"cap": {"name": "x"}}}}, "Did you mean 'cup'"),
+        ({"b.mp4": {"hints": {"cup": {"box": [9, 0, 0, 9]}}}}, "x0 < x1"),
+        ({"b.mp4": {"hints": {"cup": 3}}}, "must be an object"),
+        ({"b.mp4": {"hints": 3}}, "name -> hint"),
+        ({"clips": [{"hints": {"cup": {"name": "x"}}}]}, "no such video"),
+        ([], "neither a caption file nor a review"),
+        ('{"b.mp4"', "not valid JSON"),
+    ],
+)
+def test_additions_that_cannot_be_used_are_named_and_change_nothing(folder, addition, said):
+    write(folder, {"b.mp4": CUP})
+    before = (folder / "captions.json").read_bytes()
+
+    with pytest.raises(V2PError) as error:
+        merged(folder, addition)
+
+    assert said in str(error.value)
+    assert (folder / "captions.json").read_bytes() == before

@@ -6,10 +6,15 @@ same folder (a JSON list of `{id, label, template, placeholders}`), else from th
     {"lift.mp4": "Lifting red box up",
      "push.mp4": {"caption": "Pushing blue box next to can", "objects": ["blue box", "can"],
                   "hints": {"can": {"frame": 0, "box": [310, 120, 380, 240], "size_m": [0.066, 0.066, 0.12]}}}}
+
+A hint marks one object: `box` and `points` in one `frame`, `size_m`, or the `name` of what is meant where the
+caption's words do not say it.
 """
 
 import json
+import os
 import re
+import shutil
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,11 +28,17 @@ from v2p_data.video.meaning import parse_caption as parse_caption
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".webm", ".mkv", ".gif")
 CAPTIONS_FILE = "captions.json"
-MAX_SIZE_M = 3.0
+MIN_SIZE_M = 0.002
+"""Thinner than a coin is a slip of the unit, and nothing a simulator can hold."""
+MAX_SIZE_M = 1.5
 """No object on a table is longer."""
+MAX_NAME = 60
+"""Letters; a longer name is a sentence."""
 
 _ENTRY_KEYS = ("caption", "hints", "objects")
-_HINT_KEYS = ("box", "frame", "points", "size_m")
+_HINT_KEYS = ("box", "frame", "name", "points", "size_m")
+_MARK_KEYS = ("box", "frame", "points")
+"""What belongs to one frame and is replaced together."""
 _NO_WORDS = r"\d+|img|vid|video|videos|clip|mov|pxl|dsc|gopr|rec|screen|untitled|new|final|copy"
 
 
@@ -70,6 +81,137 @@ def find_videos(folder: Path) -> list[VideoItem]:
     ]
 
 
+def check_hints(
+    hints: Mapping[str, Hint], size_px: tuple[int, int], num_frames: int, where: str
+) -> None:
+    """Check marks against the picture they were made in.
+
+    Args:
+        hints: by object phrase, in the file's pixels and frame numbers.
+        size_px: width and height of the picture as a player shows it.
+        num_frames: frames that the file holds.
+        where: what a sentence begins with, such as the file's name.
+
+    Raises:
+        V2PError: a mark lies outside of the picture, or in a frame that there is not.
+    """
+    width, height = size_px
+    for name, hint in hints.items():
+        frame = hint.get("frame", 0)
+        if frame >= num_frames:
+            raise V2PError(
+                f"{where}, hint '{name}': there is no frame {frame}; the video's frames are 0 to {num_frames - 1}"
+            )
+        x0, y0, x1, y1 = hint.get("box", [0, 0, width, height])
+        # a box drawn to the border may round to the pixel behind it
+        if x1 > width + 1 or y1 > height + 1:
+            raise V2PError(
+                f"{where}, hint '{name}': the box {[x0, y0, x1, y1]} reaches outside of the picture, "
+                f"which is {width} x {height} px"
+            )
+        for x, y in hint.get("points", []):
+            if not (0 <= x <= width and 0 <= y <= height):
+                raise V2PError(
+                    f"{where}, hint '{name}': the point {[x, y]} lies outside of the picture, "
+                    f"which is {width} x {height} px"
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Merged:
+    """A caption file with hints added, not yet written."""
+
+    path: Path
+    captions: dict[str, Any]
+    """All that the file is to hold: entries that got no hint are as they were, to the letter."""
+    hints: dict[str, dict[str, Hint]]
+    """By file name, all hints of each video that got one; their marks are not yet checked against the picture."""
+    added: tuple[str, ...]
+    """One line for each object whose hint changed."""
+    kept: tuple[str, ...]
+    """One sentence for each caption or list of objects that differs and stays as it is in the folder."""
+
+
+def merge_captions(folder: Path, addition: Path) -> Merged:
+    """Return a folder's captions with the hints of another caption file, or of a review, added.
+
+    Nothing is taken away: hints for other objects and videos stay. For one object a new box or new points replace the
+    old marks together, because they belong to one frame; a size or a name replaces only itself.
+
+    Args:
+        folder: the folder of the videos.
+        addition: a `captions.json`, or a `review.json` (`{"clips": [{"video", "hints"}]}`).
+
+    Raises:
+        V2PError: no such file, a clip or an object that is not known, or a hint that cannot be used.
+    """
+    items = {video.path.name: video for video in find_videos(folder)}
+    path = folder / CAPTIONS_FILE
+    captions: dict[str, Any] = _read_json(path) if path.is_file() else {}
+    changed: dict[str, dict[str, Hint]] = {}
+    added: list[str] = []
+    kept: list[str] = []
+    for name, entry in _entries_of(addition).items():
+        where = f"{addition}, entry '{name}'"
+        if name not in items:
+            raise V2PError(
+                f"{where}: there is no such video in {folder}.{did_you_mean(name, items)}"
+            )
+        video = items[name]
+        hints = entry.get("hints") or {}
+        for key, here in (("caption", video.caption), ("objects", list(video.objects))):
+            if entry.get(key, here) != here:
+                kept.append(f"{name}: {key} stays {here!r}; the other file has {entry[key]!r}")
+        if not hints:
+            continue
+        entry_here = captions.get(name)
+        old: dict[str, Any] = (
+            entry_here if isinstance(entry_here, dict) else {"caption": video.caption}
+        )
+        both: dict[str, Any] = dict(old.get("hints", {}))
+        for phrase, hint in hints.items():
+            both[phrase] = _merged_hint(both.get(phrase), hint)
+        if both == old.get("hints", {}):
+            continue
+        new = {"objects": list(video.objects), **old, "hints": both}
+        new = {key: new[key] for key in ("caption", "objects", "hints")}
+        _, _, checked = _entry(new, where)
+        changed[name] = checked
+        added += [
+            f"{name}, '{phrase}': {', '.join(k for k in sorted(both[phrase]) if k != 'frame')}"
+            for phrase in hints
+            if both[phrase] != old.get("hints", {}).get(phrase)
+        ]
+        captions[name] = new
+    return Merged(
+        path=path, captions=captions, hints=changed, added=tuple(added), kept=tuple(kept)
+    )
+
+
+def write_captions(merged: Merged) -> Path | None:
+    """Write the caption file so that it is either whole or as it was; return the copy of the old one, if there was one.
+
+    Raises:
+        V2PError: the folder cannot be written.
+    """
+    path, backup = merged.path, None
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        if path.is_file():
+            backup = _free_name(path)
+            shutil.copyfile(path, backup)
+        with temporary.open("w", encoding="utf-8") as stream:
+            json.dump(merged.captions, stream, indent=1, ensure_ascii=False)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise V2PError(
+            f"{path} cannot be written: {error.strerror}; nothing was changed"
+        ) from error
+    return backup
+
+
 def unique_items(stems: list[str]) -> list[str]:
     """Return an identifier for each file name; where two would be the same, the later gets a number."""
     taken: set[str] = set()
@@ -83,6 +225,49 @@ def unique_items(stems: list[str]) -> list[str]:
         taken.add(item)
         items.append(item)
     return items
+
+
+def _entries_of(path: Path) -> dict[str, dict[str, Any]]:
+    """Return caption, objects and hints by file name, from either kind of file."""
+    data = _read_json(path)
+    if not isinstance(data, dict):
+        raise V2PError(
+            f"{path} is neither a caption file nor a review: both are objects, not a {_type_of(data)}"
+        )
+    if isinstance(data.get("clips"), list):
+        clips = [c for c in data["clips"] if isinstance(c, dict) and c.get("hints")]
+        data = {str(c.get("video", "")): {"hints": c["hints"]} for c in clips}
+    entries: dict[str, dict[str, Any]] = {}
+    for name, entry in data.items():
+        where = f"{path}, entry '{name}'"
+        entry = {"caption": entry} if isinstance(entry, str) else entry
+        if not isinstance(entry, dict):
+            raise V2PError(
+                f"{where}: give a caption, or an object with caption, objects and hints, not a {_type_of(entry)}"
+            )
+        _check_keys(entry, _ENTRY_KEYS, where)
+        if not isinstance(entry.get("hints", {}), dict):
+            raise V2PError(
+                f"{where}: 'hints' must be an object, name -> hint, not a {_type_of(entry['hints'])}"
+            )
+        entries[name] = entry
+    return entries
+
+
+def _merged_hint(old: Any, new: Any) -> Any:
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return new
+    if "box" in new or "points" in new:
+        old = {k: v for k, v in old.items() if k not in _MARK_KEYS}
+        return {**old, **new}
+    return {**old, **{k: v for k, v in new.items() if k != "frame"}}
+
+
+def _free_name(path: Path) -> Path:
+    backup, number = path.with_name(f"{path.name}.bak"), 2
+    while backup.exists():
+        backup, number = path.with_name(f"{path.name}.bak{number}"), number + 1
+    return backup
 
 
 _Said = tuple[str, tuple[str, ...], dict[str, Hint]]
@@ -171,13 +356,21 @@ def _hint(hint: Any, where: str) -> Hint:
         checked["points"] = [_numbers(p, 2, f"{where}: a point must be [x, y]") for p in points]
     if "size_m" in hint:
         size = _numbers(hint["size_m"], 3, f"{where}: 'size_m' must be [length, width, height]")
-        if not all(0 < side <= MAX_SIZE_M for side in size):
+        if not all(MIN_SIZE_M <= side <= MAX_SIZE_M for side in size):
             raise V2PError(
-                f"{where}: 'size_m' is in metres, each above 0 and at most {MAX_SIZE_M}, got {size}"
+                f"{where}: 'size_m' is in metres, each from {MIN_SIZE_M} to {MAX_SIZE_M}, got {size}"
             )
         checked["size_m"] = size
+    if "name" in hint:
+        name = _words(hint["name"], f"{where}: 'name'")
+        if len(name) > MAX_NAME:
+            raise V2PError(
+                f"{where}: 'name' is the object's name in a word or two, at most {MAX_NAME} letters, "
+                f"not {len(name)}"
+            )
+        checked["name"] = name
     if len(checked) == 1:
-        raise V2PError(f"{where}: says nothing; give a box, points or size_m")
+        raise V2PError(f"{where}: says nothing; give a box, points, size_m or name")
     return checked
 
 

@@ -20,6 +20,8 @@ class Hint(TypedDict, total=False):
     """Points on the object, `[x, y]` [px]."""
     size_m: list[float]
     """Length, width, height [m]."""
+    name: str
+    """What the object is, where the caption's words do not say it or say it badly: `mug`."""
 
 
 @dataclass(frozen=True, kw_only=True)
