@@ -1,0 +1,317 @@
+"""Truth and reconstruction are compared by what can be seen and used; numbers by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from v2p_data.geometry.mesh import mesh_for
+from v2p_data.geometry.pose import transform
+from v2p_data.scene.score import (
+    FoundClip,
+    FoundThing,
+    TrueClip,
+    TrueThing,
+    opening,
+    rejected,
+    score_clip,
+    shape_ious,
+    size_sides,
+    turn_between,
+)
+
+BOX_M = (0.12, 0.08, 0.04)
+CAMERA = transform(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.5]))
+
+
+def about(axis: str, degrees: float) -> np.ndarray:
+    return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+
+
+def mask(rows: slice, columns: slice) -> np.ndarray:
+    image = np.zeros((40, 60), bool)
+    image[rows, columns] = True
+    return image
+
+
+SEEN = mask(slice(10, 20), slice(10, 20))
+
+
+def true_thing(size=BOX_M, form="box", hollow=False, symmetry="box", move=(0.1, 0, 0), **more):
+    mesh = mesh_for(form, size, hollow=hollow)
+    T = np.tile(np.eye(4), (10, 1, 1))
+    T[:, :3, 3] = np.linspace(0, 1, 10)[:, None] * move + [0, 0, size[2] / 2]
+    values = {
+        "phrase": "red box",
+        "size_m": size,
+        "hollow": hollow,
+        "symmetry": symmetry,
+        "mesh": mesh,
+        "T_world_objs": T,
+        "masks": {0: SEEN, 5: SEEN, 9: SEEN},
+    }
+    return TrueThing(**{**values, **more})
+
+
+def found_thing(size=BOX_M, form="box", hollow=False, move=(0.1, 0, 0), **more):
+    at = np.array([0, 0, size[2] / 2])
+    values = {
+        "phrase": "red box",
+        "size_m": size,
+        "hollow": hollow,
+        "is_round": form == "cylinder",
+        "mesh": mesh_for(form, size, hollow=hollow),
+        "T_world_first": transform(np.eye(3), at),
+        "T_world_last": transform(np.eye(3), at + move),
+        "last_frame": 9,
+        "masks": {0: SEEN, 5: SEEN, 9: SEEN},
+    }
+    return FoundThing(**{**values, **more})
+
+
+def scored(true, found, kind="push_left", found_kind=None):
+    return score_clip(
+        TrueClip(kind=kind, things=(true,), T_world_cam=CAMERA),
+        FoundClip(kind=found_kind or kind, things=(found,), T_world_cam=CAMERA),
+    )
+
+
+def test_the_truth_itself_is_a_usable_scene_without_error():
+    score = scored(true_thing(), found_thing())
+
+    assert score.usable
+    thing = score.things[0]
+    assert (thing.box_iou, thing.iou_mean, thing.shape_iou) == (1, 1, 1)
+    assert thing.size_error_m == 0
+    assert thing.position_last_m == pytest.approx(0)
+    assert thing.turn_last_rad == pytest.approx(0, abs=1e-6)
+
+
+def test_errors_are_distances_between_centres_in_metres():
+    thing = scored(true_thing(), found_thing(move=(0.1, 0.03, 0.04))).things[0]
+
+    assert thing.position_first_m == pytest.approx(0)
+    assert thing.position_last_m == pytest.approx(0.05)
+
+
+def test_a_camera_that_is_taken_to_be_higher_shows_in_its_own_frame_only():
+    true, found = true_thing(), found_thing()
+    higher = CAMERA.copy()
+    higher[2, 3] += 0.07
+    thing = score_clip(
+        TrueClip(kind="push_left", things=(true,), T_world_cam=CAMERA),
+        FoundClip(kind="push_left", things=(found,), T_world_cam=higher),
+    ).things[0]
+
+    assert thing.position_first_m == pytest.approx(0)
+    assert thing.position_first_cam_m == pytest.approx(0.07)
+
+
+def test_a_box_may_name_its_sides_in_another_order():
+    found = found_thing(size=(BOX_M[1], BOX_M[0], BOX_M[2]))
+    swapped = turn_between(true_thing(), found, np.eye(3), about("z", 90))
+    unturned = turn_between(true_thing(), found, np.eye(3), np.eye(3))
+
+    assert swapped == pytest.approx(0, abs=1e-6)
+    assert np.degrees(unturned) == pytest.approx(90)
+
+
+@pytest.mark.parametrize(("axis", "degrees"), [("x", 180), ("y", 180), ("z", 180)])
+def test_a_box_turned_by_half_a_turn_is_the_same_box(axis, degrees):
+    turn = turn_between(true_thing(), found_thing(), np.eye(3), about(axis, degrees))
+
+    assert turn == pytest.approx(0, abs=1e-6)
+
+
+def test_a_quarter_turn_of_a_square_box_is_nothing_and_of_a_long_one_a_quarter_turn():
+    square = (0.08, 0.08, 0.04)
+    of_square = turn_between(
+        true_thing(square), found_thing(square), np.eye(3), about("z", 90 + 12)
+    )
+    of_long = turn_between(true_thing(), found_thing(), np.eye(3), about("z", 90))
+
+    assert np.degrees(of_square) == pytest.approx(12)
+    assert np.degrees(of_long) == pytest.approx(90)
+
+
+def test_of_a_can_only_the_axis_counts_and_of_a_cup_its_direction_too():
+    size = (0.07, 0.07, 0.11)
+    can = true_thing(size, "cylinder", symmetry="round"), found_thing(size, "cylinder")
+    cup = (
+        true_thing(size, "cylinder", hollow=True, symmetry="round"),
+        found_thing(size, "cylinder", hollow=True),
+    )
+    over, spun = about("x", 180), about("z", 70)
+
+    assert turn_between(*can, np.eye(3), spun) == pytest.approx(0, abs=1e-6)
+    assert turn_between(*can, np.eye(3), over) == pytest.approx(0, abs=1e-6)
+    assert np.degrees(turn_between(*can, np.eye(3), about("x", 80))) == pytest.approx(80)
+    assert np.degrees(turn_between(*cup, np.eye(3), over)) == pytest.approx(180)
+
+
+def test_a_ball_has_no_orientation():
+    ball = true_thing((0.07,) * 3, "sphere", symmetry="sphere")
+
+    assert turn_between(ball, found_thing(), np.eye(3), about("y", 77)) == 0
+
+
+def test_a_can_taken_for_a_box_has_the_mean_side_as_its_diameter():
+    can = true_thing((0.07, 0.07, 0.11), "cylinder", symmetry="round")
+    # lies on its side in its own frame: the axis is x
+    sides, ours = size_sides(can, found_thing((0.12, 0.06, 0.08)))
+
+    assert sides.tolist() == pytest.approx([0.07, 0.11])
+    assert ours.tolist() == pytest.approx([0.07, 0.12])
+
+
+def test_the_size_error_of_a_box_is_of_its_sorted_sides():
+    thing = scored(true_thing(), found_thing((0.05, 0.13, 0.08))).things[0]
+
+    # 12 8 4 against 13 8 5 cm
+    assert thing.size_error_m == pytest.approx(0.02 / 3)
+    assert thing.size_error_share == pytest.approx((1 / 12 + 0 + 1 / 4) / 3)
+
+
+def test_shapes_overlap_as_their_volumes_do():
+    cube = trimesh.creation.box((1, 1, 1))
+    ball, can = trimesh.creation.icosphere(4, 0.5), trimesh.creation.cylinder(0.5, 1, sections=64)
+    plain = {"hollow": (False, False), "cavity_matters": False}
+
+    assert shape_ious(cube, ball, **plain)[0] == pytest.approx(np.pi / 6, abs=0.01)
+    assert shape_ious(cube, can, **plain)[0] == pytest.approx(np.pi / 4, abs=0.01)
+    assert shape_ious(cube, mesh_for("box", (3.0, 1.0, 0.2)), **plain)[0] == 1
+
+
+def test_a_lying_mesh_is_turned_upright_before_it_is_compared():
+    cone = trimesh.creation.cone(0.04, 0.1)
+    lying = cone.copy()
+    lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+
+    volume, shape = shape_ious(cone, lying, hollow=(False, False), cavity_matters=False)
+
+    assert volume == shape
+    assert volume > 0.95
+
+
+def test_an_open_box_is_open_upwards_and_a_closed_one_nowhere():
+    bin_ = mesh_for("box", (0.2, 0.15, 0.1), hollow=True)
+    over = bin_.copy()
+    over.apply_transform(trimesh.transformations.rotation_matrix(np.pi, [1, 0, 0]))
+
+    assert opening(mesh_for("box", BOX_M)) is None
+    assert opening(mesh_for("sphere", (0.1, 0.1, 0.1))) is None
+    assert opening(bin_).tolist() == [0, 0, 1]
+    assert opening(over).tolist() == [0, 0, -1]
+
+
+def test_a_thicker_wall_is_no_broken_mesh_but_a_solid_container_is_one():
+    size = (0.16, 0.12, 0.08)
+    thin = mesh_for("box", size, hollow=True)
+    thick = trimesh.util.concatenate(  # walls of 1 cm, a floor of 1 cm
+        [
+            trimesh.creation.box((0.16, 0.12, 0.01)).apply_translation((0, 0, -0.035)),
+            trimesh.creation.box((0.01, 0.12, 0.07)).apply_translation((0.075, 0, 0.005)),
+            trimesh.creation.box((0.01, 0.12, 0.07)).apply_translation((-0.075, 0, 0.005)),
+            trimesh.creation.box((0.14, 0.01, 0.07)).apply_translation((0, 0.055, 0.005)),
+            trimesh.creation.box((0.14, 0.01, 0.07)).apply_translation((0, -0.055, 0.005)),
+        ]
+    )
+    volume, shape = shape_ious(thin, thick, hollow=(True, True), cavity_matters=True)
+    true = true_thing(size, hollow=True)
+
+    assert volume < 0.6 < 0.75 < shape
+    assert "mesh" in scored(true, found_thing(size), kind="insert").failures
+    assert "mesh" not in scored(true, found_thing(size), kind="push_left").failures
+
+
+def test_the_wrong_place_in_the_picture_fails_grounding_and_segmentation():
+    elsewhere = mask(slice(10, 20), slice(16, 26))  # 4 of 16 columns in common
+    found = found_thing(masks={0: elsewhere, 9: elsewhere})
+    score = scored(true_thing(), found)
+
+    assert score.things[0].box_iou == pytest.approx(0.25)
+    assert score.things[0].iou_mean == pytest.approx(0.25)
+    assert set(score.failures) == {"grounding", "segmentation"}
+    assert score.trouble == ("grounding", "'red box': box IoU 0.25")
+
+
+def test_what_is_hidden_at_first_is_looked_for_at_the_end():
+    hidden = np.zeros_like(SEEN)
+    true = true_thing(masks={0: hidden, 5: hidden, 9: SEEN})
+    found = found_thing(masks={0: ~SEEN, 9: SEEN})
+
+    thing = scored(true, found).things[0]
+    assert thing.box_iou == 1
+    assert thing.iou_mean == 1
+
+
+def test_a_reconstruction_that_stops_before_the_motion_fails_its_pose():
+    # after frame 3 of 9 a third of the way is done, and the pose is right
+    found = found_thing(move=(0.1 / 3, 0, 0), last_frame=3)
+
+    assert scored(true_thing(), found).failures == {
+        "pose": "'red box': ends after 33% of the motion"
+    }
+
+
+@pytest.mark.parametrize(
+    ("found", "stage"),
+    [
+        (found_thing(move=(0.16, 0, 0)), "pose"),
+        (found_thing((0.2, 0.08, 0.04)), "size"),
+        (
+            found_thing(T_world_last=transform(about("z", 40), np.array([0.1, 0, 0.02]))),
+            "pose",
+        ),
+        (found_thing(mesh=trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 1]], [[0, 1, 2]])), "mesh"),
+    ],
+)  # fmt: skip
+def test_a_scene_with_one_fault_is_not_usable(found, stage):
+    trouble = scored(true_thing(), found).trouble
+
+    assert trouble is not None
+    assert trouble[0] == stage
+
+
+def test_another_kind_of_task_is_not_usable():
+    assert scored(true_thing(), found_thing(), found_kind="lift_up").trouble == (
+        "kind",
+        "lift_up instead of push_left",
+    )
+
+
+def test_a_missing_second_object_fails_grounding():
+    true = true_thing(), true_thing(phrase="can")
+    score = score_clip(
+        TrueClip(kind="push_next_to", things=true, T_world_cam=CAMERA),
+        FoundClip(kind="push_next_to", things=(found_thing(),), T_world_cam=CAMERA),
+    )
+
+    assert "'can'" in score.failures["grounding"]
+    assert not score.things[0].failures()
+
+
+def test_objects_are_matched_by_what_the_caption_calls_them():
+    true = (
+        true_thing(),
+        true_thing(phrase="can"),
+        true_thing(phrase="cup"),
+    )
+    others = [replace(found_thing(), phrase=p) for p in ("cup", "can")]
+    moved = replace(others[0], T_world_first=transform(np.eye(3), np.array([1.0, 0, 0.02])))
+    score = score_clip(
+        TrueClip(kind="generic", things=true, T_world_cam=CAMERA),
+        FoundClip(kind="generic", things=(found_thing(), moved, others[1]), T_world_cam=CAMERA),
+    )
+
+    assert score.things[1].position_first_m == pytest.approx(0)
+    assert score.things[2].position_first_m == pytest.approx(1)
+
+
+def test_a_rejected_clip_fails_every_stage_with_its_slug():
+    true = TrueClip(kind="push_left", things=(true_thing(),), T_world_cam=CAMERA)
+
+    assert set(rejected(true, "camera_moves").failures.values()) == {"camera_moves"}
+    assert not rejected(true, "camera_moves").usable
