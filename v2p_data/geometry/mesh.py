@@ -155,6 +155,14 @@ def wall_m(size_m: Size) -> float:
     return float(min(np.clip(0.06 * min(size_m), _MIN_WALL_M, 0.006), 0.2 * min(size_m)))
 
 
+def mass_properties(
+    mesh: trimesh.Trimesh, mass_kg: float
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Return the centre of mass [m] and the inertia about it [kg m2] of a closed mesh of one density."""
+    found = trimesh.triangles.mass_properties(mesh.triangles, density=mass_kg / mesh.volume)
+    return np.asarray(found.center_mass), np.asarray(found.inertia)
+
+
 def outline_points(form: str, size_m: Size, taper: float = 1.0) -> Float[np.ndarray, "n 3"]:
     """Return few points whose convex hull is the shape: what a silhouette needs."""
     length, width, height = size_m

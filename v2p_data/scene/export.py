@@ -1,53 +1,72 @@
-"""A reconstruction becomes a folder: `scene.json`, meshes, URDF per object, one MJCF of all, and the overlay.
+"""A reconstruction becomes a folder: `scene.json`, meshes with their convex parts, masks, and models for simulators.
 
-The MJCF shows the scene as the video did, without a robot, with the keyframes `first` and `last`; the simulator builds
-its own worlds from `scene.json`.
+`meshes/` holds per object OBJ, PLY and convex parts, `masks/` its mask track, `urdf/` and `mjcf/` the object alone,
+`scene.xml` all of them in MJCF: the scene as the video showed it, without a robot, with the keyframes `first` and `last`.
+The simulator builds its own worlds from `scene.json`.
 """
 
 import xml.etree.ElementTree as ET
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
+from jaxtyping import Float
 
 from v2p_data.geometry.camera import mujoco_xyaxes
-from v2p_data.geometry.mesh import mesh_for, write_obj
+from v2p_data.geometry.mesh import mass_properties, mesh_for, parts_for, write_obj, write_ply
 from v2p_data.geometry.pose import pose_from_transform
 from v2p_data.scene.overlay import write_overlay
 from v2p_data.scene.reconstruct import Estimate, Reconstruction
-from v2p_data.scene.scene import Scene, SceneObject, Shape
+from v2p_data.scene.scene import Scene, SceneObject, Shape, StageConfidence, write_masks
 
 MJCF_FILE = "scene.xml"
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Body:
+    """An object with what its models need beside `scene.json`."""
+
+    thing: SceneObject
+    com: Float[np.ndarray, "3"]
+    inertia: Float[np.ndarray, "3 3"]
+    """About the centre of mass [kg m2]."""
+
+
 def write_scene(reconstruction: Reconstruction, folder: Path) -> Scene:
     """Write the scene with all its files into `folder` and return it."""
-    (folder / "meshes").mkdir(parents=True, exist_ok=True)
-    (folder / "urdf").mkdir(exist_ok=True)
+    for name in ("meshes", "urdf", "mjcf", "masks"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
     clip = reconstruction.clip
-    objects = tuple(_write_object(thing, folder) for thing in reconstruction.objects)
+    bodies = [_write_object(thing, folder) for thing in reconstruction.objects]
     scene = Scene(
         title=clip.item,
         video=clip.path.name,
         description=clip.caption,
         kind=reconstruction.kind,
-        objects=objects,
+        objects=tuple(body.thing for body in bodies),
         camera=reconstruction.camera,
         fps=float(clip.fps),
         num_frames=len(clip.frames),
         confidence=round(reconstruction.confidence, 4),
+        confidences={
+            stage: StageConfidence(value=round(value, 4), reason=reason)
+            for stage, (value, reason) in reconstruction.stages.items()
+        },
         warnings=(*clip.warnings, *reconstruction.warnings),
         folder=folder,
     )
-    (folder / MJCF_FILE).write_text(_xml(mjcf_of(scene)))
+    (folder / MJCF_FILE).write_text(_xml(_scene_mjcf(scene, bodies)))
     write_overlay(reconstruction, folder)
     scene.save(folder)
     return scene
 
 
-def mjcf_of(scene: Scene) -> ET.Element:
+def _scene_mjcf(scene: Scene, bodies: list[_Body]) -> ET.Element:
     """Return the scene as MJCF: a table top at z = 0, the objects free on it, the video's camera."""
     root = ET.Element("mujoco", model=scene.title)
     ET.SubElement(root, "compiler", meshdir="meshes", angle="radian")
+    ET.SubElement(root, "option", gravity=_numbers(scene.gravity_m_s2))
     camera = scene.camera
     ET.SubElement(
         ET.SubElement(root, "visual"),
@@ -67,30 +86,8 @@ def mjcf_of(scene: Scene) -> ET.Element:
         xyaxes=_numbers(mujoco_xyaxes(camera.T_world_cam)),
         fovy=f"{np.degrees(2 * np.arctan(camera.height_px / 2 / camera.K[1, 1])):.4f}",
     )
-    for thing in scene.objects:
-        pose = thing.first_pose
-        body = ET.SubElement(
-            world, "body", name=thing.name, pos=_numbers(pose[:3]), quat=_numbers(pose[3:])
-        )
-        ET.SubElement(body, "freejoint", name=f"{thing.name}_free")
-        look = {
-            "rgba": _numbers(thing.rgba),
-            "mass": f"{thing.mass_kg:.6g}",
-            "friction": f"{thing.friction:.4g} 0.005 0.0001",
-        }
-        half = np.array(thing.size_m) / 2
-        if thing.shape == "box":
-            look |= {"type": "box", "size": _numbers(half)}
-        elif thing.shape == "sphere":
-            look |= {"type": "sphere", "size": _numbers(half[:1])}
-        elif thing.shape == "cylinder":
-            look |= {"type": "cylinder", "size": _numbers(half[[0, 2]])}
-        else:
-            ET.SubElement(
-                asset, "mesh", name=thing.name, file=Path(thing.mesh).name, inertia="shell"
-            )
-            look |= {"type": "mesh", "mesh": thing.name}
-        ET.SubElement(body, "geom", {"name": thing.name, **look})
+    for body in bodies:
+        _add_body(world, asset, body, body.thing.first_pose)
     keyframes = ET.SubElement(root, "keyframe")
     for name in ("first", "last"):
         poses = [o.first_pose if name == "first" else o.last_pose for o in scene.objects]
@@ -98,8 +95,51 @@ def mjcf_of(scene: Scene) -> ET.Element:
     return root
 
 
-def urdf_of(thing: SceneObject) -> ET.Element:
+def _object_mjcf(body: _Body) -> ET.Element:
+    root = ET.Element("mujoco", model=body.thing.name)
+    ET.SubElement(root, "compiler", meshdir="../meshes", angle="radian")
+    asset, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
+    _add_body(world, asset, body, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    return root
+
+
+def _add_body(
+    world: ET.Element, asset: ET.Element, body: _Body, pose: Float[np.ndarray, "7"]
+) -> None:
+    """Add a free body: a primitive is one geom; else the mesh is seen and its convex parts collide."""
+    thing, i = body.thing, body.inertia
+    element = ET.SubElement(
+        world, "body", name=thing.name, pos=_numbers(pose[:3]), quat=_numbers(pose[3:])
+    )
+    ET.SubElement(element, "freejoint", name=f"{thing.name}_free")
+    ET.SubElement(
+        element,
+        "inertial",
+        pos=_numbers(body.com),
+        mass=f"{thing.mass_kg:.6g}",
+        fullinertia=_numbers([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]),
+    )
+    look = {"rgba": _numbers(thing.rgba)}
+    touch = {"friction": f"{thing.friction:.4g} 0.005 0.0001"}
+    half = np.array(thing.size_m) / 2
+    sizes = {"box": half, "sphere": half[:1], "cylinder": half[[0, 2]]}
+    if thing.shape != "mesh":
+        form = {"type": thing.shape, "size": _numbers(sizes[thing.shape])}
+        ET.SubElement(element, "geom", {"name": thing.name, **form, **look, **touch})
+        return
+    for file in dict.fromkeys((thing.mesh, *thing.parts)):
+        # The body's own inertia counts; MuJoCo refuses thin solids unless it takes them for shells.
+        ET.SubElement(asset, "mesh", name=Path(file).stem, file=Path(file).name, inertia="shell")
+    seen = {"type": "mesh", "mesh": Path(thing.mesh).stem, "contype": "0", "conaffinity": "0"}
+    ET.SubElement(element, "geom", {"name": thing.name, "group": "2", **seen, **look})
+    for k, file in enumerate(thing.parts):
+        form = {"type": "mesh", "mesh": Path(file).stem, "group": "3"}
+        ET.SubElement(element, "geom", {"name": f"{thing.name}_{k}", **form, **look, **touch})
+
+
+def _urdf(body: _Body) -> ET.Element:
     """Return one object as URDF; the `mujoco` element lets MuJoCo find the mesh in its own folder."""
+    thing = body.thing
     robot = ET.Element("robot", name=thing.name)
     ET.SubElement(
         ET.SubElement(robot, "mujoco"),
@@ -107,35 +147,44 @@ def urdf_of(thing: SceneObject) -> ET.Element:
         meshdir="../meshes",
         strippath="true",
         discardvisual="false",
-        balanceinertia="true",
+        fusestatic="false",
     )
     link = ET.SubElement(robot, "link", name=thing.name)
     inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=_numbers(body.com), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=f"{thing.mass_kg:.6g}")
-    a, b, c = thing.size_m
-    moments = thing.mass_kg / 12 * np.array([b * b + c * c, a * a + c * c, a * a + b * b])
-    names = ("ixx", "iyy", "izz")
-    values = {n: f"{max(m, 1e-9):.6g}" for n, m in zip(names, moments, strict=True)}
-    ET.SubElement(inertial, "inertia", {"ixy": "0", "ixz": "0", "iyz": "0", **values})
-    for part in ("visual", "collision"):
-        element = ET.SubElement(link, part)
-        geometry = ET.SubElement(element, "geometry")
-        ET.SubElement(geometry, "mesh", filename=f"../{thing.mesh}")
-        if part == "visual":
-            material = ET.SubElement(element, "material", name=f"{thing.name}_colour")
-            ET.SubElement(material, "color", rgba=_numbers(thing.rgba))
+    moments = {
+        f"i{'xyz'[a]}{'xyz'[b]}": f"{body.inertia[a, b]:.6g}"
+        for a in range(3)
+        for b in range(a, 3)
+    }
+    ET.SubElement(inertial, "inertia", moments)
+    visual = _urdf_mesh(link, "visual", thing.mesh)
+    material = ET.SubElement(visual, "material", name=f"{thing.name}_colour")
+    ET.SubElement(material, "color", rgba=_numbers(thing.rgba))
+    for file in thing.parts:
+        _urdf_mesh(link, "collision", file)
     return robot
 
 
-def _write_object(thing: Estimate, folder: Path) -> SceneObject:
-    noun = thing.noun
-    mesh_file, urdf_file = f"meshes/{thing.name}.obj", f"urdf/{thing.name}.urdf"
-    mesh = mesh_for(noun.form, thing.size_m, hollow=noun.hollow, taper=noun.taper)
-    write_obj(mesh, folder / mesh_file)
-    primitive = not noun.hollow and (noun.form != "cylinder" or abs(noun.taper - 1) < 0.06)
-    shape: Shape = noun.form if primitive else "mesh"
+def _urdf_mesh(link: ET.Element, use: str, file: str) -> ET.Element:
+    element = ET.SubElement(link, use)
+    ET.SubElement(ET.SubElement(element, "geometry"), "mesh", filename=f"../{file}")
+    return element
+
+
+def _write_object(thing: Estimate, folder: Path) -> _Body:
+    noun, name = thing.noun, thing.name
+    if thing.mesh is None:
+        mesh = mesh_for(noun.form, thing.size_m, hollow=noun.hollow, taper=noun.taper)
+        parts = parts_for(noun.form, thing.size_m, hollow=noun.hollow, taper=noun.taper)
+        simple = not noun.hollow and (noun.form != "cylinder" or abs(noun.taper - 1) < 0.06)
+    else:
+        mesh, simple = thing.mesh, False
+        parts = thing.parts or (mesh.convex_hull,)
+    shape: Shape = noun.form if simple else "mesh"
     written = SceneObject(
-        name=thing.name,
+        name=name,
         label=thing.label,
         role=thing.role,
         shape=shape,
@@ -143,8 +192,13 @@ def _write_object(thing: Estimate, folder: Path) -> SceneObject:
         mass_kg=thing.mass_kg,
         friction=noun.friction,
         hollow=noun.hollow,
-        mesh=mesh_file,
-        urdf=urdf_file,
+        mesh=f"meshes/{name}.obj",
+        mesh_ply=f"meshes/{name}.ply",
+        parts=_write_parts(mesh, parts, name, folder),
+        urdf=f"urdf/{name}.urdf",
+        mjcf=f"mjcf/{name}.xml",
+        mask_track=f"masks/{name}.npz",
+        symmetry=thing.symmetry,
         rgba=thing.rgba,
         source=thing.source,
         frames=thing.frames,
@@ -152,9 +206,28 @@ def _write_object(thing: Estimate, folder: Path) -> SceneObject:
             tuple(round(float(v), 6) for v in pose_from_transform(T)) for T in thing.T_world_objs
         ),
         confidences=thing.confidences,
+        observed=thing.observed or ("full",) * len(thing.frames),
     )
-    (folder / urdf_file).write_text(_xml(urdf_of(written)))
-    return written
+    com, inertia = mass_properties(mesh, thing.mass_kg)
+    body = _Body(thing=written, com=com, inertia=inertia)
+    write_obj(mesh, folder / written.mesh)
+    write_ply(mesh, folder / written.mesh_ply)
+    write_masks(folder / written.mask_track, thing.masks)
+    (folder / written.urdf).write_text(_xml(_urdf(body)))
+    (folder / written.mjcf).write_text(_xml(_object_mjcf(body)))
+    return body
+
+
+def _write_parts(
+    mesh: trimesh.Trimesh, parts: tuple[trimesh.Trimesh, ...], name: str, folder: Path
+) -> tuple[str, ...]:
+    """Write the parts and return their files; the only part of a convex mesh is the mesh."""
+    if len(parts) == 1 and np.isclose(parts[0].volume, mesh.volume, rtol=1e-4):
+        return (f"meshes/{name}.obj",)
+    files = tuple(f"meshes/{name}_part_{k:02d}.obj" for k in range(len(parts)))
+    for part, file in zip(parts, files, strict=True):
+        write_obj(part, folder / file)
+    return files
 
 
 def _xml(root: ET.Element) -> str:

@@ -6,12 +6,14 @@ side, so the same words (left, right, in front of) mean the same in the video an
 """
 
 import json
+import zipfile
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
@@ -21,10 +23,39 @@ Shape = Literal["box", "cylinder", "sphere", "mesh"]
 Symmetry = Literal["none", "box", "round", "sphere"]
 Observed = Literal["full", "no_depth"]
 SCENE_FILE = "scene.json"
-SCHEMA = 1
+SCHEMA = 2
+GRAVITY_M_S2 = (0.0, 0.0, -9.81)
 FLOOR_MIN_M = 0.006
 """Through thinner floors hard-pressed objects were pushed into the table."""
 FLOOR_MAX_M = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plane:
+    """All points p of the world frame with normal · p = offset."""
+
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Of unit length."""
+    offset_m: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageConfidence:
+    """How sure one stage of the reconstruction is."""
+
+    value: float
+    """0 to 1."""
+    reason: str
+    """What made it low, in words; empty for a sure one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A move from one pose to another, in the world frame."""
+
+    translation_m: tuple[float, float, float]
+    rotation_vector_rad: tuple[float, float, float]
+    """Axis times angle; of a symmetric object the smallest that looks the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +68,7 @@ class SceneObject:
     """The words of the caption."""
     role: Role
     shape: Shape
-    """A primitive when it fits within tolerance, else `mesh` (its convex hull collides)."""
+    """A primitive when it fits within tolerance, else `mesh` (its `parts` collide)."""
     size_m: tuple[float, float, float]
     """Full extents along the object's own x, y, z. Cylinders: (diameter, diameter, height), axis z."""
     mass_kg: float
@@ -45,8 +76,17 @@ class SceneObject:
     hollow: bool = False
     """Open at the top: a bowl, a cup, a box without a lid."""
     mesh: str = ""
-    """OBJ file, relative to the scene folder, centred on its bounding box, in metres."""
+    """OBJ file, relative to the scene folder, watertight, centred on its bounding box, in metres."""
+    mesh_ply: str = ""
+    """The same mesh as PLY."""
+    parts: tuple[str, ...] = ()
+    """OBJ files of convex solids in the mesh's frame that together are the object: what collides."""
     urdf: str = ""
+    mjcf: str = ""
+    mask_track: str = ""
+    """File with the object's masks; `Scene.masks` reads it."""
+    symmetry: Symmetry = "none"
+    """Turns that leave it alike: `box` half turns about its axes, `round` any about its own z, `sphere` all."""
     rgba: tuple[float, float, float, float] = (0.8, 0.4, 0.2, 1.0)
     """Mean colour in the video."""
     source: dict[str, str] = field(default_factory=dict[str, str])
@@ -57,6 +97,8 @@ class SceneObject:
     """Per frame `[x, y, z, qw, qx, qy, qz]` of the object's centre [m]."""
     confidences: tuple[float, ...] = ()
     """Per frame, 0 to 1."""
+    observed: tuple[Observed, ...] = ()
+    """Per frame: `no_depth` where one view does not show how far away it is, as in mid-air; empty: all `full`."""
 
     @property
     def first_pose(self) -> Float[np.ndarray, "7"]:
@@ -65,6 +107,59 @@ class SceneObject:
     @property
     def last_pose(self) -> Float[np.ndarray, "7"]:
         return np.asarray(self.poses_world[-1], float)
+
+    @property
+    def first_to_last(self) -> Motion:
+        """What the video did to the object."""
+        first, last = (
+            Rotation.from_quat(p[3:], scalar_first=True) for p in (self.first_pose, self.last_pose)
+        )
+        move = self.last_pose[:3] - self.first_pose[:3]
+        turn = least_turn(first, last, self.symmetry).as_rotvec()
+        return Motion(translation_m=_rounded3(move), rotation_vector_rad=_rounded3(turn))
+
+
+def least_turn(first: Rotation, last: Rotation, symmetry: Symmetry) -> Rotation:
+    """Return the smallest rotation, in the world frame, from `first` to what looks like `last`."""
+    if symmetry == "sphere":
+        return Rotation.identity()
+    if symmetry == "round":
+        Q = (first.inv() * last).as_matrix()
+        spin = np.arctan2(Q[0, 1] - Q[1, 0], Q[0, 0] + Q[1, 1])
+        return last * Rotation.from_rotvec([0.0, 0.0, spin]) * first.inv()
+    group = Rotation.create_group("D2" if symmetry == "box" else "C1")
+    turns = last * group * first.inv()
+    return turns[int(np.argmin(turns.magnitude()))]
+
+
+def write_masks(path: Path, masks: dict[int, Bool[np.ndarray, "h w"]]) -> None:
+    """Write masks by clip frame, one bit per pixel and deflated: about 300 bytes each."""
+    frames = sorted(masks)
+    h, w = masks[frames[0]].shape if frames else (0, 0)
+    stack = np.array([masks[f] for f in frames], bool).reshape(len(frames), h * w)
+    np.savez_compressed(
+        path,
+        frames=np.array(frames, np.int32),
+        shape=np.array([h, w], np.int32),
+        bits=np.packbits(stack, axis=1),
+    )
+
+
+def read_masks(path: Path) -> dict[int, Bool[np.ndarray, "h w"]]:
+    """Return what `write_masks` wrote.
+
+    Raises:
+        V2PError: there is no such file, or it holds no masks.
+    """
+    try:
+        with np.load(path) as stored:
+            h, w = (int(v) for v in stored["shape"])
+            pixels = np.unpackbits(stored["bits"], axis=1, count=h * w).astype(bool)
+            return {int(f): m.reshape(h, w) for f, m in zip(stored["frames"], pixels, strict=True)}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise V2PError(
+            f"{path} holds no mask track ({type(error).__name__}); remake the scene with 'v2p scene'"
+        ) from error
 
 
 def hollow_floor_m(height_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -91,6 +186,11 @@ class Scene:
     num_frames: int
     confidence: float
     """0 to 1; below the gate a scene is rejected."""
+    confidences: dict[str, StageConfidence] = field(default_factory=dict[str, StageConfidence])
+    """Per stage of the reconstruction."""
+    table: Plane = Plane()
+    """The table's top."""
+    gravity_m_s2: tuple[float, float, float] = GRAVITY_M_S2
     warnings: tuple[str, ...] = ()
     folder: Path = Path()
     """Where the files are; set on load, never saved."""
@@ -115,8 +215,21 @@ class Scene:
         known = ", ".join(o.name for o in self.objects)
         raise V2PError(f"scene '{self.title}' has no object '{name}'; it has {known}")
 
+    def masks(self, name: str) -> dict[int, Bool[np.ndarray, "h w"]]:
+        """Return the object's masks by clip frame, at the size at which the video was understood.
+
+        Raises:
+            V2PError: no such object, or it has no mask track.
+        """
+        thing = self.object(name)
+        if not thing.mask_track:
+            raise V2PError(
+                f"object '{name}' of scene '{self.title}' has no mask track: it was not made from a video"
+            )
+        return read_masks(self.folder / thing.mask_track)
+
     def save(self, folder: Path) -> None:
-        """Write `scene.json`; meshes and URDFs are written by their makers."""
+        """Write `scene.json`; meshes, masks and URDFs are written by their makers."""
         data = asdict(replace(self, folder=Path()))
         del data["folder"]
         data["camera"] = {
@@ -125,6 +238,9 @@ class Scene:
             "K": self.camera.K.tolist(),
             "T_world_cam": self.camera.T_world_cam.tolist(),
         }
+        for written, thing in zip(data["objects"], self.objects, strict=True):
+            if thing.poses_world:  # for readers of the file; here it follows from the poses
+                written["first_to_last"] = asdict(thing.first_to_last)
         data["schema"] = SCHEMA
         (folder / SCENE_FILE).write_text(json.dumps(data, indent=1))
 
@@ -143,23 +259,13 @@ class Scene:
         data: dict[str, Any] = json.loads(path.read_text())
         if data.pop("schema", None) != SCHEMA:
             raise V2PError(f"{path} was written by another version; remake it with 'v2p scene'")
-        camera = data.pop("camera")
-        objects = tuple(
-            SceneObject(
-                **{
-                    **o,
-                    "size_m": tuple(o["size_m"]),
-                    "rgba": tuple(o["rgba"]),
-                    "frames": tuple(o["frames"]),
-                    "poses_world": tuple(tuple(p) for p in o["poses_world"]),
-                    "confidences": tuple(o["confidences"]),
-                }
-            )
-            for o in data.pop("objects")
-        )
+        camera, table = data.pop("camera"), data.pop("table")
+        stages, things = data.pop("confidences"), data.pop("objects")
         return Scene(
-            **{**data, "warnings": tuple(data["warnings"])},
-            objects=objects,
+            **_with_tuples(data),
+            objects=tuple(_object_of(thing) for thing in things),
+            confidences={stage: StageConfidence(**sure) for stage, sure in stages.items()},
+            table=Plane(normal=tuple(table["normal"]), offset_m=table["offset_m"]),
             camera=Camera(
                 width_px=camera["width_px"],
                 height_px=camera["height_px"],
@@ -168,3 +274,18 @@ class Scene:
             ),
             folder=folder,
         )
+
+
+def _object_of(data: dict[str, Any]) -> SceneObject:
+    data.pop("first_to_last", None)
+    poses = tuple(tuple(pose) for pose in data.pop("poses_world"))
+    return SceneObject(**_with_tuples(data), poses_world=poses)
+
+
+def _with_tuples(data: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+
+
+def _rounded3(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = (round(float(v), 6) + 0.0 for v in values)
+    return x, y, z
