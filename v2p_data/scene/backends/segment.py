@@ -1,0 +1,271 @@
+"""Boxes, points or masks at one frame become masks at every frame, by SAM 2.
+
+As in the paper an object is prompted by a few positive points inside its mask; for a box that mask is what SAM 2 sees in
+the box. The clip is followed from the prompted frame to its end and to its start, one frame at a time; what the tracker
+no longer looks back at is forgotten, so that memory does not grow with the clip.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from v2p_data.errors import V2PError
+from v2p_data.scene.backends.checkpoint import Checkpoint, load_checkpoint
+from v2p_data.scene.backends.config import SegmentConfig
+from v2p_data.scene.backends.worker import WorkerRequest, run_worker
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prompt:
+    """Where one object is at one frame: exactly one of box, points and mask."""
+
+    frame_idx: int = 0
+    box_xyxy: tuple[float, float, float, float] | None = None
+    """Left, top, right, bottom [px]."""
+    points_px: tuple[tuple[float, float], ...] | None = None
+    """Points on the object, u right and v down."""
+    mask: Bool[np.ndarray, "h w"] | None = None
+
+    def __post_init__(self) -> None:
+        given = [self.box_xyxy is not None, bool(self.points_px), self.mask is not None]
+        if sum(given) != 1:
+            raise ValueError("a prompt is exactly one of box_xyxy, points_px and mask")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentedVideo:
+    """Where every object is seen at every frame; a pixel belongs to one object at most."""
+
+    masks: Bool[np.ndarray, "object time h w"]
+    scores: Float[np.ndarray, "object time"]
+    """How sure the model is that the object is seen at all, 0 to 1."""
+    points_px: tuple[Float[np.ndarray, "_k 2"], ...]
+    """The positive points that each object was prompted with, u right and v down; none where a worker got its box."""
+
+
+def segment_video(
+    frames: UInt8[np.ndarray, "time h w 3"] | Sequence[UInt8[np.ndarray, "h w 3"]],
+    prompts: Sequence[Prompt],
+    cfg: SegmentConfig,
+) -> SegmentedVideo:
+    """Return the masks of the prompted objects in the whole clip.
+
+    `frames` is read one at a time, so it may be anything with a length that gives RGB frames by index.
+
+    Raises:
+        V2PError: no prompt, a prompt outside the clip or its pictures, or the model cannot be loaded.
+
+    Source: Ravi et al. 2024 (SAM 2), arXiv:2408.00714.
+    """
+    if cfg.backend not in ("sam2", "worker"):
+        raise V2PError(f"segment backend '{cfg.backend}' is no video model; known: sam2, worker")
+    if not len(frames) or not prompts:
+        raise V2PError(
+            f"segmenting needs a frame and a prompt, got {len(frames)} frames and {len(prompts)} prompts"
+        )
+    h, w = np.asarray(frames[0]).shape[:2]
+    for i, prompt in enumerate(prompts):
+        _check(prompt, i, len(frames), (h, w))
+    if cfg.backend == "worker":
+        return _by_worker(frames, prompts, cfg)
+    checkpoint = load_checkpoint("sam2", cfg.model, cfg.device, cfg.dtype)
+    masks = np.zeros((len(prompts), len(frames), h, w), bool)
+    scores = np.zeros((len(prompts), len(frames)))
+    points: list[np.ndarray] = [np.zeros((0, 2))] * len(prompts)
+    for start in sorted({prompt.frame_idx for prompt in prompts}):
+        which = [i for i, prompt in enumerate(prompts) if prompt.frame_idx == start]
+        for i in which:
+            points[i] = _points(checkpoint, np.asarray(frames[start]), prompts[i], cfg)
+        prompted = [points[i] for i in which]
+        for step in (1, -1):
+            order = range(start, len(frames) if step > 0 else -1, step)
+            for t, logits, sure in _follow(checkpoint, frames, order, prompted, cfg):
+                masks[which, t] = _apart(logits, cfg.mask_threshold)
+                scores[which, t] = sure
+            if start == 0:
+                break
+    return SegmentedVideo(masks=masks, scores=scores, points_px=tuple(points))
+
+
+def points_inside(mask: Bool[np.ndarray, "h w"], count: int) -> Float[np.ndarray, "count 2"]:
+    """Return points well inside a mask and far from each other, u right and v down [px].
+
+    The first is the deepest; every further one is the farthest from all before, among the pixels at least a third as
+    deep. A mask with fewer pixels than points repeats some.
+
+    Raises:
+        V2PError: the mask is empty.
+    """
+    if not mask.any():
+        raise V2PError("an empty mask has no points inside; give a mask with at least one pixel")
+    depth = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    y, x = np.nonzero(mask & (depth >= depth.max() / 3))
+    spots = np.stack([x, y], axis=1) + 0.5
+    chosen = [int(np.argmax(depth[y, x]))]
+    distance = np.linalg.norm(spots - spots[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(spots - spots[chosen[-1]], axis=1))
+    return spots[chosen]
+
+
+def _by_worker(
+    frames: Sequence[np.ndarray] | np.ndarray, prompts: Sequence[Prompt], cfg: SegmentConfig
+) -> SegmentedVideo:
+    request = WorkerRequest(
+        kind="segment",
+        arrays={
+            "images": np.stack([np.asarray(frames[t]) for t in range(len(frames))]),
+            "boxes_xyxy": np.array([_box_of(prompt) for prompt in prompts]),
+            "frame_idx": np.array([prompt.frame_idx for prompt in prompts]),
+        },
+    )
+    found = run_worker(cfg.worker, request, cfg.worker_timeout_s).arrays
+    return SegmentedVideo(
+        masks=found["masks"],
+        scores=found["scores"].astype(np.float64),
+        points_px=tuple(np.zeros((0, 2)) for _ in prompts),
+    )
+
+
+def _box_of(prompt: Prompt) -> tuple[float, float, float, float]:
+    """Return the box around whatever the prompt is [px]."""
+    if prompt.box_xyxy is not None:
+        return prompt.box_xyxy
+    if prompt.mask is not None:
+        y, x = np.nonzero(prompt.mask)
+        return float(x.min()), float(y.min()), float(x.max() + 1), float(y.max() + 1)
+    xy = np.array(prompt.points_px)
+    return (
+        float(xy[:, 0].min()),
+        float(xy[:, 1].min()),
+        float(xy[:, 0].max()),
+        float(xy[:, 1].max()),
+    )
+
+
+def _points(
+    checkpoint: Checkpoint, image: np.ndarray, prompt: Prompt, cfg: SegmentConfig
+) -> Float[np.ndarray, "k 2"]:
+    """Return the positive points that stand for a prompt."""
+    if prompt.points_px is not None:
+        return np.array(prompt.points_px, np.float64)
+    if prompt.mask is not None:
+        return points_inside(prompt.mask, cfg.num_points)
+    assert prompt.box_xyxy is not None
+    h, w = image.shape[:2]
+    session = _session(checkpoint, cfg)
+    inputs = _prepared(checkpoint, image)
+    checkpoint.processor.add_inputs_to_inference_session(
+        session, 0, [0], input_boxes=[[list(prompt.box_xyxy)]], original_size=(h, w)
+    )
+    with torch.inference_mode():
+        out = checkpoint.model(session, frame=inputs, run_mem_encoder=False)
+    inside = np.zeros((h, w), bool)
+    left, top, right, bottom = (round(v) for v in prompt.box_xyxy)
+    inside[max(0, top) : max(bottom, top + 1), max(0, left) : max(right, left + 1)] = True
+    seen = (_logits(checkpoint, out.pred_masks, (h, w))[0] > cfg.mask_threshold) & inside
+    # Where the model sees next to nothing in the box, the middle of the box is the best guess.
+    return points_inside(seen if seen.sum() >= 0.02 * inside.sum() else inside, cfg.num_points)
+
+
+def _follow(
+    checkpoint: Checkpoint,
+    frames: Sequence[np.ndarray] | np.ndarray,
+    order: Sequence[int],
+    points: Sequence[Float[np.ndarray, "k 2"]],
+    cfg: SegmentConfig,
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yield frame, logits at full size and scores per object, from the prompted frame on in the order given.
+
+    Backwards the tracker is shown the clip in reverse, as a clip of its own.
+    """
+    session = _session(checkpoint, cfg)
+    config = checkpoint.model.config
+    remembered = max(config.num_maskmem, config.max_object_pointers_in_encoder)
+    for k, t in enumerate(order):
+        image = np.asarray(frames[t])
+        size = (image.shape[0], image.shape[1])
+        if k == 0:
+            for i, xy in enumerate(points):
+                checkpoint.processor.add_inputs_to_inference_session(
+                    session,
+                    0,
+                    [i],
+                    input_points=[[xy.tolist()]],
+                    input_labels=[[[1] * len(xy)]],
+                    original_size=size,
+                )
+            # Adding an object replaces the list of those with new prompts.
+            session.obj_with_new_inputs = list(range(len(points)))
+        with torch.inference_mode():
+            out = checkpoint.model(session, frame=_prepared(checkpoint, image), frame_idx=k)
+        yield (
+            t,
+            _logits(checkpoint, out.pred_masks, size),
+            torch.sigmoid(out.object_score_logits.float()).reshape(-1).cpu().numpy(),
+        )
+        _forget(session, k, remembered)
+
+
+def _forget(session: Any, now: int, remembered: int) -> None:
+    """Drop the frame just seen and what the tracker has made of frames that it no longer looks back at."""
+    session.processed_frames.pop(now)
+    for outputs in session.output_dict_per_obj.values():
+        outputs["non_cond_frame_outputs"].pop(now - remembered, None)
+
+
+def _session(checkpoint: Checkpoint, cfg: SegmentConfig) -> Any:
+    return checkpoint.processor.init_video_session(
+        inference_device=checkpoint.device,
+        inference_state_device="cpu" if cfg.offload else checkpoint.device,
+        video_storage_device=checkpoint.device,
+        dtype=checkpoint.dtype,
+    )
+
+
+def _prepared(checkpoint: Checkpoint, image: np.ndarray) -> torch.Tensor:
+    inputs = checkpoint.processor(images=image, device=checkpoint.device, return_tensors="pt")
+    return inputs["pixel_values"][0].to(checkpoint.dtype)
+
+
+def _logits(
+    checkpoint: Checkpoint, pred_masks: torch.Tensor, size: tuple[int, int]
+) -> Float[np.ndarray, "object h w"]:
+    full = checkpoint.processor.post_process_masks(
+        [pred_masks.float()], original_sizes=[list(size)], binarize=False
+    )[0]
+    return full[:, 0].cpu().numpy()
+
+
+def _apart(
+    logits: Float[np.ndarray, "object h w"], threshold: float
+) -> Bool[np.ndarray, "object h w"]:
+    """Return masks in which a pixel goes to the object that claims it most."""
+    owner = logits.argmax(0)
+    return (logits > threshold) & (owner == np.arange(len(logits))[:, None, None])
+
+
+def _check(prompt: Prompt, i: int, num_frames: int, size: tuple[int, int]) -> None:
+    h, w = size
+    if not 0 <= prompt.frame_idx < num_frames:
+        raise V2PError(
+            f"prompt {i} is at frame {prompt.frame_idx}, but the clip has frames 0..{num_frames - 1}"
+        )
+    if prompt.mask is not None and (prompt.mask.shape != (h, w) or not prompt.mask.any()):
+        raise V2PError(
+            f"the mask of prompt {i} must be {h} x {w} with a pixel set, got {prompt.mask.shape}"
+        )
+    corners = prompt.points_px or ()
+    if prompt.box_xyxy is not None:
+        left, top, right, bottom = prompt.box_xyxy
+        if not (left < right and top < bottom):
+            raise V2PError(f"the box of prompt {i} is empty: {prompt.box_xyxy}")
+        corners = (((left + right) / 2, (top + bottom) / 2),)
+    if not all(0 <= x <= w and 0 <= y <= h for x, y in corners):
+        raise V2PError(f"prompt {i} lies outside its {w} x {h} picture")
