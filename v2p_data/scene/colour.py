@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.ndimage import gaussian_filter
 
+from v2p_data.scene.nouns import noun_for
+
 _BINS = np.array([12, 24, 24])
 _HUES_DEG = {
     "red": (26.0, 22.0),
@@ -31,12 +33,6 @@ _SYNONYMS = {
     "cardboard": "brown", "wooden": "brown", "crimson": "red", "scarlet": "red", "turquoise": "green", "teal": "green",
     "cyan": "blue", "navy": "blue", "silver": "grey", "steel": "grey", "metal": "grey", "magenta": "pink",
 }  # fmt: skip
-_NOUN_COLOURS = {
-    "apple": "red", "tomato": "red", "strawberry": "red", "carrot": "orange", "banana": "yellow", "lemon": "yellow",
-    "cucumber": "green", "lime": "green", "avocado": "green", "egg": "white", "duck": "yellow", "chocolate": "brown",
-    "bread": "brown", "cork": "brown", "pear": "green", "peach": "orange",
-}  # fmt: skip
-"""Used only where the phrase names no colour."""
 _PLAIN = ("brown", "black", "white", "grey")
 
 
@@ -45,7 +41,7 @@ def colour_words(phrase: str) -> tuple[str, ...]:
     words = re.findall(r"[a-z]+", phrase.lower())
     named = [_SYNONYMS.get(word, word) for word in words]
     found = [word for word in named if word in _HUES_DEG or word in _PLAIN]
-    found = found or [_NOUN_COLOURS[word] for word in words if word in _NOUN_COLOURS]
+    found = found or list(noun_for(phrase).colours)
     return tuple(dict.fromkeys(found))
 
 

@@ -154,10 +154,12 @@ def find_other(
     kind: str,
     moved: Moved,
     taken: Bool[np.ndarray, "h w"] | None = None,
+    things: list[Bool[np.ndarray, "h w"]] | None = None,
 ) -> Found | None:
     """Return the thing that stays, or None where the still shows no candidate.
 
-    For `uncover` the late still is searched, for all others the early one.
+    For `uncover` the late still is searched, for all others the early one. `things` are masks in which things are
+    apart from table and wall, if anyone knows; else what does not look like the table.
     """
     late = kind == "uncover"
     still = footage.late if late else footage.early
@@ -175,6 +177,8 @@ def find_other(
     stands_out = table.stands_out(still) & inner_hull & ~restless
     hand = footage.hand(still) & ~colour
     sets = [stands_out, stands_out & ~hand] + ([colour & ~restless] if words else [])
+    if things is not None:
+        sets = things + ([pixels & colour for pixels in things] if words else [])
     lab = lab_of(still)
     occupied = grow(moved.first, 3)
     best: Found | None = None

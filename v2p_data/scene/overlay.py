@@ -276,11 +276,7 @@ def _mask_at(scene: Reconstruction, thing: Estimate, frame: int) -> Bool[np.ndar
     if len(thing.masks) > 2:
         nearest = min(thing.masks, key=lambda other: abs(other - frame))
         return thing.masks[nearest] if abs(nearest - frame) <= _MASK_GAP else None
-    # Only the ends are kept: the others stand still, and the manipulated one has its track.
-    if thing is not scene.objects[0]:
-        return thing.masks[min(thing.masks)] if thing.masks else None
-    i = int(np.abs(np.array(scene.footage_frames) - frame).argmin())
-    return scene.track.masks[i] if scene.track.quality[i] > 0.4 else None
+    return thing.masks[min(thing.masks)] if thing.masks and thing is not scene.objects[0] else None
 
 
 def _pose_at(thing: Estimate, frame: int) -> Float[np.ndarray, "4 4"]:

@@ -63,6 +63,8 @@ class TrueThing:
 
     phrase: str
     """What the caption calls it."""
+    manipulated: bool
+    """Whether it is the one that the clip is about."""
     size_m: tuple[float, float, float]
     hollow: bool
     symmetry: Symmetry
@@ -238,12 +240,8 @@ class ClipScore:
 def found_of(reconstruction: Reconstruction) -> FoundClip:
     """Return what is compared of a reconstruction; frames become those of the file."""
     file_frame = reconstruction.clip.source_frame
-    tracked = {
-        int(file_frame[f]): mask
-        for f, mask in zip(reconstruction.footage_frames, reconstruction.track.masks, strict=False)
-    }
     things = []
-    for i, thing in enumerate(reconstruction.objects):
+    for thing in reconstruction.objects:
         masks = {int(file_frame[f]): mask for f, mask in thing.masks.items()}
         noun = thing.noun
         mesh = thing.mesh
@@ -260,7 +258,7 @@ def found_of(reconstruction: Reconstruction) -> FoundClip:
                 T_world_first=thing.T_world_objs[0],
                 T_world_last=thing.T_world_objs[-1],
                 last_frame=int(file_frame[thing.frames[-1]]),
-                masks={**tracked, **masks} if i == 0 else masks,
+                masks=masks,
             )
         )
     return FoundClip(
@@ -279,7 +277,8 @@ def rejected(true: TrueClip, slug: str) -> ClipScore:
 def score_clip(true: TrueClip, found: FoundClip) -> ClipScore:
     """Compare a reconstruction with the truth.
 
-    The manipulated objects of both are compared with each other, the others by phrase, then by their order.
+    Objects are compared by phrase; where a phrase was understood differently, the manipulated one with the manipulated
+    one and the others in their order.
     """
     pairs = zip(true.things, _matched(true, found), strict=True)
     things = tuple(
@@ -371,15 +370,19 @@ def size_sides(
 
 def _matched(true: TrueClip, found: FoundClip) -> list[FoundThing | None]:
     left = list(found.things)
-    out: list[FoundThing | None] = [left.pop(0) if left else None]
-    for thing in true.things[1:]:
-        same = [f for f in left if f.phrase == thing.phrase]
-        out.append(same[0] if same else None)
-        if same:
-            left = [f for f in left if f is not same[0]]
-    named = {thing.phrase for thing in true.things}
-    spare = [f for f in left if f.phrase not in named]
-    return [f if f is not None or not spare else spare.pop(0) for f in out]
+    pairs: dict[str, FoundThing] = {}
+    for thing in true.things:
+        same = next((f for f in left if f.phrase == thing.phrase), None)
+        if same is not None:
+            pairs[thing.phrase] = same
+            left = [f for f in left if f is not same]
+    for thing in true.things:
+        # what is left has another name than in the truth: the manipulated object comes first, the others follow
+        spare = [f for f in left if (f is found.things[0]) == thing.manipulated]
+        if thing.phrase not in pairs and spare:
+            pairs[thing.phrase] = spare[0]
+            left = [f for f in left if f is not spare[0]]
+    return [pairs.get(thing.phrase) for thing in true.things]
 
 
 def _score_thing(

@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float32, UInt8
 
 from v2p_data.scene.colour import lab_of
 
+_LEAST_SEEN = 0.03
+"""Share of the picture; from less bare table its colour cannot be told."""
 _CHANNEL_WEIGHT = np.array([0.55, 1.2, 1.2], np.float32)
 """Shadows change lightness, objects change hue: lightness counts half."""
 
@@ -31,11 +33,19 @@ class Table:
         return (_distance(lab, self.lab) > max(7.0, self.noise)) & self.hull
 
 
-def find_table(image: UInt8[np.ndarray, "h w 3"]) -> Table:
-    """Return the largest low, central, even-coloured region of a still as the table.
+def find_table(
+    image: UInt8[np.ndarray, "h w 3"], given: Bool[np.ndarray, "h w"] | None = None
+) -> Table:
+    """Return the table in a still: where `given` says it is, or the largest low, central, even-coloured region.
 
     k-means in Lab proposes regions; a quadratic in x and y then follows the light across the winner.
     """
+    if given is not None and given.mean() > _LEAST_SEEN:
+        return _coat(image, given, spreads=False)
+    return _coat(image, _even_region(image), spreads=True)
+
+
+def _even_region(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     h, w = image.shape[:2]
     y, x = np.mgrid[:h, :w].astype(np.float32)
     lab = np.asarray(cv2.GaussianBlur(lab_of(image), (0, 0), 1.5), np.float32)
@@ -56,6 +66,16 @@ def find_table(image: UInt8[np.ndarray, "h w 3"]) -> Table:
             value = float((prior * (edges < 40))[parts == j].sum())
             if value > best:
                 best, seen = value, parts == j
+    return seen
+
+
+def _coat(
+    image: UInt8[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"], *, spreads: bool
+) -> Table:
+    """Return the table whose bare part is `seen`, with the colour that it has; `spreads` lets the part grow."""
+    h, w = image.shape[:2]
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    lab = np.asarray(cv2.GaussianBlur(lab_of(image), (0, 0), 1.5), np.float32)
     basis = np.stack(
         [np.ones_like(x), x / w, y / h, (x / w) ** 2, (y / h) ** 2, x * y / w / h], -1
     )
@@ -65,6 +85,8 @@ def find_table(image: UInt8[np.ndarray, "h w 3"]) -> Table:
         model = (basis @ coefficients).astype(np.float32)
         residual = np.linalg.norm((lab - model) * np.array([0.7, 1.2, 1.2]), axis=-1)
         noise = 3 * float(np.clip(1.5 * np.median(residual[seen]), 2.5, 6))
+        if not spreads:
+            break
         even = cv2.morphologyEx(
             (residual < noise).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))
         )

@@ -4,6 +4,7 @@ Optical flow carries the mask on; colour decides what of it is object. The decis
 that still looks as in the first frame is not the object. A track that got lost says so by a low quality.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -28,15 +29,21 @@ class Track:
     """Overlap of the mask carried forwards with the one found at the end, or backwards at the start; 0 to 1."""
 
 
-def track(footage: Footage, moved: Moved, *, every: int = 1) -> Track:
+Moving = Callable[[int], Float[np.ndarray, "h w"]]
+
+
+def track(
+    footage: Footage, moved: Moved, *, every: int = 1, moving: Moving | None = None
+) -> Track:
     """Return the object's mask over time: forwards from the first and backwards from the last outline.
 
     At each frame the direction is taken whose mask looks more like the object. `every` skips frames for speed; the
-    skipped ones repeat their neighbour with no quality.
+    skipped ones repeat their neighbour with no quality. `moving` says how likely each pixel of a frame belongs to
+    something that moves and is no hand, if anyone knows.
     """
     n = len(footage.rgb)
     steps = sorted({*range(0, n, every), n - 1})
-    forward = _follow(footage, steps, moved.first, moved.look, anchor=0)
+    forward = _follow(footage, steps, moved.first, moved.look, 0, moving)
     area_first = float(moved.first.sum())
     found, carried = (
         _likeness(footage, n - 1, mask, moved.look, area_first)
@@ -48,7 +55,7 @@ def track(footage: Footage, moved: Moved, *, every: int = 1) -> Track:
         if carried > found + 0.05 and _iou(forward[-1], moved.last) > 0.05
         else moved.last
     )
-    backward = _follow(footage, steps[::-1], end, moved.look, anchor=n - 1)[::-1]
+    backward = _follow(footage, steps[::-1], end, moved.look, n - 1, moving)[::-1]
     area_last = float(end.sum())
     masks = np.zeros((n, *footage.shape), bool)
     quality = np.zeros(n)
@@ -77,6 +84,7 @@ def _follow(
     start: Bool[np.ndarray, "h w"],
     look: Float[np.ndarray, "l a b"],
     anchor: int,
+    moving: Moving | None,
 ) -> list[Bool[np.ndarray, "h w"]]:
     h, w = footage.shape
     flow_of = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
@@ -111,7 +119,10 @@ def _follow(
         others = np.maximum(likelihood(local, part), likelihood(footage.hand_hist, part))
         others = np.maximum(others, 0.7 * likelihood(footage.rest_hist, part))
         ratio = np.log(likelihood(look, part) + 1e-6) - np.log(others + 1e-6)
-        vote = cv2.GaussianBlur((ratio + 3 * (prior - 0.35)).astype(np.float32), (0, 0), 1)
+        votes = ratio + 3 * (prior - 0.35)
+        if moving is not None:
+            votes = 0.35 * ratio + 2 * (prior - 0.35) + 5 * (moving(i)[rows, cols] - 0.5)
+        vote = cv2.GaussianBlur(votes.astype(np.float32), (0, 0), 1)
         smooth = cv2.GaussianBlur(footage.lab[i][rows, cols], (0, 0), 1)
         still = np.linalg.norm(smooth - before[rows, cols], axis=-1) < _SAME_LAB
         floor = 0.03 if mask.sum() < 1.3 * area else 0.3

@@ -1,0 +1,263 @@
+"""Which pixels are the thing that moved and which are the others, from the scene network: the default way.
+
+The network says of every pixel what it is; this module cuts that into things, takes those that fit the caption, and
+says from 0 to 1 how sure that is and why not surer.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int, UInt8
+
+from v2p_data.scene.classes import HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.colour import (
+    balance,
+    colour_match,
+    colour_words,
+    histogram,
+    likelihood,
+    similarity,
+)
+from v2p_data.scene.footage import Footage
+from v2p_data.scene.ground import Moved
+from v2p_data.scene.segment import bounding_box, grow, largest, refine, tidy
+
+MOST_FRAMES = 50
+"""Frames of a clip that the network looks at; those between take the nearest one's word."""
+_LIKELY, _POSSIBLE = 0.5, 0.25
+_LEAST_SHARE = 0.0007
+"""Of the picture: smaller things cannot be measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Watched:
+    """What the network sees over a clip, at working size."""
+
+    idx: Int[np.ndarray, "n"]
+    """Footage frames it looked at, the first and the last among them."""
+    shares: Float32[np.ndarray, "n 5 h w"]
+    early: Float32[np.ndarray, "5 h w"]
+    """In the still of the beginning."""
+    late: Float32[np.ndarray, "5 h w"]
+    """In the still of the end."""
+    pitch_rad: float
+    pitch_sd_rad: float
+    focal_widths: float
+    focal_sd: float
+
+    def at(self, i: int) -> Float32[np.ndarray, "5 h w"]:
+        """Return the probabilities at the footage frame nearest to `i`."""
+        return self.shares[int(np.abs(self.idx - i).argmin())]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Blob:
+    mask: Bool[np.ndarray, "h w"]
+    area: int
+    hist: np.ndarray
+    parts: dict[str, float]
+    """What its rating is the product of, each 0 to 1."""
+
+    @property
+    def rating(self) -> float:
+        return float(np.prod(list(self.parts.values())))
+
+
+def watch(footage: Footage) -> Watched:
+    """Return what the network sees in the clip's frames and in its two stills."""
+    from v2p_data.scene.network import look  # torch takes a second to import
+
+    n = len(footage.rgb)
+    idx = np.unique(np.linspace(0, n - 1, min(n, MOST_FRAMES)).round().astype(int))
+    pictures = np.concatenate([footage.rgb[idx], footage.early[None], footage.late[None]])
+    seen = look(pictures, footage.early, footage.late)
+    return Watched(
+        idx=idx,
+        shares=seen.shares[:-2],
+        early=seen.shares[-2],
+        late=seen.shares[-1],
+        pitch_rad=seen.pitch_rad,
+        pitch_sd_rad=seen.pitch_sd_rad,
+        focal_widths=seen.focal_widths,
+        focal_sd=seen.focal_sd,
+    )
+
+
+def find_movers(
+    footage: Footage,
+    watched: Watched,
+    phrase: str,
+    kind: str,
+    tool: str = "",
+    first: Bool[np.ndarray, "h w"] | None = None,
+    last: Bool[np.ndarray, "h w"] | None = None,
+) -> tuple[Moved, Moved | None] | None:
+    """Return the manipulated object and, where the caption names one that a hand holds, the tool.
+
+    A mask given by the user for either end is taken as it is. None where nothing that moved was seen.
+    """
+    starts = _ends(footage, watched, phrase, 0, first)
+    stops = _ends(footage, watched, phrase, len(footage.rgb) - 1, last)
+    pairs = sorted(
+        (
+            (_pair_parts(a, b, kind, footage.shape), a, b)
+            for a in starts
+            for b in stops
+        ),
+        key=lambda pair: -pair[1].rating * pair[2].rating * float(np.prod(list(pair[0].values()))),
+    )  # fmt: skip
+    if not pairs:
+        return None
+    if not tool:
+        return _moved(pairs, pairs[0]), None
+    # The tool is what the hand holds; the object is pushed by it and lies farther from the hand.
+    best = pairs[0]
+    rest = [p for p in pairs[1:] if p[1] is not best[1] and p[2] is not best[2]]
+    if not rest:
+        return _moved(pairs, best), None
+    second = rest[0]
+    held = [_held(footage, watched, pair[1].hist) for pair in (best, second)]
+    words = [colour_words(text) for text in (phrase, tool)]
+    by_colour = [
+        _named(footage.rgb[0], best[1].mask, words[0]) * _named(footage.rgb[0], second[1].mask, words[1]),
+        _named(footage.rgb[0], second[1].mask, words[0]) * _named(footage.rgb[0], best[1].mask, words[1]),
+    ]  # fmt: skip
+    if by_colour[1] * (0.3 + held[0]) > by_colour[0] * (0.3 + held[1]):
+        best, second = second, best
+    return _moved(pairs, best), _moved(pairs, second)
+
+
+def things_standing(watched: Watched, *, late: bool) -> list[Bool[np.ndarray, "h w"]]:
+    """Return masks over the still of the beginning (or end) in which the things that stay are apart from all else."""
+    shares = watched.late if late else watched.early
+    things = shares[OTHER]
+    return [tidy(things > _LIKELY), tidy(things > _POSSIBLE), tidy(things + shares[MOVED] > 0.6)]
+
+
+def hand_at(watched: Watched, i: int) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels that are hand or arm at a footage frame."""
+    return watched.at(i)[HAND] > _LIKELY
+
+
+def table_seen(watched: Watched) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels that are bare table both at the beginning and at the end."""
+    return (watched.early[TABLE] > _LIKELY) & (watched.late[TABLE] > _LIKELY)
+
+
+def mask_of_mover(
+    footage: Footage, watched: Watched, i: int, blob: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return a blob's outline at footage frame `i` at working size, the hand cut away."""
+    never = grow(hand_at(watched, i) & ~blob, 1) & ~blob
+    return refine(footage.rgb[i], blob, never)
+
+
+def _ends(
+    footage: Footage,
+    watched: Watched,
+    phrase: str,
+    i: int,
+    given: Bool[np.ndarray, "h w"] | None,
+) -> list[_Blob]:
+    image = footage.rgb[i]
+    if given is not None:
+        hist = histogram(image[given])
+        return [_Blob(mask=given, area=int(given.sum()), hist=hist, parts={"given": 1.0})]
+    moved = watched.at(i)[MOVED]
+    words = colour_words(phrase)
+    match = colour_match(balance(image), words) if words else None
+    h, w = footage.shape
+    blobs: list[_Blob] = []
+    for level in (_LIKELY, _POSSIBLE):
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(
+            tidy(moved > level).astype(np.uint8)
+        )
+        for k in range(1, count):
+            area = int(stats[k, cv2.CC_STAT_AREA])
+            mask = parts == k
+            if area < _LEAST_SHARE * h * w or any((mask & b.mask).any() for b in blobs):
+                continue
+            mask = mask_of_mover(footage, watched, i, largest(mask))
+            blobs.append(
+                _Blob(
+                    mask=mask,
+                    area=int(mask.sum()),
+                    hist=histogram(image[mask]),
+                    parts={
+                        "moved": float(moved[mask].mean()),
+                        "size": float(1 - np.exp(-area / (0.002 * h * w))),
+                        "colour": _named_by(match, mask),
+                        "edge": 0.75 if _cut(mask) else 1.0,
+                    },
+                )
+            )
+    return sorted(blobs, key=lambda blob: -blob.rating)[:8]
+
+
+def _pair_parts(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[str, float]:
+    ratio = abs(float(np.log(a.area / b.area)))
+    parts = {
+        "alike": 0.3 + 0.7 * similarity(a.hist, b.hist),
+        "same size": float(np.exp(-0.5 * (max(0.0, ratio - 0.4) / 0.7) ** 2)),
+    }
+    spots = [np.argwhere(blob.mask).mean(0) for blob in (a, b)]
+    (rise, across) = (spots[0] - spots[1]) / shape[1]
+    if kind in ("push_left", "push_right"):
+        along = -across if kind == "push_right" else across
+        parts["direction"] = float(np.clip(0.5 + along / 0.06, 0.1, 1))
+    elif kind == "lift_up":
+        parts["direction"] = float(np.clip(0.6 + rise / 0.08, 0.1, 1))
+    return parts
+
+
+def _moved(
+    pairs: list[tuple[dict[str, float], _Blob, _Blob]],
+    chosen: tuple[dict[str, float], _Blob, _Blob],
+) -> Moved:
+    how, a, b = chosen
+    rivals = [
+        p[1].rating * p[2].rating * float(np.prod(list(p[0].values())))
+        for p in pairs
+        if p[1] is not a and p[2] is not b
+    ]
+    own = a.rating * b.rating * float(np.prod(list(how.values())))
+    cues = {
+        **{f"first {k}": v for k, v in a.parts.items()},
+        **{f"last {k}": v for k, v in b.parts.items()},
+        **how,
+        "no rival": float(1 / (1 + (max(rivals, default=0.0) / max(own, 1e-6)) ** 2)),
+    }
+    return Moved(first=a.mask, last=b.mask, score=own, look=a.hist, cues=cues)
+
+
+def _held(footage: Footage, watched: Watched, hist: np.ndarray) -> float:
+    """Return how much of the time a hand adjoins what looks like this (0 to 1)."""
+    touches = []
+    for i in watched.idx[len(watched.idx) // 4 : -(len(watched.idx) // 4) or None]:
+        shares = watched.at(int(i))
+        hand = shares[HAND] > _LIKELY
+        if hand.sum() < 30:
+            continue
+        alike = (shares[MOVED] > _LIKELY) & (likelihood(hist, footage.rgb[i]) > 2e-4)
+        near = grow(hand, 5) & alike
+        touches.append(min(1.0, near.sum() / max(1.0, 0.25 * alike.sum())))
+    return float(np.mean(touches)) if touches else 0.0
+
+
+def _named(
+    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], words: tuple[str, ...]
+) -> float:
+    return _named_by(colour_match(balance(image), words) if words else None, mask)
+
+
+def _named_by(match: Float32[np.ndarray, "h w"] | None, mask: Bool[np.ndarray, "h w"]) -> float:
+    """Return 1 for a mask of the colour its phrase names, down to 0.4; 1 where it names none."""
+    if match is None or not mask.any():
+        return 1.0
+    return 0.4 + 0.6 * min(1.0, float(match[mask].mean()) / 0.4)
+
+
+def _cut(mask: Bool[np.ndarray, "h w"]) -> bool:
+    x, y, w, h = bounding_box(mask)
+    return x <= 1 or y <= 1 or x + w >= mask.shape[1] - 1 or y + h >= mask.shape[0] - 1

@@ -1,0 +1,185 @@
+"""A small network of our own looks at one frame beside what stood there before and after: hand, moved thing, other things, table.
+
+Three pictures go in (the frame, the still of the clip's beginning, the still of its end), class probabilities and a guess
+of the camera come out. It was trained on rendered clips only (`scripts/train_scene_network.py`): hands and the change they
+cause look much the same there. Weights lie beside this file.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+from safetensors.torch import load_file
+from torch import nn
+from torch.nn import functional as F  # noqa: N812  (the usual name)
+
+from v2p_data.errors import V2PError
+from v2p_data.scene.classes import CLASSES
+
+LONG_SIDE_PX = 256
+WEIGHTS = Path(__file__).with_name("network.safetensors")
+_STEP = 16
+_WIDTHS = (24, 48, 80, 128)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """What the network says about some frames of a clip, at the frames' own size."""
+
+    shares: Float32[np.ndarray, "n 5 h w"]
+    """Probability of each class, summing to one."""
+    pitch_rad: float
+    """How far the camera looks below the horizon."""
+    pitch_sd_rad: float
+    """Its standard deviation, as the network states it."""
+    focal_widths: float
+    """Focal length over picture width."""
+    focal_sd: float
+    """Standard deviation of its logarithm."""
+
+
+def net_size(height_px: int, width_px: int) -> tuple[int, int]:
+    """Return (height, width) at which the network looks at pictures of this size: longer side 256, multiples of 16."""
+    step_px = max(height_px, width_px) * _STEP / LONG_SIDE_PX
+    return max(1, round(height_px / step_px)) * _STEP, max(1, round(width_px / step_px)) * _STEP
+
+
+class SceneNetwork(nn.Module):
+    """U-Net whose coarsest level compares all places with each other (one attention layer)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        a, b, c, d = _WIDTHS
+        self.stem = nn.Sequential(nn.Conv2d(15, a, 4, 2, 1), nn.BatchNorm2d(a), nn.ReLU())
+        self.enc1 = _pair(a, a)
+        self.enc2 = _pair(a, b)
+        self.enc3 = _pair(b, c)
+        self.enc4 = _pair(c, d)
+        self.compare = nn.TransformerEncoderLayer(
+            d, 4, 2 * d, dropout=0.0, batch_first=True, norm_first=True
+        )
+        self.dec3 = _pair(c + d, c)
+        self.dec2 = _pair(b + c, b)
+        self.dec1 = _pair(a + b, a)
+        self.head = nn.Sequential(nn.Conv2d(a, len(CLASSES) * 4, 3, padding=1), nn.PixelShuffle(2))
+        self.camera = nn.Sequential(nn.Linear(d + 1, 64), nn.ReLU(), nn.Linear(64, 4))
+
+    def forward(
+        self, x: Float[torch.Tensor, "n 15 h w"]
+    ) -> tuple[Float[torch.Tensor, "n 5 h w"], Float[torch.Tensor, "n 4"]]:
+        """Return class logits, and the camera as (pitch [rad], log focal over width, log sd of either)."""
+        x1 = self.enc1(self.stem(x))
+        x2 = self.enc2(F.max_pool2d(x1, 2))
+        x3 = self.enc3(F.max_pool2d(x2, 2))
+        x4 = self.enc4(F.max_pool2d(x3, 2))
+        n, d, h, w = x4.shape
+        tokens = self.compare(x4.flatten(2).transpose(1, 2))
+        x4 = tokens.transpose(1, 2).reshape(n, d, h, w)
+        up = self.dec3(torch.cat([x3, _twice(x4)], 1))
+        up = self.dec2(torch.cat([x2, _twice(up)], 1))
+        up = self.dec1(torch.cat([x1, _twice(up)], 1))
+        aspect = torch.full((n, 1), float(np.log(w / h)), device=x.device, dtype=tokens.dtype)
+        return self.head(up), self.camera(torch.cat([tokens.mean(1), aspect], 1))
+
+
+def inputs_of(
+    frame: UInt8[torch.Tensor, "n 3 h w"],
+    early: UInt8[torch.Tensor, "n 3 h w"],
+    late: UInt8[torch.Tensor, "n 3 h w"],
+) -> Float[torch.Tensor, "n 15 h w"]:
+    """Return the network's input: the three pictures, how much each pair differs, and the place."""
+    now, before, after = (x.float() / 127.5 - 1 for x in (frame, early, late))
+    pairs = ((now, before), (now, after), (before, after))
+    changes = [(p - q).abs().amax(1, keepdim=True) for p, q in pairs]
+    n, _, h, w = frame.shape
+    longest = max(h, w)
+    y = (torch.arange(h, device=frame.device) - h / 2) / longest * 2
+    x = (torch.arange(w, device=frame.device) - w / 2) / longest * 2
+    place = [y[None, None, :, None].expand(n, 1, h, w), x[None, None, None, :].expand(n, 1, h, w)]
+    flat = (before - after).mean(1, keepdim=True)
+    return torch.cat([now, before, after, *changes, flat, *place], 1)
+
+
+@lru_cache(maxsize=1)
+def network() -> SceneNetwork:
+    """Return the trained network, on the CPU.
+
+    Raises:
+        V2PError: its weights are missing or belong to another version.
+    """
+    if not WEIGHTS.is_file():
+        raise V2PError(
+            f"the scene network's weights are not at {WEIGHTS.name} beside network.py; reinstall the package, train "
+            "them with scripts/train_scene_network.py, or use --scene.ground.backend=heuristic"
+        )
+    net = SceneNetwork()
+    try:
+        net.load_state_dict({k: v.float() for k, v in load_file(WEIGHTS).items()})
+    except (RuntimeError, ValueError, OSError) as error:
+        raise V2PError(
+            f"{WEIGHTS.name} does not fit this version's network; train it anew with "
+            f"scripts/train_scene_network.py ({type(error).__name__})"
+        ) from error
+    net.eval()
+    return net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # five times as fast on a CPU
+
+
+@torch.inference_mode()
+def look(
+    frames: UInt8[np.ndarray, "n h w 3"],
+    early: UInt8[np.ndarray, "h w 3"],
+    late: UInt8[np.ndarray, "h w 3"],
+    batch: int = 8,
+) -> Seen:
+    """Return what the network sees in the frames of one clip, given its two stills."""
+    h, w = early.shape[:2]
+    size = net_size(h, w)
+    stills = [
+        torch.from_numpy(_small(image, size)).permute(2, 0, 1)[None] for image in (early, late)
+    ]
+    net = network()
+    shares, cameras = [], []
+    for start in range(0, len(frames), batch):
+        part = np.stack([_small(image, size) for image in frames[start : start + batch]])
+        now = torch.from_numpy(part).permute(0, 3, 1, 2)
+        before, after = (still.expand(len(part), -1, -1, -1) for still in stills)
+        logits, camera = net(
+            inputs_of(now, before, after).contiguous(memory_format=torch.channels_last)
+        )
+        shares.append(logits.softmax(1).numpy())
+        cameras.append(camera.numpy())
+    small = np.concatenate(shares)
+    full = np.stack(
+        [
+            [cv2.resize(plane, (w, h), interpolation=cv2.INTER_LINEAR) for plane in one]
+            for one in small
+        ]
+    )
+    camera = np.concatenate(cameras).mean(0)
+    return Seen(
+        shares=full.astype(np.float32),
+        pitch_rad=float(camera[0]),
+        pitch_sd_rad=float(np.exp(camera[2])),
+        focal_widths=float(np.exp(camera[1])),
+        focal_sd=float(np.exp(camera[3])),
+    )
+
+
+def _small(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "a b 3"]:
+    how = cv2.INTER_AREA if size[1] < image.shape[1] else cv2.INTER_LINEAR
+    return np.ascontiguousarray(cv2.resize(image, (size[1], size[0]), interpolation=how))
+
+
+def _pair(n_in: int, n_out: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(n_in, n_out, 3, padding=1, bias=False), nn.BatchNorm2d(n_out), nn.ReLU(),
+        nn.Conv2d(n_out, n_out, 3, padding=1, bias=False), nn.BatchNorm2d(n_out), nn.ReLU(),
+    )  # fmt: skip
+
+
+def _twice(x: torch.Tensor) -> torch.Tensor:
+    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)

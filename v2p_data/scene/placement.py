@@ -1,0 +1,386 @@
+"""Masks become a camera, shapes and poses: everything here is in camera heights, until `height_m` turns it into metres.
+
+The camera stands at (0, 0, 1), level, and looks along +x. Objects rest on the table unless something shows that they
+are held; how far away something in mid-air is cannot be seen from one side and is taken over from where it stood.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from v2p_data.geometry.camera import Camera
+from v2p_data.geometry.pose import transform
+from v2p_data.scene.colour import lab_of
+from v2p_data.scene.footage import Footage
+from v2p_data.scene.pose import (
+    Fit,
+    Silhouette,
+    camera_above,
+    fit_lifted,
+    fit_pose,
+    fit_shape,
+    on_wall,
+    orientations,
+)
+from v2p_data.scene.scale import SizeVote, camera_height_m
+from v2p_data.scene.scene import Observed
+from v2p_data.scene.segment import bounding_box, grow, tidy
+from v2p_data.scene.sight import Sighting
+
+_INSIDE_KINDS = ("insert", "throw_into", "place_onto")
+_CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
+_SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
+_TURN_COST = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraGuess:
+    """What is known of the camera before the outlines are looked at."""
+
+    pitch_rad: float
+    pitch_sd_rad: float
+    fov_rad: float
+    """Horizontal field of view."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    """One object in camera heights."""
+
+    first: Fit
+    last: Fit
+    last_i: int
+    """Footage frame of the last pose."""
+    last_mask: Bool[np.ndarray, "h w"]
+    frames: tuple[int, ...]
+    """Footage frames with a pose, the first and the last among them."""
+    T_world_objs: Float[np.ndarray, "pose 4 4"]
+    confidences: tuple[float, ...]
+    observed: tuple[Observed, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """Camera and objects, in the order of the sightings."""
+
+    camera: Camera
+    """At working size, one camera height above the table."""
+    pitch_rad: float
+    objects: tuple[Placed, ...]
+    height_m: float
+    """Metres per camera height."""
+    scale_spread: float
+    """Standard deviation of the logarithm of `height_m`."""
+    upright_cost: float
+    """What standing as at first would have cost the manipulated object at the end."""
+
+
+def place(
+    footage: Footage, objects: tuple[Sighting, ...], kind: str, guess: CameraGuess, max_poses: int
+) -> Placement:
+    """Return camera, shapes and poses such that all outlines fit their masks, the manipulated object's at both ends."""
+    thing = objects[0]
+    unknown = [
+        _hidden(footage, s.at, s.first, s.last) if s.moves else _hidden(footage, s.at, s.first)
+        for s in objects
+    ]
+    shape = footage.shape
+    pitch_rad, firsts = _best_pitch(shape, objects, unknown, guess)
+    camera = camera_above(shape, pitch_rad, guess.fov_rad)
+    ends = [_end_of(s, kind) for s in objects]
+    upright_cost, lasts = 0.0, list(firsts)
+    for k, s in enumerate(objects):
+        if not s.moves:
+            continue
+        last_i, last_mask = ends[k]
+        silhouette = Silhouette(last_mask, _hidden(footage, last_i, last_mask, s.first), camera)
+        # One outline often fits a standing and a lying box alike; both ends together seldom do.
+        options = _options(s, unknown[k], camera, thorough=True, all_rests=True)
+        role = kind if s is thing else "generic"
+        held_by = _support(kind, objects, firsts) if s is thing else 0.0
+        found = [_fit_last(silhouette, s, role, first, held_by) for first in options]
+        best = min(range(len(options)), key=lambda i: options[i].cost + found[i][0].cost)
+        firsts[k], (lasts[k], cost) = options[best], found[best]
+        upright_cost = cost if s is thing else upright_cost
+    height_m, spread = camera_height_m(
+        [vote_of(s, fit) for s, fit in zip(objects, firsts, strict=True)]
+    )
+    placed = []
+    for k, s in enumerate(objects):
+        last_i, last_mask = ends[k]
+        course = _Course([0], [firsts[k].T_world_obj], [firsts[k].iou], ["full"])
+        if s.moves:
+            course = _course(s, kind, firsts[k], lasts[k], ends[k], camera, max_poses)
+        else:
+            course = course.then(len(s.masks) - 1, firsts[k].T_world_obj, firsts[k].iou, "full")
+        placed.append(
+            Placed(
+                first=firsts[k],
+                last=lasts[k],
+                last_i=last_i,
+                last_mask=last_mask,
+                frames=tuple(course.frames),
+                T_world_objs=np.stack(course.poses),
+                confidences=tuple(course.sure),
+                observed=tuple(course.observed),
+            )
+        )
+    return Placement(
+        camera=camera,
+        pitch_rad=pitch_rad,
+        objects=tuple(placed),
+        height_m=height_m,
+        scale_spread=spread,
+        upright_cost=upright_cost,
+    )
+
+
+def _best_pitch(
+    shape: tuple[int, int],
+    objects: tuple[Sighting, ...],
+    unknown: list[Bool[np.ndarray, "h w"]],
+    guess: CameraGuess,
+) -> tuple[float, list[Fit]]:
+    """Try pitches around the guess; the silhouettes decide, as far as the guess lets them."""
+    best: tuple[float, float, list[Fit]] | None = None
+    tried: list[float] = []
+
+    def fits_at(pitch: float, *, thorough: bool) -> list[Fit]:
+        camera = camera_above(shape, pitch, guess.fov_rad)
+        return [
+            min(
+                _options(s, unknown[k], camera, thorough=thorough, all_rests=thorough or k == 0),
+                key=lambda fit: fit.cost,
+            )
+            for k, s in enumerate(objects)
+        ]
+
+    sd = guess.pitch_sd_rad
+    for offsets in ((-1.8 * sd, -0.9 * sd, 0.0, 0.9 * sd, 1.8 * sd), (-0.4 * sd, 0.4 * sd)):
+        centre = guess.pitch_rad if best is None else best[1]
+        for offset in offsets:
+            pitch = centre + offset
+            if not 0.15 < pitch < 1.4 or any(abs(pitch - other) < 0.01 for other in tried):
+                continue
+            tried.append(pitch)
+            fits = fits_at(pitch, thorough=False)
+            off = (pitch - guess.pitch_rad) / sd
+            cost = sum(fit.cost for fit in fits) + _TURN_COST * off**2
+            if best is None or cost < best[0]:
+                best = cost, pitch, fits
+    assert best is not None
+    return best[1], fits_at(best[1], thorough=len(objects) > 1)
+
+
+def _options(
+    s: Sighting,
+    unknown: Bool[np.ndarray, "h w"],
+    camera: Camera,
+    *,
+    thorough: bool,
+    all_rests: bool,
+) -> list[Fit]:
+    """Return the best fit for every way in which the object may rest."""
+    silhouette = Silhouette(s.first, unknown, camera)
+    rests = orientations(s.noun)
+    fits = []
+    for rest, extra in rests if all_rests else rests[:1]:
+        fit = fit_shape(silhouette, s.noun, rest, thorough=thorough)
+        fit = replace(fit, cost=fit.cost + extra)
+        fits.append(_upright_axes(fit) if s.noun.form == "box" else fit)
+    return fits
+
+
+def _end_of(s: Sighting, kind: str) -> tuple[int, Bool[np.ndarray, "h w"]]:
+    """Return the footage frame of an object's last pose, and its mask there."""
+    if s.role == "manipulated" and kind == "lift_up":
+        i = _peak(s)
+        return i, s.masks[i]
+    return len(s.masks) - 1, s.last
+
+
+def _fit_last(
+    silhouette: Silhouette, s: Sighting, kind: str, first: Fit, support: float
+) -> tuple[Fit, float]:
+    """Return an object's pose at the end, and what standing as at first would have cost."""
+    noun = s.noun
+    if kind == "lift_up":
+        return fit_lifted(silhouette, noun, first.size, first.T_world_obj), 0.0
+    rest = _rest_of(first.T_world_obj[:3, :3])
+    yaw = _yaw_between(first.T_world_obj[:3, :3], rest)
+    same = fit_pose(silhouette, noun, first.size, rest, yaw_near=yaw, support=support)
+    if kind in _CARRY_KINDS:
+        held = fit_lifted(silhouette, noun, first.size, first.T_world_obj)
+        if held.cost + 0.1 < same.cost:  # the clip ends before it is put down
+            return held, same.cost
+    if kind != "tip_over" or noun.form == "sphere":
+        return same, same.cost
+    turned = []
+    for axis in ("y", "x"):
+        tipped = Rotation.from_euler(axis, 90, degrees=True).as_matrix() @ rest
+        fit = fit_pose(silhouette, noun, first.size, tipped)
+        turned.append(_tipped_along(fit, first.T_world_obj))
+    return min(turned, key=lambda fit: fit.cost), same.cost
+
+
+def _support(kind: str, objects: tuple[Sighting, ...], fits: list[Fit]) -> float:
+    """Return how high above the table the manipulated object comes to rest [camera heights]."""
+    if kind not in (*_INSIDE_KINDS, "cover") or len(objects) < 2:
+        return 0.0
+    other, height = objects[1].noun, fits[1].size[2]
+    if kind == "cover":
+        return 0.0 if objects[0].noun.hollow else height
+    return 0.15 * height if other.hollow else height
+
+
+@dataclass
+class _Course:
+    frames: list[int]
+    poses: list[Float[np.ndarray, "4 4"]]
+    sure: list[float]
+    observed: list[Observed]
+
+    def then(
+        self, frame: int, pose: Float[np.ndarray, "4 4"], sure: float, observed: Observed
+    ) -> "_Course":
+        """Return the course with one pose more, unless it has one at that frame."""
+        if frame > self.frames[-1]:
+            self.frames.append(frame)
+            self.poses.append(pose)
+            self.sure.append(float(np.clip(sure, 0, 1)))
+            self.observed.append(observed)
+        return self
+
+
+def _course(
+    s: Sighting,
+    kind: str,
+    first_fit: Fit,
+    last_fit: Fit,
+    end: tuple[int, Bool[np.ndarray, "h w"]],
+    camera: Camera,
+    max_poses: int,
+) -> _Course:
+    """Return poses at well-tracked frames: position from the mask's centre, rotation blended."""
+    first, last = first_fit.T_world_obj, last_fit.T_world_obj
+    last_i, last_mask = end
+    course = _Course([0], [first], [float(np.clip(first_fit.iou, 0, 1))], ["full"])
+    spots = np.unique(np.linspace(0, last_i, min(max_poses, last_i + 1)).round().astype(int))
+    on_table = kind in _SLIDING_KINDS
+    turn = Rotation.from_matrix(last[:3, :3] @ first[:3, :3].T).as_rotvec()
+    ends = [_centre(s.masks[0]), _centre(last_mask)]
+    bias = [
+        centre - camera.project(T[None, :3, 3])[0]
+        for centre, T in zip(ends, (first, last), strict=True)
+    ]
+    travel = ends[1] - ends[0]
+    for i in spots.tolist()[1:-1]:
+        if s.quality[i] < 0.5 or not s.masks[i].any():
+            continue
+        centre = _centre(s.masks[i])
+        share = float(np.clip((centre - ends[0]) @ travel / max(1.0, travel @ travel), 0, 1))
+        pixel = centre - (1 - share) * bias[0] - share * bias[1]
+        if on_table:
+            position = camera.on_plane(pixel[None], float(first[2, 3]))[0]
+        else:
+            position = on_wall(
+                camera, pixel, float((1 - share) * first[0, 3] + share * last[0, 3])
+            )
+            position[2] = max(position[2], min(first[2, 3], last[2, 3]))
+        if not np.isfinite(position).all():
+            continue
+        rotation = Rotation.from_rotvec(share * turn).as_matrix() @ first[:3, :3]
+        free = position[2] > max(first[2, 3], last[2, 3]) + 0.02
+        course.then(
+            i,
+            transform(rotation, position),
+            0.7 * float(s.quality[i]),
+            "no_depth" if free else "full",
+        )
+    in_air = kind == "lift_up"
+    return course.then(last_i, last, last_fit.iou, "no_depth" if in_air else "full")
+
+
+def _peak(s: Sighting) -> int:
+    """Return the footage frame at which a lift is highest in the picture, among the believable ones."""
+    n = len(s.masks)
+    heights = np.full(n, -np.inf)
+    start = _centre(s.first)[1]
+    for i in range(n):
+        if s.quality[i] >= 0.5 and s.masks[i].any():
+            heights[i] = start - _centre(s.masks[i])[1]
+    top = heights.max()
+    # The end of the clip counts as the peak when it is nearly as high: a hand that holds still trembles.
+    near = np.flatnonzero(heights >= 0.93 * top)
+    return int(near[-1]) if len(near) and top > 0 else n - 1
+
+
+def _hidden(
+    footage: Footage,
+    i: int,
+    mask: Bool[np.ndarray, "h w"],
+    other_end: Bool[np.ndarray, "h w"] | None = None,
+) -> Bool[np.ndarray, "h w"]:
+    """Return pixels near the mask that say nothing: what passes there (the hand, a shadow) may hide the object."""
+    background = footage.late if i < len(footage.rgb) / 2 else footage.early
+    passing = np.linalg.norm(footage.lab[i] - lab_of(background), axis=-1) > 12
+    hidden = tidy(passing) & ~mask
+    if other_end is not None:
+        hidden &= ~grow(other_end, 2)
+    x, y, w, h = bounding_box(mask)
+    near = np.zeros_like(mask)
+    pad = max(4, int(0.3 * max(w, h)))
+    near[max(0, y - pad) : y + h + pad, max(0, x - pad) : x + w + pad] = True
+    return hidden & near
+
+
+def _upright_axes(fit: Fit) -> Fit:
+    """Return the same box with its own axes such that at first its z points up."""
+    rest = _rest_of(fit.T_world_obj[:3, :3])
+    size = np.abs(rest) @ np.array(fit.size)
+    yawed = fit.T_world_obj[:3, :3] @ rest.T
+    T = transform(yawed, fit.T_world_obj[:3, 3])
+    return replace(fit, size=_tuple3(size), T_world_obj=T)
+
+
+def _rest_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the resting orientation of a pose without its yaw: identity for upright things."""
+    if rotation[2, 2] > 0.7:
+        return np.eye(3)
+    if rotation[2, 2] < -0.7:
+        return np.diag([1.0, -1.0, -1.0])
+    axis = "y" if abs(rotation[2, 0]) > 0.7 else "x"
+    return Rotation.from_euler(axis, 90, degrees=True).as_matrix()
+
+
+def _yaw_between(rotation: Float[np.ndarray, "3 3"], rest: Float[np.ndarray, "3 3"]) -> float:
+    turn = rotation @ rest.T
+    return float(np.arctan2(turn[1, 0], turn[0, 0]))
+
+
+def _tipped_along(fit: Fit, T_first: Float[np.ndarray, "4 4"]) -> Fit:
+    """Return the lying pose whose top points the way the object went: silhouettes do not tell top from bottom."""
+    top = fit.T_world_obj[:3, 2]
+    way = fit.T_world_obj[:3, 3] - T_first[:3, 3]
+    if float(top[:2] @ way[:2]) >= 0:
+        return fit
+    T = fit.T_world_obj.copy()
+    T[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ T[:3, :3]
+    return replace(fit, T_world_obj=T)
+
+
+def _centre(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
+    y, x = np.nonzero(mask)
+    return np.array([x.mean() + 0.5, y.mean() + 0.5]) if len(x) else np.array([np.nan, np.nan])
+
+
+def vote_of(s: Sighting, fit: Fit) -> SizeVote:
+    """Return what a fitted object says about the scale."""
+    return SizeVote(size=fit.size, noun=s.noun, trust=max(0.1, fit.iou), known_m=s.known_m)
+
+
+def _tuple3(values: np.ndarray) -> tuple[float, float, float]:
+    a, b, c = (float(v) for v in values)
+    return a, b, c

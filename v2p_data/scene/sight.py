@@ -1,0 +1,324 @@
+"""Which pixels are which object of the caption, in every frame: grounding, then segmentation, by the chosen backends.
+
+A user's box, points or a detector's box say where an object is in one frame; without them what moved and what stands
+there decides. Everything works at the footage's size.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.scene.backends.config import GroundConfig, SegmentConfig
+from v2p_data.scene.classes import HAND, MOVED, OTHER
+from v2p_data.scene.colour import histogram
+from v2p_data.scene.find import (
+    Watched,
+    find_movers,
+    hand_at,
+    table_seen,
+    things_standing,
+    watch,
+)
+from v2p_data.scene.footage import Footage
+from v2p_data.scene.ground import Found, Moved, find_moved, find_other
+from v2p_data.scene.nouns import Noun, noun_for
+from v2p_data.scene.scene import Role
+from v2p_data.scene.segment import bounding_box, from_box, from_points, grow
+from v2p_data.scene.table import Table, find_table
+from v2p_data.scene.track import Track, track
+from v2p_data.video.clip import Clip
+from v2p_data.video.meaning import Meaning
+
+_HINTED_SURE = 0.97
+_OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
+"""What the caption says of other objects is an aside here: such a scene makes sense without them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sighting:
+    """One object of the caption in the picture, before geometry."""
+
+    phrase: str
+    role: Role
+    noun: Noun
+    masks: Bool[np.ndarray, "time h w"] = field(repr=False)
+    """Its visible pixels in every footage frame."""
+    quality: Float[np.ndarray, "time"] = field(repr=False)
+    """How far to believe each mask, 0 to 1."""
+    moves: bool
+    at: int
+    """Footage frame that shows where it stands at first; the last one for what is uncovered."""
+    known_m: tuple[float, float, float] | None
+    """Its size where the user gave it."""
+    sure: float
+    """That these are the object's pixels, 0 to 1."""
+    why: str
+    """Why not surer."""
+    meets: float = 1.0
+    """How well the track from the start agrees with the one from the end, 0 to 1."""
+    hinted: bool = False
+
+    @property
+    def first(self) -> Bool[np.ndarray, "h w"]:
+        return self.masks[self.at]
+
+    @property
+    def last(self) -> Bool[np.ndarray, "h w"]:
+        return self.masks[-1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sights:
+    """Everything seen in a clip."""
+
+    objects: tuple[Sighting, ...]
+    """The manipulated one first."""
+    footage: Footage
+    """As given, now knowing the hand's colours."""
+    table: Table
+    watched: Watched | None
+    """None where the network was not asked."""
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Marked:
+    """A mask that a user or a detector stands for."""
+
+    mask: Bool[np.ndarray, "h w"]
+    frame: int
+    """Footage frame."""
+    sure: float
+
+
+def sight(
+    clip: Clip,
+    footage: Footage,
+    meaning: Meaning,
+    ground: GroundConfig,
+    segment: SegmentConfig,
+    min_found: float,
+) -> Sights:
+    """Return the masks of all objects that the caption names.
+
+    Raises:
+        ItemRejectedError: `object_not_found` or `reference_not_found`, with how sure the best finding was.
+    """
+    watched = None if ground.backend == "heuristic" else watch(footage)
+    if watched is not None:
+        footage = _knowing_hand(footage, watched)
+    table = find_table(footage.always, table_seen(watched) if watched else None)
+    marked = _marked(clip, footage, watched)
+    tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
+    moved, held = _find_movers(footage, table, watched, meaning, tool, marked)
+    mark = marked.get(meaning.manipulated)
+    sure, why = _sureness(moved, watched, mark)
+    if sure < min_found:
+        raise ItemRejectedError(
+            "object_not_found",
+            f"the best match for '{meaning.manipulated}' in {clip.item} is sure to {sure:.2f}, below {min_found:.2f} "
+            f"({why}); mark it with a box in captions.json",
+            round(sure, 3),
+        )
+    if watched is None:
+        footage = footage.knowing(moved.look)
+    followed = _followed(footage, watched, moved)
+    thing = _sighting(clip, meaning.manipulated, "manipulated")
+    objects = [
+        replace(
+            thing,
+            masks=followed.masks,
+            quality=followed.quality,
+            meets=followed.meets,
+            moves=True,
+            sure=sure,
+            why=why,
+            hinted=mark is not None,
+        )
+    ]
+    moved = replace(moved, last=followed.masks[-1])
+    warnings: list[str] = []
+    taken = np.zeros(footage.shape, bool)
+    for phrase, role in meaning.others:
+        thing = _sighting(clip, phrase, role)
+        mark = marked.get(phrase)
+        if role == "tool" and held is not None:
+            course = _followed(footage, watched, held)
+            sure, why = _sureness(held, watched, mark)
+            thing = replace(
+                thing, masks=course.masks, quality=course.quality, meets=course.meets, moves=True
+            )
+            objects.append(replace(thing, sure=sure, why=why, hinted=mark is not None))
+            continue
+        late = meaning.kind == "uncover" if mark is None else mark.frame > 0
+        found = (
+            Found(mask=mark.mask, score=5.0)
+            if mark
+            else find_other(
+                footage, table, phrase, meaning.kind, moved, taken,
+                things_standing(watched, late=late) if watched else None,
+            )
+        )  # fmt: skip
+        sure = _HINTED_SURE if mark else _rise(found.score, 1.0, 0.5) if found else 0.0
+        if found is None or sure < min_found:
+            if phrase.lower() in clip.caption.lower() and meaning.kind not in _OPTIONAL_KINDS:
+                raise ItemRejectedError(
+                    "reference_not_found",
+                    f"the '{phrase}' was not found in {clip.item} (sure to {sure:.2f}); mark it with a box in "
+                    "captions.json",
+                    round(sure, 3),
+                )
+            warnings.append(f"the '{phrase}' was not found and is left out")
+            continue
+        taken |= grow(found.mask, 2)
+        masks = _standing(footage, watched, found.mask, objects[0].masks)
+        objects.append(
+            replace(
+                thing,
+                masks=masks,
+                quality=masks.sum((1, 2)) / max(1, found.mask.sum()),
+                at=len(masks) - 1 if late else 0,
+                sure=sure,
+                why="" if mark else "what stands there fits the words only so far",
+                hinted=mark is not None,
+            )
+        )
+    del segment
+    return Sights(
+        objects=tuple(objects),
+        footage=footage,
+        table=table,
+        watched=watched,
+        warnings=tuple(warnings),
+    )
+
+
+def _sighting(clip: Clip, phrase: str, role: Role) -> Sighting:
+    """Return an object of which nothing is seen yet."""
+    hint = clip.hints.get(phrase, {})
+    size = hint.get("size_m")
+    return Sighting(
+        phrase=phrase,
+        role=role,
+        noun=noun_for(hint.get("name") or phrase),
+        masks=np.zeros((0, 0, 0), bool),
+        quality=np.zeros(0),
+        moves=False,
+        at=0,
+        known_m=(size[0], size[1], size[2]) if size else None,
+        sure=0.0,
+        why="",
+    )
+
+
+def _knowing_hand(footage: Footage, watched: Watched) -> Footage:
+    """Return the footage with the colours of the hand that the network saw."""
+    pixels = [footage.rgb[i][hand_at(watched, int(i))] for i in watched.idx]
+    hand = np.concatenate(pixels)
+    if len(hand) < 300:
+        return footage
+    return replace(
+        footage, hand_hist=histogram(hand[:: max(1, len(hand) // 60000)]), skin_only=False
+    )
+
+
+def _marked(clip: Clip, footage: Footage, watched: Watched | None) -> dict[str, _Marked]:
+    """Return the masks that users' boxes and points mean, by phrase."""
+    out = {}
+    for phrase, hint in clip.hints.items():
+        if not ("box" in hint or "points" in hint):
+            continue
+        i = int(np.abs(footage.frame_idx - hint.get("frame", 0)).argmin())
+        image, scale = footage.rgb[i], footage.px_scale
+        if "box" in hint:
+            x0, y0, x1, y1 = (v * scale for v in hint["box"])
+            mask = from_box(image, (x0, y0, x1, y1), _thing_at(watched, i))
+        else:
+            mask = from_points(image, [(x * scale, y * scale) for x, y in hint["points"]])
+        out[phrase] = _Marked(mask=mask, frame=i, sure=_HINTED_SURE)
+    return out
+
+
+def _thing_at(watched: Watched | None, i: int) -> Float[np.ndarray, "h w"] | None:
+    if watched is None:
+        return None
+    shares = watched.at(i)
+    return shares[MOVED] + shares[OTHER]
+
+
+def _find_movers(
+    footage: Footage,
+    table: Table,
+    watched: Watched | None,
+    meaning: Meaning,
+    tool: str,
+    marked: dict[str, _Marked],
+) -> tuple[Moved, Moved | None]:
+    mark = marked.get(meaning.manipulated)
+    at_end = mark is not None and mark.frame > 0.5 * (len(footage.rgb) - 1)
+    first = mark.mask if mark and not at_end else None
+    last = mark.mask if mark and at_end else None
+    moved, held = None, None
+    if watched is not None:
+        found = find_movers(footage, watched, meaning.manipulated, meaning.kind, tool, first, last)
+        moved, held = found or (None, None)
+    if moved is None:
+        moved = find_moved(
+            footage, table, meaning.manipulated, meaning.kind, first=first, last=last
+        )
+    if moved is None:
+        raise ItemRejectedError(
+            "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
+        )
+    return moved, held
+
+
+def _sureness(moved: Moved, watched: Watched | None, mark: _Marked | None) -> tuple[float, str]:
+    if mark is not None:
+        return mark.sure, ""
+    if watched is None or "no rival" not in moved.cues:
+        return _rise(moved.score, 3.6, 0.8), f"its cues add up to {moved.score:.1f}"
+    weakest = min(moved.cues, key=lambda cue: moved.cues[cue])
+    sure = float(np.prod(list(moved.cues.values())) ** 0.5)
+    return sure, f"weakest is '{weakest}' with {moved.cues[weakest]:.2f}"
+
+
+def _followed(footage: Footage, watched: Watched | None, moved: Moved) -> Track:
+    return track(
+        footage,
+        moved,
+        every=1 if len(footage.rgb) < 80 else 2,
+        moving=None if watched is None else lambda i: watched.at(i)[MOVED],
+    )
+
+
+def _standing(
+    footage: Footage,
+    watched: Watched | None,
+    mask: Bool[np.ndarray, "h w"],
+    mover: Bool[np.ndarray, "time h w"],
+) -> Bool[np.ndarray, "time h w"]:
+    """Return a standing thing's mask over time, less what passes in front of it."""
+    out = np.repeat(mask[None], len(footage.rgb), axis=0)
+    for i in range(len(out)):
+        hidden = mover[i]
+        if watched is not None:
+            shares = watched.at(i)
+            hidden = hidden | (shares[HAND] + shares[MOVED] > 0.5)
+        out[i] &= ~hidden
+    return out
+
+
+def stands_on(table: Table, mask: Bool[np.ndarray, "h w"]) -> bool:
+    """Return whether the mask's foot lies on the table's part of the picture."""
+    x, y, w, h = bounding_box(mask)
+    foot = np.zeros_like(mask)
+    foot[y + int(0.75 * h) : y + h, x : x + w] = True
+    foot &= mask
+    return float((foot & grow(table.hull, 6)).sum()) > 0.3 * float(foot.sum())
+
+
+def _rise(x: float, middle: float, width: float) -> float:
+    return float(1 / (1 + np.exp(-(x - middle) / width)))
