@@ -49,11 +49,13 @@ class VideoConfig:
     min_side_px: int = 64
     """Smaller pictures show too little."""
     max_side_file_px: int = 8192
-    """Larger pictures are refused before memory is asked for."""
+    """Longer sides are refused before memory is asked for."""
+    max_file_mpx: float = 36.0
+    """So are more megapixels: 8192 x 4320 is the most that H.264 knows, and a decoder holds several pictures."""
     max_duration_s: float = 120.0
     """A clip shows one motion; longer recordings are to be cut."""
-    max_decode_s: float = 60.0
-    """A file that takes longer to decode is given up."""
+    max_decode_s: float = 120.0
+    """A file that takes longer to decode is given up: the longest clip in its own time."""
 
     def __post_init__(self) -> None:
         if not 64 <= self.max_side_px <= 4096:
@@ -66,10 +68,10 @@ class VideoConfig:
             raise ValueError(
                 f"need 16 <= min_side_px <= max_side_px, got {self.min_side_px} and {self.max_side_px}"
             )
-        if self.max_duration_s <= 0 or self.max_decode_s <= 0:
+        if min(self.max_duration_s, self.max_decode_s, self.max_file_mpx) <= 0:
             raise ValueError(
-                f"max_duration_s and max_decode_s must be positive, "
-                f"got {self.max_duration_s} and {self.max_decode_s}"
+                f"max_duration_s, max_decode_s and max_file_mpx must be positive, "
+                f"got {self.max_duration_s}, {self.max_decode_s} and {self.max_file_mpx}"
             )
 
 
@@ -103,12 +105,18 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
             f"{name} has {total} frames; at least {cfg.min_frames} are needed to see a motion",
             float(total),
         )
+    if len(film.numbers) < cfg.min_frames:
+        raise ItemRejectedError(
+            "unreadable",
+            f"{name} holds pictures that cannot be shown: {len(film.numbers)} of {total} can",
+            float(len(film.numbers)),
+        )
     for warning in warnings:
         log.warning("%s", warning)
 
     chosen, fps = _even(film.times_s, film.duration_s, total, cfg.max_frames)
-    frames = np.stack([film.kept[i] for i in chosen])
     source_frame = np.array([film.numbers[i] for i in chosen])
+    frames = film.take(chosen)
     return Clip(
         item=item.item,
         path=item.path,
@@ -128,20 +136,48 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
 
 @dataclass
 class _Film:
-    """What one pass over a file gathers: at most `2 * max_frames` pictures."""
+    """What one pass over a file gathers: at most `2 * max_frames` pictures, all in one piece of memory."""
 
     promised: int
     """Frames the container speaks of; 0 when it does not."""
     seen: int = 0
     broken: int = 0
     """Packets that could not be decoded."""
-    kept: list[UInt8[np.ndarray, "h w 3"]] = field(default_factory=list)
+    pixels: UInt8[np.ndarray, "room h w 3"] = field(
+        default_factory=lambda: np.empty((0, 0, 0, 3), np.uint8)
+    )
+    """The kept pictures, then room for more."""
     numbers: list[int] = field(default_factory=list[int])
+    """The file's frame number of each kept picture."""
     times_s: list[float] = field(default_factory=list[float])
     """When each kept picture is shown, from the first one."""
     duration_s: float = 0.0
     """From the first frame to the last."""
     shown_px: tuple[int, int] = (0, 0)
+
+    def keep(self, pixels: UInt8[np.ndarray, "h w 3"], time_s: float, most: int) -> None:
+        """Add the picture seen last; there is room for `most`."""
+        if not self.numbers:
+            self.pixels = np.empty((most, *pixels.shape), np.uint8)
+        self.pixels[len(self.numbers)] = pixels
+        self.numbers.append(self.seen - 1)
+        self.times_s.append(time_s)
+
+    def halve(self) -> None:
+        """Keep every other picture."""
+        self.numbers, self.times_s = self.numbers[::2], self.times_s[::2]
+        for i in range(len(self.numbers)):
+            self.pixels[i] = self.pixels[2 * i]
+
+    def take(self, chosen: Int[np.ndarray, "time"]) -> UInt8[np.ndarray, "time h w 3"]:
+        """Return the chosen pictures, and give the others' memory back; afterwards none is kept."""
+        if (chosen < np.arange(len(chosen))).any():  # a pause: some are shown several times
+            return self.pixels[chosen]
+        for i, at in enumerate(chosen):
+            self.pixels[i] = self.pixels[at]
+        taken, self.pixels = self.pixels, self.pixels[:0].copy()
+        taken.resize((len(chosen), *taken.shape[1:]), refcheck=False)
+        return taken
 
 
 def _decode(path: Path, cfg: VideoConfig) -> _Film:
@@ -192,7 +228,7 @@ def _film_of(container: "av.container.InputContainer", path: Path, cfg: VideoCon
     _check_duration(path, seconds, cfg)
     # threads would reorder what a damaged file gives
     stream.codec_context.thread_count = 1
-    stream.codec_context.options = {"max_pixels": str(cfg.max_side_file_px**2)}
+    stream.codec_context.options = {"max_pixels": str(round(cfg.max_file_mpx * 1e6))}
     rate = stream.average_rate or stream.guessed_rate or Fraction(30)
     promised = stream.frames or round(seconds * rate)
     film = _Film(promised=promised if 0 < promised < 1e6 else 0)
@@ -204,18 +240,18 @@ def _film_of(container: "av.container.InputContainer", path: Path, cfg: VideoCon
             picture = _Picture.of(path, frame, stream, cfg)
             film.shown_px = picture.shown_px
         if film.times_s and seen_s - film.times_s[-1] < 0.75 * step:
+            del frame
             continue
         try:
             pixels = picture.rgb(frame)
         except (av.error.FFmpegError, ValueError, MemoryError):
             film.broken += 1
             continue
-        film.kept.append(pixels)
-        film.numbers.append(film.seen - 1)
-        film.times_s.append(seen_s)
-        if len(film.kept) >= 2 * cfg.max_frames:
-            film.kept, film.numbers = film.kept[::2], film.numbers[::2]
-            film.times_s = film.times_s[::2]
+        finally:
+            del frame
+        film.keep(pixels, seen_s, 2 * cfg.max_frames)
+        if len(film.numbers) >= 2 * cfg.max_frames:
+            film.halve()
             step = 2 * step if step else 2 * seen_s / (2 * cfg.max_frames - 1)
     return film
 
@@ -244,7 +280,9 @@ def _timed_frames(
         except (av.error.FFmpegError, ValueError, MemoryError):
             film.broken += 1
             continue
-        for frame in frames:
+        # a picture of 8K takes 50 to 100 MB: none is held while the next one is decoded
+        while frames:
+            frame = frames.pop(0)
             if not isinstance(frame, VideoFrame):
                 continue
             shown = frame.time
@@ -255,6 +293,7 @@ def _timed_frames(
             film.seen += 1
             film.duration_s = last
             yield last, frame
+            del frame
 
 
 def _packets(
@@ -363,6 +402,13 @@ def _check_size(path: Path, width: int, height: int, cfg: VideoConfig, low: bool
             "too_small",
             f"{path.name} is {width} x {height} px; each side needs {cfg.min_side_px}",
             float(min(width, height)),
+        )
+    if width * height > 1e6 * cfg.max_file_mpx:
+        raise ItemRejectedError(
+            "too_large",
+            f"{path.name} has pictures of {width * height / 1e6:.0f} megapixels; at most "
+            f"{cfg.max_file_mpx:g} are read",
+            float(width * height / 1e6),
         )
     if max(width, height) > cfg.max_side_file_px:
         raise ItemRejectedError(
