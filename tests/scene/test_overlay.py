@@ -14,7 +14,6 @@ from v2p_data.scene.overlay import draw as draw_over
 from v2p_data.scene.overlay import write_overlay
 from v2p_data.scene.pose import camera_above
 from v2p_data.scene.reconstruct import Estimate, Reconstruction
-from v2p_data.scene.track import Track
 
 SIZE = (640, 480)
 HEAD_PX = 24
@@ -49,7 +48,7 @@ def pushed(draw):
         frames=frames,
         T_world_objs=np.stack([transform(np.eye(3), position(i)) for i in frames]),
         confidences=(0.9,) * NUM_FRAMES,
-        masks={0: masks[0] > 0, NUM_FRAMES - 1: masks[-1] > 0},
+        masks={i: masks[i] > 0 for i in frames},
         source={},
         mass_kg=0.1,
     )
@@ -59,10 +58,8 @@ def pushed(draw):
         objects=(box,),
         camera=camera,
         confidence=0.9,
-        cues={},
         warnings=(),
-        track=Track(masks=masks > 0, quality=np.ones(NUM_FRAMES), meets=1.0),
-        footage_frames=frames,
+        stages={"pose": (0.9, "")},
     )
 
 
@@ -90,7 +87,6 @@ def test_mask_and_shape_are_drawn_around_the_object(pushed, frame):
 def test_a_mesh_is_drawn_instead_of_the_usual_shape(pushed):
     bowl = revolution(0.2, 0.05, taper=0.5, hollow=True)
     scene = replace(pushed, objects=(replace(pushed.objects[0], mesh=bowl, masks={}),))
-    scene = replace(scene, track=replace(pushed.track, quality=np.zeros(NUM_FRAMES)))
 
     _, x = np.nonzero(drawn_over(scene, 0))
     pixels = 2 * pushed.camera.project(np.asarray(bowl.vertices) + position(0))
@@ -130,8 +126,7 @@ def test_what_lies_behind_the_camera_is_left_out(pushed):
     box = pushed.objects[0]
     T = box.T_world_objs.copy()
     T[:, 0, 3] = -5.0
-    track = replace(pushed.track, quality=np.zeros(NUM_FRAMES))
-    away = replace(pushed, objects=(replace(box, T_world_objs=T, masks={}),) * 2, track=track)
+    away = replace(pushed, objects=(replace(box, T_world_objs=T, masks={}),) * 2)
 
     assert not drawn_over(away, 0).any()
 

@@ -87,7 +87,7 @@ def draw(
     ]
     # The manipulated object last: it passes in front of the others more often than behind them.
     for thing, colour in things[::-1]:
-        mask = _mask_at(reconstruction, thing, frame)
+        mask = _mask_at(thing, frame)
         if mask is not None and mask.any():
             _draw_mask(image, mask, colour)
     shown = [
@@ -269,14 +269,12 @@ def _row(band: UInt8[np.ndarray, "h w 3"], left: str, right: str, colour: Colour
         _text(band, right, (width - 8 - needed, base), (170, 176, 182))
 
 
-def _mask_at(scene: Reconstruction, thing: Estimate, frame: int) -> Bool[np.ndarray, "h w"] | None:
-    """Return the object's outline at a frame, None where it was not followed."""
-    if frame in thing.masks:
-        return thing.masks[frame]
-    if len(thing.masks) > 2:
-        nearest = min(thing.masks, key=lambda other: abs(other - frame))
-        return thing.masks[nearest] if abs(nearest - frame) <= _MASK_GAP else None
-    return thing.masks[min(thing.masks)] if thing.masks and thing is not scene.objects[0] else None
+def _mask_at(thing: Estimate, frame: int) -> Bool[np.ndarray, "h w"] | None:
+    """Return the object's outline at a frame or one close by, None where it was not followed."""
+    nearest = min(thing.masks, key=lambda other: abs(other - frame), default=None)
+    if nearest is None or abs(nearest - frame) > _MASK_GAP:
+        return None
+    return thing.masks[nearest]
 
 
 def _pose_at(thing: Estimate, frame: int) -> Float[np.ndarray, "4 4"]:
