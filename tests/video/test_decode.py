@@ -1,6 +1,7 @@
 """Every container that we promise to read, and what becomes of files that are no good."""
 
 import struct
+from fractions import Fraction
 
 import av
 import numpy as np
@@ -154,6 +155,117 @@ def test_what_is_transparent_is_white(film):
     assert frame[50, 120].tolist() == [255, 255, 255]
 
 
+@pytest.mark.parametrize(
+    ("pix_fmt", "codec"),
+    [
+        ("gray16le", "ffv1"),
+        ("gbrp10le", "ffv1"),
+        ("yuva444p", "ffv1"),
+        ("yuva444p10le", "prores_ks"),
+    ],
+)
+def test_deep_colours_and_opaque_alpha_give_the_plain_picture(film, pix_fmt, codec):
+    path = film("deep.mkv", squares(10), codec=codec, pix_fmt=pix_fmt)
+
+    frame = read_clip(item(path)).frames[9].astype(int)
+
+    # of (200, 30, 30) a grey picture has the luma, 81
+    inside = [81] * 3 if pix_fmt == "gray16le" else [200, 30, 30]
+    assert np.abs(frame[5, 5] - 120).max() <= 2
+    assert np.abs(frame[48, 50] - inside).max() <= 6
+
+
+def gif(disposal, background):
+    """Return a GIF with a grey picture, then nine red squares, each 8 px further right; colour 2 is blue.
+
+    The pixels stand in it uncompressed: codes of 8 bits, with a code that clears the table (0x80) every 100.
+    """
+    pictures = [(0, 0, np.zeros((96, 128), np.uint8))]
+    pictures += [(8 * i, 32, np.ones((32, 32), np.uint8)) for i in range(1, 10)]
+    table = bytes([120, 120, 120, 200, 30, 30, 30, 30, 200]).ljust(384, b"\0")
+    out = b"GIF89a" + struct.pack("<HHBBB", 128, 96, 0xF6, background, 0) + table
+    for number, (x, y, colours) in enumerate(pictures):
+        way = disposal if number else 1
+        out += b"\x21\xf9\x04" + struct.pack("<BHB", way << 2, 4, 0) + b"\0"
+        out += b"\x2c" + struct.pack("<HHHHB", x, y, *colours.shape[::-1], 0) + b"\x07"
+        flat = colours.tobytes()
+        codes = b"".join(b"\x80" + flat[k : k + 100] for k in range(0, len(flat), 100)) + b"\x81"
+        parts = [codes[k : k + 255] for k in range(0, len(codes), 255)]
+        out += b"".join(bytes([len(part)]) + part for part in parts) + b"\0"
+    return out + b";"
+
+
+@pytest.mark.parametrize(
+    ("disposal", "left_behind"),
+    # GIF89a, section 23: not said, keep, back to the background's colour, back to what was there before
+    [(0, (200, 30, 30)), (1, (200, 30, 30)), (2, (30, 30, 200)), (3, (120, 120, 120))],
+)
+def test_a_gif_leaves_behind_what_its_disposal_mode_says(tmp_path, disposal, left_behind):
+    path = tmp_path / "squares.gif"
+    path.write_bytes(gif(disposal, background=2))
+
+    clip = read_clip(item(path))
+
+    assert clip.frames.shape == (10, 96, 128, 3)
+    assert clip.fps == pytest.approx(25)  # 4 hundredths of a second each
+    last = clip.frames[9, 48]
+    assert last[20].tolist() == list(left_behind)
+    assert last[80].tolist() == [200, 30, 30]  # from 72 to 103
+    assert last[110].tolist() == [120, 120, 120]
+
+
+def test_pictures_of_eight_thousand_pixels_are_read(tmp_path):
+    path = tmp_path / "huge.mp4"
+    picture = av.VideoFrame(7680, 4320, "yuvj420p")
+    for plane, value in zip(picture.planes, (90, 128, 128), strict=True):
+        plane.update(bytes([value]) * plane.buffer_size)
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mjpeg", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 7680, 4320, "yuvj420p"
+        (packet,) = stream.encode(picture)
+        data = bytes(packet)
+        for i in range(2):
+            again = av.Packet(data)
+            again.stream, again.is_keyframe = stream, True
+            again.pts = again.dts = i
+            again.time_base = Fraction(1, 30)
+            out.mux(again)
+
+    clip = read_clip(item(path), VideoConfig(min_frames=2))
+
+    assert clip.frames.shape == (2, 360, 640, 3)
+    assert clip.source_size_px == (7680, 4320)
+    assert np.abs(clip.frames.astype(int) - 90).max() <= 3
+
+
+def test_a_long_clip_holds_its_frames_and_nothing_more(film):
+    frames = [np.full((96, 128, 3), i, np.uint8) for i in range(50)]
+    path = film("long.mkv", frames, codec="ffv1", pix_fmt="yuv444p")
+
+    clip = read_clip(item(path), VideoConfig(max_frames=20))
+
+    assert clip.frames.base is None
+    assert clip.frames.nbytes == 20 * 96 * 128 * 3
+    shown = clip.frames[:, 48, 64, 0].astype(int)
+    assert np.abs(shown - clip.source_frame).max() <= 2
+
+
+def test_a_picture_that_changes_its_size_keeps_that_of_its_beginning(film, tmp_path):
+    path = tmp_path / "joined.mp4"
+    parts = [
+        film(f"{i}.ts", flat(value, 10, height, width))
+        for i, (value, height, width) in enumerate(
+            [(60, 96, 128), (120, 192, 256), (180, 120, 64)]
+        )
+    ]
+    path.write_bytes(b"".join(part.read_bytes() for part in parts))
+
+    clip = read_clip(item(path))
+
+    assert clip.frames.shape[1:3] == (96, 128)
+    assert [clip.frames[i].mean().round(-1) for i in (0, -1)] == [60, 180]
+
+
 def test_hints_follow_scaling_and_sampling(film):
     path = film("large.mkv", squares(40, height=400, width=800), codec="ffv1", pix_fmt="yuv444p")
     hints = {
@@ -244,6 +356,23 @@ def test_too_few_too_small_too_long_and_too_large_are_told_apart(film):
     assert reason_for(film("long.mp4"), max_duration_s=0.5) == "too_long"
     assert reason_for(film("large.mp4"), max_side_file_px=100) == "too_large"
     assert len(read_clip(item(film("enough.mp4", squares(8)))).frames) == 8
+
+
+def test_one_picture_and_one_pixel_have_their_own_reasons(film):
+    with pytest.raises(ItemRejectedError) as single:
+        read_clip(item(film("single.mkv", squares(1), codec="ffv1", pix_fmt="bgra")))
+    with pytest.raises(ItemRejectedError) as dot:
+        read_clip(item(film("dot.mkv", flat(9, 10, 1, 1), codec="ffv1", pix_fmt="bgra")))
+
+    assert (single.value.reason, single.value.value) == ("too_few_frames", 1)
+    assert (dot.value.reason, dot.value.value) == ("too_small", 1)
+
+
+def test_too_many_pixels_are_refused_before_a_picture_is_decoded(film):
+    path = film("wide.mp4", squares(10))
+    # 128 x 96 is 0.0123 megapixels
+    assert reason_for(path, max_file_mpx=0.0122) == "too_large"
+    assert len(read_clip(item(path), VideoConfig(max_file_mpx=0.0123)).frames) == 10
 
 
 def test_decoding_gives_up_in_time(film):
