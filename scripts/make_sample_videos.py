@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from v2p_data.video.synthetic import COLOURS, VideoSpec, View, render, write
+from v2p_data.video.synthetic_sample import COLOURS, VideoSpec, View, render, write
 from v2p_data.video.synthetic_scene import Hand, Room, Thing
 
 SAMPLES = (

@@ -1,212 +1,189 @@
-"""Drawn clips: the truth beside them is the truth in them."""
+"""Drawn clips of every kind: the truth beside them is the truth in them."""
 
 import itertools
-import json
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from v2p_data.errors import V2PError
-from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import apply, transform_from_pose
 from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos, parse_caption
 from v2p_data.video.decode import read_clip
-from v2p_data.video.synthetic import VideoSpec, View, animate, random_spec, render, write
-from v2p_data.video.synthetic_scene import LABEL_OBJECT, Hand, Placed, Thing
-
-SAMPLES = Path(__file__).parents[2] / "datasets" / "sample_videos"
-BOX = Thing(
-    label="red box",
-    shape="box",
-    size_m=(0.05, 0.06, 0.09),
-    base=(0.8, 0.0, 0.0),
-    accent=(0.9, 0.9, 0.9),
+from v2p_data.video.synthetic import (
+    LABEL_HAND,
+    LABEL_TABLE,
+    LABEL_THING,
+    MOTION_KINDS,
+    motion_of,
+    random_spec,
+    render,
+    render_views,
 )
-SMALL = VideoSpec(
-    name="small",
-    kind="push_left",
-    thing=BOX,
-    seconds=2.0,
-    fps=8,
-    view=View(width_px=320, height_px=240, side_m=0.05),
-)
-KINDS = ("lift_up", "push_left", "push_right", "tip_over")
+from v2p_data.video.synthetic_props import NOUNS, prop_called, shape_of
+from v2p_data.video.synthetic_truth import load_truth, write
 
 
-def corners(size_m, pose):
-    signs = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-    return apply(transform_from_pose(np.asarray(pose, float)), signs * np.asarray(size_m))
+def corners(size_m):
+    return np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * np.asarray(size_m)
 
 
-def rims(size_m, pose):
-    angles = np.linspace(0, 2 * np.pi, 60)
-    ring = np.stack([np.cos(angles), np.sin(angles), np.ones(60)], 1)
-    points = np.concatenate([ring, ring * (1, 1, -1)]) * np.asarray(size_m) / 2
-    return apply(transform_from_pose(np.asarray(pose, float)), points)
-
-
-def bounds_of(mask):
-    rows, columns = np.nonzero(mask)
-    return np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
-
-
-def bounds_of_corners(camera, points):
-    uv = camera.project(points)
-    return np.concatenate([uv.min(0), uv.max(0)])
-
-
-def drawn(spec):
+def drawn(spec, **chosen):
     try:
-        return render(spec)
+        return render(spec, **chosen)
     except V2PError as error:
         pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module")
+def specs():
+    return {kind: random_spec(kind, kind, rng_for(5, kind)) for kind in MOTION_KINDS}
+
+
+@pytest.fixture(scope="module")
 def pushed():
-    other = Placed(thing=replace(BOX, label="box"), xy_m=(0.15, -0.12), yaw_rad=0.4)
-    return drawn(replace(SMALL, others=(other,)))
+    spec = random_spec("pushed", "push_left", rng_for(11, "pushed"), others=0)
+    view = replace(spec.view, width_px=320, height_px=240)
+    return drawn(replace(spec, view=view, fps=8, sensor=replace(spec.sensor, crf=18, noise=0.5)))
 
 
-def test_masks_lie_where_the_true_box_projects(pushed):
-    for mask, pose in (
-        (pushed.mask_first, pushed.poses_world[0]),
-        (pushed.mask_last, pushed.poses_world[-1]),
-    ):
-        expected = bounds_of_corners(pushed.camera, corners(BOX.size_m, pose))
-        assert np.abs(bounds_of(mask == LABEL_OBJECT) - expected).max() < 1.5
+def test_every_shape_is_closed_and_as_large_as_its_product():
+    for noun in NOUNS:
+        prop = prop_called(noun, rng_for(0, *noun.words))
+        shape = shape_of(prop)
+        mesh = trimesh.Trimesh(shape.vertices, shape.faces)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
 
-    pose = [0.15, -0.12, 0.045, np.cos(0.2), 0, 0, np.sin(0.2)]
-    expected = bounds_of_corners(pushed.camera, corners(BOX.size_m, pose))
-    assert np.abs(bounds_of(pushed.mask_first == LABEL_OBJECT + 1) - expected).max() < 1.5
-
-
-def test_the_hand_comes_and_goes(pushed):
-    assert not pushed.hand_in_view[0]
-    assert not pushed.hand_in_view[-1]
-    assert pushed.hand_in_view.any()
-    assert set(np.unique(pushed.mask_first)) == {0, LABEL_OBJECT, LABEL_OBJECT + 1}
+        assert mesh.is_watertight, noun
+        assert mesh.volume > 0, noun
+        # handles and spouts stick out; nothing is smaller than the product by more than its spread
+        ratio = shape.extents[[0, 2]] * 100 / np.array(noun.size_cm)[[0, 2]]
+        assert ratio.min() > 1 - 3 * noun.spread - 0.03, noun
 
 
-def test_the_picture_shows_the_object_in_its_colour(pushed):
-    inside = pushed.frames[0][pushed.mask_first == LABEL_OBJECT].astype(float)
-    outside = pushed.frames[0][pushed.mask_first == 0].astype(float)
+def test_hollow_things_have_room_inside():
+    for noun in NOUNS:
+        prop = prop_called(noun, rng_for(0, *noun.words))
+        if prop.hollow:
+            shape = shape_of(prop)
+            mesh = trimesh.Trimesh(shape.vertices, shape.faces)
+            mesh.merge_vertices(merge_tex=True, merge_norm=True)
+            x, y, z = prop.size_m
 
-    assert (inside[:, 0] - inside[:, 1]).mean() > (outside[:, 0] - outside[:, 1]).mean() + 20
-
-
-def test_the_same_spec_gives_the_same_pictures():
-    spec = replace(SMALL, fps=2)
-
-    assert np.array_equal(drawn(spec).frames, drawn(spec).frames)
-
-
-def test_a_lifted_object_ends_higher_and_stays_in_the_hand():
-    T = animate(replace(SMALL, kind="lift_up", distance_m=0.15)).T_world_obj
-
-    # 9 cm tall: the centre starts at 4.5 cm
-    assert T[0, :3, 3] == pytest.approx([0, 0, 0.045])
-    assert T[-1, 2, 3] == pytest.approx(0.195)
+            assert mesh.volume < 0.45 * x * y * z, noun
 
 
-@pytest.mark.parametrize(
-    ("kind", "side", "y"), [("push_left", "right", 0.12), ("push_right", "left", -0.12)]
-)
-def test_pushing_moves_along_the_table_to_its_side(kind, side, y):
-    T = animate(replace(SMALL, kind=kind, distance_m=0.12, hand=Hand(side=side))).T_world_obj
+@pytest.mark.parametrize("kind", MOTION_KINDS)
+def test_the_caption_says_the_kind_and_names_the_things(kind, specs):
+    spec = specs[kind]
+    meaning = parse_caption(spec.caption)
 
-    assert T[-1, :3, 3] == pytest.approx([0, y, 0.045])
-    assert T[-1, :3, :3] == pytest.approx(T[0, :3, :3])
-
-
-@pytest.mark.parametrize(("side", "sign"), [("right", 1), ("left", -1)])
-def test_a_tipped_object_lies_on_its_side_away_from_the_hand(side, sign):
-    spec = replace(SMALL, kind="tip_over", yaw_rad=0.0, hand=Hand(side=side))
-
-    T = animate(spec).T_world_obj[-1]
-
-    # it turned about its lower edge at y = 3 cm: it now reaches from there to 12 cm, 6 cm high
-    assert T[:3, 3] == pytest.approx([0, sign * 0.075, 0.03])
-    assert T[:3, 2] == pytest.approx([0, sign, 0])
+    assert meaning.kind == kind
+    assert meaning.phrases == spec.objects
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_random_clips_keep_the_laws_of_a_table(kind):
-    for i in range(12):
-        spec = random_spec(f"clip{i}", kind, rng_for(0, kind, i), others=3)
-        motion = animate(spec)
-        camera = spec.view.camera()
+@pytest.mark.parametrize("kind", MOTION_KINDS)
+def test_nothing_sinks_into_the_table_or_jumps(kind, specs):
+    spec = specs[kind]
+    motion = motion_of(spec)
 
-        lowest = min(
-            (corners(spec.thing.size_m, [0, 0, 0, 1, 0, 0, 0]) @ T[:3, :3].T + T[:3, 3])[
-                :, 2
-            ].min()
-            for T in motion.T_world_obj
-        )
-        assert lowest > -1e-6
-        steps = np.linalg.norm(np.diff(motion.T_world_obj[:, :3, 3], axis=0), axis=1)
-        assert steps.max() < 0.03
-        first = bounds_of_corners(
-            camera, corners(spec.thing.size_m, [0, 0, spec.thing.size_m[2] / 2, 1, 0, 0, 0])
-        )
-        assert first[:2].min() > 0
-        assert first[2] < camera.width_px
-        assert first[3] < camera.height_px
-        assert parse_caption(spec.caption).kind == kind
-        labels = [spec.thing.label, *(placed.thing.label for placed in spec.others)]
-        assert len(labels) == len({label.split()[0] for label in labels}) == 4
+    for actor, track in zip(spec.story.actors, motion.T_world_things, strict=True):
+        box = shape_of(actor.prop).vertices
+        assert min(float((box @ T[2, :3]).min() + T[2, 3]) for T in track) > -0.003
+        if actor.role != "tool":
+            steps = np.linalg.norm(np.diff(track[:, :3, 3], axis=0), axis=1) * spec.fps
+            assert steps.max() < 4.0  # metres a second
+    assert motion.T_world_things[0, 0, :2, 3] == pytest.approx([0, 0], abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", MOTION_KINDS)
+def test_what_the_caption_names_is_in_the_picture_at_first_and_at_last(kind, specs):
+    spec = specs[kind]
+    camera, motion = spec.view.camera(), motion_of(spec)
+
+    for actor, track in zip(spec.story.actors, motion.T_world_things, strict=True):
+        if actor.role in ("bystander", "tool"):
+            continue
+        for T in (track[0], track[-1]):
+            uv = camera.project(apply(T, corners(actor.extents_m)))
+            assert uv.min() > 0
+            assert (uv < (camera.width_px, camera.height_px)).all()
+
+
+def test_each_kind_ends_as_it_says(specs):
+    ends = {kind: motion_of(spec).T_world_things[:, -1] for kind, spec in specs.items()}
+
+    assert ends["push_left"][0, 1, 3] > 0.05
+    assert ends["push_right"][0, 1, 3] < -0.05
+    lifted = motion_of(specs["lift_up"]).T_world_things[0]
+    assert lifted[-1, 2, 3] - lifted[0, 2, 3] > 0.05
+    assert abs(ends["tip_over"][0, 2, 2]) < 1e-6  # its upright lies level
+    assert np.linalg.norm(ends["uncover"][0, :2, 3] - ends["uncover"][1, :2, 3]) > 0.05
+    assert ends["drop_in_front_of"][0, 0, 3] < ends["drop_in_front_of"][1, 0, 3]
+    for kind in ("insert", "throw_into", "place_onto", "cover"):
+        assert np.linalg.norm(ends[kind][0, :2, 3] - ends[kind][1, :2, 3]) < 0.05
 
 
 def test_a_random_clip_is_the_same_for_the_same_stream():
-    assert random_spec("a", "lift_up", rng_for(3)) == random_spec("a", "lift_up", rng_for(3))
-    assert random_spec("a", "lift_up", rng_for(3)) != random_spec("a", "lift_up", rng_for(4))
+    assert random_spec("a", "insert", rng_for(3)) == random_spec("a", "insert", rng_for(3))
+    assert random_spec("a", "insert", rng_for(3)) != random_spec("a", "insert", rng_for(4))
+
+
+def test_masks_lie_where_the_true_shape_projects(pushed):
+    camera = pushed.camera
+    actor = pushed.spec.story.actors[0]
+    for k in (0, -1):
+        pose = pushed.poses_world[0, pushed.mask_idx[k]]
+        uv = camera.project(apply(transform_from_pose(pose), shape_of(actor.prop).vertices))
+        rows, columns = np.nonzero(pushed.masks[k] == LABEL_THING)
+        low, high = uv.min(0), uv.max(0)
+        if (pushed.masks[k] == LABEL_HAND).any():
+            continue
+        assert np.abs([columns.min() - low[0], rows.min() - low[1]]).max() < 1.6
+        assert np.abs([columns.max() + 1 - high[0], rows.max() + 1 - high[1]]).max() < 1.6
+
+
+def test_a_still_view_has_no_hand(pushed):
+    middle = round(0.5 * len(pushed.frames))
+    with_hand, labels = render_views(pushed.spec, [middle], with_hand=True)
+    still, still_labels = render_views(pushed.spec, [middle], with_hand=False)
+
+    assert (labels == LABEL_HAND).any()
+    assert not (still_labels == LABEL_HAND).any()
+    assert (still_labels == LABEL_TABLE).any()
+    same = labels == still_labels
+    assert (
+        np.abs(with_hand[labels == LABEL_HAND].astype(int) - still[labels == LABEL_HAND]).mean()
+        > 5
+    )
+    assert same.mean() > 0.5
+
+
+def test_a_frame_drawn_alone_is_the_same_as_in_the_clip(pushed):
+    alone = drawn(pushed.spec, frames=[3])
+
+    assert np.array_equal(alone.frames[0], pushed.frames[3])
 
 
 def test_a_written_clip_is_read_back_with_its_truth(pushed, tmp_path):
     path = write(pushed, tmp_path)
 
     (item,) = find_videos(tmp_path)
-    clip = read_clip(item)
-    truth = json.loads((tmp_path / "truth" / "small.json").read_text())
-    assert item.path == path
-    assert len(clip.frames) == truth["num_frames"] == 16
+    clip, truth = read_clip(item), load_truth(tmp_path, "pushed")
+    assert item.path == path == truth.video
+    assert len(clip.frames) == truth.num_frames == len(truth.hand_in_view)
     assert clip.fps == pytest.approx(8)
     assert np.abs(clip.frames[0].astype(int) - pushed.frames[0]).mean() < 6
-    assert len(truth["object"]["poses_world"]) == 16
-    saved = cv2.imread(str(tmp_path / "truth" / "small_first.png"), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(saved, pushed.mask_first)
+    assert truth.things[0].role == "manipulated"
+    assert truth.things[0].poses_world.shape == (truth.num_frames, 7)
+    assert truth.mask_idx[[0, -1]].tolist() == [0, truth.num_frames - 1]
+    assert np.array_equal(truth.masks, pushed.masks)
+    mesh = trimesh.load_mesh(truth.things[0].mesh, process=False)
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(truth.things[0].size_m, abs=1e-5)
 
 
-@pytest.mark.parametrize("path", sorted(SAMPLES.rglob("*.mp4")), ids=lambda p: p.stem)
-def test_the_committed_samples_hold_together(path):
-    (item,) = find_videos(path)
-    clip = read_clip(item)
-    truth = json.loads((path.parent / "truth" / f"{path.stem}.json").read_text())
-    camera = Camera(
-        width_px=640,
-        height_px=480,
-        K=np.array(truth["camera"]["K"]),
-        T_world_cam=np.array(truth["camera"]["T_world_cam"]),
-    )
-    thing = truth["object"]
-    mask = cv2.imread(str(path.parent / "truth" / f"{path.stem}_first.png"), cv2.IMREAD_UNCHANGED)
-
-    assert path.stat().st_size < 1_000_000
-    assert len(clip.frames) == truth["num_frames"] == 108
-    assert clip.frames.shape[1:] == (480, 640, 3)
-    assert clip.warnings == ()
-    assert parse_caption(item.caption, item.objects).kind == truth["kind"]
-    assert item.objects == (thing["label"],)
-    outline = {"box": corners, "cylinder": rims}[thing["shape"]]
-    points = outline(thing["size_m"], thing["poses_world"][0])
-    assert np.abs(bounds_of(mask == 2) - bounds_of_corners(camera, points)).max() < 1.5
-    assert not truth["hand_in_view"][0]
-    assert truth["hand_in_view"][-1] == (truth["kind"] == "lift_up")
-
-
-def test_there_are_samples():
-    assert len(list(SAMPLES.glob("*.mp4"))) == 3
+def test_truth_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(V2PError, match="no truth for clip 'nothing'"):
+        load_truth(tmp_path, "nothing")

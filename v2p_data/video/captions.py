@@ -202,6 +202,7 @@ def write_captions(merged: Merged) -> Path | None:
             shutil.copyfile(path, backup)
         with temporary.open("w", encoding="utf-8") as stream:
             json.dump(merged.captions, stream, indent=1, ensure_ascii=False)
+            stream.write("\n")
             stream.flush()
             os.fsync(stream.fileno())
         temporary.replace(path)

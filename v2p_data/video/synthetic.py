@@ -1,78 +1,52 @@
-"""Clips with ground truth: a hand does something to an object on a table, drawn with MuJoCo.
+"""Clips with ground truth over all kinds of task: a hand acts on household things on a table, drawn with MuJoCo.
 
 A `VideoSpec` says everything about a clip; the same spec gives the same pictures on the same machine. The world
-frame is that of a scene from video (origin under the object's first position, +x away, +y left, +z up), so truth
-and reconstruction compare number by number. `random_spec` varies camera, light, colours, sizes and motion.
+frame is that of a scene from video (origin under the moving thing's first position, +x away along the camera's
+heading, +y left, +z up), so truth and reconstruction compare number by number.
 """
 
 # mujoco's classes come from a compiled module that declares none of them.
 # pyright: reportAttributeAccessIssue=false
 
-import json
-from dataclasses import asdict, dataclass, field
-from fractions import Fraction
-from pathlib import Path
-from typing import Any, Literal
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 
-import av
-import cv2
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from v2p_data.geometry.camera import CV_FROM_GL, Camera, intrinsics
-from v2p_data.geometry.pose import (
-    apply,
-    pose_from_transform,
-    quat_from_matrix,
-    transform,
-)
+from v2p_data.geometry.camera import CV_FROM_GL, Camera
+from v2p_data.geometry.pose import apply, inverse, pose_from_transform, quat_from_matrix
 from v2p_data.seeds import rng_for
-from v2p_data.video.synthetic_scene import (
+from v2p_data.video.synthetic_camera import Drawer, Sensor, View, developed, random_sensor
+from v2p_data.video.synthetic_hand import WRIST, Hand
+from v2p_data.video.synthetic_motion import Motion, Timing, animate
+from v2p_data.video.synthetic_room import (
     LABEL_HAND,
-    LABEL_OBJECT,
-    PALM_HALF_M,
-    Drawer,
-    Hand,
-    Placed,
-    Rgb,
     Room,
-    Side,
-    Thing,
     build,
-    knuckles_past_centre_m,
+    random_room,
 )
+from v2p_data.video.synthetic_room import (
+    LABEL_TABLE as LABEL_TABLE,
+)
+from v2p_data.video.synthetic_room import (
+    LABEL_THING as LABEL_THING,
+)
+from v2p_data.video.synthetic_story import (
+    MOTION_KINDS as MOTION_KINDS,
+)
+from v2p_data.video.synthetic_story import (
+    MotionKind,
+    Story,
+    random_story,
+)
+from v2p_data.video.synthetic_textures import Rgb, any_colour
 
-MotionKind = Literal["lift_up", "push_left", "push_right", "tip_over"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """The camera: level, heading along +x, as a person sitting at the table sees."""
-
-    height_m: float = 0.45
-    pitch_rad: float = 0.61
-    """Below the horizon."""
-    back_m: float = 0.58
-    """From the object's first position to the point under the camera."""
-    side_m: float = 0.0
-    """How far the camera stands to the left of the object's first position."""
-    fovy_rad: float = 0.70
-    width_px: int = 640
-    height_px: int = 480
-
-    def camera(self) -> Camera:
-        """Return the camera that this describes."""
-        c, s = np.cos(self.pitch_rad), np.sin(self.pitch_rad)
-        right, down, forward = [0, -1.0, 0], [-s, 0, -c], [c, 0, -s]
-        T_world_cam = transform(
-            np.array([right, down, forward]).T,
-            np.array([-self.back_m, self.side_m, self.height_m]),
-        )
-        K = intrinsics(self.width_px, self.height_px, self.fovy_rad)
-        return Camera(
-            width_px=self.width_px, height_px=self.height_px, K=K, T_world_cam=T_world_cam
-        )
+NUM_MASKS = 16
+"""Evenly spaced frames whose masks are kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,51 +55,32 @@ class VideoSpec:
 
     name: str
     """File name without its ending."""
-    kind: MotionKind
-    thing: Thing
-    distance_m: float = 0.15
-    """How far it is lifted or pushed; no meaning for tipping."""
-    yaw_rad: float = 0.15
-    """How the object stands at first, from +x towards +y."""
-    others: tuple[Placed, ...] = ()
-    """Objects that stay where they are."""
+    story: Story
+    hand: Hand = field(default_factory=Hand)
+    timing: Timing = field(default_factory=Timing)
     view: View = field(default_factory=View)
     room: Room = field(default_factory=Room)
-    hand: Hand = field(default_factory=Hand)
+    sensor: Sensor = field(default_factory=Sensor)
     seconds: float = 3.6
     fps: int = 30
-    noise: float = 1.5
-    """Standard deviation of the sensor's noise, of 255."""
+    hide_m: float = 0.8
+    """How far the hand draws back along its arm to leave the picture."""
     seed: int = 0
-    """For textures, noise and the hand's trembling."""
+    """For textures, noise and the trunk's swaying."""
 
-    def __post_init__(self) -> None:
-        if not 2.0 <= self.seconds <= 20:
-            raise ValueError(f"seconds must lie in 2..20, got {self.seconds}")
-        if self.kind == "push_right" and self.hand.side != "left":
-            raise ValueError("push_right needs a hand on the left side of the object")
-        if self.kind == "push_left" and self.hand.side != "right":
-            raise ValueError("push_left needs a hand on the right side of the object")
+    @property
+    def kind(self) -> MotionKind:
+        return self.story.kind
 
     @property
     def caption(self) -> str:
-        words = {
-            "lift_up": "Lifting {} up",
-            "push_left": "Pushing {} from right to left",
-            "push_right": "Pushing {} from left to right",
-            "tip_over": "Tipping {} over",
-        }
-        return words[self.kind].format(self.thing.label)
+        return self.story.caption
 
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """Where everything is in every frame."""
-
-    T_world_obj: Float[np.ndarray, "time 4 4"]
-    T_world_hand: Float[np.ndarray, "time 4 4"]
-    grip: Float[np.ndarray, "time"]
-    """0 flat hand, 1 fingers and thumb closed on the object."""
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Phrases of the caption's things: the one that moves, then the others."""
+        first, *others = self.story.actors
+        return (first.phrase or "cover", *(a.phrase for a in others if a.phrase))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,143 +88,69 @@ class SyntheticVideo:
     """A drawn clip with its truth."""
 
     spec: VideoSpec
+    frame_idx: tuple[int, ...]
+    """Which of the clip's frames these are."""
     frames: UInt8[np.ndarray, "time h w 3"] = field(repr=False)
     camera: Camera
-    poses_world: Float[np.ndarray, "time 7"] = field(repr=False)
-    """`[x, y, z, qw, qx, qy, qz]` of the manipulated object's centre."""
-    mask_first: UInt8[np.ndarray, "h w"] = field(repr=False)
-    """Labels: 0 background, 1 hand, 2 manipulated object, then the others in their order."""
-    mask_last: UInt8[np.ndarray, "h w"] = field(repr=False)
-    hand_in_view: Bool[np.ndarray, "time"] = field(repr=False)
+    poses_world: Float[np.ndarray, "thing all_time 7"] = field(repr=False)
+    """`[x, y, z, qw, qx, qy, qz]` of the bounding boxes' middles in every frame of the clip."""
+    mask_idx: tuple[int, ...]
+    """The clip's frames that have masks."""
+    masks: UInt8[np.ndarray, "some_time h w"] = field(repr=False)
+    """Labels: 0 background, 1 hand and arm, 2 and on the things in their order, 255 the bare table."""
+    hand_in_view: Bool[np.ndarray, "all_time"] = field(repr=False)
 
 
-def animate(spec: VideoSpec) -> Motion:
-    """Return the motion: the hand comes, acts, and (but for lifting) leaves again."""
-    n = round(spec.seconds * spec.fps)
-    t = np.arange(n) / (n - 1)
-    thing, s = spec.thing, spec.hand.sign
-    half = np.array(thing.size_m) / 2
-    c, si = np.cos(spec.yaw_rad), np.sin(spec.yaw_rad)
-    R0 = np.array([[c, -si, 0], [si, c, 0], [0, 0, 1.0]])
-    left = np.array([0, 1.0, 0])
-    away = spec.hand.arm_direction
-    lifts = spec.kind == "lift_up"
-
-    comes, closes = _ease(t, 0.08, 0.30), _ease(t, 0.29, 0.37)
-    goes = np.zeros(n) if lifts else _ease(t, 0.70, 0.90)
-    acts = _ease(t, 0.40, 0.72) if lifts else _ease(t, 0.36, 0.64)
-
-    T_obj = np.tile(np.eye(4), (n, 1, 1))
-    T_obj[:, :3, :3] = R0
-    T_obj[:, 2, 3] = half[2]
-    # where the palm touches, in the object's frame: the face that looks to the hand
-    low = PALM_HALF_M[2] + 0.008 - half[2]
-    touch = np.array([knuckles_past_centre_m(thing), -s * (half[1] + 0.001), max(0.0, low)])
-    if lifts:
-        T_obj[:, 2, 3] += spec.distance_m * acts
-        T_obj[:, 0, 3] -= 0.03 * acts
-        tilt = 0.10 * acts * np.sin(2.2 * t)
-        T_obj[:, :3, :3] = np.stack([_about_x(s * a) @ R0 for a in tilt])
-        hand_at = T_obj[:, :3, 3] + np.einsum("tij,j->ti", T_obj[:, :3, :3], touch)
-        R_hand = T_obj[:, :3, :3].copy()
-    elif spec.kind == "tip_over":
-        touch[0], touch[2] = -0.02, 0.62 * half[2]
-        angle = _fall(t, 0.36, 0.62)
-        edge = R0 @ np.array([0, s * half[1], 0]) + np.array([0, 0, half[2]])
-        axis_turn = np.stack([R0 @ _about_x(-s * a) @ R0.T for a in angle])
-        corner = edge - np.array([0, 0, half[2]])
-        centre = np.array([0, 0, half[2]]) - corner
-        T_obj[:, :3, 3] = corner + np.einsum("tij,j->ti", axis_turn, centre)
-        T_obj[:, :3, :3] = axis_turn @ R0
-        followed = np.minimum(angle, 0.60)
-        turn = np.stack([R0 @ _about_x(-s * a) for a in followed])
-        hand_at = corner + np.einsum("tij,j->ti", turn, R0.T @ centre + touch)
-        R_hand = np.stack([R0 @ _about_x(-0.4 * s * a) for a in followed])
-    else:
-        T_obj[:, :3, 3] += spec.distance_m * s * acts[:, None] * left
-        touch[0] = -0.02
-        hand_at = T_obj[:, :3, 3] + R0 @ touch
-        R_hand = np.tile(R0, (n, 1, 1))
-
-    # the hand comes along the arm, a little aside so that it does not brush the object
-    aside = (1 - _ease(t, 0.22, 0.33)) + goes
-    hand_at = (
-        hand_at - 0.055 * s * aside[:, None] * (R0 @ left) + 0.01 * aside[:, None] * [0, 0, 1]
-    )
-    hidden = _hidden_m(spec, hand_at[0])
-    hand_at = hand_at + hidden * ((1 - comes) + goes)[:, None] * away
-    tremble = rng_for(spec.seed, "tremble").normal(0, 1, (8, 3))
-    waves = np.sin(2 * np.pi * (np.arange(8)[:, None] * 0.6 + 1) * t + tremble[:, :1])
-    shake = 0.0005 * waves.T @ tremble
-    free = (1 - closes if lifts else np.ones(n))[:, None]
-    hand_at = hand_at + shake * free
-    T_hand = np.stack([transform(R, p) for R, p in zip(R_hand, hand_at, strict=True)])
-    return Motion(T_world_obj=T_obj, T_world_hand=T_hand, grip=closes if lifts else np.zeros(n))
+def motion_of(spec: VideoSpec) -> Motion:
+    """Return where everything is in every frame."""
+    return animate(spec.story, spec.hand, spec.timing, spec.seconds, spec.fps, spec.hide_m)
 
 
-def render(spec: VideoSpec) -> SyntheticVideo:
-    """Draw the clip.
+def render(spec: VideoSpec, *, frames: Sequence[int] | None = None) -> SyntheticVideo:
+    """Draw the clip, or only some of its frames.
 
     Raises:
         V2PError: there is no OpenGL.
     """
-    view, camera, motion = spec.view, spec.view.camera(), animate(spec)
-    model = build(
-        spec.thing,
-        spec.others,
-        spec.room,
-        spec.hand,
-        view.fovy_rad,
-        (view.width_px, view.height_px),
-        rng_for(spec.seed, "textures"),
-    )
-    data = mujoco.MjData(model)
-    noise = rng_for(spec.seed, "noise")
-    frames, masks, seen = [], [], []
-    with Drawer(model) as drawer:
-        for i in range(len(motion.grip)):
-            _pose(model, data, motion, i, camera)
-            image = drawer.picture(data).astype(np.float32)
-            if spec.noise:
-                image += noise.normal(0, spec.noise, image.shape).astype(np.float32)
-            frames.append(image.round().clip(0, 255).astype(np.uint8))
-            mask = drawer.mask(data)
-            seen.append(bool((mask == LABEL_HAND).any()))
-            masks = [*masks[:1], mask]
+    motion, camera = motion_of(spec), spec.view.camera()
+    n = len(motion.gesture)
+    chosen = tuple(range(n)) if frames is None else tuple(frames)
+    masked = tuple(sorted({chosen[round(k)] for k in np.linspace(0, len(chosen) - 1, NUM_MASKS)}))
+    pictures, masks = [], []
+    with _stage(spec, motion) as stage:
+        for i in chosen:
+            pictures.append(stage.shot(i))
+            if i in masked:
+                masks.append(stage.mask(i))
+    seen = _hand_in_view(motion, spec.hand, camera)
+    for i, mask in zip(masked, masks, strict=True):
+        seen[i] = bool((mask == LABEL_HAND).any())
     return SyntheticVideo(
-        spec=spec,
-        frames=np.stack(frames),
-        camera=camera,
-        poses_world=np.stack([pose_from_transform(T) for T in motion.T_world_obj]),
-        mask_first=masks[0],
-        mask_last=masks[-1],
-        hand_in_view=np.array(seen),
-    )
+        spec=spec, frame_idx=chosen, frames=np.stack(pictures), camera=camera,
+        poses_world=np.stack([[pose_from_transform(T) for T in track] for track in motion.T_world_things]),
+        mask_idx=masked, masks=np.stack(masks), hand_in_view=seen,
+    )  # fmt: skip
 
 
-def write(video: SyntheticVideo, folder: Path) -> Path:
-    """Write `<name>.mp4`, and `truth/<name>.json` with `truth/<name>_{first,last}.png` beside it."""
-    spec = video.spec
-    truth = folder / "truth"
-    truth.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{spec.name}.mp4"
-    with av.open(str(path), "w", options={"movflags": "faststart"}) as out:
-        # one thread and no tool version in the stream: the same pictures give the same bytes
-        options = {"crf": "21", "preset": "slow", "x264-params": "threads=1:no-info=1"}
-        stream = out.add_stream("libx264", rate=Fraction(spec.fps), options=options)
-        stream.width, stream.height = spec.view.width_px, spec.view.height_px
-        stream.pix_fmt = "yuv420p"
-        for pixels in video.frames:
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-        out.mux(stream.encode(None))
-    for when, mask in (("first", video.mask_first), ("last", video.mask_last)):
-        cv2.imwrite(str(truth / f"{spec.name}_{when}.png"), mask)
-    (truth / f"{spec.name}.json").write_text(json.dumps(_truth(video), indent=1) + "\n")
-    return path
+def render_views(
+    spec: VideoSpec, frames: Sequence[int], *, with_hand: bool
+) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
+    """Draw only these frames, and their labels.
+
+    Args:
+        spec: the clip.
+        frames: which frames.
+        with_hand: without it hand and arm are not drawn, as in a still picture of the same moment.
+
+    Raises:
+        V2PError: there is no OpenGL.
+    """
+    with _stage(spec, motion_of(spec), with_hand=with_hand) as stage:
+        return np.stack([stage.shot(i) for i in frames]), np.stack([stage.mask(i) for i in frames])
 
 
 def random_spec(
-    name: str, kind: MotionKind, rng: np.random.Generator, others: int = 0
+    name: str, kind: MotionKind, rng: np.random.Generator, others: int | None = None
 ) -> VideoSpec:
     """Return a clip of this kind with everything else drawn at random.
 
@@ -277,223 +158,320 @@ def random_spec(
         name: file name without its ending.
         kind: what happens.
         rng: where the draws come from.
-        others: objects that stand around, up to four.
+        others: things that stand around, at most; 0 to 4 by chance where None.
     """
-    side: Side = "right" if kind == "push_left" or rng.random() < 0.5 else "left"
-    if kind == "push_right":
-        side = "left"
-    shape = "box" if kind == "tip_over" else str(rng.choice(["box", "cylinder"]))
-    colours = [str(c) for c in rng.permutation(list(COLOURS))]
-    thing = _random_thing(
-        shape, colours.pop(), rng, tall=kind == "tip_over", flat=kind.startswith("push")
-    )
-    sign = 1 if side == "right" else -1
-    moves = sign if kind.startswith("push") else 0
-    distance = float(rng.uniform(0.10, 0.18))
-    spots = [(0.17, 0.13), (0.19, -0.15), (0.05, -0.24), (0.26, 0.02)]
-    if moves:
-        spots[1] = (0.21, -0.20)
-    placed = tuple(
-        Placed(
-            thing=_random_thing(str(rng.choice(["box", "cylinder"])), colours.pop(), rng),
-            xy_m=(spots[i][0] + float(rng.uniform(0, 0.04)), sign * spots[i][1]),
-            yaw_rad=float(rng.uniform(-0.6, 0.6)),
-        )
-        for i in rng.permutation(4)[: min(others, 4)]
-    )
-    view = View(
-        height_m=float(rng.uniform(0.38, 0.55)),
-        pitch_rad=float(rng.uniform(0.52, 0.72)),
-        side_m=float(moves * distance / 2 + rng.uniform(-0.04, 0.04)),
-        fovy_rad=float(rng.uniform(0.70, 0.86)),
-    )
-    # the optical axis meets the table near the object, a little behind it
-    back = view.height_m / np.tan(view.pitch_rad) - float(rng.uniform(0.02, 0.08))
-    tone = float(rng.uniform(0.45, 1.1))
-    return VideoSpec(
-        name=name,
-        kind=kind,
-        thing=thing,
-        distance_m=distance,
-        yaw_rad=float(rng.uniform(-0.3, 0.3)),
-        others=placed,
-        view=View(**{**asdict(view), "back_m": float(back)}),
-        room=Room(
-            wood=_times((0.64, 0.47, 0.32), float(rng.uniform(0.6, 1.25))),
-            grain=float(rng.uniform(0.05, 0.14)),
-            table_far_m=float(rng.uniform(0.4, 0.9)),
-            wall=_times((0.72, 0.73, 0.70), float(rng.uniform(0.6, 1.2))),
-            light_azimuth_rad=float(rng.uniform(0, 6.28)),
-            light_elevation_rad=float(rng.uniform(0.8, 1.3)),
-            light=float(rng.uniform(0.45, 0.7)),
-            ambient=float(rng.uniform(0.28, 0.42)),
+    for _ in range(60):
+        hand, across = _random_hand(rng, kind)
+        arm = np.array(hand.shoulder_m)
+        count = int(rng.integers(0, 5)) if others is None else others
+        story = random_story(kind, rng, count, arm_azimuth_rad=float(np.arctan2(arm[1], arm[0])))
+        timing = _random_timing(rng, kind)
+        fps = int(rng.choice([12, 15, 24, 30], p=[0.15, 0.1, 0.35, 0.4]))
+        spec = VideoSpec(
+            name=name, story=story, hand=hand, timing=timing,
+            room=random_room(rng, across or bool(rng.random() < 0.15)), sensor=random_sensor(rng),
+            seconds=float(rng.uniform(2.5, 5.0)), fps=fps, hide_m=0.0, seed=int(rng.integers(2**31)),
+        )  # fmt: skip
+        framed = _framed(spec, rng)
+        if framed is not None:
+            return framed
+    raise ValueError(f"no camera sees all of a '{kind}' clip; draw again with another stream")
+
+
+def _random_hand(rng: np.random.Generator, kind: MotionKind) -> tuple[Hand, bool]:
+    where = str(rng.choice(["camera", "side", "across"], p=[0.55, 0.27, 0.18]))
+    side = float(rng.choice([-1.0, 1.0]))
+    if kind in ("push_left", "push_right") and rng.random() < 0.8:
+        side = -1.0 if kind == "push_left" else 1.0
+    shoulder = {
+        "camera": (
+            -rng.uniform(0.35, 0.7),
+            side * rng.uniform(0.12, 0.5),
+            rng.uniform(0.22, 0.45),
         ),
-        hand=Hand(
-            side=side,
-            skin=_times((0.82, 0.60, 0.48), tone),
-            sleeve=(
-                float(rng.uniform(0.12, 0.75)),
-                float(rng.uniform(0.12, 0.75)),
-                float(rng.uniform(0.12, 0.75)),
-            ),
-            arm=(-0.8, -float(rng.uniform(0.35, 0.8)), float(rng.uniform(0.08, 0.22))),
-        ),
-        seconds=float(rng.uniform(3.0, 4.2)),
-        noise=float(rng.uniform(0.5, 3.0)),
-        seed=int(rng.integers(2**31)),
+        "side": (rng.uniform(-0.3, 0.3), side * rng.uniform(0.5, 0.8), rng.uniform(0.18, 0.4)),
+        "across": (rng.uniform(0.4, 0.7), side * rng.uniform(0.15, 0.55), rng.uniform(0.2, 0.4)),
+    }[where]
+    tone = rng.uniform(0, 1)
+    # from deep brown to pale pink, redder or yellower by chance
+    deep, pale = np.array((0.23, 0.14, 0.10)), np.array((0.90, 0.70, 0.60))
+    r, g, b = ((1 - tone) * deep + tone * pale + rng.normal(0, 0.02, 3)).clip(0.05, 0.98).tolist()
+    from_left = shoulder[1] > 0 if where != "across" else shoulder[1] < 0
+    sleeve: Rgb | None = any_colour(rng) if rng.random() < 0.6 else None
+    return Hand(
+        left=bool(from_left if rng.random() < 0.85 else not from_left),
+        scale=float(rng.uniform(0.9, 1.1)), skin=(r, g, b), sleeve=sleeve,
+        sleeve_print=rng.choice(["plain", "plain", "plain", "stripes", "checker"]).item(),
+        cuff_m=float(rng.choice([rng.uniform(0.01, 0.06), rng.uniform(0.06, 0.3)])),
+        shoulder_m=(float(shoulder[0]), float(shoulder[1]), float(shoulder[2])),
+    ), where == "across"  # fmt: skip
+
+
+def _random_timing(rng: np.random.Generator, kind: MotionKind) -> Timing:
+    late = float(rng.uniform(-0.05, 0.05))
+    act_end = float(rng.uniform(0.6, 0.70)) + late
+    if kind == "lift_up":
+        act_end += 0.1
+    leave = act_end + float(rng.uniform(0.05, 0.10))
+    return Timing(
+        come=(0.08 + late, 0.26 + late), close=(0.27 + late, 0.33 + late), act=(0.35 + late, act_end),
+        leave=(leave, min(0.97, leave + float(rng.uniform(0.12, 0.2)))),
+        starts_in_view=bool(rng.random() < (0.4 if kind == "push_with" else 0.15)),
+        stays_in_view=bool(rng.random() < 0.25),
+        from_side=bool(rng.random() < 0.65),
+        push=str(rng.choice(["palm", "fingers"])),
+    )  # fmt: skip
+
+
+_SIZES = ((640, 480), (854, 480), (480, 640), (426, 240), (640, 360), (320, 240), (360, 640))
+_SHARES = (0.36, 0.18, 0.14, 0.14, 0.08, 0.05, 0.05)
+
+
+def _framed(spec: VideoSpec, rng: np.random.Generator) -> VideoSpec | None:
+    """Return the clip with a camera that sees every thing of the caption at first and at last; None where none does."""
+    story = spec.story
+    motion = motion_of(spec)
+    named = [k for k, a in enumerate(story.actors) if a.role not in ("bystander", "tool")]
+    boxes = [_corners(story.actors[k].extents_m) for k in named]
+    ends = [0, -1]
+    points = np.concatenate(
+        [
+            apply(motion.T_world_things[k, i], box)
+            for i in ends
+            for k, box in zip(named, boxes, strict=True)
+        ]
     )
-
-
-COLOURS: dict[str, Rgb] = {
-    "red": (0.78, 0.10, 0.10),
-    "blue": (0.10, 0.25, 0.72),
-    "green": (0.12, 0.55, 0.22),
-    "yellow": (0.90, 0.76, 0.10),
-    "orange": (0.93, 0.45, 0.06),
-    "purple": (0.45, 0.16, 0.60),
-    "white": (0.88, 0.88, 0.86),
-    "black": (0.09, 0.09, 0.10),
-}
-
-
-def _random_thing(
-    shape: str,
-    colour: str,
-    rng: np.random.Generator,
-    tall: bool = False,
-    flat: bool = False,
-) -> Thing:
-    printed = rng.choice([name for name in COLOURS if name != colour])
-    if shape == "cylinder":
-        across = float(rng.uniform(0.05, 0.08))
-        size = (
-            across,
-            across,
-            float(rng.uniform(0.05, 0.08) if flat else rng.uniform(0.08, 0.13)),
+    middle = (points.min(0) + points.max(0)) / 2
+    for _ in range(60):
+        width, height = _SIZES[int(rng.choice(len(_SIZES), p=_SHARES))]
+        camera_height, pitch = (
+            float(rng.uniform(0.25, 0.8)),
+            float(np.radians(rng.uniform(20, 60))),
         )
-    else:
-        low, high = ((0.12, 0.18) if tall else (0.04, 0.07)) if tall or flat else (0.06, 0.12)
-        sides = rng.uniform(0.04, 0.06, 2) if tall else rng.uniform(0.05, 0.085, 2)
-        size = (float(sides[0]), float(sides[1]), float(rng.uniform(low, high)))
-    noun = {"box": "carton" if tall else "box", "cylinder": "can"}[shape]
-    return Thing(
-        label=f"{colour} {noun}",
-        shape="box" if shape == "box" else "cylinder",
-        size_m=size,
-        base=COLOURS[colour],
-        accent=COLOURS[str(printed)],
-        print=rng.choice(["label", "stripes", "checker", "speckle"]).item(),
-    )
-
-
-def _times(colour: Rgb, factor: float) -> Rgb:
-    return (
-        min(1.0, colour[0] * factor),
-        min(1.0, colour[1] * factor),
-        min(1.0, colour[2] * factor),
-    )
-
-
-def _ease(t: Float[np.ndarray, "time"], start: float, end: float) -> Float[np.ndarray, "time"]:
-    """Return 0 before `start`, 1 after `end`, and a minimum-jerk step between."""
-    x = ((t - start) / (end - start)).clip(0, 1)
-    return x**3 * (10 - 15 * x + 6 * x * x)
-
-
-def _fall(t: Float[np.ndarray, "time"], start: float, end: float) -> Float[np.ndarray, "time"]:
-    """Return an angle from 0 to a quarter turn: slowly while pushed, then faster and faster, and at rest."""
-    x = ((t - start) / (end - start)).clip(0, 1)
-    return np.pi / 2 * (0.30 * x + 0.70 * x**4)
-
-
-def _about_x(angle: float) -> Float[np.ndarray, "3 3"]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
-
-
-def _hidden_m(spec: VideoSpec, hand_at: Float[np.ndarray, "3"]) -> float:
-    """Return how far along the arm the hand must be drawn back to leave the picture."""
-    camera, away = spec.view.camera(), spec.hand.arm_direction
-    reach = np.linspace(-0.13, 0.7, 24)[:, None] * away
-    around = np.array([[0, 0, 0], [0, 0, 0.07], [0, 0.07, 0], [0, -0.07, 0], [0.07, 0, 0]])
-    shape = (reach[:, None] + around).reshape(-1, 3)
-    for distance in np.arange(0.2, 1.6, 0.02):
-        points = hand_at + distance * away + shape
-        in_camera = apply(np.linalg.inv(camera.T_world_cam), points)
+        aim = middle[:2] + rng.normal(0, 0.04, 2)
+        view = View(
+            height_m=camera_height, pitch_rad=pitch, roll_rad=float(np.radians(rng.normal(0, 0.9))),
+            back_m=float((camera_height - middle[2]) / np.tan(pitch) - aim[0]), side_m=float(aim[1]),
+            fovy_rad=float(np.radians(rng.uniform(35, 60))), width_px=width, height_px=height,
+        )  # fmt: skip
+        camera = view.camera()
         uv = camera.project(points)
-        inside = (uv > 0).all(1) & (uv < (camera.width_px, camera.height_px)).all(1)
-        # what is behind the camera, or so close that it would fill the picture, cannot be judged by a pixel
-        if not (inside & (in_camera[:, 2] > 0.05)).any():
-            return float(distance) + 0.12
-    raise ValueError(f"no way out of the picture for the hand of '{spec.name}'")
+        margin = 0.015 * width
+        fits = (
+            not np.isnan(uv).any()
+            and (uv > margin).all()
+            and (uv < (width - margin, height - margin)).all()
+        )
+        if not fits:
+            continue
+        spread = [np.ptp(uv[8 * j : 8 * j + 8], axis=0) for j in range(2 * len(named))]
+        if min(float(s.max()) for s in spread) < 0.045 * max(width, height):
+            continue
+        if _hides(story, uv, len(named)):
+            continue
+        hide = _hide_m(motion, spec, camera)
+        if hide is None:
+            continue
+        far = max(float(points[:, 0].max()) + 0.12, spec.room.table_far_m)
+        side = max(float(np.abs(points[:, 1]).max()) + 0.15, spec.room.table_side_m)
+        room = replace(
+            spec.room,
+            table_far_m=far + 0.3 * abs(spec.room.yaw_rad),
+            table_side_m=side + 0.3 * abs(spec.room.yaw_rad),
+        )
+        return replace(spec, view=view, hide_m=hide, room=room)
+    return None
 
 
-def _pose(
-    model: mujoco.MjModel, data: mujoco.MjData, motion: Motion, i: int, camera: Camera
-) -> None:
-    R_gl = camera.T_world_cam[:3, :3] @ CV_FROM_GL
-    T_cam = transform(R_gl, camera.T_world_cam[:3, 3])
-    for name, T in (
-        ("thing", motion.T_world_obj[i]),
-        ("hand", motion.T_world_hand[i]),
-        ("camera", T_cam),
-    ):
-        mocap = model.body(name).mocapid[0]
-        data.mocap_pos[mocap] = T[:3, 3]
-        data.mocap_quat[mocap] = quat_from_matrix(T[:3, :3])
-    grip = motion.grip[i]
-    flat, closed = (0.12, 0.16, 0.10), (1.35, 0.30, 0.50)
-    for finger in range(4):
-        for joint in range(3):
-            spread = 0.05 * (finger - 1.5)
-            angle = flat[joint] * (1 + spread) * (1 - grip) + closed[joint] * (1 + spread) * grip
-            data.joint(f"finger{finger}_{joint}").qpos = angle
-    data.joint("thumb_0").qpos = -0.05 * grip - 1.0 * (1 - grip) + 1.9 * (1 - grip)
-    data.joint("thumb_1").qpos = -0.25 * grip
-    mujoco.mj_forward(model, data)
+def _hides(story: Story, uv: Float[np.ndarray, "n 2"], num: int) -> bool:
+    """Return whether one thing of the caption hides much of another at first."""
+    if story.kind == "uncover" or num < 2:
+        return False
+    one, two = ((uv[8 * j : 8 * j + 8].min(0), uv[8 * j : 8 * j + 8].max(0)) for j in (0, 1))
+    both = (np.minimum(one[1], two[1]) - np.maximum(one[0], two[0])).clip(0).prod()
+    return float(both) > 0.35 * min(
+        float((one[1] - one[0]).prod()), float((two[1] - two[0]).prod())
+    )
 
 
-def _truth(video: SyntheticVideo) -> dict[str, Any]:
-    spec, camera = video.spec, video.camera
-    still = [
-        {
-            "label": p.thing.label,
-            "role": "bystander",
-            "shape": p.thing.shape,
-            "size_m": p.thing.size_m,
-            "mask_label": LABEL_OBJECT + 1 + i,
-            "pose_world": [
-                *p.xy_m,
-                p.thing.size_m[2] / 2,
-                float(np.cos(p.yaw_rad / 2)),
-                0.0,
-                0.0,
-                float(np.sin(p.yaw_rad / 2)),
-            ],
-        }
-        for i, p in enumerate(spec.others)
-    ]
-    return {
-        "video": f"{spec.name}.mp4",
-        "caption": spec.caption,
-        "kind": spec.kind,
-        "fps": spec.fps,
-        "num_frames": len(video.frames),
-        "camera": {
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "K": camera.K.round(6).tolist(),
-            "T_world_cam": camera.T_world_cam.round(9).tolist(),
-        },
-        "object": {
-            "label": spec.thing.label,
-            "shape": spec.thing.shape,
-            "size_m": spec.thing.size_m,
-            "mask_label": LABEL_OBJECT,
-            "poses_world": video.poses_world.round(6).tolist(),
-        },
-        "others": still,
-        "hand_in_view": video.hand_in_view.tolist(),
-        "masks": {"first": f"{spec.name}_first.png", "last": f"{spec.name}_last.png"},
-        "mask_labels": {"background": 0, "hand": LABEL_HAND, "object": LABEL_OBJECT},
-    }
+def _corners(extents: Float[np.ndarray, "3"]) -> Float[np.ndarray, "8 3"]:
+    return np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * extents
+
+
+def _hand_points(motion: Motion, hand: Hand, i: int) -> Float[np.ndarray, "n 3"]:
+    """Return points about hand and arm in one frame."""
+    T = motion.T_world_hand[i]
+    bones = motion.gestures[motion.gesture[i]].bones
+    mirror = np.array([1.0, -1.0 if hand.left else 1.0, 1.0])
+    inner = np.array(
+        [p for b in bones for p in (b[0], b[1])] + [WRIST, (0, 0.035, 0.02), (0, -0.035, 0.02)]
+    )
+    wrist = apply(T, (WRIST * hand.scale)[None])[0]
+    side = np.cross(motion.arm[i], [0, 0, 1.0])
+    reach = np.linspace(0.0, 0.75, 16)[:, None] * motion.arm[i]
+    arm = np.concatenate([wrist + reach + k * 0.045 * side for k in (-1, 0, 1)])
+    return np.concatenate(
+        [apply(T, inner * mirror * hand.scale), arm, arm + np.array([0, 0, 0.045])]
+    )
+
+
+def _seen(points: Float[np.ndarray, "n 3"], camera: Camera, margin_px: float) -> bool:
+    ahead = apply(inverse(camera.T_world_cam), points)[:, 2] > 0.05
+    uv = np.nan_to_num(camera.project(points), nan=-1e9)
+    inside = (uv > -margin_px).all(1) & (
+        uv < (camera.width_px + margin_px, camera.height_px + margin_px)
+    ).all(1)
+    return bool((ahead & inside).any())
+
+
+def _hand_in_view(motion: Motion, hand: Hand, camera: Camera) -> Bool[np.ndarray, "time"]:
+    return np.array(
+        [_seen(_hand_points(motion, hand, i), camera, 0.0) for i in range(len(motion.gesture))]
+    )
+
+
+def _hide_m(motion: Motion, spec: VideoSpec, camera: Camera) -> float | None:
+    """Return how far the hand must draw back along its arm to leave the picture; None where two metres do not do."""
+    away = np.array(spec.hand.shoulder_m) - motion.T_world_things[0, 0, :3, 3]
+    away /= np.linalg.norm(away)
+    worst = 0.0
+    for i in (0, len(motion.gesture) - 1):
+        points = _hand_points(motion, spec.hand, i)
+        if spec.kind == "push_with":
+            points = np.concatenate(
+                [
+                    points,
+                    apply(motion.T_world_things[1, i], _corners(spec.story.actors[1].extents_m)),
+                ]
+            )
+        far = next(
+            (d for d in np.arange(0.1, 1.9, 0.05) if not _seen(points + d * away, camera, 8.0)),
+            None,
+        )
+        if far is None:
+            return None
+        worst = max(worst, float(far))
+    return worst + 0.06
+
+
+class _Stage:
+    """A built scene in which any moment of the clip can be drawn."""
+
+    def __init__(self, spec: VideoSpec, motion: Motion, with_hand: bool) -> None:
+        view = spec.view
+        props = [a.prop for a in spec.story.actors]
+        self.spec, self.motion, self.with_hand = spec, motion, with_hand
+        self.model = build(
+            props, spec.room, spec.hand, motion.gestures, view.fovy_rad,
+            (view.width_px, view.height_px), rng_for(spec.seed, "textures"),
+        )  # fmt: skip
+        self.data = mujoco.MjData(self.model)
+        self.camera = view.camera()
+        self.drawer = Drawer(self.model)
+        names = [self.model.geom(k).name for k in range(self.model.ngeom)]
+        self.hands = [names.index(f"hand{k}") for k in range(len(motion.gestures))]
+        self.arms = [names.index(n) for n in ("forearm", "sleeve") if n in names]
+        self.sway = rng_for(spec.seed, "sway").normal(0, 1, 4)
+        self.speed_px = self._speeds()
+
+    def shot(self, i: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Return frame i as the sensor sees it."""
+        sensor, n = self.spec.sensor, len(self.motion.gesture)
+        blur_px = float(self.speed_px[i]) * sensor.exposure
+        parts = 1 if blur_px < 2.5 else 3 if blur_px < 14 else 4
+        total = np.zeros((self.spec.view.height_px, self.spec.view.width_px, 3), np.float32)
+        for k in range(parts):
+            self._pose(i + sensor.exposure * ((k + 0.5) / parts - 0.5))
+            total += self.drawer.picture(self.data)
+        return developed(
+            total / parts, sensor, i / max(n - 1, 1), rng_for(self.spec.seed, "noise", i)
+        )
+
+    def mask(self, i: int) -> UInt8[np.ndarray, "h w"]:
+        """Return the labels of frame i."""
+        self._pose(float(i))
+        return self.drawer.mask(self.data)
+
+    def _speeds(self) -> Float[np.ndarray, "time"]:
+        m = self.motion
+        tracks = [
+            *m.T_world_things[:2, :, :3, 3],
+            *((m.T_world_hand[:, :3, 3],) if self.with_hand else ()),
+        ]
+        uv = np.stack([np.nan_to_num(self.camera.project(track)) for track in tracks])
+        uv = uv.clip(-200, 1200)
+        return np.linalg.norm(np.gradient(uv, axis=1), axis=2).max(0)
+
+    def _pose(self, at: float) -> None:
+        m, n = self.motion, len(self.motion.gesture)
+        at = float(np.clip(at, 0, n - 1))
+        i, f = int(at), at - int(at)
+        j = min(i + 1, n - 1)
+        for k in range(len(m.T_world_things)):
+            self._put(f"thing{k}", m.T_world_things[k, i], m.T_world_things[k, j], f)
+        self._put("hand", m.T_world_hand[i], m.T_world_hand[j], f)
+        arm = (1 - f) * m.arm[i] + f * m.arm[j]
+        wrist = np.stack(
+            [
+                T[:3, 3] + T[:3, :3] @ (WRIST * self.spec.hand.scale)
+                for T in (m.T_world_hand[i], m.T_world_hand[j])
+            ]
+        )
+        self._put_at(
+            "arm",
+            (1 - f) * wrist[0] + f * wrist[1],
+            _along_z(arm / np.linalg.norm(arm), m.T_world_hand[i, :3, 2]),
+        )
+        self._put_at(
+            "camera", self.camera.T_world_cam[:3, 3], self.camera.T_world_cam[:3, :3] @ CV_FROM_GL
+        )
+        for k, geom in enumerate(self.hands):
+            self.model.geom_group[geom] = 0 if self.with_hand and k == m.gesture[i] else 5
+        for geom in self.arms:
+            self.model.geom_group[geom] = 0 if self.with_hand else 5
+        if self.spec.room.person:
+            s = self.sway
+            shoulder = np.array(self.spec.hand.shoulder_m)
+            across = shoulder[0] > 0.3
+            x = max(self.spec.room.table_far_m + 0.16, shoulder[0]) + 0.01 * np.sin(
+                4 * at / n + s[0]
+            )
+            y = (shoulder[1] * 0.6 if across else 0.45 * np.sign(s[1])) + 0.012 * np.sin(
+                3 * at / n + s[2]
+            )
+            self._put_at("trunk", np.array([x, y, 0.12]), np.eye(3))
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    def _put(
+        self, name: str, a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"], f: float
+    ) -> None:
+        if f < 1e-6:
+            self._put_at(name, a[:3, 3], a[:3, :3])
+            return
+        p, q = quat_from_matrix(a[:3, :3]), quat_from_matrix(b[:3, :3])
+        q = (1 - f) * p + f * q * (1 if p @ q > 0 else -1)
+        mocap = self.model.body(name).mocapid[0]
+        self.data.mocap_pos[mocap] = (1 - f) * a[:3, 3] + f * b[:3, 3]
+        self.data.mocap_quat[mocap] = q / np.linalg.norm(q)
+
+    def _put_at(
+        self, name: str, place: Float[np.ndarray, "3"], R: Float[np.ndarray, "3 3"]
+    ) -> None:
+        mocap = self.model.body(name).mocapid[0]
+        self.data.mocap_pos[mocap] = place
+        self.data.mocap_quat[mocap] = quat_from_matrix(R)
+
+
+@contextmanager
+def _stage(spec: VideoSpec, motion: Motion, *, with_hand: bool = True) -> Iterator[_Stage]:
+    stage = _Stage(spec, motion, with_hand)
+    with stage.drawer:
+        yield stage
+
+
+def _along_z(z: Float[np.ndarray, "3"], back: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation with z along the arm and x out of the hand's back."""
+    x = back - (back @ z) * z
+    x /= max(float(np.linalg.norm(x)), 1e-9)
+    return np.stack([x, np.cross(z, x), z], 1)
