@@ -132,6 +132,7 @@ def make_sam2(folder: Path) -> None:
         Sam2VideoVideoProcessor,
     )
 
+    # The memory's 64 channels are fixed in the library, and pointers must be several times as wide.
     config = Sam2VideoConfig(
         vision_config={
             "backbone_config": {
@@ -142,19 +143,19 @@ def make_sam2(folder: Path) -> None:
             },
             "backbone_channel_list": [64, 32, 16, 8],
             "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]],
-            "fpn_hidden_size": 16,
+            "fpn_hidden_size": 128,
         },
-        prompt_encoder_config={"hidden_size": 16, "image_size": 64, "patch_size": 16,
+        prompt_encoder_config={"hidden_size": 128, "image_size": 64, "patch_size": 16,
                                "mask_input_channels": 8},
         image_size=64, num_maskmem=3, max_object_pointers_in_encoder=4,
-        memory_attention_hidden_size=16, memory_attention_num_layers=1,
+        memory_attention_hidden_size=128, memory_attention_num_layers=1,
         memory_attention_feed_forward_hidden_size=16, memory_attention_rope_feat_sizes=[4, 4],
-        memory_encoder_hidden_size=16, memory_encoder_output_channels=8,
-        mask_downsampler_embed_dim=16, memory_fuser_num_layers=1, memory_fuser_embed_dim=16,
+        memory_encoder_hidden_size=128, memory_encoder_output_channels=64,
+        mask_downsampler_embed_dim=128, memory_fuser_num_layers=1, memory_fuser_embed_dim=128,
         memory_fuser_intermediate_dim=16,
     )  # fmt: skip
     decoder = config.mask_decoder_config
-    decoder.hidden_size, decoder.mlp_dim, decoder.num_attention_heads = 16, 16, 2
+    decoder.hidden_size, decoder.mlp_dim, decoder.num_attention_heads = 128, 16, 2
     decoder.iou_head_hidden_dim = 16
     Sam2VideoModel(config).save_pretrained(folder)
     size = {"height": 64, "width": 64}

@@ -168,8 +168,8 @@ def _may_be_table(slope: Float[np.ndarray, "3"], max_roll_rad: float) -> bool:
         return False
     x, y, z = -slope / size
     looks_down = np.arcsin(np.clip(-z, -1, 1))
-    # Straight from above roll means nothing.
-    level = abs(np.arctan2(-x, -y)) < max_roll_rad or np.hypot(x, y) < 0.2
+    # Straight from above (to 6 degrees) roll means nothing; a wall faced squarely looks the same.
+    level = abs(np.arctan2(-x, -y)) < max_roll_rad or np.hypot(x, y) < 0.1
     return bool(looks_down > 0.05 and level)
 
 
