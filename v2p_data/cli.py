@@ -31,6 +31,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("run", "the whole chain on three sample clips"),
 }
 """Command -> module of `v2p_data.commands` that holds it, and what it does."""
+SUBCOMMANDS: dict[str, tuple[str, str]] = {
+    "scene review": ("review", "a page to judge a run's scenes on and to mark what was not found"),
+}
+"""The same for commands of two words; a folder of the second word's name is given as `./review`."""
 
 
 def main() -> None:
@@ -52,11 +56,12 @@ def run(argv: Sequence[str]) -> int:
 
         print(f"v2p {version('lerobot_policy_v2p')}")
         return 0
-    name = argv[0]
+    name = " ".join(argv[:2]) if " ".join(argv[:2]) in SUBCOMMANDS else argv[0]
     try:
-        return _command(name)(list(argv[1:]))
+        return _command(name)(list(argv[len(name.split()) :]))
     except V2PError as error:
-        print(f"v2p {name}: {error}" if name in COMMANDS else f"v2p: {error}", file=sys.stderr)
+        known = name in COMMANDS or name in SUBCOMMANDS
+        print(f"v2p {name}: {error}" if known else f"v2p: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(
@@ -83,7 +88,7 @@ def parse[T](kind: type[T], argv: list[str], command: str, default: T | None = N
                 kind,
                 args=argv,
                 prog=f"v2p {command}",
-                description=COMMANDS[command][1],
+                description=(COMMANDS | SUBCOMMANDS)[command][1],
                 **keywords,
             )
     except SystemExit as error:
@@ -101,17 +106,19 @@ def _one_sentence(box: str, command: str) -> str:
 
 
 def _command(name: str) -> Callable[[list[str]], int]:
-    if name not in COMMANDS:
+    known = COMMANDS | SUBCOMMANDS
+    if name not in known:
         raise V2PError(f"there is no command '{name}'.{did_you_mean(name, COMMANDS)}")
     from importlib import import_module
 
-    module = import_module(f"v2p_data.commands.{COMMANDS[name][0]}")
-    return getattr(module, f"{name}_command")
+    module = import_module(f"v2p_data.commands.{known[name][0]}")
+    return getattr(module, f"{name.split()[-1]}_command")
 
 
 def _help() -> str:
-    width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {words}" for name, (_, words) in COMMANDS.items()]
+    width = max(map(len, (*COMMANDS, *SUBCOMMANDS)))
+    both = {**COMMANDS, **SUBCOMMANDS}
+    lines = [f"  {name:<{width}}  {words}" for name, (_, words) in both.items()]
     return "\n".join(
         [
             "usage: v2p COMMAND ...",
