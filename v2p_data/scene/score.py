@@ -330,7 +330,7 @@ def turn_between(
     A ball has no orientation. Of a round thing only the axis counts, and which way it points only where it is open on
     one side. A box, and anything without symmetry, is compared as a posed box: the found one's axes are renamed so that
     its sides fit the true ones, the six ways of equal sides and turns by 180 degrees included; what is open on one
-    side keeps the side.
+    side keeps the side. Where a solid of revolution was found for it, that one's axis counts alone.
     """
     if true.symmetry == "sphere":
         return 0.0
@@ -342,7 +342,7 @@ def turn_between(
         else:
             cosine = abs(float(R_true[:, 2] @ R_found[:, _round_axis(true, found)]))
         return float(np.arccos(np.clip(cosine, -1, 1)))
-    angles = []
+    angles: list[float] = []
     for order, signs in _fitting_turns(true.size_m, found.size_m):
         rename = np.zeros((3, 3))  # true axis i is the found axis order[i], with its sign
         rename[list(order), range(3)] = signs
@@ -352,7 +352,12 @@ def turn_between(
             and float(open_found @ rename @ open_true) < 0.5
         ):
             continue
-        angles.append(angle_between(R_true, R_found @ rename))
+        if found.is_round:  # nobody says how it is turned about its own axis
+            i = order.index(2)
+            cosine = float(R_true[:, i] @ (R_found @ rename)[:, i])
+            angles.append(float(np.arccos(np.clip(cosine, -1, 1))))
+        else:
+            angles.append(angle_between(R_true, R_found @ rename))
     return min(angles) if angles else float(np.pi)
 
 
