@@ -43,6 +43,10 @@ class CameraGuess:
     pitch_sd_rad: float
     fov_rad: float
     """Horizontal field of view."""
+    height_m: float | None = None
+    """Over the table, where something measured it."""
+    height_sd: float = 0.12
+    """Standard deviation of its logarithm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +109,8 @@ def place(
         firsts[k], (lasts[k], cost) = options[best], found[best]
         upright_cost = cost if s is thing else upright_cost
     height_m, spread = camera_height_m(
-        [vote_of(s, fit) for s, fit in zip(objects, firsts, strict=True)]
+        [vote_of(s, fit) for s, fit in zip(objects, firsts, strict=True)],
+        None if guess.height_m is None else (guess.height_m, guess.height_sd),
     )
     placed = []
     for k, s in enumerate(objects):

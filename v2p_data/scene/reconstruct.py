@@ -25,6 +25,7 @@ from v2p_data.scene.backends.config import (
 )
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
 from v2p_data.scene.gate import by_stage, check_confidence, check_motion, cues_of
+from v2p_data.scene.learned import DETECTORS, camera_from_depth, detected, segmented
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.placement import CameraGuess, Placed, Placement, place
 from v2p_data.scene.scene import Observed, Role, Symmetry
@@ -132,14 +133,21 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
         ItemRejectedError: `camera_moves`, `nothing_moves`, `object_not_found`, `reference_not_found`,
             `motion_contradicts_caption` or `low_confidence`, with the number that decided.
     """
-    del rng  # every step here is deterministic; a sampling backend will need it
     meaning = parse_caption(clip.caption, clip.objects)
     footage = footage_of(clip)
     _check_still(footage, cfg)
-    sights = sight(clip, footage, meaning, cfg.ground, cfg.segment, cfg.min_found)
-    placement = place(
-        sights.footage, sights.objects, meaning.kind, _camera_guess(sights, cfg), cfg.max_poses
-    )
+    boxes = None
+    if cfg.ground.backend in DETECTORS:
+        boxes = detected(clip, footage, meaning.phrases, cfg.ground)
+    sights = sight(clip, footage, meaning, cfg.ground, cfg.min_found, boxes)
+    if cfg.segment.backend != "flow":
+        sights = replace(
+            sights, objects=segmented(clip, sights.footage, sights.objects, cfg.segment)
+        )
+    guess = _camera_guess(sights, cfg)
+    if cfg.depth.backend != "none":
+        guess = camera_from_depth(clip, sights.footage, sights.objects, guess, cfg.depth, rng)
+    placement = place(sights.footage, sights.objects, meaning.kind, guess, cfg.max_poses)
     objects = _estimates(sights, placement)
     if cfg.check_motion:
         poses = [thing.T_world_objs for thing in objects]

@@ -28,9 +28,17 @@ class SizeVote:
     """The true size, where the user gave it."""
 
 
-def camera_height_m(votes: list[SizeVote]) -> tuple[float, float]:
-    """Return the camera's height [m] and the standard deviation of its logarithm."""
+def camera_height_m(
+    votes: list[SizeVote], measured: tuple[float, float] | None = None
+) -> tuple[float, float]:
+    """Return the camera's height [m] and the standard deviation of its logarithm.
+
+    `measured` is such a pair from elsewhere, as from predicted depth.
+    """
     means, weights = [float(np.log(_USUAL_HEIGHT_M))], [_HEIGHT_SPREAD**-2]
+    if measured is not None:
+        means.append(float(np.log(measured[0])))
+        weights.append(measured[1] ** -2)
     for vote in votes:
         mean, spread = _implied(vote)
         means.append(mean)

@@ -4,13 +4,14 @@ A user's box, points or a detector's box say where an object is in one frame; wi
 there decides. Everything works at the footage's size.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.backends.config import GroundConfig, SegmentConfig
+from v2p_data.scene.backends.config import GroundConfig
 from v2p_data.scene.classes import HAND, MOVED, OTHER
 from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
@@ -84,6 +85,17 @@ class Sights:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Box:
+    """Where a detector sees a phrase."""
+
+    frame: int
+    """Of the clip."""
+    box_xyxy: tuple[float, float, float, float]
+    """[px] of the clip's frames."""
+    score: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Marked:
     """A mask that a user or a detector stands for."""
 
@@ -98,19 +110,21 @@ def sight(
     footage: Footage,
     meaning: Meaning,
     ground: GroundConfig,
-    segment: SegmentConfig,
     min_found: float,
+    boxes: Mapping[str, Box] | None = None,
 ) -> Sights:
     """Return the masks of all objects that the caption names.
+
+    `boxes` are what a detector says, by phrase; a user's hint for the phrase goes before it.
 
     Raises:
         ItemRejectedError: `object_not_found` or `reference_not_found`, with how sure the best finding was.
     """
-    watched = None if ground.backend == "heuristic" else watch(footage)
+    watched = watch(footage) if ground.backend == "network" else None
     if watched is not None:
         footage = _knowing_hand(footage, watched)
     table = find_table(footage.always, table_seen(watched) if watched else None)
-    marked = _marked(clip, footage, watched)
+    marked = _marked(clip, footage, watched, boxes or {})
     tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
     moved, held = _find_movers(footage, table, watched, meaning, tool, marked)
     mark = marked.get(meaning.manipulated)
@@ -161,7 +175,7 @@ def sight(
                 things_standing(watched, late=late) if watched else None,
             )
         )  # fmt: skip
-        sure = _HINTED_SURE if mark else _rise(found.score, 1.0, 0.5) if found else 0.0
+        sure = mark.sure if mark else _rise(found.score, 1.0, 0.5) if found else 0.0
         if found is None or sure < min_found:
             if phrase.lower() in clip.caption.lower() and meaning.kind not in _OPTIONAL_KINDS:
                 raise ItemRejectedError(
@@ -185,7 +199,6 @@ def sight(
                 hinted=mark is not None,
             )
         )
-    del segment
     return Sights(
         objects=tuple(objects),
         footage=footage,
@@ -224,9 +237,16 @@ def _knowing_hand(footage: Footage, watched: Watched) -> Footage:
     )
 
 
-def _marked(clip: Clip, footage: Footage, watched: Watched | None) -> dict[str, _Marked]:
-    """Return the masks that users' boxes and points mean, by phrase."""
+def _marked(
+    clip: Clip, footage: Footage, watched: Watched | None, boxes: Mapping[str, Box]
+) -> dict[str, _Marked]:
+    """Return the masks that users' boxes and points mean, and detectors' boxes, by phrase."""
     out = {}
+    for phrase, box in boxes.items():
+        i = int(np.abs(footage.frame_idx - box.frame).argmin())
+        x0, y0, x1, y1 = (v * footage.px_scale for v in box.box_xyxy)
+        mask = from_box(footage.rgb[i], (x0, y0, x1, y1), _thing_at(watched, i))
+        out[phrase] = _Marked(mask=mask, frame=i, sure=box.score)
     for phrase, hint in clip.hints.items():
         if not ("box" in hint or "points" in hint):
             continue

@@ -1,0 +1,351 @@
+"""Train the scene network (`v2p_data/scene/network.py`) on rendered clips, from nothing, on a CPU.
+
+    python scripts/train_scene_network.py data --out DATA --clips 1500 --jobs 2
+    python scripts/train_scene_network.py train DATA --out v2p_data/scene/network.safetensors --minutes 60
+
+`data` renders clips of all kinds at low resolution and keeps six frames of each with the two stills that the scene room
+makes of the whole clip. `train` prints the intersection over union of each class on clips that it does not train on. No real
+video is used for training. Clips here are drawn from seeds of their own (`network`), so that no clip of
+`bench_reconstruction.py` is among them.
+"""
+
+import argparse
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from safetensors.torch import load_file, save_file
+from torch.nn import functional as F  # noqa: N812  (the usual name)
+
+from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.colour import lab_of
+from v2p_data.scene.footage import still_of
+from v2p_data.scene.network import (
+    SceneNetwork,
+    inputs_of,
+    net_size,
+)
+from v2p_data.seeds import rng_for
+from v2p_data.video.synthetic import (
+    LABEL_HAND,
+    LABEL_TABLE,
+    LABEL_THING,
+    MOTION_KINDS,
+    VideoSpec,
+    motion_of,
+    random_spec,
+    render_views,
+)
+
+FRAMES_DRAWN = 24
+FRAMES_KEPT = 6
+BATCH = 12
+HELD_OUT = 20
+"""Every so-manieth clip is for measuring."""
+CLASS_WEIGHTS = (0.6, 0.6, 1.0, 2.0, 1.5)
+
+
+def make_clip(job: tuple[int, Path]) -> str:
+    """Render one clip and write what training needs; return an error's words, or nothing."""
+    number, out = job
+    path = out / f"{number:05d}.npz"
+    if path.is_file():
+        return ""
+    rng = rng_for(number, "network")
+    kind = MOTION_KINDS[number % len(MOTION_KINDS)]
+    try:
+        spec = random_spec(f"clip{number}", kind, rng)
+        h, w = net_size(spec.view.height_px, spec.view.width_px)
+        spec = replace(spec, view=replace(spec.view, height_px=h, width_px=w))
+        total = round(spec.seconds * spec.fps)
+        steps = np.linspace(0, total - 1, FRAMES_DRAWN).round().astype(int)
+        rgb, labels = render_views(spec, steps.tolist(), with_hand=True)
+    except (ValueError, RuntimeError) as error:
+        return f"{number} {kind}: {type(error).__name__} {error}"
+    rgb = np.stack([_compressed(image, rng) for image in rgb])
+    lab, quarter = lab_of(rgb), FRAMES_DRAWN // 4
+    keep = np.unique([0, FRAMES_DRAWN - 1, *rng.integers(1, FRAMES_DRAWN - 1, FRAMES_KEPT - 2)])
+    camera = spec.view.camera()
+    forward = camera.T_world_cam[:3, 2]
+    np.savez(
+        path,
+        early=still_of(rgb[:quarter], lab[:quarter]),
+        late=still_of(rgb[-quarter:], lab[-quarter:]),
+        frames=rgb[keep],
+        labels=_classes(labels[keep], _moved_labels(spec)),
+        camera=np.array([np.arcsin(-forward[2]), np.log(camera.K[0, 0] / w)], np.float32),
+    )
+    return ""
+
+
+def _moved_labels(spec: VideoSpec) -> list[int]:
+    """Return the labels of the things that do not stay where and as they are."""
+    tracks = motion_of(spec).T_world_things
+    away_m = np.linalg.norm(tracks[:, :, :3, 3] - tracks[:, :1, :3, 3], axis=-1).max(1)
+    turned = np.abs(tracks[:, :, :3, :3] - tracks[:, :1, :3, :3]).max((1, 2, 3))
+    return [LABEL_THING + k for k in np.flatnonzero((away_m > 0.005) | (turned > 0.1))]
+
+
+def _classes(labels: UInt8[np.ndarray, "n h w"], moved: list[int]) -> UInt8[np.ndarray, "n h w"]:
+    to = np.full(256, OTHER, np.uint8)
+    to[0], to[LABEL_HAND], to[LABEL_TABLE] = BACKGROUND, HAND, TABLE
+    to[moved] = MOVED
+    return to[labels]
+
+
+def _compressed(image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> np.ndarray:
+    quality = int(rng.integers(35, 95))
+    _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1]
+
+
+def make_data(out: Path, clips: int, jobs: int, start: int) -> None:
+    """Render the clips that are not there yet."""
+    out.mkdir(parents=True, exist_ok=True)
+    began = time.time()
+    with ProcessPoolExecutor(jobs) as pool:
+        work = [(number, out) for number in range(start, start + clips)]
+        for done, words in enumerate(pool.map(make_clip, work, chunksize=4), 1):
+            if words:
+                print(f"left out {words}", file=sys.stderr)
+            if done % 50 == 0:
+                print(f"{done} clips, {(time.time() - began) / done:.2f} s each", flush=True)
+
+
+class Examples:
+    """Clips in memory, grouped by picture size."""
+
+    def __init__(self) -> None:
+        self.groups: dict[tuple[int, int], list[dict[str, np.ndarray]]] = {}
+        self.files: set[Path] = set()
+
+    def add(self, files: list[Path]) -> None:
+        """Read the files that were not read yet."""
+        for file in sorted(set(files) - self.files):
+            with np.load(file) as data:
+                clip = {key: data[key] for key in data.files}
+            self.groups.setdefault(clip["early"].shape[:2], []).append(clip)
+            self.files.add(file)
+        self.sizes = sorted(self.groups)
+        counts = np.array([len(self.groups[size]) for size in self.sizes], float)
+        self.shares = counts / counts.sum()
+
+    def batch(self, rng: np.random.Generator, n: int) -> dict[str, torch.Tensor]:
+        """Return a random batch of one picture size, changed at random in ways that keep its labels true."""
+        clips = self.groups[self.sizes[rng.choice(len(self.sizes), p=self.shares)]]
+        rows = []
+        for _ in range(n):
+            clip = clips[rng.integers(len(clips))]
+            n_frames = len(clip["frames"])
+            i = int(rng.choice(np.array([0, n_frames - 1, rng.integers(n_frames)])))
+            rows.append(_varied(clip, i, rng))
+        return {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
+
+    def everything(self) -> list[dict[str, torch.Tensor]]:
+        """Return every frame of every clip, unchanged."""
+        out = []
+        for clips in self.groups.values():
+            for clip in clips:
+                n = len(clip["frames"])
+                same = {k: np.repeat(clip[k][None], n, 0) for k in ("early", "late", "camera")}
+                row = {**same, "frame": clip["frames"], "labels": clip["labels"]}
+                for key in ("frame", "early", "late"):
+                    row[key] = row[key].transpose(0, 3, 1, 2)
+                out.append({k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in row.items()})
+        return out
+
+
+def _varied(
+    clip: dict[str, np.ndarray], i: int, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    pictures = [clip["frames"][i], clip["early"], clip["late"]]
+    labels = clip["labels"][i]
+    if rng.random() < 0.3:  # a clip played backwards
+        pictures[1], pictures[2] = pictures[2], pictures[1]
+    if rng.random() < 0.5:
+        pictures, labels = [p[:, ::-1] for p in pictures], labels[:, ::-1]
+    camera = clip["camera"]
+    if rng.random() < 0.6:
+        pictures, labels, camera = _nearer(pictures, labels, camera, rng)
+    mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
+    if rng.random() < 0.1:
+        mix = np.full((3, 3), 1 / 3) + 0.15 * mix
+    gain, bias, gamma = rng.uniform(0.75, 1.25), rng.normal(0, 8), np.exp(rng.normal(0, 0.2))
+    blur, noise = rng.choice([0, 0, 0.7, 1.1]), rng.uniform(0, 4)
+    out = []
+    for k, picture in enumerate(pictures):
+        x = picture.astype(np.float32) @ mix.T.astype(np.float32)
+        x = 255 * (np.clip(x, 0, 255) / 255) ** gamma
+        x = x * (gain * (1 + rng.normal(0, 0.012))) + bias + rng.normal(0, 0.8)
+        if blur:
+            x = cv2.GaussianBlur(x, (0, 0), blur)
+        if k == 0:
+            x = x + rng.normal(0, noise, x.shape)
+        out.append(np.clip(x, 0, 255).astype(np.uint8).transpose(2, 0, 1))
+    return {
+        "frame": out[0],
+        "early": out[1],
+        "late": out[2],
+        "labels": np.ascontiguousarray(labels),
+        "camera": camera,
+    }
+
+
+def _nearer(
+    pictures: list[np.ndarray], labels: np.ndarray, camera: np.ndarray, rng: np.random.Generator
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Return a part of the pictures, enlarged, with the camera that would have seen it.
+
+    The camera is the one turned towards the part's middle, which is right but for a slight distortion.
+    """
+    h, w = labels.shape
+    zoom = rng.uniform(1.05, 2.0)
+    ch, cw = int(h / zoom), int(w / zoom)
+    spots = np.argwhere(labels == MOVED)
+    middle = spots[rng.integers(len(spots))] if len(spots) else np.array([h / 2, w / 2])
+    y = int(np.clip(middle[0] - ch * rng.uniform(0.25, 0.75), 0, h - ch))
+    x = int(np.clip(middle[1] - cw * rng.uniform(0.25, 0.75), 0, w - cw))
+    part = slice(y, y + ch), slice(x, x + cw)
+    large = [cv2.resize(np.ascontiguousarray(p[part]), (w, h)) for p in pictures]
+    labels = cv2.resize(
+        np.ascontiguousarray(labels[part]), (w, h), interpolation=cv2.INTER_NEAREST
+    )
+    down = np.arctan((y + ch / 2 - h / 2) / (np.exp(camera[1]) * w))
+    seen = np.array([camera[0] + down, camera[1] + np.log(zoom)], np.float32)
+    return large, labels, seen
+
+
+def loss_of(
+    logits: Float[torch.Tensor, "n 5 h w"], camera: Float[torch.Tensor, "n 4"], batch: dict
+) -> torch.Tensor:
+    """Return cross entropy, soft Dice of hand, moved and other, and the camera's Gaussian likelihood."""
+    labels = batch["labels"].long()
+    ce = F.cross_entropy(logits, labels, torch.tensor(CLASS_WEIGHTS), label_smoothing=0.02)
+    share = logits.softmax(1)
+    dice = 0.0
+    for c in (HAND, MOVED, OTHER):
+        truth = (labels == c).float()
+        common = (share[:, c] * truth).sum((1, 2))
+        total = share[:, c].sum((1, 2)) + truth.sum((1, 2))
+        dice = dice + (1 - (2 * common + 50) / (total + 50)).mean()
+    off, log_sd = camera[:, :2] - batch["camera"], camera[:, 2:].clamp(-4, 1)
+    likelihood = (log_sd + 0.5 * (off / log_sd.exp()) ** 2).mean()
+    return ce + 0.3 * dice + 0.05 * likelihood
+
+
+@torch.inference_mode()
+def measure(net: SceneNetwork, held_out: list[dict[str, torch.Tensor]]) -> str:
+    """Return IoU by class over all held-out pixels, the median IoU of `moved` per frame, and camera errors, in words."""
+    net.eval()
+    common, either = np.zeros(len(CLASSES)), np.zeros(len(CLASSES))
+    each, off = [], []
+    for row in held_out:
+        logits, camera = net(inputs_of(row["frame"], row["early"], row["late"]))
+        guess, truth = logits.argmax(1).numpy(), row["labels"].numpy()
+        for c in range(len(CLASSES)):
+            common[c] += ((guess == c) & (truth == c)).sum()
+            either[c] += ((guess == c) | (truth == c)).sum()
+        for g, t in zip(guess == MOVED, truth == MOVED, strict=True):
+            if t.sum() > 40:
+                each.append((g & t).sum() / (g | t).sum())
+        off.append((camera[:, :2] - row["camera"]).abs().mean(0).numpy())
+    net.train()
+    ious = ", ".join(f"{n} {i:.3f}" for n, i in zip(CLASSES, common / either, strict=True))
+    pitch, focal = np.median(off, axis=0)
+    good = float(np.mean(np.array(each) > 0.6))
+    return (
+        f"{ious}; moved per frame: median {np.median(each):.3f}, {good:.1%} above 0.6; "
+        f"pitch off {np.degrees(pitch):.1f} deg, focal {focal:.1%}"
+    )
+
+
+def train(
+    data: Path, out: Path, minutes: float, seed: int, start_from: Path | None, lr: float
+) -> None:
+    """Train for so many minutes, writing the weights (half precision) every two minutes."""
+    held, examples = Examples(), Examples()
+
+    def read() -> None:  # clips may still be rendered while training runs
+        files = sorted(data.glob("*.npz"))
+        held.add([f for f in files if int(f.stem) % HELD_OUT == 0][:40])
+        examples.add([f for f in files if int(f.stem) % HELD_OUT])
+
+    read()
+    held_out = held.everything()
+    print(f"{len(examples.files)} clips to train on, {len(held_out)} held out", flush=True)
+    rng = rng_for(seed, "network", "batches")
+    with torch.random.fork_rng():
+        torch.random.default_generator.manual_seed(seed)
+        net = SceneNetwork()
+        net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if start_from:
+        net.load_state_dict({k: v.float() for k, v in load_file(start_from).items()})
+    optimiser = torch.optim.AdamW(net.parameters(), lr, weight_decay=1e-3)
+    began, saved, step, losses = time.time(), time.time(), 0, []
+    while (share := (time.time() - began) / (60 * minutes)) < 1:
+        for group in optimiser.param_groups:
+            group["lr"] = lr * min(1, (step + 1) / 100) * (0.02 + 0.98 * np.cos(np.pi / 2 * share))
+        batch = examples.batch(rng, BATCH)
+        x = inputs_of(batch["frame"], batch["early"], batch["late"])
+        logits, camera = net(x.contiguous(memory_format=torch.channels_last))
+        loss = loss_of(logits, camera, batch)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimiser.step()
+        losses.append(loss.item())
+        step += 1
+        if time.time() - saved > 120:
+            saved = time.time()
+            write(net, out)
+            read()
+            words = f"{len(examples.files)} clips, {measure(net, held_out[::3])}"
+            print(
+                f"{saved - began:5.0f} s step {step} loss {np.mean(losses[-100:]):.3f}: {words}",
+                flush=True,
+            )
+    write(net, out)
+    print(f"{step} steps of {BATCH}: {measure(net, held_out)}", flush=True)
+
+
+def write(net: SceneNetwork, out: Path) -> None:
+    """Write the weights in half precision, in one move."""
+    partial = out.with_suffix(".partial")
+    state = {
+        k: (v.half() if v.is_floating_point() else v).contiguous()
+        for k, v in net.state_dict().items()
+    }
+    save_file(state, partial)
+    partial.replace(out)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    data = commands.add_parser("data", help="render training clips")
+    data.add_argument("--out", type=Path, required=True)
+    data.add_argument("--clips", type=int, default=1500)
+    data.add_argument("--start", type=int, default=0, help="number of the first clip")
+    data.add_argument("--jobs", type=int, default=2)
+    learn = commands.add_parser("train", help="train on them")
+    learn.add_argument("data", type=Path)
+    learn.add_argument("--out", type=Path, required=True)
+    learn.add_argument("--minutes", type=float, default=60)
+    learn.add_argument("--seed", type=int, default=0)
+    learn.add_argument("--lr", type=float, default=2e-3)
+    learn.add_argument("--start-from", type=Path)
+    args = parser.parse_args()
+    if args.command == "data":
+        make_data(args.out, args.clips, args.jobs, args.start)
+    else:
+        train(args.data, args.out, args.minutes, args.seed, args.start_from, args.lr)
+
+
+if __name__ == "__main__":
+    main()
