@@ -46,7 +46,7 @@ def specs():
 def pushed():
     spec = random_spec("pushed", "push_left", rng_for(11, "pushed"), others=0)
     view = replace(spec.view, width_px=320, height_px=240)
-    return drawn(replace(spec, view=view, fps=8, sensor=replace(spec.sensor, crf=18, noise=0.5)))
+    return drawn(replace(spec, view=view, fps=4, sensor=replace(spec.sensor, crf=18, noise=0.5)))
 
 
 def test_every_shape_is_closed_and_as_large_as_its_product():
@@ -174,7 +174,7 @@ def test_a_written_clip_is_read_back_with_its_truth(pushed, tmp_path):
     clip, truth = read_clip(item), load_truth(tmp_path, "pushed")
     assert item.path == path == truth.video
     assert len(clip.frames) == truth.num_frames == len(truth.hand_in_view)
-    assert clip.fps == pytest.approx(8)
+    assert clip.fps == pytest.approx(4)
     assert np.abs(clip.frames[0].astype(int) - pushed.frames[0]).mean() < 6
     assert truth.things[0].role == "manipulated"
     assert truth.things[0].poses_world.shape == (truth.num_frames, 7)

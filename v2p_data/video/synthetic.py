@@ -265,7 +265,7 @@ def _framed(spec: VideoSpec, rng: np.random.Generator) -> VideoSpec | None:
         if not fits:
             continue
         spread = [np.ptp(uv[8 * j : 8 * j + 8], axis=0) for j in range(2 * len(named))]
-        if min(float(s.max()) for s in spread) < 0.045 * max(width, height):
+        if min(float(s.max()) for s in spread) < 0.065 * max(width, height):
             continue
         if _hides(story, uv, len(named)):
             continue

@@ -75,7 +75,7 @@ def random_sensor(rng: np.random.Generator) -> Sensor:
         noise=float(rng.uniform(0.3, 5.0)),
         exposure=float(rng.uniform(0.1, 0.8)),
         defocus_px=float(rng.choice([0.0, rng.uniform(0.4, 1.1)])),
-        gamma=float(rng.uniform(0.8, 1.25)),
+        gamma=float(rng.uniform(0.7, 1.15)),
         tint=(float(rng.normal(1, 0.05)), 1.0, float(rng.normal(1, 0.05))),
         drift=float(rng.choice([0.0, rng.uniform(0.0, 0.12)])),
         flicker=float(rng.choice([0.0, rng.uniform(0.0, 0.015)])),

@@ -5,6 +5,7 @@ z out of the hand's back. A left hand is the mirror image in y.
 """
 
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -55,11 +56,12 @@ class Pose:
     """Where the hand touches: x along the fingers, z from thumb to fingers or out of the back."""
 
 
+@lru_cache(maxsize=64)
 def grip(width_m: float) -> Pose:
     """Return thumb and fingers around something this wide."""
     low, high = -0.08, 0.075
     pose, _ = _grip_at(low, width_m)
-    for _ in range(22):  # the higher the finger tips the wider the gap
+    for _ in range(14):  # the higher the finger tips the wider the gap
         middle = (low + high) / 2
         pose, gap = _grip_at(middle, width_m)
         low, high = (middle, high) if gap < width_m else (low, middle)
@@ -143,12 +145,18 @@ def _grip_at(tip_z: float, width: float) -> tuple[Pose, float]:
 
 def _reaching(reach: float, down: float, scale: float) -> tuple[float, float]:
     """Return first angle and bend of a finger whose tip lies `reach` away and `down` below its knuckle."""
-    bends = np.linspace(0.05, 1.9, 60)
-    tips = np.stack([_links(0.0, b, scale)[-1] for b in bends])
-    far = np.linalg.norm(tips, axis=1)
+    bends, tips, far = _bent(scale)
     k = int(np.abs(far - reach).argmin())
     want = np.arcsin(np.clip(down / far[k], -0.95, 0.95))
     return float(want - np.arctan2(tips[k, 1], tips[k, 0])), float(bends[k])
+
+
+@cache
+def _bent(scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return bends of a finger, and where its tip lies and how far away."""
+    bends = np.linspace(0.05, 1.9, 60)
+    tips = np.stack([_links(0.0, b, scale)[-1] for b in bends])
+    return bends, tips, np.linalg.norm(tips, axis=1)
 
 
 def _links(angle: float, bend: float, scale: float) -> Float[np.ndarray, "4 2"]:

@@ -87,7 +87,7 @@ def random_room(rng: np.random.Generator, person: bool) -> Room:
     else:
         base = np.array(any_colour(rng))
     warm = rng.uniform(-0.12, 0.14)
-    light = rng.uniform(0.25, 0.65)
+    light = rng.uniform(0.35, 0.8)
     lamp = (light * (1 + warm), light, light * (1 - warm))
     fill = rng.uniform(0.02, 0.3)
     return Room(
@@ -112,7 +112,7 @@ def random_room(rng: np.random.Generator, person: bool) -> Room:
         lamp=lamp,
         second_lamp=(fill, fill, fill * float(rng.uniform(0.8, 1.2))),
         second_azimuth_rad=float(rng.uniform(0, 6.28)),
-        ambient=float(rng.uniform(0.22, 0.45)),
+        ambient=float(rng.uniform(0.3, 0.5)),
     )
 
 

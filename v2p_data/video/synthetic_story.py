@@ -290,6 +290,7 @@ def _placed(
     lift = float(rng.uniform(0.05, 0.10))
     if kind == "cover":
         lid = a.prop.kind == "lid"
+        a = replace(a, upside_down=not lid)
         bottom = (
             b.extents_m[2] - 0.001
             if lid and b.prop.kind == "bowl"
@@ -300,7 +301,7 @@ def _placed(
         b = replace(b, xy_m=there)
         body = _body(b) if lid else np.array(there)
         own = body - (_body(a) - np.array(a.xy_m))
-        return Story(kind=kind, caption=caption, actors=(replace(a, upside_down=not lid), b), target_bottom_m=float(bottom),
+        return Story(kind=kind, caption=caption, actors=(a, b), target_bottom_m=float(bottom),
                      target_xy_m=(float(own[0]), float(own[1])), turn_rad=0.0 if a.prop.kind == "mug" else turn, lift_m=lift + b.extents_m[2])  # fmt: skip
     if kind == "uncover":
         lid = a.prop.kind == "lid"
