@@ -148,9 +148,15 @@ def main() -> None:
 
 
 def planned(split: str, clips: int, kinds: list[MotionKind], fps: int | None = None) -> list[Job]:
-    """Return the clips of a split: kinds in turn; tune has even seeds, final odd ones."""
+    """Return the clips of a split, kinds in turn; tune has even seeds, final odd ones.
+
+    A clip depends on its kind and seed alone, so that fewer kinds or clips are a part of the same clips.
+    """
     odd = {"tune": 0, "final": 1}[split]
-    return [Job(kind=kinds[i % len(kinds)], seed=2 * i + odd, fps=fps) for i in range(clips)]
+    return [
+        Job(kind=kinds[i % len(kinds)], seed=2 * (i // len(kinds)) + odd, fps=fps)
+        for i in range(clips)
+    ]
 
 
 def true_of(truth: Truth) -> TrueClip:
