@@ -117,8 +117,14 @@ def _command(name: str) -> Callable[[list[str]], int]:
 
 def _help() -> str:
     width = max(map(len, (*COMMANDS, *SUBCOMMANDS)))
-    both = {**COMMANDS, **SUBCOMMANDS}
-    lines = [f"  {name:<{width}}  {words}" for name, (_, words) in both.items()]
+    lines = [
+        f"  {name:<{width}}  {words}"
+        for command, what in COMMANDS.items()
+        for name, (_, words) in [
+            (command, what),
+            *(pair for pair in SUBCOMMANDS.items() if pair[0].split()[0] == command),
+        ]
+    ]
     return "\n".join(
         [
             "usage: v2p COMMAND ...",
