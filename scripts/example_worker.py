@@ -10,10 +10,12 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 SCHEMA, VERSION = "v2p-worker", 1
 BAD_REQUEST, REFUSED = 2, 3
@@ -54,7 +56,7 @@ def main() -> int:
     return 0
 
 
-def answer_mesh(arrays: dict[str, np.ndarray]) -> tuple[dict, dict, trimesh.Trimesh]:
+def answer_mesh(arrays: dict[str, np.ndarray]) -> tuple[dict, dict, "trimesh.Trimesh"]:
     if arrays["mask"].sum() < 16:
         raise RefusedError(f"the outline has {arrays['mask'].sum()} pixels, too few for a shape")
     return {"metric": False}, {}, inflate(arrays["mask"])
@@ -66,8 +68,10 @@ def answer_depth(arrays: dict[str, np.ndarray]) -> tuple[dict, dict, None]:
     return {"metric": True}, {"depth_m": depth, "fov_rad": np.full(count, FOV_RAD)}, None
 
 
-def inflate(mask: np.ndarray) -> trimesh.Trimesh:
+def inflate(mask: np.ndarray) -> "trimesh.Trimesh":
     """Return a closed cushion with the outline of the mask: x towards the camera, y right, z up in the picture."""
+    import trimesh  # here, so that the other kinds do not wait for it
+
     y, x = np.nonzero(mask)
     side = max(np.ptp(x), np.ptp(y)) + 1
     step = max(1, round(side / CELLS))
