@@ -225,6 +225,9 @@ def prop_called(noun: Noun, rng: np.random.Generator) -> Prop:
         second = (0.72, 0.72, 0.73) if noun.words[0] not in {"tape", "candle"} else second
     if noun.words[0] in {"book", "notebook"}:
         second = (0.92, 0.9, 0.84)
+    if noun.kind in ("bowl", "plate", "bin", "coaster") or "block" in noun.words:
+        # what one sees of these is their inside or top: it has the colour that people name
+        second = base if rng.random() < 0.85 else second
     metal = noun.kind in {"pot", "pan", "lid", "spoon", "can"}
     return Prop(
         noun=str(rng.choice(noun.words)), kind=noun.kind,

@@ -108,7 +108,7 @@ def random_room(rng: np.random.Generator, person: bool) -> Room:
         person=person,
         shirt=any_colour(rng),
         lamp_azimuth_rad=float(rng.uniform(0, 6.28)),
-        lamp_elevation_rad=float(rng.uniform(0.6, 1.45)),
+        lamp_elevation_rad=float(rng.uniform(0.8, 1.45)),
         lamp=lamp,
         second_lamp=(fill, fill, fill * float(rng.uniform(0.8, 1.2))),
         second_azimuth_rad=float(rng.uniform(0, 6.28)),
@@ -133,7 +133,7 @@ def build(
     spec.stat.extent, spec.stat.center = 0.6, [0.0, 0.0, 0.1]
     visual.map.znear, visual.map.zfar = 0.05, 20.0
     _add_lamps(spec, room)
-    _add_surroundings(spec, room, rng)
+    _add_surroundings(spec, room, hand.skin, rng)
     for i, prop in enumerate(props):
         pixels = printed(prop.print, prop.base, prop.accent, prop.second, prop.detail, rng)
         _add_material(spec, f"thing{i}", pixels, prop.specular)
@@ -178,7 +178,9 @@ def _add_lamps(spec: mujoco.MjSpec, room: Room) -> None:
         )  # fmt: skip
 
 
-def _add_surroundings(spec: mujoco.MjSpec, room: Room, rng: np.random.Generator) -> None:
+def _add_surroundings(
+    spec: mujoco.MjSpec, room: Room, skin: Rgb, rng: np.random.Generator
+) -> None:
     c, s = math.cos(room.yaw_rad / 2), math.sin(room.yaw_rad / 2)
     base = spec.worldbody.add_body(name="room", quat=[c, 0, 0, s])
     table = spec.worldbody.add_body(name="table", quat=[c, 0, 0, s])
@@ -228,9 +230,15 @@ def _add_surroundings(spec: mujoco.MjSpec, room: Room, rng: np.random.Generator)
         cloth = surface("cloth", room.shirt, room.shirt, rng)
         _add_material(spec, "shirt", cloth, 0.0, 2.0)
         trunk = spec.worldbody.add_body(name="trunk", mocap=True)
-        trunk.add_geom(type=geom.mjGEOM_ELLIPSOID, size=[0.13, 0.21, 0.36], material="shirt")
+        parts = (([0.12, 0.20, 0.40], [0, 0, -0.06]), ([0.11, 0.22, 0.17], [0, 0, 0.22]))
+        for size, at in parts:
+            trunk.add_geom(type=geom.mjGEOM_ELLIPSOID, size=size, pos=at, material="shirt")
+        tone = [*skin, 1.0]
         trunk.add_geom(
-            type=geom.mjGEOM_ELLIPSOID, size=[0.10, 0.25, 0.12], pos=[0, 0, 0.26], material="shirt"
+            type=geom.mjGEOM_CYLINDER, size=[0.055, 0.08, 0], pos=[0, 0, 0.40], rgba=tone
+        )
+        trunk.add_geom(
+            type=geom.mjGEOM_ELLIPSOID, size=[0.095, 0.078, 0.125], pos=[-0.02, 0, 0.56], rgba=tone
         )
 
 

@@ -117,7 +117,7 @@ def random_story(
 
 
 def _phrase(prop: Prop, with_colour: bool) -> str:
-    clear = prop.print not in ("photo", "checker", "wood") and prop.noun not in (
+    clear = prop.print not in ("photo", "checker", "wood", "gradient") and prop.noun not in (
         "orange",
         "wooden block",
     )
