@@ -35,6 +35,7 @@ EXIT_REFUSED = 3
 MAX_BYTES = 4 * 2**30
 """All that a worker may write, logs included."""
 _MAX_JSON = 2**20
+_MAX_OBJ = 2**29
 _MAX_FACES = 2_000_000
 _TAIL = 2000
 _POLL_S = 0.05
@@ -351,7 +352,7 @@ def _read_npz(path: Path, wanted: set[str], max_bytes: int) -> dict[str, np.ndar
 
 def _read_mesh(path: Path) -> tuple[trimesh.Trimesh, Repair]:
     """Return the mesh, watertight and turned outwards, and what had to be done to it."""
-    text = _bytes_of(path, MAX_BYTES).decode(errors="replace")
+    text = _bytes_of(path, _MAX_OBJ).decode(errors="replace")
     if text.count("\nf ") > _MAX_FACES:
         raise V2PError(f"the worker's mesh.obj has more than {_MAX_FACES} faces; simplify it")
     try:
@@ -372,6 +373,18 @@ def _read_mesh(path: Path) -> tuple[trimesh.Trimesh, Repair]:
         raise V2PError(
             f"the worker's mesh.obj is flat or out of scale: extents {mesh.extents.tolist()}"
         )
+    try:
+        mesh, repair = _closed(mesh)
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise V2PError(
+            f"the worker's mesh.obj cannot be closed ({str(error).splitlines()[0]})"
+        ) from error
+    if not mesh.is_watertight or mesh.volume <= 0:
+        raise V2PError("the worker's mesh.obj encloses no volume, and could not be repaired")
+    return mesh, repair
+
+
+def _closed(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Repair]:
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
@@ -383,8 +396,6 @@ def _read_mesh(path: Path) -> tuple[trimesh.Trimesh, Repair]:
         repair = "convex_hull"
         mesh = mesh.convex_hull
     trimesh.repair.fix_normals(mesh, multibody=True)
-    if not mesh.is_watertight or mesh.volume <= 0:
-        raise V2PError("the worker's mesh.obj encloses no volume, and could not be repaired")
     return mesh, repair
 
 
