@@ -10,6 +10,7 @@ video is used for training. Clips here are drawn from seeds of their own (`netwo
 """
 
 import argparse
+import os
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -43,7 +44,7 @@ from v2p_data.video.synthetic import (
     render_views,
 )
 
-FRAMES_DRAWN = 24
+FRAMES_DRAWN = 14
 FRAMES_KEPT = 6
 BATCH = 12
 HELD_OUT = 20
@@ -79,7 +80,14 @@ def make_clip(job: tuple[int, Path]) -> str:
         late=still_of(rgb[-quarter:], lab[-quarter:]),
         frames=rgb[keep],
         labels=_classes(labels[keep], _moved_labels(spec)),
-        camera=np.array([np.arcsin(-forward[2]), np.log(camera.K[0, 0] / w)], np.float32),
+        camera=np.array(
+            [
+                np.arcsin(-forward[2]),
+                np.log(camera.K[0, 0] / w),
+                np.log(camera.T_world_cam[2, 3]),
+            ],
+            np.float32,
+        ),
     )
     return ""
 
@@ -107,6 +115,7 @@ def _compressed(image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> 
 
 def make_data(out: Path, clips: int, jobs: int, start: int) -> None:
     """Render the clips that are not there yet."""
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
     out.mkdir(parents=True, exist_ok=True)
     began = time.time()
     with ProcessPoolExecutor(jobs) as pool:
@@ -217,12 +226,12 @@ def _nearer(
         np.ascontiguousarray(labels[part]), (w, h), interpolation=cv2.INTER_NEAREST
     )
     down = np.arctan((y + ch / 2 - h / 2) / (np.exp(camera[1]) * w))
-    seen = np.array([camera[0] + down, camera[1] + np.log(zoom)], np.float32)
+    seen = np.array([camera[0] + down, camera[1] + np.log(zoom), camera[2]], np.float32)
     return large, labels, seen
 
 
 def loss_of(
-    logits: Float[torch.Tensor, "n 5 h w"], camera: Float[torch.Tensor, "n 4"], batch: dict
+    logits: Float[torch.Tensor, "n 5 h w"], camera: Float[torch.Tensor, "n 6"], batch: dict
 ) -> torch.Tensor:
     """Return cross entropy, soft Dice of hand, moved and other, and the camera's Gaussian likelihood."""
     labels = batch["labels"].long()
@@ -234,7 +243,7 @@ def loss_of(
         common = (share[:, c] * truth).sum((1, 2))
         total = share[:, c].sum((1, 2)) + truth.sum((1, 2))
         dice = dice + (1 - (2 * common + 50) / (total + 50)).mean()
-    off, log_sd = camera[:, :2] - batch["camera"], camera[:, 2:].clamp(-4, 1)
+    off, log_sd = camera[:, :3] - batch["camera"], camera[:, 3:].clamp(-4, 1)
     likelihood = (log_sd + 0.5 * (off / log_sd.exp()) ** 2).mean()
     return ce + 0.3 * dice + 0.05 * likelihood
 
@@ -254,14 +263,14 @@ def measure(net: SceneNetwork, held_out: list[dict[str, torch.Tensor]]) -> str:
         for g, t in zip(guess == MOVED, truth == MOVED, strict=True):
             if t.sum() > 40:
                 each.append((g & t).sum() / (g | t).sum())
-        off.append((camera[:, :2] - row["camera"]).abs().mean(0).numpy())
+        off.append((camera[:, :3] - row["camera"]).abs().mean(0).numpy())
     net.train()
     ious = ", ".join(f"{n} {i:.3f}" for n, i in zip(CLASSES, common / either, strict=True))
-    pitch, focal = np.median(off, axis=0)
+    pitch, focal, height = np.median(off, axis=0)
     good = float(np.mean(np.array(each) > 0.6))
     return (
         f"{ious}; moved per frame: median {np.median(each):.3f}, {good:.1%} above 0.6; "
-        f"pitch off {np.degrees(pitch):.1f} deg, focal {focal:.1%}"
+        f"pitch off {np.degrees(pitch):.1f} deg, focal {focal:.1%}, height {height:.1%}"
     )
 
 
@@ -285,7 +294,11 @@ def train(
         net = SceneNetwork()
         net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if start_from:
-        net.load_state_dict({k: v.float() for k, v in load_file(start_from).items()})
+        weights = {k: v.float() for k, v in load_file(start_from).items()}
+        fresh = net.state_dict()
+        net.load_state_dict(
+            {k: weights[k] if weights[k].shape == v.shape else v for k, v in fresh.items()}
+        )
     optimiser = torch.optim.AdamW(net.parameters(), lr, weight_decay=1e-3)
     began, saved, step, losses = time.time(), time.time(), 0, []
     while (share := (time.time() - began) / (60 * minutes)) < 1:

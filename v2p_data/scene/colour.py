@@ -38,11 +38,14 @@ _PLAIN = ("brown", "black", "white", "grey")
 
 def colour_words(phrase: str) -> tuple[str, ...]:
     """Return the colours that an object phrase names, or that its noun usually has."""
+    return named_colours(phrase) or noun_for(phrase).colours
+
+
+def named_colours(phrase: str) -> tuple[str, ...]:
+    """Return the colours that an object phrase itself names."""
     words = re.findall(r"[a-z]+", phrase.lower())
     named = [_SYNONYMS.get(word, word) for word in words]
-    found = [word for word in named if word in _HUES_DEG or word in _PLAIN]
-    found = found or list(noun_for(phrase).colours)
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(word for word in named if word in _HUES_DEG or word in _PLAIN))
 
 
 def lab_of(image: UInt8[np.ndarray, "*time h w 3"]) -> Float32[np.ndarray, "*time h w 3"]:

@@ -16,12 +16,13 @@ from v2p_data.scene.colour import (
     colour_match,
     colour_words,
     histogram,
+    lab_of,
     likelihood,
     similarity,
 )
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Moved
-from v2p_data.scene.segment import bounding_box, grow, largest, refine, tidy
+from v2p_data.scene.segment import bounding_box, edge_contrast, grow, largest, refine, tidy
 
 MOST_FRAMES = 50
 """Frames of a clip that the network looks at; those between take the nearest one's word."""
@@ -45,6 +46,8 @@ class Watched:
     pitch_sd_rad: float
     focal_widths: float
     focal_sd: float
+    height_m: float
+    height_sd: float
 
     def at(self, i: int) -> Float32[np.ndarray, "5 h w"]:
         """Return the probabilities at the footage frame nearest to `i`."""
@@ -81,6 +84,8 @@ def watch(footage: Footage) -> Watched:
         pitch_sd_rad=seen.pitch_sd_rad,
         focal_widths=seen.focal_widths,
         focal_sd=seen.focal_sd,
+        height_m=seen.height_m,
+        height_sd=seen.height_sd,
     )
 
 
@@ -168,6 +173,7 @@ def _ends(
     words = colour_words(phrase)
     match = colour_match(balance(image), words) if words else None
     h, w = footage.shape
+    lab, gone = lab_of(image), lab_of(footage.late if i == 0 else footage.early)
     blobs: list[_Blob] = []
     for level in (_LIKELY, _POSSIBLE):
         count, parts, stats, _ = cv2.connectedComponentsWithStats(
@@ -188,11 +194,25 @@ def _ends(
                         "moved": float(moved[mask].mean()),
                         "size": float(1 - np.exp(-area / (0.002 * h * w))),
                         "colour": _named_by(match, mask),
-                        "edge": 0.75 if _cut(mask) else 1.0,
+                        "whole": 0.75 if _cut(mask) else 1.0,
+                        "vanishing": _vanishing(lab, gone, mask),
                     },
                 )
             )
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
+
+
+def _vanishing(
+    lab: Float32[np.ndarray, "h w 3"],
+    gone: Float32[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+) -> float:
+    """Return whether the mask's outline is an edge here and none once the thing is gone: 0.2 to 1.
+
+    Both where a thing was and where it goes the picture changes; only where it is there is an edge.
+    """
+    here, after = edge_contrast(lab, mask), edge_contrast(gone, mask)
+    return float(np.clip(0.6 + 0.6 * (here - after) / (here + after + 4), 0.2, 1))
 
 
 def _pair_parts(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[str, float]:

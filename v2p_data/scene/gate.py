@@ -9,12 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.scene.colour import balance, colour_match, named_colours
 from v2p_data.scene.nouns import is_clear
 from v2p_data.scene.placement import Placement, vote_of
 from v2p_data.scene.scale import disagreement, height_plausibility
 from v2p_data.scene.segment import grow
 from v2p_data.scene.sight import Sights, stands_on
 
+_COLOURED = 0.25
+"""Share of a thing's pixels that need its colour: few things are one colour all over."""
 _NEARING_KINDS = ("push_next_to", "slide_to", "drop_in_front_of", "push_with")
 _ENDING_AT_KINDS = ("insert", "throw_into", "place_onto", "cover")
 
@@ -39,6 +42,10 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
     for s, placed in zip(sights.objects, placement.objects, strict=True):
         which = f"'{s.phrase}'"
         add("grounding", f"finding {which}" + (f" ({s.why})" if s.why else ""), s.sure)
+        if not s.hinted and (words := named_colours(s.phrase)):
+            image = sights.footage.rgb[s.at]
+            match = float(colour_match(balance(image), words)[s.first].mean())
+            add("grounding", f"colour of {which}", 0.4 + 0.6 * match / _COLOURED)
         if s.moves:
             add("segmentation", f"track of {which} from start to end", 0.65 + 0.7 * s.meets)
         off = abs(disagreement(vote_of(s, placed.first), placement.height_m))

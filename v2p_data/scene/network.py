@@ -40,6 +40,10 @@ class Seen:
     """Focal length over picture width."""
     focal_sd: float
     """Standard deviation of its logarithm."""
+    height_m: float
+    """Of the camera over the table."""
+    height_sd: float
+    """Standard deviation of its logarithm."""
 
 
 def net_size(height_px: int, width_px: int) -> tuple[int, int]:
@@ -66,12 +70,12 @@ class SceneNetwork(nn.Module):
         self.dec2 = _pair(b + c, b)
         self.dec1 = _pair(a + b, a)
         self.head = nn.Sequential(nn.Conv2d(a, len(CLASSES) * 4, 3, padding=1), nn.PixelShuffle(2))
-        self.camera = nn.Sequential(nn.Linear(d + 1, 64), nn.ReLU(), nn.Linear(64, 4))
+        self.camera = nn.Sequential(nn.Linear(d + 1, 64), nn.ReLU(), nn.Linear(64, 6))
 
     def forward(
         self, x: Float[torch.Tensor, "n 15 h w"]
-    ) -> tuple[Float[torch.Tensor, "n 5 h w"], Float[torch.Tensor, "n 4"]]:
-        """Return class logits, and the camera as (pitch [rad], log focal over width, log sd of either)."""
+    ) -> tuple[Float[torch.Tensor, "n 5 h w"], Float[torch.Tensor, "n 6"]]:
+        """Return class logits, and the camera as (pitch [rad], log focal over width, log height [m], log sd of each)."""
         x1 = self.enc1(self.stem(x))
         x2 = self.enc2(F.max_pool2d(x1, 2))
         x3 = self.enc3(F.max_pool2d(x2, 2))
@@ -163,9 +167,11 @@ def look(
     return Seen(
         shares=full.astype(np.float32),
         pitch_rad=float(camera[0]),
-        pitch_sd_rad=float(np.exp(camera[2])),
+        pitch_sd_rad=float(np.exp(camera[3])),
         focal_widths=float(np.exp(camera[1])),
-        focal_sd=float(np.exp(camera[3])),
+        focal_sd=float(np.exp(camera[4])),
+        height_m=float(np.exp(camera[2])),
+        height_sd=float(np.exp(camera[5])),
     )
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from v2p_data.errors import V2PError
+from v2p_data.scene.scene import Symmetry
 
 Form = Literal["box", "cylinder", "sphere"]
 Matter = Literal["rigid", "soft", "clear"]
-Symmetry = Literal["none", "box", "round", "sphere"]
 SourceKind = Literal["standard", "YCB", "USDA", "retail", "estimate"]
 
 TABLE = Path(__file__).with_name("nouns.tsv")

@@ -17,6 +17,7 @@ from v2p_data.scene.footage import Footage
 from v2p_data.scene.pose import (
     Fit,
     Silhouette,
+    Within,
     camera_above,
     fit_lifted,
     fit_pose,
@@ -33,6 +34,8 @@ _INSIDE_KINDS = ("insert", "throw_into", "place_onto")
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 _SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
 _TURN_COST = 0.02
+_MOUTH_DOWN = np.diag([1.0, -1.0, -1.0])
+type _Rests = list[tuple[Float[np.ndarray, "3 3"], float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +61,8 @@ class Placed:
     last_i: int
     """Footage frame of the last pose."""
     last_mask: Bool[np.ndarray, "h w"]
+    hidden: Bool[np.ndarray, "h w"]
+    """Where something may stand in front of it at first."""
     frames: tuple[int, ...]
     """Footage frames with a pose, the first and the last among them."""
     T_world_objs: Float[np.ndarray, "pose 4 4"]
@@ -87,11 +92,12 @@ def place(
     """Return camera, shapes and poses such that all outlines fit their masks, the manipulated object's at both ends."""
     thing = objects[0]
     unknown = [
-        _hidden(footage, s.at, s.first, s.last) if s.moves else _hidden(footage, s.at, s.first)
+        _hidden(footage, s.at, s.first, s.last if s.moves else None) | _others(objects, s, s.at)
         for s in objects
     ]
     shape = footage.shape
-    pitch_rad, firsts = _best_pitch(shape, objects, unknown, guess)
+    rests = [_rests(s, kind if s is thing else "generic") for s in objects]
+    pitch_rad, firsts = _best_pitch(shape, objects, unknown, rests, guess)
     camera = camera_above(shape, pitch_rad, guess.fov_rad)
     ends = [_end_of(s, kind) for s in objects]
     upright_cost, lasts = 0.0, list(firsts)
@@ -99,12 +105,13 @@ def place(
         if not s.moves:
             continue
         last_i, last_mask = ends[k]
-        silhouette = Silhouette(last_mask, _hidden(footage, last_i, last_mask, s.first), camera)
+        hidden = _hidden(footage, last_i, last_mask, s.first) | _others(objects, s, last_i)
+        silhouette = Silhouette(last_mask, hidden, camera)
         # One outline often fits a standing and a lying box alike; both ends together seldom do.
-        options = _options(s, unknown[k], camera, thorough=True, all_rests=True)
-        role = kind if s is thing else "generic"
-        held_by = _support(kind, objects, firsts) if s is thing else 0.0
-        found = [_fit_last(silhouette, s, role, first, held_by) for first in options]
+        options = _options(s, unknown[k], camera, rests[k], thorough=True)
+        role = kind if s is thing else "push_with"
+        support, within = _goal(kind, objects, firsts) if s is thing else (0.0, None)
+        found = [_fit_last(silhouette, s, role, first, support, within) for first in options]
         best = min(range(len(options)), key=lambda i: options[i].cost + found[i][0].cost)
         firsts[k], (lasts[k], cost) = options[best], found[best]
         upright_cost = cost if s is thing else upright_cost
@@ -126,6 +133,7 @@ def place(
                 last=lasts[k],
                 last_i=last_i,
                 last_mask=last_mask,
+                hidden=unknown[k],
                 frames=tuple(course.frames),
                 T_world_objs=np.stack(course.poses),
                 confidences=tuple(course.sure),
@@ -146,6 +154,7 @@ def _best_pitch(
     shape: tuple[int, int],
     objects: tuple[Sighting, ...],
     unknown: list[Bool[np.ndarray, "h w"]],
+    rests: list[_Rests],
     guess: CameraGuess,
 ) -> tuple[float, list[Fit]]:
     """Try pitches around the guess; the silhouettes decide, as far as the guess lets them."""
@@ -156,7 +165,13 @@ def _best_pitch(
         camera = camera_above(shape, pitch, guess.fov_rad)
         return [
             min(
-                _options(s, unknown[k], camera, thorough=thorough, all_rests=thorough or k == 0),
+                _options(
+                    s,
+                    unknown[k],
+                    camera,
+                    rests[k][: None if thorough or k == 0 else 1],
+                    thorough=thorough,
+                ),
                 key=lambda fit: fit.cost,
             )
             for k, s in enumerate(objects)
@@ -179,22 +194,31 @@ def _best_pitch(
     return best[1], fits_at(best[1], thorough=len(objects) > 1)
 
 
+def _rests(s: Sighting, kind: str) -> _Rests:
+    """Return the ways an object may rest at first, each with what it costs: a cover lies with its mouth down."""
+    if s.noun.hollow and kind == "uncover":
+        return [(_MOUTH_DOWN, 0.0)]
+    if s.noun.hollow and kind == "cover":
+        return [(_MOUTH_DOWN, 0.0), (np.eye(3), 0.03)]
+    return orientations(s.noun)
+
+
 def _options(
     s: Sighting,
     unknown: Bool[np.ndarray, "h w"],
     camera: Camera,
+    rests: _Rests,
     *,
     thorough: bool,
-    all_rests: bool,
 ) -> list[Fit]:
     """Return the best fit for every way in which the object may rest."""
     silhouette = Silhouette(s.first, unknown, camera)
-    rests = orientations(s.noun)
     fits = []
-    for rest, extra in rests if all_rests else rests[:1]:
+    for rest, extra in rests:
         fit = fit_shape(silhouette, s.noun, rest, thorough=thorough)
         fit = replace(fit, cost=fit.cost + extra)
-        fits.append(_upright_axes(fit) if s.noun.form == "box" else fit)
+        upright = s.noun.form == "box" and rest is not _MOUTH_DOWN
+        fits.append(_upright_axes(fit) if upright else fit)
     return fits
 
 
@@ -207,7 +231,12 @@ def _end_of(s: Sighting, kind: str) -> tuple[int, Bool[np.ndarray, "h w"]]:
 
 
 def _fit_last(
-    silhouette: Silhouette, s: Sighting, kind: str, first: Fit, support: float
+    silhouette: Silhouette,
+    s: Sighting,
+    kind: str,
+    first: Fit,
+    support: float,
+    within: Within | None,
 ) -> tuple[Fit, float]:
     """Return an object's pose at the end, and what standing as at first would have cost."""
     noun = s.noun
@@ -215,7 +244,14 @@ def _fit_last(
         return fit_lifted(silhouette, noun, first.size, first.T_world_obj), 0.0
     rest = _rest_of(first.T_world_obj[:3, :3])
     yaw = _yaw_between(first.T_world_obj[:3, :3], rest)
-    same = fit_pose(silhouette, noun, first.size, rest, yaw_near=yaw, support=support)
+    if kind == "cover" and noun.hollow:
+        rest = _MOUTH_DOWN
+    same = fit_pose(
+        silhouette, noun, first.size, rest, yaw_near=yaw, support=support, within=within
+    )
+    if kind == "uncover" and noun.hollow:  # put down either way
+        upright = fit_pose(silhouette, noun, first.size, np.eye(3), yaw_near=yaw)
+        same = upright if upright.cost + 0.03 < same.cost else same
     if kind in _CARRY_KINDS:
         held = fit_lifted(silhouette, noun, first.size, first.T_world_obj)
         if held.cost + 0.1 < same.cost:  # the clip ends before it is put down
@@ -230,14 +266,22 @@ def _fit_last(
     return min(turned, key=lambda fit: fit.cost), same.cost
 
 
-def _support(kind: str, objects: tuple[Sighting, ...], fits: list[Fit]) -> float:
-    """Return how high above the table the manipulated object comes to rest [camera heights]."""
+def _goal(
+    kind: str, objects: tuple[Sighting, ...], fits: list[Fit]
+) -> tuple[float, Within | None]:
+    """Return how high above the table the manipulated object comes to rest, and over which disc [camera heights]."""
     if kind not in (*_INSIDE_KINDS, "cover") or len(objects) < 2:
-        return 0.0
-    other, height = objects[1].noun, fits[1].size[2]
+        return 0.0, None
+    thing, other = objects[0].noun, objects[1].noun
+    own, there = np.array(fits[0].size), np.array(fits[1].size)
+    reach = there[:2].max() / 2
     if kind == "cover":
-        return 0.0 if objects[0].noun.hollow else height
-    return 0.15 * height if other.hollow else height
+        room = max(0.2 * reach, (own[:2].max() - there[:2].max()) / 2)
+        support = 0.0 if thing.hollow else float(there[2])
+    else:
+        room = max(0.2 * reach, reach - own.min() / 2)
+        support = 0.15 * float(there[2]) if other.hollow else float(there[2])
+    return support, Within(xy=fits[1].T_world_obj[:2, 3], radius=float(room))
 
 
 @dataclass
@@ -339,6 +383,12 @@ def _hidden(
     pad = max(4, int(0.3 * max(w, h)))
     near[max(0, y - pad) : y + h + pad, max(0, x - pad) : x + w + pad] = True
     return hidden & near
+
+
+def _others(objects: tuple[Sighting, ...], s: Sighting, i: int) -> Bool[np.ndarray, "h w"]:
+    """Return where other objects are seen at footage frame `i`: this one may go on behind them."""
+    shown = [other.masks[i] for other in objects if other is not s]
+    return np.any(shown, axis=0) & ~s.masks[i] if shown else np.zeros_like(s.first)
 
 
 def _upright_axes(fit: Fit) -> Fit:

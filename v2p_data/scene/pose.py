@@ -39,6 +39,14 @@ class Fit:
     """1 - IoU plus what the proportions cost: comparable between fits of one mask."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Within:
+    """A disc on the table over which an object's middle must be, in camera heights."""
+
+    xy: Float[np.ndarray, "2"]
+    radius: float
+
+
 def camera_above(
     shape: tuple[int, int], pitch_rad: float, fov_rad: float, height: float = 1.0
 ) -> Camera:
@@ -223,10 +231,11 @@ def fit_pose(
     *,
     yaw_near: float | None = None,
     support: float = 0.0,
+    within: Within | None = None,
 ) -> Fit:
     """Return where a shape of known size rests in orientation `rest`, `support` above the table.
 
-    `yaw_near` holds the yaw where the outline does not decide it.
+    `yaw_near` holds the yaw where the outline does not decide it; `within` holds the place.
     """
     extents = np.array(size)
     points0 = outline_points(noun.form, size, noun.taper)
@@ -239,10 +248,13 @@ def fit_pose(
 
     def cost(v: np.ndarray) -> float:
         T = place(v)
-        turn = 0.0
+        held = 0.0
         if yaw_near is not None:
-            turn = 0.01 * (1 - np.cos(2 * (v[2] - yaw_near)))
-        return 1 - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3], _HIDDEN_WEIGHT) + turn
+            held = 0.01 * (1 - np.cos(2 * (v[2] - yaw_near)))
+        if within is not None:
+            outside = float(np.linalg.norm(T[:2, 3] - within.xy)) - within.radius
+            held += max(0.0, outside) / max(within.radius, 0.5 * float(extents.max()))
+        return 1 - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3], _HIDDEN_WEIGHT) + held
 
     turns = _yaw_starts(noun, rest, thorough=True)
     if yaw_near is not None:
@@ -256,6 +268,9 @@ def fit_pose(
         _aligned(silhouette, np.array([0.0, 0.0, yaw]), outline, float(extents.max()))
         for yaw in turns
     ]
+    if within is not None:
+        there = (within.xy - ground) / extents.max()
+        starts += [np.array([*there, yaw]) for yaw in turns[:1]]
     best = _search(cost, starts, np.array([0.15, 0.15, 0.3]))
     T = place(best)
     points = points0 @ T[:3, :3].T + T[:3, 3]

@@ -25,16 +25,28 @@ from v2p_data.scene.backends.config import (
 )
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
 from v2p_data.scene.gate import by_stage, check_confidence, check_motion, cues_of
-from v2p_data.scene.learned import DETECTORS, camera_from_depth, detected, segmented
+from v2p_data.scene.learned import (
+    DETECTORS,
+    camera_from_depth,
+    detected,
+    mesh_by_worker,
+    poses_by_worker,
+    segmented,
+)
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.placement import CameraGuess, Placed, Placement, place
 from v2p_data.scene.scene import Observed, Role, Symmetry
+from v2p_data.scene.shape import View, best_shape
 from v2p_data.scene.sight import Sighting, Sights, sight
 from v2p_data.video.captions import parse_caption
 from v2p_data.video.clip import Clip
 
 log = logging.getLogger(__name__)
 
+_OVER = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Upside down, about x."""
+_LEAST_HEIGHT_SD = 0.2
+"""Of the logarithm of the camera's height: rooms and hands that the network never saw make it surer than it may be."""
 _LEAST_QUALITY = 0.4
 """Masks that are believed less are left out of an object's track."""
 
@@ -130,7 +142,7 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     """Return the scene that the clip shows.
 
     Raises:
-        ItemRejectedError: `camera_moves`, `nothing_moves`, `object_not_found`, `reference_not_found`,
+        ItemRejectedError: `camera_moves`, `nothing_moves`, `no_hand`, `object_not_found`, `reference_not_found`,
             `motion_contradicts_caption` or `low_confidence`, with the number that decided.
     """
     meaning = parse_caption(clip.caption, clip.objects)
@@ -148,7 +160,7 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     if cfg.depth.backend != "none":
         guess = camera_from_depth(clip, sights.footage, sights.objects, guess, cfg.depth, rng)
     placement = place(sights.footage, sights.objects, meaning.kind, guess, cfg.max_poses)
-    objects = _estimates(sights, placement)
+    objects = _estimates(clip, sights, placement, meaning.kind, cfg)
     if cfg.check_motion:
         poses = [thing.T_world_objs for thing in objects]
         check_motion(meaning.kind, sights, placement, poses, objects[0].size_m)
@@ -206,6 +218,8 @@ def _camera_guess(sights: Sights, cfg: SceneConfig) -> CameraGuess:
         pitch_rad=seen.pitch_rad,
         pitch_sd_rad=float(np.clip(seen.pitch_sd_rad, 0.05, cfg.pitch_spread_rad)),
         fov_rad=float(2 * np.arctan(0.5 / seen.focal_widths)),
+        height_m=seen.height_m,
+        height_sd=max(seen.height_sd, _LEAST_HEIGHT_SD),
     )
 
 
@@ -214,16 +228,42 @@ def _origin(placement: Placement) -> Float[np.ndarray, "3"]:
     return placement.objects[0].first.T_world_obj[:3, 3] * np.array([1, 1, 0])
 
 
-def _estimates(sights: Sights, placement: Placement) -> list[Estimate]:
+def _estimates(
+    clip: Clip, sights: Sights, placement: Placement, kind: str, cfg: SceneConfig
+) -> list[Estimate]:
     footage, origin, height = sights.footage, _origin(placement), placement.height_m
+    work = _metric(placement.camera, origin, height)
     taken: set[str] = set()
     out = []
     for s, placed in zip(sights.objects, placement.objects, strict=True):
         name = slug_for(s.phrase, taken)
         taken.add(name)
         length, width, tall = (float(v) * height for v in placed.first.size)
-        size = (length, width, tall)
-        poses = [transform(T[:3, :3], (T[:3, 3] - origin) * height) for T in placed.T_world_objs]
+        poses = np.stack(
+            [transform(T[:3, :3], (T[:3, 3] - origin) * height) for T in placed.T_world_objs]
+        )
+        frames, sure, observed = placed.frames, placed.confidences, placed.observed
+        shape = best_shape(
+            [View(mask=s.first, T_world_obj=poses[0], hidden=placed.hidden)],
+            work,
+            (length, width, tall),
+            s.noun,
+        )
+        size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
+        poses = poses @ shape.T_obj_shape
+        if s.noun.hollow and s.role in ("manipulated", "cover") and kind in ("cover", "uncover"):
+            # A cover's own frame has its mouth below, as it lies: so the simulator builds it.
+            poses = poses @ _OVER
+            mesh, parts = _turned(mesh), tuple(_turned(part) for part in parts)
+        if cfg.mesh.worker:
+            mesh = mesh_by_worker(clip, footage, s, size, cfg.mesh)
+            parts, how = (), "made by the mesh worker from one picture, scaled to the outline"
+            size = _size3(mesh.extents)
+        if cfg.pose.worker and s.moves:
+            camera = _clip_camera(clip, placement, origin)
+            poses, marks = poses_by_worker(clip, footage, s.masks, mesh, camera, cfg.pose)
+            frames, sure = tuple(range(len(poses))), tuple(float(c) for c in marks)
+            observed = ("full",) * len(poses)
         image = footage.rgb[s.at] if s.moves else footage.late if s.at else footage.early
         out.append(
             Estimate(
@@ -233,16 +273,30 @@ def _estimates(sights: Sights, placement: Placement) -> list[Estimate]:
                 noun=s.noun,
                 size_m=size,
                 rgba=_colour_in(image, s.first),
-                frames=tuple(int(footage.frame_idx[i]) for i in placed.frames),
-                T_world_objs=np.stack(poses),
-                confidences=tuple(round(c, 3) for c in placed.confidences),
+                frames=tuple(int(footage.frame_idx[i]) for i in frames),
+                T_world_objs=poses,
+                confidences=tuple(round(c, 3) for c in sure),
                 masks=_mask_track(footage, s, placed),
-                source=_sources(s),
+                source={**_sources(s), "shape": how},
                 mass_kg=_mass(s.noun, size),
-                observed=placed.observed,
+                mesh=mesh,
+                parts=parts,
+                symmetry=s.noun.symmetry,
+                observed=observed,
             )
         )
     return out
+
+
+def _turned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    return mesh.copy().apply_transform(_OVER)
+
+
+def _metric(camera: Camera, origin: Float[np.ndarray, "3"], height_m: float) -> Camera:
+    """Return a camera given in camera heights in the scene frame and metres."""
+    T = camera.T_world_cam.copy()
+    T[:3, 3] = (T[:3, 3] - origin) * height_m
+    return replace(camera, T_world_cam=T)
 
 
 def _mask_track(
@@ -277,12 +331,10 @@ def _remarks(kind: str, sights: Sights, placement: Placement, num_frames: int) -
 
 
 def _clip_camera(clip: Clip, placement: Placement, origin: Float[np.ndarray, "3"]) -> Camera:
-    work = placement.camera
+    work = _metric(placement.camera, origin, placement.height_m)
     h, w = clip.frames.shape[1:3]
     K = np.diag([w / work.width_px, h / work.height_px, 1.0]) @ work.K
-    T = work.T_world_cam.copy()
-    T[:3, 3] = (T[:3, 3] - origin) * placement.height_m
-    return Camera(width_px=w, height_px=h, K=K, T_world_cam=T)
+    return replace(work, width_px=w, height_px=h, K=K)
 
 
 def _colour_in(
@@ -301,3 +353,8 @@ def _sources(s: Sighting) -> dict[str, str]:
 def _mass(noun: Noun, size: tuple[float, float, float]) -> float:
     ratio = float(np.prod(size) / np.prod(noun.size_m))
     return round(noun.mass_kg * float(np.clip(ratio, 0.4, 2.5)), 4)
+
+
+def _size3(extents: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in extents)
+    return x, y, z

@@ -33,6 +33,8 @@ from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
 
 _HINTED_SURE = 0.97
+_LEAST_HAND = 0.002
+"""Share of the picture that a hand covers when it is seen best."""
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
 """What the caption says of other objects is an aside here: such a scene makes sense without them."""
 
@@ -118,10 +120,11 @@ def sight(
     `boxes` are what a detector says, by phrase; a user's hint for the phrase goes before it.
 
     Raises:
-        ItemRejectedError: `object_not_found` or `reference_not_found`, with how sure the best finding was.
+        ItemRejectedError: `no_hand`, `object_not_found` or `reference_not_found`, with the number that decided.
     """
     watched = watch(footage) if ground.backend == "network" else None
     if watched is not None:
+        _check_hand(clip, watched)
         footage = _knowing_hand(footage, watched)
     table = find_table(footage.always, table_seen(watched) if watched else None)
     marked = _marked(clip, footage, watched, boxes or {})
@@ -224,6 +227,17 @@ def _sighting(clip: Clip, phrase: str, role: Role) -> Sighting:
         sure=0.0,
         why="",
     )
+
+
+def _check_hand(clip: Clip, watched: Watched) -> None:
+    most = float((watched.shares[:, HAND] > 0.5).mean((1, 2)).max())
+    if most < _LEAST_HAND:
+        raise ItemRejectedError(
+            "no_hand",
+            f"no hand is seen in {clip.item}: it covers {most:.2%} of the picture at most; what moves by itself shows no "
+            "manipulation",
+            round(most, 5),
+        )
 
 
 def _knowing_hand(footage: Footage, watched: Watched) -> Footage:
