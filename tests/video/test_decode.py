@@ -274,6 +274,7 @@ def test_hints_follow_scaling_and_sampling(film):
             "box": [80.0, 40.0, 160.0, 120.0],
             "points": [[400.0, 200.0]],
             "size_m": [0.1, 0.1, 0.1],
+            "name": "matchbox",
         }
     }
 
@@ -284,7 +285,27 @@ def test_hints_follow_scaling_and_sampling(film):
         "box": [40.0, 20.0, 80.0, 60.0],
         "points": [[200.0, 100.0]],
         "size_m": [0.1, 0.1, 0.1],
+        "name": "matchbox",
     }
+
+
+@pytest.mark.parametrize(
+    ("hint", "said"),
+    [
+        ({"frame": 0, "box": [600.0, 40.0, 900.0, 120.0]}, "which is 800 x 400 px"),
+        ({"frame": 0, "points": [[10.0, 401.0]]}, "lies outside of the picture"),
+        ({"frame": 40, "box": [80.0, 40.0, 160.0, 120.0]}, "the video's frames are 0 to 39"),
+    ],
+    ids=["box", "point", "frame"],
+)
+def test_a_mark_that_the_video_does_not_have_is_a_bad_hint(film, hint, said):
+    path = film("large.mkv", squares(40, height=400, width=800), codec="ffv1", pix_fmt="yuv444p")
+    marked = item(path, hints={"red box": hint})
+
+    with pytest.raises(ItemRejectedError, match=f"large.mkv, hint 'red box': .*{said}") as error:
+        read_clip(marked, VideoConfig(max_side_px=400, max_frames=20))
+
+    assert error.value.reason == "bad_hint"
 
 
 def test_text_named_mp4_is_unreadable(tmp_path, capfd):

@@ -22,8 +22,8 @@ from av.video.reformatter import Colorspace
 from av.video.stream import VideoStream
 from jaxtyping import Int, UInt8
 
-from v2p_data.errors import ItemRejectedError
-from v2p_data.video.captions import VideoItem
+from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.video.captions import VideoItem, check_hints
 from v2p_data.video.clip import Clip, Hint
 
 log = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
 
     Raises:
         ItemRejectedError: `unreadable`, `truncated`, `no_video_stream`, `too_few_frames`, `too_small`,
-            `too_large`, `too_long` or `too_slow`.
+            `too_large`, `too_long` or `too_slow`; `bad_hint` where a hint marks what the video does not have.
     """
     film = _decode(item.path, cfg)
     total = film.seen
@@ -112,6 +112,10 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
             f"{name} holds pictures that cannot be shown: {len(film.numbers)} of {total} can",
             float(len(film.numbers)),
         )
+    try:
+        check_hints(item.hints, film.shown_px, total, name)
+    except V2PError as error:
+        raise ItemRejectedError("bad_hint", str(error)) from error
     for warning in warnings:
         log.warning("%s", warning)
 
@@ -393,6 +397,8 @@ def _hints_in_clip(
             there["points"] = [[x * sx, y * sy] for x, y in hint["points"]]
         if "size_m" in hint:
             there["size_m"] = hint["size_m"]
+        if "name" in hint:
+            there["name"] = hint["name"]
         moved[name] = there
     return moved
 
