@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 import trimesh
 from mujoco.batch import Batch
 
+from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
 from v2p_data.sim import convex, randomize
@@ -20,6 +22,8 @@ from v2p_data.sim.world import CAMERA, MESH_SCALES, build_world
 SIZE = (0.08, 0.08, 0.04)
 NOTCH = np.array([0.02, 0.02, 0.0])
 """Inside the hull of the angle, outside the angle."""
+LEGS = [((0.08, 0.02, 0.04), (0.0, -0.03)), ((0.02, 0.06, 0.04), (-0.03, 0.01))]
+"""The angle as two boxes: size, and centre in x and y, about the centre of its bounding box."""
 
 
 @pytest.fixture(autouse=True)
@@ -70,15 +74,59 @@ def test_a_concave_mesh_becomes_parts_that_leave_its_notch_free(angle_file: Path
     np.testing.assert_allclose(np.ptp(solids.hull, axis=0), SIZE, rtol=1e-6)
 
 
+@pytest.fixture
+def leg_files(tmp_path: Path) -> list[Path]:
+    """The angle's two legs where they are in its file, which is four times smaller and begins at the origin."""
+    files = [tmp_path / f"leg_{k}.obj" for k in range(len(LEGS))]
+    for file, (size, centre) in zip(files, LEGS, strict=True):
+        leg = trimesh.creation.box(np.array(size) / 4)
+        leg.apply_translation((np.array([*centre, 0.0]) + np.array(SIZE) / 2) / 4)
+        leg.export(file)
+    return files
+
+
+def test_a_scene_that_brings_parts_along_is_built_of_them_and_nothing_is_split(
+    angle_scene: Scene, leg_files: list[Path]
+):
+    angle = replace(angle_scene.objects[0], parts=tuple(f.name for f in leg_files))
+
+    world = build_world(replace(angle_scene, objects=(angle,)), COARSE)
+
+    assert not cache_folder().exists()  # where parts that were found by splitting would lie
+    obj, model = world.objects[0], world.model
+    np.testing.assert_allclose(np.ptp(obj.hull, axis=0), SIZE, rtol=1e-6)
+    assert len(obj.geom_ids) == len(LEGS)
+    for geom, (size, centre) in zip(obj.geom_ids, LEGS, strict=True):
+        np.testing.assert_allclose(model.geom_pos[geom], [*centre, 0.0], atol=1e-6)
+        np.testing.assert_allclose(
+            np.sort(2 * model.geom_aabb[geom, 3:]), np.sort(size), atol=1e-6
+        )
+
+
+def test_one_part_of_a_concave_mesh_is_its_hull_and_does_not_save_it_the_splitting(
+    angle_file: Path, tmp_path: Path
+):
+    hull = tmp_path / "hull.obj"
+    trimesh.load_mesh(angle_file).convex_hull.export(hull)
+
+    assert len(solids_of(angle_file, "angle", SIZE, ready=[hull]).parts) >= 2
+
+
+def test_a_part_that_is_not_there_is_named(angle_file: Path, leg_files: list[Path]):
+    leg_files[1].unlink()
+
+    with pytest.raises(ItemRejectedError, match=r"mesh of 'angle' is missing: .*leg_1\.obj"):
+        solids_of(angle_file, "angle", SIZE, ready=leg_files)
+
+
 def test_a_split_mesh_has_the_inertia_of_the_mesh(angle_scene: Scene):
-    # Two boxes: 8 x 2 x 4 cm, and 2 x 6 x 4 cm on its end; by hand, about the common centre of mass.
-    boxes = [((0.08, 0.02, 0.04), (0.0, -0.03)), ((0.02, 0.06, 0.04), (-0.03, 0.01))]
-    mass = np.array([np.prod(size) for size, _ in boxes])
+    # By hand, about the two legs' common centre of mass.
+    mass = np.array([np.prod(size) for size, _ in LEGS])
     mass *= 0.12 / mass.sum()
-    com = mass @ np.array([c for _, c in boxes]) / 0.12
+    com = mass @ np.array([c for _, c in LEGS]) / 0.12
     around_z = sum(
         m * ((s[0] ** 2 + s[1] ** 2) / 12 + ((np.array(c) - com) ** 2).sum())
-        for m, (s, c) in zip(mass, boxes, strict=True)
+        for m, (s, c) in zip(mass, LEGS, strict=True)
     )
 
     body = build_world(angle_scene, COARSE).model.body("angle")

@@ -1,10 +1,12 @@
 """An object's mesh file becomes convex solids: read, mended, brought to size, split where it is concave.
 
-MuJoCo collides convex shapes only. What is nearly convex becomes one hull; a concave mesh becomes a few parts
-(`convex`), which are found once and then lie in a cache. A mesh that cannot be mended is refused in one sentence.
+MuJoCo collides convex shapes only. What is nearly convex becomes one hull; a concave mesh becomes a few parts: those that
+its scene brings along, else some that are found once (`convex`) and then lie in a cache. A mesh that cannot be mended is
+refused in one sentence.
 """
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,7 +51,12 @@ class Solids:
 
 
 def solids_of(
-    path: Path, name: str, size_m: tuple[float, float, float], cfg: ConvexConfig | None = None
+    path: Path,
+    name: str,
+    size_m: tuple[float, float, float],
+    cfg: ConvexConfig | None = None,
+    *,
+    ready: Sequence[Path] = (),
 ) -> Solids:
     """Return the mesh in `path` as convex solids that fill a box of `size_m` about the origin.
 
@@ -58,6 +65,8 @@ def solids_of(
         name: of the object, for messages.
         size_m: full extents.
         cfg: how concave meshes are split.
+        ready: mesh files of convex parts in the mesh's frame that together are the mesh. They save a concave mesh the
+            splitting; a single one can only be its hull and does not.
 
     Raises:
         ItemRejectedError: there is no such file, or no solid in it.
@@ -72,7 +81,10 @@ def solids_of(
     if _is_closed(mesh, path, name):
         ratio = trimesh.convex.convex_hull(outer).volume / _volume(mesh)
         if ratio > cfg.concave_above:
-            parts = convex_parts(path, *_thinned(mesh), cfg, name)
+            if len(ready) > 1:
+                parts = [np.asarray(read_mesh(file, name).vertices, float) for file in ready]
+            else:
+                parts = convex_parts(path, *_thinned(mesh), cfg, name)
             found = [_hull(p, cfg.part_vertices) for p in parts] or found
     parts = _brought_to_size(found, size_m)
     if len(parts) == 1:

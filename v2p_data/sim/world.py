@@ -310,7 +310,8 @@ def _draft(obj: SceneObject, scene: Scene, opening_m: float) -> _Draft:
         com, inertia = _mass_properties(parts, obj.mass_kg)
     elif obj.shape == "mesh":
         kind = "mesh"
-        solids = solids_of(scene.folder / obj.mesh, obj.name, thick)
+        ready = [scene.folder / part for part in obj.parts]
+        solids = solids_of(scene.folder / obj.mesh, obj.name, thick, ready=ready)
         parts = [
             Part(kind="mesh", half_size=_half(np.ptp(p.vertices, axis=0))) for p in solids.parts
         ]
