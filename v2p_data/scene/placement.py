@@ -34,6 +34,8 @@ _INSIDE_KINDS = ("insert", "throw_into", "place_onto")
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 _SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
 _TURN_COST = 0.02
+_PITCH_RANGE_RAD = (0.15, 1.4)
+"""From nearly level to nearly straight down: beyond, outlines on the table say nothing of places on it."""
 _MOUTH_DOWN = np.diag([1.0, -1.0, -1.0])
 type _Rests = list[tuple[Float[np.ndarray, "3 3"], float]]
 
@@ -181,8 +183,8 @@ def _best_pitch(
     for offsets in ((-1.8 * sd, -0.9 * sd, 0.0, 0.9 * sd, 1.8 * sd), (-0.4 * sd, 0.4 * sd)):
         centre = guess.pitch_rad if best is None else best[1]
         for offset in offsets:
-            pitch = centre + offset
-            if not 0.15 < pitch < 1.4 or any(abs(pitch - other) < 0.01 for other in tried):
+            pitch = float(np.clip(centre + offset, *_PITCH_RANGE_RAD))
+            if any(abs(pitch - other) < 0.01 for other in tried):
                 continue
             tried.append(pitch)
             fits = fits_at(pitch, thorough=False)
