@@ -1,4 +1,4 @@
-"""Judge the reconstruction of real clips against boxes that a person drew: the table of `docs/real_clips.md`.
+"""Judge the reconstruction of real clips against boxes that a person drew: the table of `docs/reconstruction.md`.
 
 Each clip is decoded and rebuilt as `v2p scene` does it, without hints, or with `--boxes` with one box per object.
 A clip is right when every outline's box overlaps the drawn one by half or more (intersection over union), at the

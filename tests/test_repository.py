@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from v2p_data.cli import COMMANDS
+from v2p_data.cli import COMMANDS, SUBCOMMANDS
 
 ROOT = Path(__file__).parents[1]
 LARGEST = 5_000_000
@@ -20,8 +20,8 @@ def tracked_files() -> list[Path]:
     return [ROOT / name for name in listed.stdout.decode().split("\0") if name]
 
 
-def readme_commands() -> list[str]:
-    blocks = re.findall(r"```(?:bash|sh)\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+def shown_commands(page: str) -> list[str]:
+    blocks = re.findall(r"```(?:bash|sh)\n(.*?)```", (ROOT / page).read_text(), re.S)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
     return [line.split("#")[0].strip() for line in lines if line.split("#")[0].strip()]
 
@@ -36,28 +36,42 @@ def test_no_text_names_a_package_index_or_a_machine_of_ours():
 
 
 def test_the_readme_shows_its_two_commands():
-    assert {"make demo", "make test"} <= set(readme_commands())
+    assert {"make demo", "make test"} <= set(shown_commands("README.md"))
 
 
 def test_every_v2p_command_in_the_readme_exists():
-    ours = [shlex.split(line) for line in readme_commands() if line.startswith("v2p ")]
+    ours = [shlex.split(line) for line in shown_commands("README.md") if line.startswith("v2p ")]
 
     assert ours
     assert {words[1] for words in ours} <= set(COMMANDS)
 
 
 @pytest.mark.slow
-def test_every_v2p_command_in_the_readme_parses(tmp_path):
+@pytest.mark.parametrize(
+    "page", ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
+)
+def test_every_v2p_command_in_readme_and_docs_parses(page):
     from v2p_data.cli import parse
-    from v2p_data.commands import run, share, show
+    from v2p_data.commands import review, run, share, show
 
     kinds = {
         "generate": run.Generate, "train": run.Train, "eval": run.Evaluate, "demo": run.Demo,
         "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
         "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify,
-        "status": show.Shown, "report": show.Shown,
+        "status": show.Shown, "report": show.Shown, "scene review": review.Review,
     }  # fmt: skip
-    assert set(kinds) == set(COMMANDS)
-    for words in map(shlex.split, readme_commands()):
+    assert set(kinds) == {*COMMANDS, *SUBCOMMANDS}
+    for words in map(shlex.split, shown_commands(page)):
         if words[0] == "v2p":
-            parse(kinds[words[1]], words[2:], words[1])
+            name = " ".join(words[1:3]) if " ".join(words[1:3]) in SUBCOMMANDS else words[1]
+            parse(kinds[name], words[1 + len(name.split()) :], name)
+
+
+def test_links_between_our_pages_lead_somewhere():
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        text = page.read_text()
+        links = re.findall(r"\]\(([^)#:]+)\)", text)
+        named = re.findall(r"`((?:docs|scripts|configs)/[\w./]+\.\w+)`", text)
+
+        missing = [link for link in links if not (page.parent / link).exists()]
+        assert missing + [path for path in named if not (ROOT / path).exists()] == [], page.name
