@@ -248,7 +248,8 @@ def _moved(
         **how,
         "no rival": float(1 / (1 + (max(rivals, default=0.0) / max(own, 1e-6)) ** 2)),
     }
-    return Moved(first=a.mask, last=b.mask, score=own, look=a.hist, cues=cues)
+    score = float(np.prod(list(cues.values())))
+    return Moved(first=a.mask, last=b.mask, score=score, look=a.hist, cues=cues)
 
 
 def _held(footage: Footage, watched: Watched, hist: np.ndarray) -> float:

@@ -50,7 +50,7 @@ class Moved:
     first: Bool[np.ndarray, "h w"]
     last: Bool[np.ndarray, "h w"]
     score: float
-    """Sum of the cues; above about 4.5 it was nearly always right."""
+    """Sum of the cues, where above about 4.5 it was nearly always right; with the network their product."""
     look: Float[np.ndarray, "l a b"] = field(repr=False)
     """Colour histogram of the object."""
     cues: dict[str, float] = field(default_factory=dict)

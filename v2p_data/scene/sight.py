@@ -315,7 +315,7 @@ def _sureness(moved: Moved, watched: Watched | None, mark: _Marked | None) -> tu
     if watched is None or "no rival" not in moved.cues:
         return _rise(moved.score, 3.6, 0.8), f"its cues add up to {moved.score:.1f}"
     weakest = min(moved.cues, key=lambda cue: moved.cues[cue])
-    sure = float(np.prod(list(moved.cues.values())) ** 0.5)
+    sure = moved.score**0.5
     return sure, f"weakest is '{weakest}' with {moved.cues[weakest]:.2f}"
 
 

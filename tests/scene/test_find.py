@@ -1,0 +1,142 @@
+"""The network's word is drawn by hand here: what is made of it must not depend on how well it was trained."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.find import Watched, find_movers, things_standing
+from v2p_data.scene.footage import footage_of
+from v2p_data.video.clip import Clip
+
+H, W = 90, 120
+TABLE_RGB, RED, BLUE = (150, 140, 120), (190, 40, 40), (40, 60, 190)
+
+
+def square(x, y, size=14):
+    mask = np.zeros((H, W), bool)
+    mask[y : y + size, x : x + size] = True
+    return mask
+
+
+def scene(parts_by_frame):
+    """Return a clip whose frames show coloured masks on a table, with the class of every pixel.
+
+    `parts_by_frame` holds per frame `(mask, colour, class)` tuples, drawn in order.
+    """
+    frames, shares = [], []
+    for parts in parts_by_frame:
+        image = np.full((H, W, 3), TABLE_RGB, np.uint8)
+        label = np.full((H, W), TABLE)
+        for mask, colour, what in parts:
+            image[mask], label[mask] = colour, what
+        frames.append(image)
+        shares.append(0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None]))
+    return np.stack(frames), np.stack(shares).astype(np.float32)
+
+
+def watched_of(parts_by_frame):
+    frames, shares = scene(parts_by_frame)
+    clip = Clip(
+        item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=frames, fps=12.0,
+        total_frames=len(frames), source_fps=12.0, source_frame=np.arange(len(frames)),
+        times_s=np.arange(len(frames)) / 12, source_size_px=(W, H), warnings=(),
+    )  # fmt: skip
+    footage = footage_of(clip)
+    h, w = footage.shape
+    rows, columns = (np.arange(h) * H) // h, (np.arange(w) * W) // w
+    large = shares[:, :, rows][..., columns]
+    return footage, Watched(
+        idx=np.arange(len(frames)), shares=large, early=large[0], late=large[-1], pitch_rad=0.6,
+        pitch_sd_rad=0.1, focal_widths=0.9, focal_sd=0.2, height_m=0.5, height_sd=0.3,
+    )  # fmt: skip
+
+
+def pushed(colour_a, colour_b):
+    """Two squares move from left to right, `a` above `b`."""
+    frames = []
+    for i in range(12):
+        shift = 3 * i
+        frames.append(
+            [(square(15 + shift, 20), colour_a, MOVED), (square(15 + shift, 60), colour_b, MOVED)]
+        )
+    return frames
+
+
+def iou(mask, truth):
+    rows, columns = (
+        (np.arange(mask.shape[0]) * H) // mask.shape[0],
+        (np.arange(mask.shape[1]) * W) // mask.shape[1],
+    )
+    truth = truth[rows][:, columns]
+    return (mask & truth).sum() / (mask | truth).sum()
+
+
+@pytest.mark.parametrize(("phrase", "y"), [("red box", 20), ("blue box", 60)])
+def test_of_two_things_that_move_the_one_of_the_named_colour_is_taken(phrase, y):
+    footage, watched = watched_of(pushed(RED, BLUE))
+
+    found, _ = find_movers(footage, watched, phrase, "push_right")
+
+    assert iou(found.first, square(15, y)) > 0.8
+    assert iou(found.last, square(48, y)) > 0.8
+
+
+def test_a_rival_makes_the_finding_less_sure():
+    footage, watched = watched_of(pushed(RED, BLUE))
+    alone, seen = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
+
+    between_two, _ = find_movers(footage, watched, "box", "push_right")
+    only_one, _ = find_movers(alone, seen, "box", "push_right")
+
+    assert between_two.cues["no rival"] < 0.7 < only_one.cues["no rival"]
+    assert between_two.score < only_one.score
+
+
+def test_the_wrong_direction_makes_the_finding_less_sure():
+    footage, watched = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
+
+    right, _ = find_movers(footage, watched, "red box", "push_right")
+    left, _ = find_movers(footage, watched, "red box", "push_left")
+
+    assert left.score < 0.3 * right.score
+
+
+def test_the_tool_is_what_the_hand_holds():
+    frames = pushed(RED, BLUE)
+    for i, parts in enumerate(frames):
+        if 2 < i < 10:
+            parts.append((square(15 + 3 * i - 8, 58, 8), (200, 150, 120), HAND))
+            parts.append((square(15 + 3 * i - 8, 66, 20), (200, 150, 120), HAND))
+    footage, watched = watched_of(frames)
+
+    thing, tool = find_movers(footage, watched, "box", "push_with", "stick")
+
+    assert iou(thing.first, square(15, 20)) > 0.8
+    assert iou(tool.first, square(15, 60)) > 0.8
+
+
+def test_nothing_that_moved_is_nothing_found():
+    footage, watched = watched_of([[(square(40, 40), RED, OTHER)] for _ in range(12)])
+
+    assert find_movers(footage, watched, "red box", "push_right") is None
+
+
+def test_a_mask_given_by_hand_is_taken_as_it_is():
+    footage, watched = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
+    given = np.zeros(footage.shape, bool)
+    given[60:100, 50:90] = True
+
+    found, _ = find_movers(footage, watched, "box", "push_right", first=given)
+
+    np.testing.assert_array_equal(found.first, given)
+
+
+def test_what_stands_is_apart_from_table_and_wall():
+    parts = [(square(0, 0, 30), (90, 90, 90), BACKGROUND), (square(60, 50), RED, OTHER)]
+    _, watched = watched_of([parts for _ in range(12)])
+
+    masks = things_standing(watched, late=False)
+
+    assert all(iou(mask, square(60, 50)) > 0.8 for mask in masks)
