@@ -70,6 +70,8 @@ class Placed:
     T_world_objs: Float[np.ndarray, "pose 4 4"]
     confidences: tuple[float, ...]
     observed: tuple[Observed, ...]
+    rival: float | None
+    """By how much the next best way of lying covers the outlines worse; None where there is no other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +105,7 @@ def place(
     camera = camera_above(shape, pitch_rad, guess.fov_rad)
     ends = [_end_of(s, kind) for s in objects]
     upright_cost, lasts = 0.0, list(firsts)
+    rivals: list[float | None] = [None] * len(objects)
     for k, s in enumerate(objects):
         if not s.moves:
             continue
@@ -114,7 +117,10 @@ def place(
         role = kind if s is thing else "push_with"
         support, within = _goal(kind, objects, firsts) if s is thing else (0.0, None)
         found = [_fit_last(silhouette, s, role, first, support, within) for first in options]
-        best = min(range(len(options)), key=lambda i: options[i].cost + found[i][0].cost)
+        costs = [a.cost + b.cost for a, (b, _) in zip(options, found, strict=True)]
+        best = int(np.argmin(costs))
+        if len(costs) > 1:
+            rivals[k] = float(np.partition(costs, 1)[1] - min(costs))
         firsts[k], (lasts[k], cost) = options[best], found[best]
         upright_cost = cost if s is thing else upright_cost
     height_m, spread = camera_height_m(
@@ -140,6 +146,7 @@ def place(
                 T_world_objs=np.stack(course.poses),
                 confidences=tuple(course.sure),
                 observed=tuple(course.observed),
+                rival=rivals[k],
             )
         )
     return Placement(

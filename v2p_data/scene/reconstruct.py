@@ -43,6 +43,8 @@ from v2p_data.video.clip import Clip
 
 log = logging.getLogger(__name__)
 
+_CLOSE_RIVAL = 0.02
+"""In units of IoU: below, which face of a box is down was as good as drawn by lot."""
 _OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 """Upside down, about x."""
 _LEAST_HEIGHT_SD = 0.2
@@ -250,6 +252,9 @@ def _estimates(
             s.noun,
         )
         size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
+        if s.known_m:  # the user's word on the size outranks the outline's
+            size = (length, width, tall)
+            mesh, parts = _stretched(size, mesh, *parts)
         poses = poses @ shape.T_obj_shape
         if s.noun.hollow and s.role in ("manipulated", "cover") and kind in ("cover", "uncover"):
             # A cover's own frame has its mouth below, as it lies: so the simulator builds it.
@@ -288,6 +293,15 @@ def _estimates(
     return out
 
 
+def _stretched(
+    size_m: tuple[float, float, float], mesh: trimesh.Trimesh, *parts: trimesh.Trimesh
+) -> tuple[trimesh.Trimesh, tuple[trimesh.Trimesh, ...]]:
+    """Return a mesh brought to these extents, and its parts with it."""
+    T = np.diag([*(np.array(size_m) / mesh.extents), 1.0])
+    first, *rest = (solid.copy().apply_transform(T) for solid in (mesh, *parts))
+    return first, tuple(rest)
+
+
 def _turned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh.copy().apply_transform(_OVER)
 
@@ -321,6 +335,11 @@ def _remarks(kind: str, sights: Sights, placement: Placement, num_frames: int) -
         f"'{s.phrase}' is no known noun; its size is a guess"
         for s in sights.objects
         if not s.noun.known
+    ]
+    out += [
+        f"outlines hardly tell how '{s.phrase}' lies: the next best way covers them {placed.rival:.3f} worse"
+        for s, placed in zip(sights.objects, placement.objects, strict=True)
+        if placed.rival is not None and placed.rival < _CLOSE_RIVAL
     ]
     last_frame = int(sights.footage.frame_idx[placement.objects[0].last_i])
     if kind == "lift_up":
