@@ -133,6 +133,29 @@ def find_movers(
     return _moved(pairs, best), _moved(pairs, second)
 
 
+def find_held(
+    watched: Watched, mover: Bool[np.ndarray, "time h w"]
+) -> tuple[int, Bool[np.ndarray, "h w"], float] | None:
+    """Return the footage frame that shows best what a hand brings along, its mask there and how sure that is.
+
+    A tool is often not in the first picture: the hand comes with it. `mover` is the manipulated object's track.
+    """
+    best, value = None, 0.0
+    h, w = mover.shape[1:]
+    for k, i in enumerate(watched.idx):
+        shares = watched.shares[k]
+        mask = largest(tidy((shares[MOVED] > _LIKELY) & ~grow(mover[i], 3)))
+        area = float(mask.sum())
+        if area < _LEAST_SHARE * h * w:
+            continue
+        by_hand = (grow(mask, 5) & (shares[HAND] > _LIKELY)).any()
+        worth = area * (1.0 if by_hand else 0.3) * (0.7 if _cut(mask) else 1.0)
+        if worth > value:
+            sure = float(shares[MOVED][mask].mean()) * (0.9 if by_hand else 0.6)
+            best, value = (int(i), mask, sure), worth
+    return best
+
+
 def things_standing(watched: Watched, *, late: bool) -> list[Bool[np.ndarray, "h w"]]:
     """Return masks over the still of the beginning (or end) in which the things that stay are apart from all else."""
     shares = watched.late if late else watched.early

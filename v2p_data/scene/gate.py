@@ -18,7 +18,7 @@ from v2p_data.scene.sight import Sights, stands_on
 
 _COLOURED = 0.25
 """Share of a thing's pixels that need its colour: few things are one colour all over."""
-_NEARING_KINDS = ("push_next_to", "slide_to", "drop_in_front_of", "push_with")
+_NEARING_KINDS = ("push_next_to", "slide_to", "drop_in_front_of")
 _ENDING_AT_KINDS = ("insert", "throw_into", "place_onto", "cover")
 
 

@@ -16,6 +16,7 @@ from v2p_data.scene.classes import HAND, MOVED, OTHER
 from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
     Watched,
+    find_held,
     find_movers,
     hand_at,
     table_seen,
@@ -169,6 +170,11 @@ def sight(
             )
             objects.append(replace(thing, sure=sure, why=why, hinted=mark is not None))
             continue
+        if role == "tool" and mark is None and watched is not None:
+            brought = find_held(watched, objects[0].masks)
+            if brought is not None and brought[2] >= min_found:
+                objects.append(_at_one_frame(thing, len(footage.rgb), *brought))
+                continue
         late = meaning.kind == "uncover" if mark is None else mark.frame > 0
         found = (
             Found(mask=mark.mask, score=5.0)
@@ -208,6 +214,17 @@ def sight(
         table=table,
         watched=watched,
         warnings=tuple(warnings),
+    )
+
+
+def _at_one_frame(
+    thing: Sighting, n: int, i: int, mask: Bool[np.ndarray, "h w"], sure: float
+) -> Sighting:
+    """Return an object of a clip of `n` footage frames that is taken to lie where frame `i` shows it."""
+    masks, quality = np.zeros((n, *mask.shape), bool), np.zeros(n)
+    masks[i], quality[i] = mask, 1.0
+    return replace(
+        thing, masks=masks, quality=quality, at=i, sure=sure, why="it comes with the hand"
     )
 
 
