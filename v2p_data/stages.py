@@ -113,7 +113,7 @@ def scene_stage(video: VideoItem, cfg: EngineConfig) -> Stage:
         item=video.item,
         config=recipe,
         sources={"video": file_digest(video.path)},
-        version=1,
+        version=2,
         make=partial(make_scene, video=video),
     )
 

@@ -136,8 +136,10 @@ def camera_from_depth(
 
 def mesh_by_worker(
     clip: Clip, footage: Footage, s: Sighting, size_m: tuple[float, float, float], cfg: MeshConfig
-) -> trimesh.Trimesh:
-    """Return the worker's mesh of an object, centred on its bounding box, scaled such that its diagonal is `size_m`'s.
+) -> tuple[trimesh.Trimesh, str]:
+    """Return the worker's mesh of an object and what had to be mended about it.
+
+    It is centred on its bounding box and scaled such that its diagonal is `size_m`'s.
 
     Raises:
         V2PError: the worker fails.
@@ -151,12 +153,12 @@ def mesh_by_worker(
     request = WorkerRequest(
         kind="mesh", arrays={"image": image, "mask": mask}, fields={"name": s.phrase}
     )
-    mesh = run_worker(cfg.worker, request, cfg.worker_timeout_s).mesh
-    assert mesh is not None  # the contract of `mesh` has one
-    mesh = mesh.copy()
+    answer = run_worker(cfg.worker, request, cfg.worker_timeout_s)
+    assert answer.mesh is not None  # the contract of `mesh` has one
+    mesh = answer.mesh.copy()
     mesh.apply_translation(-mesh.bounds.mean(0))
     mesh.apply_scale(float(np.linalg.norm(size_m) / np.linalg.norm(mesh.extents)))
-    return mesh
+    return mesh, answer.repair
 
 
 def poses_by_worker(

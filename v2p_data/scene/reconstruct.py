@@ -252,17 +252,21 @@ def _estimates(
             s.noun,
         )
         size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
+        plain = shape.kind == "primitive" and not cfg.mesh.worker
         if s.known_m:  # the user's word on the size outranks the outline's
             size = (length, width, tall)
             mesh, parts = _stretched(size, mesh, *parts)
         poses = poses @ shape.T_obj_shape
         if s.noun.hollow and s.role in ("manipulated", "cover") and kind in ("cover", "uncover"):
             # A cover's own frame has its mouth below, as it lies: so the simulator builds it.
+            plain = False
             poses = poses @ _OVER
             mesh, parts = _turned(mesh), tuple(_turned(part) for part in parts)
         if cfg.mesh.worker:
-            mesh = mesh_by_worker(clip, footage, s, size, cfg.mesh)
+            mesh, repair = mesh_by_worker(clip, footage, s, size, cfg.mesh)
             parts, how = (), "made by the mesh worker from one picture, scaled to the outline"
+            if repair != "none":
+                how += f"; its mesh was not closed and was mended ({repair})"
             size = _size3(mesh.extents)
         if cfg.pose.worker and s.moves:
             camera = _clip_camera(clip, placement, origin)
@@ -284,8 +288,8 @@ def _estimates(
                 masks=_mask_track(footage, s, placed),
                 source={**_sources(s), "shape": how},
                 mass_kg=_mass(s.noun, size),
-                mesh=mesh,
-                parts=parts,
+                mesh=None if plain else mesh,
+                parts=() if plain else parts,
                 symmetry=s.noun.symmetry,
                 observed=observed,
             )
