@@ -27,7 +27,7 @@ DEFAULT_MODELS: dict[str, str] = {
 class GroundConfig:
     """How the objects of a caption are found in a frame."""
 
-    backend: GroundBackend = "heuristic"
+    backend: GroundBackend = "network"
     """`heuristic` and `network` need no downloaded weights; `worker` asks a process of yours."""
     model: str = ""
     """Hub id or folder of a checkpoint; empty takes the backend's default."""
