@@ -499,7 +499,7 @@ def _reconstructed(job: Job, folder: Path, boxes: bool, pictures: Path) -> tuple
         row["sentence"] = f"{type(error).__name__}: {error} ({Path(at.filename).name}:{at.lineno})"
     row["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
     if made is not None and clip is not None:
-        row["accepted"], row["gate_slug"] = _accepted(clip, made, job)
+        row["accepted"], row["gate_slug"] = _accepted(made)
     score = rejected(true, slug or "unknown") if found is None else score_clip(true, found)
     row |= {
         "slug": score.slug,
@@ -514,17 +514,14 @@ def _reconstructed(job: Job, folder: Path, boxes: bool, pictures: Path) -> tuple
     return job.name, row
 
 
-def _accepted(clip: Clip, made: Reconstruction, job: Job) -> tuple[bool, str | None]:
-    """Return whether the gate lets the clip through, and why not; a confidence below the bar needs no second run."""
+def _accepted(made: Reconstruction) -> tuple[bool, str | None]:
+    """Return whether the default gate lets through what was made without one, and why not."""
     cfg = SceneConfig()
-    if made.confidence < cfg.min_confidence:
-        return False, "low_confidence"
-    try:
-        with _limit(MAX_SECONDS):
-            reconstruct(clip, cfg, rng_for(job.seed, "scene"))
-    except ItemRejectedError as error:
-        return False, error.reason
-    return True, None
+    if made.least_found < cfg.min_found:
+        return False, "object_not_found"
+    if made.contradiction is not None:
+        return False, "motion_contradicts_caption"
+    return (True, None) if made.confidence >= cfg.min_confidence else (False, "low_confidence")
 
 
 @contextmanager

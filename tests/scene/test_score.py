@@ -63,6 +63,7 @@ def found_thing(size=BOX_M, form="box", hollow=False, move=(0.1, 0, 0), **more):
         "size_m": size,
         "hollow": hollow,
         "is_round": form == "cylinder",
+        "is_ball": form == "sphere",
         "mesh": mesh_for(form, size, hollow=hollow),
         "T_world_first": transform(np.eye(3), at),
         "T_world_last": transform(np.eye(3), at + move),

@@ -4,7 +4,7 @@ The network says of every pixel what it is; this module cuts that into things, t
 says from 0 to 1 how sure that is and why not surer.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from v2p_data.scene.colour import (
     histogram,
     lab_of,
     likelihood,
+    named_colours,
     similarity,
 )
 from v2p_data.scene.footage import Footage
@@ -27,6 +28,10 @@ from v2p_data.scene.segment import bounding_box, edge_contrast, grow, largest, r
 MOST_FRAMES = 50
 """Frames of a clip that the network looks at; those between take the nearest one's word."""
 _LIKELY, _POSSIBLE = 0.5, 0.25
+_GAP_PX = 7
+"""Of a picture 320 px wide: parts of one thing lie as near as this."""
+_END_WEIGHT = {"insert": 0.4, "throw_into": 0.4, "place_onto": 0.5, "cover": 0.5}
+"""How much the last outline counts: a rim, or the hand that still holds it, hides part of what was put there."""
 _LEAST_SHARE = 0.0007
 """Of the picture: smaller things cannot be measured."""
 
@@ -104,6 +109,7 @@ def find_movers(
     """
     starts = _ends(footage, watched, phrase, 0, first)
     stops = _ends(footage, watched, phrase, len(footage.rgb) - 1, last)
+    stops = [_hidden_end(blob, _END_WEIGHT.get(kind, 0.7)) for blob in stops]
     pairs = sorted(
         (
             (_pair_parts(a, b, kind, footage.shape), a, b)
@@ -135,32 +141,40 @@ def find_movers(
 
 def find_held(
     watched: Watched, mover: Bool[np.ndarray, "time h w"]
-) -> tuple[int, Bool[np.ndarray, "h w"], float] | None:
-    """Return the footage frame that shows best what a hand brings along, its mask there and how sure that is.
+) -> tuple[int, Bool[np.ndarray, "time h w"], float] | None:
+    """Return what a hand brings along: the footage frame that shows it best, its masks and how sure that is.
 
     A tool is often not in the first picture: the hand comes with it. `mover` is the manipulated object's track.
     """
-    best, value = None, 0.0
+    found: dict[int, Bool[np.ndarray, "h w"]] = {}
+    best, value, sure = 0, 0.0, 0.0
     h, w = mover.shape[1:]
-    for k, i in enumerate(watched.idx):
+    for k, i in enumerate(watched.idx.tolist()):
         shares = watched.shares[k]
         mask = largest(tidy((shares[MOVED] > _LIKELY) & ~grow(mover[i], 3)))
         area = float(mask.sum())
         if area < _LEAST_SHARE * h * w:
             continue
+        found[i] = mask
         by_hand = (grow(mask, 5) & (shares[HAND] > _LIKELY)).any()
         worth = area * (1.0 if by_hand else 0.3) * (0.7 if _cut(mask) else 1.0)
         if worth > value:
+            best, value = i, worth
             sure = float(shares[MOVED][mask].mean()) * (0.9 if by_hand else 0.6)
-            best, value = (int(i), mask, sure), worth
-    return best
+    if not found:
+        return None
+    masks = np.zeros_like(mover)
+    for i, mask in found.items():
+        if mask.sum() > 0.3 * found[best].sum():
+            masks[i] = mask
+    return best, masks, sure
 
 
-def things_standing(watched: Watched, *, late: bool) -> list[Bool[np.ndarray, "h w"]]:
-    """Return masks over the still of the beginning (or end) in which the things that stay are apart from all else."""
+def standing(watched: Watched, *, late: bool) -> Float32[np.ndarray, "h w"]:
+    """Return how likely each pixel of the still of the beginning (or end) belongs to something that stands there."""
     shares = watched.late if late else watched.early
-    things = shares[OTHER]
-    return [tidy(things > _LIKELY), tidy(things > _POSSIBLE), tidy(things + shares[MOVED] > 0.6)]
+    # What is uncovered was not there before: the network may call it moved.
+    return shares[OTHER] + shares[MOVED] if late else shares[OTHER]
 
 
 def hand_at(watched: Watched, i: int) -> Bool[np.ndarray, "h w"]:
@@ -198,31 +212,48 @@ def _ends(
     h, w = footage.shape
     lab, gone = lab_of(image), lab_of(footage.late if i == 0 else footage.early)
     blobs: list[_Blob] = []
+    hand = hand_at(watched, i)
     for level in (_LIKELY, _POSSIBLE):
-        count, parts, stats, _ = cv2.connectedComponentsWithStats(
-            tidy(moved > level).astype(np.uint8)
-        )
+        # Print on a thing and what lies in it break it up: gaps are closed, but not over the hand.
+        whole = tidy(moved > level, _GAP_PX) & ~(hand & (moved < _POSSIBLE))
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(whole.astype(np.uint8))
         for k in range(1, count):
             area = int(stats[k, cv2.CC_STAT_AREA])
             mask = parts == k
             if area < _LEAST_SHARE * h * w or any((mask & b.mask).any() for b in blobs):
                 continue
-            mask = mask_of_mover(footage, watched, i, largest(mask))
+            mask = mask_of_mover(footage, watched, i, largest(_grown_to(mask, moved)))
             blobs.append(
                 _Blob(
                     mask=mask,
                     area=int(mask.sum()),
                     hist=histogram(image[mask]),
                     parts={
-                        "moved": float(moved[mask].mean()),
+                        "moved": min(1.0, 0.4 + 0.75 * float(moved[mask].mean())),
                         "size": float(1 - np.exp(-area / (0.002 * h * w))),
-                        "colour": _named_by(match, mask),
+                        "colour": _named_by(match, mask)
+                        ** (1.0 if named_colours(phrase) else 0.3),
                         "whole": 0.75 if _cut(mask) else 1.0,
                         "vanishing": _vanishing(lab, gone, mask),
                     },
                 )
             )
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
+
+
+def _hidden_end(blob: _Blob, weight: float) -> _Blob:
+    """Return a blob of the last frame with ratings that count by this exponent."""
+    return replace(blob, parts={name: part**weight for name, part in blob.parts.items()})
+
+
+def _grown_to(
+    core: Bool[np.ndarray, "h w"], moved: Float32[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the core with what adjoins it and may be part of it, unless that would more than double it."""
+    _, parts = cv2.connectedComponents(((moved > 0.35) | core).astype(np.uint8))
+    labels = np.unique(parts[core])
+    wider = tidy(np.isin(parts, labels[labels > 0])) | core
+    return wider if wider.sum() < 2 * core.sum() else core
 
 
 def _vanishing(
@@ -240,9 +271,10 @@ def _vanishing(
 
 def _pair_parts(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[str, float]:
     ratio = abs(float(np.log(a.area / b.area)))
+    weight = _END_WEIGHT.get(kind, 0.7)
     parts = {
-        "alike": 0.3 + 0.7 * similarity(a.hist, b.hist),
-        "same size": float(np.exp(-0.5 * (max(0.0, ratio - 0.4) / 0.7) ** 2)),
+        "alike": (0.3 + 0.7 * similarity(a.hist, b.hist)) ** weight,
+        "same size": float(np.exp(-0.5 * (max(0.0, ratio - 0.4) / 0.7) ** 2)) ** weight,
     }
     spots = [np.argwhere(blob.mask).mean(0) for blob in (a, b)]
     (rise, across) = (spots[0] - spots[1]) / shape[1]
@@ -250,7 +282,8 @@ def _pair_parts(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[s
         along = -across if kind == "push_right" else across
         parts["direction"] = float(np.clip(0.5 + along / 0.06, 0.1, 1))
     elif kind == "lift_up":
-        parts["direction"] = float(np.clip(0.6 + rise / 0.08, 0.1, 1))
+        # What is lifted may be put down again before the clip ends.
+        parts["direction"] = float(np.clip(0.8 + rise / 0.08, 0.6, 1))
     return parts
 
 

@@ -154,12 +154,12 @@ def find_other(
     kind: str,
     moved: Moved,
     taken: Bool[np.ndarray, "h w"] | None = None,
-    things: list[Bool[np.ndarray, "h w"]] | None = None,
+    likely: Float32[np.ndarray, "h w"] | None = None,
 ) -> Found | None:
     """Return the thing that stays, or None where the still shows no candidate.
 
-    For `uncover` the late still is searched, for all others the early one. `things` are masks in which things are
-    apart from table and wall, if anyone knows; else what does not look like the table.
+    For `uncover` the late still is searched, for all others the early one. `likely` is how probable it is that
+    a pixel belongs to something that stands there, if anyone knows.
     """
     late = kind == "uncover"
     still = footage.late if late else footage.early
@@ -177,8 +177,9 @@ def find_other(
     stands_out = table.stands_out(still) & inner_hull & ~restless
     hand = footage.hand(still) & ~colour
     sets = [stands_out, stands_out & ~hand] + ([colour & ~restless] if words else [])
-    if things is not None:
-        sets = things + ([pixels & colour for pixels in things] if words else [])
+    if likely is not None:
+        seen = [likely > 0.5, likely > 0.25, (likely > 0.25) & stands_out]
+        sets += seen + ([pixels & colour for pixels in seen[:2]] if words else [])
     lab = lab_of(still)
     occupied = grow(moved.first, 3)
     best: Found | None = None
@@ -197,6 +198,7 @@ def find_other(
             ring = grow(mask, 3) & ~mask
             score += float(table.seen[ring].mean()) if ring.any() else 0.0
             score += 1.6 * float(colour[mask].mean()) if words else 0.0
+            score += 1.5 * (float(likely[mask].mean()) - 0.4) if likely is not None else 0.0
             score += 0.8 * area / (bw * bh)
             score += 0.02 * min(40.0, edge_contrast(lab, mask))
             score -= 0.5 * max(0.0, float(np.log(0.008 * h * w / area)))

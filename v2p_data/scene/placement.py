@@ -260,7 +260,7 @@ def _fit_last(
     )
     if kind == "uncover" and noun.hollow:  # put down either way
         upright = fit_pose(silhouette, noun, first.size, np.eye(3), yaw_near=yaw)
-        same = upright if upright.cost + 0.03 < same.cost else same
+        same = upright if upright.cost + 0.1 < same.cost else same
     if kind in _CARRY_KINDS:
         held = fit_lifted(silhouette, noun, first.size, first.T_world_obj)
         if held.cost + 0.1 < same.cost:  # the clip ends before it is put down

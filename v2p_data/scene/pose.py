@@ -150,7 +150,7 @@ class Silhouette:
 
 def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
     """Return the ways a noun's shape can rest, as rotations with what each costs: upright first."""
-    upright, cost = np.eye(3), 0.12 if noun.spread < 0.3 else 0.0
+    upright, cost = np.eye(3), 0.15 if noun.spread < 0.3 else 0.1
     if noun.form == "sphere":
         return [(upright, 0.0)]
     lying = Rotation.from_euler("y", 90, degrees=True).as_matrix()

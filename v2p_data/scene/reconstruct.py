@@ -138,6 +138,10 @@ class Reconstruction:
     warnings: tuple[str, ...]
     stages: dict[str, tuple[float, str]]
     """Per stage how sure it is, 0 to 1, and why it is not surer."""
+    least_found: float = 1.0
+    """How sure the least sure finding is, 0 to 1."""
+    contradiction: str | None = None
+    """How the motion contradicts the caption, where nothing is rejected for it."""
 
 
 def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Reconstruction:
@@ -163,9 +167,14 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
         guess = camera_from_depth(clip, sights.footage, sights.objects, guess, cfg.depth, rng)
     placement = place(sights.footage, sights.objects, meaning.kind, guess, cfg.max_poses)
     objects = _estimates(clip, sights, placement, meaning.kind, cfg)
-    if cfg.check_motion:
+    contradiction = None
+    try:
         poses = [thing.T_world_objs for thing in objects]
         check_motion(meaning.kind, sights, placement, poses, objects[0].size_m)
+    except ItemRejectedError as error:
+        if cfg.check_motion:
+            raise
+        contradiction = error.detail
     cues = cues_of(sights, placement, meaning.kind)
     origin = _origin(placement)
     return Reconstruction(
@@ -175,6 +184,8 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
         camera=_clip_camera(clip, placement, origin),
         confidence=check_confidence(cues, cfg.min_confidence),
         stages=by_stage(cues),
+        least_found=min(s.sure for s in sights.objects),
+        contradiction=contradiction,
         warnings=(*sights.warnings, *_remarks(meaning.kind, sights, placement, len(clip.frames))),
     )
 

@@ -95,6 +95,8 @@ class FoundThing:
     hollow: bool
     is_round: bool
     """Whether its own z is an axis of revolution."""
+    is_ball: bool
+    """Whether every axis is one."""
     mesh: trimesh.Trimesh = field(repr=False)
     """In its own frame [m]."""
     T_world_first: Float[np.ndarray, "4 4"]
@@ -254,6 +256,7 @@ def found_of(reconstruction: Reconstruction) -> FoundClip:
                 size_m=thing.size_m,
                 hollow=hollow,
                 is_round=noun.form == "cylinder",
+                is_ball=noun.form == "sphere",
                 mesh=mesh,
                 T_world_first=thing.T_world_objs[0],
                 T_world_last=thing.T_world_objs[-1],
@@ -327,12 +330,12 @@ def turn_between(
 ) -> float:
     """Return the angle between two posed objects [rad], up to what cannot be told apart.
 
-    A ball has no orientation. Of a round thing only the axis counts, and which way it points only where it is open on
+    A ball has no orientation; where one was found for an egg, that shows in its shape. Of a round thing only the axis counts, and which way it points only where it is open on
     one side. A box, and anything without symmetry, is compared as a posed box: the found one's axes are renamed so that
     its sides fit the true ones, the six ways of equal sides and turns by 180 degrees included; what is open on one
     side keeps the side. Where a solid of revolution was found for it, that one's axis counts alone.
     """
-    if true.symmetry == "sphere":
+    if true.symmetry == "sphere" or found.is_ball:
         return 0.0
     open_true = opening(true.mesh) if true.hollow else None
     open_found = opening(found.mesh) if found.hollow else None
@@ -550,11 +553,12 @@ class _Solid:
         except QhullError:  # a broken mesh without volume
             hull = filled
         best, towards = np.zeros_like(hull), None
-        for axis, sign in itertools.product(range(3), (1, -1)):
+        # Walls thinner than a cell are not seen from the side: up comes first, and others must be clearly roomier.
+        for axis, sign in itertools.product((2, 0, 1), (1, -1)):
             from_there = np.flip(filled, axis) if sign > 0 else filled
             met = np.maximum.accumulate(from_there, axis=axis)
             room = hull & ~(np.flip(met, axis) if sign > 0 else met)
-            if room.sum() > max(best.sum(), MIN_CAVITY * hull.sum()):
+            if room.sum() > max(1.05 * best.sum(), MIN_CAVITY * hull.sum()):
                 best, towards = room, sign * np.eye(3)[axis]
         return cls(filled, hull, best, towards)
 

@@ -19,21 +19,25 @@ from v2p_data.scene.find import (
     find_held,
     find_movers,
     hand_at,
+    standing,
     table_seen,
-    things_standing,
     watch,
 )
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Found, Moved, find_moved, find_other
 from v2p_data.scene.nouns import Noun, noun_for
 from v2p_data.scene.scene import Role
-from v2p_data.scene.segment import bounding_box, from_box, from_points, grow
+from v2p_data.scene.segment import bounding_box, from_box, from_points, grow, solidity
 from v2p_data.scene.table import Table, find_table
 from v2p_data.scene.track import Track, track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
 
 _HINTED_SURE = 0.97
+_CHANGE_TELLS = 4.0
+"""Score of the hand-written cues from which their finding is an opinion."""
+_NO_OPINION = 0.75
+"""What the finding of the network alone counts where those cues have none."""
 _LEAST_HAND = 0.002
 """Share of the picture that a hand covers when it is seen best."""
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
@@ -173,7 +177,17 @@ def sight(
         if role == "tool" and mark is None and watched is not None:
             brought = find_held(watched, objects[0].masks)
             if brought is not None and brought[2] >= min_found:
-                objects.append(_at_one_frame(thing, len(footage.rgb), *brought))
+                at, masks, sure = brought
+                objects.append(
+                    replace(
+                        thing,
+                        masks=masks,
+                        quality=masks.any((1, 2)).astype(float),
+                        at=at,
+                        sure=sure,
+                        why="it comes with the hand",
+                    )
+                )
                 continue
         late = meaning.kind == "uncover" if mark is None else mark.frame > 0
         found = (
@@ -181,7 +195,7 @@ def sight(
             if mark
             else find_other(
                 footage, table, phrase, meaning.kind, moved, taken,
-                things_standing(watched, late=late) if watched else None,
+                standing(watched, late=late) if watched else None,
             )
         )  # fmt: skip
         sure = mark.sure if mark else _rise(found.score, 1.0, 0.5) if found else 0.0
@@ -197,12 +211,14 @@ def sight(
             continue
         taken |= grow(found.mask, 2)
         masks = _standing(footage, watched, found.mask, objects[0].masks)
+        at = len(masks) - 1 if late else 0
+        masks[at] = found.mask
         objects.append(
             replace(
                 thing,
                 masks=masks,
                 quality=masks.sum((1, 2)) / max(1, found.mask.sum()),
-                at=len(masks) - 1 if late else 0,
+                at=at,
                 sure=sure,
                 why="" if mark else "what stands there fits the words only so far",
                 hinted=mark is not None,
@@ -214,17 +230,6 @@ def sight(
         table=table,
         watched=watched,
         warnings=tuple(warnings),
-    )
-
-
-def _at_one_frame(
-    thing: Sighting, n: int, i: int, mask: Bool[np.ndarray, "h w"], sure: float
-) -> Sighting:
-    """Return an object of a clip of `n` footage frames that is taken to lie where frame `i` shows it."""
-    masks, quality = np.zeros((n, *mask.shape), bool), np.zeros(n)
-    masks[i], quality[i] = mask, 1.0
-    return replace(
-        thing, masks=masks, quality=quality, at=i, sure=sure, why="it comes with the hand"
     )
 
 
@@ -315,15 +320,55 @@ def _find_movers(
     if watched is not None:
         found = find_movers(footage, watched, meaning.manipulated, meaning.kind, tool, first, last)
         moved, held = found or (None, None)
-    if moved is None:
-        moved = find_moved(
+    if moved is None or (mark is None and not tool):
+        by_change = find_moved(
             footage, table, meaning.manipulated, meaning.kind, first=first, last=last
+        )
+        moved = (
+            by_change if moved is None or watched is None else _agreed(moved, by_change, watched)
         )
     if moved is None:
         raise ItemRejectedError(
             "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
         )
     return moved, held
+
+
+def _agreed(moved: Moved, by_change: Moved | None, watched: Watched) -> Moved:
+    """Return what the network found, completed and weighed by what colours and vanishing edges say.
+
+    The two ways err differently: the network loses parts of things that look like none it knows, the other takes
+    shadows and hands along.
+    """
+    if by_change is None or by_change.score < _CHANGE_TELLS:
+        return replace(
+            moved,
+            cues={**moved.cues, "second opinion": _NO_OPINION},
+            score=_NO_OPINION * moved.score,
+        )
+    ends = []
+    overlaps = []
+    for i, own, other in (
+        (0, moved.first, by_change.first),
+        (int(watched.idx[-1]), moved.last, by_change.last),
+    ):
+        common = float((own & other).sum())
+        overlaps.append(common / max(1.0, float((own | other).sum())))
+        surplus = other & ~own
+        fuller = (
+            common > 0.8 * own.sum()
+            and 1.15 * own.sum() < other.sum() < 6 * own.sum()
+            and solidity(other) > max(0.85, solidity(own) - 0.05)
+            and watched.at(i)[HAND][surplus].mean() < 0.25
+        )
+        ends.append(other if fuller else own)
+        if fuller:
+            overlaps[-1] = max(overlaps[-1], 0.5)
+    opinion = float(np.clip(0.55 + 0.75 * max(0.0, overlaps[0]), 0, 1)) * float(
+        np.clip(0.75 + 0.5 * overlaps[1], 0, 1)
+    )
+    cues = {**moved.cues, "second opinion": opinion}
+    return replace(moved, first=ends[0], last=ends[1], score=moved.score * opinion, cues=cues)
 
 
 def _sureness(moved: Moved, watched: Watched | None, mark: _Marked | None) -> tuple[float, str]:
