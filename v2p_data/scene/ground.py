@@ -176,6 +176,8 @@ def find_other(
     inner_hull = shrink(table.hull, 1)
     stands_out = table.stands_out(still) & inner_hull & ~restless
     hand = footage.hand(still) & ~colour
+    # Small patches are noise, unless the network takes them for things.
+    least, small = (0.0025, 0.5) if likely is None else (0.0008, 0.2)
     sets = [stands_out, stands_out & ~hand] + ([colour & ~restless] if words else [])
     if likely is not None:
         seen = [likely > 0.5, likely > 0.25, (likely > 0.25) & stands_out]
@@ -184,9 +186,9 @@ def find_other(
     occupied = grow(moved.first, 3)
     best: Found | None = None
     for pixels in sets:
-        free = pixels if late else pixels & ~occupied
+        free = pixels & ~grow(moved.last, 2) if late else pixels & ~occupied
         free = free if taken is None else free & ~taken
-        for mask in _parts(tidy(free, 5), h * w, 0.0025, 0.2):
+        for mask in _parts(tidy(free, 5), h * w, least, 0.2):
             x, y, bw, bh = bounding_box(mask)
             area = int(mask.sum())
             score = -_border_sides((x, y, bw, bh), w, h) * 0.8
@@ -201,7 +203,7 @@ def find_other(
             score += 1.5 * (float(likely[mask].mean()) - 0.4) if likely is not None else 0.0
             score += 0.8 * area / (bw * bh)
             score += 0.02 * min(40.0, edge_contrast(lab, mask))
-            score -= 0.5 * max(0.0, float(np.log(0.008 * h * w / area)))
+            score -= small * max(0.0, float(np.log(0.008 * h * w / area)))
             if best is None or score > best.score:
                 best = Found(mask=mask, score=score)
     if best is None:
