@@ -1,7 +1,9 @@
 """Train the scene network (`v2p_data/scene/network.py`) on rendered clips, from nothing, on a CPU.
 
     python scripts/train_scene_network.py data --out DATA --clips 1500 --jobs 2
-    python scripts/train_scene_network.py train DATA --out v2p_data/scene/network.safetensors --minutes 60
+    python scripts/train_scene_network.py train DATA --out a.safetensors --minutes 30
+    python scripts/train_scene_network.py train DATA --out b.safetensors --minutes 30 --start-from a.safetensors --seed 1
+    python scripts/train_scene_network.py average a.safetensors b.safetensors --out v2p_data/scene/network.safetensors
 
 `data` renders clips of all kinds at low resolution and keeps six frames of each with the two stills that the scene room
 makes of the whole clip. `train` prints the intersection over union of each class on clips that it does not train on. No real
@@ -327,6 +329,18 @@ def train(
     print(f"{step} steps of {BATCH}: {measure(net, held_out)}", flush=True)
 
 
+def average(files: list[Path], out: Path) -> None:
+    """Write the mean of the weights of runs that went on from one another: it sees more than either."""
+    states = [load_file(file) for file in files]
+    mean = {
+        k: torch.stack([s[k].float() for s in states]).mean(0).to(v.dtype)
+        if v.is_floating_point()
+        else v
+        for k, v in states[0].items()
+    }
+    save_file({k: v.contiguous() for k, v in mean.items()}, out)
+
+
 def write(net: SceneNetwork, out: Path) -> None:
     """Write the weights in half precision, in one move."""
     partial = out.with_suffix(".partial")
@@ -353,9 +367,14 @@ def main() -> None:
     learn.add_argument("--seed", type=int, default=0)
     learn.add_argument("--lr", type=float, default=2e-3)
     learn.add_argument("--start-from", type=Path)
+    merge = commands.add_parser("average", help="average the weights of runs")
+    merge.add_argument("weights", type=Path, nargs="+")
+    merge.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     if args.command == "data":
         make_data(args.out, args.clips, args.jobs, args.start)
+    elif args.command == "average":
+        average(args.weights, args.out)
     else:
         train(args.data, args.out, args.minutes, args.seed, args.start_from, args.lr)
 
