@@ -26,7 +26,7 @@ def make_clip(
     shake_px: float = 0.0,
     hints: dict | None = None,
     num_frames: int = 36,
-    hand: bool = True,
+    with_hand: bool = True,
 ) -> Clip:
     camera = camera_above((240, 320), 0.61, 1.01, HEIGHT_M)
     rng = np.random.default_rng(0)
@@ -45,7 +45,7 @@ def make_clip(
             shade = (0.75, 1.0, 0.85, 0.8, 1.1)[k]
             colour = tuple(min(255.0, shade * c) for c in (25, 60, 190))
             cv2.fillPoly(image, [corners[list(face)].astype(np.int32)], colour, cv2.LINE_AA)
-        if hand and (0.15 < t < 0.85 or (lift_m and t > 0.15)):
+        if with_hand and (0.15 < t < 0.85 or (lift_m and t > 0.15)):
             reach = min(1.0, (t - 0.15) / 0.2, (0.85 - t) / 0.2 if not lift_m else 1.0)
             hand = np.array([x, y - 0.06, centre[2]]) + (1 - reach) * np.array([0, -0.5, 0])
             tip = camera.project(hand[None])[0]

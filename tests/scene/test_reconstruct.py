@@ -85,6 +85,14 @@ def test_a_picture_in_which_nothing_moves_is_turned_away(draw):
     assert caught.value.value < 0.003
 
 
+def test_what_moves_without_a_hand_is_turned_away(draw):
+    with pytest.raises(ItemRejectedError) as caught:
+        rebuild(draw(with_hand=False))
+
+    assert caught.value.reason == "no_hand"
+    assert caught.value.value < 0.002
+
+
 def test_a_camera_that_moves_is_turned_away_with_its_shift(draw):
     with pytest.raises(ItemRejectedError) as caught:
         rebuild(draw(shake_px=14.0))
