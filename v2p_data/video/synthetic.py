@@ -164,7 +164,12 @@ def random_spec(
         hand, across = _random_hand(rng, kind)
         arm = np.array(hand.shoulder_m)
         count = int(rng.integers(0, 5)) if others is None else others
-        story = random_story(kind, rng, count, arm_azimuth_rad=float(np.arctan2(arm[1], arm[0])))
+        try:
+            story = random_story(
+                kind, rng, count, arm_azimuth_rad=float(np.arctan2(arm[1], arm[0]))
+            )
+        except ValueError:  # nothing of the drawn size fits the part: another cast
+            continue
         timing = _random_timing(rng, kind)
         fps = int(rng.choice([12, 15, 24, 30], p=[0.15, 0.1, 0.35, 0.4]))
         spec = VideoSpec(
