@@ -24,6 +24,7 @@ from v2p_data.scene.pose import (
     fit_shape,
     on_wall,
     orientations,
+    yaw_of,
 )
 from v2p_data.scene.scale import SizeVote, camera_height_m
 from v2p_data.scene.scene import Observed
@@ -252,7 +253,7 @@ def _fit_last(
     if kind == "lift_up":
         return fit_lifted(silhouette, noun, first.size, first.T_world_obj), 0.0
     rest = _rest_of(first.T_world_obj[:3, :3])
-    yaw = _yaw_between(first.T_world_obj[:3, :3], rest)
+    yaw = yaw_of(first.T_world_obj[:3, :3], rest)
     if kind == "cover" and noun.hollow:
         rest = _MOUTH_DOWN
     same = fit_pose(
@@ -417,11 +418,6 @@ def _rest_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
         return np.diag([1.0, -1.0, -1.0])
     axis = "y" if abs(rotation[2, 0]) > 0.7 else "x"
     return Rotation.from_euler(axis, 90, degrees=True).as_matrix()
-
-
-def _yaw_between(rotation: Float[np.ndarray, "3 3"], rest: Float[np.ndarray, "3 3"]) -> float:
-    turn = rotation @ rest.T
-    return float(np.arctan2(turn[1, 0], turn[0, 0]))
 
 
 def _tipped_along(fit: Fit, T_first: Float[np.ndarray, "4 4"]) -> Fit:

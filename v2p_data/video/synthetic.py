@@ -27,6 +27,7 @@ from v2p_data.video.synthetic_room import (
     LABEL_HAND,
     Room,
     build,
+    labels_of,
     random_room,
 )
 from v2p_data.video.synthetic_room import (
@@ -372,7 +373,7 @@ class _Stage:
         )  # fmt: skip
         self.data = mujoco.MjData(self.model)
         self.camera = view.camera()
-        self.drawer = Drawer(self.model)
+        self.drawer = Drawer(self.model, labels_of(self.model))
         names = [self.model.geom(k).name for k in range(self.model.ngeom)]
         self.hands = [names.index(f"hand{k}") for k in range(len(motion.gestures))]
         self.arms = [names.index(n) for n in ("forearm", "sleeve") if n in names]

@@ -16,7 +16,6 @@ from jaxtyping import Float, UInt8
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.geometry.pose import transform
-from v2p_data.video.synthetic_room import labels_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,9 +124,9 @@ def _noise_field(h: int, w: int) -> Float[np.ndarray, "h w 3"]:
 class Drawer:
     """Draws camera `view` of a model without a window."""
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, labels: UInt8[np.ndarray, "geom"]) -> None:
         width, height = model.vis.global_.offwidth, model.vis.global_.offheight
-        self._model, self._labels = model, labels_of(model)
+        self._model, self._labels = model, labels
         self._context = gl_context(width, height)
         self._context.make_current()
         self._drawer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)

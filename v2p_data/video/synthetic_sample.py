@@ -29,11 +29,11 @@ from v2p_data.geometry.pose import (
     transform,
 )
 from v2p_data.seeds import rng_for
+from v2p_data.video.synthetic_camera import Drawer
 from v2p_data.video.synthetic_scene import (
     LABEL_HAND,
     LABEL_OBJECT,
     PALM_HALF_M,
-    Drawer,
     Hand,
     Placed,
     Rgb,
@@ -41,6 +41,7 @@ from v2p_data.video.synthetic_scene import (
     Thing,
     build,
     knuckles_past_centre_m,
+    labels_of,
 )
 
 MotionKind = Literal["lift_up", "push_left", "push_right", "tip_over"]
@@ -226,7 +227,7 @@ def render(spec: VideoSpec) -> SyntheticVideo:
     data = mujoco.MjData(model)
     noise = rng_for(spec.seed, "noise")
     frames, masks, seen = [], [], []
-    with Drawer(model) as drawer:
+    with Drawer(model, labels_of(model)) as drawer:
         for i in range(len(motion.grip)):
             _pose(model, data, motion, i, camera)
             image = drawer.picture(data).astype(np.float32)

@@ -9,16 +9,12 @@ first position, +x away from the camera, +y to the left of the picture, +z up, m
 # pyright: reportAttributeAccessIssue=false
 
 import itertools
-import os
-import sys
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
-
-from v2p_data.errors import V2PError
 
 Rgb = tuple[float, float, float]
 Side = Literal["left", "right"]
@@ -146,75 +142,6 @@ def labels_of(model: mujoco.MjModel) -> UInt8[np.ndarray, "geom"]:
         elif name.startswith("other"):
             labels[geom] = LABEL_OBJECT + 1 + int(name.removeprefix("other"))
     return labels
-
-
-class Drawer:
-    """Draws camera `view` of a model without a window."""
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        width, height = model.vis.global_.offwidth, model.vis.global_.offheight
-        self._model, self._labels = model, labels_of(model)
-        self._context = _gl_context(width, height)
-        self._context.make_current()
-        self._drawer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawer)
-        self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + 50)
-        self._option = mujoco.MjvOption()
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = model.camera("view").id
-        self._rect = mujoco.MjrRect(0, 0, width, height)
-
-    def picture(self, data: mujoco.MjData) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the picture."""
-        return self._draw(data, segmentation=False)
-
-    def mask(self, data: mujoco.MjData) -> UInt8[np.ndarray, "h w"]:
-        """Return labels."""
-        codes = self._draw(data, segmentation=True).astype(np.int32)
-        shown = codes[..., 0] + (codes[..., 1] << 8) + (codes[..., 2] << 16)
-        labels = np.zeros(self._scene.ngeom + 1, np.uint8)
-        for k in range(self._scene.ngeom):
-            geom = self._scene.geoms[k]
-            if geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM):
-                labels[geom.segid + 1] = self._labels[geom.objid]
-        return labels[shown]
-
-    def _draw(self, data: mujoco.MjData, *, segmentation: bool) -> UInt8[np.ndarray, "h w 3"]:
-        self._context.make_current()
-        mujoco.mjv_updateScene(
-            self._model, data, self._option, None, self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value, self._scene,
-        )  # fmt: skip
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = segmentation
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = segmentation
-        mujoco.mjr_render(self._rect, self._scene, self._drawer)
-        pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
-        mujoco.mjr_readPixels(pixels, None, self._rect, self._drawer)
-        return pixels[::-1].copy()
-
-    def __enter__(self) -> "Drawer":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._context.make_current()
-        self._drawer.free()
-        self._context.free()
-
-
-def _gl_context(width: int, height: int) -> Any:
-    """Return an OpenGL context: EGL on Linux, for MuJoCo would look for a window where MUJOCO_GL is unset."""
-    try:
-        if sys.platform == "linux" and os.environ.get("MUJOCO_GL", "egl").lower() in {"egl", ""}:
-            from mujoco.egl import GLContext
-        else:
-            from mujoco.rendering.classic.gl_context import GLContext
-        return GLContext(width, height)
-    except (ImportError, AttributeError, OSError, RuntimeError) as error:
-        raise V2PError(
-            "drawing clips needs OpenGL without a screen and there is none; on Debian or Ubuntu: "
-            f"apt-get install -y libegl1 libgl1 ({type(error).__name__}: {error})"
-        ) from error
 
 
 def thumb_at_m(thing: Thing) -> float:
