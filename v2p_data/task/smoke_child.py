@@ -1,27 +1,25 @@
 """The child process of `smoke`: reads task codes as JSON, tries each in a fork with nothing left to abuse.
 
 A fork may open no file and no socket, start no process, write no file, and use a bounded amount of time and
-memory; where we run as root it gives that up as well.
+memory (`confine`).
 """
 
 import json
 import os
-import resource
 import select
 import signal
 import sys
 import time
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import torch
 
+from v2p_data.task.confine import confine, leave_the_network
 from v2p_data.task.sandbox import TaskCodeError, line_in_task_code, make_task
 
 MEMORY_BYTES = 2 * 1024**3
 """On top of what importing torch has mapped."""
-NOBODY = 65534
 MAX_COMPONENTS = 32
 MAX_REWARD = 1000.0
 """Ten times the bonus for success, which then hardly counts."""
@@ -68,7 +66,7 @@ class FakePlacer:
 def main() -> None:
     """Answer one request from stdin on stdout."""
     request: dict[str, Any] = json.load(sys.stdin)
-    _leave_the_network()
+    leave_the_network()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
     with suppress(
@@ -215,32 +213,6 @@ def _tensors(lists: dict[str, Any]) -> dict[str, torch.Tensor]:
 # --- confinement ---------------------------------------------------------------------------------------------
 
 
-def _leave_the_network() -> None:
-    flags = os.CLONE_NEWNET if os.geteuid() == 0 else os.CLONE_NEWUSER | os.CLONE_NEWNET
-    with suppress(
-        OSError
-    ):  # not every container allows it; no socket can be opened in the fork anyway
-        os.unshare(flags)
-
-
-def _confine(seconds: float) -> None:
-    """Give up everything the rest of this process does not need."""
-    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    for limit, value in (
-        (resource.RLIMIT_AS, mapped + MEMORY_BYTES),
-        (resource.RLIMIT_CPU, int(seconds) + 1),
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_FSIZE, 0),
-        (resource.RLIMIT_NPROC, 0),
-        (resource.RLIMIT_NOFILE, 0),
-    ):
-        resource.setrlimit(limit, (value, value))
-    if os.geteuid() == 0:
-        os.setgroups([])
-        os.setgid(NOBODY)
-        os.setuid(NOBODY)
-
-
 def _in_a_fork(source: str, request: dict[str, Any]) -> dict[str, Any]:
     """Return the fork's answer, or a sentence that says how it ended."""
     read_end, write_end = os.pipe()
@@ -250,7 +222,7 @@ def _in_a_fork(source: str, request: dict[str, Any]) -> dict[str, Any]:
         os.close(read_end)
         code = 1
         try:
-            _confine(seconds)
+            confine(seconds, MEMORY_BYTES)
             _send(write_end, _answer(source, request))
             code = 0
         finally:
