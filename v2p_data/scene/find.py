@@ -182,6 +182,11 @@ def hand_at(watched: Watched, i: int) -> Bool[np.ndarray, "h w"]:
     return watched.at(i)[HAND] > _LIKELY
 
 
+def passed(watched: Watched) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels where at some time a hand or what it moves is seen."""
+    return grow(((watched.shares[:, HAND] + watched.shares[:, MOVED]) > _LIKELY).any(0), 3)
+
+
 def table_seen(watched: Watched) -> Bool[np.ndarray, "h w"]:
     """Return the pixels that are bare table both at the beginning and at the end."""
     return (watched.early[TABLE] > _LIKELY) & (watched.late[TABLE] > _LIKELY)

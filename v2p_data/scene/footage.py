@@ -16,6 +16,8 @@ from v2p_data.video.clip import Clip
 
 WIDTH_PX = 320
 MAX_FRAMES = 150
+_LEAST_STILL = 0.8
+"""Of a tile, for it to tell of the camera."""
 _FEW_CORNERS = 12
 """With fewer corners to follow nothing is said about the camera."""
 
@@ -147,25 +149,31 @@ def still_of(
     return np.clip(mean.round(), 0, 255).astype(np.uint8)
 
 
-def camera_shift_px(footage: Footage) -> float:
+def camera_shift_px(footage: Footage, passed: Bool[np.ndarray, "h w"] | None = None) -> float:
     """Return how far the picture moved as a whole, at working size: the largest over nine frames.
 
     Two measures look at it and the smaller one counts, since a camera that moves shows in both: corners fail where
-    most of them lie on what is moved, tiles where the picture is plain.
+    most of them lie on what is moved, tiles where the picture is plain. `passed` is where things moved in front of the
+    camera, as far as that is known: it says nothing of the camera.
     """
+    if passed is None:
+        passed = np.zeros(footage.shape, bool)
     grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in footage.rgb]
     pick = np.unique(np.linspace(0, len(grey) - 1, 9).astype(int))
     chosen = [grey[i] for i in pick]
-    shifts = [shift for shift in (_corner_shift(chosen), _tile_shift(chosen)) if shift is not None]
+    measured = _corner_shift(chosen, ~passed), _tile_shift(chosen, ~passed)
+    shifts = [shift for shift in measured if shift is not None]
     return min(shifts) if shifts else 0.0
 
 
-def _corner_shift(grey: list[UInt8[np.ndarray, "h w"]]) -> float | None:
+def _corner_shift(
+    grey: list[UInt8[np.ndarray, "h w"]], still: Bool[np.ndarray, "h w"]
+) -> float | None:
     """Return the distance that one in six corners stays below: if the camera moved, hardly any stays.
 
     On a bare table most corners lie on what is moved.
     """
-    corners = cv2.goodFeaturesToTrack(grey[0], 250, 0.01, 6)
+    corners = cv2.goodFeaturesToTrack(grey[0], 250, 0.01, 6, mask=still.astype(np.uint8))
     if corners is None or len(corners) < _FEW_CORNERS:
         return None
     worst = None
@@ -180,7 +188,9 @@ def _corner_shift(grey: list[UInt8[np.ndarray, "h w"]]) -> float | None:
     return worst
 
 
-def _tile_shift(grey: list[UInt8[np.ndarray, "h w"]]) -> float | None:
+def _tile_shift(
+    grey: list[UInt8[np.ndarray, "h w"]], still: Bool[np.ndarray, "h w"]
+) -> float | None:
     """Return the median shift of six phase-correlated tiles, of those with texture."""
     h, w = grey[0].shape
     th, tw = h // 2, w // 3
@@ -189,6 +199,8 @@ def _tile_shift(grey: list[UInt8[np.ndarray, "h w"]]) -> float | None:
     for image in grey[1:]:
         shifts = []
         for y, x in ((r * th, c * tw) for r in range(2) for c in range(3)):
+            if still[y : y + th, x : x + tw].mean() < _LEAST_STILL:
+                continue
             a, b = (g[y : y + th, x : x + tw].astype(np.float32) for g in (grey[0], image))
             if a.std() < 4:
                 continue

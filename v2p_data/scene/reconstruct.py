@@ -23,6 +23,7 @@ from v2p_data.scene.backends.config import (
     PoseConfig,
     SegmentConfig,
 )
+from v2p_data.scene.find import Watched, passed, watch
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
 from v2p_data.scene.gate import by_stage, check_confidence, check_motion, cues_of
 from v2p_data.scene.learned import (
@@ -153,11 +154,13 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     """
     meaning = parse_caption(clip.caption, clip.objects)
     footage = footage_of(clip)
-    _check_still(footage, cfg)
+    _check_change(footage)
+    watched = watch(footage) if cfg.ground.backend == "network" else None
+    _check_still(footage, watched, cfg)
     boxes = None
     if cfg.ground.backend in DETECTORS:
         boxes = detected(clip, footage, meaning.phrases, cfg.ground)
-    sights = sight(clip, footage, meaning, cfg.ground, cfg.min_found, boxes)
+    sights = sight(clip, footage, meaning, watched, cfg.min_found, boxes)
     if cfg.segment.backend != "flow":
         sights = replace(
             sights, objects=segmented(clip, sights.footage, sights.objects, cfg.segment)
@@ -201,8 +204,8 @@ def slug_for(phrase: str, taken: set[str]) -> str:
     return name
 
 
-def _check_still(footage: Footage, cfg: SceneConfig) -> None:
-    shift = camera_shift_px(footage)
+def _check_still(footage: Footage, watched: Watched | None, cfg: SceneConfig) -> None:
+    shift = camera_shift_px(footage, None if watched is None else passed(watched))
     if shift > cfg.max_camera_shift_px:
         raise ItemRejectedError(
             "camera_moves",
@@ -210,6 +213,9 @@ def _check_still(footage: Footage, cfg: SceneConfig) -> None:
             "understood: film from a stand",
             round(shift, 2),
         )
+
+
+def _check_change(footage: Footage) -> None:
     change = np.linalg.norm(footage.lab[1:] - footage.lab[:1], axis=-1).max(0)
     share = float((change > 15).mean())
     if share < 0.003:

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.backends.config import GroundConfig
 from v2p_data.scene.classes import HAND, MOVED, OTHER
 from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
@@ -21,7 +20,6 @@ from v2p_data.scene.find import (
     hand_at,
     standing,
     table_seen,
-    watch,
 )
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Found, Moved, find_moved, find_other
@@ -116,18 +114,17 @@ def sight(
     clip: Clip,
     footage: Footage,
     meaning: Meaning,
-    ground: GroundConfig,
+    watched: Watched | None,
     min_found: float,
     boxes: Mapping[str, Box] | None = None,
 ) -> Sights:
     """Return the masks of all objects that the caption names.
 
-    `boxes` are what a detector says, by phrase; a user's hint for the phrase goes before it.
+    `watched` is what the network sees, where it was asked; `boxes` are what a detector says, by phrase; a user's hint for the phrase goes before it.
 
     Raises:
         ItemRejectedError: `no_hand`, `object_not_found` or `reference_not_found`, with the number that decided.
     """
-    watched = watch(footage) if ground.backend == "network" else None
     if watched is not None:
         _check_hand(clip, watched)
         footage = _knowing_hand(footage, watched)
