@@ -6,7 +6,7 @@ them by the episode's outcome is the paper's addition to Eureka; correlation, sa
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ DEAD_SPREAD = 1e-6
 """A component whose values differ by less than this, or by less than this part of their size, says nothing."""
 SATURATED_MARGIN = 0.05
 """Values within this part of the observed range from its end count as saturated."""
+REACHED_MARGIN_M = 0.03
+RAISED_M = 0.03
 CURVE_POINTS = 10
 """Values of a training curve that go into the text (Eureka's number)."""
 
@@ -61,6 +63,24 @@ class ComponentFeedback:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ObjectFeedback:
+    """How far the policy came with one object, whatever the reward says."""
+
+    name: str
+    nearest_m: float
+    """Median over episodes of the smallest distance between tool and centre."""
+    reached: float
+    """Share of episodes in which the tool came into the object or within 3 cm of it."""
+    touched: float
+    """Share of episodes, as the next two."""
+    grasped: float
+    raised: float
+    """By 3 cm or more."""
+    moved_m: float
+    """Median over episodes of how far it was carried from its start, at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Feedback:
     """What can be said about a reward after a policy was trained with it."""
 
@@ -78,7 +98,8 @@ class Feedback:
     reward_ranks: float | None
     """Probability that a successful episode earned more generated reward per step than a failed one; 0.5 is chance."""
     success_curve: tuple[float, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    objects: tuple[ObjectFeedback, ...] = ()
+    """Of the moments whose states were kept, the manipulated object first."""
 
     @property
     def success_rate(self) -> float:
@@ -116,7 +137,7 @@ class Feedback:
                     "reward": _component_from(known["reward"]),
                     "components": tuple(_component_from(c) for c in known["components"]),
                     "success_curve": tuple(known.get("success_curve", ())),
-                    "notes": tuple(known.get("notes", ())),
+                    "objects": tuple(ObjectFeedback(**o) for o in known.get("objects", ())),
                 }
             )
         except (TypeError, KeyError, AttributeError) as error:
@@ -144,7 +165,7 @@ class Feedback:
             )
         for part in (*self.components, self.reward):
             lines += ["", *_part_lines(part)]
-        lines += [f"note: {n}" for n in self.notes]
+        lines += [""] * bool(self.objects) + [_object_line(o) for o in self.objects]
         return "\n".join(lines)
 
 
@@ -188,6 +209,7 @@ def feedback_of(
         ),
         reward_ranks=ranking(rewards[succeeded & played], rewards[~succeeded & played]),
         success_curve=_thinned(curves.get("success", ())),
+        objects=_objects(t),
     )
 
 
@@ -302,6 +324,34 @@ def _first_held(t: Trajectories) -> Float[np.ndarray, "env"]:
     return first
 
 
+def _objects(t: Trajectories) -> tuple[ObjectFeedback, ...]:
+    names = [k.removesuffix("_start_pos") for k in t.states if k.endswith("_start_pos")]
+    inside = (t.moments[:, None] < t.length)[..., None]
+    if not inside.any(0).all() or "eef_pos" not in t.states:
+        return ()
+    found: list[ObjectFeedback] = []
+    for name in names:
+        pos, start, size, touched, grasped = (
+            t.states[f"{name}_{key}"].astype(float)
+            for key in ("pos", "start_pos", "size", "touched", "grasped")
+        )
+        pos = np.where(inside, pos, start)
+        away = np.where(inside[..., 0], np.linalg.norm(pos - t.states["eef_pos"], axis=-1), np.inf)
+        held, felt = (np.where(inside[..., 0], x, 0.0) for x in (grasped, touched))
+        found.append(
+            ObjectFeedback(
+                name=name,
+                nearest_m=float(np.median(away.min(0))),
+                reached=float((away < size.max(-1) / 2 + REACHED_MARGIN_M).any(0).mean()),
+                touched=float((felt > 0.5).any(0).mean()),
+                grasped=float((held > 0.5).any(0).mean()),
+                raised=float(((pos - start)[..., 2] > RAISED_M).any(0).mean()),
+                moved_m=float(np.median(np.linalg.norm(pos - start, axis=-1).max(0))),
+            )
+        )
+    return tuple(found)
+
+
 # --- text ----------------------------------------------------------------------------------------------------
 
 
@@ -325,6 +375,14 @@ def _part_lines(part: ComponentFeedback) -> list[str]:
     if part.curve:
         lines.append(f"  mean in the course of training: {_curve(part.curve)}")
     return lines
+
+
+def _object_line(obj: ObjectFeedback) -> str:
+    return (
+        f"{obj.name}: the gripper came within {100 * obj.nearest_m:.1f} cm of its centre; share of episodes in which "
+        f"it was reached {obj.reached:.2f}, touched {obj.touched:.2f}, grasped {obj.grasped:.2f}, "
+        f"raised {obj.raised:.2f}; it moved by {100 * obj.moved_m:.1f} cm"
+    )
 
 
 def _spread_text(spread: Spread | None) -> str:

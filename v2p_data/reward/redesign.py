@@ -1,0 +1,349 @@
+"""New rewards for a task whose old one led nowhere: from the templates, or straight from the task's success function.
+
+The second kind works for any task code: the conditions of `compute_success` become slopes, with stages of reaching and
+grasping before them.
+"""
+
+import ast
+import copy
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from v2p_data.reward.reward_code import FUNCTION, UnreadableError, number
+from v2p_data.reward.soften import conditions, softened
+from v2p_data.scene.scene import Scene
+from v2p_data.task.templates import VARIANTS, write_task
+
+GRASPED_KINDS = {
+    "lift_up",
+    "insert",
+    "place_onto",
+    "drop_in_front_of",
+    "cover",
+    "uncover",
+    "throw_into",
+    "push_with",
+}
+GRIP_DEPTH_M = 0.035
+"""Fingers reach about this far down from an object's top."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Design:
+    """A reward in place of another one."""
+
+    code: str
+    """The whole task code."""
+    words: str
+    """What kind of design it is."""
+
+
+def target_of(scene: Scene) -> tuple[str, float]:
+    """Return the object that the gripper must go to, and how far above its centre to hold it [m]."""
+    with_tool = scene.kind == "push_with" and scene.others
+    obj = scene.others[0] if with_tool else scene.manipulated
+    return obj.name, round(max(obj.size_m[2] / 2 - GRIP_DEPTH_M, 0.0), 3)
+
+
+def must_grasp(scene: Scene, code: str) -> bool:
+    """Return whether the task needs the object in the gripper."""
+    asks = f'"{scene.manipulated.name}_grasped"' in code.replace("'", '"')
+    return scene.kind in GRASPED_KINDS or (scene.kind == "generic" and asks)
+
+
+# --- stages --------------------------------------------------------------------------------------------------
+
+
+def reach_text(scene: Scene, *, temperature: float = 6.0) -> str:
+    """Return nearness of the gripper to the object, 0 to 1."""
+    name, above = target_of(scene)
+    point = f'states["{name}_pos"]'
+    if above:
+        point = f"({point} + torch.tensor([0.0, 0.0, {above}], device={point}.device))"
+    return (
+        f'1 - torch.tanh({number(temperature)} * torch.norm({point} - states["eef_pos"], dim=-1))'
+    )
+
+
+def grasp_text(scene: Scene) -> str:
+    """Return 0 to 1: closing around the object, touching it, holding it."""
+    name, above = target_of(scene)
+    point = f'states["{name}_pos"]'
+    if above:
+        point = f"({point} + torch.tensor([0.0, 0.0, {above}], device={point}.device))"
+    near = f'torch.exp(-20.0 * torch.norm({point} - states["eef_pos"], dim=-1))'
+    closing = f'{near} * (1 - states["gripper_width"] / 0.085)'
+    return f'(0.2 * {closing} + 0.2 * states["{name}_touched"] + 0.6 * states["{name}_grasped"])'
+
+
+def touch_text(scene: Scene) -> str:
+    """Return 1 where the gripper touches the object."""
+    return f'states["{target_of(scene)[0]}_touched"]'
+
+
+def raise_text(scene: Scene) -> str:
+    """Return 0 to 1: the object in the gripper, raised by up to 12 cm."""
+    name, _ = target_of(scene)
+    height = f'(states["{name}_pos"][:, 2] - states["{name}_start_pos"][:, 2])'
+    return f'states["{name}_grasped"] * ({height} / 0.12).clamp(0.0, 1.0)'
+
+
+def goal_text(code: str) -> str | None:
+    """Return the task's own success as a slope from 0 to 1, in terms of `states` alone; None where it has none."""
+    try:
+        lines, expr = _success_of(code)
+    except UnreadableError:
+        return None
+    made = {n: v for n, v in lines.items() if v is not None}
+    soft = softened(expr, made.get)
+    if soft is None:
+        return None
+    for _ in range(len(lines) + 1):
+        soft = _Names(made).visit(soft)
+    text = ast.unparse(ast.fix_missing_locations(soft))
+    left = {n.id for n in ast.walk(soft) if isinstance(n, ast.Name)}
+    return None if left & set(lines) or "self" in left or len(text) > 4_000 else f"({text})"
+
+
+# --- whole rewards -------------------------------------------------------------------------------------------
+
+
+def from_template(code: str, scene: Scene, rng: np.random.Generator, index: int) -> Design:
+    """Return the task code with the reward of a template variant, its weights varied after the first round."""
+    variant = VARIANTS[index % len(VARIANTS)]
+    words = f"template '{variant.idea.rstrip('.')}'"
+    if index >= len(VARIANTS):
+        variant = replace(
+            variant,
+            temperature=round(variant.temperature * float(rng.uniform(0.5, 1.6)), 2),
+            reach=round(variant.reach * float(rng.uniform(0.5, 2.0)), 3),
+            contact=round(max(variant.contact, 0.1) * float(rng.uniform(0.5, 2.0)), 3),
+            progress=round(variant.progress * float(rng.uniform(0.7, 1.8)), 3),
+        )
+        words += (
+            f", temperature {variant.temperature}, weights {variant.reach} (reach), {variant.contact} "
+            f"(contact), {variant.progress} (progress)"
+        )
+    return Design(code=transplanted(code, write_task(scene, variant)), words=words)
+
+
+def from_success(code: str, scene: Scene, rng: np.random.Generator | None = None) -> Design | None:
+    """Return the task code with a reward in stages that ends in its own success; None where that has no slope."""
+    try:
+        lines, expr = _success_lines(code)
+    except UnreadableError:
+        return None
+    known = {
+        node.targets[0].id: node.value
+        for node in lines
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    }
+    asked = [(name, softened(c, known.get)) for name, c in conditions(expr, known.get)]
+    slopes = [(name, soft) for name, soft in asked if soft is not None]
+    if not slopes:
+        return None
+    jitter = (lambda: 1.0) if rng is None else (lambda: float(rng.uniform(0.6, 1.6)))
+    temperature = 6.0 * jitter()
+    grasp = must_grasp(scene, code)
+    parts = [
+        ("reach", f"{number(0.2 * jitter())} * ({reach_text(scene, temperature=temperature)})")
+    ]
+    if grasp:
+        parts.append(("grasp", f"{number(0.3 * jitter())} * {grasp_text(scene)}"))
+        if scene.kind != "push_with":
+            parts.append(("raise", f"{number(0.3 * jitter())} * {raise_text(scene)}"))
+    else:
+        parts.append(("touch", f"{number(0.05 * jitter())} * {touch_text(scene)}"))
+    share = 0.8 / len(slopes)
+    for i, (name, soft) in enumerate(slopes):
+        text = ast.unparse(ast.fix_missing_locations(soft))
+        if not _is_place(soft, known):
+            continue
+        parts.append(
+            (f"toward_{name or f'condition_{i + 1}'}", f"{number(share * jitter())} * ({text})")
+        )
+    every = " * ".join(f"({ast.unparse(ast.fix_missing_locations(s))})" for _, s in slopes)
+    if len(slopes) > 1:
+        parts.append(("all_at_once", f"{number(0.6 * jitter())} * ({every})"))
+    parts.append(("effort", "-0.005 * (actions**2).sum(dim=-1)"))
+    text = _function_text([ast.unparse(node) for node in lines], parts)
+    words = f"stages that end in the {len(slopes)} conditions of the success function, as slopes"
+    return Design(code=transplanted(code, text), words=words)
+
+
+def transplanted(code: str, donor: str) -> str:
+    """Return task code with another code's reward function, and the functions that this one calls."""
+    rows = code.splitlines(keepends=True)
+    functions = {n.name: n for n in ast.parse(code).body if isinstance(n, ast.FunctionDef)}
+    given = {n.name: n for n in ast.parse(donor).body if isinstance(n, ast.FunctionDef)}
+    if FUNCTION in functions:
+        first, last = _rows_of(functions[FUNCTION])
+        rows[first:last] = [_text_of(donor, given[FUNCTION]) + "\n"]
+        text = "".join(rows)
+    else:
+        text = _calling_function(code) + "\n\n" + _text_of(donor, given[FUNCTION]) + "\n"
+    for name in _called(given[FUNCTION], given):
+        if name not in functions:
+            text = text.rstrip("\n") + "\n\n\n" + _text_of(donor, given[name]) + "\n"
+        elif ast.dump(functions[name]) != ast.dump(given[name]):
+            raise UnreadableError(f"'{name}' means something else in the code at hand")
+    return text
+
+
+def wrapped(code: str, scale: float, name: str, text: str) -> str:
+    """Return task code whose reward is the old one, scaled, plus one component if it has a name.
+
+    Raises:
+        UnreadableError: it has no reward function of the usual name.
+    """
+    function = next(
+        (n for n in ast.parse(code).body if isinstance(n, ast.FunctionDef) and n.name == FUNCTION),
+        None,
+    )
+    if function is None or len(function.args.args) != 2:
+        raise UnreadableError(f"it has no function '{FUNCTION}' of actions and states")
+    inner, i = "inner_reward", 2
+    while inner in code:
+        inner, i = f"inner_reward_{i}", i + 1
+    rows = code.splitlines(keepends=True)
+    first, last = _rows_of(function)
+    at = function.lineno - 1
+    rows[at] = rows[at].replace(f"def {FUNCTION}", f"def {inner}", 1)
+    added = ["extra = " + text, f'components["{name}"] = extra'] if name else []
+    total = "total" if scale == 1 else f"{number(scale)} * total"
+    new = [
+        "@torch.jit.script",
+        f"def {FUNCTION}(actions, states):",
+        "    # type: (Tensor, Dict[str, Tensor]) -> Tuple[Tensor, Dict[str, torch.Tensor]]",
+        f"    total, components = {inner}(actions, states)",
+        *[f"    {line}" for line in added],
+        f"    return {total}{' + extra' if name else ''}, components",
+    ]
+    rows[last:last] = ["\n\n", *[f"{line}\n" for line in new]]
+    del first
+    return "".join(rows)
+
+
+# --- inside --------------------------------------------------------------------------------------------------
+
+
+class _Names(ast.NodeTransformer):
+    def __init__(self, made: dict[str, ast.expr]) -> None:
+        self.made = made
+
+    def visit_Name(self, node: ast.Name) -> ast.AST:
+        return self.made.get(node.id, node)
+
+
+def _is_place(soft: ast.expr, known: dict[str, ast.expr]) -> bool:
+    """Whether a slope is about where things are; being still or let go is worth something at the end only."""
+    for _ in range(len(known) + 1):
+        soft = _Names(known).visit(copy.deepcopy(soft))
+    keys = {
+        n.value for n in ast.walk(soft) if isinstance(n, ast.Constant) and isinstance(n.value, str)
+    }
+    return any(k.endswith(("_pos", "_quat", "_up")) and not k.endswith("start_pos") for k in keys)
+
+
+def _success_lines(code: str) -> tuple[list[ast.stmt], ast.expr]:
+    """Return the lines of `compute_success` and what it returns.
+
+    Raises:
+        UnreadableError: it is more than a list of assignments, or asks the task object something.
+    """
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.FunctionDef) and node.name == "compute_success":
+            body = [
+                s
+                for s in node.body
+                if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
+            ]
+            own = any(
+                isinstance(n, ast.Name) and n.id == "self" for s in body for n in ast.walk(s)
+            )
+            if own or not all(isinstance(s, ast.Assign | ast.Return) for s in body):
+                break
+            last = body[-1] if body else None
+            if isinstance(last, ast.Return) and last.value is not None:
+                return body[:-1], last.value
+    raise UnreadableError("its success function is more than a list of assignments")
+
+
+def _success_of(code: str) -> tuple[dict[str, ast.expr | None], ast.expr]:
+    """Return what each name of `compute_success` stands for, None where it is changed in place, and the result."""
+    lines, expr = _success_lines(code)
+    made: dict[str, ast.expr | None] = {}
+    for node in lines:
+        match node:
+            case ast.Assign(targets=[ast.Name(id=name)], value=value):
+                made[name] = None if name in made else value
+            case ast.Assign(targets=targets):
+                for child in ast.walk(ast.Tuple(targets)):
+                    if isinstance(child, ast.Name) and child.id in made:
+                        made[child.id] = None
+    return made, expr
+
+
+def _function_text(lines: list[str], parts: list[tuple[str, str]]) -> str:
+    body = [
+        "# type: (Tensor, Dict[str, Tensor]) -> Tuple[Tensor, Dict[str, torch.Tensor]]",
+        '"""',
+        "Stages: reach the object, take hold of it where that is needed, then make the success come true.",
+        "# Reward Components:",
+        *[f"{i}. {name}" for i, (name, _) in enumerate(parts, 1)],
+        '"""',
+        *[row for line in lines for row in line.splitlines()],
+        "reward_components = {}",
+        *[f'reward_components["{name}"] = {text}' for name, text in parts],
+        "total = 100.0 * ("
+        + " + ".join(f'reward_components["{name}"]' for name, _ in parts)
+        + ")",
+        "return total, reward_components",
+    ]
+    head = f"@torch.jit.script\ndef {FUNCTION}(actions, states):\n"
+    return head + "".join(f"    {row}\n" for row in body)
+
+
+def _rows_of(node: ast.FunctionDef) -> tuple[int, int]:
+    first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
+    return first - 1, node.end_lineno or node.lineno
+
+
+def _text_of(source: str, node: ast.FunctionDef) -> str:
+    first, last = _rows_of(node)
+    return "\n".join(source.splitlines()[first:last])
+
+
+def _called(function: ast.FunctionDef, known: dict[str, ast.FunctionDef]) -> list[str]:
+    """Return the functions that one calls, directly or not, callers first."""
+    found: list[str] = []
+    waiting = [function]
+    while waiting:
+        for node in ast.walk(waiting.pop(0)):
+            if (
+                isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Name)
+                and node.func.id in known
+                and node.func.id not in found
+            ):
+                found.append(node.func.id)
+                waiting.append(known[node.func.id])
+    return found
+
+
+def _calling_function(code: str) -> str:
+    """Return task code whose `compute_reward` hands over to a function of the module."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.FunctionDef) and node.name == "compute_reward":
+            rows = code.splitlines(keepends=True)
+            pad = re.match(r"\s*", rows[node.lineno - 1])
+            inner = (pad[0] if pad else "") + "    "
+            first, last = node.body[0].lineno - 1, node.end_lineno or node.lineno
+            if first < node.lineno:
+                raise UnreadableError("its compute_reward is written in one line")
+            names = [a.arg for a in node.args.args[1:]]
+            rows[first:last] = [f"{inner}return {FUNCTION}({', '.join(names)})\n"]
+            return "".join(rows).rstrip("\n") + "\n"
+    raise UnreadableError("it has no compute_reward")
