@@ -1,25 +1,31 @@
 """From a scene to its task: eight samples, each tried and audited, the best one picked.
 
-Offline samples come from `templates`; whoever else writes code passes it in as `sources`.
+Offline samples come from `templates`, with a model from `vlm_writer`; whoever else writes code passes it in as `sources`.
 """
 
 import json
 import logging
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
 from v2p_data.task.audit import Audit, audit, build_probes
+from v2p_data.task.calls import Call
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates import write_samples
+from v2p_data.task.vlm_config import VlmConfig
 
 AUDIT_FILE = "audit.json"
 SAMPLES_FOLDER = "samples"
+CALLS_FOLDER = "calls"
+"""In the samples' folder: every call to a model that had a part in this task."""
 HORIZON_STEPS = {"lift_up": 60, "push_left": 60, "push_right": 60, "tip_over": 60}
 """Control steps (20 Hz) per episode, by kind; `TaskConfig.horizon_steps` for the others."""
 MOTION_SCALE = {"throw_into": 2.0}
@@ -32,6 +38,8 @@ logger = logging.getLogger(__name__)
 class TaskConfig:
     """How a task is made from a scene."""
 
+    writer: Literal["templates", "vlm"] = "templates"
+    """Who writes the codes: our templates, offline and free, or a model that is asked over the network."""
     num_samples: int = 8
     """Codes to choose from (the paper's number)."""
     horizon_steps: int = 100
@@ -40,6 +48,17 @@ class TaskConfig:
     """Limit for the trial run of one sample."""
     timeout_s: float = 180.0
     """Limit for the trial run of all samples."""
+    vlm: VlmConfig = field(default_factory=VlmConfig)
+    """Which model, where `writer` is `vlm`."""
+
+    def recipe(self) -> "TaskConfig":
+        """Return the settings that decide what is written, without those of how it is asked for.
+
+        Replaying stored calls, or waiting longer for an answer, makes the same task.
+        """
+        if self.writer == "templates":
+            return replace(self, vlm=VlmConfig())
+        return replace(self, vlm=self.vlm.recipe())
 
     def __post_init__(self) -> None:
         if self.num_samples < 1:
@@ -73,61 +92,160 @@ class GeneratedTask:
     bundle: TaskBundle
     samples: tuple[Sample, ...] = field(repr=False)
     picked: int
+    first: tuple[Sample, ...] = field(default=(), repr=False)
+    """The samples as they were before any was sent back; empty where none was."""
+    about: dict[str, Any] = field(default_factory=dict[str, Any])
+    """Who wrote and who picked, and what it took."""
+    calls: tuple[Call, ...] = field(default=(), repr=False)
+    """Every call to a model that had a part in it."""
+
+    def rates(self) -> dict[str, Any]:
+        """Return how many samples are of no use, before and after sending back and picking (the paper's table 8)."""
+        return {
+            "first_answers": hallucination(self.first or self.samples),
+            "before_pick": hallucination(self.samples),
+            "after_pick": hallucination([self.samples[self.picked]]),
+        }
 
     def save(self, folder: Path) -> None:
-        """Write the bundle, `samples/<i>.py` and `audit.json`."""
+        """Write the bundle, `samples/<i>.py`, `samples/calls/<key>.json` and `audit.json`."""
         self.bundle.save(folder)
         samples = folder / SAMPLES_FOLDER
         samples.mkdir()
         for i, sample in enumerate(self.samples):
             (samples / f"{i}.py").write_text(sample.code)
-        table = {"picked": self.picked, "samples": [s.as_dict() for s in self.samples]}
+        for call in self.calls:
+            (samples / CALLS_FOLDER).mkdir(exist_ok=True)
+            path = samples / CALLS_FOLDER / f"{call.key}.json"
+            path.write_text(json.dumps(call.as_dict(), indent=1))
+        table = {
+            "picked": self.picked,
+            **self.about,
+            "rates": self.rates(),
+            "samples": [s.as_dict() for s in self.samples],
+        }
         (folder / AUDIT_FILE).write_text(json.dumps(table, indent=1))
 
 
+def hallucination(samples: Sequence[Sample]) -> dict[str, float]:
+    """Return the share of samples that do not run, that run but score zero, and of both together."""
+    broken = sum(not s.runnable for s in samples) / len(samples)
+    zero = sum(s.runnable and s.score == 0 for s in samples) / len(samples)
+    return {
+        "samples": len(samples),
+        "non_runnable": round(broken, 4),
+        "zero_score": round(zero, 4),
+        "hallucination": round(broken + zero, 4),
+    }
+
+
 def generate_task(
-    scene: Scene, cfg: TaskConfig, seed: int, *, sources: list[str] | None = None
+    scene: Scene,
+    cfg: TaskConfig,
+    seed: int,
+    *,
+    sources: list[str] | None = None,
+    calls: Path | None = None,
+    pool: Path | None = None,
 ) -> GeneratedTask:
     """Return the scene's task.
 
     Args:
         scene: what was understood of the video.
-        cfg: how many samples, and limits.
-        seed: of the audit's random probes.
-        sources: task codes to choose from, instead of the templates'.
+        cfg: who writes, how many samples, and limits.
+        seed: of the audit's random probes; with a model, another one asks anew instead of taking stored answers.
+        sources: task codes to choose from, instead of the templates' or the model's.
+        calls: folder in which calls to a model are stored; without one they are kept with the task only.
+        pool: folder of tasks solved so far, which a model is shown as examples.
 
     Raises:
         ItemRejectedError: `no_acceptable_task`: no sample runs and passes the audit.
+        V2PError: the model cannot be asked, or its budget is used up.
     """
-    codes = write_samples(scene, cfg.num_samples) if sources is None else sources
     probes = build_probes(scene, rng_for(seed, "audit", scene.title))
-    results = smoke_run_all(
-        codes,
-        scene,
-        probes=probes.states,
-        seconds_each=cfg.seconds_each,
-        timeout_s=cfg.timeout_s,
-    )
-    samples = tuple(
-        _sample(code, result, audit(scene, probes, result))
-        for code, result in zip(codes, results, strict=True)
-    )
+
+    def try_all(codes: list[str]) -> list[SmokeResult]:
+        return smoke_run_all(
+            codes,
+            scene,
+            probes=probes.states,
+            seconds_each=cfg.seconds_each,
+            timeout_s=cfg.timeout_s,
+        )
+
+    def judged(written: Sequence[tuple[str, SmokeResult]]) -> tuple[Sample, ...]:
+        return tuple(
+            _sample(code, result, audit(scene, probes, result)) for code, result in written
+        )
+
+    if sources is None and cfg.writer == "vlm":
+        return _by_model(scene, cfg, seed, try_all, judged, calls, pool)
+    codes = write_samples(scene, cfg.num_samples) if sources is None else sources
+    samples = judged(list(zip(codes, try_all(codes), strict=True)))
     picked = _pick(scene, samples)
-    chosen = samples[picked]
     return GeneratedTask(
-        bundle=TaskBundle(
-            title=scene.title,
-            description=scene.description,
-            kind=scene.kind,
-            class_name=class_name(chosen.code),
-            code=chosen.code,
-            scene=scene,
-            horizon_steps=HORIZON_STEPS.get(scene.kind, cfg.horizon_steps),
-            motion_scale=MOTION_SCALE.get(scene.kind, 1.0),
-            audit=chosen.audit.as_dict(),
-        ),
+        bundle=_bundle(scene, cfg, samples[picked]),
         samples=samples,
         picked=picked,
+        about={
+            "writer": "templates" if sources is None else "given",
+            "pick": {"by": "audit", "reasons": {}},
+        },
+    )
+
+
+def _by_model(
+    scene: Scene,
+    cfg: TaskConfig,
+    seed: int,
+    try_all: Callable[[list[str]], list[SmokeResult]],
+    judged: Callable[[Sequence[tuple[str, SmokeResult]]], tuple[Sample, ...]],
+    calls: Path | None,
+    pool: Path | None,
+) -> GeneratedTask:
+    """Let a model write the samples and choose among those that the audit accepts."""
+    from v2p_data.task import vlm_writer
+    from v2p_data.task.pool import examples_for, read_pool
+    from v2p_data.task.vlm import VlmClient
+
+    pools = [p for p in (pool, cfg.vlm.pool) if p is not None]
+    examples = examples_for(scene, read_pool(*pools), cfg.vlm.num_examples)
+    with tempfile.TemporaryDirectory(prefix="v2p-calls-") as kept_nowhere_else:
+        client = VlmClient(cfg.vlm, calls or Path(kept_nowhere_else), seed)
+        written = vlm_writer.write_samples(client, scene, cfg.num_samples, examples, try_all)
+        samples = judged(written.final)
+        audits_pick = _pick(scene, samples)
+        pick = vlm_writer.pick_sample(
+            client, scene, [(s.code, s.audit) for s in samples], audits_pick=audits_pick
+        )
+    return GeneratedTask(
+        bundle=_bundle(scene, cfg, samples[pick.index]),
+        samples=samples,
+        picked=pick.index,
+        first=judged(written.first),
+        about={
+            "writer": "vlm",
+            "pick": {**pick.as_dict(), "audits_pick": audits_pick},
+            "model": cfg.vlm.model,
+            "examples": [e.source for e in examples],
+            "codes_asked_for": written.answers,
+            "spent": client.spent.as_dict(),
+        },
+        calls=tuple(client.used.values()),
+    )
+
+
+def _bundle(scene: Scene, cfg: TaskConfig, chosen: Sample) -> TaskBundle:
+    return TaskBundle(
+        title=scene.title,
+        description=scene.description,
+        kind=scene.kind,
+        class_name=class_name(chosen.code),
+        code=chosen.code,
+        scene=scene,
+        horizon_steps=HORIZON_STEPS.get(scene.kind, cfg.horizon_steps),
+        motion_scale=MOTION_SCALE.get(scene.kind, 1.0),
+        audit=chosen.audit.as_dict(),
     )
 
 

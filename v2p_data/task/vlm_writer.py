@@ -1,0 +1,295 @@
+"""A model writes task codes until enough of them run, chooses among them, and writes rewards for a task that exists.
+
+Whatever it writes is tried in the sandbox before anybody sees it, and goes back to it with the error and the line where it
+does not run. Nothing it says overrules the audit: it chooses among codes that the audit finds acceptable.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+from v2p_data.errors import V2PError
+from v2p_data.scene.scene import Scene
+from v2p_data.task.answers import choice_in, reward_code_in, task_code_in
+from v2p_data.task.audit import Audit
+from v2p_data.task.example_tasks import Example
+from v2p_data.task.pictures import scene_pictures
+from v2p_data.task.prompts import (
+    Message,
+    better_reward_message,
+    fault_message,
+    first_reward_message,
+    pick_message,
+    scene_message,
+    system_message,
+)
+from v2p_data.task.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.splice import SpliceError, reward_part, with_reward
+from v2p_data.task.task import TaskBundle
+from v2p_data.task.templates import VARIANTS
+from v2p_data.task.vlm import FaultyAnswerError, VlmClient
+
+logger = logging.getLogger(__name__)
+
+TryAll = Callable[[list[str]], list[SmokeResult]]
+"""Runs task codes in the sandbox, one result each."""
+IDEAS = tuple(v.idea for v in VARIANTS if not v.is_naive)
+"""For variety among samples: what each reward may be like."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenSamples:
+    """What the model wrote, in the order of the samples."""
+
+    first: tuple[tuple[str, SmokeResult], ...] = field(repr=False)
+    """Each sample's first answer: what there is without sending anything back."""
+    final: tuple[tuple[str, SmokeResult], ...] = field(repr=False)
+    """After regeneration."""
+    answers: int
+    """Codes that were asked for, with those that were sent back."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pick:
+    """Which sample was chosen, by whom, and why."""
+
+    index: int
+    by: str
+    """`vlm` or `audit`."""
+    reasons: dict[str, str]
+
+    def as_dict(self) -> dict[str, object]:
+        """Return it for JSON."""
+        return {"by": self.by, "reasons": self.reasons}
+
+
+@dataclass(kw_only=True)
+class _Draft:
+    """One sample on its way: the conversation about it and where it stands."""
+
+    talk: list[Message]
+    code: str = ""
+    result: SmokeResult = field(
+        default_factory=lambda: SmokeResult(runnable=False, error="no code was written")
+    )
+
+
+# --- task codes ----------------------------------------------------------------------------------------------
+
+
+def write_samples(
+    client: VlmClient,
+    scene: Scene,
+    count: int,
+    examples: Sequence[Example],
+    try_all: TryAll,
+) -> WrittenSamples:
+    """Return `count` task codes for a scene, sent back with their errors until they run, a bounded number of times.
+
+    Args:
+        client: the model.
+        scene: what was understood of the video.
+        count: how many.
+        examples: solved tasks to show.
+        try_all: the sandbox.
+
+    Raises:
+        BudgetError: the budget is used up.
+        V2PError: the server cannot be asked.
+    """
+    cfg = client.cfg
+    system = system_message([o.name for o in scene.objects], examples)
+    pictures = scene_pictures(scene, cfg.image_side_px, cfg.sheet_frames) if cfg.images else []
+    drafts = [
+        _Draft(
+            talk=[
+                system,
+                scene_message(scene, pictures, tracking=cfg.tracking, end=_end(i, count)),
+            ]
+        )
+        for i in range(count)
+    ]
+    first: list[tuple[str, SmokeResult]] = []
+    answers = 0
+    for turn in range(cfg.max_regenerations + 1):
+        open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
+        if not open_ones:
+            break
+        purpose = f"task {scene.title}, turn {turn}, sample "
+        _ask_all(client, {f"{purpose}{i}": drafts[i] for i in open_ones}, task_code_in, try_all)
+        answers += len(open_ones)
+        if turn == 0:
+            first = [(d.code, d.result) for d in drafts]
+    final = tuple((d.code, d.result) for d in drafts)
+    broken = sum(not r.runnable for _, r in final)
+    if broken:
+        logger.warning(
+            "%d of %d samples for '%s' still do not run after %d regenerations",
+            broken, count, scene.title, cfg.max_regenerations,
+        )  # fmt: skip
+    return WrittenSamples(first=tuple(first), final=final, answers=answers)
+
+
+def _end(index: int, count: int) -> str:
+    idea = IDEAS[index % len(IDEAS)]
+    return (
+        f"This is sample {index + 1} of {count}. So that the samples differ, let this one's reward follow this idea if it suits "
+        f"the task: {idea}"
+    )
+
+
+def _ask_all(
+    client: VlmClient,
+    drafts: dict[str, _Draft],
+    read: Callable[[str], str],
+    try_all: TryAll,
+) -> None:
+    """Ask for each draft's code at the same time, try them all, and add what is wrong to their conversations."""
+
+    def asked(item: tuple[str, _Draft]) -> None:
+        purpose, draft = item
+        try:
+            draft.code, draft.talk = client.ask(draft.talk, purpose, read)
+            draft.result = SmokeResult(runnable=True)
+        except FaultyAnswerError as fault:
+            draft.result = SmokeResult(runnable=False, error=f"no usable answer: {fault}")
+
+    with ThreadPoolExecutor(max_workers=client.cfg.parallel) as threads:
+        list(threads.map(asked, drafts.items()))
+    written = [d for d in drafts.values() if d.result.runnable]
+    for draft, result in zip(written, try_all([d.code for d in written]), strict=True):
+        draft.result = result
+        if not result.runnable:
+            draft.talk = [*draft.talk, fault_message(result.error, draft.code)]
+
+
+# --- the pick ------------------------------------------------------------------------------------------------
+
+
+def pick_sample(
+    client: VlmClient,
+    scene: Scene,
+    samples: Sequence[tuple[str, Audit]],
+    *,
+    audits_pick: int,
+) -> Pick:
+    """Return the model's choice among the acceptable samples; the audit's where there is nothing to choose, or no answer.
+
+    Args:
+        client: the model.
+        scene: what was understood of the video.
+        samples: codes and their audits; those that are not acceptable are not shown.
+        audits_pick: index of the acceptable sample that the audit alone would take.
+
+    Raises:
+        BudgetError: the budget is used up.
+        V2PError: the server cannot be asked.
+    """
+    candidates = {i: s for i, s in enumerate(samples) if s[1].is_acceptable}
+    if client.cfg.pick == "audit":
+        return Pick(
+            index=audits_pick, by="audit", reasons={"why": "the settings leave it to the audit"}
+        )
+    if len(candidates) == 1:
+        return Pick(
+            index=audits_pick, by="audit", reasons={"why": "no other sample is acceptable"}
+        )
+    question = pick_message(scene, candidates, tracking=client.cfg.tracking)
+    allowed = list(candidates)
+    try:
+        (index, reasons), _ = client.ask(
+            [question],
+            f"pick for {scene.title}",
+            lambda text: choice_in(text, allowed),
+        )
+    except FaultyAnswerError as fault:
+        words = f"the model gave no usable choice, so the audit's was taken; the last answer's fault: {fault}"
+        logger.warning("%s: %s", scene.title, words)
+        return Pick(index=audits_pick, by="audit", reasons={"why": words})
+    return Pick(index=index, by="vlm", reasons=reasons)
+
+
+# --- rewards -------------------------------------------------------------------------------------------------
+
+
+def first_rewards(client: VlmClient, bundle: TaskBundle, count: int) -> list[str]:
+    """Return the task's code with `count` other rewards, before anything was trained.
+
+    Raises:
+        BudgetError: the budget is used up.
+        V2PError: no answer could be used, or the server cannot be asked.
+    """
+    question = first_reward_message(bundle.description, bundle.code)
+    return _rewards(client, bundle, bundle.code, question, count, "first reward")
+
+
+def improve_reward(
+    client: VlmClient, bundle: TaskBundle, code: str, feedback_text: str, count: int
+) -> list[str]:
+    """Return `code` with `count` better rewards; everything but the reward is the same, so success cannot move.
+
+    All of them run in the sandbox on the bundle's scene, and they differ from `code` and from each other. There are fewer
+    than `count` where the model gave no more in a bounded number of turns.
+
+    Args:
+        client: the model.
+        bundle: the task, for its scene and its words.
+        code: the task code that was trained with.
+        feedback_text: what the training showed, component by component.
+        count: how many.
+
+    Raises:
+        BudgetError: the budget is used up.
+        V2PError: no answer could be used, the code's success depends on its reward, or the server cannot be asked.
+    """
+    question = better_reward_message(bundle.description, code, feedback_text)
+    return _rewards(client, bundle, code, question, count, "better reward")
+
+
+def _rewards(
+    client: VlmClient, bundle: TaskBundle, parent: str, question: Message, count: int, what: str
+) -> list[str]:
+    system = system_message([o.name for o in bundle.scene.objects])
+    drafts = [_Draft(talk=[system, _with_idea(question, i, count)]) for i in range(count)]
+
+    def read(text: str) -> str:
+        try:
+            return with_reward(parent, reward_code_in(text))
+        except SpliceError as fault:
+            raise FaultyAnswerError(str(fault)) from fault
+
+    for turn in range(client.cfg.max_regenerations + 1):
+        open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
+        if not open_ones:
+            break
+        purpose = f"{what} for {bundle.title}, turn {turn}, sample "
+        _ask_all(
+            client, {f"{purpose}{i}": drafts[i] for i in open_ones}, read,
+            lambda codes: smoke_run_all(codes, bundle.scene),
+        )  # fmt: skip
+        _send_back_twins(drafts)
+    made = [d.code for d in drafts if d.result.runnable]
+    if not made:
+        raise V2PError(
+            f"no {what} for '{bundle.title}' could be used; the last one's fault: {drafts[-1].result.error}. "
+            "Try a stronger model, or --task.vlm.max-regenerations"
+        )
+    return made
+
+
+def _with_idea(question: Message, index: int, count: int) -> Message:
+    return {**question, "content": f"{question['content']}\n\n{_end(index, count)}"}
+
+
+def _send_back_twins(drafts: list[_Draft]) -> None:
+    """Mark rewards that an earlier sample has too as not done."""
+    seen: set[str] = set()
+    for draft in drafts:
+        if draft.result.runnable:
+            part = reward_part(draft.code)
+            if part in seen:
+                fault = "another sample has the same reward; write a different one"
+                draft.result = SmokeResult(runnable=False, error=fault)
+                draft.talk = [*draft.talk, {"role": "user", "content": f"{fault.capitalize()}."}]
+            seen.add(part)
