@@ -127,7 +127,7 @@ class GeneratedTask:
         (folder / AUDIT_FILE).write_text(json.dumps(table, indent=1))
 
 
-def hallucination(samples: Sequence[Sample]) -> dict[str, float]:
+def hallucination(samples: Sequence[Sample]) -> dict[str, int | float]:
     """Return the share of samples that do not run, that run but score zero, and of both together."""
     broken = sum(not s.runnable for s in samples) / len(samples)
     zero = sum(s.runnable and s.score == 0 for s in samples) / len(samples)
