@@ -17,10 +17,10 @@ BELOW: dict[str, set[str]] = {
     # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
     "sim": {"task", "scene", "geometry", "errors", "seeds"},
     "episodes": {"sim", "task", "scene", "geometry", "pipeline", "errors", "seeds"},
-    "reward": {"task", "sim", "scene", "errors", "seeds"},
+    "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds"},
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }
-TOP = {"stages", "learning", "solved", "cli", "commands"}
+TOP = {"stages", "learning", "solved", "candidate_worker", "cli", "commands"}
 
 
 def imported_modules(path: Path) -> set[str]:

@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "push": ("share", "push a dataset or a policy to the Hub"),
     "scene": ("run", "videos -> scenes only: objects, meshes, sizes, poses"),
     "task": ("run", "up to the task code and its audit"),
+    "reward": ("reward", "up to the rewards: rounds of them, trained against each other"),
     "expert": ("run", "up to the trained experts"),
     "episodes": ("run", "up to the episodes, without packing them"),
     "verify": ("share", "reopen a dataset with LeRobot and check every frame"),
@@ -33,6 +34,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
 """Command -> module of `v2p_data.commands` that holds it, and what it does."""
 SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "scene review": ("review", "a page to judge a run's scenes on and to mark what was not found"),
+    "task show": ("task", "a task's code, and the audit's answers"),
+    "reward search": ("reward", "search for one task's reward"),
+    "reward show": ("reward", "what a search tried, with curves, analysis and differences"),
 }
 """The same for commands of two words; a folder of the second word's name is given as `./review`."""
 

@@ -1,7 +1,7 @@
 """START HERE: the engine's stages in the order they happen.
 
-    video --> scene --> task --> expert --> episodes --+--> dataset --> policy --> evaluation
-    video --> scene --> task --> expert --> episodes --+
+    video --> scene --> task --> (reward -->) expert --> episodes --+--> dataset --> policy --> evaluation
+    video --> scene --> task --> (reward -->) expert --> episodes --+
 
 Each stage is a recipe and inputs (what it is) and a `make_*` function (how it comes about). A `make_*` loads
 its inputs, calls the craft, saves, and returns the counts that the record keeps. Heavy libraries are imported
@@ -24,6 +24,7 @@ from v2p_data.learning import ExpertConfig, learn
 from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.reward.config import RewardConfig
 from v2p_data.scene.reconstruct import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
@@ -38,6 +39,7 @@ ROOT_OF_TASKS = "v2p/tasks"
 """Where a dataset carries the tasks that its episodes were made in."""
 EVALUATION_FILE = "evaluation.json"
 POLICY_FOLDER = "policy"
+REWARD_SEARCH_FOLDER = "search"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +81,7 @@ class EngineConfig:
     scene: SceneConfig = field(default_factory=SceneConfig)
     task: TaskConfig = field(default_factory=TaskConfig)
     sim: SimulatorConfig = field(default_factory=SimulatorConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     episodes: EpisodesConfig = field(default_factory=EpisodesConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -199,6 +202,51 @@ def make_task(
         "runnable": sum(s.runnable for s in generated.samples),
         "picked": generated.picked,
     }
+
+
+# --- task -> reward (with --reward.iterations above 0) --------------------------------------------------------
+
+
+def reward_stage(task: Stage, cfg: EngineConfig) -> Stage:
+    """Return the stage that searches a task's reward; its result is the task with the reward that was found.
+
+    Raises:
+        V2PError: the method plays programs and leaves no reward.
+    """
+    if cfg.reward.method == "code_as_policy":
+        raise V2PError(
+            "--reward.method=code_as_policy has no reward to learn from; scripts/compare_reward_methods.py plays it"
+        )
+    return Stage(
+        name="reward",
+        item=task.item,
+        config=Seeded(config=cfg.reward, seed=cfg.seed),
+        inputs={"task": task},
+        version=1,
+        make=make_reward,
+        resumes=True,
+    )
+
+
+def make_reward(
+    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
+) -> dict[str, Any]:
+    """Search, and write the task with the reward that was found."""
+    from v2p_data.reward.search import How, search_reward
+    from v2p_data.task.task import SCENE_FOLDER, TaskBundle
+
+    bundle = TaskBundle.load(inputs["task"])
+    found = search_reward(
+        bundle,
+        cfg.config,
+        out / REWARD_SEARCH_FOLDER,
+        seed=seed_for(cfg.seed, "reward", bundle.title),
+        how=How(num_threads=runtime.num_threads),
+        on_progress=runtime.progress,
+    )
+    shutil.rmtree(out / SCENE_FOLDER, ignore_errors=True)  # of a run that was killed just here
+    replace(bundle, code=found.code, class_name=found.class_name).save(out)
+    return found.as_dict()
 
 
 # --- task -> expert ------------------------------------------------------------------------------------------
@@ -362,7 +410,9 @@ def make_dataset(
         shutil.copytree(
             stage.folder(runtime.root),
             root / ROOT_OF_TASKS / item,
-            ignore=shutil.ignore_patterns("record.json", "samples", "overlay*"),
+            ignore=shutil.ignore_patterns(
+                "record.json", "samples", "overlay*", REWARD_SEARCH_FOLDER
+            ),
         )
     runtime.progress(0.75, "comparing every frame")
     report = verify(root, staged=staged)
@@ -516,5 +566,7 @@ def chain(video: VideoItem, cfg: EngineConfig) -> Stage:
     """Return the episodes stage of one video, with everything before it."""
     scene = scene_stage(video, cfg)
     task = task_stage(scene, cfg)
+    if cfg.reward.iterations:
+        task = reward_stage(task, cfg)
     expert = expert_stage(task, cfg)
     return episodes_stage(task, expert, cfg)

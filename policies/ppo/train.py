@@ -170,6 +170,7 @@ def train_expert(
     eval_env: EnvBase | None = None,
     warm_start: Path | None = None,
     on_progress: Callable[[int, int, float], None] | None = None,
+    draws: bool = True,
 ) -> ExpertResult:
     """Train until the target, the step budget or the time limit; go on from `out/checkpoint.pt` if it exists.
 
@@ -181,6 +182,8 @@ def train_expert(
         eval_env: where the best expert plays fresh episodes at the end.
         warm_start: another expert's folder; its actor and normalisation are the starting point.
         on_progress: called after every batch with steps, total steps and deterministic success (NaN at first).
+        draws: write the curve's picture and its mirror for TensorBoard too; a training that is stopped and gone
+            on with many times would spend much of its time on them.
 
     Raises:
         ValueError: the checkpoint was made with another recipe, or there are too few worlds.
@@ -193,7 +196,7 @@ def train_expert(
         )
     out.mkdir(parents=True, exist_ok=True)
     with torch_threads(cfg.num_threads):
-        learner = _Learner(env, cfg, out, seed, warm_start)
+        learner = _Learner(env, cfg, out, seed, warm_start, draws)
         stopped_by = learner.run(on_progress)
     progress = learner.progress
     rate = None
@@ -214,9 +217,15 @@ class _Learner:
     """The parts of one training run, so that the checkpoint can list them."""
 
     def __init__(
-        self, env: EnvBase, cfg: PPOConfig, out: Path, seed: int, warm_start: Path | None
+        self,
+        env: EnvBase,
+        cfg: PPOConfig,
+        out: Path,
+        seed: int,
+        warm_start: Path | None,
+        draws: bool,
     ) -> None:
-        self.env, self.cfg, self.out = env, cfg, out
+        self.env, self.cfg, self.out, self.draws = env, cfg, out, draws
         self.num_envs = env.batch_size[0]
         self.recipe = _recipe(cfg, seed)
         self.generator = torch.Generator().manual_seed(seed)
@@ -260,22 +269,24 @@ class _Learner:
         before, started = progress.seconds, time.monotonic()
         last_save = started
         batches = iter(self.collector)
-        events = EventMirror(self.out / CURVE_FILE)
+        events = EventMirror(self.out / CURVE_FILE) if self.draws else None
         while (reason := self._reason_to_stop()) is None:
             row = self._iterate(next(batches))
             progress.seconds = before + time.monotonic() - started
             row = {"steps": progress.steps, "seconds": progress.seconds} | row
             append_row(self.out / CURVE_FILE, row)
-            events.add(row)
+            if events is not None:
+                events.add(row)
             if on_progress is not None:
                 on_progress(progress.steps, cfg.total_steps, progress.success(cfg))
             if time.monotonic() - last_save > cfg.checkpoint_seconds:
                 self._save()
                 last_save = time.monotonic()
         self._save()
-        events.close()
+        if events is not None:
+            events.close()
         self.collector.shutdown(close_env=False)
-        if (self.out / CURVE_FILE).is_file():
+        if self.draws and (self.out / CURVE_FILE).is_file():
             plot_curve(self.out / CURVE_FILE, self.out / PICTURE_FILE)
         return reason
 

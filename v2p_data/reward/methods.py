@@ -1,0 +1,142 @@
+"""What each method of the paper's comparison starts from: whose eyes the writer has, and which success is trained on.
+
+* `v2p`: the audited task; every first reward is another template's over the same success.
+* `eureka`: the writer sees the caption and no video, so success comes from words alone, and is not audited.
+* `robogen`: the task as it is, one reward, no bonus for success and no second round.
+* `code_as_policy`: no training; `reward.programs` plays scripted programs, chosen anew every 50 control steps.
+
+The switches of `RewardConfig.without` take single parts of `v2p` away, as in the paper's tables 3 and 7.
+Simulation is the same for all: only what the writer is told differs.
+"""
+
+import ast
+import shutil
+import tempfile
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from v2p_data.reward.config import RewardConfig
+from v2p_data.scene.scene import SCENE_FILE, Scene, SceneObject
+from v2p_data.task.sandbox import class_name
+from v2p_data.task.splice import REWARD, reward_part, with_reward
+from v2p_data.task.task import TaskBundle
+from v2p_data.task.templates import NUM_VARIANTS, write_samples
+
+UNSEEN_SIZE_M = (0.06, 0.06, 0.06)
+"""What a writer supposes who has seen nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """A task to search rewards for, as one method sees it."""
+
+    bundle: TaskBundle
+    """Its code has the success, reset and observation that every candidate keeps; it is simulated as it is."""
+    seen: Scene
+    """What the writer knows of the scene."""
+    codes: tuple[str, ...] = field(repr=False)
+    """The first round, without those that turn out alike."""
+    origins: tuple[str, ...]
+
+
+def prepare(bundle: TaskBundle, cfg: RewardConfig, rng: np.random.Generator) -> Prepared:
+    """Return the task and the first rewards of a method.
+
+    Args:
+        bundle: the task as it was written and audited with all that the video says.
+        cfg: method and switches.
+        rng: which sample is taken where nobody picks.
+    """
+    seen = what_the_writer_sees(bundle.scene, cfg)
+    is_own_success = cfg.method == "eureka" or "pick" in cfg.without or seen is not bundle.scene
+    samples = write_samples(seen, NUM_VARIANTS)
+    base = bundle
+    if is_own_success:
+        # Nobody holds it against the video: the writer's first thought, or any of its samples.
+        chosen = int(rng.integers(NUM_VARIANTS)) if "pick" in cfg.without else 0
+        code = samples[chosen]
+        base = replace(bundle, code=code, class_name=class_name(code), audit={})
+    codes = list(dict.fromkeys([base.code, *(in_place_of_reward(base.code, s) for s in samples)]))
+    if cfg.num_candidates == 1:
+        # Without a choice there is no reason why the one reward should be the best known.
+        codes = [codes[int(rng.integers(len(codes)))]]
+    codes = codes[: cfg.num_candidates]
+    return Prepared(
+        bundle=base,
+        seen=seen,
+        codes=tuple(codes),
+        origins=tuple("given" if code == bundle.code else "template" for code in codes),
+    )
+
+
+def what_the_writer_sees(scene: Scene, cfg: RewardConfig) -> Scene:
+    """Return the scene as the writer of task code knows it: all of it, or less."""
+    if cfg.method == "eureka" or "visual" in cfg.without:
+        blind = tuple(replace(_still(o), shape="box", size_m=UNSEEN_SIZE_M) for o in scene.objects)
+        return replace(scene, objects=blind)
+    if "tracking" in cfg.without:
+        return replace(scene, objects=tuple(_still(o) for o in scene.objects))
+    return scene
+
+
+def _still(obj: SceneObject) -> SceneObject:
+    """Return an object of whose motion nothing is known."""
+    return replace(
+        obj,
+        frames=obj.frames[:1],
+        poses_world=obj.poses_world[:1],
+        confidences=obj.confidences[:1],
+    )
+
+
+# --- code ----------------------------------------------------------------------------------------------------
+
+
+def in_place_of_reward(code: str, other: str) -> str:
+    """Return task code with another one's reward, or as it is where that is the same.
+
+    Raises:
+        SpliceError: the other one holds no reward that could be put there.
+    """
+    if reward_part(code) == reward_part(other):
+        return code
+    return with_reward(code, other)
+
+
+def reward_text(code: str) -> str:
+    """Return the text of a task's reward function, for a person."""
+    for node in ast.parse(code).body:
+        if isinstance(node, ast.FunctionDef) and node.name == REWARD:
+            return "\n".join(code.splitlines()[node.lineno - 1 : node.end_lineno])
+    return ""
+
+
+# --- disk ----------------------------------------------------------------------------------------------------
+
+
+def save_bundle(bundle: TaskBundle, folder: Path) -> None:
+    """Write a task so that it is whole or absent, also one whose scene never lay on disk."""
+    partial = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    with tempfile.TemporaryDirectory(prefix="v2p-scene-") as made:
+        source = bundle.scene.folder
+        if (source / SCENE_FILE).is_file():
+            shutil.copytree(
+                source,
+                made,
+                ignore=shutil.ignore_patterns("record.json", "*.mp4", "*.partial"),
+                dirs_exist_ok=True,
+            )
+        bundle.scene.save(Path(made))
+        replace(bundle, scene=replace(bundle.scene, folder=Path(made))).save(partial)
+    partial.rename(folder)
+
+
+def load_candidate(bundle: Path, code: Path) -> TaskBundle:
+    """Return a saved task with a candidate's code."""
+    loaded = TaskBundle.load(bundle)
+    text = code.read_text()
+    return replace(loaded, code=text, class_name=class_name(text))
