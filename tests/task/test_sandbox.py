@@ -1,11 +1,18 @@
+import inspect
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 
 from v2p_data.task.sandbox import TaskCodeError, check_code, load_task
-from v2p_data.task.smoke import smoke_run_all
+from v2p_data.task.smoke import _results, smoke_run_all
 from v2p_data.task.smoke_child import FakePlacer
+from v2p_data.task.watched import StatesChangedError
+
+sys.path.insert(0, str(Path(__file__).parent))
+from escapes import program
+from harmless import ACCEPTED, REFUSED_WITH_ADVICE
 
 CODE = '''
 import torch
@@ -41,122 +48,32 @@ def placer(n=3):
     )
 
 
-HARMLESS = [
-    "for i in range(3):\n    x = x + i",
-    "y = [v for v in states.values()]",
-    "m = torch.where(x > 0, x, torch.zeros_like(x)).clamp(0.0, 1.0)",
-    "n = torch.linalg.norm(x, dim=-1) ** 2 if len(states) > 3 else x",
-    "name = 'box'\ny = states[f'{name}_pos']",
-    "a, b = x[:, 0], x[..., 1]\na += b",
-    "y = torch.stack([x, x], dim=0).mean(dim=0) * math.pi",
-    "self.seen = x\ny = self.seen",
-    "w: float = 1.0",
-]
+@pytest.mark.parametrize("source", ACCEPTED.values(), ids=ACCEPTED)
+def test_a_harmless_program_is_accepted(source):
+    check_code(source)
 
 
-@pytest.mark.parametrize("body", HARMLESS)
-def test_harmless_code_loads_and_runs(body, scene_of):
-    task = load_task(code(body), placer(), scene_of("lift_up"))
+@pytest.mark.slow
+def test_every_harmless_program_runs_in_the_child(scene_of):
+    results = smoke_run_all(list(ACCEPTED.values()), scene_of("lift_up"))
 
-    states = {"box_pos": torch.tensor([[0, 0, 0.2], [0, 0, 0.0]]), "eef_pos": torch.zeros(2, 3), "a": torch.ones(1), "b": torch.ones(1)}  # fmt: skip
-
-    assert task.compute_success(states)[0].item() in (True, False)
-
-
-ESCAPES = {
-    "dunder walk": "y = x.__class__.__mro__",
-    "subclasses through a constant": "y = ().__class__.__bases__[0].__subclasses__()",
-    "import": "import os",
-    "import by name": "y = __import__('os')",
-    "open": "y = open('/etc/passwd')",
-    "eval": "y = eval('1')",
-    "exec through a list": "y = [exec][0]('1')",
-    "getattr": "y = getattr(x, 'data')",
-    "globals": "y = globals()",
-    "type": "y = type(x)",
-    "torch.load": "y = torch.load('x')",
-    "torch.save": "torch.save(x, 'x')",
-    "torch.ops": "torch.ops.aten.add(x, x)",
-    "torch.hub": "torch.hub.load('a', 'b')",
-    "torch.jit.load": "torch.jit.load('x')",
-    "torch.utils": "torch.utils.cpp_extension.load('x')",
-    "ctypes through torch": "torch.ctypes.CDLL('libc.so.6')",
-    "torch under another name": "t = torch\nt.load('x')",
-    "numpy writes files": "x.numpy().tofile('x')",
-    "storage": "x.untyped_storage()",
-    "in place": "x.zero_()",
-    "format reads attributes": "y = '{0.device}'.format(x)",
-    "f-string reads attributes": "y = f'{x.device}'",
-    "f-string width": "n = 1\ny = f'{n:1000000000}'",
-    "percent width": "y = '%1000000000d' % 1",
-    "lambda": "f = lambda a=open: a",
-    "while": "while True:\n    pass",
-    "generator": "y = sum(i for i in range(9))",
-    "comprehension bomb": "y = [1 for a in range(9) for b in range(9)]",
-    "loops within loops": "for a in range(9):\n    for b in range(9):\n        for c in range(9):\n            pass",
-    "huge power": "y = 9 ** 9 ** 9",
-    "power of a name": "n = 9\ny = n ** n",
-    "shift": "y = 1 << 999999",
-    "huge number": "y = 10000000000000000000",
-    "long list": "y = [0] * 999999",
-    "long string": "y = 'a' * 999999",
-    "global": "global scene_info\nscene_info = 1",
-    "try": "try:\n    pass\nexcept BaseException:\n    pass",
-    "with": "with x:\n    pass",
-    "walrus": "y = (z := 1)",
-    "star call": "torch.zeros(*[1, 2])",
-    "double star call": "torch.zeros(**{'size': (1,)})",
-    "out argument": "torch.add(x, x, out=states['eef_pos'])",
-    "new self": "self = states",
-    "new torch": "torch = states",
-    "private attribute": "self.envs._envs.bundle",
-    "the environment's inside": "self.envs.bundle",
-    "base class's inside": "Task.compute_success(self, states)",
-    "super with arguments": "super(Lift, self).compute_success(states)",
-    "super's attribute": "y = super().scene_info",
-    "own name of a tensor's method": "self.untyped_storage = 1",
-    "function in a function": "def f():\n    pass",
-    "class in a function": "class A:\n    pass",
-    "unicode look-alike": "\N{FULLWIDTH LATIN SMALL LETTER E}val('1')",
-    "deep nesting": "y = " + "(" * 300 + "1" + ")" * 300,
-    "deep operators": "y = " + "-" * 60 + "1",
-    "match": "match x:\n    case _:\n        pass",
-    "await": "await x",
-    "random numbers": "y = torch.rand(3)",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("body", ESCAPES.values(), ids=ESCAPES)
-def test_an_escape_is_refused_with_its_line(body):
-    with pytest.raises(TaskCodeError) as refusal:
-        check_code(code(body))
-
-    if "nesting" not in body:
-        assert refusal.value.line is None or refusal.value.line > 0
-    assert refusal.value.reason
+    assert dict(zip(ACCEPTED, [r.error for r in results], strict=True)) == dict.fromkeys(
+        ACCEPTED, ""
+    )
+    assert all(r.runnable for r in results)
 
 
 @pytest.mark.parametrize(
-    "top",
-    [
-        "print('hello')",
-        "x = open('f')",
-        "from os import system",
-        "import torch as t",
-        "from torch import load",
-        "@staticmethod\ndef f():\n    pass",
-        "def f(a=open('x')):\n    pass",
-        "def f(*a):\n    pass",
-        "def f(a: open('x')):\n    pass",
-        "class Other(Task):\n    pass",
-        "_hidden = 1",
-        "x = [i for i in (1, 2)]",
-        "for i in range(3):\n    pass",
-    ],
+    ("source", "advice"), REFUSED_WITH_ADVICE.values(), ids=REFUSED_WITH_ADVICE
 )
-def test_nothing_but_constants_functions_and_the_class_stands_at_module_level(top):
-    with pytest.raises(TaskCodeError):
-        check_code(code(top=top))
+def test_a_harmless_program_that_is_refused_hears_which_line_and_what_to_do(source, advice):
+    with pytest.raises(TaskCodeError) as refusal:
+        check_code(source)
+
+    assert advice in refusal.value.reason
+    assert refusal.value.line is not None
+    skeleton = program("#BODY").splitlines()
+    assert source.splitlines()[refusal.value.line - 1] != skeleton[refusal.value.line - 1]
 
 
 def test_the_line_named_is_the_line_in_the_text():
@@ -165,6 +82,7 @@ def test_the_line_named_is_the_line_in_the_text():
     with pytest.raises(TaskCodeError) as refusal:
         check_code(source)
 
+    assert refusal.value.line is not None
     assert source.splitlines()[refusal.value.line - 1].strip() == "y = eval('2')"
 
 
@@ -183,7 +101,7 @@ def test_code_that_is_no_python_gets_the_line():
 def test_loaded_code_has_no_way_to_builtins(scene_of):
     task = load_task(code(), placer(), scene_of("lift_up"))
 
-    inside = type(task).compute_success.__globals__
+    inside = inspect.unwrap(type(task).compute_success).__globals__
     assert "open" not in inside["__builtins__"]
     assert not hasattr(inside["torch"], "load")
     assert inside["torch"] is not sys.modules["torch"]
@@ -197,70 +115,41 @@ def test_task_code_sees_two_things_of_the_environment(scene_of):
     assert not hasattr(task.envs, "_states")
 
 
-@pytest.mark.slow
-def test_what_cannot_be_read_off_is_contained_by_the_child(scene_of):
-    """One child for all, so that torch is imported once; each sample is its own result."""
-    attempts = {
-        "fine": (code(), ""),
-        "memory bomb": (code("y = torch.zeros(200000, 200000)"), "memory"),
-        "endless growth": (code("y = 3\nfor i in range(999):\n    y = y * y"), "took more than"),
-        "deep recursion": (code("return self.compute_success(states)"), "RecursionError"),
-        "unknown state": (code("y = states['nothing']"), "line 13: KeyError"),
-        "changes its input": (code("x[0, 0] = 1"), "changes states['box_pos'] in place"),
-        "wrong type": (code("return x"), "compute_success must have one row"),
-        "not bool": (code("return x[:, 2]"), "must be of type torch.bool"),
-        "divides by zero": (code("y = 1 / 0"), "line 13: ZeroDivisionError"),
-        "not a number": (code().replace("r = 1 -", "r = torch.log(-states['progress'] - 1) -"), "not finite"),
-        "depends on order": (code("x = x * torch.arange(len(x)).reshape(-1, 1)"), "order"),
-        "wrong length": (
-            code().replace("    def compute_reward", "    def get_observation_space(self):\n        return 7\n    def compute_reward"),
-            "says 7, but the observation has length 90",
-        ),
-        "long range": (code("for i in range(999999):\n    pass"), "range of 999999 steps"),
-        "remembers": (
-            code("self.calls = self.calls + 1\nx = x * self.calls").replace(
-                "scene_info)\n", "scene_info)\n        self.calls = 0\n"
-            ),
-            "two calls",
-        ),
-    }  # fmt: skip
+def test_writing_into_a_state_stops_a_loaded_task(scene_of):
+    task = load_task(code("if len(x) > 16:\n    x[0, 2] = 1"), placer(), scene_of("lift_up"))
+    small = {"box_pos": torch.zeros(2, 3), "eef_pos": torch.zeros(2, 3)}
+    large = {"box_pos": torch.zeros(32, 3), "eef_pos": torch.zeros(32, 3)}
 
-    results = smoke_run_all(
-        [source for source, _ in attempts.values()], scene_of("lift_up"), seconds_each=5.0
-    )
-
-    got = dict(zip(attempts, results, strict=True))
-    assert got["fine"].runnable
-    assert got["fine"].components == ("reach",)
-    for name, (_, words) in attempts.items():
-        if name != "fine":
-            assert not got[name].runnable, name
-            assert words in got[name].error, name
+    assert not task.compute_success(small).any()
+    with pytest.raises(StatesChangedError, match=r"changes states\['box_pos'\] in place"):
+        task.compute_success(large)
 
 
-@pytest.mark.slow
-def test_the_fork_can_open_no_file_and_start_no_process(monkeypatch, tmp_path):
-    """What a hole in the reader would let through, run by the fork itself."""
-    from v2p_data.task import smoke_child
+def test_a_key_that_the_task_added_may_be_written_again(scene_of):
+    source = code("states['height'] = x[:, 2:3] + 1\nstates['height'] = x[:, 2]")
+    task = load_task(source, placer(), scene_of("lift_up"))
+    states = {"box_pos": torch.zeros(2, 3), "eef_pos": torch.zeros(2, 3)}
 
-    target = tmp_path / "written"
-    outcomes = {}
+    for _ in range(2):
+        task.compute_success(states)
 
-    def hostile(source, request):
-        try:
-            {
-                "write": lambda: target.write_text("x"),
-                "read": lambda: open("/etc/hostname").read(),  # noqa: PTH123, SIM115
-                "socket": lambda: __import__("socket").socket(),
-                "process": lambda: __import__("os").fork(),
-            }[source]()
-        except OSError as error:
-            return {"runnable": False, "error": type(error).__name__}
-        return {"runnable": True}
+    assert states["height"].shape == (2,)
 
-    monkeypatch.setattr(smoke_child, "_answer", hostile)
-    for attempt in ("write", "read", "socket", "process"):
-        outcomes[attempt] = smoke_child._in_a_fork(attempt, {"seconds_each": 20})
 
-    assert not target.exists()
-    assert {k: v["runnable"] for k, v in outcomes.items()} == dict.fromkeys(outcomes, False)
+def test_the_poses_that_a_task_is_given_are_copies(scene_of):
+    given = placer()
+    task = load_task(code(), given, scene_of("lift_up"))
+
+    task.reset_objects_states(torch.arange(2))["box"].fill_(9.0)
+
+    assert float(given.sample_object_poses(torch.arange(2))["box"].max()) == 1.0
+
+
+def test_an_answer_of_another_kind_is_that_samples_own_failure():
+    answer = b'[{"runnable": true, "probe_success": [1]}, {"runnable": false, "error": "a\\u001b[2Jb\\ud800"}, 7]'
+
+    strange, shown, number = _results(answer, 3, 0)
+
+    assert not strange.runnable
+    assert not number.runnable
+    assert shown.error == "a [2Jb "

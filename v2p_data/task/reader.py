@@ -5,14 +5,14 @@ What it does and does not protect against is said in `sandbox`.
 
 import ast
 import builtins
-import math
 import re
 import typing
+import warnings
 
 import torch
 
 from v2p_data.errors import V2PError, did_you_mean
-from v2p_data.task import allowed
+from v2p_data.task import allowed, source_text
 from v2p_data.task.task import Task
 
 MAX_SOURCE_CHARS = 40_000
@@ -22,7 +22,7 @@ MAX_LOOP_DEPTH = 2
 MAX_STRING_CHARS = 4_000
 MAX_NUMBER = 1e6
 MAX_EXPONENT = 8
-_WIDE_FORMAT = re.compile(r"%[-+ #0]*(?:\d{3,}|\*)")
+_WIDE_FORMAT = re.compile(r"%(?:\(\w*\))?[-+ #0]*(?:\d{3,}|\*|\d{0,2}\.(?:\d{3,}|\*))")
 
 
 class TaskCodeError(V2PError):
@@ -89,13 +89,21 @@ _STATEMENTS = (
     ast.arguments,
     ast.arg,
 )
-_TOP_LEVEL = (ast.Import, ast.ImportFrom, ast.ClassDef, ast.FunctionDef, ast.Assign, ast.Expr)
+_TOP_LEVEL = (
+    ast.Import,
+    ast.ImportFrom,
+    ast.ClassDef,
+    ast.FunctionDef,
+    ast.Assign,
+    ast.AnnAssign,
+    ast.Expr,
+)
 _WORDS = {
     "While": "while loops are not allowed; use tensor operations, or for with range",
     "Lambda": "lambda is not allowed; write a function at module level",
     "GeneratorExp": "generators are not allowed; use a list or a tensor operation",
     "Try": "try is not allowed; an error should be seen",
-    "With": "with is not allowed",
+    "With": "with is not allowed; no gradients are kept anyway",
     "Global": "global is not allowed; keep state in tensors",
     "Nonlocal": "nonlocal is not allowed",
     "NamedExpr": "':=' is not allowed; assign on a line of its own",
@@ -105,39 +113,63 @@ _WORDS = {
     "Delete": "del is not allowed",
     "Yield": "yield is not allowed",
     "Match": "match is not allowed; use if",
-    "MatMult": "'@' is not allowed; use torch.matmul",
 }
 
 
 def checked_tree(source: str) -> ast.Module:
     if len(source) > MAX_SOURCE_CHARS:
         raise TaskCodeError(f"it has {len(source)} characters; {MAX_SOURCE_CHARS} are allowed")
+    _refuse_text(source_text.hidden_character(source))
     try:
-        tree = ast.parse(source)
+        with warnings.catch_warnings():  # a backslash in a docstring is no matter
+            warnings.simplefilter("ignore", SyntaxWarning)
+            tree = ast.parse(source)
     except SyntaxError as error:
         raise TaskCodeError(f"it is not Python: {error.msg}", error.lineno) from error
     except (ValueError, MemoryError, RecursionError) as error:
         raise TaskCodeError(
             f"it cannot be parsed ({type(error).__name__}: {error}); nest less deeply"
         ) from error
+    _refuse_text(source_text.foreign_name(source))
     _check_amount(tree)
     _Reader(tree).read()
     return tree
 
 
+def _refuse_text(found: tuple[str, int] | None) -> None:
+    if found:
+        raise TaskCodeError(*found)
+
+
 def _check_amount(tree: ast.Module) -> None:
-    """Bound nodes and depth, without recursion."""
+    """Bound nodes, depth and the length of names, without recursion."""
     count, level = 0, [tree]
     line = 1
     for _ in range(MAX_DEPTH):
         count += len(level)
         line = next((n.lineno for n in level if hasattr(n, "lineno")), line)  # pyright: ignore[reportAttributeAccessIssue]
+        for node in level:
+            longest = max((len(getattr(node, f, None) or "") for f in _names_of(node)), default=0)
+            if longest > source_text.MAX_WORD_CHARS:
+                raise TaskCodeError(
+                    f"a name of {longest} characters; {source_text.MAX_WORD_CHARS} are allowed",
+                    getattr(node, "lineno", line),
+                )
         level = [child for node in level for child in ast.iter_child_nodes(node)]
         if count > MAX_NODES:
             raise TaskCodeError(f"it has more than {MAX_NODES} syntax nodes; write less")
         if not level:
             return
     raise TaskCodeError(f"it is nested more than {MAX_DEPTH} levels deep; split it up", line)
+
+
+def _names_of(node: ast.AST) -> tuple[str, ...]:
+    """Return the fields of a node that hold a name."""
+    if isinstance(node, ast.Constant):
+        return ()
+    return tuple(
+        f for f in ("id", "attr", "arg", "name", "module") if isinstance(getattr(node, f, 0), str)
+    )
 
 
 class _Reader:
@@ -169,12 +201,8 @@ class _Reader:
             if isinstance(node, ast.FunctionDef | ast.ClassDef):
                 self._new_name(node.name)
                 self.top_names.add(node.name)
-            if isinstance(node, ast.Assign):
-                for target in node.targets:
-                    if not isinstance(target, ast.Name):
-                        self._refuse("only plain names are assigned at module level")
-                    self._new_name(target.id)
-                    self.top_names.add(target.id)
+            if isinstance(node, ast.Assign | ast.AnnAssign):
+                self.top_names.update(self._constant_names(node, "at module level"))
         self._collect_own_attributes(classes[0])
         for node in self.tree.body:
             self._at(node)
@@ -185,12 +213,27 @@ class _Reader:
                     self._class(node)
                 case ast.FunctionDef():
                     self._function(node)
-                case ast.Assign():
-                    self._literal(node.value)
+                case ast.Assign() | ast.AnnAssign():
+                    self._constant_value(node)
                 case ast.Expr():
                     self._docstring(node)
 
     # -- statements
+
+    def _constant_names(self, node: ast.Assign | ast.AnnAssign, where: str) -> list[str]:
+        names: list[str] = []
+        for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+            if not isinstance(target, ast.Name):
+                self._refuse(f"only plain names are assigned {where}")
+            self._new_name(target.id)
+            names.append(target.id)
+        return names
+
+    def _constant_value(self, node: ast.Assign | ast.AnnAssign) -> None:
+        if isinstance(node, ast.AnnAssign):
+            self._annotation(node.annotation)
+        if node.value is not None:
+            self._literal(node.value)
 
     def _import(self, node: ast.Import | ast.ImportFrom) -> None:
         names = [a.name for a in node.names]
@@ -222,6 +265,8 @@ class _Reader:
             self._refuse("the class must derive from Task and nothing else")
         if node.decorator_list:
             self._refuse("decorators on the class are not allowed")
+        if node.type_params:
+            self._refuse("type parameters are not allowed")
         for item in node.body:
             self._at(item)
             match item:
@@ -229,12 +274,9 @@ class _Reader:
                     self.in_class = True
                     self._function(item)
                     self.in_class = False
-                case ast.Assign():
-                    for target in item.targets:
-                        if not isinstance(target, ast.Name):
-                            self._refuse("only plain names are assigned in the class body")
-                        self._new_name(target.id)
-                    self._literal(item.value)
+                case ast.Assign() | ast.AnnAssign():
+                    self._constant_names(item, "in the class body")
+                    self._constant_value(item)
                 case ast.Expr():
                     self._docstring(item)
                 case ast.Pass():
@@ -244,19 +286,30 @@ class _Reader:
 
     def _function(self, node: ast.FunctionDef) -> None:
         a = node.args
+        if node.type_params:
+            self._refuse("type parameters are not allowed")
         if a.vararg or a.kwarg or a.posonlyargs or a.kwonlyargs:
             self._refuse("'*' and '**' parameters are not allowed")
+        is_static = False
         for decorator in node.decorator_list:
-            if ast.unparse(decorator) != allowed.SCRIPT_DECORATOR:
+            self._at(decorator)
+            name = ast.unparse(decorator)
+            if name == allowed.STATIC_DECORATOR and self.in_class:
+                is_static = True
+            elif name != allowed.SCRIPT_DECORATOR:
                 self._refuse(
-                    f"decorator {ast.unparse(decorator)[:60]} is not allowed; only torch.jit.script is"
+                    f"decorator {name[:60]!a} is not allowed; torch.jit.script is, and staticmethod on a method"
                 )
+        self._at(node)
         for default in a.defaults:
             self._literal(default)
         names = [p.arg for p in a.args]
-        if self.in_class and (not names or names[0] != "self"):
+        is_method = self.in_class and not is_static
+        if is_static and node.name in allowed.TASK_METHODS:
+            self._refuse(f"{node.name} cannot be a staticmethod")
+        if is_method and (not names or names[0] != "self"):
             self._refuse(f"the first parameter of method {node.name} must be self")
-        for name in names[1:] if self.in_class else names:
+        for name in names[1:] if is_method else names:
             self._new_name(name)
         for annotation in [p.annotation for p in a.args] + [node.returns]:
             if annotation is not None:
@@ -287,14 +340,32 @@ class _Reader:
             match child:
                 case ast.Constant():
                     self._constant(child)
-                case ast.UnaryOp(op=ast.USub(), operand=ast.Constant()):
+                case ast.BinOp():
+                    self._constant_sum(child)
+                case ast.UnaryOp(op=ast.USub()) | ast.operator() | ast.unaryop():
                     pass
-                case ast.List() | ast.Tuple() | ast.Dict() | ast.expr_context() | ast.unaryop():
+                case ast.List() | ast.Tuple() | ast.Dict() | ast.expr_context():
+                    pass
+                case ast.Attribute() if (self._path(child) or "").startswith("math."):
+                    self._check_path(ast.unparse(child))
+                case ast.Name(id="math"):
                     pass
                 case _:
                     self._refuse(
                         f"{type(child).__name__} is not allowed in a constant; write its value"
                     )
+
+    def _constant_sum(self, node: ast.BinOp) -> None:
+        """Arithmetic on numbers, such as `0.5 * math.pi`; a text or a list times a number can fill the memory."""
+        self._operation(node)
+        for side in (node.left, node.right):
+            match side:
+                case ast.BinOp() | ast.UnaryOp() | ast.Attribute():
+                    pass
+                case ast.Constant(value=int() | float()):
+                    pass
+                case _:
+                    self._refuse("only numbers can be calculated with in a constant")
 
     def _annotation(self, node: ast.expr) -> None:
         for child in ast.walk(node):
@@ -322,7 +393,7 @@ class _Reader:
             self._refuse("functions and classes inside functions are not allowed")
         if isinstance(node, ast.Import | ast.ImportFrom):
             self._refuse("import inside a function is not allowed; put it at the top")
-        if isinstance(node, ast.MatMult) or not isinstance(node, _EXPRESSIONS + _STATEMENTS):
+        if not isinstance(node, _EXPRESSIONS + _STATEMENTS):
             self._refuse(_WORDS.get(kind, f"{kind} is not allowed"))
         match node:
             case ast.For() | ast.ListComp():
@@ -341,6 +412,11 @@ class _Reader:
                 self._call(node)
             case ast.BinOp():
                 self._operation(node)
+            case ast.AugAssign():
+                # Looked at as the operation it stands for: 'n **= m' is 'n = n ** m'.
+                self._operation(ast.BinOp(left=node.target, op=node.op, right=node.value))
+            case ast.comprehension(is_async=1):
+                self._refuse("async is not allowed")
             case ast.AnnAssign():
                 self._annotation(node.annotation)
                 for part in (node.target, node.value):
@@ -367,13 +443,22 @@ class _Reader:
                 )
             if _WIDE_FORMAT.search(value):
                 self._refuse("format strings with a width are not allowed")
+            self._hidden(value)
         elif isinstance(value, bool) or value is None or value is Ellipsis:
             pass
         elif isinstance(value, int | float):
-            if abs(value) > MAX_NUMBER and not math.isinf(value):
-                self._refuse(f"the number is larger than {MAX_NUMBER:g}")
+            if isinstance(value, int) and abs(value) > MAX_NUMBER:
+                self._refuse(
+                    f"the whole number is larger than {MAX_NUMBER:g}; write it as 1e9 if no size or count is meant"
+                )
         else:
             self._refuse(f"{type(value).__name__} constants are not allowed")
+
+    def _hidden(self, value: str) -> None:
+        """What an escape such as backslash-x-1-b puts into a string."""
+        found = source_text.hidden_character(value.replace("\r", ""))
+        if found:
+            self._refuse("a string: " + found[0])
 
     def _f_string(self, node: ast.JoinedStr | ast.FormattedValue) -> None:
         if isinstance(node, ast.FormattedValue) and (
@@ -389,12 +474,18 @@ class _Reader:
             self._refuse(f"'{name}' is not a value; use {name}.<function>")
         if name == "super":
             self._refuse("super() may only be used to call a method of the base class")
-        if name in self.local_names | self.top_names | {"Tensor"} or name in allowed.BUILTINS:
+        known = (self.local_names, self.top_names, allowed.BUILTINS)
+        if name == "Tensor" or any(name in names for names in known):
             return
         what = "builtin" if hasattr(builtins, name) else "name"
+        if name in allowed.INSTEAD:
+            self._refuse(f"{what} '{name}' is not allowed; {allowed.INSTEAD[name]}")
         self._refuse(f"{what} '{name}' is not allowed.", name=name, known=set(allowed.BUILTINS))
 
     def _attribute(self, node: ast.Attribute) -> None:
+        is_own = isinstance(node.value, ast.Name) and node.value.id == "self"
+        if not isinstance(node.ctx, ast.Load) and not (is_own and self.in_class):
+            self._refuse("attributes can only be assigned on self")
         path = self._path(node)
         if path is not None:
             self._check_path(path)
@@ -402,14 +493,11 @@ class _Reader:
         if self._is_super(node):
             self._refuse("methods of the base class may only be called")
         name = node.attr
-        if name.startswith("_") or name.endswith("_"):
+        if (name.startswith("_") or name.endswith("_")) and name not in allowed.IN_PLACE:
             self._refuse(
                 f"attribute '{name}' is not allowed; none with an underscore at either end is"
             )
-        if isinstance(node.value, ast.Name) and node.value.id == "self":
-            if name in self.own_attributes or name in allowed.ATTRIBUTES:
-                return
-        elif name in allowed.ATTRIBUTES:
+        if name in allowed.ATTRIBUTES or (is_own and name in self.own_attributes):
             return
         self._refuse(f"attribute '{name}' is not allowed.", name=name, known=allowed.ATTRIBUTES)
 
@@ -446,7 +534,12 @@ class _Reader:
                 self._refuse("'**' in a call is not allowed; name the arguments")
             if keyword.arg == "out" or keyword.arg.startswith("_"):
                 self._refuse(f"argument '{keyword.arg}' is not allowed; assign the result")
+            is_off = isinstance(keyword.value, ast.Constant) and keyword.value.value is False
+            if keyword.arg in {"requires_grad", "pin_memory"} and not is_off:
+                self._refuse(f"argument '{keyword.arg}' is not allowed; leave it out")
         if self._is_super(node.func):
+            if not self.in_class:
+                self._refuse("super() may only be used in a method of the class")
             inner = node.func.value  # pyright: ignore[reportAttributeAccessIssue]
             method = node.func.attr  # pyright: ignore[reportAttributeAccessIssue]
             if inner.args or inner.keywords or method not in allowed.TASK_METHODS:
@@ -463,6 +556,8 @@ class _Reader:
             and abs(node.right.value) <= MAX_EXPONENT
         ):
             self._refuse(f"the exponent of '**' must be a number of at most {MAX_EXPONENT}")
+        if isinstance(node.op, ast.Pow) and self._is_power_of_numbers(node.left):
+            self._refuse("powers of powers of numbers are not allowed; write the value")
         if isinstance(node.op, ast.LShift | ast.RShift):
             self._refuse("shifts are not allowed")
         texts = (ast.List, ast.Tuple, ast.JoinedStr)
@@ -472,9 +567,21 @@ class _Reader:
         ):
             self._refuse("lists and strings cannot be multiplied; use torch.full")
 
+    def _is_power_of_numbers(self, node: ast.expr) -> bool:
+        parts = list(ast.walk(node))
+        return any(isinstance(p, ast.Pow) for p in parts) and not any(
+            isinstance(p, ast.Name) for p in parts
+        )
+
     # -- helpers
 
     def _collect_own_attributes(self, node: ast.ClassDef) -> None:
+        constants = {
+            id(t)
+            for item in node.body
+            if isinstance(item, ast.Assign | ast.AnnAssign)
+            for t in (item.targets if isinstance(item, ast.Assign) else [item.target])
+        }
         for child in ast.walk(node):
             self._at(child)
             name = None
@@ -483,12 +590,7 @@ class _Reader:
                 if name in allowed.TASK_METHODS:
                     self.own_attributes.add(name)
                     continue
-            elif (
-                isinstance(child, ast.Name)
-                and isinstance(child.ctx, ast.Store)
-                and child
-                in [t for item in node.body if isinstance(item, ast.Assign) for t in item.targets]
-            ):
+            elif isinstance(child, ast.Name) and id(child) in constants:
                 name = child.id
             elif isinstance(child, ast.Attribute) and isinstance(child.ctx, ast.Store):
                 if not (isinstance(child.value, ast.Name) and child.value.id == "self"):

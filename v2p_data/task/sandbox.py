@@ -30,6 +30,7 @@ from v2p_data.task import allowed
 from v2p_data.task.reader import TaskCodeError, checked_tree
 from v2p_data.task.reader import check_code as check_code
 from v2p_data.task.task import Placer, Task
+from v2p_data.task.watched import watch
 
 MAX_RANGE = 1_000
 CODE_NAME = "<task code>"
@@ -60,6 +61,7 @@ def make_task(source: str, envs: Placer, urdf_assets_root: str) -> Task:
             for v in namespace.values()
             if isinstance(v, type) and issubclass(v, Task) and v is not Task
         ]
+        watch(made[0])
         return made[0](_PlacerView(envs), urdf_assets_root)  # pyright: ignore[reportCallIssue]
     except Exception as error:
         raise TaskCodeError(
@@ -92,7 +94,9 @@ class _Strip(ast.NodeTransformer):
         del node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
-        node.decorator_list = []
+        node.decorator_list = [
+            d for d in node.decorator_list if ast.unparse(d) == allowed.STATIC_DECORATOR
+        ]
         node.returns = None
         for parameter in node.args.args:
             parameter.annotation = None
@@ -118,7 +122,25 @@ class _PlacerView:
         return self._envs.num_envs
 
     def sample_object_poses(self, env_ids: torch.Tensor) -> dict[str, torch.Tensor]:
-        return self._envs.sample_object_poses(env_ids)
+        # Copies, so that what task code does to them stays its own.
+        return {n: p.clone() for n, p in self._envs.sample_object_poses(env_ids).items()}
+
+
+class _TensorKind(type):
+    """Answers isinstance for tensors. The class itself is one object for the whole process, not to be handed out."""
+
+    def __instancecheck__(cls, instance: Any) -> bool:
+        return isinstance(instance, torch.Tensor)
+
+    def __call__(cls, data: Any) -> torch.Tensor:
+        # torch.Tensor(5) would give five numbers of whatever the memory held before.
+        if not isinstance(data, list | tuple | torch.Tensor):
+            raise TypeError("a tensor is made of a list of numbers; use torch.zeros for a size")
+        return torch.tensor(data, dtype=torch.float32)
+
+
+class _Tensor(metaclass=_TensorKind):
+    """What task code gets for `torch.Tensor` and `torch.FloatTensor`."""
 
 
 def _short_range(*bounds: int) -> range:
@@ -139,14 +161,16 @@ def _namespace() -> dict[str, Any]:
     functions: dict[str, Any] = {n: getattr(builtins, n) for n in allowed.BUILTINS}
     functions["range"] = _short_range
     functions["super"] = super
+    functions["staticmethod"] = staticmethod
     functions["__build_class__"] = builtins.__build_class__
     functions["__import__"] = _torch_module
     linalg = {n: getattr(torch.linalg, n) for n in allowed.TORCH_NAMESPACES["linalg"]}
     functional = {
         n: getattr(torch.nn.functional, n) for n in allowed.TORCH_NAMESPACES["nn.functional"]
     }
+    stand_ins = {"Tensor": _Tensor, "FloatTensor": _Tensor}
     torch_view = SimpleNamespace(
-        **{n: getattr(torch, n) for n in allowed.TORCH if hasattr(torch, n)},
+        **{n: getattr(torch, n) for n in allowed.TORCH if hasattr(torch, n)} | stand_ins,
         linalg=SimpleNamespace(**linalg),
         nn=SimpleNamespace(functional=SimpleNamespace(**functional)),
     )
@@ -155,7 +179,7 @@ def _namespace() -> dict[str, Any]:
         "__name__": "task_code",
         "torch": torch_view,
         "math": SimpleNamespace(**{n: getattr(math, n) for n in allowed.MATH}),
-        "Tensor": torch.Tensor,
+        "Tensor": _Tensor,
         "Task": Task,
         **{n: getattr(typing, n) for n in allowed.TYPING},
     }

@@ -5,6 +5,7 @@ or a memory bomb in one sample is that sample's own result. See `sandbox` for wh
 """
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -23,6 +24,7 @@ from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
 from v2p_data.task.probes import States, at_rest, concatenated, random_states
 from v2p_data.task.sandbox import TaskCodeError, check_code
+from v2p_data.task.source_text import shown
 
 BATCH = 16
 MAX_ANSWER_CHARS = 20_000_000
@@ -57,12 +59,14 @@ class SmokeResult:
         reward = [float(x) for x in data.get("probe_reward", [])]
         if data["runnable"] and not len(success) == len(reward) == num_probes:
             raise ValueError(f"{len(success)} answers to {num_probes} probes")
+        if not all(math.isfinite(r) for r in reward):
+            raise ValueError("a reward that is no number")
         return SmokeResult(
             runnable=data["runnable"],
-            error=str(data.get("error", ""))[:1000],
+            error=shown(data.get("error", ""), 1000),
             observation_dim=int(data.get("observation_dim", 0)),
-            components=tuple(str(c)[:100] for c in data.get("components", [])),
-            warnings=tuple(str(w)[:300] for w in data.get("warnings", [])),
+            components=tuple(shown(c, 100) for c in data.get("components", [])),
+            warnings=tuple(shown(w, 300) for w in data.get("warnings", [])),
             probe_success=tuple(success),
             probe_reward=tuple(reward),
             seconds=float(data.get("seconds", 0.0)),
@@ -147,9 +151,7 @@ def _ask_child(
         except subprocess.TimeoutExpired:
             _end(child)
             return [
-                SmokeResult(
-                    runnable=False, error=f"the trial run took more than {timeout_s:.0f} s"
-                )
+                SmokeResult(runnable=False, error=f"the trial run took more than {timeout_s:g} s")
             ] * len(sources)
         finally:
             _end(child)
@@ -173,7 +175,15 @@ def _results(answer: bytes, count: int, num_probes: int) -> list[SmokeResult]:
     data = json.loads(answer)
     if not isinstance(data, list) or len(data) != count:
         raise ValueError(f"{count} answers wanted")
-    return [SmokeResult.from_json(d, num_probes) for d in data]
+    return [_result(d, num_probes) for d in data]
+
+
+def _result(data: Any, num_probes: int) -> SmokeResult:
+    """Return one sample's answer; one that cannot be read is that sample's own failure."""
+    try:
+        return SmokeResult.from_json(data, num_probes)
+    except (ValueError, TypeError, OverflowError) as error:
+        return SmokeResult(runnable=False, error=f"its answer cannot be read: {shown(error, 200)}")
 
 
 def _edge_states(scene: Scene) -> States:

@@ -17,6 +17,7 @@ import torch
 
 from v2p_data.task.confine import confine, leave_the_network
 from v2p_data.task.sandbox import TaskCodeError, line_in_task_code, make_task
+from v2p_data.task.watched import StatesChangedError
 
 MEMORY_BYTES = 2 * 1024**3
 """On top of what importing torch has mapped."""
@@ -234,19 +235,19 @@ def _in_a_fork(source: str, request: dict[str, Any]) -> dict[str, Any]:
         os.kill(pid, signal.SIGKILL)
     _, status = os.waitpid(pid, 0)
     if is_late:
-        return _failed(f"it took more than {seconds:.0f} s")
+        return _failed(f"it took more than {seconds:g} s")
     try:
         return json.loads(received)
-    except ValueError:
+    except (ValueError, RecursionError):
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
-            return _failed(f"it took more than {seconds:.0f} s of computing")
+            return _failed(f"it took more than {seconds:g} s of computing")
         return _failed("its process ended before it had answered; it may need too much memory")
 
 
 def _answer(source: str, request: dict[str, Any]) -> dict[str, Any]:
     try:
         return judge(source, request)
-    except (BadTaskError, TaskCodeError) as error:
+    except (BadTaskError, TaskCodeError, StatesChangedError) as error:
         return _failed(str(error))
     except MemoryError:
         return _failed("it needs too much memory")
