@@ -27,7 +27,6 @@ from safetensors.torch import load_file, save_file
 from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
-from v2p_data.scene.colour import lab_of
 from v2p_data.scene.footage import still_of
 from v2p_data.scene.network import (
     SceneNetwork,
@@ -77,14 +76,14 @@ def make_clip(job: tuple[int, Path]) -> str:
     except (ValueError, RuntimeError) as error:
         return f"{number} {kind}: {type(error).__name__} {error}"
     rgb = np.stack([_compressed(image, rng) for image in rgb])
-    lab, quarter = lab_of(rgb), FRAMES_DRAWN // 4
+    quarter = FRAMES_DRAWN // 4
     keep = np.unique([0, FRAMES_DRAWN - 1, *rng.integers(1, FRAMES_DRAWN - 1, FRAMES_KEPT - 2)])
     camera = spec.view.camera()
     forward = camera.T_world_cam[:3, 2]
     np.savez(
         path,
-        early=still_of(rgb[:quarter], lab[:quarter]),
-        late=still_of(rgb[-quarter:], lab[-quarter:]),
+        early=still_of(rgb[:quarter]),
+        late=still_of(rgb[-quarter:]),
         frames=rgb[keep],
         labels=_classes(labels[keep], _moved_labels(spec)),
         camera=np.array(

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
+from scipy.ndimage import median_filter
 
-from v2p_data.scene.classes import HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.classes import HAND, LONG_SIDE_PX, MOVED, OTHER, TABLE
 from v2p_data.scene.colour import (
     balance,
     colour_match,
@@ -21,13 +22,20 @@ from v2p_data.scene.colour import (
     named_colours,
     similarity,
 )
-from v2p_data.scene.footage import Footage
+from v2p_data.scene.footage import Footage, still_of
 from v2p_data.scene.ground import Moved
 from v2p_data.scene.segment import bounding_box, edge_contrast, grow, largest, refine, tidy
+from v2p_data.video.clip import Clip
 
 MOST_FRAMES = 50
 """Frames of a clip that the network looks at; those between take the nearest one's word."""
 _LIKELY, _POSSIBLE = 0.5, 0.25
+_MARGIN = 0.5
+"""Around what moves, as a share of its extent: room for what it may belong to, and for the hand."""
+_MOST_OF_PICTURE = 0.75
+_FADE_PX = 5
+_MOST_ZOOM = 2.5
+"""As far as the network was trained on enlarged parts."""
 _GAP_PX = 7
 """Of a picture 320 px wide: parts of one thing lie as near as this."""
 _END_WEIGHT = {"insert": 0.4, "throw_into": 0.4, "place_onto": 0.5, "cover": 0.5}
@@ -72,14 +80,22 @@ class _Blob:
         return float(np.prod(list(self.parts.values())))
 
 
-def watch(footage: Footage) -> Watched:
-    """Return what the network sees in the clip's frames and in its two stills."""
+def watch(clip: Clip, footage: Footage) -> Watched:
+    """Return what the network sees in the clip's frames and in its two stills.
+
+    Where what moves is small, the network looks at it a second time, enlarged.
+    """
     from v2p_data.scene.network import look  # torch takes a second to import
 
     n = len(footage.rgb)
     idx = np.unique(np.linspace(0, n - 1, min(n, MOST_FRAMES)).round().astype(int))
     pictures = np.concatenate([footage.rgb[idx], footage.early[None], footage.late[None]])
-    seen = look(pictures, footage.early, footage.late)
+    seen = look(
+        pictures,
+        np.broadcast_to(footage.early, pictures.shape),
+        np.broadcast_to(footage.late, pictures.shape),
+    )
+    _look_closer(clip, footage, idx, seen.shares)
     return Watched(
         idx=idx,
         shares=seen.shares[:-2],
@@ -92,6 +108,88 @@ def watch(footage: Footage) -> Watched:
         height_m=seen.height_m,
         height_sd=seen.height_sd,
     )
+
+
+def _look_closer(
+    clip: Clip,
+    footage: Footage,
+    idx: Int[np.ndarray, "n"],
+    shares: Float32[np.ndarray, "n+2 5 h w"],
+) -> None:
+    """Replace the shares around what moves by what the network sees there at the clip's own resolution.
+
+    The window keeps its size and goes along. The last two shares are those of the stills, of the beginning and the end.
+    """
+    from v2p_data.scene.network import look
+
+    windows = _windows(shares[:-2, MOVED])
+    if windows is None:
+        return
+    w, h = windows.size
+    clip_w = clip.frames.shape[2]
+    zoom = LONG_SIDE_PX / max(w, h)
+    size = (round(footage.shape[1] * zoom), round(footage.shape[0] * zoom))
+    how = cv2.INTER_AREA if size[0] < clip_w else cv2.INTER_LINEAR
+
+    def large(picks: Int[np.ndarray, "k"]) -> UInt8[np.ndarray, "k y x 3"]:
+        frames = (clip.frames[i] for i in footage.frame_idx[picks])
+        return np.stack([cv2.resize(frame, size, interpolation=how) for frame in frames])
+
+    n = len(footage.rgb)
+    quarter = max(3, n // 4)
+    early, late = (still_of(large(p)) for p in (np.arange(n)[:quarter], np.arange(n)[-quarter:]))
+    pictures = np.concatenate([large(idx), early[None], late[None]])
+    corners = windows.corners[[*range(len(idx)), 0, -1]]
+    spots = [
+        (slice(y, y + round(h * zoom)), slice(x, x + round(w * zoom)))
+        for x, y in (corners * zoom).astype(int)
+    ]
+    seen = look(
+        np.stack([picture[spot] for picture, spot in zip(pictures, spots, strict=True)]),
+        np.stack([early[spot] for spot in spots]),
+        np.stack([late[spot] for spot in spots]),
+    )
+    inside = np.zeros((h, w), np.float32)
+    inside[_FADE_PX:-_FADE_PX, _FADE_PX:-_FADE_PX] = 1
+    inside = cv2.blur(inside, (2 * _FADE_PX - 1, 2 * _FADE_PX - 1), borderType=cv2.BORDER_CONSTANT)
+    for whole, near, (x, y) in zip(shares, seen.shares, corners, strict=True):
+        there = whole[:, y : y + h, x : x + w]
+        own = [cv2.resize(plane, (w, h), interpolation=cv2.INTER_AREA) for plane in near]
+        there += inside * (np.stack(own) - there)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Windows:
+    size: tuple[int, int]
+    """(width, height) [px], of the picture's proportions."""
+    corners: Int[np.ndarray, "n 2"]
+    """Upper left, (x, y), one for each frame."""
+
+
+def _windows(moved: Float32[np.ndarray, "n h w"]) -> _Windows | None:
+    """Return a part of each picture around what moves in it; None where that is most of it, or nothing."""
+    h, w = moved.shape[1:]
+    boxes = np.full((len(moved), 4), np.nan)
+    for k, plane in enumerate(moved):
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(
+            tidy(plane > _LIKELY).astype(np.uint8)
+        )
+        large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] > _LEAST_SHARE * h * w]
+        if large:
+            boxes[k] = bounding_box(np.isin(parts, large))
+    seen = np.flatnonzero(np.isfinite(boxes[:, 0]))
+    if not len(seen):
+        return None
+    extent = np.maximum(boxes[seen, 2] / w, boxes[seen, 3] / h)
+    wide = max(float(np.percentile(extent, 80)) * (1 + 2 * _MARGIN), 1 / _MOST_ZOOM)
+    if wide > _MOST_OF_PICTURE:
+        return None
+    size = np.array([round(wide * w), round(wide * h)])
+    centre = boxes[:, :2] + boxes[:, 2:] / 2
+    every = np.arange(len(moved))
+    smooth = [median_filter(np.interp(every, seen, centre[seen, c]), 5) for c in (0, 1)]
+    corners = np.clip(np.stack(smooth, 1) - size / 2, 0, np.array([w, h]) - size)
+    return _Windows(size=(int(size[0]), int(size[1])), corners=corners.astype(int))
 
 
 def find_movers(

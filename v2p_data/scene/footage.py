@@ -18,6 +18,8 @@ WIDTH_PX = 320
 MAX_FRAMES = 150
 _LEAST_STILL = 0.8
 """Of a tile, for it to tell of the camera."""
+_STILL_FRAMES = 24
+"""At most so many frames make a still."""
 _FEW_CORNERS = 12
 """With fewer corners to follow nothing is said about the camera."""
 
@@ -116,7 +118,7 @@ def footage_of(clip: Clip) -> Footage:
     rgb = np.stack([cv2.resize(clip.frames[i], size, interpolation=how) for i in frame_idx])
     lab = lab_of(rgb)
     quarter = max(3, len(rgb) // 4)
-    always = still_of(rgb, lab)
+    always = still_of(rgb)
     moving = _passing(rgb, lab, always)
     skin = moving[skin_prior(moving[None])[0]] if len(moving) else moving
     return Footage(
@@ -124,8 +126,8 @@ def footage_of(clip: Clip) -> Footage:
         lab=lab,
         frame_idx=frame_idx,
         px_scale=WIDTH_PX / w,
-        early=still_of(rgb[:quarter], lab[:quarter]),
-        late=still_of(rgb[-quarter:], lab[-quarter:]),
+        early=still_of(rgb[:quarter]),
+        late=still_of(rgb[-quarter:]),
         always=always,
         moving=moving,
         hand_hist=histogram(skin if len(skin) > 300 else skin[:0]),
@@ -133,12 +135,10 @@ def footage_of(clip: Clip) -> Footage:
     )
 
 
-def still_of(
-    rgb: UInt8[np.ndarray, "time h w 3"], lab: Float32[np.ndarray, "time h w 3"], most: int = 24
-) -> UInt8[np.ndarray, "h w 3"]:
+def still_of(rgb: UInt8[np.ndarray, "time h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return per pixel the colour that is there most of the time (mode seeking from the median)."""
-    pick = np.unique(np.linspace(0, len(rgb) - 1, min(most, len(rgb))).astype(int))
-    colours, lab = rgb[pick].astype(np.float32), lab[pick]
+    pick = np.unique(np.linspace(0, len(rgb) - 1, min(_STILL_FRAMES, len(rgb))).astype(int))
+    colours, lab = rgb[pick].astype(np.float32), lab_of(rgb[pick])
     centre = np.median(lab, axis=0)
     weight = np.ones(lab.shape[:3], np.float32)
     for _ in range(3):

@@ -18,9 +18,8 @@ from torch import nn
 from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.classes import CLASSES
+from v2p_data.scene.classes import CLASSES, LONG_SIDE_PX
 
-LONG_SIDE_PX = 256
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 _STEP = 16
 _WIDTHS = (24, 48, 80, 128)
@@ -135,22 +134,23 @@ def network() -> SceneNetwork:
 @torch.inference_mode()
 def look(
     frames: UInt8[np.ndarray, "n h w 3"],
-    early: UInt8[np.ndarray, "h w 3"],
-    late: UInt8[np.ndarray, "h w 3"],
+    early: UInt8[np.ndarray, "n h w 3"],
+    late: UInt8[np.ndarray, "n h w 3"],
     batch: int = 8,
 ) -> Seen:
-    """Return what the network sees in the frames of one clip, given its two stills."""
-    h, w = early.shape[:2]
+    """Return what the network sees in frames of one clip, given the stills of beginning and end that go with each."""
+    h, w = frames.shape[1:3]
     size = net_size(h, w)
-    stills = [
-        torch.from_numpy(_small(image, size)).permute(2, 0, 1)[None] for image in (early, late)
-    ]
     net = network()
     shares, cameras = [], []
     for start in range(0, len(frames), batch):
-        part = np.stack([_small(image, size) for image in frames[start : start + batch]])
-        now = torch.from_numpy(part).permute(0, 3, 1, 2)
-        before, after = (still.expand(len(part), -1, -1, -1) for still in stills)
+        part = slice(start, start + batch)
+        now, before, after = (
+            torch.from_numpy(np.stack([_small(image, size) for image in images[part]])).permute(
+                0, 3, 1, 2
+            )
+            for images in (frames, early, late)
+        )
         logits, camera = net(
             inputs_of(now, before, after).contiguous(memory_format=torch.channels_last)
         )

@@ -155,7 +155,7 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     meaning = parse_caption(clip.caption, clip.objects)
     footage = footage_of(clip)
     _check_change(footage)
-    watched = watch(footage) if cfg.ground.backend == "network" else None
+    watched = watch(clip, footage) if cfg.ground.backend == "network" else None
     _check_still(footage, watched, cfg)
     boxes = None
     if cfg.ground.backend in DETECTORS:
