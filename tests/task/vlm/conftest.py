@@ -102,10 +102,12 @@ def chat(serve):
     return serve()
 
 
-@pytest.fixture(autouse=True)
-def environment(monkeypatch):
-    monkeypatch.setenv("V2P_TEST_KEY", SECRET)
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+@pytest.fixture(autouse=True, scope="module")
+def environment():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("V2P_TEST_KEY", SECRET)
+        patch.setenv("NO_PROXY", "127.0.0.1")
+        yield
 
 
 @pytest.fixture

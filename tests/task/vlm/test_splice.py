@@ -159,7 +159,7 @@ def test_what_is_not_reward_keeps_every_line_and_the_reward_its_comments():
 
 
 def test_rewards_can_be_put_into_what_our_own_templates_write(scene_of):
-    first, *others = write_samples(scene_of("insert"), 8)
+    first, *others = write_samples(scene_of("insert"), 4)
 
     for other in others:
         made = with_reward(first, other)
