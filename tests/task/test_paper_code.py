@@ -1,13 +1,28 @@
-"""The code printed in the paper's appendix (figures 7, 8 and 11), quotes straightened, elisions completed, runs."""
+"""The code printed in the paper's appendix (figures 7, 8 and 11), quotes straightened, elisions completed, runs.
+
+Every printed line stands here as it is printed, indented as Python needs it. What is not printed was completed so:
+
+- Figure 7: `import torch` before the first import; the name and the objects in `scene_info`; the heights of the lower
+  and upper ends of fork and box, which the success function names and the figure leaves out; a reward function of
+  one component over the distance that its observation adds.
+- Figure 8 prints a reward function alone: the class of the task *Throw* around it is figure 7's, with the one
+  observation (`dist_garlic_to_bowl`) that the reward reads.
+- Figure 11 prints three methods of a class, twice: the rest of the class is figure 7's, with the card's height above
+  the table as reward.
+"""
+
+import ast
 
 import numpy as np
 import pytest
 import torch
 
+from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.task.probes import at_rest
 from v2p_data.task.sandbox import check_code, load_task
 from v2p_data.task.smoke import smoke_run_all
 from v2p_data.task.smoke_child import FakePlacer
+from v2p_data.task.task import OBJECT_STATES, ROBOT_STATES, TaskBundle
 
 FIGURE_7 = '''
 import torch
@@ -237,6 +252,62 @@ def test_it_runs_in_the_child(scenes, scene_of):
 
     assert [r.error for r in results] == [""] * 4
     assert [r.observation_dim for r in results] == [92, 91, 90, 91]
+
+
+@pytest.mark.parametrize("code", CODES.values(), ids=CODES)
+def test_every_state_it_reads_is_in_the_table_or_of_its_own_making(code, scenes):
+    keys = {"read": set(), "made": set()}
+    for node in ast.walk(ast.parse(code)):
+        match node:
+            case ast.Subscript(value=ast.Name(id="states"), slice=ast.Constant(value=key)):
+                keys["made" if isinstance(node.ctx, ast.Store) else "read"].add(key)
+    documented = set(ROBOT_STATES)
+    documented |= {f"{o.name}_{k}" for o in scenes[code].objects for k in OBJECT_STATES}
+
+    assert len(keys["read"]) >= 2
+    assert keys["read"] <= documented | keys["made"]
+
+
+@pytest.mark.parametrize(
+    ("code", "observation", "names"),
+    [
+        (FIGURE_7, 92, {"dist_to_fork"}),
+        (THROW, 91, {
+            "dist_grasp_reward", "dist_garlic_to_bowl", "vel_reward", "final_position_reward",
+            "total_reward", "step_penalty",
+        }),
+        (FIGURE_11_1, 90, {"height"}),
+        (FIGURE_11_2, 91, {"height"}),
+    ],
+    ids=CODES,
+)  # fmt: skip
+def test_it_is_simulated_unchanged(code, observation, names, scenes):
+    bundle = TaskBundle(
+        title="paper", description="paper", kind=scenes[code].kind, class_name="", code=code, scene=scenes[code]
+    )  # fmt: skip
+    env = BatchEnv(bundle, num_envs=4, seed=0, num_threads=1)
+
+    results = [env.step(np.zeros((4, 7))) for _ in range(5)]
+
+    assert results[-1].obs.shape == (4, observation)
+    assert set(results[-1].components) == names
+    assert not any(r.success.any() for r in results)
+    assert all(np.isfinite(r.reward).all() for r in results)
+    states = {k: v.numpy() for k, v in env.states().items()}
+    if code == FIGURE_7:
+        distance = np.linalg.norm(states["fork_pos"] - states["eef_pos"], axis=1)
+        assert results[-1].task_reward == pytest.approx(1 - np.tanh(8 * distance), abs=1e-5)
+
+
+def test_a_reward_finds_what_the_observation_adds_though_it_is_asked_first(scenes):
+    task, scene = loaded(THROW, scenes[THROW]), scenes[THROW]
+    task.compute_observation_key(states_of(scene))
+    fresh = states_of(scene)
+
+    reward, _ = task.compute_reward(torch.zeros(1, 7), fresh)
+
+    assert bool(reward.isfinite().all())
+    assert "dist_garlic_to_bowl" in fresh
 
 
 def states_of(scene, **objects):
