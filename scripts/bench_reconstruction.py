@@ -488,6 +488,12 @@ def _reconstructed(job: Job, folder: Path, boxes: bool, pictures: Path) -> tuple
             row["frames_per_cpu_s"] = round(len(clip.frames) / (time.process_time() - cpu), 2)
             row["confidence"] = round(made.confidence, 4)
             row["stages"] = {stage: [sure, why] for stage, (sure, why) in made.stages.items()}
+            row["cues"] = [[cue.stage, cue.what, round(cue.value, 4)] for cue in made.cues]
+            row["scale_spread"] = round(made.scale_spread, 4)
+            row["height_m"] = round(float(made.camera.T_world_cam[2, 3]), 4)
+            row["true_height_m"] = round(float(true.T_world_cam[2, 3]), 4)
+            row["least_found"] = round(made.least_found, 4)
+            row["contradiction"] = made.contradiction
             row["objects"] = [thing.label for thing in made.objects]
             found = found_of(made)
     except ItemRejectedError as error:

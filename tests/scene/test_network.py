@@ -19,7 +19,7 @@ SAMPLES = Path(__file__).parents[2] / "datasets" / "sample_videos"
 
 
 def _stills(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(np.broadcast_to(frames[i], frames.shape) for i in (0, 1))
+    return np.broadcast_to(frames[0], frames.shape), np.broadcast_to(frames[1], frames.shape)
 
 
 @pytest.mark.parametrize(("h", "w"), [(240, 320), (180, 320), (427, 320), (33, 320), (320, 320)])
@@ -89,6 +89,7 @@ def test_hand_and_moved_thing_of_a_sample_clip_are_seen_where_they_were_drawn(it
 
     for when, i in (("first", 0), ("last", -1)):
         labels = cv2.imread(str(folder / truth["masks"][when]), cv2.IMREAD_UNCHANGED)
+        assert labels is not None
         h, w = footage.shape
         labels = cv2.resize(labels, (w, h), interpolation=cv2.INTER_NEAREST)
         true = labels == truth["mask_labels"]["object"]

@@ -80,6 +80,20 @@ class _Blob:
         return float(np.prod(list(self.parts.values())))
 
 
+@dataclass(frozen=True)
+class _Pair:
+    """One thing at both ends of the clip."""
+
+    first: _Blob
+    last: _Blob
+    parts: dict[str, float]
+    """What speaks for their being the same thing, each 0 to 1."""
+
+    @property
+    def rating(self) -> float:
+        return self.first.rating * self.last.rating * float(np.prod(list(self.parts.values())))
+
+
 def watch(clip: Clip, footage: Footage) -> Watched:
     """Return what the network sees in the clip's frames and in its two stills.
 
@@ -210,11 +224,11 @@ def find_movers(
     stops = [_hidden_end(blob, _END_WEIGHT.get(kind, 0.7)) for blob in stops]
     pairs = sorted(
         (
-            (_pair_parts(a, b, kind, footage.shape), a, b)
+            _Pair(a, b, _pair_parts(a, b, kind, footage.shape))
             for a in starts
             for b in stops
         ),
-        key=lambda pair: -pair[1].rating * pair[2].rating * float(np.prod(list(pair[0].values()))),
+        key=lambda pair: -pair.rating,
     )  # fmt: skip
     if not pairs:
         return None
@@ -222,15 +236,15 @@ def find_movers(
         return _moved(pairs, pairs[0]), None
     # The tool is what the hand holds; the object is pushed by it and lies farther from the hand.
     best = pairs[0]
-    rest = [p for p in pairs[1:] if p[1] is not best[1] and p[2] is not best[2]]
+    rest = [p for p in pairs[1:] if p.first is not best.first and p.last is not best.last]
     if not rest:
         return _moved(pairs, best), None
     second = rest[0]
-    held = [_held(footage, watched, pair[1].hist) for pair in (best, second)]
+    held = [_held(footage, watched, pair.first.hist) for pair in (best, second)]
     words = [colour_words(text) for text in (phrase, tool)]
     by_colour = [
-        _named(footage.rgb[0], best[1].mask, words[0]) * _named(footage.rgb[0], second[1].mask, words[1]),
-        _named(footage.rgb[0], second[1].mask, words[0]) * _named(footage.rgb[0], best[1].mask, words[1]),
+        _named(footage.rgb[0], best.first.mask, words[0]) * _named(footage.rgb[0], second.first.mask, words[1]),
+        _named(footage.rgb[0], second.first.mask, words[0]) * _named(footage.rgb[0], best.first.mask, words[1]),
     ]  # fmt: skip
     if by_colour[1] * (0.3 + held[0]) > by_colour[0] * (0.3 + held[1]):
         best, second = second, best
@@ -282,7 +296,8 @@ def hand_at(watched: Watched, i: int) -> Bool[np.ndarray, "h w"]:
 
 def passed(watched: Watched) -> Bool[np.ndarray, "h w"]:
     """Return the pixels where at some time a hand or what it moves is seen."""
-    return grow(((watched.shares[:, HAND] + watched.shares[:, MOVED]) > _LIKELY).any(0), 3)
+    shares = watched.shares[:, HAND] + watched.shares[:, MOVED]
+    return grow(shares.max(0) > _LIKELY, 3)
 
 
 def table_seen(watched: Watched) -> Bool[np.ndarray, "h w"]:
@@ -390,22 +405,14 @@ def _pair_parts(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[s
     return parts
 
 
-def _moved(
-    pairs: list[tuple[dict[str, float], _Blob, _Blob]],
-    chosen: tuple[dict[str, float], _Blob, _Blob],
-) -> Moved:
-    how, a, b = chosen
-    rivals = [
-        p[1].rating * p[2].rating * float(np.prod(list(p[0].values())))
-        for p in pairs
-        if p[1] is not a and p[2] is not b
-    ]
-    own = a.rating * b.rating * float(np.prod(list(how.values())))
+def _moved(pairs: list[_Pair], chosen: _Pair) -> Moved:
+    a, b = chosen.first, chosen.last
+    rival = max((p.rating for p in pairs if p.first is not a and p.last is not b), default=0.0)
     cues = {
         **{f"first {k}": v for k, v in a.parts.items()},
         **{f"last {k}": v for k, v in b.parts.items()},
-        **how,
-        "no rival": float(1 / (1 + (max(rivals, default=0.0) / max(own, 1e-6)) ** 2)),
+        **chosen.parts,
+        "no rival": float(1 / (1 + (rival / max(chosen.rating, 1e-6)) ** 2)),
     }
     score = float(np.prod(list(cues.values())))
     return Moved(first=a.mask, last=b.mask, score=score, look=a.hist, cues=cues)

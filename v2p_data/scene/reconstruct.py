@@ -25,7 +25,7 @@ from v2p_data.scene.backends.config import (
 )
 from v2p_data.scene.find import Watched, passed, watch
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
-from v2p_data.scene.gate import by_stage, check_confidence, check_motion, cues_of
+from v2p_data.scene.gate import Cue, by_stage, check_confidence, check_motion, cues_of
 from v2p_data.scene.learned import (
     DETECTORS,
     camera_from_depth,
@@ -48,6 +48,12 @@ _CLOSE_RIVAL = 0.02
 """In units of IoU: below, which face of a box is down was as good as drawn by lot."""
 _OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 """Upside down, about x."""
+_USUAL_PITCH_RAD = 0.61
+"""35 degrees, for a camera on a stand at a table."""
+_USUAL_FOV_RAD = 1.01
+"""58 degrees, for web cameras and phones filming wide."""
+_MEASURED_SD = 0.02
+"""Of a pitch [rad], or of the logarithm of a height, that the user gives."""
 _LEAST_HEIGHT_SD = 0.2
 """Of the logarithm of the camera's height: rooms and hands that the network never saw make it surer than it may be."""
 _LEAST_QUALITY = 0.4
@@ -66,12 +72,14 @@ class SceneConfig:
     """Of a picture 320 px wide. Everything here takes the camera to stand still."""
     check_motion: bool = True
     """Reject what does not move as its caption says."""
-    pitch_rad: float = 0.61
-    """How far the camera usually looks down: 35 degrees for a camera on a stand at a table."""
+    camera_height_m: float | None = None
+    """Of the camera above the table, where you measured it: it gives all sizes, which are guesses otherwise."""
+    pitch_rad: float | None = None
+    """How far the camera looks below the horizon, where you know it."""
     pitch_spread_rad: float = 0.14
-    """How far silhouettes may pull the pitch from the usual one."""
-    fov_rad: float = 1.01
-    """Horizontal field of view; 58 degrees is usual for web cameras and phones filming wide."""
+    """How far silhouettes may pull the pitch from the expected one."""
+    fov_rad: float | None = None
+    """Horizontal field of view of the camera, where you know it."""
     max_poses: int = 150
     """Poses kept per object, the first and last among them."""
     ground: GroundConfig = field(default_factory=GroundConfig)
@@ -85,10 +93,12 @@ class SceneConfig:
             raise ValueError(f"min_confidence must lie in 0..1, got {self.min_confidence}")
         if not 0 <= self.min_found < 1:
             raise ValueError(f"min_found must lie in 0..1, got {self.min_found}")
-        if not 0.1 < self.pitch_rad < 1.5:
-            raise ValueError(f"pitch_rad must lie in 0.1..1.5, got {self.pitch_rad}")
-        if not 0.3 < self.fov_rad < 2.2:
-            raise ValueError(f"fov_rad must lie in 0.3..2.2, got {self.fov_rad}")
+        for name, low, high in (
+            ("camera_height_m", 0.05, 5.0), ("pitch_rad", 0.1, 1.5), ("fov_rad", 0.3, 2.2),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not low < value < high:
+                raise ValueError(f"{name} must lie in {low}..{high}, got {value}")
         if self.max_poses < 2:
             raise ValueError(f"max_poses must be at least 2, got {self.max_poses}")
 
@@ -139,6 +149,10 @@ class Reconstruction:
     warnings: tuple[str, ...]
     stages: dict[str, tuple[float, str]]
     """Per stage how sure it is, 0 to 1, and why it is not surer."""
+    cues: tuple[Cue, ...] = ()
+    """All that the confidence is the product of."""
+    scale_spread: float = 0.0
+    """Standard deviation of the logarithm of all lengths together: one view does not show scale."""
     least_found: float = 1.0
     """How sure the least sure finding is, 0 to 1."""
     contradiction: str | None = None
@@ -187,6 +201,8 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
         camera=_clip_camera(clip, placement, origin),
         confidence=check_confidence(cues, cfg.min_confidence),
         stages=by_stage(cues),
+        cues=cues,
+        scale_spread=placement.scale_spread,
         least_found=min(s.sure for s in sights.objects),
         contradiction=contradiction,
         warnings=(*sights.warnings, *_remarks(meaning.kind, sights, placement, len(clip.frames))),
@@ -227,19 +243,26 @@ def _check_change(footage: Footage) -> None:
 
 
 def _camera_guess(sights: Sights, cfg: SceneConfig) -> CameraGuess:
-    """Return what the settings, or better the network, say of the camera."""
+    """Return what is known of the camera: the user's word goes before the network's, that before what is usual."""
     seen = sights.watched
-    if seen is None:
-        return CameraGuess(
-            pitch_rad=cfg.pitch_rad, pitch_sd_rad=cfg.pitch_spread_rad, fov_rad=cfg.fov_rad
-        )
-    return CameraGuess(
-        pitch_rad=seen.pitch_rad,
-        pitch_sd_rad=float(np.clip(seen.pitch_sd_rad, 0.05, cfg.pitch_spread_rad)),
-        fov_rad=float(2 * np.arctan(0.5 / seen.focal_widths)),
-        height_m=seen.height_m,
-        height_sd=max(seen.height_sd, _LEAST_HEIGHT_SD),
+    guess = CameraGuess(
+        pitch_rad=_USUAL_PITCH_RAD, pitch_sd_rad=cfg.pitch_spread_rad, fov_rad=_USUAL_FOV_RAD
     )
+    if seen is not None:
+        guess = CameraGuess(
+            pitch_rad=seen.pitch_rad,
+            pitch_sd_rad=float(np.clip(seen.pitch_sd_rad, 0.05, cfg.pitch_spread_rad)),
+            fov_rad=float(2 * np.arctan(0.5 / seen.focal_widths)),
+            height_m=seen.height_m,
+            height_sd=max(seen.height_sd, _LEAST_HEIGHT_SD),
+        )
+    if cfg.pitch_rad is not None:
+        guess = replace(guess, pitch_rad=cfg.pitch_rad, pitch_sd_rad=_MEASURED_SD)
+    if cfg.fov_rad is not None:
+        guess = replace(guess, fov_rad=cfg.fov_rad)
+    if cfg.camera_height_m is not None:
+        guess = replace(guess, height_m=cfg.camera_height_m, height_sd=_MEASURED_SD)
+    return guess
 
 
 def _origin(placement: Placement) -> Float[np.ndarray, "3"]:

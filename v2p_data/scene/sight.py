@@ -22,12 +22,12 @@ from v2p_data.scene.find import (
     table_seen,
 )
 from v2p_data.scene.footage import Footage
-from v2p_data.scene.ground import Found, Moved, find_moved, find_other
+from v2p_data.scene.ground import Moved, find_moved, find_other
 from v2p_data.scene.nouns import Noun, noun_for
 from v2p_data.scene.scene import Role
 from v2p_data.scene.segment import bounding_box, from_box, from_points, grow, solidity
 from v2p_data.scene.table import Table, find_table
-from v2p_data.scene.track import Track, track
+from v2p_data.scene.track import track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
 
@@ -120,7 +120,8 @@ def sight(
 ) -> Sights:
     """Return the masks of all objects that the caption names.
 
-    `watched` is what the network sees, where it was asked; `boxes` are what a detector says, by phrase; a user's hint for the phrase goes before it.
+    `watched` is what the network sees, where it was asked; `boxes` are what a detector says, by phrase: a user's hint
+    for the phrase goes before it.
 
     Raises:
         ItemRejectedError: `no_hand`, `object_not_found` or `reference_not_found`, with the number that decided.
@@ -143,90 +144,133 @@ def sight(
         )
     if watched is None:
         footage = footage.knowing(moved.look)
-    followed = _followed(footage, watched, moved)
-    thing = _sighting(clip, meaning.manipulated, "manipulated")
-    objects = [
-        replace(
-            thing,
-            masks=followed.masks,
-            quality=followed.quality,
-            meets=followed.meets,
-            moves=True,
-            sure=sure,
-            why=why,
-            hinted=mark is not None,
-        )
-    ]
-    moved = replace(moved, last=followed.masks[-1])
-    warnings: list[str] = []
+    thing = _mover(
+        _sighting(clip, meaning.manipulated, "manipulated"), footage, watched, moved, mark
+    )
+    moved = replace(moved, last=thing.masks[-1])
+    scene = _Scene(clip, footage, table, watched, meaning, moved, thing.masks, min_found)
+    objects, warnings = [thing], list[str]()
     taken = np.zeros(footage.shape, bool)
     for phrase, role in meaning.others:
-        thing = _sighting(clip, phrase, role)
-        mark = marked.get(phrase)
+        thing, mark = _sighting(clip, phrase, role), marked.get(phrase)
+        seen: Sighting | None = None
         if role == "tool" and held is not None:
-            course = _followed(footage, watched, held)
-            sure, why = _sureness(held, watched, mark)
-            thing = replace(
-                thing, masks=course.masks, quality=course.quality, meets=course.meets, moves=True
-            )
-            objects.append(replace(thing, sure=sure, why=why, hinted=mark is not None))
-            continue
-        if role == "tool" and mark is None and watched is not None:
-            brought = find_held(watched, objects[0].masks)
-            if brought is not None and brought[2] >= min_found:
-                at, masks, sure = brought
-                objects.append(
-                    replace(
-                        thing,
-                        masks=masks,
-                        quality=masks.any((1, 2)).astype(float),
-                        at=at,
-                        sure=sure,
-                        why="it comes with the hand",
-                    )
-                )
-                continue
-        late = meaning.kind == "uncover" if mark is None else mark.frame > 0
-        found = (
-            Found(mask=mark.mask, score=5.0)
-            if mark
-            else find_other(
-                footage, table, phrase, meaning.kind, moved, taken,
-                standing(watched, late=late) if watched else None,
-            )
-        )  # fmt: skip
-        sure = mark.sure if mark else _rise(found.score, 1.0, 0.5) if found else 0.0
-        if found is None or sure < min_found:
-            if phrase.lower() in clip.caption.lower() and meaning.kind not in _OPTIONAL_KINDS:
-                raise ItemRejectedError(
-                    "reference_not_found",
-                    f"the '{phrase}' was not found in {clip.item} (sure to {sure:.2f}); mark it with a box in "
-                    "captions.json",
-                    round(sure, 3),
-                )
+            seen = _mover(thing, footage, watched, held, mark)
+        elif role == "tool" and mark is None:
+            seen = _brought(scene, thing)
+        seen = seen or _stander(scene, thing, mark, taken)
+        if seen is None:
             warnings.append(f"the '{phrase}' was not found and is left out")
             continue
-        taken |= grow(found.mask, 2)
-        masks = _standing(footage, watched, found.mask, objects[0].masks)
-        at = len(masks) - 1 if late else 0
-        masks[at] = found.mask
-        objects.append(
-            replace(
-                thing,
-                masks=masks,
-                quality=masks.sum((1, 2)) / max(1, found.mask.sum()),
-                at=at,
-                sure=sure,
-                why="" if mark else "what stands there fits the words only so far",
-                hinted=mark is not None,
-            )
-        )
+        if not seen.moves:
+            taken |= grow(seen.first, 2)
+        objects.append(seen)
     return Sights(
         objects=tuple(objects),
         footage=footage,
         table=table,
         watched=watched,
         warnings=tuple(warnings),
+    )
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What the search for the other objects goes by."""
+
+    clip: Clip
+    footage: Footage
+    table: Table
+    watched: Watched | None
+    meaning: Meaning
+    moved: Moved
+    mover: Bool[np.ndarray, "time h w"]
+    """The manipulated object's masks."""
+    min_found: float
+
+
+def _mover(
+    thing: Sighting,
+    footage: Footage,
+    watched: Watched | None,
+    moved: Moved,
+    mark: _Marked | None,
+) -> Sighting:
+    """Return a thing that moves, followed from its first outline to its last."""
+    sure, why = _sureness(moved, watched, mark)
+    course = track(
+        footage,
+        moved,
+        every=1 if len(footage.rgb) < 80 else 2,
+        moving=None if watched is None else lambda i: watched.at(i)[MOVED],
+    )
+    return replace(
+        thing,
+        masks=course.masks,
+        quality=course.quality,
+        meets=course.meets,
+        moves=True,
+        sure=sure,
+        why=why,
+        hinted=mark is not None,
+    )
+
+
+def _brought(scene: _Scene, thing: Sighting) -> Sighting | None:
+    """Return a tool that comes with the hand, or None."""
+    if scene.watched is None:
+        return None
+    brought = find_held(scene.watched, scene.mover)
+    if brought is None or brought[2] < scene.min_found:
+        return None
+    at, masks, sure = brought
+    return replace(
+        thing,
+        masks=masks,
+        quality=masks.any((1, 2)).astype(float),
+        at=at,
+        sure=sure,
+        why="it comes with the hand",
+    )
+
+
+def _stander(
+    scene: _Scene, thing: Sighting, mark: _Marked | None, taken: Bool[np.ndarray, "h w"]
+) -> Sighting | None:
+    """Return a thing that stands still; None where it is not found and the caption can do without.
+
+    Raises:
+        ItemRejectedError: `reference_not_found`.
+    """
+    phrase, kind, watched = thing.phrase, scene.meaning.kind, scene.watched
+    late = kind == "uncover" if mark is None else mark.frame > 0
+    if mark is not None:
+        mask, sure = mark.mask, mark.sure
+    else:
+        there = standing(watched, late=late) if watched else None
+        found = find_other(scene.footage, scene.table, phrase, kind, scene.moved, taken, there)
+        sure = _rise(found.score, 1.0, 0.5) if found else 0.0
+        mask = found.mask if found else np.zeros_like(taken)
+    if sure < scene.min_found or not mask.any():
+        if phrase.lower() in scene.clip.caption.lower() and kind not in _OPTIONAL_KINDS:
+            raise ItemRejectedError(
+                "reference_not_found",
+                f"the '{phrase}' was not found in {scene.clip.item} (sure to {sure:.2f}); mark it with a box in "
+                "captions.json",
+                round(sure, 3),
+            )
+        return None
+    masks = _less_what_passes(scene, mask)
+    at = len(masks) - 1 if late else 0
+    masks[at] = mask
+    return replace(
+        thing,
+        masks=masks,
+        quality=masks.sum((1, 2)) / max(1, mask.sum()),
+        at=at,
+        sure=sure,
+        why="" if mark else "what stands there fits the words only so far",
+        hinted=mark is not None,
     )
 
 
@@ -378,27 +422,14 @@ def _sureness(moved: Moved, watched: Watched | None, mark: _Marked | None) -> tu
     return sure, f"weakest is '{weakest}' with {moved.cues[weakest]:.2f}"
 
 
-def _followed(footage: Footage, watched: Watched | None, moved: Moved) -> Track:
-    return track(
-        footage,
-        moved,
-        every=1 if len(footage.rgb) < 80 else 2,
-        moving=None if watched is None else lambda i: watched.at(i)[MOVED],
-    )
-
-
-def _standing(
-    footage: Footage,
-    watched: Watched | None,
-    mask: Bool[np.ndarray, "h w"],
-    mover: Bool[np.ndarray, "time h w"],
+def _less_what_passes(
+    scene: _Scene, mask: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "time h w"]:
     """Return a standing thing's mask over time, less what passes in front of it."""
-    out = np.repeat(mask[None], len(footage.rgb), axis=0)
-    for i in range(len(out)):
-        hidden = mover[i]
-        if watched is not None:
-            shares = watched.at(i)
+    out = np.repeat(mask[None], len(scene.mover), axis=0)
+    for i, hidden in enumerate(scene.mover):
+        if scene.watched is not None:
+            shares = scene.watched.at(i)
             hidden = hidden | (shares[HAND] + shares[MOVED] > 0.5)
         out[i] &= ~hidden
     return out
