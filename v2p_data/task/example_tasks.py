@@ -70,7 +70,7 @@ def reward_function(actions, states):
     reward_components["reach"] = 1 - torch.tanh(5.0 * distance)
     reward_components["calm"] = -0.2 * near * torch.norm(states["eef_vel_linear"], dim=-1).clamp(max=1.0)
     reward_components["disturb"] = -0.5 * (moved - 0.01).clamp(0.0, 0.3)
-    total = reward_components["reach"] + reward_components["calm"] + reward_components["disturb"]
+    total = 100.0 * (reward_components["reach"] + reward_components["calm"] + reward_components["disturb"])
     return total, reward_components
 '''
 
@@ -136,7 +136,7 @@ def reward_function(actions, states):
     reward_components["grasp"] = 0.2 * held
     reward_components["raise"] = 0.6 * (height / 0.05).clamp(0.0, 1.0) * held
     reward_components["effort"] = -0.005 * (actions**2).sum(dim=-1)
-    total = (
+    total = 100.0 * (
         reward_components["reach"]
         + reward_components["grasp"]
         + reward_components["raise"]

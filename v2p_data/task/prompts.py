@@ -34,9 +34,10 @@ You write tasks for a robot arm with a parallel gripper in a physics simulator. 
 6. `compute_reward(self, actions, states)`, which returns `reward_function(actions, states)`; and the module-level
    `reward_function(actions, states)`, decorated with `@torch.jit.script`, which returns the total reward (env,) float32
    and a dict of its named components, each (env,). `actions` is (env, 7), -1 to 1. The docstring holds your chain of
-   thoughts for the reward and the list of its components. Each step the trainer adds 100 times success by itself: do not
-   pay for success. Keep the total between about -10 and 100, let it rise smoothly from anywhere, and let no moment
-   before success be worth staying in.
+   thoughts for the reward and the list of its components. Weigh the components so that they add up to about 1 just before
+   success and return 100 times their sum. To each step in success the trainer adds another 100 by itself, so do not pay for
+   success. Let the total rise smoothly from anywhere, reward the next step more than staying in the last, and let no moment
+   before success be worth staying in for ever.
 
 The class derives from `Task` (`from factory.tasks.task import Task`) and its constructor is
 `def __init__(self, envs, urdf_assets_root): super().__init__(envs, urdf_assets_root, scene_info)`, followed by
@@ -68,7 +69,7 @@ The code is read by a guard that refuses whatever is not on its list, with the l
 - imports: `import torch`, `import math`, `from torch import Tensor`, names of typing, and `from factory.tasks.task import Task`.
 - exactly one class, derived from Task; functions and constants (numbers, strings, lists, tuples, dicts of them) at module
   level; nothing else at module level.
-- no while, try, with, lambda, generator expression, assert, raise, del, global, `:=`, `@` as an operator, starred arguments,
+- no while, try, with, lambda, generator expression, assert, raise, del, global, `:=`, starred arguments,
   `**` with anything but a number of at most {exponent} behind it, nested functions or classes; loops at most {loops} deep.
 - no name or attribute with an underscore in front or at its end but `__init__` and those listed below.
 - no strings or lists multiplied; f-strings with plain names only; numbers of at most {number:g}; at most {chars} characters.
