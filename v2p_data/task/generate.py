@@ -206,13 +206,20 @@ def _by_model(
     """Let a model write the samples and choose among those that the audit accepts."""
     from v2p_data.task import vlm_writer
     from v2p_data.task.pool import examples_for, read_pool
+    from v2p_data.task.prompts import audit_table
     from v2p_data.task.vlm import VlmClient
+
+    def objections(written: Sequence[tuple[str, SmokeResult]]) -> list[str]:
+        audits = [s.audit for s in judged(written)]
+        return ["" if a.is_acceptable else audit_table(a) for a in audits]
 
     pools = [p for p in (pool, cfg.vlm.pool) if p is not None]
     examples = examples_for(scene, read_pool(*pools), cfg.vlm.num_examples)
     with tempfile.TemporaryDirectory(prefix="v2p-calls-") as kept_nowhere_else:
         client = VlmClient(cfg.vlm, calls or Path(kept_nowhere_else), seed)
-        written = vlm_writer.write_samples(client, scene, cfg.num_samples, examples, try_all)
+        written = vlm_writer.write_samples(
+            client, scene, cfg.num_samples, examples, try_all, objections
+        )
         samples = judged(written.final)
         audits_pick = _pick(scene, samples)
         pick = vlm_writer.pick_sample(

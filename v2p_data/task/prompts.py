@@ -184,6 +184,16 @@ def fault_message(fault: str, code: str) -> Message:
     }
 
 
+def objection_message(table: str) -> Message:
+    """Return what is said about code that runs but that the audit does not accept, as are all the others."""
+    return {
+        "role": "user",
+        "content": f"This code runs, but an audit of its success function found fault with it:\n\n{table}\n\n"
+        "Say which condition is wrong or missing and why, then answer in the same form as before, with everything. Do not "
+        "fit numbers to the audit: say what must be true.",
+    }
+
+
 # --- the pick ------------------------------------------------------------------------------------------------
 
 

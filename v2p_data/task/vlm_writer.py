@@ -20,6 +20,7 @@ from v2p_data.task.prompts import (
     better_reward_message,
     fault_message,
     first_reward_message,
+    objection_message,
     pick_message,
     scene_message,
     system_message,
@@ -34,6 +35,11 @@ logger = logging.getLogger(__name__)
 
 TryAll = Callable[[list[str]], list[SmokeResult]]
 """Runs task codes in the sandbox, one result each."""
+Written = tuple[str, SmokeResult]
+Objections = Callable[[Sequence[Written]], list[str]]
+"""Says of each code what an audit has against it; empty where it is acceptable."""
+MAX_OBJECTIONS = 1
+"""Times all samples go back with their audits where none is acceptable."""
 IDEAS = tuple(v.idea for v in VARIANTS if not v.is_naive)
 """For variety among samples: what each reward may be like."""
 
@@ -42,9 +48,9 @@ IDEAS = tuple(v.idea for v in VARIANTS if not v.is_naive)
 class WrittenSamples:
     """What the model wrote, in the order of the samples."""
 
-    first: tuple[tuple[str, SmokeResult], ...] = field(repr=False)
+    first: tuple[Written, ...] = field(repr=False)
     """Each sample's first answer: what there is without sending anything back."""
-    final: tuple[tuple[str, SmokeResult], ...] = field(repr=False)
+    final: tuple[Written, ...] = field(repr=False)
     """After regeneration."""
     answers: int
     """Codes that were asked for, with those that were sent back."""
@@ -84,8 +90,11 @@ def write_samples(
     count: int,
     examples: Sequence[Example],
     try_all: TryAll,
+    objections: Objections,
 ) -> WrittenSamples:
     """Return `count` task codes for a scene, sent back with their errors until they run, a bounded number of times.
+
+    Where all run and none is acceptable, they go back once with what the audit has against them.
 
     Args:
         client: the model.
@@ -93,6 +102,7 @@ def write_samples(
         count: how many.
         examples: solved tasks to show.
         try_all: the sandbox.
+        objections: the audit.
 
     Raises:
         BudgetError: the budget is used up.
@@ -110,10 +120,17 @@ def write_samples(
         )
         for i in range(count)
     ]
-    first: list[tuple[str, SmokeResult]] = []
-    answers = 0
+    first: list[Written] = []
+    answers = rounds = 0
     for turn in range(cfg.max_regenerations + 1):
         open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
+        if not open_ones and rounds < MAX_OBJECTIONS:
+            rounds += 1
+            faults = objections([(d.code, d.result) for d in drafts])
+            if all(faults):
+                for draft, fault in zip(drafts, faults, strict=True):
+                    draft.talk = [*draft.talk, objection_message(fault)]
+                open_ones = list(range(count))
         if not open_ones:
             break
         purpose = f"task {scene.title}, turn {turn}, sample "

@@ -157,7 +157,9 @@ def test_everything_that_was_said_is_kept_with_the_task_and_can_be_said_again(wr
         ]
 
     broken = written.made.first[1]
-    again = write_samples(client, written.scene, 3, examples_for(written.scene, [], 2), known)
+    again = write_samples(
+        client, written.scene, 3, examples_for(written.scene, [], 2), known, no_objection
+    )
     pick = pick_sample(
         client, written.scene, [(s.code, s.audit) for s in written.made.samples], audits_pick=1
     )
@@ -216,6 +218,10 @@ def runs(codes):
     return [SmokeResult(runnable=True) for _ in codes]
 
 
+def no_objection(written):
+    return [""] * len(written)
+
+
 def never_runs(codes):
     return [SmokeResult(runnable=False, error="line 2: it hangs") for _ in codes]
 
@@ -232,7 +238,7 @@ def never_runs(codes):
 def test_an_answer_without_all_six_parts_is_asked_for_again(bad, told, chat, client, say):
     chat.script = [say(bad), say(fenced(GRASP_A_BLOCK))]
 
-    made = write_samples(client(), lifting_scene(), 1, [], runs)
+    made = write_samples(client(), lifting_scene(), 1, [], runs, no_objection)
 
     assert made.final[0][0] == GRASP_A_BLOCK
     assert told in text_of(chat.requests[1])[-1]
@@ -241,17 +247,38 @@ def test_an_answer_without_all_six_parts_is_asked_for_again(bad, told, chat, cli
 def test_sending_back_has_an_end(chat, client, say):
     chat.otherwise = say(fenced(GRASP_A_BLOCK))
 
-    made = write_samples(client(max_regenerations=2), lifting_scene(), 2, [], never_runs)
+    made = write_samples(
+        client(max_regenerations=2), lifting_scene(), 2, [], never_runs, no_objection
+    )
 
     assert made.answers == len(chat.requests) == 6
     assert not any(r.runnable for _, r in made.final)
+
+
+@pytest.mark.parametrize(
+    ("faults", "asked"), [(["too early", "too late"], 4), (["too early", ""], 2)]
+)
+def test_where_the_audit_accepts_none_all_go_back_once_with_its_table(
+    faults, asked, chat, client, say
+):
+    chat.otherwise = say(fenced(GRASP_A_BLOCK))
+
+    made = write_samples(client(), lifting_scene(), 2, [], runs, lambda written: faults)
+
+    assert made.answers == len(chat.requests) == asked
+    last = [text_of(r)[-1] for r in chat.requests[2:]]
+    assert sorted(f for f in ("too early", "too late") if any(f in t for t in last)) == (
+        sorted(faults) if asked == 4 else []
+    )
 
 
 def test_a_budget_ends_the_writing(chat, client, say):
     chat.otherwise = say(fenced(GRASP_A_BLOCK))
 
     with pytest.raises(BudgetError, match="max-total-tokens"):
-        write_samples(client(max_total_tokens=3000, parallel=1), lifting_scene(), 8, [], runs)
+        write_samples(
+            client(max_total_tokens=3000, parallel=1), lifting_scene(), 8, [], runs, no_objection
+        )
 
     assert len(chat.requests) == 2
 
@@ -259,7 +286,7 @@ def test_a_budget_ends_the_writing(chat, client, say):
 def test_without_visual_information_only_the_caption_and_the_objects_are_told(chat, client, say):
     chat.otherwise = say(fenced(GRASP_A_BLOCK))
 
-    write_samples(client(tracking=False, images=False), lifting_scene(), 1, [], runs)
+    write_samples(client(tracking=False, images=False), lifting_scene(), 1, [], runs, no_objection)
 
     question = text_of(chat.requests[0])[1]
     assert "lift up the block" in question
