@@ -1,19 +1,25 @@
 """The guard between task code, whoever wrote it, and the machine.
 
-What it covers. `check_code` reads the code without running it and refuses everything that is not on an allow-list
-(`allowed`): imports other than torch, math, typing and the task base class; names, attributes and functions
-that are not tensor maths; every underscore name except `__init__`; while loops, generators, lambdas, `try`,
-`with`, `global`, starred calls, decorators other than `torch.jit.script`; long, deep or many-noded
-programs and huge constants. `load_task` runs what is left with a handful of builtins and stand-ins for
-`torch` and `math` that hold the listed functions and nothing else; of the environment it sees `num_envs` and
-`sample_object_poses`. `smoke.smoke_run` runs unknown code in a child process without network (where the
-kernel lets us take it away), without the right to open a file or start a process, in an empty folder, with
-an empty environment and limits on time and memory; what comes back is read as data.
+What it covers. Three walls, one behind the other:
+
+- `check_code` reads the code without running it and refuses everything that is not on an allow-list (`allowed`): imports
+  other than torch, math, typing and the task base class; names, attributes and functions that are not tensor maths;
+  every underscore name except `__init__`; assignment to anything but the task's own variables and attributes; while
+  loops, generators, lambdas, `try`, `with`, `global`, starred calls, decorators other than `torch.jit.script` and
+  `staticmethod`, type parameters; letters that only look like ASCII, and characters that hide what a line says;
+  long, deep or many-noded programs and huge constants. Every refusal names the line and the reason.
+- `load_task` runs what is left with a handful of builtins and stand-ins for `torch`, `math` and `torch.Tensor`
+  that hold the listed functions and nothing else. Of the environment it sees `num_envs` and copies of what
+  `sample_object_poses` gives, and a call that writes into a state or into the actions is an error (`watched`).
+- `smoke.smoke_run` runs unknown code in a child process first, which has given up its rights (`confine`): no
+  file, no socket, no process, no program, an empty folder and environment, and limits on time and memory. What comes
+  back is JSON, read as data; nothing is ever unpickled.
 
 What it does not cover. Nothing here is proof against a hole in CPython, torch or the kernel. Code that has passed the
-smoke run is loaded into the training process, where no limit on time and memory holds any more: code
-that turns slow only for large batches slows training down. Task code may also be *wrong*; that is `audit`'s
-business.
+smoke run is loaded into the training process, where the second wall stands alone unless that process calls
+`confine` too: code that turns slow or large for large batches only slows it down or ends it. Where the kernel has
+neither Landlock nor seccomp the limits of the third wall remain. Task code may also be *wrong*; that is
+`audit`'s business. `docs/safety.md` says how all this is tested.
 """
 
 import ast

@@ -112,16 +112,12 @@ def _refused(source: str) -> SmokeResult | None:
     return None
 
 
-def _ask_child(
-    sources: list[str],
-    scene: Scene,
-    probes: States | None,
-    seconds_each: float,
-    timeout_s: float,
-) -> list[SmokeResult]:
+def trial_request(
+    sources: list[str], scene: Scene, probes: States | None, seconds_each: float
+) -> dict[str, Any]:
+    """Return what the child is asked, as data that JSON can hold."""
     states = random_states(scene, BATCH, rng_for(0, "smoke", scene.title))
-    num_probes = len(next(iter(probes.values()))) if probes else 0
-    request = {
+    return {
         "sources": sources,
         "object_names": [o.name for o in scene.objects],
         "states": _as_lists(states),
@@ -129,6 +125,17 @@ def _ask_child(
         "probes": _as_lists(probes or {}),
         "seconds_each": seconds_each,
     }
+
+
+def _ask_child(
+    sources: list[str],
+    scene: Scene,
+    probes: States | None,
+    seconds_each: float,
+    timeout_s: float,
+) -> list[SmokeResult]:
+    num_probes = len(next(iter(probes.values()))) if probes else 0
+    request = trial_request(sources, scene, probes, seconds_each)
     root = str(Path(v2p_data.__file__).parents[1])
     starter = f"import sys; sys.path.insert(0, {root!r}); from v2p_data.task.smoke_child import main; main()"
     with tempfile.TemporaryDirectory(prefix="v2p-task-") as folder:

@@ -10,6 +10,7 @@ import select
 import signal
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -70,12 +71,15 @@ def main() -> None:
     leave_the_network()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
-    with suppress(
-        BadTaskError
-    ):  # loads what torch loads late, before files can no longer be opened
-        judge(_HARMLESS, request)
-    answers = [_in_a_fork(source, request) for source in request["sources"]]
+    warm_up(request)
+    answers = [in_a_fork(source, request) for source in request["sources"]]
     sys.stdout.write(json.dumps(answers))
+
+
+def warm_up(request: dict[str, Any]) -> None:
+    """Let torch load what it loads late, before files can no longer be opened."""
+    with suppress(BadTaskError):
+        judge(_HARMLESS, request)
 
 
 def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
@@ -214,8 +218,18 @@ def _tensors(lists: dict[str, Any]) -> dict[str, torch.Tensor]:
 # --- confinement ---------------------------------------------------------------------------------------------
 
 
-def _in_a_fork(source: str, request: dict[str, Any]) -> dict[str, Any]:
-    """Return the fork's answer, or a sentence that says how it ended."""
+def in_a_fork(
+    source: str,
+    request: dict[str, Any],
+    answer_to: Callable[[str, dict[str, Any]], dict[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Return the confined fork's answer, or a sentence that says how it ended.
+
+    Args:
+        source: task code.
+        request: what `smoke.trial_request` returns.
+        answer_to: what the fork does with them instead of `answer`, for whoever looks on.
+    """
     read_end, write_end = os.pipe()
     seconds = float(request["seconds_each"])
     pid = os.fork()
@@ -224,7 +238,7 @@ def _in_a_fork(source: str, request: dict[str, Any]) -> dict[str, Any]:
         code = 1
         try:
             confine(seconds, MEMORY_BYTES)
-            _send(write_end, _answer(source, request))
+            _send(write_end, (answer_to or answer)(source, request))
             code = 0
         finally:
             os._exit(code)
@@ -244,7 +258,8 @@ def _in_a_fork(source: str, request: dict[str, Any]) -> dict[str, Any]:
         return _failed("its process ended before it had answered; it may need too much memory")
 
 
-def _answer(source: str, request: dict[str, Any]) -> dict[str, Any]:
+def answer(source: str, request: dict[str, Any]) -> dict[str, Any]:
+    """Return the verdict on task code as data, whatever the code does."""
     try:
         return judge(source, request)
     except (BadTaskError, TaskCodeError, StatesChangedError) as error:
