@@ -42,5 +42,6 @@ def component_names(
     task: Task, idle: Float[torch.Tensor, "env act"], states: dict[str, torch.Tensor]
 ) -> tuple[str, ...]:
     """Return the names of the reward's parts, asked with the action `idle`."""
+    task.compute_observation_key(states)  # a reward may use what the observation adds
     _, parts = task.compute_reward(idle, states)
     return tuple(parts)
