@@ -35,7 +35,7 @@ from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 
 METHODS = ("v2p", "eureka", "robogen", "code_as_policy")
-TAUGHT_ROUNDS = {"lift_up": 1, "uncover": 1, "throw_into": 6}
+TAUGHT_ROUNDS = {"lift_up": 2, "uncover": 2, "throw_into": 8}
 """Rounds of imitation that leave something to be learned."""
 RESULTS = "results.jsonl"
 Act = Callable[[np.ndarray], np.ndarray]
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="*", type=int, default=[0, 1, 2])
     parser.add_argument("--start", choices=["taught", "nothing"], default="taught")
     parser.add_argument("--iterations", type=int, default=2)
-    parser.add_argument("--candidates", type=int, default=3)
+    parser.add_argument("--candidates", type=int, default=2)
     parser.add_argument("--steps", type=int, default=16_384, help="of one candidate")
     parser.add_argument("--num-envs", type=int, default=128)
     parser.add_argument("--episodes", type=int, default=100)

@@ -108,20 +108,24 @@ class Jobs:
         """
         waiting = [job for job in jobs if not job.is_settled]
         running: dict[int, _Running] = {}
-        while waiting or running:
-            while waiting and len(running) < self.workers:
-                started = self._start(waiting.pop(0))
-                running[started.number] = started
-            for number, status in self._ended(POLL_S):
-                ended = running.pop(number, None)
-                if ended is not None:
-                    self._settle(ended, status)
-                    on_settled(ended.job)
-            if self._process is not None and self._process.poll() is not None:
-                self._lost(running, waiting)
-            for each in running.values():
-                self._watch(each)
-            on_wait([r.job for r in running.values()])
+        try:
+            while waiting or running:
+                while waiting and len(running) < self.workers:
+                    started = self._start(waiting.pop(0))
+                    running[started.number] = started
+                for number, status in self._ended(POLL_S):
+                    ended = running.pop(number, None)
+                    if ended is not None:
+                        self._settle(ended, status)
+                        on_settled(ended.job)
+                if self._process is not None and self._process.poll() is not None:
+                    self._lost(running, waiting)
+                for each in running.values():
+                    self._watch(each)
+                on_wait([r.job for r in running.values()])
+        finally:
+            for number in running:  # only after an exception: they go on from their checkpoints
+                self._tell({"kill": number})
 
     def close(self) -> None:
         """End everything that is still running."""

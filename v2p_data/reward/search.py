@@ -302,8 +302,8 @@ class _Search:
         if not drafts:
             return []
         faults: list[Fault | None] = [None] * len(drafts)
-        # What `reflect` gives has run already.
-        unknown = [k for k, d in enumerate(drafts) if d.origin != "reflection"]
+        # Templates are ours, and what `reflect` gives has run already.
+        unknown = [k for k, d in enumerate(drafts) if d.origin == "model"]
         results = smoke_run_all([drafts[k].code for k in unknown], self.base.scene)
         for k, result in zip(unknown, results, strict=True):
             if not result.runnable:

@@ -1,0 +1,141 @@
+"""What successive halving costs, and what it loses: the same rewards, raced against each other and all trained to the end.
+
+    python scripts/bench_reward_search.py --quick          # under a minute on an idle core; a mechanism, not a result
+    python scripts/bench_reward_search.py --task lift_up   # five rounds of eight, as in the paper: hours
+
+First the search runs. Then every candidate that it stopped goes on from its checkpoint to the end, which is what training all
+of them would have come to, step for step. The final policy of the search's choice and that of the best of all are
+played on the same fresh episodes, which decided nothing. A candidate that has no result at all counts for neither.
+
+The last three lines are `cost_share: X` (control steps, evaluations included, of the search and its confirmation over those of
+all to the end), `cost_share_at_most: X` (what halving allows, however the candidates do) and `success_lost: X`.
+"""
+
+import json
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import tyro
+
+from policies.evaluation.rate import Rate, wilson
+from policies.ppo.policy import Expert
+from v2p_data.reward.candidate import Candidate, load_candidates
+from v2p_data.reward.config import RewardConfig
+from v2p_data.reward.jobs import REQUEST_FILE, Job, Jobs
+from v2p_data.reward.search import How, search_reward
+from v2p_data.seeds import seed_for
+from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.teacher import play
+from v2p_data.task.benchmark import load_benchmark
+from v2p_data.task.task import TaskBundle
+
+QUICK = RewardConfig(
+    iterations=2,
+    candidates=3,
+    steps=8_192,
+    rungs=(0.25, 1.0),
+    start="taught",
+    taught_rounds=2,
+    num_envs=64,
+    eval_worlds=16,
+    evaluations=2,
+    confirm_seeds=1,
+    target_success=1.01,
+)
+FULL = RewardConfig(iterations=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What is measured."""
+
+    task: str = "lift_up"
+    """A benchmark task."""
+    quick: bool = False
+    """Two rounds of three and few steps."""
+    iterations: int | None = None
+    candidates: int | None = None
+    steps: int | None = None
+    """Of one candidate."""
+    start: str | None = None
+    """`nothing` or `taught`, see `RewardConfig.start`."""
+    taught_rounds: int | None = None
+    confirm_seeds: int | None = None
+    seed: int = 0
+    workers: int = 1
+    episodes: int = 128
+    """Fresh ones, per policy."""
+    out: Path | None = None
+    """Folder of the search, to go on with it later; by default a temporary one."""
+
+
+def main() -> None:
+    """Search, train all to the end, compare."""
+    settings = tyro.cli(Settings, description=(__doc__ or "").split("\n")[0])
+    given = {
+        name: value
+        for name in (
+            "iterations",
+            "candidates",
+            "steps",
+            "start",
+            "taught_rounds",
+            "confirm_seeds",
+        )
+        if (value := getattr(settings, name)) is not None
+    }
+    cfg = replace(QUICK if settings.quick else FULL, **given)
+    bundle = load_benchmark(settings.task)
+    with (
+        tempfile.TemporaryDirectory(prefix="v2p-bench-") as folder,
+        Jobs(workers=settings.workers) as jobs,
+    ):
+        out = settings.out or Path(folder)
+        print("\n".join(measure(bundle, cfg, out, jobs, settings.seed, settings.episodes)))
+
+
+def measure(
+    bundle: TaskBundle, cfg: RewardConfig, out: Path, jobs: Jobs, seed: int, episodes: int
+) -> list[str]:
+    """Return the comparison, line by line."""
+    found = search_reward(bundle, cfg, out, seed=seed, how=How(workers=jobs.workers), jobs=jobs)
+    candidates = load_candidates(out)
+    stopped = [c for c in candidates if c.training().fault is None]
+    jobs.run([_to_the_end(c, cfg.marks[-1]) for c in stopped])
+    ended = [c for c in stopped if c.training().fault is None]
+    best = max(ended, key=lambda c: (c.training().rank(cfg.evaluations), -c.number))
+    worlds = BatchEnv(
+        bundle, num_envs=episodes, seed=seed_for(seed, "bench reward search"), num_threads=1
+    )
+    chosen = next(c for c in candidates if c.number == found.chosen)
+    rates = {c.number: _rate(worlds, c) for c in (chosen, best)}
+    lost = rates[best.number].value - rates[chosen.number].value
+    return [
+        *(
+            f"candidate {c.number:2d}, round {c.iteration + 1}, {c.origin}: "
+            f"{c.training().success(cfg.evaluations):.2f} at the end"
+            for c in ended
+        ),
+        f"search chose {chosen.number}: {rates[chosen.number]} on fresh episodes",
+        f"best of all at the end {best.number}: {rates[best.number]} on fresh episodes",
+        json.dumps({k: v for k, v in found.as_dict().items() if k != "per_seed"}),
+        f"cost_share: {found.cost_share:.3f}",
+        f"cost_share_at_most: {cfg.steps_at_most() / cfg.steps_without_halving():.3f}",
+        f"success_lost: {lost:.3f}",
+    ]
+
+
+def _to_the_end(candidate: Candidate, mark: int) -> Job:
+    folder = candidate.training_folder()
+    return Job(folder=folder, mark=mark, request=json.loads((folder / REQUEST_FILE).read_text()))
+
+
+def _rate(worlds: BatchEnv, candidate: Candidate) -> Rate:
+    worlds.seed(0)
+    at_end, _ = play(worlds, Expert.load(candidate.policy_folder()).act)
+    return wilson(int(at_end.sum()), len(at_end))
+
+
+if __name__ == "__main__":
+    main()
