@@ -5,8 +5,8 @@ expert succeeds. It starts empty; the two basic examples are shown in any case.
 """
 
 import json
-import shutil
 import tempfile
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,8 +47,9 @@ def add_solved(pool: Path, bundle: TaskBundle, success: float) -> Path | None:
         replace(bundle, scene=replace(bundle.scene, folder=Path(bare))).save(made)
         (made / SOLVED_FILE).write_text(json.dumps({"success": success}))
         if home.is_dir():
-            shutil.rmtree(home)
-        made.rename(home)
+            home.rename(Path(place) / "before")
+        with suppress(OSError):  # another process put its own there in between
+            made.rename(home)
     return home
 
 

@@ -47,6 +47,7 @@ def with_reward(parent: str, answer: str) -> str:
         raise SpliceError("This is the reward that was there before. Write another one.")
     own |= {REWARD} | {n for n in wanted if _is_mutable(both[n])}
     taken = {n.id for n in ast.walk(old) if isinstance(n, ast.Name)} | set(there)
+    taken |= {n.name for n in old.body if isinstance(n, ast.ClassDef)}
     names: dict[str, str] = {}
     for name in sorted(own - {REWARD}):
         if name in taken:

@@ -33,7 +33,7 @@ class VlmConfig:
     connect_timeout_s: float = 10.0
     """Until the server takes the connection."""
     timeout_s: float = 180.0
-    """Until the answer has come."""
+    """The longest silence of the server: answers come in one piece, so until the answer."""
     max_retries: int = 6
     """Further tries of one request after a busy server or a broken line."""
     first_backoff_s: float = 1.0
@@ -71,7 +71,7 @@ class VlmConfig:
     mode: Literal["live", "replay"] = "live"
     """`replay` answers from stored calls alone; `live` asks for those that are not stored."""
     calls: Path | None = None
-    """Folder in and below which calls are looked for and into which they are written; by default the run's own."""
+    """Folder in and below which calls are looked for and into which they are written; without one the caller's."""
     pool: Path | None = None
     """Folder of solved tasks of other runs, to be shown as examples too."""
 

@@ -212,3 +212,12 @@ def test_a_task_that_computes_its_reward_in_the_class_gets_a_function(moments):
     check_code(made)
     rise = moments["block_pos"][:, 2] - moments["block_start_pos"][:, 2]
     assert torch.equal(said_by(made, moments)[2], -rise * 5)
+
+
+def test_a_helper_with_the_name_of_the_class_gets_another(moments):
+    named = reward("Up(states['rise'])", "\ndef Up(x):\n    return x * 3\n")
+
+    made = with_reward(PARENT, named)
+
+    assert "def reward_Up(x)" in made
+    assert torch.equal(said_by(made, moments)[2], said_by(PARENT, moments)[0][1] * 3)
