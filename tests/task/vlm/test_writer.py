@@ -16,6 +16,8 @@ from v2p_data.task.templates import write_samples as write_by_template
 from v2p_data.task.vlm import BudgetError, VlmClient
 from v2p_data.task.vlm_writer import first_rewards, improve_reward, pick_sample, write_samples
 
+pytestmark = pytest.mark.slow
+
 WRONG_LINE = "distance = torch.nrom(states['block_pos'] - states['eef_pos'], dim=-1)"
 CHOICE = {"index": 2, "correctness": "held and raised", "reasonability": "r", "efficiency": "e"}
 
