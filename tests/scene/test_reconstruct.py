@@ -137,7 +137,7 @@ def test_the_written_scene_is_read_back(folder, pushed):
     assert json.loads((folder / "scene.json").read_text())["objects"][0]["urdf"] == (
         "urdf/blue_box.urdf"
     )
-    for name in ("overlay.mp4", "overlay_first.png", "overlay_last.png"):
+    for name in ("overlay.mp4", "overlay_first.png", "overlay_last.png", "frame_first.jpg"):
         assert (folder / name).stat().st_size > 1000
 
 

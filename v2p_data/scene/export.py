@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import trimesh
 from jaxtyping import Float
@@ -58,6 +59,8 @@ def write_scene(reconstruction: Reconstruction, folder: Path) -> Scene:
     )
     (folder / MJCF_FILE).write_text(_xml(_scene_mjcf(scene, bodies)))
     write_overlay(reconstruction, folder)
+    for name, frame in (("first", clip.frames[0]), ("last", clip.frames[-1])):
+        cv2.imwrite(str(folder / f"frame_{name}.jpg"), frame[..., ::-1])
     scene.save(folder)
     return scene
 
