@@ -26,6 +26,8 @@ PROBES = 64
 """States on which two rewards must differ somewhere."""
 MAX_CANDIDATES = 200
 STRENGTHS = (1.0, 0.5, 1.5)
+SPARE = 3
+"""So many more are tried at once than are wanted: starting the sandbox takes longer than a trial."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +67,7 @@ def reflect(
             if shape not in seen:
                 seen.add(shape)
                 fresh.append(candidate)
-            if len(fresh) == count - len(found) + 1:
+            if len(fresh) == count - len(found) + SPARE:
                 break
         if not fresh:
             break
@@ -148,7 +150,7 @@ def _with_changes(reward: Reward, known: list[rules.Change], strength: float) ->
         except UnreadableError as error:
             reasons.append(f"{change.reason} - not done: {error}")
     if strength != 1.0:
-        reasons.append(f"{'half as' if strength == 0.5 else f'{strength:.2g} times as'} strongly")
+        reasons.append(f"all of this {strength:.2f} times as strongly")
     return Reflection(code=reward.code(), reasons=tuple(reasons))
 
 

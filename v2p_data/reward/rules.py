@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from v2p_data.reward import redesign
 from v2p_data.reward.feedback import ComponentFeedback, Feedback
 from v2p_data.reward.kernels import centring_factor, kernels_of, simple_kind
-from v2p_data.reward.reward_code import Part, Reward
+from v2p_data.reward.reward_code import Part, Reward, split_constant
 from v2p_data.reward.soften import gates_softened
 from v2p_data.scene.scene import Scene
 
@@ -218,7 +218,8 @@ def _dead(
     if not reward.states_of(part):
         return  # a constant by intention, such as a price per step
     value = n.overall.mean
-    if value == 0 and part.weight < 0:
+    weight, _ = split_constant(reward.inlined(part.expr, part.position))
+    if value == 0 and weight < 0:
         return  # a penalty that was never due
     soft, count = gates_softened(part.expr, _definitions(reward, part))
     words = f"never leaves {value:.3g} in {feedback.num_episodes} episodes"

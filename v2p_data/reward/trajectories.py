@@ -38,9 +38,10 @@ class Trajectories:
     """Steps, ascending, for which `states` and `actions` are kept: those that `reward[moments]` was paid for."""
     states: dict[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
     """`task.task.ROBOT_STATES` and `OBJECT_STATES`, each `(moment, env, ...)` float32."""
-    actions: Float32[np.ndarray, "moment env act"] = field(
+    actions: Float32[np.ndarray, "kept num act"] = field(
         default_factory=lambda: np.zeros((0, 0, 7), np.float32)
     )
+    """`(moment, env, 7)`; of no length where nothing is kept."""
 
     def __post_init__(self) -> None:
         steps, envs = self.success.shape
