@@ -30,6 +30,7 @@ from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
 from v2p_data.solved import find_solved, solved_digests
 from v2p_data.task.generate import TaskConfig
+from v2p_data.task.vlm_config import VlmConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
 
@@ -217,31 +218,46 @@ def reward_stage(task: Stage, cfg: EngineConfig) -> Stage:
         raise V2PError(
             "--reward.method=code_as_policy has no reward to learn from; scripts/compare_reward_methods.py plays it"
         )
+    vlm = cfg.task.vlm if cfg.task.writer == "vlm" else None
     return Stage(
         name="reward",
         item=task.item,
         config=Seeded(config=cfg.reward, seed=cfg.seed),
         inputs={"task": task},
+        sources={} if vlm is None else {"model": fingerprint(vlm.recipe())},
         version=1,
-        make=make_reward,
+        make=partial(make_reward, vlm=vlm),
         resumes=True,
     )
 
 
 def make_reward(
-    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
+    cfg: Seeded,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    vlm: VlmConfig | None,
 ) -> dict[str, Any]:
-    """Search, and write the task with the reward that was found."""
+    """Search, and write the task with the reward that was found; a model, if there is one, writes half of them."""
     from v2p_data.reward.search import How, search_reward
     from v2p_data.task.task import SCENE_FOLDER, TaskBundle
 
     bundle = TaskBundle.load(inputs["task"])
+    seed = seed_for(cfg.seed, "reward", bundle.title)
+    ask_model = None
+    if vlm is not None:
+        from v2p_data.task.vlm import VlmClient
+        from v2p_data.task.vlm_writer import improve_reward
+
+        ask_model = partial(improve_reward, VlmClient(vlm, out / "calls", seed))
     found = search_reward(
         bundle,
         cfg.config,
         out / REWARD_SEARCH_FOLDER,
-        seed=seed_for(cfg.seed, "reward", bundle.title),
+        seed=seed,
         how=How(num_threads=runtime.num_threads),
+        ask_model=ask_model,
         on_progress=runtime.progress,
     )
     shutil.rmtree(out / SCENE_FOLDER, ignore_errors=True)  # of a run that was killed just here

@@ -16,7 +16,7 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -255,16 +255,13 @@ class _Search:
         for rank, standing in enumerate(parents):
             parent = standing.candidate
             share = count // len(parents) + (rank < count % len(parents))
-            data = read_json(standing.training.folder / FEEDBACK_FILE)
-            if not isinstance(data, dict):
+            try:
+                feedback = Feedback.from_dict(read_json(standing.training.folder / FEEDBACK_FILE))
+            except V2PError:  # its process ran generated code
+                logger.warning("candidate %d left no readable feedback", parent.number)
                 continue
-            feedback = Feedback.from_dict(data)
-            asked = 0 if self.ask_model is None else (share + 1) // 2
-            if self.ask_model is not None:
-                drafts += [
-                    _Draft(code=code, origin="model", parent=parent.number)
-                    for code in self.ask_model(told, parent.code, feedback.text(), asked)
-                ]
+            written = self._asked(told, parent, feedback, (share + 1) // 2)
+            drafts += written
             rng = rng_for(self.seed, "reflect", iteration, parent.number)
             # One more than needed: some will be rewards that were tried before.
             drafts += [
@@ -274,9 +271,22 @@ class _Search:
                     parent=parent.number,
                     reasons=tuple(child.reasons),
                 )
-                for child in reflect(told, parent.code, feedback, rng, share - asked + 1)
+                for child in reflect(told, parent.code, feedback, rng, share - len(written) + 1)
             ]
         return drafts
+
+    def _asked(
+        self, told: TaskBundle, parent: Candidate, feedback: Feedback, count: int
+    ) -> list[_Draft]:
+        """Return rewards that the model wrote, if there is one; where it fails, rules write all of them."""
+        if self.ask_model is None:
+            return []
+        try:
+            codes = self.ask_model(told, parent.code, feedback.text(), count)
+        except V2PError as error:
+            logger.warning("no reward from the model: %s", error)
+            return []
+        return [_Draft(code=c, origin="model", parent=parent.number) for c in codes]
 
     def _new_ones(self, drafts: Sequence[_Draft]) -> list[_Draft]:
         """Return the drafts without rewards that were tried before, as many as a round has.
@@ -322,7 +332,7 @@ class _Search:
         stored: list[Trajectories] = []
         for standing in self._elites() if self.rounds else []:
             path = standing.training.folder / TRAJECTORIES_FILE
-            if path.is_file():
+            with suppress(V2PError):
                 stored.append(Trajectories.load(path))
         return stored
 
