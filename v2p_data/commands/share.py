@@ -1,6 +1,5 @@
 """Commands for finished things: check them, give them away."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,8 @@ from v2p_data.errors import V2PError
 class Verify:
     dataset: tyro.conf.Positional[Path]
     """Folder of a LeRobot v3 dataset, ours or anybody's."""
+    json: Path | None = None
+    """Write the findings as JSON to this file, too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,13 +28,15 @@ class Push:
 
 
 def verify_command(argv: list[str]) -> int:
+    """Return 0 where all is well, 1 where there are problems; what cannot be read is an error (2)."""
     from v2p_data.episodes.verify import verify
+    from v2p_data.pipeline.artifact import write_json_atomically
 
     args = parse(Verify, argv, "verify")
-    if not (args.dataset / "meta" / "info.json").is_file():
-        raise V2PError(f"{args.dataset} holds no meta/info.json: it is no LeRobot dataset")
     report = verify(args.dataset)
-    print(json.dumps(report.as_json(), indent=1))  # noqa: T201
+    if args.json is not None:
+        write_json_atomically(args.json, report.as_json())
+    print("\n".join([*report.lines(), report.summary()]))  # noqa: T201
     return 0 if report.is_good else 1
 
 

@@ -1,12 +1,11 @@
 """A dataset, reopened with LeRobot and looked at frame by frame.
 
-Everything is read the way a training would read it. With the staged episodes at hand each mask, state and
-action is compared with what was recorded; without them the checks that any LeRobot v3 dataset should pass
-remain, and for datasets of ours those on palette, action bounds and success.
+The tables are read first, without LeRobot (`tables`); then every frame is read the way a training would read
+it. With the staged episodes at hand each mask, state and action is compared with what was recorded. Any LeRobot
+v3 dataset is welcome: what holds for all is checked, what holds for ours only is left out elsewhere, and
+the report says what was left out and why.
 """
 
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,31 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from v2p_data.episodes.features import (
-    ACTION_KEY,
-    ACTION_NAMES,
-    MASK_KEY,
-    METADATA_FILE,
-    STATE_KEY,
-    SUCCESS_KEY,
-)
+from v2p_data.episodes.features import METADATA_FILE
+from v2p_data.episodes.frames import Checks, Said
 from v2p_data.episodes.staging import Episode
-from v2p_data.errors import V2PError
-from v2p_data.sim.masks import PALETTE, rgb_to_labels
+from v2p_data.episodes.tables import (
+    STOPPING,
+    Found,
+    episodes_of,
+    layout_problems,
+    read_info,
+    read_json,
+)
 
-TIME_TOLERANCE_S = 1e-4
-STATS_TOLERANCE = 1e-4
+Problem = Found
 SHOWN_PROBLEMS = 5
-
-
-@dataclass(frozen=True, kw_only=True)
-class Problem:
-    """One thing that is not as it should be."""
-
-    check: str
-    """Slug of the check."""
-    where: str
-    detail: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +41,10 @@ class VerifyReport:
     is_compared: bool
     """Every frame was compared with what was recorded."""
     problems: tuple[Problem, ...]
+    notes: tuple[Problem, ...] = ()
+    """Oddities that no training suffers from."""
+    skipped: tuple[str, ...] = ()
+    """What was not checked, and why."""
 
     @property
     def is_good(self) -> bool:
@@ -69,6 +61,14 @@ class VerifyReport:
         return f"{read}: {len(self.problems)} problems: {shown}" + (
             f"; and {more} more" if more > 0 else ""
         )
+
+    def lines(self) -> list[str]:
+        """Return it for people, a line each."""
+        return [
+            *(f"problem  {p.check:<16} {p.where}: {p.detail}" for p in self.problems),
+            *(f"note     {p.check:<16} {p.where}: {p.detail}" for p in self.notes),
+            *(f"skipped  {words}" for words in self.skipped),
+        ]
 
     def as_json(self) -> dict[str, Any]:
         """Return it for JSON."""
@@ -91,26 +91,24 @@ def verify(
     Raises:
         V2PError: there is no LeRobot v3 dataset at `root`.
     """
-    info = _read_info(root)
-    about = _read_json(root / METADATA_FILE)
-    checks = _Checks(root=root, info=info, is_ours=about is not None)
-    missing = _missing_files(root, info)
-    if missing:
-        # LeRobot would look for them on the Hub.
-        for path in missing:
-            checks.add(
-                "missing_file",
-                path,
-                "is missing; the dataset was not finalized or not copied whole",
-            )
-        return checks.report(0, 0, is_compared=False)
+    info = read_info(root)
+    about = read_json(root / METADATA_FILE)
+    said = Said()
+    said.problems += layout_problems(root, info)
+    checks = Checks(info=info, about=about if isinstance(about, dict) else None, said=said)
+    if any(p.check in STOPPING for p in said.problems):
+        return _report(root, checks, 0, 0, is_compared=False)
+    leftovers = sorted(p.name for p in [root / "images", *root.glob("tmp*")] if p.exists())
+    if leftovers:
+        said.note("leftovers", ", ".join(leftovers), "LeRobot's temporary files; a push of its own uploads tmp*")  # fmt: skip
     repo_id = str((about or {}).get("repo_id", "local/dataset"))
     on_progress(0.0, "starting LeRobot")
-    return _read(checks, repo_id, staged, on_progress)
+    return _read(root, checks, repo_id, staged, on_progress)
 
 
 def _read(
-    checks: "_Checks",
+    root: Path,
+    checks: Checks,
     repo_id: str,
     staged: Sequence[Path] | None,
     on_progress: Callable[[float, str], None],
@@ -118,197 +116,84 @@ def _read(
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     try:
-        dataset: Any = LeRobotDataset(repo_id, root=checks.root, return_uint8=True)
+        dataset: Any = LeRobotDataset(repo_id, root=root, return_uint8=True)
     except Exception as error:  # noqa: BLE001 - whatever LeRobot stumbles over is the finding
-        checks.add("does_not_open", str(checks.root), f"{type(error).__name__}: {error}")
-        return checks.report(0, 0, is_compared=False)
-    checks.counts(dataset, staged)
+        checks.said.add("does_not_open", str(root), f"{type(error).__name__}: {error}")
+        return _report(root, checks, 0, 0, is_compared=False)
+    lengths = [int(n) for n in episodes_of(root).column("length").to_pylist()]
+    if staged is not None and len(staged) != len(lengths):
+        checks.said.add(
+            "counts", "dataset", f"holds {len(lengths)} episodes, {len(staged)} were recorded"
+        )
     start = 0
-    for k in range(dataset.meta.total_episodes):
-        length = int(dataset.meta.episodes[k]["length"])
+    for k, length in enumerate(lengths):
+        recorded = Episode.load(staged[k]) if staged is not None and k < len(staged) else None
+        episode = checks.episode(k, start, length, recorded)
+        i = start
         try:
-            rows = [dataset[i] for i in range(start, start + length)]
+            for i in range(start, start + length):
+                episode.look_at(dataset[i])
         except Exception as error:  # noqa: BLE001 - whatever LeRobot stumbles over is the finding
-            checks.add("does_not_read", f"episode {k}", f"{type(error).__name__}: {error}")
+            words = str(error).strip().splitlines()[:1] or [""]
+            checks.said.add("does_not_read", f"episode {k}", f"row {i}: {type(error).__name__}: {words[0][:200]}")  # fmt: skip
         else:
-            checks.episode(k, start, rows)
-            if staged is not None and k < len(staged):
-                checks.compare(k, rows, Episode.load(staged[k]))
+            episode.finish()
         start += length
-        on_progress((k + 1) / dataset.meta.total_episodes, f"read {k + 1} episodes")
+        on_progress((k + 1) / len(lengths), f"read {k + 1} episodes")
     checks.statistics(dataset.meta.stats or {})
-    return checks.report(dataset.meta.total_episodes, start, is_compared=staged is not None)
+    return _report(root, checks, len(lengths), start, is_compared=staged is not None)
 
 
-class _Checks:
-    def __init__(self, *, root: Path, info: dict[str, Any], is_ours: bool) -> None:
-        self.root = root
-        self.info = info
-        self.is_ours = is_ours
-        self.features: dict[str, Any] = info["features"]
-        self.cameras = [k for k, f in self.features.items() if f["dtype"] in ("video", "image")]
-        self.floats = [
-            k for k, f in self.features.items()
-            if f["dtype"] in ("float32", "float64") and k != "timestamp"
-        ]  # fmt: skip
-        self.problems: list[Problem] = []
-        self.seen: dict[str, int] = {}
-        self.columns: dict[str, list[np.ndarray]] = {k: [] for k in self.floats}
+def _report(
+    root: Path, checks: Checks, num_episodes: int, num_frames: int, *, is_compared: bool
+) -> VerifyReport:
+    return VerifyReport(
+        root=root,
+        num_episodes=num_episodes,
+        num_frames=num_frames,
+        is_ours=checks.is_ours,
+        is_compared=is_compared,
+        problems=tuple(checks.said.problems),
+        notes=tuple(checks.said.notes),
+        skipped=tuple(checks.skipped()),
+    )
 
-    def add(self, check: str, where: str, detail: str) -> None:
-        self.problems.append(Problem(check=check, where=where, detail=detail))
 
-    def report(self, num_episodes: int, num_frames: int, *, is_compared: bool) -> VerifyReport:
-        return VerifyReport(
-            root=self.root,
-            num_episodes=num_episodes,
-            num_frames=num_frames,
-            is_ours=self.is_ours,
-            is_compared=is_compared,
-            problems=tuple(self.problems),
-        )
+def frames_differ(
+    root: Path, sources: Sequence[tuple[Path, Sequence[int]]], keys: Sequence[str] | None = None
+) -> str:
+    """Return how the dataset at `root` differs from episodes of other datasets, frame by frame.
 
-    def counts(self, dataset: Any, staged: Sequence[Path] | None) -> None:
-        lengths = [int(n) for n in dataset.meta.episodes["length"]]
-        rows = len(dataset.hf_dataset)
-        said = int(self.info["total_episodes"]), int(self.info["total_frames"])
-        if said != (len(lengths), sum(lengths)):
-            self.add("counts", "meta/info.json",
-                     f"names {said} episodes and frames, the episode table {(len(lengths), sum(lengths))}")  # fmt: skip
-        if rows != sum(lengths):
-            self.add("counts", "data", f"holds {rows} rows, the episode table {sum(lengths)}")
-        if staged is not None and len(staged) != len(lengths):
-            self.add(
-                "counts", "dataset", f"holds {len(lengths)} episodes, {len(staged)} were recorded"
-            )
+    Args:
+        root: the dataset; its episodes are those of `sources`, in order.
+        sources: folders of datasets, each with the numbers of its episodes.
+        keys: columns to compare; all but the numbering by default.
 
-    def episode(self, k: int, start: int, rows: list[dict[str, Any]]) -> None:
-        where = f"episode {k}"
-        fps = float(self.info["fps"])
-        index = np.array([int(r["index"]) for r in rows])
-        times = np.array([float(r["timestamp"]) for r in rows])
-        if not (index == np.arange(start, start + len(rows))).all():
-            self.add("index", where, "rows are out of order or from another episode")
-        if any(int(r["episode_index"]) != k for r in rows):
-            self.add("index", where, "rows carry another episode's number")
-        if np.abs(times - np.arange(len(rows)) / fps).max() > TIME_TOLERANCE_S:
-            self.add("timestamps", where, f"timestamps do not follow {fps:g} frames a second")
-        if len(rows) < 2:
-            self.add("length", where, f"{len(rows)} frames")
-        if not str(rows[0]["task"]).strip():
-            self.add("task", where, "has no instruction")
-        for key in self.floats:
-            values = np.stack([np.asarray(r[key]) for r in rows])
-            self.columns[key].append(values.reshape(len(rows), -1))
-            if not np.isfinite(values).all():
-                self.add("finite", where, f"{key} holds NaN or infinity")
-        self._actions(where, rows)
-        self._duplicate(k, where, rows)
-        for key in self.cameras:
-            self._camera(where, key, np.stack([np.asarray(r[key]) for r in rows]))
-        if (
-            self.is_ours
-            and SUCCESS_KEY in rows[-1]
-            and not bool(np.all(np.asarray(rows[-1][SUCCESS_KEY])))
-        ):
-            self.add("success", where, "ends before its task is done")
+    Returns:
+        A sentence, empty where all pixels and numbers are equal.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    def _actions(self, where: str, rows: list[dict[str, Any]]) -> None:
-        if list(self.features.get(ACTION_KEY, {}).get("names") or []) != list(ACTION_NAMES):
-            return
-        largest = max(float(np.abs(np.asarray(r[ACTION_KEY])).max()) for r in rows)
-        if largest > 1.0:
-            self.add("action_bounds", where, f"an action is {largest:.3f}, beyond 1")
-
-    def _duplicate(self, k: int, where: str, rows: list[dict[str, Any]]) -> None:
-        digest = hashlib.sha256()
-        for row in rows:
-            for key in self.floats:
-                digest.update(np.asarray(row[key]).tobytes())
-        first = self.seen.setdefault(digest.hexdigest(), k)
-        if first != k:
-            self.add("duplicate", where, f"holds the same numbers as episode {first}")
-
-    def _camera(self, where: str, key: str, pictures: np.ndarray) -> None:
-        if len(pictures) > 1 and (pictures == pictures[:1]).all():
-            self.add("dead_camera", where, f"{key} never changes")
-        if self.is_ours and key == MASK_KEY and not np.isin(pictures, PALETTE).all():
-            self.add("palette", where, f"{key} holds greys that are no label")
-
-    def compare(self, k: int, rows: list[dict[str, Any]], episode: Episode) -> None:
-        where = f"episode {k} ({episode.id})"
-        if len(rows) != episode.num_frames:
-            self.add(
-                "differs", where, f"has {len(rows)} frames, {episode.num_frames} were recorded"
-            )
-            return
-        pictures = np.stack([np.asarray(r[MASK_KEY]) for r in rows]).transpose(0, 2, 3, 1)
-        wrong = int((rgb_to_labels(np.ascontiguousarray(pictures)) != episode.labels).sum())
-        if wrong:
-            self.add("differs", where, f"{wrong} mask pixels differ from what was drawn")
-        recorded = {
-            STATE_KEY: episode.state,
-            ACTION_KEY: episode.action,
-            SUCCESS_KEY: episode.success[:, None],
-        }
-        for key, values in recorded.items():
-            read = np.stack([np.asarray(r[key]) for r in rows]).reshape(values.shape)
-            if not (read == values).all():
-                self.add("differs", where, f"{key} differs from what was recorded")
-        if rows[0]["task"] != episode.task:
-            self.add("differs", where, f"says '{rows[0]['task']}', recorded was '{episode.task}'")
-
-    def statistics(self, stats: dict[str, Any]) -> None:
-        for key in self.floats:
-            if not self.columns[key]:
-                continue
-            values = np.concatenate(self.columns[key])
-            if key not in stats:
-                self.add("statistics", "meta/stats.json", f"has nothing on {key}")
-                continue
-            for name, true in (
-                ("min", values.min(0)), ("max", values.max(0)), ("mean", values.mean(0)), ("std", values.std(0)),
-            ):  # fmt: skip
-                said = np.asarray(stats[key][name], float).reshape(-1)
-                if said.shape != true.shape or np.abs(said - true).max() > STATS_TOLERANCE * max(
-                    1.0, float(np.abs(true).max())
-                ):
-                    self.add(
-                        "statistics", "meta/stats.json", f"{name} of {key} is not that of the data"
+    made: Any = LeRobotDataset("local/made", root=root, return_uint8=True)
+    columns = keys or [k for k in made.meta.features if k not in ("index", "episode_index", "task_index")]  # fmt: skip
+    at = 0
+    for folder, numbers in sources:
+        source: Any = LeRobotDataset("local/source", root=folder, return_uint8=True)
+        for number in numbers:
+            entry = source.meta.episodes[number]
+            for i in range(int(entry["dataset_from_index"]), int(entry["dataset_to_index"])):
+                if at >= len(made):
+                    return f"{root} ends at row {at}, before episode {number} of {folder}"
+                old, new = source[i], made[at]
+                wrong = [
+                    key for key in columns
+                    if not np.array_equal(np.asarray(old[key]), np.asarray(new[key]), equal_nan=True)
+                ]  # fmt: skip
+                if old["task"] != new["task"]:
+                    wrong.append("task")
+                if wrong:
+                    return (
+                        f"row {at} differs from episode {number} of {folder} in {', '.join(wrong)}"
                     )
-
-
-def _read_info(root: Path) -> dict[str, Any]:
-    info = _read_json(root / "meta/info.json")
-    if info is None:
-        raise V2PError(
-            f"{root} holds no LeRobot dataset: there is no readable meta/info.json in it; "
-            "give the folder that 'v2p generate' named at its end"
-        )
-    version = str(info.get("codebase_version", ""))
-    if not version.startswith("v3"):
-        raise V2PError(
-            f"{root} is a LeRobot dataset of version '{version}'; only v3 can be read, "
-            "convert it with LeRobot's own converter"
-        )
-    return info
-
-
-def _read_json(path: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads(path.read_text())
-    except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
-        return None
-
-
-def _missing_files(root: Path, info: dict[str, Any]) -> list[str]:
-    wanted = [
-        "meta/stats.json",
-        "meta/tasks.parquet",
-        "meta/episodes/*/*.parquet",
-        "data/*/*.parquet",
-    ]
-    wanted += [
-        f"videos/{key}/*/*.mp4" for key, f in info["features"].items() if f["dtype"] == "video"
-    ]
-    return [pattern for pattern in wanted if not any(root.glob(pattern))]
+                at += 1
+    return "" if at == len(made) else f"{root} holds {len(made)} rows, {at} were to be in it"

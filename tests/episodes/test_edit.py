@@ -1,0 +1,214 @@
+"""Merging and dropping change no pixel and no number, and refuse what does not go together."""
+
+import json
+import resource
+import shutil
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from v2p_data.episodes.edit import drop, merge
+from v2p_data.episodes.staging import Episode
+from v2p_data.episodes.verify import verify
+from v2p_data.episodes.writer import pack
+from v2p_data.errors import V2PError
+from v2p_data.sim.masks import PALETTE
+
+pytestmark = pytest.mark.slow
+LIFT, PUSH = "lift the toy up", "push the toy to the left"
+
+
+@pytest.fixture
+def file_limit() -> Callable[[int], AbstractContextManager[None]]:
+    """No file may grow beyond so many bytes: a real failure of the system, as on a full disk."""
+
+    @contextmanager
+    def limited(size: int) -> Generator[None]:
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return limited
+
+
+@pytest.fixture(scope="module")
+def more_staged(tmp_path_factory: pytest.TempPathFactory, make_episode) -> list[Path]:
+    folder = tmp_path_factory.mktemp("more")
+    return [make_episode(k, num_frames=8 + k).save(folder) for k in (3, 4)]
+
+
+@pytest.fixture(scope="module")
+def more(tmp_path_factory: pytest.TempPathFactory, more_staged: list[Path]) -> Path:
+    root = tmp_path_factory.mktemp("dataset") / "more"
+    pack(more_staged, "user/more", root, provenance={"items": {"toy": {"stage": "episodes"}}})
+    return root
+
+
+@pytest.fixture(scope="module")
+def merged(tmp_path_factory: pytest.TempPathFactory, packed: Path, more: Path) -> Path:
+    root = tmp_path_factory.mktemp("dataset") / "both"
+    merge([packed, more], "user/both", root)
+    return root
+
+
+def assert_holds(root: Path, staged: list[Path]) -> None:
+    """Compare every pixel and number that LeRobot reads with the recorded episodes."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("user/x", root=root, return_uint8=True)
+    at = 0
+    for number, path in enumerate(staged):
+        episode = Episode.load(path)
+        for t in range(episode.num_frames):
+            row = dataset[at]
+            grey = np.asarray(PALETTE)[episode.labels[t]]
+            assert (np.asarray(row["observation.images.mask"]) == grey[None]).all()
+            assert np.array_equal(row["observation.state"], episode.state[t])
+            assert np.array_equal(row["action"], episode.action[t])
+            assert bool(row["next.success"]) == episode.success[t]
+            assert (int(row["episode_index"]), int(row["index"])) == (number, at)
+            assert row["task"] == episode.task
+            at += 1
+    assert len(dataset) == at
+
+
+def about(root: Path) -> dict:
+    return json.loads((root / "meta/v2p.json").read_text())
+
+
+def test_a_merged_dataset_holds_every_pixel_of_both(
+    merged: Path, staged: list[Path], more_staged: list[Path]
+):
+    assert_holds(merged, [*staged, *more_staged])
+    report = verify(merged, [*staged, *more_staged])
+    assert report.is_good, report.summary()
+    assert report.notes == ()
+    assert sorted(p.name for p in merged.parent.iterdir()) == ["both"]
+
+
+def test_provenance_of_both_is_kept(merged: Path):
+    told = about(merged)
+
+    assert [e["id"] for e in told["episodes"]] == [f"toy_{k:05d}" for k in range(5)]
+    assert [e["from"] for e in told["episodes"]] == ["user/toys"] * 3 + ["user/more"] * 2
+    assert told["provenance"]["items"] == {"toy": {"stage": "episodes"}}
+    (edit,) = told["provenance"]["edits"]
+    assert [s["repo_id"] for s in edit["sources"]] == ["user/toys", "user/more"]
+    assert edit["sources"][0]["commit"] == "abc"
+    assert "user/both" in (merged / "README.md").read_text()
+
+
+def test_dropping_a_task_leaves_the_others_pixel_by_pixel(
+    merged: Path, staged: list[Path], more_staged: list[Path], tmp_path: Path
+):
+    every = [*staged, *more_staged]
+
+    edited = drop(merged, [LIFT], tmp_path / "pushes")
+
+    left = [path for path in every if Episode.load(path).task == PUSH]
+    assert (edited.num_episodes, edited.tasks, edited.notes) == (2, (PUSH,), ())
+    assert_holds(edited.root, left)
+    report = verify(edited.root, left)
+    assert report.is_good, report.summary()
+    assert report.notes == ()
+    assert [e["id"] for e in about(edited.root)["episodes"]] == ["toy_00001", "toy_00003"]
+    video = Path("videos/observation.images.mask/chunk-000/file-000.mp4")
+    assert (edited.root / video).stat().st_size < 0.7 * (merged / video).stat().st_size
+
+
+def test_a_task_dropped_can_be_added_again_and_tasks_of_other_code_stay_apart(
+    merged: Path, packed: Path, staged: list[Path], more_staged: list[Path], tmp_path: Path
+):
+    """The first part was merged and cut, so its files are of several origins."""
+    pushes = drop(carrying(merged, tmp_path / "both", "first"), [LIFT], tmp_path / "pushes").root
+    lifts = carrying(packed, tmp_path / "toys", "second")
+
+    out = merge([drop(lifts, [PUSH], tmp_path / "lifts").root, pushes], "user/x", tmp_path / "x")
+
+    assert_holds(out.root, [staged[0], staged[2], staged[1], more_staged[0]])
+    assert verify(out.root).notes == ()
+    code = {p.parent.name: p.read_text() for p in out.root.glob("v2p/tasks/*/task.py")}
+    assert code == {"toy": "second", "toy-2": "first"}
+    assert [e["item"] for e in about(out.root)["episodes"]] == ["toy"] * 2 + ["toy-2"] * 2
+
+
+def carrying(root: Path, copy: Path, code: str) -> Path:
+    """Return a copy of the dataset that carries its task."""
+    shutil.copytree(root, copy)
+    (copy / "v2p/tasks/toy").mkdir(parents=True)
+    (copy / "v2p/tasks/toy/task.py").write_text(code)
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("palette", {"0": 0, "1": 200}, "palette"),
+        ("action", ["x.pos"], "action"),
+    ],
+)
+def test_datasets_of_other_meaning_do_not_go_together(
+    packed: Path, more: Path, tmp_path: Path, field: str, value: object, words: str
+):
+    other = Path(shutil.copytree(more, tmp_path / "other"))
+    (other / "meta/v2p.json").write_text(json.dumps(about(other) | {field: value}))
+
+    with pytest.raises(V2PError, match=f"do not go together: the {words} in meta/v2p.json"):
+        merge([packed, other], "user/both", tmp_path / "both")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["other"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda info: info.update(fps=30), "fps"),
+        (lambda info: info["features"]["action"].update(names=list("abcdefg")), "names of action"),
+        (lambda info: info["features"].pop("next.success"), "the list of columns"),
+    ],
+)
+def test_datasets_of_other_columns_or_rates_do_not_go_together(
+    packed: Path, more: Path, tmp_path: Path, change, words: str
+):
+    other = Path(shutil.copytree(more, tmp_path / "other"))
+    info = json.loads((other / "meta/info.json").read_text())
+    change(info)
+    (other / "meta/info.json").write_text(json.dumps(info))
+
+    with pytest.raises(V2PError, match=rf"{words}|is not sound"):
+        merge([packed, other], "user/both", tmp_path / "both")
+
+
+def test_no_episode_is_merged_twice(packed: Path, tmp_path: Path):
+    with pytest.raises(V2PError, match=r"episode 0 of .* is episode 0 of .* once more"):
+        merge([packed, packed], "user/both", tmp_path / "both")
+
+
+def test_nothing_is_overwritten(packed: Path, more: Path, tmp_path: Path):
+    (tmp_path / "both").mkdir()
+
+    with pytest.raises(V2PError, match="exists already; nothing is overwritten"):
+        merge([packed, more], "user/both", tmp_path / "both")
+    with pytest.raises(V2PError, match="exists already; nothing is overwritten"):
+        drop(packed, [LIFT], tmp_path / "both")
+
+
+def test_an_unknown_task_is_named_with_the_known_ones(packed: Path, tmp_path: Path):
+    with pytest.raises(V2PError, match=f"no task 'lift the toy'.*Known: {LIFT}; {PUSH}; toy"):
+        drop(packed, ["lift the toy"], tmp_path / "out")
+    with pytest.raises(V2PError, match="without an episode"):
+        drop(packed, ["toy"], tmp_path / "out")
+
+
+def test_a_write_that_the_system_refuses_leaves_nothing_behind(
+    merged: Path, tmp_path: Path, file_limit: Callable[[int], AbstractContextManager[None]]
+):
+    with file_limit(4000), pytest.raises(V2PError, match=r"cannot write .*out .*File too large"):
+        drop(merged, [LIFT], tmp_path / "out")
+
+    assert list(tmp_path.iterdir()) == []
