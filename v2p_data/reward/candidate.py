@@ -63,10 +63,11 @@ class Fault:
             return None
         data = read_json(path)
         said = data.get("kind") if isinstance(data, dict) else None
-        kind = next((k for k in KINDS if k == said), None)
-        if kind is None:
-            return Fault(kind="crashed", reason="its process left no readable reason")
-        return Fault(kind=kind, reason=str(data.get("reason", ""))[:MAX_WORDS])
+        kind: Kind
+        for kind in KINDS:
+            if kind == said:
+                return Fault(kind=kind, reason=str(data.get("reason", ""))[:MAX_WORDS])
+        return Fault(kind="crashed", reason="its process left no readable reason")
 
 
 @dataclass(frozen=True, kw_only=True)
