@@ -1,4 +1,4 @@
-"""Masks against rays, palettes against the codec's arithmetic."""
+"""Masks drawn in three ways, palettes against the codec's arithmetic."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,26 +115,81 @@ def test_labels_are_named_in_scene_order():
     assert label_names(("box", "bowl")) == {0: "background", 1: "robot", 2: "box", 3: "bowl"}
 
 
-def test_opengl_and_rays_draw_the_same_masks(world: World, moments: Moments, gl: MaskRenderer):
-    rays = MaskRenderer(world, SIZE_PX, backend="rays")
-    pairs = [(gl.draw(moments, k), rays.draw(moments, k)) for k in range(len(moments.qpos))]
-    drawn, cast = (np.stack(images) for images in zip(*pairs, strict=True))
-
-    assert set(np.unique(cast)) == {0, 1, 2, 3, 4}
-    for label in range(5):
-        either = ((drawn == label) | (cast == label)).sum()
-        both = ((drawn == label) & (cast == label)).sum()
-        assert both / either >= 0.995, f"label {label}"
+@pytest.fixture(scope="module")
+def renderer(world: World):
+    with MaskRenderer(world, SIZE_PX) as renderer:
+        yield renderer
 
 
-def test_a_moment_looks_the_same_whatever_was_drawn_before(moments: Moments, gl: MaskRenderer):
-    first = gl.draw(moments, 0)
-    gl.draw(moments, 3)
-
-    assert (gl.draw(moments, 0) == first).all()
+@pytest.fixture(scope="module")
+def drawn(moments: Moments, renderer: MaskRenderer) -> np.ndarray:
+    return renderer.draw_many([(moments, k) for k in range(len(moments.qpos))])
 
 
-def test_a_larger_box_covers_more_pixels(world: World, moments: Moments, gl: MaskRenderer):
+def least_overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the lowest intersection over union of any label."""
+    assert set(np.unique(a)) == set(np.unique(b)) == {0, 1, 2, 3, 4}
+    return min(
+        ((a == label) & (b == label)).sum() / ((a == label) | (b == label)).sum()
+        for label in range(5)
+    )
+
+
+def test_the_z_buffer_draws_what_opengl_draws(
+    drawn: np.ndarray, moments: Moments, gl: MaskRenderer
+):
+    peers = np.stack([gl.draw(moments, k) for k in range(len(drawn))])
+
+    assert least_overlap(drawn, peers) >= 0.998
+
+
+def test_the_z_buffer_draws_what_rays_hit(world: World, drawn: np.ndarray, moments: Moments):
+    with MaskRenderer(world, SIZE_PX, backend="rays") as rays:
+        peers = np.stack([rays.draw(moments, k) for k in range(len(drawn))])
+
+    assert least_overlap(drawn, peers) >= 0.995
+
+
+@pytest.mark.parametrize("backend", ["zbuffer", "gl", "rays"])
+def test_images_need_not_be_square(world: World, moments: Moments, drawn: np.ndarray, backend):
+    try:
+        renderer = MaskRenderer(world, (128, 64), backend=backend)
+    except V2PError as error:
+        pytest.skip(str(error))
+
+    image = renderer.draw(moments, 0)
+    renderer.close()
+
+    # As high as wide is the whole; half as wide is its middle.
+    assert image.shape == (128, 64)
+    assert (image != drawn[0, 1::2, 65:193:2]).mean() < 0.05
+
+
+def test_several_images_are_those_drawn_one_by_one(
+    renderer: MaskRenderer, moments: Moments, drawn: np.ndarray
+):
+    assert (np.stack([renderer.draw(moments, k) for k in range(len(drawn))]) == drawn).all()
+
+
+def test_pictures_are_drawn_beside_masks(
+    renderer: MaskRenderer, gl: MaskRenderer, moments: Moments
+):
+    picture = renderer.draw_rgb(moments, 0)
+
+    assert picture.shape == (SIZE_PX, SIZE_PX, 3)
+    assert (picture == gl.draw_rgb(moments, 0)).all()
+
+
+def test_a_moment_looks_the_same_whatever_was_drawn_before(
+    moments: Moments, renderer: MaskRenderer
+):
+    first = renderer.draw(moments, 0)
+    renderer.draw(moments, 3)
+
+    assert (renderer.draw(moments, 0) == first).all()
+
+
+def test_a_larger_box_covers_more_pixels(world: World, renderer: MaskRenderer):
     qpos = np.tile(world.model.qpos0, (2, 1))
     for k, obj in enumerate(world.objects):
         qpos[:, obj.qpos_adr : obj.qpos_adr + 3] = (0.45 + 0.1 * k, 0.15 * (k - 1), 0.05)
@@ -142,12 +197,12 @@ def test_a_larger_box_covers_more_pixels(world: World, moments: Moments, gl: Mas
     sizes[1, world.objects[0].geom_ids[0]] *= 1.3
     pair = Moments(qpos=qpos, geom_size=sizes)
 
-    small, large = ((gl.draw(pair, k) == 2).sum() for k in range(2))
+    small, large = ((renderer.draw(pair, k) == 2).sum() for k in range(2))
 
     assert 1.3 * small < large < 2.0 * small
 
 
-def test_the_robots_left_is_the_pictures_left(world: World, gl: MaskRenderer):
+def test_the_robots_left_is_the_pictures_left(world: World, renderer: MaskRenderer):
     qpos = np.tile(world.model.qpos0, (2, 1))
     at = world.objects[0].qpos_adr
     for obj in world.objects[1:]:
@@ -155,13 +210,13 @@ def test_the_robots_left_is_the_pictures_left(world: World, gl: MaskRenderer):
     qpos[0, at : at + 3] = (0.5, 0.2, 0.04)
     qpos[1, at : at + 3] = (0.5, -0.2, 0.04)
 
-    left, right = (np.nonzero(gl.draw(Moments(qpos), k) == 2)[1].mean() for k in range(2))
+    left, right = (np.nonzero(renderer.draw(Moments(qpos), k) == 2)[1].mean() for k in range(2))
 
     assert left < SIZE_PX / 2 < right
 
 
-def test_the_callers_model_is_left_alone(world: World, moments: Moments, gl: MaskRenderer):
-    gl.draw(moments, 0)
+def test_the_callers_model_is_left_alone(world: World, moments: Moments, renderer: MaskRenderer):
+    renderer.draw(moments, 0)
 
     assert world.model.geom_size[world.objects[0].geom_ids[0]] == pytest.approx(
         (0.025, 0.03, 0.04)
