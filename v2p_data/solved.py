@@ -1,7 +1,7 @@
 """Experts that earlier runs finished, as starting points for tasks that no program solves.
 
 A folder of runs holds `expert/<item>-<fingerprint>` with a record that names its task, and the task beside it in
-`task/`. What is there is part of the recipe of an expert that may start from it: see `solved_digests`.
+`task/`, or in `reward/` where its reward was searched. What is there is part of the recipe of an expert that may start from it: see `solved_digests`.
 """
 
 import json
@@ -26,8 +26,9 @@ def find_solved(runs: Path) -> list[Solved]:
         record = read_record(folder)
         if record is None or record.rejected is not None:
             continue
-        task = runs / "task" / record.inputs["task"]
-        if not task.is_dir():
+        places = (runs / stage / record.inputs["task"] for stage in ("task", "reward"))
+        task = next((place for place in places if place.is_dir()), None)
+        if task is None:
             continue  # cleared away: what the expert can do is not known any more
         about = json.loads((folder / EXPERT_FILE).read_text())
         found.append(Solved(bundle=TaskBundle.load(task), folder=folder, obs_dim=about["obs_dim"]))

@@ -38,6 +38,10 @@ logger = logging.getLogger(__name__)
 
 ROOT_OF_TASKS = "v2p/tasks"
 """Where a dataset carries the tasks that its episodes were made in."""
+MODEL_CALLS_FOLDER = "vlm"
+"""Of a run: everything that a language model was asked and answered."""
+SOLVED_POOL_FOLDER = "pool"
+"""Of a run: solved tasks that a language model is shown as examples."""
 EVALUATION_FILE = "evaluation.json"
 POLICY_FOLDER = "policy"
 REWARD_SEARCH_FOLDER = "search"
@@ -158,11 +162,11 @@ def task_stage(scene: Stage, cfg: EngineConfig) -> Stage:
     return Stage(
         name="task",
         item=scene.item,
-        config=Seeded(config=cfg.task, seed=cfg.seed),
+        config=Seeded(config=cfg.task.recipe(), seed=cfg.seed),
         inputs={"scene": scene},
         sources=_robot_digests(robot),
         version=1,
-        make=partial(make_task, robot=robot),
+        make=partial(make_task, robot=robot, how=cfg.task),
     )
 
 
@@ -183,15 +187,22 @@ def make_task(
     runtime: Runtime,
     *,
     robot: RobotConfig,
+    how: TaskConfig,
 ) -> dict[str, Any]:
-    """Write eight task codes, audit them, keep the best."""
+    """Write eight task codes, audit them, keep the best. What a model answers is kept for all tasks of the run."""
     from v2p_data.scene.scene import Scene
     from v2p_data.sim.task_check import check_task
     from v2p_data.task.generate import generate_task
 
     scene = Scene.load(inputs["scene"])
     runtime.progress(0.1, "writing task code")
-    generated = generate_task(scene, cfg.config, seed_for(cfg.seed, "task", scene.title))
+    generated = generate_task(
+        scene,
+        how,
+        seed_for(cfg.seed, "task", scene.title),
+        calls=runtime.root / MODEL_CALLS_FOLDER,
+        pool=runtime.root / SOLVED_POOL_FOLDER,
+    )
     bundle = replace(generated.bundle, robot=robot_to_json(robot))
     generated = replace(generated, bundle=bundle)
     runtime.progress(0.9, "asking the simulator")
@@ -281,7 +292,11 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
         inputs={"task": task},
         sources=solved_digests(cfg.expert.warm_start),
         version=2,
-        make=partial(make_expert, warm_start=cfg.expert.warm_start),
+        make=partial(
+            make_expert,
+            warm_start=cfg.expert.warm_start,
+            teaches_model=cfg.task.writer == "vlm",
+        ),
     )
 
 
@@ -292,12 +307,14 @@ def make_expert(
     runtime: Runtime,
     *,
     warm_start: Path | None,
+    teaches_model: bool,
 ) -> dict[str, Any]:
     """Find a teacher, imitate it, go on with PPO, all at the coarse time step; judge at the fine one with the independent referee."""
     from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.task_check import check_task
+    from v2p_data.task.pool import add_solved
     from v2p_data.task.task import TaskBundle
 
     expert_cfg: ExpertConfig = cfg.config
@@ -339,6 +356,8 @@ def make_expert(
             f"below the {expert_cfg.min_success:.0%} that are worth collecting",
             rate.value,
         )
+    if teaches_model:  # an example for the tasks that come after
+        add_solved(runtime.root / SOLVED_POOL_FOLDER, bundle, rate.value)
     return counts
 
 

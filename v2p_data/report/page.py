@@ -96,7 +96,7 @@ def render_page(root: Path, cfg: PageConfig) -> str:
         summary=_summary(run, items, evaluation),
         figures=_key_figures(run, items, evaluation),
         items=items,
-        item_stages=ITEM_STAGES,
+        item_stages=[s for s in ITEM_STAGES if s != "reward" or run.of_stage(s)],
         joint=[r for stage in JOINT_STAGES for r in run.of_stage(stage)],
         evaluation=evaluation,
         policy_charts=_policy_charts(run),

@@ -15,7 +15,7 @@ import numpy as np
 
 from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record, read_rejects
 
-ITEM_STAGES = ("scene", "task", "expert", "episodes")
+ITEM_STAGES = ("scene", "task", "reward", "expert", "episodes")
 """Stages that each video goes through by itself."""
 JOINT_STAGES = ("dataset", "policy", "evaluation")
 STAGES = ITEM_STAGES + JOINT_STAGES
