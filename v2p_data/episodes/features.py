@@ -8,9 +8,11 @@ from typing import Any
 FPS = 20
 ROBOT_TYPE = "v2p_franka"
 MASK_KEY = "observation.images.mask"
+RGB_KEY = "observation.images.rgb"
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 SUCCESS_KEY = "next.success"
+KEY_OF_CAMERA = {"mask": MASK_KEY, "rgb": RGB_KEY}
 METADATA_FILE = "meta/v2p.json"
 """Palette, provenance and drawn parameters; LeRobot ignores it and uploads it."""
 
@@ -36,13 +38,16 @@ ACTION_NAMES = (
 """Each in [-1, 1]: x 0.03 m, x 0.2 rad about the world's axes, and x 0.012 m of finger travel (+ closes)."""
 
 
-def features(size_px: int) -> dict[str, dict[str, Any]]:
-    """Return LeRobot's feature table for masks of `size_px` x `size_px`."""
+def features(size_px: int, cameras: tuple[str, ...] = ("mask",)) -> dict[str, dict[str, Any]]:
+    """Return LeRobot's feature table for pictures of `size_px` x `size_px` from these cameras."""
     return {
-        MASK_KEY: {
-            "dtype": "video",
-            "shape": (size_px, size_px, 3),
-            "names": ["height", "width", "channels"],
+        **{
+            KEY_OF_CAMERA[camera]: {
+                "dtype": "video",
+                "shape": (size_px, size_px, 3),
+                "names": ["height", "width", "channels"],
+            }
+            for camera in cameras
         },
         STATE_KEY: {"dtype": "float32", "shape": (7,), "names": list(STATE_NAMES)},
         ACTION_KEY: {"dtype": "float32", "shape": (7,), "names": list(ACTION_NAMES)},

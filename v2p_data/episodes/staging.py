@@ -5,8 +5,13 @@ a temporary name, flushed and renamed, so a kill loses only the episode in hand.
 content alone.
 """
 
+import errno
+import hashlib
 import json
 import os
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +23,16 @@ from v2p_data.errors import V2PError
 
 EPISODES_FOLDER = "episodes"
 SCHEMA = 1
+ARRAYS = ("labels", "state", "action", "success")
+MASK_CAMERA, RGB_CAMERA = "mask", "rgb"
+_REFUSALS = {
+    errno.ENOSPC: "the disk is full; free some space",
+    errno.EDQUOT: "the disk quota is used up; free some space",
+    errno.EFBIG: "a file may not grow that large here; raise the limit (ulimit -f)",
+    errno.EROFS: "the file system is read-only; make it writable or choose another place",
+    errno.EACCES: "there is no permission to write; change it or choose another place",
+    errno.EPERM: "writing is not permitted; change that or choose another place",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,11 +57,19 @@ class Episode:
     """Names behind labels 2, 3, ..."""
     params: dict[str, Any] = field(default_factory=dict[str, Any])
     """What the randomisation drew."""
+    cameras: tuple[str, ...] = (MASK_CAMERA,)
+    """Which pictures go into a dataset: `mask`, `rgb` or both. Label images are staged in any case."""
+    rgb_mp4: bytes = b""
+    """The pictures of `rgb`, a video already."""
 
     def __post_init__(self) -> None:
         lengths = {len(self.labels), len(self.state), len(self.action), len(self.success)}
         if len(lengths) != 1:
             raise ValueError(f"episode {self.id}: columns differ in length: {sorted(lengths)}")
+        if (RGB_CAMERA in self.cameras) != bool(self.rgb_mp4):
+            raise ValueError(
+                f"episode {self.id}: cameras are {self.cameras}, rgb_mp4 has {len(self.rgb_mp4)} bytes"
+            )
 
     @property
     def num_frames(self) -> int:
@@ -67,41 +90,135 @@ class Episode:
             "objects": list(self.objects),
             "params": self.params,
         }
-        with temporary.open("wb") as stream:
-            np.savez_compressed(
-                stream,
-                labels=self.labels,
-                state=self.state,
-                action=self.action,
-                success=self.success,
-                about=np.array(json.dumps(about, sort_keys=True)),
-            )
-            stream.flush()
-            os.fsync(stream.fileno())
+        arrays: dict[str, np.ndarray] = {name: getattr(self, name) for name in ARRAYS}
+        if self.cameras != (MASK_CAMERA,):
+            about["cameras"] = list(self.cameras)
+        if self.rgb_mp4:
+            arrays["rgb_mp4"] = np.frombuffer(self.rgb_mp4, np.uint8)
+        arrays["about"] = np.array(json.dumps(about, sort_keys=True))
+        try:
+            with temporary.open("wb") as stream:
+                np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError:
+            with suppress(OSError):  # half a file takes room that may be what is missing
+                temporary.unlink()
+            raise
         temporary.replace(path)
         return path
 
     @staticmethod
-    def load(path: Path) -> "Episode":
-        """Read a staged episode.
+    def load(path: Path, *, pictures: bool = True) -> "Episode":
+        """Read a staged episode; without pictures its `labels` are of size 0 and it has no cameras.
 
         Raises:
             V2PError: the file is damaged or was written by another version.
         """
         try:
             with np.load(path) as data:
-                about: dict[str, Any] = json.loads(str(data["about"]))
-                arrays = {k: data[k] for k in ("labels", "state", "action", "success")}
+                about = _about(data, path)
+                names = ARRAYS if pictures else ARRAYS[1:]
+                arrays: dict[str, Any] = {k: data[k] for k in names}
+                if not pictures:
+                    arrays["labels"] = np.zeros((len(arrays["state"]), 0, 0), np.uint8)
+                    about["cameras"] = ()
+                elif "rgb_mp4" in data:
+                    arrays["rgb_mp4"] = data["rgb_mp4"].tobytes()
         except FileNotFoundError:
             raise V2PError(f"there is no staged episode {path}") from None
+        except V2PError:
+            raise
         except Exception as error:
-            raise V2PError(
-                f"staged episode {path} cannot be read ({type(error).__name__}: {error}); "
-                "delete it and run the same command again"
-            ) from error
-        if about.pop("schema", None) != SCHEMA:
-            raise V2PError(f"staged episode {path} was written by another version; remake it")
-        return Episode(**{**about, "objects": tuple(about["objects"])}, **arrays)
+            raise _unreadable(path, error) from error
+        return Episode(**about, **arrays)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heading:
+    """What a staged file says of itself, read without unpacking its pictures."""
+
+    path: Path
+    id: str
+    item: str
+    task: str
+    num_frames: int
+    size_px: tuple[int, int]
+    """Height and width of the label images."""
+    cameras: tuple[str, ...]
+    digest: str
+    """SHA-256 of the file."""
+
+    @staticmethod
+    def read(path: Path) -> "Heading":
+        """Return it.
+
+        Raises:
+            V2PError: the file is damaged or was written by another version.
+        """
+        try:
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            with np.load(path) as data:
+                about = _about(data, path)
+            with zipfile.ZipFile(path) as archive, archive.open("labels.npy") as member:
+                np.lib.format.read_magic(member)
+                shape, _, _ = np.lib.format.read_array_header_1_0(member)
+            count, height, width = shape
+        except FileNotFoundError:
+            raise V2PError(f"there is no staged episode {path}") from None
+        except V2PError:
+            raise
+        except Exception as error:
+            raise _unreadable(path, error) from error
+        return Heading(
+            path=path,
+            id=about["id"],
+            item=about["item"],
+            task=about["task"],
+            num_frames=count,
+            size_px=(height, width),
+            cameras=about.get("cameras", (MASK_CAMERA,)),
+            digest=digest,
+        )
+
+
+@contextmanager
+def refusals_told(doing: str, where: Path) -> Iterator[None]:
+    """Turn a full disk, a limit or a read-only folder into one sentence.
+
+    Args:
+        doing: what stops, e.g. `collecting episodes`.
+        where: the folder that is written to.
+
+    Raises:
+        V2PError: nothing can be written at `where`.
+    """
+    try:
+        yield
+    except V2PError:
+        raise
+    except Exception as error:  # FFmpeg's errors have an errno and are no OSError
+        reason = _REFUSALS.get(getattr(error, "errno", None) or 0)
+        if reason is None:
+            raise
+        raise V2PError(
+            f"{doing} at {where} stopped: {reason} and run the same command again; "
+            "what was finished is kept"
+        ) from error
+
+
+def _about(data: Any, path: Path) -> dict[str, Any]:
+    about: dict[str, Any] = json.loads(str(data["about"]))
+    if about.pop("schema", None) != SCHEMA:
+        raise V2PError(f"staged episode {path} was written by another version; remake it")
+    return about | {name: tuple(about[name]) for name in ("objects", "cameras") if name in about}
+
+
+def _unreadable(path: Path, error: Exception) -> V2PError:
+    return V2PError(
+        f"staged episode {path} cannot be read ({type(error).__name__}: {error}); "
+        "delete it and run the same command again"
+    )
 
 
 def staged_episodes(folder: Path) -> list[Path]:

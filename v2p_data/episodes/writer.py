@@ -1,25 +1,30 @@
-"""Staged episodes become one LeRobot dataset: the only place that holds LeRobot's writer.
+"""Staged episodes become one LeRobot dataset.
 
-The dataset grows in `<root>.partial`, is checked, and is renamed into place at the end, so that what lies at
-`root` is finished. Masks are H.264 with crf 0 in greys, which is exact; LeRobot's default codec would alter
-42 % of a mask's pixels. One encoder thread, so that the same episodes give the same bytes anywhere.
+The video files are made first (`shards`); then the tables, by LeRobot's own functions for metadata and statistics. The
+dataset grows in `<root>.partial`, is checked, and is renamed into place at the end, so that what lies at `root` is
+finished. The same episodes give the same bytes, after any number of kills, with any number of threads.
 """
 
+import contextlib
 import logging
+import os
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
+from v2p_data.episodes.episode_stats import number_stats
 from v2p_data.episodes.features import (
     ACTION_KEY,
     ACTION_NAMES,
     FPS,
-    MASK_KEY,
+    KEY_OF_CAMERA,
     METADATA_FILE,
     ROBOT_TYPE,
     STATE_KEY,
@@ -27,15 +32,20 @@ from v2p_data.episodes.features import (
     SUCCESS_KEY,
     features,
 )
-from v2p_data.episodes.staging import Episode
+from v2p_data.episodes.shards import Shard, make_shards, plan_shards, stats_of
+from v2p_data.episodes.staging import MASK_CAMERA, Episode, Heading, refusals_told
+from v2p_data.episodes.stream import MASK_CRF, RGB_CRF, encoder_config
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
-from v2p_data.sim.masks import PALETTE, label_names, labels_to_rgb
+from v2p_data.sim.masks import PALETTE, label_names
 
 logger = logging.getLogger(__name__)
 
 VIDEO_FILE_MB = 10
-"""Many episodes share a file, but each new one rewrites its file, so files must not grow forever."""
+"""What LeRobot's tools go by when they add to the dataset; our own files end earlier."""
+DATA_FILE_FRAMES = 400_000
+"""Rows per file, 40 MB; each episode is a row group of its own, as LeRobot writes it."""
+EPISODES_PER_WRITE = 100
 METADATA_SCHEMA = 1
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
@@ -56,49 +66,63 @@ def pack(
     root: Path,
     *,
     provenance: Mapping[str, Any] | None = None,
+    num_threads: int = 0,
     on_progress: Callable[[float, str], None] = lambda share, words: None,
 ) -> Packed:
     """Write staged episodes, in this order, as a LeRobot v3 dataset at `root`.
+
+    A packing that was stopped goes on where it was when it is called again.
 
     Args:
         staged: files that `Episode.save` wrote.
         repo_id: `user/name`, under which it will be pushed.
         root: where it shall lie; must not exist.
         provenance: how the episodes came about, JSON; kept in `meta/v2p.json`.
+        num_threads: 0 for all cores; changes no byte.
         on_progress: told the share that is done and a few words.
 
     Raises:
-        V2PError: there is something at `root`, nothing to pack, or the episodes do not go together.
+        V2PError: there is something at `root`, nothing to pack, the episodes do not go together, or nothing can be
+            written there.
     """
     check_repo_id(repo_id)
     if root.exists():
         raise V2PError(
             f"{root} exists already; delete it to write the dataset anew, or choose another place with --out"
         )
-    size_px = _check_staged(staged)
+    headings = _headings(staged)
     partial = root.with_name(root.name + ".partial")
-    if partial.exists():
+    with refusals_told("packing", root.parent):
+        partial.mkdir(parents=True, exist_ok=True)
+        on_progress(0.0, "starting LeRobot")
+        shards = plan_shards(headings)
+        make_shards(shards, partial / "shards", num_threads=num_threads,
+                    on_progress=lambda share, words: on_progress(0.9 * share, words))  # fmt: skip
+        growing = partial / "dataset"
+        if growing.exists():
+            shutil.rmtree(growing)
+        on_progress(0.9, "writing the tables")
+        described = _write(shards, partial / "shards", repo_id, growing)
+        write_json_atomically(
+            growing / METADATA_FILE,
+            {
+                "schema": METADATA_SCHEMA,
+                "repo_id": repo_id,
+                "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
+                "state": list(STATE_NAMES),
+                "action": list(ACTION_NAMES),
+                "episodes": described,
+                "provenance": dict(provenance or {}),
+            },
+        )
+        _check_tables(growing, shards)
+        _flush(growing)
+        growing.rename(root)
+        _flush_folder(root.parent)
         shutil.rmtree(partial)
-    partial.parent.mkdir(parents=True, exist_ok=True)
-    on_progress(0.0, "starting LeRobot")
-    described = _write(staged, repo_id, partial, size_px, on_progress)
-    _drop_leftovers(partial)
-    write_json_atomically(
-        partial / METADATA_FILE,
-        {
-            "schema": METADATA_SCHEMA,
-            "repo_id": repo_id,
-            "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
-            "state": list(STATE_NAMES),
-            "action": list(ACTION_NAMES),
-            "episodes": described,
-            "provenance": dict(provenance or {}),
-        },
-    )
-    partial.rename(root)
-    num_frames = sum(e["length"] for e in described)
-    logger.info("packed %d episodes, %d frames, at %s", len(described), num_frames, root)
-    return Packed(root=root, repo_id=repo_id, num_episodes=len(described), num_frames=num_frames)
+    num_frames = sum(h.num_frames for h in headings)
+    logger.info("packed %d episodes, %d frames, at %s", len(headings), num_frames, root)
+    return Packed(root=root, repo_id=repo_id, num_episodes=len(headings), num_frames=num_frames)
 
 
 def check_repo_id(repo_id: str) -> None:
@@ -113,77 +137,183 @@ def check_repo_id(repo_id: str) -> None:
         )
 
 
-def _check_staged(staged: Sequence[Path]) -> int:
+def _headings(staged: Sequence[Path]) -> list[Heading]:
     if not staged:
         raise V2PError("there are no staged episodes to pack; collect some with 'v2p episodes'")
-    ids = [path.stem for path in staged]
+    headings = [Heading.read(path) for path in staged]
+    ids = [h.id for h in headings]
     if len(set(ids)) != len(ids):
         twice = sorted({i for i in ids if ids.count(i) > 1})
         raise V2PError(f"episodes are given twice: {', '.join(twice[:5])}")
-    height, width = Episode.load(staged[0]).labels.shape[1:]
-    if height != width:
-        raise V2PError(f"masks must be square, {staged[0]} has {height} x {width}")
-    return height
+    first = headings[0]
+    if first.size_px[0] != first.size_px[1]:
+        raise V2PError(
+            f"masks must be square, {first.path} has {first.size_px[0]} x {first.size_px[1]}"
+        )
+    for heading in headings:
+        if heading.size_px != first.size_px:
+            raise V2PError(
+                f"{heading.path} has masks of {heading.size_px} px, the first episode of {first.size_px} px; "
+                "collect all episodes at one size"
+            )
+        if heading.cameras != first.cameras:
+            raise V2PError(
+                f"{heading.path} has pictures of {', '.join(heading.cameras)}, the first episode of "
+                f"{', '.join(first.cameras)}; collect all episodes with one --episodes.render"
+            )
+        if heading.num_frames < 2:
+            raise V2PError(
+                f"{heading.path} has {heading.num_frames} frames; an episode has two at least"
+            )
+    return headings
 
 
 def _write(
-    staged: Sequence[Path],
-    repo_id: str,
-    partial: Path,
-    size_px: int,
-    on_progress: Callable[[float, str], None],
+    shards: Sequence[Shard], finished: Path, repo_id: str, root: Path
 ) -> list[dict[str, Any]]:
-    from lerobot.configs.video import RGBEncoderConfig
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    """Write everything but our own metadata; return what is told of each episode there."""
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.io_utils import write_info, write_stats
 
-    dataset = LeRobotDataset.create(
+    first = shards[0].episodes[0]
+    meta: Any = LeRobotDatasetMetadata.create(
         repo_id,
         fps=FPS,
-        features=features(size_px),
-        root=partial,
+        features=features(first.size_px[0], first.cameras),
         robot_type=ROBOT_TYPE,
-        rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=0, pix_fmt="yuv420p", g=2),
-        encoder_threads=1,
+        root=root,
         video_files_size_in_mb=VIDEO_FILE_MB,
+        metadata_buffer_size=EPISODES_PER_WRITE,
     )
+    for shard in shards:
+        for camera in first.cameras:
+            _place(shard.file(finished, camera), _video_path(meta, shard, camera))
+    for camera in first.cameras:
+        crf = MASK_CRF if camera == MASK_CAMERA else RGB_CRF
+        meta.update_video_info(KEY_OF_CAMERA[camera], video_encoder=encoder_config(crf))
     described: list[dict[str, Any]] = []
+    data = _DataFiles(meta)
     try:
-        for number, path in enumerate(staged):
-            episode = Episode.load(path)
-            _add(dataset, episode, size_px, path)
-            described.append(_describe(episode))
-            on_progress((number + 1) / len(staged), f"packed {number + 1}/{len(staged)} episodes")
+        for shard in shards:
+            frame = 0
+            for heading, stats in zip(
+                shard.episodes, stats_of(shard, finished) or [], strict=True
+            ):
+                episode = Episode.load(heading.path, pictures=False)
+                where = {
+                    f"videos/{KEY_OF_CAMERA[camera]}/{name}": value
+                    for camera in first.cameras
+                    for name, value in {
+                        "chunk_index": shard.number // meta.chunks_size,
+                        "file_index": shard.number % meta.chunks_size,
+                        "from_timestamp": frame / FPS,
+                        "to_timestamp": (frame + episode.num_frames) / FPS,
+                    }.items()
+                }
+                data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
+                described.append(_describe(episode))
+                frame += episode.num_frames
     finally:
-        dataset.finalize()
-    frames = sum(e["length"] for e in described)
-    counted = (dataset.meta.total_episodes, dataset.meta.total_frames)
-    if counted != (len(described), frames):
-        raise RuntimeError(
-            f"LeRobot wrote {counted} episodes and frames, not {(len(described), frames)}"
-        )
+        data.close()
+        meta.finalize()
+    write_info(meta.info, root)
+    # LeRobot's sum goes through a set, whose order changes from run to run.
+    write_stats({key: meta.stats[key] for key in meta.features if key in meta.stats}, root)
     return described
 
 
-def _add(dataset: Any, episode: Episode, size_px: int, path: Path) -> None:
-    if episode.labels.shape[1:] != (size_px, size_px):
-        raise V2PError(
-            f"{path} has masks of {episode.labels.shape[1:]}, the first episode of {size_px} px; "
-            "collect all episodes at one size"
-        )
-    if episode.num_frames < 2:
-        raise V2PError(f"{path} has {episode.num_frames} frames; an episode has two at least")
-    pictures = labels_to_rgb(episode.labels)
-    for t in range(episode.num_frames):
-        dataset.add_frame(
+class _DataFiles:
+    """Writes rows and what LeRobot notes of each episode.
+
+    Args:
+        meta: LeRobot's metadata, which grows.
+    """
+
+    def __init__(self, meta: Any) -> None:
+        from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+        self.meta = meta
+        self.schema: pa.Schema = get_hf_features_from_features(meta.features).arrow_schema
+        self.numbers = {k: f for k, f in meta.features.items() if f["dtype"] != "video"}
+        self.file = 0
+        self.first_row = 0
+        self.writer: pq.ParquetWriter | None = None
+
+    def add(self, episode: Episode, picture_stats: dict[str, Any], where: dict[str, Any]) -> None:
+        """Append an episode."""
+        meta, count = self.meta, episode.num_frames
+        index, first = int(meta.total_episodes), int(meta.total_frames)
+        meta.save_episode_tasks([episode.task])
+        columns = {
+            STATE_KEY: episode.state,
+            ACTION_KEY: episode.action,
+            SUCCESS_KEY: episode.success,
+            "timestamp": (np.arange(count) / FPS).astype(np.float32),
+            "frame_index": np.arange(count),
+            "episode_index": np.full(count, index),
+            "index": np.arange(first, first + count),
+            "task_index": np.full(count, meta.get_task_index(episode.task)),
+        }
+        if self.writer is None or first - self.first_row + count > DATA_FILE_FRAMES:
+            self._next_file(first)
+        assert self.writer is not None
+        table = pa.table({n: _column(columns[n], self.schema.field(n)) for n in self.schema.names})
+        self.writer.write_table(table.cast(self.schema))
+        chunk, file = divmod(self.file - 1, meta.chunks_size)
+        meta.save_episode(
+            index,
+            count,
+            [episode.task],
+            picture_stats | number_stats(columns, self.numbers),
             {
-                MASK_KEY: pictures[t],
-                STATE_KEY: episode.state[t],
-                ACTION_KEY: episode.action[t],
-                SUCCESS_KEY: episode.success[t : t + 1],
-                "task": episode.task,
-            }
+                "data/chunk_index": chunk,
+                "data/file_index": file,
+                "dataset_from_index": first,
+                "dataset_to_index": first + count,
+                **where,
+            },
         )
-    dataset.save_episode(parallel_encoding=False)
+
+    def _next_file(self, first_row: int) -> None:
+        self.close()
+        chunk, file = divmod(self.file, self.meta.chunks_size)
+        path = self.meta.root / self.meta.data_path.format(chunk_index=chunk, file_index=file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.writer = pq.ParquetWriter(
+            path, schema=self.schema, compression="snappy", use_dictionary=True
+        )
+        self.file += 1
+        self.first_row = first_row
+
+    def close(self) -> None:
+        """Finish the file in hand."""
+        if self.writer is not None:
+            self.writer.close()
+            self.writer = None
+
+
+def _column(values: np.ndarray, field: pa.Field) -> pa.Array:
+    if values.ndim == 1:
+        return pa.array(values, type=field.type)
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1), type=field.type.value_type)
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+
+def _video_path(meta: Any, shard: Shard, camera: str) -> Path:
+    chunk, file = divmod(shard.number, meta.chunks_size)
+    name = meta.video_path.format(
+        video_key=KEY_OF_CAMERA[camera], chunk_index=chunk, file_index=file
+    )
+    return Path(meta.root) / name
+
+
+def _place(source: Path, target: Path) -> None:
+    """Put a finished file into the dataset and keep it, for a kill may come before the end."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(OSError):
+        os.link(source, target)
+        return
+    shutil.copyfile(source, target)
 
 
 def _describe(episode: Episode) -> dict[str, Any]:
@@ -200,8 +330,32 @@ def _describe(episode: Episode) -> dict[str, Any]:
     }
 
 
-def _drop_leftovers(root: Path) -> None:
-    """Remove LeRobot's temporary pictures; a push would upload `tmp*`."""
-    for path in [root / "images", *root.glob("tmp*")]:
-        if path.is_dir():
-            shutil.rmtree(path)
+def _check_tables(root: Path, shards: Sequence[Shard]) -> None:
+    """Raise unless the files on disk hold as many rows and episodes as were put in."""
+
+    def rows(pattern: str) -> int:
+        return sum(pq.ParquetFile(p).metadata.num_rows for p in root.glob(pattern))
+
+    wanted = (sum(len(s.episodes) for s in shards), sum(s.num_frames for s in shards))
+    counted = (rows("meta/episodes/*/*.parquet"), rows("data/*/*.parquet"))
+    if counted != wanted:
+        raise RuntimeError(f"the tables hold {counted} episodes and frames, not {wanted}")
+
+
+def _flush(root: Path) -> None:
+    """Have everything on disk before it is renamed: after a power cut, too, it is whole or absent."""
+    for path in _files(root):
+        with path.open("rb") as stream:
+            os.fsync(stream.fileno())
+
+
+def _flush_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _files(root: Path) -> Iterator[Path]:
+    return (path for path in root.rglob("*") if path.is_file())
