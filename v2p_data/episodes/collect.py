@@ -4,51 +4,45 @@ Physics first, pictures after: a batch of worlds runs to its end while states ar
 successful episodes are drawn. A batch follows from (seed, its number) alone and is written down in a ledger
 once its episodes are staged, so a killed run that is started again makes the same files as an undisturbed
 one. An episode succeeds if the task's own success held and the independent referee agrees; it is cut soon
-after, and the referee sees it as cut.
+after, and the referee sees it as cut. What failed is kept aside, with its reason and without pictures.
 """
 
 import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
 
-from v2p_data.episodes.features import FPS
-from v2p_data.episodes.staging import EPISODES_FOLDER, Episode, staged_episodes
+from v2p_data.episodes.mask_noise import MaskNoiseConfig
+from v2p_data.episodes.pictures import Artist, Render
+from v2p_data.episodes.rollouts import Act, CutConfig, Referee, Rollouts, roll_out
+from v2p_data.episodes.staging import (
+    EPISODES_FOLDER,
+    Episode,
+    refusals_told,
+    save_arrays,
+    staged_episodes,
+)
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.artifact import REJECTS_FILE, write_json_atomically, write_rejects
 from v2p_data.seeds import seed_for
 from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot
-from v2p_data.sim.masks import MaskRenderer
+from v2p_data.sim.batch_env import SimConfig
+from v2p_data.sim.furnish import DistractorConfig, LookConfig
 from v2p_data.sim.randomize import RandomizationConfig
-from v2p_data.sim.verdict import referee_verdict
 from v2p_data.task.task import Task, TaskBundle
 
 logger = logging.getLogger(__name__)
 
 LEDGER_FOLDER = "batches"
-Act = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
-Course = Mapping[str, np.ndarray]
-"""Per key of the task interface's `states` an array `(time, env, ...)`, the moment after the reset first."""
-Referee = Callable[[TaskBundle, Course], Bool[np.ndarray, "env"]]
+FAILED_FOLDER = "failed"
 Progress = Callable[[float, str], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class CutConfig:
-    """Where an episode ends."""
-
-    tail_steps: int = 6
-    """Control steps kept after success has held (0.3 s): a policy sees what being done looks like, and the
-    referee whether it lasts."""
-    min_frames: int = 10
-    """Shorter episodes go on up to this length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,9 +58,17 @@ class EpisodesConfig:
     min_episodes: int = 1
     """With fewer the task is rejected."""
     size_px: int = 256
-    """Width and height of the masks."""
+    """Width and height of the pictures; even, as video must be."""
+    render: Render = "masks"
+    """Pictures in the dataset: exact label masks, colour pictures (close but not equal), or each as a camera of its own."""
     cut: CutConfig = field(default_factory=CutConfig)
     randomization: RandomizationConfig = field(default_factory=randomize.recording)
+    distractors: DistractorConfig = field(default_factory=DistractorConfig)
+    """Things that stand about in the pictures; none by default."""
+    look: LookConfig = field(default_factory=LookConfig)
+    """Light and colours of RGB pictures; always the same by default."""
+    mask_noise: MaskNoiseConfig = field(default_factory=MaskNoiseConfig)
+    """Faults as a real segmenter makes them; none by default."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.min_episodes <= self.num_episodes:
@@ -75,51 +77,10 @@ class EpisodesConfig:
             )
         if self.batch_worlds < 1 or self.max_batches < 1:
             raise ValueError("batch_worlds and max_batches must be at least 1")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rollouts:
-    """One batch of episodes, drawn later or never. Row `t` precedes action `t`."""
-
-    seed: int
-    state: Float32[np.ndarray, "time env 7"]
-    action: Float32[np.ndarray, "time env 7"]
-    success: Bool[np.ndarray, "time env"]
-    """The task's judgement after action `t`."""
-    snapshots: tuple[Snapshot, ...]
-    """All worlds, before action `t`."""
-    num_frames: Int[np.ndarray, "env"]
-    """Rows that belong to the episode."""
-    held_at: Int[np.ndarray, "env"]
-    """Row at whose end success had held for the first time; beyond the last row where it never did."""
-    task_successes: Bool[np.ndarray, "env"]
-    """The task's success held."""
-    referee: Bool[np.ndarray, "env"]
-    """The independent success function agrees."""
-    broke: Bool[np.ndarray, "env"]
-    """The simulation broke down during the episode."""
-    params: tuple[dict[str, Any], ...]
-    """What the randomisation drew, per world."""
-
-    @property
-    def successes(self) -> Bool[np.ndarray, "env"]:
-        return self.task_successes & self.referee
-
-    @property
-    def snapshot_seconds(self) -> tuple[float, ...]:
-        return tuple(t / FPS for t in range(len(self.snapshots)))
-
-    def reject(self, world: int) -> dict[str, Any]:
-        """Return why the episode of `world` is no demonstration."""
-        steps_true = int(self.success[:, world].sum())
-        if self.broke[world]:
-            return {"reason": "simulation_broke", "detail": "the state was not finite",
-                    "value": int(self.num_frames[world])}  # fmt: skip
-        if not self.task_successes[world]:
-            return {"reason": "not_successful", "value": steps_true,
-                    "detail": f"success was true in {steps_true} steps and never held"}  # fmt: skip
-        return {"reason": "referee_disagrees", "value": int(self.num_frames[world]),
-                "detail": "the task's success held, the independent one did not"}  # fmt: skip
+        if self.size_px < 16 or self.size_px % 2:
+            raise ValueError(f"size_px must be even and at least 16, got {self.size_px}")
+        if not self.look.is_off and self.render == "masks":
+            raise ValueError("look changes RGB pictures only; set render to rgb or both")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,21 +125,38 @@ def collect(
         bundle: the task.
         act: the deterministic expert.
         cfg: how many, and under what.
-        out: `episodes/<id>.npz`, `rejected.jsonl` and `batches/` are written here.
+        out: `episodes/<id>.npz`, `failed/<batch>.npz`, `rejected.jsonl` and `batches/` are written here.
         seed: decides everything that is drawn.
-        num_threads: for the physics; changes no result.
+        num_threads: for physics, masks and writing; changes no result.
         on_progress: told the share that is done and a few words.
         task: the task, instead of `bundle.code`.
         referee: the independent judge, instead of `task.referee`.
 
     Raises:
         ItemRejectedError: after `cfg.max_batches` there are fewer than `cfg.min_episodes`.
+        V2PError: the disk is full, or `out` cannot be written to; what was staged is kept.
     """
-    folder, ledgers = out / EPISODES_FOLDER, out / LEDGER_FOLDER
-    folder.mkdir(parents=True, exist_ok=True)
-    ledgers.mkdir(exist_ok=True)
-    for leftover in [*folder.glob("*.tmp"), *ledgers.glob("*.tmp")]:
-        leftover.unlink()
+    with refusals_told("collecting episodes", out):
+        return _collect(bundle, act, cfg, out, seed, num_threads, on_progress, task, referee)
+
+
+def _collect(
+    bundle: TaskBundle,
+    act: Act,
+    cfg: EpisodesConfig,
+    out: Path,
+    seed: int,
+    num_threads: int,
+    on_progress: Progress,
+    task: type[Task] | None,
+    referee: Referee | None,
+) -> Collected:
+    folders = [out / name for name in (EPISODES_FOLDER, LEDGER_FOLDER, FAILED_FOLDER)]
+    for folder in folders:
+        folder.mkdir(parents=True, exist_ok=True)
+        for leftover in folder.glob("*.tmp"):
+            leftover.unlink()
+    ledgers = folders[1]
     batches: list[dict[str, Any]] = []
     for number in range(cfg.max_batches):
         have = sum(len(b["episodes"]) for b in batches)
@@ -200,7 +178,7 @@ def collect(
                 task=task,
                 referee=referee,
             )
-            entry = _stage(bundle, rollouts, cfg, folder, number, have, on_progress)
+            entry = _stage(bundle, rollouts, cfg, out, number, have, num_threads, on_progress)
             write_json_atomically(ledger, entry)
         batches.append(json.loads(ledger.read_text()))
     return _finish(bundle, cfg, out, batches)
@@ -231,87 +209,14 @@ def judge_expert(
     )
 
 
-def roll_out(
-    bundle: TaskBundle,
-    act: Act,
-    sim: SimConfig,
-    *,
-    num_worlds: int,
-    seed: int,
-    num_threads: int = 1,
-    cut: CutConfig,
-    task: type[Task] | None = None,
-    referee: Referee | None = None,
-) -> Rollouts:
-    """Run one episode in every world until each has succeeded or its time is up."""
-    env = BatchEnv(bundle, sim, num_envs=num_worlds, seed=seed, num_threads=num_threads, task=task)
-    everyone = np.arange(num_worlds)
-    params = tuple(env.episode_params(k) for k in range(num_worlds))
-    obs = env.observe()
-    states, actions, successes, snapshots = [], [], [], []
-    trajectory = [_copied(env)]
-    held = np.zeros(num_worlds, bool)
-    broke = np.zeros(num_worlds, bool)
-    end = np.full(num_worlds, env.horizon)
-    held_at = end.copy()
-    for t in range(env.horizon):
-        states.append(env.robot_state())
-        snapshots.append(env.snapshot(everyone))
-        action = np.clip(np.asarray(act(obs), np.float32), -1.0, 1.0)
-        result = env.step(action)
-        obs = result.obs
-        actions.append(action)
-        successes.append(result.success)
-        trajectory.append(_copied(env))
-        now = result.held & ~held & ~broke
-        end[now] = np.clip(t + 1 + cut.tail_steps, cut.min_frames, env.horizon)
-        held_at[now] = t
-        held |= now
-        gone = result.terminated & ~broke & (t < end)
-        end[gone] = t + 1
-        broke |= gone
-        if (t + 1 >= end).all():
-            break
-    held &= ~broke
-    judge = referee or referee_verdict
-    verdict = judge(bundle, _as_cut(trajectory, end)) & held if held.any() else held
-    return Rollouts(
-        seed=seed,
-        state=np.stack(states),
-        action=np.stack(actions),
-        success=np.stack(successes),
-        snapshots=tuple(snapshots),
-        num_frames=end,
-        held_at=held_at,
-        task_successes=held,
-        referee=verdict,
-        broke=broke,
-        params=params,
-    )
-
-
-def _copied(env: BatchEnv) -> dict[str, np.ndarray]:
-    return {
-        key: value.numpy().copy()
-        for key, value in env.states().items()
-        if key != "base_observation"
-    }
-
-
-def _as_cut(moments: list[dict[str, np.ndarray]], end: Int[np.ndarray, "env"]) -> Course:
-    """Return the moments stacked, each world standing still from its episode's end on."""
-    time = np.minimum(np.arange(len(moments))[:, None], end[None])
-    worlds = np.arange(len(end))
-    return {key: np.stack([m[key] for m in moments])[time, worlds] for key in moments[0]}
-
-
 def _stage(
     bundle: TaskBundle,
     rollouts: Rollouts,
     cfg: EpisodesConfig,
-    folder: Path,
+    out: Path,
     batch: int,
     have: int,
+    num_threads: int,
     on_progress: Progress,
 ) -> dict[str, Any]:
     """Draw and write the successful episodes that are still wanted; return the batch's ledger."""
@@ -319,43 +224,71 @@ def _stage(
     def name(world: int) -> str:
         return f"{bundle.title}_{batch * cfg.batch_worlds + world:05d}"
 
+    folder = out / EPISODES_FOLDER
     winners = [int(w) for w in np.flatnonzero(rollouts.successes)]
+    losers = [int(w) for w in np.flatnonzero(~rollouts.successes)]
     kept = winners[: cfg.num_episodes - have]
     missing = [w for w in kept if not (folder / f"{name(w)}.npz").is_file()]
-    if missing:
-        with MaskRenderer(bundle, cfg.size_px) as renderer:
-            for world in missing:
-                _drawn(bundle, rollouts, world, name(world), renderer).save(folder)
-                done = have + sum((folder / f"{name(w)}.npz").is_file() for w in kept)
-                on_progress(done / cfg.num_episodes, f"{done}/{cfg.num_episodes} episodes")
-    losers = np.flatnonzero(~rollouts.successes)
+    done = have + len(kept) - len(missing)
+    artist = Artist(
+        bundle,
+        size_px=cfg.size_px,
+        render=cfg.render,
+        distractors=cfg.distractors,
+        look=cfg.look,
+        mask_noise=cfg.mask_noise,
+        num_threads=num_threads,
+    )
+    with _writer(folder) as write, artist:
+        for world in missing:
+            write(artist.episode(rollouts, world, name(world)))
+            done += 1
+            on_progress(done / cfg.num_episodes, f"{done}/{cfg.num_episodes} episodes")
+    _keep_aside(rollouts, losers, [name(w) for w in losers], out, batch)
     return {
         "episodes": [name(w) for w in kept],
         "frames": int(rollouts.num_frames[kept].sum()),
         "rollouts": len(rollouts.successes),
         "successes": len(winners),
         "task_successes": int(rollouts.task_successes.sum()),
-        "rejected": [{"id": name(int(w)), **rollouts.reject(int(w))} for w in losers],
+        "rejected": [{"id": name(w), **rollouts.reject(w)} for w in losers],
     }
 
 
-def _drawn(
-    bundle: TaskBundle, rollouts: Rollouts, world: int, episode_id: str, renderer: MaskRenderer
-) -> Episode:
-    length = int(rollouts.num_frames[world])
-    return Episode(
-        id=episode_id,
-        item=bundle.title,
-        task=bundle.description,
-        seed=rollouts.seed,
-        labels=np.stack([renderer.draw(s, world) for s in rollouts.snapshots[:length]]),
-        state=rollouts.state[:length, world].copy(),
-        action=rollouts.action[:length, world].copy(),
-        success=np.arange(length) >= rollouts.held_at[world],
-        referee=bool(rollouts.referee[world]),
-        objects=tuple(o.name for o in bundle.scene.objects),
-        params=rollouts.params[world],
-    )
+@contextmanager
+def _writer(folder: Path) -> Iterator[Callable[[Episode], None]]:
+    """Yield what writes an episode while the next one is drawn; in the end all are written."""
+    waiting: list[Future[Path]] = []
+    with ThreadPoolExecutor(1) as pool:
+
+        def write(episode: Episode) -> None:
+            if len(waiting) > 1:  # two in memory are enough
+                waiting.pop(0).result()
+            waiting.append(pool.submit(episode.save, folder))
+
+        yield write
+        for future in waiting:
+            future.result()
+
+
+def _keep_aside(
+    rollouts: Rollouts, losers: list[int], names: list[str], out: Path, batch: int
+) -> None:
+    """Write what failed in a batch, end to end, without pictures."""
+    if not losers:
+        return
+    lengths = rollouts.num_frames[losers]
+
+    def rows(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values[:n, w] for n, w in zip(lengths, losers, strict=True)])
+
+    about = [
+        {"id": name, "num_frames": int(n), "params": rollouts.params[w], **rollouts.reject(w)}
+        for name, n, w in zip(names, lengths, losers, strict=True)
+    ]
+    arrays = {name: rows(getattr(rollouts, name)) for name in ("state", "action", "success")}
+    arrays["about"] = np.array(json.dumps(about, sort_keys=True))
+    save_arrays(out / FAILED_FOLDER / f"{batch:03d}.npz", arrays)
 
 
 def _finish(

@@ -79,7 +79,6 @@ class Episode:
         """Write `folder/<id>.npz` atomically and return it."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.id}.npz"
-        temporary = path.with_name(path.name + ".tmp")
         about = {
             "schema": SCHEMA,
             "id": self.id,
@@ -96,16 +95,7 @@ class Episode:
         if self.rgb_mp4:
             arrays["rgb_mp4"] = np.frombuffer(self.rgb_mp4, np.uint8)
         arrays["about"] = np.array(json.dumps(about, sort_keys=True))
-        try:
-            with temporary.open("wb") as stream:
-                np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
-                stream.flush()
-                os.fsync(stream.fileno())
-        except OSError:
-            with suppress(OSError):  # half a file takes room that may be what is missing
-                temporary.unlink()
-            raise
-        temporary.replace(path)
+        save_arrays(path, arrays)
         return path
 
     @staticmethod
@@ -180,6 +170,21 @@ class Heading:
             cameras=about.get("cameras", (MASK_CAMERA,)),
             digest=digest,
         )
+
+
+def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write a compressed `.npz` that is whole or absent."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        with temporary.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError:
+        with suppress(OSError):  # half a file takes room that may be what is missing
+            temporary.unlink()
+        raise
+    temporary.replace(path)
 
 
 @contextmanager

@@ -1,0 +1,116 @@
+"""The pictures of an episode, drawn from the saved states of its course: masks, colours, faults, distractors.
+
+Everything drawn at random has a stream of its own per episode, so switching one thing on changes no other.
+"""
+
+from typing import Any, Literal
+
+import numpy as np
+
+from v2p_data.episodes import stream
+from v2p_data.episodes.mask_noise import MaskNoiseConfig, apply_faults, as_json, draw_faults
+from v2p_data.episodes.rollouts import Rollouts
+from v2p_data.episodes.staging import MASK_CAMERA, RGB_CAMERA, Episode
+from v2p_data.seeds import rng_for
+from v2p_data.sim.batch_env import Snapshot
+from v2p_data.sim.furnish import DistractorConfig, LookConfig, furnish
+from v2p_data.sim.masks import BACKGROUND, MaskRenderer
+from v2p_data.task.task import TaskBundle
+
+Render = Literal["masks", "rgb", "both"]
+CAMERAS: dict[str, tuple[str, ...]] = {
+    "masks": (MASK_CAMERA,),
+    "rgb": (RGB_CAMERA,),
+    "both": (MASK_CAMERA, RGB_CAMERA),
+}
+
+
+class Artist:
+    """Draws episodes.
+
+    Args:
+        bundle: the task.
+        size_px: width and height.
+        render: which pictures go into the dataset; masks are drawn in any case.
+        distractors: things that stand about.
+        look: light and colours.
+        mask_noise: faults of the masks.
+        num_threads: for the masks, 0 for all cores; changes no result.
+    """
+
+    def __init__(
+        self,
+        bundle: TaskBundle,
+        *,
+        size_px: int,
+        render: Render,
+        distractors: DistractorConfig,
+        look: LookConfig,
+        mask_noise: MaskNoiseConfig,
+        num_threads: int,
+    ) -> None:
+        self.bundle, self.size_px, self.render = bundle, size_px, render
+        self.distractors, self.look, self.mask_noise = distractors, look, mask_noise
+        self.num_threads = num_threads
+        self.is_plain = distractors.count[1] == 0 and look.is_off
+        self.renderer: MaskRenderer | None = None
+
+    def __enter__(self) -> "Artist":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.renderer is not None:
+            self.renderer.close()
+
+    def episode(self, rollouts: Rollouts, world: int, episode_id: str) -> Episode:
+        """Return the episode of a world with its pictures."""
+        bundle = self.bundle
+        length = int(rollouts.num_frames[world])
+        labels, rgb_mp4, drawn = self._pictures(rollouts, world, length, episode_id)
+        if not self.mask_noise.is_off:
+            rng = rng_for(rollouts.seed, "mask-noise", episode_id)
+            faults = draw_faults(labels, self.mask_noise, rng)
+            labels = apply_faults(labels, faults)
+            drawn["mask_faults"] = as_json(faults)
+        return Episode(
+            id=episode_id,
+            item=bundle.title,
+            task=bundle.description,
+            seed=rollouts.seed,
+            labels=labels,
+            state=rollouts.state[:length, world].copy(),
+            action=rollouts.action[:length, world].copy(),
+            success=np.arange(length) >= rollouts.held_at[world],
+            referee=bool(rollouts.referee[world]),
+            objects=tuple(o.name for o in bundle.scene.objects),
+            params=rollouts.params[world] | drawn,
+            cameras=CAMERAS[self.render],
+            rgb_mp4=rgb_mp4,
+        )
+
+    def _pictures(
+        self, rollouts: Rollouts, world: int, length: int, episode_id: str
+    ) -> tuple[np.ndarray, bytes, dict[str, Any]]:
+        course = list(rollouts.snapshots[:length])
+        if self.is_plain:
+            if self.renderer is None:
+                self.renderer = MaskRenderer(
+                    self.bundle, self.size_px, num_threads=self.num_threads
+                )
+            return *self._drawn(self.renderer, [(s, world) for s in course]), {}
+        rng = rng_for(rollouts.seed, "furnish", episode_id)
+        scene = furnish(self.bundle, course, world, self.distractors, self.look, rng)
+        with MaskRenderer(scene.world, self.size_px, num_threads=self.num_threads) as renderer:
+            if len(scene.sizes):  # the last geoms; before the first picture, which fixes labels
+                renderer.labels[-len(scene.sizes) :] = BACKGROUND
+            moments = [(scene.moment(s, world), 0) for s in course]
+            return *self._drawn(renderer, moments), scene.drawn
+
+    def _drawn(
+        self, renderer: MaskRenderer, moments: list[tuple[Snapshot, int]]
+    ) -> tuple[np.ndarray, bytes]:
+        labels = renderer.draw_many(moments)
+        if self.render == "masks":
+            return labels, b""
+        pictures = np.stack([renderer.draw_rgb(*moment) for moment in moments])
+        return labels, stream.encode_rgb(pictures).mp4
