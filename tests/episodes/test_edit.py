@@ -199,7 +199,7 @@ def test_nothing_is_overwritten(packed: Path, more: Path, tmp_path: Path):
 
 
 def test_an_unknown_task_is_named_with_the_known_ones(packed: Path, tmp_path: Path):
-    with pytest.raises(V2PError, match=f"no task 'lift the toy'.*Known: {LIFT}; {PUSH}; toy"):
+    with pytest.raises(V2PError, match=f"no task 'lift the toy'.*Known: {LIFT}, {PUSH}, toy"):
         drop(packed, ["lift the toy"], tmp_path / "out")
     with pytest.raises(V2PError, match="without an episode"):
         drop(packed, ["toy"], tmp_path / "out")

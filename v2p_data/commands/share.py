@@ -1,6 +1,7 @@
-"""Commands for finished things: check them, give them away."""
+"""Commands for finished things: check them, tell where they come from, give them away."""
 
-from dataclasses import dataclass
+import tempfile
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
@@ -20,11 +21,27 @@ class Verify:
 @dataclass(frozen=True, kw_only=True)
 class Push:
     path: tyro.conf.Positional[Path]
-    """Folder of a dataset or of a policy."""
+    """Folder of a dataset or of a policy; with --envhub of a task, of tasks, of a run, or of a dataset with its tasks."""
     repo_id: str
     """Where to: USER/NAME. The token comes from the environment variable HF_TOKEN."""
     private: bool = False
     """Make the repository private."""
+    envhub: bool = False
+    """Push the tasks as an environment that LeRobot loads by its name."""
+    tag: str | None = None
+    """Tag this version, say v1.0; a dataset gets LeRobot's format version as a tag in any case."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explain:
+    path: tyro.conf.Positional[Path]
+    """Folder of a dataset, or of any result of a run."""
+    other: tyro.conf.Positional[Path | None] = None
+    """A second one, to be told in which fields the two differ."""
+    episode: int | None = None
+    """Tell of this episode only."""
+    json: Path | None = None
+    """Write it as JSON to this file, too."""
 
 
 def verify_command(argv: list[str]) -> int:
@@ -41,18 +58,48 @@ def verify_command(argv: list[str]) -> int:
 
 
 def push_command(argv: list[str]) -> int:
-    from v2p_data.episodes.hub import push_dataset, push_policy
-
     args = parse(Push, argv, "push")
-    if (args.path / "meta" / "info.json").is_file():
-        url = push_dataset(args.path, args.repo_id, private=args.private).url
-        then = f"LeRobotDataset('{args.repo_id}')"
-    elif (args.path / "model.safetensors").is_file():
-        url = push_policy(args.path, args.repo_id, private=args.private).url
-        then = f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS"
-    else:
-        raise V2PError(
-            f"{args.path} is neither a LeRobot dataset (meta/info.json) nor a policy (model.safetensors)"
-        )
+    url, then = _pushed(args)
     print(f"Pushed to {url}\nNext: {then}")  # noqa: T201
+    return 0
+
+
+def _pushed(args: Push) -> tuple[str, str]:
+    from v2p_data.episodes.hub import push_dataset, push_envhub, push_policy
+
+    if args.envhub:
+        from v2p_data.episodes.envhub import write_envhub
+
+        with tempfile.TemporaryDirectory() as folder:
+            made = write_envhub(args.path, args.repo_id, Path(folder) / "envhub")
+            pushed = push_envhub(made.folder, args.repo_id, private=args.private, tag=args.tag)
+        return pushed.url, f"make_env('{args.repo_id}', trust_remote_code=True)"
+    if (args.path / "meta" / "info.json").is_file():
+        pushed = push_dataset(args.path, args.repo_id, private=args.private, tag=args.tag)
+        return pushed.url, f"LeRobotDataset('{args.repo_id}')"
+    if (args.path / "model.safetensors").is_file():
+        pushed = push_policy(args.path, args.repo_id, private=args.private, tag=args.tag)
+        return pushed.url, f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS"  # fmt: skip
+    raise V2PError(
+        f"{args.path} is neither a LeRobot dataset (meta/info.json) nor a policy (model.safetensors); tasks are pushed "
+        "with --envhub"
+    )
+
+
+def explain_command(argv: list[str]) -> int:
+    from v2p_data.episodes.explain import differences, explain, told_as_json
+    from v2p_data.pipeline.artifact import write_json_atomically
+
+    args = parse(Explain, argv, "explain")
+    if args.other is None:
+        lines = explain(args.path, args.episode)
+        data: object = told_as_json(args.path, args.episode)
+    else:
+        found = differences(args.path, args.other)
+        lines = [f"{d.field}: {d.first} -> {d.second}" for d in found]
+        lines.append(f"{len(found)} fields differ" if found else "they differ in nothing that makes a difference")  # fmt: skip
+        data = [asdict(d) for d in found]
+    if args.json is not None:
+        write_json_atomically(args.json, data)
+    print("\n".join(lines))  # noqa: T201
     return 0

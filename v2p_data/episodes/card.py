@@ -5,12 +5,15 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from v2p_data.episodes.features import ACTION_NAMES, METADATA_FILE, STATE_NAMES
+from v2p_data.episodes.features import ACTION_NAMES, MASK_KEY, METADATA_FILE, STATE_NAMES
+from v2p_data.episodes.sheet import SHEET_FILE, write_sheet
 from v2p_data.errors import V2PError
 
 CARD_FILE = "README.md"
 TAGS = ("LeRobot", "robotics", "segmentation", "simulation", "mujoco", "video2policy")
 LICENSE = "apache-2.0"
+SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+"""The Hub's words for how many episodes there are."""
 STATE_UNITS = ("m", "m", "m", "rad", "rad", "rad", "0 closed to 1 open")
 ACTION_UNITS = (
     *("x 0.03 m",) * 3,
@@ -32,22 +35,53 @@ def write_card(root: Path, repo_id: str) -> Path:
         raise V2PError(
             f"{root} was not written by v2p ({error.filename} is missing); its card must be written by hand"
         ) from error
+    has_sheet = _drawn(root, info, about)
     path = root / CARD_FILE
-    path.write_text(dataset_card(about, info, repo_id))
+    write_text(path, dataset_card(about, info, repo_id, has_sheet=has_sheet))
     return path
 
 
-def dataset_card(about: dict[str, Any], info: dict[str, Any], repo_id: str) -> str:
+def write_text(path: Path, text: str) -> None:
+    """Write it beside its place and rename it, so that an older one stays where this fails.
+
+    Raises:
+        V2PError: the folder cannot be written to.
+    """
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        temporary.write_text(text)
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise V2PError(
+            f"cannot write {path} ({error.strerror}); make room or make the folder writable, and run the same "
+            "command again"
+        ) from error
+
+
+def _drawn(root: Path, info: dict[str, Any], about: dict[str, Any]) -> bool:
+    try:
+        return (root / SHEET_FILE).is_file() or write_sheet(root, info, about)
+    except OSError as error:
+        raise V2PError(
+            f"cannot write {root / SHEET_FILE} ({error.strerror}); make room or make the folder writable"
+        ) from error
+
+
+def dataset_card(
+    about: dict[str, Any], info: dict[str, Any], repo_id: str, *, has_sheet: bool = False
+) -> str:
     """Return the card's Markdown with its YAML head."""
     episodes: list[dict[str, Any]] = about["episodes"]
     seconds = info["total_frames"] / info["fps"]
     sections = [
-        _head(),
+        _head(len(episodes)),
         f"# {repo_id}",
         "Demonstrations of a simulated Franka-like arm, made from ordinary videos: each video was rebuilt as a "
         "simulated task, an expert learned the task, and its successful episodes were recorded under "
         f"randomisation. {len(episodes)} episodes, {info['total_frames']} frames, {seconds:.0f} s at "
         f"{info['fps']} frames a second.",
+        *([f"![Moments of one episode of each task]({SHEET_FILE})"] if has_sheet else []),
         "```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
         f'dataset = LeRobotDataset("{repo_id}")\n```',
         "## Tasks",
@@ -58,6 +92,8 @@ def dataset_card(about: dict[str, Any], info: dict[str, Any], repo_id: str) -> s
         _palette(about, episodes),
         "## Randomisation",
         _randomisation(episodes),
+        "## Results",
+        _results(about, episodes),
         "## How it was made",
         _making(about),
         "## Limits",
@@ -67,10 +103,11 @@ def dataset_card(about: dict[str, Any], info: dict[str, Any], repo_id: str) -> s
     return "\n\n".join(sections) + "\n"
 
 
-def _head() -> str:
+def _head(num_episodes: int) -> str:
     tags = "\n".join(f"- {tag}" for tag in TAGS)
+    size = next((s for n, s in SIZES if num_episodes < n), "n>1M")
     return (
-        f"---\nlicense: {LICENSE}\ntask_categories:\n- robotics\ntags:\n{tags}\n"
+        f"---\nlicense: {LICENSE}\nlanguage:\n- en\nsize_categories:\n- {size}\ntask_categories:\n- robotics\ntags:\n{tags}\n"
         "configs:\n- config_name: default\n  data_files: data/*/*.parquet\n---"
     )
 
@@ -91,8 +128,10 @@ def _tasks(episodes: list[dict[str, Any]]) -> str:
 def _frame(info: dict[str, Any]) -> str:
     lines = ["| column | shape | meaning |", "|---|---|---|"]
     for key, feature in info["features"].items():
-        if key.startswith("observation.images"):
+        if key == MASK_KEY:
             meaning = "segmentation mask as grey video, lossless"
+        elif key.startswith("observation.images"):
+            meaning = "picture of the same camera at the same moment"
         elif key == "observation.state":
             meaning = _named(STATE_NAMES, STATE_UNITS)
         elif key == "action":
@@ -151,6 +190,41 @@ def _numbers(value: Any, name: str = "") -> list[tuple[str, float]]:
     return []
 
 
+def _results(about: dict[str, Any], episodes: list[dict[str, Any]]) -> str:
+    """Return per task how often its expert succeeded, and what became of the episodes."""
+    items: dict[str, Any] = about.get("provenance", {}).get("items", {})
+    lines = [
+        "| made from | expert succeeds | episodes tried | succeeded | left out, by reason |",
+        "|---|---|---|---|---|",
+    ]
+    known = len(lines)
+    for key in dict.fromkeys(e.get("history", e["item"]) for e in episodes):
+        counts = items.get(key, {}).get("counts") or {}
+        expert = items.get(key, {}).get("inputs", {}).get("expert", {}).get("counts", {})
+        rate = expert.get("success")
+        shown = (
+            f"{rate['rate']:.0%} [{rate['low']:.0%}, {rate['high']:.0%}]"
+            if isinstance(rate, dict) and {"rate", "low", "high"} <= set(rate)
+            else "not recorded"
+        )
+        if not counts and not expert:
+            continue
+        rejected = ", ".join(
+            f"{n} {reason}" for reason, n in (counts.get("rejected") or {}).items()
+        )
+        tried, share = counts.get("rollouts", "-"), counts.get("success")
+        won = f"{share:.1%}" if isinstance(share, float | int) else "-"
+        lines.append(f"| {_cell(key)} | {shown} | {tried} | {won} | {_cell(rejected) or 'none'} |")
+    if len(lines) == known:
+        return "No rates were recorded with this dataset."
+    lines.append("")
+    lines.append(
+        "An expert succeeds where the task's own measure and an independent one agree, at the simulator's fine time "
+        "step under the randomisation above; the interval is Wilson's at 95 %."
+    )
+    return "\n".join(lines)
+
+
 def _making(about: dict[str, Any]) -> str:
     provenance = about["provenance"]
     packages = ", ".join(f"{k} {v}" for k, v in sorted(provenance.get("packages", {}).items()))
@@ -158,6 +232,14 @@ def _making(about: dict[str, Any]) -> str:
         "`v2p generate VIDEOS`: video, scene, task code, expert (PPO), episodes, dataset. Recipes, seeds and "
         "counts of every stage are in `meta/v2p.json`.",
     ]
+    for edit in provenance.get("edits", []):
+        if edit["operation"] == "merge":
+            parts = ", ".join(
+                f"{p['repo_id']} ({p['episodes']} episodes)" for p in edit["sources"]
+            )
+            lines.append(f"Put together by `v2p merge` from {parts}.")
+        else:
+            lines.append(f"`v2p drop` took {edit['episodes']} episodes out of {edit['source']}: {'; '.join(edit['tasks'])}.")  # fmt: skip
     if provenance.get("commit"):
         lines.append(f"Commit {provenance['commit']}.")
     if packages:

@@ -337,9 +337,7 @@ def _episodes_of_tasks(source: _Source, tasks: Sequence[str]) -> set[int]:
         raise V2PError(f"say which tasks to drop with --tasks; there are: {'; '.join(known)}")
     for task in tasks:
         if task not in known:
-            raise V2PError(
-                f"{source.root} has no task '{task}'.{did_you_mean(task, known)} Known: {'; '.join(known)}"
-            )
+            raise V2PError(f"{source.root} has no task '{task}'.{did_you_mean(task, known)}")
     return {k for k, said in enumerate(names) if said & set(tasks)}
 
 

@@ -1,19 +1,25 @@
-"""Push a dataset or a policy to the Hugging Face Hub.
+"""Push a dataset, a policy or an environment to the Hugging Face Hub.
 
 The calls are those of LeRobot's `push_to_hub` but for its dataset card: ours is uploaded instead, in the same
 commit, and so nothing asks huggingface.co to check it when `HF_ENDPOINT` names another server. The token is
-read from the environment only; it is never stored, logged or shown.
+read from the environment only; it is never stored, logged or shown, and files that hold one are not sent.
+
+A lost connection, a 429 and a fault of the server are waited out, longer each time; large files that have
+arrived are not sent again (the Hub knows them by their digest). The tag that LeRobot loads moves after the last
+file has arrived, so nobody loads half a version.
 """
 
 import json
 import logging
 import os
-from collections.abc import Callable
+import re
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from v2p_data.episodes.card import CARD_FILE, LICENSE, write_card
+from v2p_data.episodes.card import CARD_FILE, LICENSE, write_card, write_text
 from v2p_data.episodes.features import METADATA_FILE
 from v2p_data.episodes.writer import check_repo_id
 from v2p_data.errors import V2PError
@@ -28,10 +34,24 @@ NOT_UPLOADED = [
     "*.tmp",
     "*.partial",
     ".cache/*",
+    "*__pycache__*",
     "record.json",
     "traceback.txt",
 ]
 POLICY_FILES = ("config.json", "model.safetensors")
+ENV_FILE = "env.py"
+DATASET_PARTS = ("data/*", "videos/*", "meta/*", "v2p/*", "media/*")
+"""What a new version replaces: LeRobot reads every file under `data/`, an older version's too."""
+ENV_PARTS = ("tasks/*", "mjcf/*", "v2p_data/*")
+WAITS_S = (2.0, 5.0, 15.0, 45.0)
+"""Before each further try; the Hub's limits are counted per five minutes."""
+LONGEST_WAIT_S = 300.0
+WORTH_ANOTHER_TRY = (408, 429, 500, 502, 503, 504)
+SECRET = re.compile(
+    rb"\bhf_[A-Za-z0-9]{30,}\b|\bsk-[A-Za-z0-9_-]{30,}\b|\bgh[pousr]_[A-Za-z0-9]{36,}\b"
+)
+TEXT_SUFFIXES = (".json", ".jsonl", ".md", ".txt", ".py", ".yaml", ".yml", ".xml", ".toml", "")
+LARGEST_TEXT = 20_000_000
 
 RepoType = Literal["dataset", "model"]
 
@@ -45,8 +65,35 @@ class Pushed:
     commit: str
 
 
-def push_dataset(root: Path, repo_id: str, *, private: bool = False) -> Pushed:
+@dataclass(frozen=True, kw_only=True)
+class _Upload:
+    folder: Path
+    repo_id: str
+    repo_type: RepoType
+    private: bool
+    marker: str
+    """A repository that holds files but not this one is about something else."""
+    replaces: tuple[str, ...] = ()
+    tags: tuple[str, ...] = ()
+    waits_s: tuple[float, ...]
+
+
+def push_dataset(
+    root: Path,
+    repo_id: str,
+    *,
+    private: bool = False,
+    tag: str | None = None,
+    waits_s: Sequence[float] = WAITS_S,
+) -> Pushed:
     """Upload the LeRobot dataset at `root` and tag it with LeRobot's format version.
+
+    Args:
+        root: folder of the dataset.
+        repo_id: `user/name`.
+        private: make a new repository private.
+        tag: a further tag, say `v1.0`.
+        waits_s: seconds before each further try.
 
     Raises:
         V2PError: no dataset, no token, or the Hub refuses; says what to do.
@@ -58,10 +105,28 @@ def push_dataset(root: Path, repo_id: str, *, private: bool = False) -> Pushed:
     version = str(json.loads(info_path.read_text()).get("codebase_version", ""))
     if (root / METADATA_FILE).is_file():
         write_card(root, repo_id)
-    return _push(root, repo_id, "dataset", private=private, tag=version)
+    return _push(
+        _Upload(
+            folder=root,
+            repo_id=repo_id,
+            repo_type="dataset",
+            private=private,
+            marker="meta/info.json",
+            replaces=DATASET_PARTS,
+            tags=tuple(t for t in (version, tag) if t),
+            waits_s=tuple(waits_s),
+        )
+    )
 
 
-def push_policy(folder: Path, repo_id: str, *, private: bool = False) -> Pushed:
+def push_policy(
+    folder: Path,
+    repo_id: str,
+    *,
+    private: bool = False,
+    tag: str | None = None,
+    waits_s: Sequence[float] = WAITS_S,
+) -> Pushed:
     """Upload a LeRobot policy (a checkpoint's `pretrained_model` folder).
 
     Raises:
@@ -75,14 +140,53 @@ def push_policy(folder: Path, repo_id: str, *, private: bool = False) -> Pushed:
             "'pretrained_model' of a checkpoint"
         )
     if not (folder / CARD_FILE).is_file():
-        (folder / CARD_FILE).write_text(_policy_card(folder, repo_id))
-    return _push(folder, repo_id, "model", private=private, tag=None)
+        write_text(folder / CARD_FILE, _policy_card(folder, repo_id))
+    return _push(
+        _Upload(
+            folder=folder,
+            repo_id=repo_id,
+            repo_type="model",
+            private=private,
+            marker="config.json",
+            tags=(tag,) if tag else (),
+            waits_s=tuple(waits_s),
+        )
+    )
 
 
-def _push(
-    folder: Path, repo_id: str, repo_type: RepoType, *, private: bool, tag: str | None
+def push_envhub(
+    folder: Path,
+    repo_id: str,
+    *,
+    private: bool = False,
+    tag: str | None = None,
+    waits_s: Sequence[float] = WAITS_S,
 ) -> Pushed:
+    """Upload a folder that `envhub.write_envhub` wrote; LeRobot looks for environments among the models.
+
+    Raises:
+        V2PError: no environment, no token, or the Hub refuses; says what to do.
+    """
+    check_repo_id(repo_id)
+    if not (folder / ENV_FILE).is_file():
+        raise V2PError(f"{folder} holds no {ENV_FILE}: it is no EnvHub repository")
+    return _push(
+        _Upload(
+            folder=folder,
+            repo_id=repo_id,
+            repo_type="model",
+            private=private,
+            marker=ENV_FILE,
+            replaces=ENV_PARTS,
+            tags=(tag,) if tag else (),
+            waits_s=tuple(waits_s),
+        )
+    )
+
+
+def _push(upload: _Upload) -> Pushed:
     token = _token()
+    _check_no_secret(upload.folder, token)
     # Not left to the library's default, which it read from the environment when it was imported.
     endpoint = os.environ.get("HF_ENDPOINT", "").rstrip("/") or DEFAULT_ENDPOINT
 
@@ -90,17 +194,28 @@ def _push(
     from huggingface_hub.errors import RevisionNotFoundError
 
     api = HfApi(endpoint=endpoint, token=token)
+    repo_id, repo_type = upload.repo_id, upload.repo_type
 
-    def upload() -> Pushed:
-        api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True)
+    def send() -> Pushed:
+        api.create_repo(repo_id, repo_type=repo_type, private=upload.private, exist_ok=True)
+        there = set(api.list_repo_files(repo_id, repo_type=repo_type)) - {
+            ".gitattributes",
+            CARD_FILE,
+        }
+        if there and upload.marker not in there:
+            raise V2PError(
+                f"the name '{repo_id}' is taken: that repository holds something else ({sorted(there)[0]}, no "
+                f"{upload.marker}); choose another --repo-id"
+            )
         commit = api.upload_folder(
             repo_id=repo_id,
             repo_type=repo_type,
-            folder_path=folder,
+            folder_path=upload.folder,
             ignore_patterns=NOT_UPLOADED,
+            delete_patterns=list(upload.replaces) or None,
             commit_message=f"Upload {repo_type} with v2p",
         )
-        if tag:
+        for tag in upload.tags:
             try:
                 api.delete_tag(repo_id, tag=tag, repo_type=repo_type)
             except RevisionNotFoundError:
@@ -109,7 +224,30 @@ def _push(
         kind = "datasets/" if repo_type == "dataset" else ""
         return Pushed(repo_id=repo_id, url=f"{endpoint}/{kind}{repo_id}", commit=commit.oid)
 
-    return _explained(upload, repo_id, endpoint, token)
+    return _explained(lambda: _patiently(send, upload.waits_s), repo_id, endpoint, token)
+
+
+def _patiently(send: Callable[[], Pushed], waits_s: Sequence[float]) -> Pushed:
+    """Return what `send` returns, trying again after what may pass."""
+    import httpx
+    from huggingface_hub.errors import HfHubHTTPError
+
+    for number, wait_s in enumerate(waits_s, start=2):
+        try:
+            return send()
+        except HfHubHTTPError as error:
+            response = error.response
+            if response is None or response.status_code not in WORTH_ANOTHER_TRY:
+                raise
+            asked = response.headers.get("Retry-After", "")
+            wait = max(wait_s, float(asked)) if asked.isdigit() else wait_s
+            what = f"the Hub answered {response.status_code}"
+        except (httpx.TransportError, ConnectionError, TimeoutError) as error:
+            wait, what = wait_s, f"the connection broke ({type(error).__name__})"
+        wait = min(wait, LONGEST_WAIT_S)
+        logger.warning("%s; try %d of %d in %g s", what, number, len(waits_s) + 1, wait)
+        time.sleep(wait)
+    return send()
 
 
 def _token() -> str:
@@ -121,6 +259,21 @@ def _token() -> str:
         "pushing needs a token of the Hugging Face Hub with write access: set it as the environment variable "
         "HF_TOKEN (make one at https://huggingface.co/settings/tokens)"
     )
+
+
+def _check_no_secret(folder: Path, token: str) -> None:
+    """Raise where a text file holds what looks like a token: what was typed on a command line is recorded."""
+    for path in sorted(folder.rglob("*")):
+        if path.suffix not in TEXT_SUFFIXES or not path.is_file():
+            continue
+        if path.stat().st_size > LARGEST_TEXT:
+            continue
+        text = path.read_bytes()
+        if SECRET.search(text) or token.encode() in text:
+            raise V2PError(
+                f"{path} holds what looks like an access token; nothing was pushed. Remove it from the file, and "
+                "revoke the token if others could read it"
+            )
 
 
 def _explained(upload: Callable[[], Pushed], repo_id: str, endpoint: str, token: str) -> Pushed:
@@ -139,6 +292,7 @@ def _explained(upload: Callable[[], Pushed], repo_id: str, endpoint: str, token:
             403: f"the token in HF_TOKEN may not write to '{repo_id}'; check the user name before the "
             "slash and that the token has write access",
             404: f"'{repo_id}' is not there, or this token may not see it",
+            507: "its storage is full; delete something there or make room in the plan",
             409: f"'{repo_id}' is in use for something else or is being changed; choose another "
             "--repo-id or try again in a minute",
             413: "a file is larger than the Hub takes",
@@ -150,10 +304,15 @@ def _explained(upload: Callable[[], Pushed], repo_id: str, endpoint: str, token:
         raise V2PError(
             f"cannot push '{repo_id}': HF_HUB_OFFLINE is set; unset it and run the command again"
         ) from None
-    except httpx.TransportError as error:
+    except (httpx.TransportError, ConnectionError, TimeoutError) as error:
         raise V2PError(
             f"cannot reach {endpoint} ({type(error).__name__}: {_first_line(str(error), token)}); check the "
             f"connection and HF_ENDPOINT, then {again}"
+        ) from None
+    except OSError as error:
+        raise V2PError(
+            f"cannot read or write here while pushing '{repo_id}' ({error.strerror or type(error).__name__}): "
+            f"{error.filename or 'no file named'}; {again}"
         ) from None
 
 
