@@ -192,9 +192,9 @@ def _varied(
         pictures[1], pictures[2] = pictures[2], pictures[1]
     if rng.random() < 0.5:
         pictures, labels = [p[:, ::-1] for p in pictures], labels[:, ::-1]
-    camera, size = clip["camera"], net_size(*labels.shape)
-    if rng.random() < 0.6:
-        pictures, labels, camera = _nearer(pictures, labels, camera, rng)
+    size, is_part = net_size(*labels.shape), rng.random() < 0.6
+    if is_part:
+        pictures, labels = _nearer(pictures, labels, rng)
     pictures, labels = [_at(size, p) for p in pictures], _labels_at(size, labels)
     mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
     if rng.random() < 0.1:
@@ -216,17 +216,15 @@ def _varied(
         "early": out[1],
         "late": out[2],
         "labels": np.ascontiguousarray(labels),
-        "camera": camera,
+        # Where a whole picture may be a part as well, its focal length is guessed too long.
+        "camera": np.full(3, np.nan, np.float32) if is_part else clip["camera"],
     }
 
 
 def _nearer(
-    pictures: list[np.ndarray], labels: np.ndarray, camera: np.ndarray, rng: np.random.Generator
-) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Return a part of the pictures, enlarged, with the camera that would have seen it.
-
-    The camera is the one turned towards the part's middle, which is right but for a slight distortion.
-    """
+    pictures: list[np.ndarray], labels: np.ndarray, rng: np.random.Generator
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return a part of the pictures, mostly with something that moves in it."""
     h, w = labels.shape
     zoom = rng.uniform(1.05, 2.5)
     ch, cw = int(h / zoom), int(w / zoom)
@@ -235,9 +233,7 @@ def _nearer(
     y = int(np.clip(middle[0] - ch * rng.uniform(0.25, 0.75), 0, h - ch))
     x = int(np.clip(middle[1] - cw * rng.uniform(0.25, 0.75), 0, w - cw))
     part = slice(y, y + ch), slice(x, x + cw)
-    down = np.arctan((y + ch / 2 - h / 2) / (np.exp(camera[1]) * w))
-    seen = np.array([camera[0] + down, camera[1] + np.log(zoom), camera[2]], np.float32)
-    return [p[part] for p in pictures], labels[part], seen
+    return [p[part] for p in pictures], labels[part]
 
 
 def _at(size: tuple[int, int], image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b 3"]:
@@ -256,7 +252,7 @@ def _labels_at(
 def loss_of(
     logits: Float[torch.Tensor, "n 5 h w"], camera: Float[torch.Tensor, "n 6"], batch: dict
 ) -> torch.Tensor:
-    """Return cross entropy, soft Dice of hand, moved and other, and the camera's Gaussian likelihood."""
+    """Return cross entropy, soft Dice of hand, moved and other, and the Gaussian likelihood of the cameras that are known."""
     labels = batch["labels"].long()
     ce = F.cross_entropy(logits, labels, torch.tensor(CLASS_WEIGHTS), label_smoothing=0.02)
     share = logits.softmax(1)
@@ -266,8 +262,9 @@ def loss_of(
         common = (share[:, c] * truth).sum((1, 2))
         total = share[:, c].sum((1, 2)) + truth.sum((1, 2))
         dice = dice + (1 - (2 * common + 50) / (total + 50)).mean()
-    off, log_sd = camera[:, :3] - batch["camera"], camera[:, 3:].clamp(-4, 1)
-    likelihood = (log_sd + 0.5 * (off / log_sd.exp()) ** 2).mean()
+    known = batch["camera"].isfinite().all(1)
+    off, log_sd = camera[known, :3] - batch["camera"][known], camera[known, 3:].clamp(-4, 1)
+    likelihood = (log_sd + 0.5 * (off / log_sd.exp()) ** 2).sum() / max(1, 3 * int(known.sum()))
     return ce + 0.3 * dice + 0.1 * likelihood
 
 
