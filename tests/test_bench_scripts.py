@@ -18,3 +18,20 @@ def test_the_simulators_benchmark_ends_with_the_share_of_the_physics_speed():
     found = re.fullmatch(r"env_over_limit: (\d\.\d\d)", done.stdout.splitlines()[-1])
     assert found is not None
     assert 0 < float(found[1]) < 1  # Python costs something, and with eight worlds a lot
+
+
+@pytest.mark.slow
+def test_the_masks_benchmark_ends_with_the_ratio_and_shows_that_both_agree():
+    tiny = ["--scenes=1", "--turns=1", "--size-px=64"]
+    command = [sys.executable, "scripts/bench_masks.py", "--quick", *tiny]
+
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if "needs OpenGL" in done.stderr:
+        pytest.skip(done.stderr.strip())
+
+    found = re.fullmatch(r"masks_over_renderer: (\d+\.\d\d)", done.stdout.splitlines()[-1])
+    assert found is not None, done.stderr
+    assert float(found[1]) > 0
+    overlaps = re.findall(r"^ *(?:robot|background|object \d) +\d+ (\d\.\d+)", done.stdout, re.M)
+    assert len(overlaps) == 4
+    assert min(map(float, overlaps)) >= 0.99  # 64 pixels wide, a border pixel weighs more

@@ -24,7 +24,9 @@ from v2p_data.sim.polyhedra import Polyhedra, polyhedra
 from v2p_data.sim.raster import LABEL_BITS, paint
 
 FRAMES_AT_ONCE = 16
-"""That many a thread takes at a time: enough that sharing out costs nothing, few enough that no thread waits long."""
+"""At most that many a thread takes at a time: sharing them out costs nothing, and no thread waits long for the last."""
+TURNS = 4
+"""That often each thread takes some, if there are enough."""
 FAR_M = 1e3
 """Half the side of a plane without end."""
 _TYPE = mujoco.mjtGeom
@@ -113,26 +115,28 @@ class ZBuffer:
         count = len(views.cam_pos)
         frames = self._frames(views)
         images = np.empty((count, self.height_px, self.width_px), np.uint8)
-        starts = range(0, count, FRAMES_AT_ONCE)
+        step = min(FRAMES_AT_ONCE, max(1, count // (TURNS * self.num_threads)))
+        starts = iter(range(0, count, step))
 
-        def some(first: int) -> None:
-            rows = slice(first, first + FRAMES_AT_ONCE)
-            paint(
-                *self.shapes.arrays,
-                self.labels,
-                self.near_m,
-                *(f[rows] for f in frames),
-                images[rows],
-            )
+        def work() -> None:
+            for first in starts:  # shared: each thread takes the next ones
+                rows = slice(first, first + step)
+                paint(
+                    *self.shapes.arrays,
+                    self.labels,
+                    self.near_m,
+                    *(f[rows] for f in frames),
+                    images[rows],
+                )
 
-        workers = min(self.num_threads, len(starts))
-        if workers <= 1:
-            for first in starts:
-                some(first)
-        else:
-            # Threads of its own, at each call: a pool that is kept would be dead, and wait for ever, in a forked process.
-            with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(some, starts))
+        # This thread draws too, so that on a busy machine nothing waits for the others. They are new at each call: kept
+        # ones would be dead in a forked process.
+        helpers = min(self.num_threads, -(-count // step)) - 1
+        with ThreadPoolExecutor(max(1, helpers)) as pool:
+            tasks = [pool.submit(work) for _ in range(helpers)]
+            work()
+            for task in tasks:
+                task.result()
         return images
 
     def _frames(self, views: Views) -> tuple[np.ndarray, ...]:

@@ -1,0 +1,493 @@
+"""Measure the masks' z-buffer against MuJoCo's renderer: frames per second on the same cores, and agreement.
+
+    python scripts/bench_masks.py            # 12 turns
+    python scripts/bench_masks.py --quick    # 3 turns, within 45 s; the same 200 states
+
+The states are 20 each of ten scenes: four benchmark tasks, and six with meshes (a convex one, a concave angle, a mug of
+twelve convex parts, random ones). Half of them come out of the batched environment after random actions, under the randomisation
+of recording with a moving camera; in the other half the objects float in random orientations. `mujoco.Renderer` draws
+segmentation of the same models in the same states, put there in the same way; turning its ids into labels is not counted.
+
+All take turns at all states, in processes of their own that are ready beforehand. "all cores": our threads against as many
+renderer processes as there are cores. "one core": one of each, held on the same core. The engine's models ask for no
+multisampling, which makes the renderer faster than with MuJoCo's default of 4 samples, also shown. What software OpenGL does with
+threads of its own is the faster of two ways: `LP_NUM_THREADS` unset for one process, 0 for one per core.
+
+The last line, `masks_over_renderer: X`, is the median over the turns of the renderer's seconds per frame over ours, all cores.
+"""
+
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Protocol
+
+os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "")
+
+import mujoco
+import numpy as np
+import trimesh
+import tyro
+from jaxtyping import UInt8
+from scipy.spatial.transform import Rotation
+
+from v2p_data.geometry.camera import Camera
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.seeds import rng_for
+from v2p_data.sim import randomize
+from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot
+from v2p_data.sim.masks import BACKGROUND, GL_HINT, MaskRenderer, geom_labels
+from v2p_data.sim.world import CAMERA, World
+from v2p_data.task.benchmark import load_benchmark
+from v2p_data.task.task import TaskBundle
+from v2p_data.task.templates import write_samples
+
+STATES = 20
+"""Of each scene."""
+WARMUP_STEPS = 12
+MESH_SCENES = ("mug", "angle", "pebble", "random 1", "random 2", "random 3")
+TASKS = ("insert", "throw_into", "push_next_to", "cover")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchConfig:
+    """What is measured, and for how long."""
+
+    quick: bool = False
+    """Three turns, or fewer if time runs out, and no multisampling."""
+    size_px: int = 256
+    scenes: int = len(MESH_SCENES) + len(TASKS)
+    """The first so many, those with meshes first."""
+    turns: int = 12
+    seconds: float = 240.0
+    """No further turn is begun after this time."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One scene and its states."""
+
+    name: str
+    world: World
+    moments: Snapshot
+
+    @property
+    def num_mesh_geoms(self) -> int:
+        return int((self.world.model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum())  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def main(cfg: BenchConfig) -> None:
+    started = time.perf_counter()
+    if cfg.quick:
+        cfg = replace(cfg, turns=min(cfg.turns, 3), seconds=min(cfg.seconds, 25.0))
+    print(f"{_cores()} cores, load before: {os.getloadavg()[0]:.2f}")
+    with tempfile.TemporaryDirectory() as folder:
+        stages = make_stages(Path(folder), cfg.scenes, cfg.seed)
+    count = len(stages) * STATES
+    meshes = sum(s.num_mesh_geoms > 0 for s in stages) * STATES
+    print(
+        f"{count} states of {len(stages)} scenes, {meshes} of them with meshes; {cfg.size_px} x {cfg.size_px}"
+    )
+    rivals = {
+        "ours, all cores": Rival("ours", stages, cfg.size_px),
+        "ours, one core": Rival("ours", stages, cfg.size_px, one_core=True),
+        "renderer, all cores": Rival("renderer", stages, cfg.size_px, processes=_cores()),
+        "renderer, one core": Rival("renderer", stages, cfg.size_px, one_core=True),
+    }
+    if not cfg.quick:
+        rivals["renderer, 4 samples, all cores"] = Rival(
+            "renderer", stages, cfg.size_px, processes=_cores(), samples=4
+        )
+    try:
+        first_s = {name: rival.ready() for name, rival in rivals.items()}
+        images = {
+            name: rivals[name].images() for name in ("ours, all cores", "renderer, all cores")
+        }
+        seconds: dict[str, list[float]] = {name: [] for name in rivals}
+        for turn in range(cfg.turns):
+            if turn and time.perf_counter() - started > cfg.seconds:
+                break
+            for name, rival in rivals.items():
+                seconds[name].append(rival.turn() / count)
+    finally:
+        for rival in rivals.values():
+            rival.stop()
+    show_speed(seconds)
+    show_agreement(stages, *images.values())
+    print(
+        f"first image of ours after {first_s['ours, all cores']:.1f} s, compiled or read from its cache"
+    )
+    print(f"load after: {os.getloadavg()[0]:.2f}; took {time.perf_counter() - started:.0f} s")
+    ratio = _ratio(seconds["renderer, all cores"], seconds["ours, all cores"])
+    print(f"masks_over_renderer: {ratio:.2f}")
+
+
+def show_speed(seconds: dict[str, list[float]]) -> None:
+    print(
+        f"\n{'':34s} {'frames/s':>9s} {'best':>7s} {'ms/frame':>9s}   {len(seconds['ours, all cores'])} turns"
+    )
+    for name, values in seconds.items():
+        middle = float(np.median(values))
+        print(f"{name:34s} {1 / middle:9.0f} {1 / min(values):7.0f} {1e3 * middle:9.2f}")
+    for cores in ("all cores", "one core"):
+        ratio = _ratio(seconds[f"renderer, {cores}"], seconds[f"ours, {cores}"])
+        print(f"ours over renderer, {cores}: {ratio:.2f}")
+    if "renderer, 4 samples, all cores" in seconds:
+        ratio = _ratio(seconds["renderer, 4 samples, all cores"], seconds["ours, all cores"])
+        print(f"ours over renderer with 4 samples, all cores: {ratio:.2f}")
+
+
+def show_agreement(
+    stages: list[Stage], ours: UInt8[np.ndarray, "n h w"], theirs: UInt8[np.ndarray, "n h w"]
+) -> None:
+    """Print how well both agree, per label over all states and in each state that shows it."""
+    differ = (ours != theirs).sum((1, 2))
+    print(
+        f"\npixels that differ: {differ.mean():.2f} per image on average, {differ.max()} at most, of {ours[0].size}"
+    )
+    print(f"{'label':>12s} {'pixels/image':>13s} {'IoU, all':>9s} {'mean':>8s} {'worst':>8s}")
+    for label in np.union1d(ours, theirs):
+        both = ((ours == label) & (theirs == label)).sum((1, 2))
+        either = ((ours == label) | (theirs == label)).sum((1, 2))
+        shown = either > 0
+        each = both[shown] / either[shown]
+        name = {BACKGROUND: "background", 1: "robot"}.get(int(label), f"object {int(label) - 1}")
+        print(
+            f"{name:>12s} {either[shown].mean():13.0f} {both.sum() / either.sum():9.5f} "
+            f"{each.mean():8.5f} {each.min():8.5f}"
+        )
+    worst = int(differ.argmax())
+    print(f"worst image: state {worst % STATES} of {stages[worst // STATES].name}")
+
+
+def _ratio(theirs: list[float], ours: list[float]) -> float:
+    return float(np.median(np.divide(theirs, ours)))
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+# --- who draws -----------------------------------------------------------------------------------------------
+
+
+class Painter(Protocol):
+    def paint(self) -> list[np.ndarray]:
+        """Draw all states."""
+        ...
+
+    def labels(self) -> UInt8[np.ndarray, "n h w"]:
+        """Return all label images."""
+        ...
+
+
+class Ours:
+    """The engine's masks."""
+
+    def __init__(self, stages: list[Stage], size_px: int) -> None:
+        self.renderers = [MaskRenderer(s.world, size_px) for s in stages]
+        self.stages = stages
+        self.renderers[0].draw(stages[0].moments, 0)
+
+    def paint(self) -> list[np.ndarray]:
+        return [
+            renderer.draw_many([(stage.moments, k) for k in range(STATES)])
+            for renderer, stage in zip(self.renderers, self.stages, strict=True)
+        ]
+
+    def labels(self) -> UInt8[np.ndarray, "n h w"]:
+        return np.concatenate(self.paint())
+
+
+class Theirs:
+    """`mujoco.Renderer` with segmentation."""
+
+    def __init__(self, stages: list[Stage], size_px: int, samples: int) -> None:
+        self.stages = stages
+        self.models = [s.world.model.__copy__() for s in stages]
+        for model in self.models:
+            model.vis.quality.offsamples = samples
+            model.vis.global_.offwidth = model.vis.global_.offheight = size_px
+        self.data = [mujoco.MjData(m) for m in self.models]
+        self.renderers = [mujoco.Renderer(m, size_px, size_px) for m in self.models]
+        for renderer in self.renderers:
+            renderer.enable_segmentation_rendering()
+
+    def paint(self) -> list[np.ndarray]:
+        pictures = []
+        for stage, model, data, renderer in zip(
+            self.stages, self.models, self.data, self.renderers, strict=True
+        ):
+            for k in range(STATES):
+                stage.moments.write(model, data, k)
+                renderer.update_scene(data, camera=CAMERA)
+                pictures.append(renderer.render())
+        return pictures
+
+    def labels(self) -> UInt8[np.ndarray, "n h w"]:
+        images = []
+        for k, picture in enumerate(self.paint()):
+            of_geom = np.append(geom_labels(self.stages[k // STATES].world), np.uint8(BACKGROUND))
+            is_geom = picture[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)  # pyright: ignore[reportAttributeAccessIssue]
+            images.append(of_geom[np.where(is_geom, picture[..., 0], -1)])
+        return np.stack(images)
+
+
+class Rival:
+    """One way to draw, in one or several processes that wait for their turn."""
+
+    def __init__(
+        self,
+        kind: str,
+        stages: list[Stage],
+        size_px: int,
+        *,
+        processes: int = 1,
+        one_core: bool = False,
+        samples: int = 0,
+    ) -> None:
+        # Forked, so that the scenes need not be sent; this process itself never opens OpenGL.
+        context = multiprocessing.get_context("fork")
+        self.ends: list[Connection] = []
+        self.workers = []
+        for _ in range(processes):
+            end, far_end = context.Pipe()
+            arguments = (far_end, kind, stages, size_px, one_core, samples, processes > 1)
+            self.workers.append(context.Process(target=_serve, args=arguments, daemon=True))
+            self.workers[-1].start()
+            far_end.close()
+            self.ends.append(end)
+
+    def ready(self) -> float:
+        """Wait for it; return the seconds that it took to prepare itself."""
+        return max(_answer(end) for end in self.ends)
+
+    def turn(self) -> float:
+        """Let each process draw all states; return the seconds per process."""
+        for end in self.ends:
+            end.send("turn")
+        return max(_answer(end) for end in self.ends) / len(self.ends)
+
+    def images(self) -> UInt8[np.ndarray, "n h w"]:
+        self.ends[0].send("images")
+        return _answer(self.ends[0])
+
+    def stop(self) -> None:
+        for worker in self.workers:
+            worker.terminate()
+            worker.join()
+
+
+def _answer(end: Connection) -> Any:
+    answer = end.recv()
+    if isinstance(answer, Exception):
+        sys.exit(
+            f"cannot measure: {type(answer).__name__}: {answer}; mujoco.Renderer needs OpenGL: {GL_HINT}"
+        )
+    return answer
+
+
+def _serve(
+    end: Connection,
+    kind: str,
+    stages: list[Stage],
+    size_px: int,
+    one_core: bool,
+    samples: int,
+    crowd: bool,
+) -> None:
+    if one_core:
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    if crowd or one_core:
+        os.environ["LP_NUM_THREADS"] = "0"
+    started = time.perf_counter()
+    try:
+        painter: Painter = (
+            Ours(stages, size_px) if kind == "ours" else Theirs(stages, size_px, samples)
+        )
+    except Exception as error:  # noqa: BLE001 - whatever OpenGL has to say is told by the parent
+        end.send(RuntimeError(repr(error)))
+        return
+    end.send(time.perf_counter() - started)
+    while True:
+        if end.recv() == "images":
+            end.send(painter.labels())
+            continue
+        started = time.perf_counter()
+        painter.paint()
+        end.send(time.perf_counter() - started)
+
+
+# --- what is drawn -------------------------------------------------------------------------------------------
+
+
+def make_stages(folder: Path, count: int, seed: int) -> list[Stage]:
+    """Return the first `count` scenes with their states; mesh files are written to `folder`."""
+    names = [*MESH_SCENES, *TASKS][:count]
+    return [
+        Stage(name=n, **_states(_bundle(folder, n, seed), rng_for(seed, "states", n)))
+        for n in names
+    ]
+
+
+def _bundle(folder: Path, name: str, seed: int) -> TaskBundle:
+    """Return one of the scenes by its name.
+
+    Raises:
+        V2PError: there is no such benchmark task.
+    """
+    rng = rng_for(seed, "scene", name)
+    if name == "mug":
+        file, parts = mug(folder)
+        cup = _object("mug", "mesh", (0.07, 0.07, 0.09), mesh=file, parts=parts)
+        return _task(folder, cup, _object("can", "cylinder", (0.06, 0.06, 0.1)))
+    if name == "angle":
+        file, parts = angle(folder)
+        corner = _object("angle", "mesh", (0.08, 0.06, 0.04), mesh=file, parts=parts)
+        return _task(folder, corner, _object("box", "box", (0.04, 0.08, 0.1)))
+    if name == "pebble":
+        size_m = (0.07, 0.05, 0.04)
+        stone = _object("pebble", "mesh", size_m, mesh=pebble(folder, rng, name, size_m))
+        bowl = _object("bowl", "cylinder", (0.15, 0.15, 0.06), role="container", hollow=True)
+        return _task(folder, stone, bowl)
+    if name in MESH_SCENES:
+        return _task(folder, *random_objects(folder, name, rng))
+    return load_benchmark(name)
+
+
+def _states(bundle: TaskBundle, rng: np.random.Generator) -> dict[str, Any]:
+    randomization = replace(
+        randomize.recording(), camera_pos_m=0.08, camera_angle_rad=0.08, camera_fovy_deg=5.0
+    )
+    cfg = SimConfig(fine=True, randomization=randomization)
+    env = BatchEnv(bundle, cfg, num_envs=STATES, seed=int(rng.integers(2**31)), num_threads=1)
+    for _ in range(WARMUP_STEPS):
+        env.step(rng.uniform(-1, 1, (STATES, 7)).astype(np.float32))
+    moments = env.snapshot(np.arange(STATES))
+    floating = np.arange(STATES // 2)
+    for obj in env.world.objects:
+        at = obj.qpos_adr
+        moments.qpos[floating, at : at + 3] = rng.uniform(
+            (0.40, -0.2, 0.04), (0.66, 0.2, 0.25), (len(floating), 3)
+        )
+        turns = Rotation.random(len(floating), rng=rng).as_quat(scalar_first=True)
+        moments.qpos[floating, at + 3 : at + 7] = turns
+    return {"world": env.world, "moments": moments}
+
+
+def pebble(
+    folder: Path, rng: np.random.Generator, name: str, size_m: tuple[float, float, float]
+) -> str:
+    """Write the hull of random points in a ball, brought to size; return the file's name."""
+    points = rng.normal(size=(60, 3))
+    points /= np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 0.5)
+    hull = trimesh.convex.convex_hull(points * np.divide(size_m, np.ptp(points, axis=0)))
+    hull.export(folder / f"{name}.obj")
+    return f"{name}.obj"
+
+
+def angle(folder: Path) -> tuple[str, tuple[str, ...]]:
+    """Write an L of two legs, whole and as its two convex parts; return the files' names."""
+    outline = np.array([(0, 0), (8, 0), (8, 2), (2, 2), (2, 6), (0, 6)], float) / 100
+    n = len(outline)
+    vertices = np.concatenate([np.c_[outline, np.full(n, z)] for z in (0.0, 0.04)])
+    after = [(k, (k + 1) % n) for k in range(n)]
+    sides = [f for i, j in after for f in [(i, j, j + n), (i, j + n, i + n)]]
+    lid = [(0, 1, 2), (0, 2, 3), (0, 3, 5), (3, 4, 5)]
+    lids = [(a + n, b + n, c + n) for a, b, c in lid] + [(c, b, a) for a, b, c in lid]
+    whole = trimesh.Trimesh(vertices, sides + lids, process=False)
+    corners = ([0, 1, 2, 3], [0, 3, 4, 5])
+    hulls = [vertices[[*c, *(k + n for k in c)]] for c in corners]
+    return _written(folder, "angle", whole, hulls)
+
+
+def mug(folder: Path, sectors: int = 12) -> tuple[str, tuple[str, ...]]:
+    """Write a mug without a handle, whole and as its floor and sectors of its wall; return the files' names."""
+    outer, inner, height, floor = 0.035, 0.029, 0.09, 0.008
+    profile = np.array(
+        [(0, 0), (outer, 0), (outer, height), (inner, height), (inner, floor), (0, floor)]
+    )
+    whole = trimesh.creation.revolve(profile, sections=2 * sectors)
+
+    def ring(radius: float, z: float, ends: tuple[float, float]) -> np.ndarray:
+        turn = np.pi / sectors * np.arange(*ends)
+        return np.c_[radius * np.cos(turn), radius * np.sin(turn), np.full(len(turn), z)]
+
+    hulls = [np.concatenate([ring(outer, z, (0, 2 * sectors)) for z in (0.0, floor)])]
+    for k in range(sectors):
+        part = [ring(r, z, (2 * k, 2 * k + 3)) for r in (inner, outer) for z in (floor, height)]
+        hulls.append(np.concatenate(part))
+    return _written(folder, "mug", whole, hulls)
+
+
+def _written(
+    folder: Path, name: str, whole: trimesh.Trimesh, hulls: list[np.ndarray]
+) -> tuple[str, tuple[str, ...]]:
+    whole.export(folder / f"{name}.obj")
+    files = tuple(f"{name}_{k}.obj" for k in range(len(hulls)))
+    for file, points in zip(files, hulls, strict=True):
+        trimesh.convex.convex_hull(points).export(folder / file)
+    return f"{name}.obj", files
+
+
+def random_objects(folder: Path, name: str, rng: np.random.Generator) -> list[SceneObject]:
+    """Return a mesh, and a primitive and a hollow thing of random kinds and sizes."""
+    x, y, z = (float(v) for v in rng.uniform(0.03, 0.075, 3))
+    side, height, depth = (float(v) for v in rng.uniform((0.1, 0.05, 0.04), (0.16, 0.14, 0.08)))
+    shape, around = rng.choice(("box", "cylinder", "sphere")), rng.choice(("box", "cylinder"))
+    return [
+        _object("stone", "mesh", (x, y, z), mesh=pebble(folder, rng, name.replace(" ", "_"), (x, y, z))),
+        _object("thing", str(shape), (0.05, 0.05, height)),
+        _object("tray", str(around), (side, side, depth), role="container", hollow=True),
+    ]  # fmt: skip
+
+
+def _object(
+    name: str, shape: Any, size_m: tuple[float, ...], *, role: Any = "manipulated", **more: Any
+) -> SceneObject:
+    x, y, z = (float(v) for v in size_m)
+    return SceneObject(
+        name=name, label=name, role=role, shape=shape, size_m=(x, y, z), mass_kg=0.12, friction=0.8,
+        frames=(0,), poses_world=((0.0, 0.0, z / 2, 1.0, 0.0, 0.0, 0.0),), **more,
+    )  # fmt: skip
+
+
+def _task(folder: Path, first: SceneObject, *others: SceneObject) -> TaskBundle:
+    """Return the task to lift the first object, beside the others."""
+    x, y, z, *quat = first.poses_world[0]
+    lifted = replace(
+        first, frames=(0, 10), poses_world=(first.first_pose, (x, y, z + 0.15, *quat))
+    )
+    placed = [
+        replace(o, role=o.role if o.role == "container" else "reference", poses_world=((0.02, 0.2 * side, *o.first_pose[2:]),))
+        for o, side in zip(others, (1, -1), strict=False)
+    ]  # fmt: skip
+    scene = Scene(
+        title="masks",
+        video="",
+        description=f"lifting a {first.name}",
+        kind="lift_up",
+        objects=(lifted, *placed),
+        camera=Camera(width_px=64, height_px=48, K=np.eye(3), T_world_cam=np.eye(4)),
+        fps=20.0,
+        num_frames=11,
+        confidence=1.0,
+        folder=folder,
+    )
+    return TaskBundle(
+        title=scene.title,
+        description=scene.description,
+        kind=scene.kind,
+        class_name="Task",
+        code=write_samples(scene, 1)[0],
+        scene=scene,
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(BenchConfig, description=__doc__))
