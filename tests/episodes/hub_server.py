@@ -8,6 +8,7 @@ import base64
 import hashlib
 import json
 import re
+import socket
 import threading
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from urllib.parse import unquote, urlsplit
 
 TOKEN = "hf_right_token"
 NAMESPACE = "user"
+CUT = 0
 LFS_SUFFIXES = (".mp4", ".parquet", ".safetensors")
 
 
@@ -54,6 +56,12 @@ class Hub:
     requests: list[str] = field(default_factory=list)
     faults: dict[str, int] = field(default_factory=dict)
     """Requests whose address holds the key get this answer."""
+    passing_faults: list[tuple[str, int]] = field(default_factory=list)
+    """The same, each for one request only; `CUT` is no answer but half a request read and the line cut."""
+
+    def count(self, start: str, part: str = "") -> int:
+        """Return how many requests there were of this kind."""
+        return sum(r.startswith(start) and part in r for r in self.requests)
 
 
 @contextmanager
@@ -101,9 +109,20 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer_to(self, method: str) -> None:
         hub = self.state
-        body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         path = unquote(urlsplit(self.path).path)
         hub.requests.append(f"{method} {path}")
+        size = int(self.headers.get("Content-Length") or 0)
+        fault = next((f for f in hub.passing_faults if f[0] in path), None)
+        if fault is not None:
+            hub.passing_faults.remove(fault)
+            if fault[1] == CUT:
+                self.rfile.read(size // 2)
+                self.close_connection = True
+                self.connection.shutdown(socket.SHUT_RDWR)
+                return None
+        body = self.rfile.read(size)
+        if fault is not None:
+            return self._json(fault[1], {"error": "told to answer so"}, {"Retry-After": "0"})
         for part, status in hub.faults.items():
             if part in path:
                 return self._json(status, {"error": "told to answer so"})

@@ -6,7 +6,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from hub_server import TOKEN, Hub
+from hub_server import CUT, TOKEN, Hub, Repo
 
 from v2p_data.episodes.hub import push_dataset, push_policy
 from v2p_data.errors import V2PError
@@ -23,12 +23,14 @@ def dataset(tmp_path: Path) -> Path:
 def online(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> Hub:
     monkeypatch.setenv("HF_ENDPOINT", hub.url)
     monkeypatch.setenv("HF_TOKEN", TOKEN)
+    # The server speaks the older way of sending large files; the library read its switch at import.
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_DISABLE_XET", True)
     return hub
 
 
 def refusal(dataset: Path, repo_id: str = "user/toys") -> str:
     with pytest.raises(V2PError) as caught:
-        push_dataset(dataset, repo_id)
+        push_dataset(dataset, repo_id, waits_s=())
     return str(caught.value)
 
 
@@ -87,6 +89,7 @@ def test_another_users_name_is_refused(dataset: Path, online: Hub):
         ("/commit/", 409, "in use"),
         ("/create", 500, "run the same command again"),
         ("/create", 429, "wait some minutes"),
+        ("/commit/", 507, "storage is full"),
     ],
 )
 def test_other_answers_say_what_to_do(
@@ -98,6 +101,123 @@ def test_other_answers_say_what_to_do(
 
     assert f"answered {status}" in said
     assert words in said
+
+
+@pytest.mark.parametrize("status", [CUT, 429, 500, 503])
+@pytest.mark.parametrize("where", ["/create", "/commit/", "/tag/"])
+def test_what_passes_is_waited_out(dataset: Path, online: Hub, where: str, status: int):
+    online.passing_faults = [(where, status)] * 2
+
+    pushed = push_dataset(dataset, "user/toys", waits_s=(0.0, 0.0, 0.0))
+
+    repo = online.repos["datasets/user/toys"]
+    assert online.passing_faults == []
+    assert repo.tags == {"v3.0": pushed.commit}
+    assert set(repo.files) == {"meta/info.json"}
+
+
+def test_large_files_that_have_arrived_are_not_sent_again(dataset: Path, online: Hub):
+    for name in ("a", "b", "c"):
+        (dataset / f"{name}.mp4").write_bytes(name.encode() * 5000)
+    online.passing_faults = [("/commit/", CUT), ("/commit/", 500)]
+
+    push_dataset(dataset, "user/toys", waits_s=(0.0, 0.0))
+
+    assert online.count("PUT /lfs/") == 3
+    assert online.count("POST", "/commit/") == 3
+    assert online.repos["datasets/user/toys"].files["b.mp4"] == b"b" * 5000
+
+
+def test_an_upload_cut_in_the_middle_is_resumed_by_the_next_command(dataset: Path, online: Hub):
+    (dataset / "a.mp4").write_bytes(b"a" * 5000)
+    online.faults["/commit/"] = 507
+    refusal(dataset)
+    assert online.repos["datasets/user/toys"].tags == {}
+    online.faults.clear()
+
+    pushed = push_dataset(dataset, "user/toys")
+
+    assert online.count("PUT /lfs/") == 1
+    assert online.repos["datasets/user/toys"].tags == {"v3.0": pushed.commit}
+
+
+def test_patience_ends(dataset: Path, online: Hub):
+    online.faults["/create"] = 503
+
+    with pytest.raises(V2PError, match="answered 503"):
+        push_dataset(dataset, "user/toys", waits_s=(0.0, 0.0))
+    assert online.count("POST /api/repos/create") == 3
+
+
+def test_a_new_version_leaves_no_file_of_the_old_one(dataset: Path, online: Hub):
+    (dataset / "data/chunk-000").mkdir(parents=True)
+    (dataset / "data/chunk-000/file-001.txt").write_text("old")
+    push_dataset(dataset, "user/toys")
+    online.repos["datasets/user/toys"].files["NOTES.md"] = b"written on the Hub"
+    (dataset / "data/chunk-000/file-001.txt").rename(dataset / "data/chunk-000/file-000.txt")
+    online.repos["datasets/user/toys"].commit()
+
+    push_dataset(dataset, "user/toys", tag="v2.0")
+
+    repo = online.repos["datasets/user/toys"]
+    assert set(repo.files) == {"meta/info.json", "data/chunk-000/file-000.txt", "NOTES.md"}
+    assert set(repo.tags) == {"v3.0", "v2.0"}
+
+
+def test_a_name_that_is_taken_by_something_else_is_left_alone(dataset: Path, online: Hub):
+    online.repos["datasets/user/toys"] = Repo(files={"thesis.pdf": b"mine"})
+    online.repos["datasets/user/toys"].commit()
+
+    said = refusal(dataset)
+
+    assert "'user/toys' is taken" in said
+    assert "thesis.pdf" in said
+    assert set(online.repos["datasets/user/toys"].files) == {"thesis.pdf"}
+
+
+def test_a_full_disk_is_named_and_the_old_card_stays(tmp_path: Path, online: Hub):
+    (tmp_path / "config.json").write_text('{"type": "v2p_bc"}')
+    (tmp_path / "model.safetensors").write_bytes(b"weights")
+    # Where the card is written first, the kernel answers that no space is left.
+    (tmp_path / "README.md.tmp").symlink_to("/dev/full")
+
+    with pytest.raises(V2PError, match=r"README.md \(No space left on device\); make room"):
+        push_policy(tmp_path, "user/policy")
+    assert not (tmp_path / "README.md").exists()
+    assert online.requests == []
+
+
+@pytest.mark.parametrize("secret", ["hf_" + "aB3" * 12, TOKEN])
+def test_a_file_that_holds_a_token_is_not_sent(
+    dataset: Path, online: Hub, secret: str, capfd: pytest.CaptureFixture[str]
+):
+    (dataset / "meta/v2p_argv.json").write_text(f'["--key={secret}"]')
+
+    said = refusal(dataset)
+
+    assert "v2p_argv.json holds what looks like an access token" in said
+    assert secret not in said + "".join(capfd.readouterr())
+    assert online.requests == []
+
+
+def test_the_token_is_in_no_file_and_no_output(
+    dataset: Path,
+    tmp_path: Path,
+    online: Hub,
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+):
+    caplog.set_level(logging.DEBUG)
+    online.passing_faults = [("/create", 500), ("/commit/", CUT), ("/tag/", 429)]
+
+    push_dataset(dataset, "user/toys", waits_s=(0.0, 0.0, 0.0))
+    online.faults["/create"] = 500
+    said = refusal(dataset)
+
+    shown = said + caplog.text + "".join(capfd.readouterr())
+    assert "try 2 of 4" in caplog.text
+    assert TOKEN not in shown
+    assert not [p for p in tmp_path.rglob("*") if p.is_file() and TOKEN.encode() in p.read_bytes()]
 
 
 def test_an_unreachable_hub_is_named(dataset: Path, monkeypatch: pytest.MonkeyPatch):
@@ -131,7 +251,7 @@ def test_a_policys_card_names_its_type_and_dataset(
     online.faults["/create"] = 500
 
     with pytest.raises(V2PError):
-        push_policy(tmp_path, "user/policy")
+        push_policy(tmp_path, "user/policy", waits_s=())
 
     card = (tmp_path / "README.md").read_text()
     assert "datasets:\n- user/toys\n" in card
