@@ -1,0 +1,274 @@
+"""Kill the making of datasets at random moments and see whether anything is lost or wrong.
+
+    python scripts/bench_kills.py --kills=200            # 15 minutes on two cores
+    python scripts/bench_kills.py --kills=20 --phases collect pack
+
+Once undisturbed: a scripted expert's episodes are collected (lifting a box, six episodes and some failures), packed (several video
+files), merged with a second dataset, and pushed to a server on the loopback. Then, over and over: a phase is chosen in
+turn and started on what the undisturbed run had before it, in a child process that is sent SIGKILL at a moment drawn from
+the time the phase takes. What must hold right after the kill:
+
+- collect: every finished episode is there, byte by byte as in the undisturbed run, and every one can be read;
+- pack, merge: the dataset is absent, or it is there whole, byte by byte;
+- push: the version that loads is absent or whole, file by file.
+
+Then the phase is started once more (every third time killed once more) and in the end must have made the same bytes as
+the undisturbed run. The children are forks of one process, because imports take longer than the work.
+
+The last line, `kills_survived: K of N`, counts kills that met a child at work and after which all of this held.
+"""
+
+import hashlib
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "episodes"))
+
+import tyro
+from hub_server import TOKEN, Hub, running_hub
+
+PHASES = ("collect", "pack", "merge", "push")
+REPO = "user/killed"
+SEED = 7
+SHARD_FRAMES = 60
+"""In place of thousands, so that there are several files to be killed between."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchConfig:
+    """How often, and what."""
+
+    kills: int = 200
+    phases: tuple[str, ...] = PHASES
+    seed: int = 0
+    """Of the moments."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """One thing that can be killed."""
+
+    run: Callable[[Path], None]
+    """Works in a folder and goes on where it was stopped."""
+    needs: tuple[str, ...]
+    """Folders of the undisturbed run that it starts from."""
+    makes: str
+    """What it makes there."""
+
+
+def main() -> None:
+    """Read the command line, run, print."""
+    cfg = tyro.cli(BenchConfig, description=__doc__.split("\n")[0])
+    with running_hub() as hub, tempfile.TemporaryDirectory() as folder:
+        # Before anything of Hugging Face is imported, which reads them once.
+        os.environ |= {
+            "HF_ENDPOINT": hub.url, "HF_TOKEN": TOKEN, "HF_HOME": f"{folder}/hf",
+            "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1",
+            "HF_HUB_DISABLE_PROGRESS_BARS": "1",
+        }  # fmt: skip
+        os.environ.pop("HF_HUB_OFFLINE", None)
+        survived = run(cfg, Path(folder), hub)
+    print(f"kills_survived: {survived} of {cfg.kills}")
+
+
+def run(cfg: BenchConfig, place: Path, hub: Hub) -> int:
+    """Kill `cfg.kills` times; return after how many everything held."""
+    import numpy as np
+
+    phases = {name: phase for name, phase in all_phases().items() if name in cfg.phases}
+    perfect = place / "perfect"
+    perfect.mkdir()
+    seconds = {name: undisturbed(p, perfect) for name, p in all_phases().items()}
+    print("undisturbed [s]: " + ", ".join(f"{n} {s:.2f}" for n, s in seconds.items()), flush=True)
+    pushed = dict(hub.repos[f"datasets/{REPO}"].files)
+    rng = np.random.default_rng(cfg.seed)
+    counts: Counter[str] = Counter()
+    troubles: list[str] = []
+    trial = 0
+    while sum(counts[f"{n} killed"] for n in phases) < cfg.kills:
+        name = list(phases)[trial % len(phases)]
+        phase, work = phases[name], place / f"trial_{trial}"
+        trial += 1
+        work.mkdir()
+        for needed in phase.needs:
+            shutil.copytree(perfect / needed, work / needed)
+        if name == "push":
+            hub.repos.clear()
+            hub.blobs.clear()
+        for _ in range(2 if trial % 3 == 0 else 1):
+            if not killed(phase, work, rng.uniform(0, 1.1 * seconds[name])):
+                counts[f"{name} done before"] += 1
+                break
+            trouble = wrong_after_kill(name, phase, work, perfect, hub, pushed)
+            counts[f"{name} killed"] += 1
+            counts["survived"] += not trouble
+            troubles += [f"{name}, right after kill: {t}" for t in trouble]
+        before = len(troubles)
+        if not finished(phase, work):
+            troubles.append(f"{name}: could not be finished after a kill")
+        elif name == "push":
+            if hub.repos[f"datasets/{REPO}"].files != pushed:
+                troubles.append("push: other files than undisturbed")
+        elif digests(work / phase.makes) != digests(perfect / phase.makes):
+            changed = set(digests(work / phase.makes).items()) ^ set(
+                digests(perfect / phase.makes).items()
+            )
+            troubles.append(
+                f"{name}: other bytes than undisturbed: {sorted(n for n, _ in changed)[:6]}"
+            )
+        counts["survived"] -= len(troubles) > before
+        shutil.rmtree(work)
+        if trial % 20 == 0:
+            print(dict(sorted(counts.items())), flush=True)
+    print(dict(sorted(counts.items())))
+    for trouble in troubles:
+        print(f"TROUBLE {trouble}")
+    return counts["survived"]
+
+
+def all_phases() -> dict[str, Phase]:
+    """Return what is killed, in order. Heavy imports happen here, once, before anything is forked."""
+    import lerobot.datasets.aggregate
+    import lerobot.datasets.lerobot_dataset  # noqa: F401
+    from bench_episodes import lift
+
+    from v2p_data.episodes import shards
+    from v2p_data.episodes.collect import EpisodesConfig, collect
+    from v2p_data.episodes.edit import merge
+    from v2p_data.episodes.hub import push_dataset
+    from v2p_data.episodes.staging import staged_episodes
+    from v2p_data.episodes.writer import pack
+    from v2p_data.task.benchmark import load_benchmark
+
+    shards.SHARD_FRAMES = SHARD_FRAMES
+    bundle = load_benchmark("lift_up")
+    recipe = EpisodesConfig(num_episodes=6, batch_worlds=4, max_batches=4, size_px=64)
+
+    def sometimes(obs: Any) -> Any:
+        action = lift(obs)
+        action[obs[:, 0] > 0.3] = 0  # hands that start far out stay there: these episodes fail
+        return action
+
+    def collecting(place: Path) -> None:
+        collect(bundle, sometimes, recipe, place / "collected", SEED, num_threads=1)
+
+    def packing(place: Path) -> None:
+        if not (place / "packed").exists():
+            staged = staged_episodes(place / "collected")
+            pack(staged[:4], "user/one", place / "packed", num_threads=2)
+
+    def merging(place: Path) -> None:
+        if not (place / "other").exists():
+            staged = staged_episodes(place / "collected")
+            pack(staged[4:], "user/two", place / "other", num_threads=2)
+        if not (place / "merged").exists():
+            merge([place / "packed", place / "other"], REPO, place / "merged")
+
+    def pushing(place: Path) -> None:
+        push_dataset(place / "merged", REPO)
+
+    return {
+        "collect": Phase(run=collecting, needs=(), makes="collected"),
+        "pack": Phase(run=packing, needs=("collected",), makes="packed"),
+        "merge": Phase(run=merging, needs=("collected", "packed"), makes="merged"),
+        "push": Phase(run=pushing, needs=("merged",), makes="merged"),
+    }
+
+
+def child(phase: Phase, work: Path) -> int:
+    """Start a phase in a fork; return its process id."""
+    sys.stdout.flush()
+    pid = os.fork()
+    if pid:
+        return pid
+    with (work / "log.txt").open("ab") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    code = 1
+    try:
+        phase.run(work)
+        code = 0
+    except BaseException:  # noqa: BLE001 - the parent sees the exit code, the log the reason
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def killed(phase: Phase, work: Path, after_s: float) -> bool:
+    """Run a phase and kill it after some time; tell whether it was still at work."""
+    pid = child(phase, work)
+    time.sleep(after_s)
+    os.kill(pid, signal.SIGKILL)
+    _, status = os.waitpid(pid, 0)
+    return os.WIFSIGNALED(status)
+
+
+def finished(phase: Phase, work: Path) -> bool:
+    """Run a phase to its end; tell whether it got there."""
+    _, status = os.waitpid(child(phase, work), 0)
+    if status:
+        print((work / "log.txt").read_text()[-2000:], flush=True)
+    return status == 0
+
+
+def undisturbed(phase: Phase, perfect: Path) -> float:
+    """Make what a phase makes without disturbance; return the seconds it takes when repeated.
+
+    Raises:
+        RuntimeError: it failed.
+    """
+    started = time.perf_counter()
+    if not finished(phase, perfect):
+        raise RuntimeError("the undisturbed run failed")
+    return time.perf_counter() - started
+
+
+def wrong_after_kill(
+    name: str, phase: Phase, work: Path, perfect: Path, hub: Hub, pushed: dict[str, bytes]
+) -> list[str]:
+    """Return what is wrong with what a kill left behind."""
+    from v2p_data.episodes.staging import Episode, staged_episodes
+
+    if name == "push":
+        repo = hub.repos.get(f"datasets/{REPO}")
+        head = repo.tags.get("v3.0") if repo else None
+        whole = head is None or (repo is not None and repo.commits[head] == pushed)
+        return [] if whole else ["a version that loads is not whole"]
+    if name == "collect":
+        wrong: list[str] = []
+        for path in staged_episodes(work / phase.makes):
+            Episode.load(path)
+            twin = perfect / path.relative_to(work)
+            if not twin.is_file() or twin.read_bytes() != path.read_bytes():
+                wrong.append(f"{path.name} is not as undisturbed")
+        return wrong
+    made = work / phase.makes
+    if made.exists() and digests(made) != digests(perfect / phase.makes):
+        return [f"{phase.makes} is there and is not as undisturbed"]
+    return []
+
+
+def digests(root: Path) -> dict[str, str]:
+    """Return the digest of every file."""
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+if __name__ == "__main__":
+    main()
