@@ -1,0 +1,141 @@
+"""A pushed environment is loaded by LeRobot, by its name, with nothing of ours installed."""
+
+import ast
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import pytest
+from hub_server import TOKEN, Hub
+from toy_task import bundle
+
+from v2p_data.episodes.envhub import engine_modules, write_envhub
+from v2p_data.episodes.hub import push_envhub
+from v2p_data.errors import V2PError
+
+CODE = """
+from factory.tasks.task import Task
+
+class PushTask(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, {})
+        self.task_description = "push the cube to the left"
+
+    def compute_success(self, states):
+        return states["eef_pos"][:, 1] > 0.08
+
+    def compute_reward(self, actions, states):
+        left = states["eef_pos"][:, 1]
+        return left, {"left": left}
+"""
+LOAD = """
+import sys
+from pathlib import Path
+
+import numpy as np
+from lerobot.envs.factory import make_env
+
+try:
+    make_env("user/tasks")
+except RuntimeError as error:
+    print("untrusted:", "trust_remote_code" in str(error))
+envs = make_env("user/tasks", n_envs=2, hub_cache_dir=sys.argv[1], trust_remote_code=True)
+print("tasks:", {suite: list(tasks) for suite, tasks in envs.items()})
+env = envs["v2p"][1]
+first, info = env.reset(seed=[5, 6])
+again, _ = env.reset(seed=[5, 6])
+observation, reward, terminated, truncated, info = env.step(np.zeros((2, 7), np.float32))
+print("seen:", observation["pixels"]["mask"].shape, observation["agent_pos"].shape)
+print("repeats:", bool((first["pixels"]["mask"] == again["pixels"]["mask"]).all()))
+print("told:", env.call("task_description"), info["is_success"].tolist())
+source = Path(sys.modules["v2p_data"].__file__)
+print("from the cache:", source.is_relative_to(sys.argv[1]))
+"""
+
+
+def write_task(folder: Path, title: str) -> Path:
+    scene = folder.parent / f"{title}_scene"
+    scene.mkdir(parents=True)
+    made = bundle()
+    made.scene.save(scene)
+    replace(made, code=CODE, title=title, scene=replace(made.scene, folder=scene)).save(folder)
+    return folder
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Path:
+    for title in ("first", "second"):
+        write_task(tmp_path / "run/task" / title, title)
+    return tmp_path / "run"
+
+
+def test_the_repository_holds_all_that_lerobot_asks_for(run_folder: Path, tmp_path: Path):
+    made = write_envhub(run_folder, "user/tasks", tmp_path / "hub")
+
+    assert made.tasks == ("first", "second")
+    names = {p.name for p in made.folder.iterdir()}
+    assert names == {"README.md", "env.py", "mjcf", "requirements.txt", "tasks", "v2p_data"}
+    (function,) = [
+        node for node in ast.parse((made.folder / "env.py").read_text()).body
+        if isinstance(node, ast.FunctionDef) and node.name == "make_env"
+    ]  # fmt: skip
+    assert [a.arg for a in function.args.args] == ["n_envs", "use_async_envs", "cfg"]
+    model = mujoco.MjModel.from_xml_path(str(made.folder / "mjcf/second.xml"))
+    assert model.body("cube").id > 0
+    required = (made.folder / "requirements.txt").read_text().splitlines()
+    assert {line.split("=")[0].split(">")[0] for line in required} >= {
+        "lerobot",
+        "mujoco",
+        "torch",
+    }
+    assert f"mujoco=={mujoco.__version__}" in required
+    assert not [p for p in made.folder.rglob("*") if p.name == "__pycache__"]
+
+
+def test_the_engine_comes_without_what_running_a_task_does_not_take():
+    modules = engine_modules()
+
+    assert {"v2p_data.sim.gym_env", "v2p_data.task.sandbox"} <= set(modules)
+    assert not [m for m in modules if m.startswith(("v2p_data.episodes", "v2p_data.video"))]
+
+
+def test_nothing_is_overwritten_and_a_folder_without_tasks_is_refused(
+    run_folder: Path, tmp_path: Path
+):
+    with pytest.raises(V2PError, match="no task in"):
+        write_envhub(tmp_path / "nowhere", "user/tasks", tmp_path / "hub")
+    with pytest.raises(V2PError, match="exists already"):
+        write_envhub(run_folder, "user/tasks", run_folder)
+
+
+@pytest.mark.slow
+def test_lerobot_loads_a_pushed_environment_by_its_name(
+    run_folder: Path, tmp_path: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("HF_ENDPOINT", hub.url)
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
+    made = write_envhub(run_folder, "user/tasks", tmp_path / "hub")
+    push_envhub(made.folder, "user/tasks", tag="v1.0")
+    cache = tmp_path / "cache"
+    env = os.environ | {"HF_HOME": str(tmp_path / "hf"), "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
+    env.pop("HF_HUB_OFFLINE", None)
+
+    done = subprocess.run(
+        [sys.executable, "-c", LOAD, str(cache)],
+        cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert [line for line in done.stdout.splitlines() if ": " in line] == [
+        "untrusted: True",
+        "tasks: {'v2p': [0, 1]}",
+        "seen: (2, 256, 256, 3) (2, 7)",
+        "repeats: True",
+        "told: ('push the cube to the left', 'push the cube to the left') [False, False]",
+        "from the cache: True",
+    ]
+    assert set(hub.repos["models/user/tasks"].tags) == {"v1.0"}
+    assert TOKEN not in done.stdout + done.stderr
