@@ -32,6 +32,6 @@ def test_the_masks_benchmark_ends_with_the_ratio_and_shows_that_both_agree():
     found = re.fullmatch(r"masks_over_renderer: (\d+\.\d\d)", done.stdout.splitlines()[-1])
     assert found is not None, done.stderr
     assert float(found[1]) > 0
-    overlaps = re.findall(r"^ *(?:robot|background|object \d) +\d+ (\d\.\d+)", done.stdout, re.M)
+    overlaps = re.findall(r"^ *(?:robot|background|object \d) +\d+ +(\d\.\d+)", done.stdout, re.M)
     assert len(overlaps) == 4
     assert min(map(float, overlaps)) >= 0.99  # 64 pixels wide, a border pixel weighs more

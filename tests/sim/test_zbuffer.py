@@ -2,6 +2,8 @@
 
 # pyright: reportAttributeAccessIssue=false
 
+import multiprocessing
+
 import mujoco
 import numpy as np
 import pytest
@@ -193,6 +195,27 @@ def test_the_number_of_threads_changes_nothing():
 
     assert len(np.unique(one, axis=0)) == count
     assert (one == three).all()
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="cannot fork")
+def test_a_forked_process_draws_what_its_parent_drew():
+    model = compiled('<geom type="sphere" size="0.2" pos="0 0 -1"/>')
+    views = views_of(model, 8)
+    zbuffer = ZBuffer(model, np.array([1], np.uint8), HEIGHT, WIDTH, num_threads=2)
+    images = zbuffer.draw(views)
+    end, far_end = multiprocessing.Pipe()
+
+    def draw_again() -> None:
+        far_end.send(zbuffer.draw(views))
+
+    child = multiprocessing.get_context("fork").Process(target=draw_again)
+    child.start()
+    again = end.recv() if end.poll(60) else None
+    child.kill()
+    child.join()
+
+    assert again is not None
+    assert (again == images).all()
 
 
 def test_no_frames_are_no_images():
