@@ -11,10 +11,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from v2p_data.episodes.features import METADATA_FILE
 from v2p_data.episodes.frames import Checks, Said
+from v2p_data.episodes.reading import Rows, same
 from v2p_data.episodes.staging import Episode
 from v2p_data.episodes.tables import (
     STOPPING,
@@ -27,6 +26,7 @@ from v2p_data.episodes.tables import (
 
 Problem = Found
 SHOWN_PROBLEMS = 5
+RENUMBERED = ("index", "episode_index", "task_index")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,10 +113,8 @@ def _read(
     staged: Sequence[Path] | None,
     on_progress: Callable[[float, str], None],
 ) -> VerifyReport:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     try:
-        dataset: Any = LeRobotDataset(repo_id, root=root, return_uint8=True)
+        rows = Rows(root, repo_id)
     except Exception as error:  # noqa: BLE001 - whatever LeRobot stumbles over is the finding
         checks.said.add("does_not_open", str(root), f"{type(error).__name__}: {error}")
         return _report(root, checks, 0, 0, is_compared=False)
@@ -129,18 +127,17 @@ def _read(
     for k, length in enumerate(lengths):
         recorded = Episode.load(staged[k]) if staged is not None and k < len(staged) else None
         episode = checks.episode(k, start, length, recorded)
-        i = start
         try:
-            for i in range(start, start + length):
-                episode.look_at(dataset[i])
+            for row in rows.episode(start, length):
+                episode.look_at(row)
         except Exception as error:  # noqa: BLE001 - whatever LeRobot stumbles over is the finding
             words = str(error).strip().splitlines()[:1] or [""]
-            checks.said.add("does_not_read", f"episode {k}", f"row {i}: {type(error).__name__}: {words[0][:200]}")  # fmt: skip
+            checks.said.add("does_not_read", f"episode {k}", f"after frame {len(episode.tasks)}: {type(error).__name__}: {words[0][:200]}")  # fmt: skip
         else:
             episode.finish()
         start += length
         on_progress((k + 1) / len(lengths), f"read {k + 1} episodes")
-    checks.statistics(dataset.meta.stats or {})
+    checks.statistics(rows.dataset.meta.stats or {})
     return _report(root, checks, len(lengths), start, is_compared=staged is not None)
 
 
@@ -172,28 +169,20 @@ def frames_differ(
     Returns:
         A sentence, empty where all pixels and numbers are equal.
     """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    made: Any = LeRobotDataset("local/made", root=root, return_uint8=True)
-    columns = keys or [k for k in made.meta.features if k not in ("index", "episode_index", "task_index")]  # fmt: skip
+    made = Rows(root)
+    columns = [*(keys or (k for k in made.dataset.meta.features if k not in RENUMBERED)), "task"]
     at = 0
     for folder, numbers in sources:
-        source: Any = LeRobotDataset("local/source", root=folder, return_uint8=True)
+        source = Rows(folder)
         for number in numbers:
-            entry = source.meta.episodes[number]
-            for i in range(int(entry["dataset_from_index"]), int(entry["dataset_to_index"])):
-                if at >= len(made):
-                    return f"{root} ends at row {at}, before episode {number} of {folder}"
-                old, new = source[i], made[at]
-                wrong = [
-                    key for key in columns
-                    if not np.array_equal(np.asarray(old[key]), np.asarray(new[key]), equal_nan=True)
-                ]  # fmt: skip
-                if old["task"] != new["task"]:
-                    wrong.append("task")
+            entry = source.dataset.meta.episodes[number]
+            start, length = int(entry["dataset_from_index"]), int(entry["length"])
+            if at + length > len(made):
+                return f"{root} ends before episode {number} of {folder}"
+            pairs = zip(source.episode(start, length), made.episode(at, length), strict=True)
+            for t, (old, new) in enumerate(pairs):
+                wrong = [key for key in columns if not same(old[key], new[key])]
                 if wrong:
-                    return (
-                        f"row {at} differs from episode {number} of {folder} in {', '.join(wrong)}"
-                    )
-                at += 1
+                    return f"row {at + t} differs from frame {t} of episode {number} of {folder} in {', '.join(wrong)}"  # fmt: skip
+            at += length
     return "" if at == len(made) else f"{root} holds {len(made)} rows, {at} were to be in it"
