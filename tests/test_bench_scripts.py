@@ -35,3 +35,18 @@ def test_the_masks_benchmark_ends_with_the_ratio_and_shows_that_both_agree():
     overlaps = re.findall(r"^ *(?:robot|background|object \d) +\d+ +(\d\.\d+)", done.stdout, re.M)
     assert len(overlaps) == 4
     assert min(map(float, overlaps)) >= 0.99  # 64 pixels wide, a border pixel weighs more
+
+
+@pytest.mark.slow
+def test_the_episodes_benchmark_finds_every_pixel_equal_and_ends_with_its_ratio():
+    tiny = ["--quick", "--episodes=2", "--size-px=64"]
+    command = [sys.executable, "scripts/bench_episodes.py", *tiny]
+
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+
+    assert re.search(r"^wrong pixels in ours: 0 of [1-9]\d+$", done.stdout, re.M)
+    found = re.fullmatch(
+        r"expert_to_dataset_over_lerobot: (\d+\.\d\d)", done.stdout.splitlines()[-1]
+    )
+    assert found is not None
+    assert float(found[1]) > 0

@@ -6,18 +6,24 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hub_server import TOKEN, Hub
 
+from v2p_data.episodes import shards
 from v2p_data.episodes.card import write_card
-from v2p_data.episodes.staging import Episode
+from v2p_data.episodes.episode_stats import rgb_stats
+from v2p_data.episodes.features import features
+from v2p_data.episodes.staging import Episode, Heading
+from v2p_data.episodes.stream import encode_rgb
+from v2p_data.episodes.tables import read_json
 from v2p_data.episodes.verify import verify
 from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
-from v2p_data.sim.masks import PALETTE
+from v2p_data.sim.masks import PALETTE, labels_to_rgb
 
 pytestmark = pytest.mark.slow
 
@@ -90,6 +96,138 @@ def digests(root: Path) -> dict[str, str]:
 def test_nothing_is_left_of_the_work(packed: Path):
     assert sorted(p.name for p in packed.iterdir()) == ["data", "meta", "videos"]
     assert not packed.with_name("toys.partial").exists()
+
+
+def test_tables_and_metadata_are_what_lerobots_writer_makes(
+    packed: Path, staged: list[Path], tmp_path: Path
+):
+    import pyarrow.parquet as pq
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = tmp_path / "lerobots"
+    dataset = LeRobotDataset.create(
+        "user/toys", fps=20, features=features(64), root=root, robot_type="v2p_franka",
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=0, pix_fmt="yuv420p", g=2),
+        video_files_size_in_mb=10,
+    )  # fmt: skip
+    for episode in map(Episode.load, staged):
+        for t, picture in enumerate(labels_to_rgb(episode.labels)):
+            dataset.add_frame(
+                {
+                    "observation.images.mask": picture,
+                    "observation.state": episode.state[t],
+                    "action": episode.action[t],
+                    "next.success": episode.success[t : t + 1],
+                    "task": episode.task,
+                }
+            )
+        dataset.save_episode(parallel_encoding=False)
+    dataset.finalize()
+
+    for name in ("data/chunk-000/file-000.parquet", "meta/tasks.parquet"):
+        ours, theirs = pq.read_table(packed / name), pq.read_table(root / name)
+        assert ours.schema.equals(theirs.schema)
+        assert ours.equals(theirs)
+        (told, told_by_them) = (  # a row of LeRobot's table has a fingerprint besides
+            json.loads(t.schema.metadata.get(b"huggingface", b"{}")).get("info")
+            for t in (ours, theirs)
+        )
+        assert told == told_by_them
+    data = "data/chunk-000/file-000.parquet"
+    assert (
+        pq.ParquetFile(packed / data).num_row_groups == pq.ParquetFile(root / data).num_row_groups
+    )
+    assert read_json(packed / "meta/info.json") == read_json(root / "meta/info.json")
+    ours, theirs = (
+        pq.read_table(r / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+        for r in (packed, root)
+    )
+    assert set(ours) == set(theirs)
+    for name, values in theirs.items():
+        if name.startswith("stats/"):  # LeRobot adds up pixels in 32 bits
+            assert np.allclose(np.array(ours[name]), np.array(values), rtol=1e-4, atol=1e-6), name
+        elif "timestamp" in name:
+            assert np.allclose(ours[name], values)
+        else:
+            assert ours[name] == values, name
+
+
+@pytest.mark.parametrize("count", [3, 130])
+def test_statistics_of_pictures_are_lerobots_without_its_rounding(count: int):
+    """Of 130 frames LeRobot looks at 100; of 320 x 320 pixels at every second row and column."""
+    from lerobot.datasets.compute_stats import get_feature_stats
+
+    rng = np.random.default_rng(count)
+    size = 320 if count < 100 else 16
+    pictures = rng.integers(3, 250, (count, size, size, 3), np.uint8)
+    chosen = np.round(np.linspace(0, count - 1, min(count, 100))).astype(int)
+    seen = pictures[chosen][:, :: size // 150 or 1, :: size // 150 or 1]
+
+    ours = rgb_stats(pictures)
+    theirs = get_feature_stats(seen.transpose(0, 3, 1, 2), axis=(0, 2, 3), keepdims=True)
+
+    assert set(ours) == set(theirs)
+    assert ours["count"] == theirs["count"] == len(chosen)
+    for name in ("min", "max", "q01", "q10", "q50", "q90", "q99"):
+        assert np.allclose(ours[name] * 255, theirs[name][0], atol=1e-4), name
+    assert np.allclose(ours["mean"][:, 0, 0] * 255, seen.reshape(-1, 3).mean(0, np.float64))
+    assert np.allclose(ours["std"][:, 0, 0] * 255, seen.reshape(-1, 3).std(0, dtype=np.float64))
+
+
+def test_a_packing_goes_on_from_its_finished_shards(
+    packed: Path, staged: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(shards, "SHARD_FRAMES", 20)  # the first two episodes, then the third
+    root, folder = tmp_path / "toys", tmp_path / "toys.partial/shards"
+    planned = shards.plan_shards([Heading.read(path) for path in staged])
+    shards.make_shards(planned, folder, num_threads=1)
+    kept = (folder / "00000.mask.mp4").stat().st_ino
+    (folder / "00001.json").write_text("half")
+
+    pack(staged, "user/toys", root, num_threads=3)
+
+    first, second = sorted(root.glob("videos/*/*/*.mp4"))
+    assert first.stat().st_ino == kept
+    assert verify(root, staged).is_good
+    assert first.stat().st_size > second.stat().st_size
+
+
+def test_a_shard_of_other_episodes_is_not_taken(staged: list[Path], tmp_path: Path, make_episode):
+    folder = tmp_path / "toys.partial/shards"
+    other = make_episode(0)
+    other.labels[3] = 0
+    shards.make_shards(shards.plan_shards([Heading.read(other.save(tmp_path))]), folder)
+
+    pack(staged[:1], "user/toys", tmp_path / "toys")
+
+    assert verify(tmp_path / "toys", staged[:1]).is_good
+
+
+def test_colours_and_masks_are_two_cameras_of_one_dataset(tmp_path: Path, make_episode):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    plain = make_episode(0)
+    pictures = np.repeat((plain.labels * 60)[..., None], 3, axis=-1)
+    both = replace(plain, cameras=("mask", "rgb"), rgb_mp4=encode_rgb(pictures).mp4)
+    root = tmp_path / "toys"
+
+    pack([both.save(tmp_path)], "user/toys", root)
+
+    dataset = LeRobotDataset("user/toys", root=root)
+    for t in (0, 5, 11):
+        row = dataset[t]
+        mask = np.asarray(row["observation.images.mask"])[0] * 255
+        assert np.abs(mask - np.asarray(PALETTE)[plain.labels[t]]).max() < 1e-3
+        colour = np.asarray(row["observation.images.rgb"]).transpose(1, 2, 0) * 255
+        assert np.abs(colour - pictures[t]).mean() < 3
+
+
+def test_episodes_of_other_cameras_do_not_go_in(staged: list[Path], tmp_path: Path, make_episode):
+    odd = replace(make_episode(7), cameras=("rgb",), rgb_mp4=b"video").save(tmp_path)
+
+    with pytest.raises(V2PError, match="collect all episodes with one"):
+        pack([*staged, odd], "user/toys", tmp_path / "toys")
 
 
 def test_an_existing_dataset_is_left_alone(packed: Path, staged: list[Path]):
