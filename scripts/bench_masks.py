@@ -143,7 +143,8 @@ def show_speed(seconds: dict[str, list[float]], busy: dict[str, list[float]]) ->
         )
     for cores in ("all cores", "one core"):
         ratio = _ratio(seconds[f"renderer, {cores}"], seconds[f"ours, {cores}"])
-        print(f"ours over renderer, {cores}: {ratio:.2f}")
+        spent = _ratio(busy[f"renderer, {cores}"], busy[f"ours, {cores}"])
+        print(f"ours over renderer, {cores}: {ratio:.2f}; by CPU time {spent:.2f}")
     if "renderer, 4 samples, all cores" in seconds:
         ratio = _ratio(seconds["renderer, 4 samples, all cores"], seconds["ours, all cores"])
         print(f"ours over renderer with 4 samples, all cores: {ratio:.2f}")
