@@ -11,7 +11,7 @@ ways to store masks, or with LeRobot's default codec (without `--quick`). Each i
 LeRobot's way its one process and what threads its parts start. Imports, compilation and the making of windows come before the clock.
 
 Then both datasets are read with LeRobot: every pixel of ours against what was drawn, and random rows with two frames of
-pictures and states, in turns. The scaling packs synthetic episodes (discs and squares, 256 x 256, 40 frames), each size in a
+pictures and states, in turns. The scaling packs synthetic episodes (discs and squares, 256 x 256, 30 frames), each size in a
 process of its own, because physics is not the question there; shown are milliseconds per frame and the largest memory.
 
 The last line, `expert_to_dataset_over_lerobot: X`, is our frames per second over LeRobot's.
@@ -68,7 +68,7 @@ from v2p_data.task.task import TaskBundle
 SEED = 5
 LIFT_M = 0.15
 READS = 60
-SYNTHETIC_FRAMES, SYNTHETIC_PX = 40, 256
+SYNTHETIC_FRAMES, SYNTHETIC_PX = 30, 256
 SIZES = ((10, 1), (100, 1), (1000, 1), (100, 10), (100, 100))
 """Episodes and tasks of `--scaling`."""
 

@@ -84,7 +84,7 @@ def make_shards(
     missing = [s for s in shards if stats_of(s, folder) is None]
     total = sum(len(s.episodes) for s in shards)
     done = total - sum(len(s.episodes) for s in missing)
-    workers = num_threads or len(os.sched_getaffinity(0))
+    workers = num_threads or _cores()
     with ThreadPoolExecutor(workers) as pool:
         jobs = (e for s in missing for e in s.episodes)
         encoded = _in_order(pool, _encode, jobs, ahead=2 * workers)
@@ -142,6 +142,12 @@ def _encode(heading: Heading) -> _Encoded:
     except ValueError as error:
         raise V2PError(f"{heading.path} cannot be packed: {error}") from error
     return _Encoded(videos=videos, stats=stats)
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):  # Linux: those that this process may use
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _in_order(
