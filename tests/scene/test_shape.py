@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import lathe
+from v2p_data.geometry.pillow import pillow
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.pose import camera_above
@@ -271,3 +272,14 @@ def test_a_mask_of_a_few_pixels_leaves_the_primitive(form):
 
     assert choice.mesh.is_watertight
     assert 0 <= choice.confidence <= 1
+
+
+def test_an_outline_with_a_line_one_pixel_wide_still_becomes_a_closed_mesh():
+    outline = np.zeros((60, 60), np.uint8)
+    cv2.circle(outline, (30, 30), 9, 1, -1)
+    cv2.line(outline, (30, 30), (56, 20), 1, 1)
+
+    mesh, parts = pillow(outline > 0, np.full(outline.shape, 0.01), 0.002)
+
+    assert mesh.is_watertight
+    assert all(part.is_watertight for part in parts)

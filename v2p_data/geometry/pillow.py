@@ -163,11 +163,9 @@ def _cut(piece: Bool[np.ndarray, "h w"], least: float) -> list[Bool[np.ndarray, 
         piece.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
     contour = max(contours, key=len)
-    hull = cv2.convexHull(contour, returnPoints=False)
-    defects = cv2.convexityDefects(contour, hull) if len(hull) > 3 else None
-    if defects is None:
+    deepest = _deepest(contour)
+    if not len(deepest):
         return None
-    deepest = defects[np.argsort(-defects[:, 0, 3])[:2], 0, 2]
     y, x = np.nonzero(piece)
     points = np.c_[x, y].astype(np.float32)
     best: tuple[float, np.ndarray] | None = None
@@ -187,6 +185,27 @@ def _cut(piece: Bool[np.ndarray, "h w"], least: float) -> list[Bool[np.ndarray, 
         half[y[side], x[side]] = True
         halves.append(half)
     return halves
+
+
+def _deepest(contour: Int[np.ndarray, "n 1 2"]) -> Int[np.ndarray, "k"]:
+    """Return which points of the contour lie deepest inside its hull: at most two, of different dents."""
+    hull = cv2.convexHull(contour, returnPoints=False)
+    if len(hull) <= 3:
+        return np.zeros(0, int)
+    try:
+        dents = cv2.convexityDefects(contour, hull)
+    except (
+        cv2.error
+    ):  # a contour that goes back over its own pixels, as along a line one pixel wide
+        corners = contour[hull[:, 0]]
+        inside = [
+            cv2.pointPolygonTest(corners, (float(x), float(y)), measureDist=True)
+            for x, y in contour[:, 0]
+        ]
+        return np.array([int(np.argmax(inside))])
+    if dents is None:
+        return np.zeros(0, int)
+    return dents[np.argsort(-dents[:, 0, 3])[:2], 0, 2]
 
 
 def _hull_area(piece: Bool[np.ndarray, "h w"]) -> float:

@@ -23,6 +23,8 @@ from v2p_data.scene.classes import CLASSES, LONG_SIDE_PX
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 _STEP = 16
 _WIDTHS = (24, 48, 80, 128)
+_QUESTIONS = 4
+"""Learned queries that gather from all places what tells of the camera: how large the hand is and where, say."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +71,9 @@ class SceneNetwork(nn.Module):
         self.dec2 = _pair(b + c, b)
         self.dec1 = _pair(a + b, a)
         self.head = nn.Sequential(nn.Conv2d(a, len(CLASSES) * 4, 3, padding=1), nn.PixelShuffle(2))
-        self.camera = nn.Sequential(nn.Linear(d + 1, 64), nn.ReLU(), nn.Linear(64, 6))
+        self.ask = nn.Parameter(0.02 * torch.randn(1, _QUESTIONS, d))
+        self.answer = nn.MultiheadAttention(d, 4, batch_first=True)
+        self.camera = nn.Sequential(nn.Linear(_QUESTIONS * d + 1, 64), nn.ReLU(), nn.Linear(64, 6))
 
     def forward(
         self, x: Float[torch.Tensor, "n 15 h w"]
@@ -85,8 +89,14 @@ class SceneNetwork(nn.Module):
         up = self.dec3(torch.cat([x3, _twice(x4)], 1))
         up = self.dec2(torch.cat([x2, _twice(up)], 1))
         up = self.dec1(torch.cat([x1, _twice(up)], 1))
-        aspect = torch.full((n, 1), float(np.log(w / h)), device=x.device, dtype=tokens.dtype)
-        return self.head(up), self.camera(torch.cat([tokens.mean(1), aspect], 1))
+        with torch.autocast(
+            x.device.type, enabled=False
+        ):  # half precision is too coarse for angles
+            tokens = tokens.float()
+            gathered = self.answer(self.ask.expand(n, -1, -1), tokens, tokens)[0].flatten(1)
+            aspect = torch.full((n, 1), float(np.log(w / h)), device=x.device)
+            camera = self.camera(torch.cat([gathered, aspect], 1))
+        return self.head(up), camera
 
 
 def inputs_of(
