@@ -4,14 +4,18 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from v2p_data.cli import run
+from v2p_data.episodes.staging import Episode
+from v2p_data.episodes.stream import encode_rgb
 from v2p_data.episodes.tables import read_info
 from v2p_data.episodes.verify import verify
+from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 
@@ -175,6 +179,21 @@ def test_a_damaged_video_of_ours_shows_greys_that_are_no_label(packed: Path, tmp
     found = {problem.check for problem in verify(root).problems}
 
     assert found & {"palette", "does_not_read"}
+
+
+def test_pictures_of_ours_are_compared_with_what_was_staged(make_episode, tmp_path: Path):
+    def with_pictures(number: int, brightness: int) -> Episode:
+        plain = make_episode(number)
+        pictures = (plain.labels[..., None] * np.array([60, 40, 70]) + brightness).astype(np.uint8)
+        return replace(plain, cameras=("mask", "rgb"), rgb_mp4=encode_rgb(pictures).mp4)
+
+    paths = [with_pictures(number, 10).save(tmp_path / "staged") for number in range(2)]
+    pack(paths, "user/toys", tmp_path / "toys")
+    other = with_pictures(1, 40).save(tmp_path / "other")
+
+    assert verify(tmp_path / "toys", paths).is_good
+    (problem,) = verify(tmp_path / "toys", [paths[0], other]).problems
+    assert problem.detail == "12 pictures differ from what was drawn"
 
 
 def test_the_exit_code_tells_good_from_bad_from_unreadable(

@@ -15,10 +15,12 @@ from v2p_data.episodes.features import (
     ACTION_NAMES,
     MASK_KEY,
     METADATA_FILE,
+    RGB_KEY,
     STATE_KEY,
     SUCCESS_KEY,
 )
 from v2p_data.episodes.staging import Episode
+from v2p_data.episodes.stream import decode_rgb
 from v2p_data.episodes.tables import BOOKKEEPING, STATS_FILE, Found
 from v2p_data.sim.masks import PALETTE, rgb_to_labels
 
@@ -30,6 +32,8 @@ FROZEN_SHARE, FROZEN_FRAMES = 0.5, 10
 """A picture that stands still for this share of an episode, and this many frames at least ..."""
 FROZEN_MOTION = 0.25
 """... while some state entry runs through this share of its range in the episode is frozen."""
+DECODERS_DIFFER = 6
+"""Of 255: LeRobot's decoders round colours differently; of greys they do not."""
 LONGEST_NOTES = 20
 IS_GREY = np.isin(np.arange(256), PALETTE)
 
@@ -148,6 +152,10 @@ class EpisodeCheck:
         self.recorded = recorded
         self.comparable = recorded is not None and recorded.num_frames == length
         self.wrong_pixels = 0
+        self.wrong_pictures = 0
+        self.pictures: np.ndarray | None = None
+        if self.comparable and recorded is not None and recorded.rgb_mp4:
+            self.pictures = decode_rgb(recorded.rgb_mp4)
         self.rows: dict[str, list[np.ndarray]] = {k: [] for k in (*checks.numbers, *BOOKKEEPING)}
         self.tasks: list[str] = []
         self.cameras = {key: _Camera(hashed=not checks.floats) for key in checks.cameras}
@@ -160,12 +168,16 @@ class EpisodeCheck:
         for key, camera in self.cameras.items():
             picture = np.asarray(row[key])
             camera.look_at(picture)
-            if key != MASK_KEY or not self.checks.has_masks:
-                continue
-            camera.strange |= not bool(IS_GREY[picture].all())
-            if self.comparable and self.recorded is not None:
-                labels = rgb_to_labels(np.ascontiguousarray(picture.transpose(1, 2, 0)))
-                self.wrong_pixels += int((labels != self.recorded.labels[camera.frames - 1]).sum())
+            if key == MASK_KEY and self.checks.has_masks:
+                camera.strange |= not bool(IS_GREY[picture].all())
+                if self.comparable and self.recorded is not None:
+                    labels = rgb_to_labels(np.ascontiguousarray(picture.transpose(1, 2, 0)))
+                    drawn = self.recorded.labels[camera.frames - 1]
+                    self.wrong_pixels += int((labels != drawn).sum())
+            elif key == RGB_KEY and self.pictures is not None:
+                shown = picture.transpose(1, 2, 0).astype(np.int16)
+                off = np.abs(shown - self.pictures[camera.frames - 1]).max()
+                self.wrong_pictures += bool(off > DECODERS_DIFFER)
 
     def finish(self) -> None:
         """Judge the episode."""
@@ -242,6 +254,8 @@ class EpisodeCheck:
             return
         if self.wrong_pixels:
             add("differs", where, f"{self.wrong_pixels} mask pixels differ from what was drawn")
+        if self.wrong_pictures:
+            add("differs", where, f"{self.wrong_pictures} pictures differ from what was drawn")
         recorded = {
             STATE_KEY: episode.state,
             ACTION_KEY: episode.action,
