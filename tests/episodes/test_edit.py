@@ -15,6 +15,7 @@ from v2p_data.episodes.staging import Episode
 from v2p_data.episodes.verify import verify
 from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
+from v2p_data.seeds import rng_for
 from v2p_data.sim.masks import PALETTE
 
 pytestmark = pytest.mark.slow
@@ -212,3 +213,92 @@ def test_a_write_that_the_system_refuses_leaves_nothing_behind(
         drop(merged, [LIFT], tmp_path / "out")
 
     assert list(tmp_path.iterdir()) == []
+
+
+CAMERA = "observation.images.cam"
+
+
+def record(root: Path, seed: int, **encoder: object) -> Path:
+    """Let LeRobot write four episodes of two tasks in colour."""
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset.create(
+        "somebody/else",
+        fps=10,
+        root=root,
+        features={
+            CAMERA: {"dtype": "video", "shape": (48, 64, 3), "names": ["height", "width", "channels"]},
+            "action": {"dtype": "float32", "shape": (2,), "names": ["a", "b"]},
+        },
+        rgb_encoder=RGBEncoderConfig(**encoder),
+    )  # fmt: skip
+    rng = rng_for(seed, "foreign")
+    slope = np.linspace(0, 255, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
+    for episode in range(4):
+        for t in range(7):
+            dataset.add_frame(
+                {
+                    CAMERA: np.roll(slope, 7 * t + 11 * episode + seed, axis=1),
+                    "action": rng.normal(size=2).astype(np.float32),
+                    "task": f"task {episode % 2}",
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def pictures(root: Path) -> np.ndarray:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("somebody/else", root=root, return_uint8=True)
+    return np.stack([np.asarray(dataset[i][CAMERA]) for i in range(len(dataset))])
+
+
+def test_datasets_of_unlike_encoders_keep_files_of_their_own(tmp_path: Path):
+    """LeRobot would put their packets into one file, of which a decoder reads the first part only."""
+    coarse = record(tmp_path / "coarse", 1, vcodec="h264", crf=30)
+    fine = record(tmp_path / "fine", 2, vcodec="h264", crf=0)
+
+    out = merge([coarse, fine], "user/both", tmp_path / "both").root
+
+    assert np.array_equal(pictures(out), np.concatenate([pictures(coarse), pictures(fine)]))
+    assert len(list(out.glob("videos/*/*/*.mp4"))) == 2
+    assert verify(out).is_good
+
+
+def test_dropping_from_lossy_video_alters_no_pixel(tmp_path: Path):
+    root = record(tmp_path / "lossy", 3)
+    before = pictures(root)
+
+    out = drop(root, ["task 1"], tmp_path / "out", "user/out").root
+
+    assert np.array_equal(pictures(out), before.reshape(4, 7, *before.shape[1:])[::2].reshape(14, *before.shape[1:]))  # fmt: skip
+    assert verify(out).is_good
+
+
+def test_a_video_that_cannot_be_cut_is_kept_whole_and_that_is_said(tmp_path: Path):
+    root = record(tmp_path / "long", 4, vcodec="h264", crf=0)
+    as_one_stream(root / f"videos/{CAMERA}/chunk-000/file-000.mp4")
+    before = pictures(root)
+
+    edited = drop(root, ["task 1"], tmp_path / "out", "user/out")
+
+    assert np.array_equal(pictures(edited.root), before[[*range(7), *range(14, 21)]])
+    assert "cannot be cut apart without encoding them anew" in edited.notes[0]
+    assert verify(edited.root).is_good
+
+
+def as_one_stream(path: Path) -> None:
+    """Encode the video anew with its first frame as the only key frame."""
+    import av
+
+    with av.open(str(path)) as video:
+        frames = [frame.to_ndarray(format="yuv420p") for frame in video.decode(video=0)]
+    with av.open(str(path), "w") as made:
+        stream = made.add_stream("h264", rate=10, options={"crf": "0", "g": "250", "sc_threshold": "0"})  # fmt: skip
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for frame in frames:
+            made.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="yuv420p")))
+        made.mux(stream.encode())
