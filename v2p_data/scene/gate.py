@@ -3,7 +3,6 @@
 A scene's confidence is the product of its cues; each cue belongs to one stage, whose confidence is the product of its own.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +16,6 @@ from v2p_data.scene.scale import disagreement, height_plausibility
 from v2p_data.scene.segment import grow
 from v2p_data.scene.sight import Sights, stands_on
 
-_NEAR_M = 0.05
-"""About half a household object: a robot that goes so far beside it grasps air."""
 _COLOURED = 0.25
 """Share of a thing's pixels that need its colour: few things are one colour all over."""
 _NEARING_KINDS = ("push_next_to", "slide_to", "drop_in_front_of")
@@ -65,7 +62,6 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
         add("pose", f"{which} seen at the end", max(0.1, 0.5 + seen))
     thing = sights.objects[0]
     add("camera", "camera height", height_plausibility(placement.height_m))
-    add("camera", "scale: that no place is off by 5 cm", _places_right(placement))
     if not stands_on(sights.table, thing.first):
         add("grounding", "standing on the table at first", 0.6)
     if not (thing.noun.known or thing.known_m):
@@ -76,18 +72,6 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
     if kind == "generic":
         add("grounding", "understanding the caption", 0.85)
     return tuple(cues)
-
-
-def _places_right(placement: Placement) -> float:
-    """Return the probability that all places are within `_NEAR_M`, as far as scale decides.
-
-    An error of scale moves every place away from the first one of the manipulated object, the farther the more.
-    """
-    origin = placement.objects[0].first.T_world_obj[:2, 3]
-    ends = [placed.T_world_objs[i, :2, 3] for placed in placement.objects for i in (0, -1)]
-    reach_m = placement.height_m * max(float(np.linalg.norm(end - origin)) for end in ends)
-    off_m = placement.scale_spread * reach_m
-    return math.erf(_NEAR_M / (math.sqrt(2) * off_m)) if off_m > 0 else 1.0
 
 
 def by_stage(cues: tuple[Cue, ...]) -> dict[str, tuple[float, str]]:
