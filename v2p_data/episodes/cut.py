@@ -28,6 +28,7 @@ from v2p_data.episodes.tables import (
     data_path,
     episodes_of,
     read_info,
+    row_spans,
     tasks_of,
     video_path,
 )
@@ -135,13 +136,13 @@ def _write_data(
     rows: list[np.ndarray] = [np.zeros(0, int)] * len(episodes)
     for chunk, file in dict.fromkeys(files):
         table = pq.read_table(root / data_path(info, int(chunk), int(file)))
-        of_row = column(table, "episode_index")
+        spans = row_spans(column(table, "episode_index"))
         path = out / DATA_PATH.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         # A row group per episode, as LeRobot writes it, so that one is read without the others.
         with pq.ParquetWriter(path, table.schema) as writer:
             for k in [k for k, where in enumerate(files) if where == (chunk, file)]:
-                part = table.filter(pa.array(of_row == old[k]))
+                part = table.slice(*spans[int(old[k])])
                 tasks = np.array([numbers[int(t)] for t in column(part, "task_index")])
                 rows[k] = tasks
                 new = {

@@ -32,6 +32,7 @@ from v2p_data.episodes.tables import (
     layout_problems,
     read_info,
     read_json,
+    row_spans,
 )
 from v2p_data.episodes.verify import frames_differ
 from v2p_data.episodes.writer import check_repo_id
@@ -169,13 +170,11 @@ def _digests(root: Path, info: dict[str, Any], count: int) -> list[str]:
     found = [hashlib.sha256() for _ in range(count)]
     for path in sorted(root.glob(DATA_GLOB)) if keys else []:
         table = pq.read_table(path, columns=[*keys, "episode_index"])
-        of_row = column(table, "episode_index")
-        for number in np.unique(of_row):
-            part = table.filter(of_row == number)
-            for key in keys:
-                found[number].update(
-                    np.asarray(part.column(key).to_pylist(), np.float64).tobytes()
-                )
+        spans = row_spans(column(table, "episode_index"))
+        for key in keys:
+            values = np.asarray(table.column(key).to_pylist(), np.float64)
+            for number, (first, count) in spans.items():
+                found[number].update(values[first : first + count].tobytes())
     return [d.hexdigest() if keys else "" for d in found]
 
 

@@ -191,6 +191,12 @@ def column(table: pa.Table, name: str) -> np.ndarray:
     return table.column(name).to_numpy()
 
 
+def row_spans(of_row: np.ndarray) -> dict[int, tuple[int, int]]:
+    """Return per episode the first row and the number of rows, which lie together, of a file's `episode_index`."""
+    numbers, first, count = np.unique(of_row, return_index=True, return_counts=True)
+    return {int(k): (int(a), int(n)) for k, a, n in zip(numbers, first, count, strict=True)}
+
+
 def _counts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
     lengths = column(episodes, "length")
     said = int(info["total_episodes"]), int(info["total_frames"])
