@@ -107,6 +107,7 @@ def test_faults_are_what_the_parameters_say(plain: list[Episode], tmp_path: Path
         assert (apply_faults(clean.labels, faults) == faulty.labels).all()
 
 
+@pytest.mark.slow  # video means LeRobot's import
 def test_pictures_in_colour_come_beside_exact_masks(plain: list[Episode], tmp_path: Path):
     needs_opengl()
     look = LookConfig(light=0.3, colour=0.3, texture=1.0)
