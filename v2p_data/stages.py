@@ -439,6 +439,7 @@ def make_dataset(
             "items": {item: _history(folder, runtime.root) for item, folder in inputs.items()},
             **provenance(),
         },
+        num_threads=runtime.num_threads,
         on_progress=lambda share, words: runtime.progress(0.7 * share, words),
     )
     for item, stage in tasks.items():

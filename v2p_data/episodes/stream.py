@@ -119,7 +119,9 @@ def _av() -> Any:
     # LeRobot's module is this room's door to video; it takes seconds to import.
     from lerobot.datasets.video_utils import av
 
-    av.logging.set_libav_level(av.logging.ERROR)  # LeRobot resets it, and x264 tells its whole life
+    av.logging.set_libav_level(
+        av.logging.ERROR
+    )  # LeRobot resets it, and x264 tells its whole life
     return av
 
 
