@@ -194,10 +194,9 @@ def _deepest(contour: Int[np.ndarray, "n 1 2"]) -> Int[np.ndarray, "k"]:
         return np.zeros(0, int)
     try:
         dents = cv2.convexityDefects(contour, hull)
-    except (
-        cv2.error
-    ):  # a contour that goes back over its own pixels, as along a line one pixel wide
-        corners = contour[hull[:, 0]]
+    except cv2.error:
+        # The contour goes back over its own pixels, as along a line one pixel wide.
+        corners = contour[hull[:, 0].astype(int)]
         inside = [
             cv2.pointPolygonTest(corners, (float(x), float(y)), measureDist=True)
             for x, y in contour[:, 0]
