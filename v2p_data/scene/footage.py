@@ -154,15 +154,18 @@ def camera_shift_px(footage: Footage, passed: Bool[np.ndarray, "h w"] | None = N
 
     Two measures look at it and the smaller one counts, since a camera that moves shows in both: corners fail where
     most of them lie on what is moved, tiles where the picture is plain. `passed` is where things moved in front of the
-    camera, as far as that is known: it says nothing of the camera.
+    camera, as far as that is known: both measures look at the rest of the picture as well, which may be too little.
     """
-    if passed is None:
-        passed = np.zeros(footage.shape, bool)
     grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in footage.rgb]
     pick = np.unique(np.linspace(0, len(grey) - 1, 9).astype(int))
     chosen = [grey[i] for i in pick]
-    measured = _corner_shift(chosen, ~passed), _tile_shift(chosen, ~passed)
-    shifts = [shift for shift in measured if shift is not None]
+    everywhere = np.ones(footage.shape, bool)
+    shifts = [
+        shift
+        for there in ([everywhere] if passed is None else [everywhere, ~passed])
+        for shift in (_corner_shift(chosen, there), _tile_shift(chosen, there))
+        if shift is not None
+    ]
     return min(shifts) if shifts else 0.0
 
 
