@@ -5,6 +5,7 @@ Only light modules are imported here, so that `v2p --help` answers at once; each
 
 import contextlib
 import io
+import logging
 import os
 import re
 import sys
@@ -46,6 +47,8 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
 
 def main() -> None:
     """Run the command line; bad input ends with one sentence and exit code 2."""
+    # Ninety lines on FFmpeg versions that say what setup says in one.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     # The Ctrl-C of a pipe's reader (`v2p status | head`) is no error of ours.
     try:
         sys.exit(run(sys.argv[1:]))
