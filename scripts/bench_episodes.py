@@ -26,7 +26,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +116,7 @@ def main() -> None:
     elif cfg.scaling:
         scaling(cfg)
     else:
-        compare(cfg)
+        compare(replace(cfg, episodes=cfg.episodes or (6 if cfg.quick else 24)))
 
 
 def compare(cfg: BenchConfig) -> None:
