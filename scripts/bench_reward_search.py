@@ -62,6 +62,8 @@ class Settings:
     """`nothing` or `taught`, see `RewardConfig.start`."""
     taught_rounds: int | None = None
     confirm_seeds: int | None = None
+    target_success: float | None = None
+    """Above 1, no round ends early: all rounds take place."""
     seed: int = 0
     workers: int = 1
     episodes: int = 128
@@ -82,6 +84,7 @@ def main() -> None:
             "start",
             "taught_rounds",
             "confirm_seeds",
+            "target_success",
         )
         if (value := getattr(settings, name)) is not None
     }
