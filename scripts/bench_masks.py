@@ -44,7 +44,7 @@ from v2p_data.sim.masks import BACKGROUND, GL_HINT, MaskRenderer, geom_labels
 from v2p_data.sim.world import CAMERA, World
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 
 STATES = 20
 """Of each scene."""

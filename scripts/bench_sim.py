@@ -44,7 +44,7 @@ from v2p_data.seeds import rng_for, torch_rng_for
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.sim.torchrl_env import TorchRLEnv
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 
 PEERS = ("gym-hil", "robosuite")
 PEER_SCRIPT = Path(__file__).parent / "peer_steps.py"

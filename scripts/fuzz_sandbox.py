@@ -33,7 +33,7 @@ from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.confine import leave_the_network
 from v2p_data.task.sandbox import CODE_NAME, TaskCodeError, check_code
 from v2p_data.task.smoke import trial_request
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 
 ROOT = Path(__file__).parents[1]
 LIBRARIES = tuple(

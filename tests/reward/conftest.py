@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 
 TASK_TESTS = Path(__file__).parents[1] / "task"
 _scenes = runpy.run_path(str(TASK_TESTS / "conftest.py"))

@@ -13,7 +13,7 @@ from v2p_data.reward.trajectories import HELD_STEPS
 from v2p_data.sim import batch_env
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 
 
 def two_episodes(**changes):

@@ -7,7 +7,7 @@ from v2p_data.reward.prescreen import PrescreenConfig, prescreen, stored_moments
 from v2p_data.reward.redesign import transplanted
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.task.probes import at_rest
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 
 EPISODES = 20
 HEIGHT = 'h = states["box_pos"][:, 2] - states["box_start_pos"][:, 2]'

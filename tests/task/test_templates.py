@@ -3,7 +3,9 @@ import pytest
 from v2p_data.task.sandbox import check_code, class_name
 from v2p_data.task.smoke import smoke_run_all
 from v2p_data.task.task import BASE_OBSERVATION_DIM
-from v2p_data.task.templates import NUM_VARIANTS, Measured, write_samples
+from v2p_data.task.templates.draft import Measured
+from v2p_data.task.templates.variants import NUM_VARIANTS
+from v2p_data.task.templates.write import write_samples
 
 SIX_PARTS = (
     "scene_info = {",

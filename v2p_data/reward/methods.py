@@ -22,7 +22,8 @@ from v2p_data.scene.scene import SCENE_FILE, Scene, SceneObject
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.splice import REWARD, reward_part, with_reward
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates import NUM_VARIANTS, write_samples
+from v2p_data.task.templates.variants import NUM_VARIANTS
+from v2p_data.task.templates.write import write_samples
 
 UNSEEN_SIZE_M = (0.06, 0.06, 0.06)
 """What a writer supposes who has seen nothing."""

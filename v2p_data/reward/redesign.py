@@ -14,7 +14,9 @@ import numpy as np
 from v2p_data.reward.reward_code import FUNCTION, UnreadableError, number
 from v2p_data.reward.soften import conditions, softened
 from v2p_data.scene.scene import Scene
-from v2p_data.task.templates import VARIANTS, write_task
+from v2p_data.task.templates.reward_text import paid_lines
+from v2p_data.task.templates.variants import VARIANTS
+from v2p_data.task.templates.write import write_task
 
 GRASPED_KINDS = {
     "lift_up",
@@ -295,12 +297,7 @@ def _function_text(lines: list[str], parts: list[tuple[str, str]]) -> str:
         *[f"{i}. {name}" for i, (name, _) in enumerate(parts, 1)],
         '"""',
         *[row for line in lines for row in line.splitlines()],
-        "reward_components = {}",
-        *[f'reward_components["{name}"] = {text}' for name, text in parts],
-        "total = 100.0 * ("
-        + " + ".join(f'reward_components["{name}"]' for name, _ in parts)
-        + ")",
-        "return total, reward_components",
+        *paid_lines(parts),
     ]
     head = f"@torch.jit.script\ndef {FUNCTION}(actions, states):\n"
     return head + "".join(f"    {row}\n" for row in body)

@@ -17,7 +17,7 @@ from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.generate import HORIZON_STEPS, MOTION_SCALE, TaskConfig
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 
 FOLDER = Path(__file__).parents[2] / "configs" / "benchmark"
 FPS = 20.0

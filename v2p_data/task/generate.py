@@ -19,7 +19,7 @@ from v2p_data.task.calls import Call
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 from v2p_data.task.vlm_config import VlmConfig
 
 AUDIT_FILE = "audit.json"

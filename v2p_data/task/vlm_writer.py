@@ -28,7 +28,7 @@ from v2p_data.task.prompts import (
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
 from v2p_data.task.splice import SpliceError, reward_part, with_reward
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates import VARIANTS
+from v2p_data.task.templates.variants import VARIANTS
 from v2p_data.task.vlm import FaultyAnswerError, VlmClient
 
 logger = logging.getLogger(__name__)

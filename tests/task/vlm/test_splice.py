@@ -12,7 +12,7 @@ from v2p_data.task.probes import random_states
 from v2p_data.task.sandbox import check_code, load_task
 from v2p_data.task.smoke_child import FakePlacer
 from v2p_data.task.splice import SpliceError, reward_part, with_reward
-from v2p_data.task.templates import write_samples
+from v2p_data.task.templates.write import write_samples
 
 PARENT = '''
 import torch

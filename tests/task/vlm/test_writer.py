@@ -12,7 +12,7 @@ from v2p_data.task.pool import examples_for
 from v2p_data.task.smoke import SmokeResult
 from v2p_data.task.splice import rest_part, reward_part
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates import write_samples as write_by_template
+from v2p_data.task.templates.write import write_samples as write_by_template
 from v2p_data.task.vlm import BudgetError, VlmClient
 from v2p_data.task.vlm_writer import first_rewards, improve_reward, pick_sample, write_samples
 

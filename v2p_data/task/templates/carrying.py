@@ -1,0 +1,245 @@
+"""Recipes for what is grasped: lifted, carried somewhere and let go, taken off something."""
+
+import numpy as np
+
+from v2p_data.task.templates.draft import Draft, Measured
+from v2p_data.task.templates.phrases import (
+    GRASP_SETUP,
+    HEIGHT,
+    LEAVE_REF,
+    REF_MOVED,
+    REF_STILL,
+    STILL_UPRIGHT,
+    is_still,
+    shifted,
+)
+from v2p_data.task.templates.variants import Variant
+
+
+def lift(m: Measured, v: Variant) -> Draft:
+    height = round(float(np.clip(0.7 * m.lift_m, 0.08, 0.12)) * v.strictness, 3)
+    return Draft(
+        thoughts=[
+            "Reach the object.",
+            "Close the gripper around it.",
+            "Raise it and hold it still.",
+        ],
+        setup=[HEIGHT],
+        success=[
+            ("is_high", f"height > {height}"),
+            (
+                "is_held",
+                "(obj_grasped > 0.5) & (torch.norm(obj_pos - eef_pos, dim=-1) < reach_limit)",
+            ),
+            is_still(v),
+        ],
+        reward_setup=GRASP_SETUP,
+        target="grasp_point",
+        contact="obj_grasped * near",
+        pays_contact=True,
+        progress=f"(height / {max(height + 0.02, 0.12):.3f}).clamp(0.0, 1.0) * contact",
+        remaining=f"({height} - height).clamp(min=0.0)",
+        goal=shifted("obj_start", z=height + 0.03),
+        direction=shifted("torch.zeros_like(obj_pos)", z=1.0),
+        extras=[
+            ("not_too_high", "-2.0 * (height - 0.2).clamp(0.0, 0.3) * near"),
+            # Without it, a lifted object is carried off to the side until the arm leaves the picture. It counts in
+            # the gripper only: a fine for knocking the object away teaches to keep off.
+            (
+                "stay_above",
+                "-1.0 * (torch.norm((obj_pos - obj_start)[:, :2], dim=-1) - 0.04).clamp(0.0, 0.3) * contact",
+            ),
+        ],
+    )
+
+
+def insert(_: Measured, v: Variant) -> Draft:
+    depth = round(0.5 / v.strictness, 3)
+    return _carry(
+        v,
+        thoughts=[
+            "Grasp the object.",
+            "Carry it over the container.",
+            "Open the gripper so that it falls in.",
+        ],
+        goal=[
+            "goal_point = ref_pos.clone()",
+            "rim = ref_pos[:, 2] + ref_size[:, 2] / 2",
+            "inner = torch.minimum(ref_size[:, 0], ref_size[:, 1]) / 2",
+        ],
+        arrived="to_goal < 0.7 * inner",
+        conditions=[
+            ("is_inside", f"(to_goal < inner) & (obj_pos[:, 2] < rim + {depth} * half_height)"),
+            ("is_not_below", "lowest_point(obj_pos, obj_quat, obj_size) > -0.01"),
+        ],
+    )
+
+
+def place_onto(_: Measured, v: Variant) -> Draft:
+    return _carry(
+        v,
+        thoughts=["Grasp the object.", "Carry it over the other one.", "Set it down and let go."],
+        goal=[
+            "goal_point = ref_pos.clone()",
+            "goal_point[:, 2] = ref_pos[:, 2] + ref_size[:, 2] / 2 + half_height",
+            "inner = torch.minimum(ref_size[:, 0], ref_size[:, 1]) / 2",
+        ],
+        arrived="to_goal < (0.6 * inner).clamp(min=0.02)",
+        conditions=[
+            (
+                "is_on_top",
+                f"(to_goal < inner.clamp(min=0.02)) & (above_goal.abs() < {0.025 / v.strictness:.3f})",
+            ),
+        ],
+    )
+
+
+def drop_in_front_of(_: Measured, v: Variant) -> Draft:
+    tolerance = round(0.04 / v.strictness, 3)
+    return _carry(
+        v,
+        thoughts=[
+            "Grasp the object and lift it.",
+            "Carry it to the near side of the other one.",
+            "Lower it and let go.",
+        ],
+        goal=[
+            "goal_point = ref_pos.clone()",
+            "front = -torch.ones_like(goal_point[:, 0])",
+            "room = torch.maximum(obj_size[:, 0], obj_size[:, 1]) / 2 + torch.maximum(ref_size[:, 0], ref_size[:, 1]) / 2",
+            "goal_point[:, 0] = ref_pos[:, 0] + front * (room + 0.02)",
+            "goal_point[:, 2] = obj_start[:, 2]",
+        ],
+        arrived="to_goal < 0.03",
+        conditions=[
+            ("is_in_front", f"(to_goal < {tolerance}) & (obj_pos[:, 0] < ref_pos[:, 0])"),
+            ("is_down", "lowest_point(obj_pos, obj_quat, obj_size).abs() < 0.015"),
+        ],
+    )
+
+
+def cover(_: Measured, v: Variant) -> Draft:
+    return _carry(
+        v,
+        thoughts=[
+            "Grasp the cover.",
+            "Carry it over the object.",
+            "Lower it over the object and let go.",
+        ],
+        goal=["goal_point = ref_pos.clone()", "goal_point[:, 2] = obj_start[:, 2]"],
+        arrived="to_goal < 0.02",
+        conditions=[
+            (
+                "is_over",
+                f"(to_goal < {0.025 / v.strictness:.3f}) & (obj_pos[:, 2] + 0.002 > ref_pos[:, 2])",
+            ),
+            ("is_upright", STILL_UPRIGHT),
+        ],
+    )
+
+
+def throw_into(m: Measured, v: Variant) -> Draft:
+    draft = insert(m, v)
+    draft.thoughts = [
+        "Grasp the object.",
+        "Swing it towards the container.",
+        "Let go so that it flies in.",
+    ]
+    draft.extras = [
+        ("flight", "0.3 * torch.tanh(4.0 * (obj_vel * torch.nn.functional.normalize(goal_point - obj_pos, dim=-1)).sum(dim=-1)) * (1 - obj_touched)"),
+        *draft.extras[:1],
+    ]  # fmt: skip
+    return draft
+
+
+def uncover(_: Measured, v: Variant) -> Draft:
+    height = round(0.08 * v.strictness, 3)
+    return Draft(
+        thoughts=[
+            "Reach the top of the cover.",
+            "Grasp it.",
+            "Lift it off or carry it aside, upright, and leave what is under it alone.",
+        ],
+        setup=[
+            HEIGHT,
+            REF_MOVED,
+            "aside = torch.norm((obj_pos - ref_pos)[:, :2], dim=-1)",
+            "room = (torch.maximum(obj_size[:, 0], obj_size[:, 1]) + torch.maximum(ref_size[:, 0], ref_size[:, 1])) / 2",
+            "standing = upright(obj_quat, obj_start_quat)",
+        ],
+        success=[
+            (
+                "is_off",
+                f"((height > {height}) & (obj_grasped > 0.5)) | ((aside > room + 0.02) & (height.abs() < 0.02))",
+            ),
+            ("is_left_alone", REF_STILL),
+            ("is_upright", "standing > 0.9"),
+            is_still(v),
+        ],
+        reward_setup=GRASP_SETUP,
+        target="grasp_point",
+        contact="obj_grasped * near",
+        pays_contact=True,
+        progress=f"torch.maximum((height / {height + 0.02:.3f}).clamp(0.0, 1.0) * contact, (aside / (room + 0.03)).clamp(0.0, 1.0) * 0.6)",
+        remaining=f"({height} - height).clamp(min=0.0)",
+        goal=shifted("obj_start", z=height + 0.03),
+        direction=shifted("torch.zeros_like(obj_pos)", z=1.0),
+        extras=[
+            LEAVE_REF,
+            ("upright", "-0.5 * (1 - standing).clamp(0.0, 1.0)"),
+            ("not_too_high", "-2.0 * (height - 0.2).clamp(0.0, 0.3)"),
+        ],
+    )
+
+
+def _carry(
+    v: Variant,
+    *,
+    thoughts: list[str],
+    goal: list[str],
+    arrived: str,
+    conditions: list[tuple[str, str]],
+) -> Draft:
+    """Return a draft for all tasks that take the object somewhere and let it go.
+
+    Args:
+        v: the variant.
+        thoughts: steps of the task.
+        goal: lines that define `goal_point`, where the object's centre comes to rest.
+        arrived: bool expression: the object is over its goal.
+        conditions: what success demands besides having let go.
+    """
+    return Draft(
+        thoughts=thoughts,
+        setup=[
+            *goal,
+            HEIGHT,
+            "to_goal = torch.norm((goal_point - obj_pos)[:, :2], dim=-1)",
+            f"arrived = {arrived}",
+            "above_goal = obj_pos[:, 2] - goal_point[:, 2]",
+            REF_MOVED,
+        ],
+        success=[
+            *conditions,
+            ("is_let_go", "obj_touched < 0.5"),
+            ("is_left_alone", REF_STILL),
+            is_still(v),
+        ],
+        reward_setup=GRASP_SETUP,
+        target="grasp_point",
+        contact="torch.maximum(obj_grasped * near, arrived.float())",
+        pays_contact=True,
+        progress=(
+            "torch.where(arrived, 1.5 + 0.6 * (1 - torch.tanh(8.0 * above_goal.abs()))"
+            " + 0.5 * (gripper_width / 0.085) * (above_goal < 0.025).float(),"
+            " (0.3 * (height / 0.08).clamp(0.0, 1.0)"
+            " + 0.8 * (1 - torch.tanh(5.0 * to_goal)) * (height / 0.05).clamp(0.0, 1.0)) * obj_grasped * near)"
+        ),
+        remaining="to_goal",
+        goal="goal_point",
+        direction="torch.nn.functional.normalize(goal_point - obj_pos, dim=-1)",
+        extras=[
+            LEAVE_REF,
+            ("not_too_high", "-1.0 * (height - 0.2).clamp(0.0, 0.3)"),
+        ],
+    )

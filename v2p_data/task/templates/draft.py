@@ -1,0 +1,68 @@
+"""What a recipe is given, the video's own measurements, and what it hands over: a task in expressions."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.task.probes import first_pose
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What the video says about the manipulated object's motion, and about the sizes."""
+
+    kind: str
+    obj: SceneObject
+    ref: SceneObject | None
+    """The first other object."""
+    move_m: tuple[float, float, float]
+    """From the first to the last pose."""
+    lift_m: float
+    """The highest the centre came above its start."""
+
+    @staticmethod
+    def of(scene: Scene) -> "Measured":
+        obj = scene.manipulated
+        poses = np.array(obj.poses_world, float).reshape(-1, 7)
+        if not len(poses):
+            poses = first_pose(obj)[None]
+        move = poses[-1, :3] - poses[0, :3]
+        return Measured(
+            kind=scene.kind,
+            obj=obj,
+            ref=scene.others[0] if scene.others else None,
+            move_m=(float(move[0]), float(move[1]), float(move[2])),
+            lift_m=float(poses[:, 2].max() - poses[0, 2]),
+        )
+
+
+@dataclass(kw_only=True)
+class Draft:
+    """A task in expressions; `eef_pos`, `obj_pos`, `ref_pos` and the like are defined before them."""
+
+    thoughts: list[str]
+    """The chain of thought: the steps of the task."""
+    setup: list[str] = field(default_factory=list[str])
+    """Lines that success and reward share."""
+    success: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    """(name, bool expression), the main condition first."""
+    target: str = "obj_pos"
+    """Point to which the gripper should go."""
+    contact: str = "near"
+    """Float expression: 1 while the gripper has the object."""
+    pays_contact: bool = False
+    """Whether contact is worth something by itself: where the object must be grasped."""
+    turn: bool = True
+    """Whether grasping pays for turning the gripper to the manipulated object's narrow side."""
+    progress: str = "obj_pos[:, 2] * 0"
+    """Float expression, 0 at the start and 1 when done."""
+    remaining: str = "obj_pos[:, 2] * 0"
+    """Metres left to go."""
+    goal: str = "obj_pos"
+    """Where the object should be."""
+    direction: str = "goal_direction"
+    """Unit vector in which the object should move."""
+    extras: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    """Further reward components (name, expression), bonuses and penalties, with their weights."""
+    reward_setup: list[str] = field(default_factory=list[str])

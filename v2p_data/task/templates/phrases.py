@@ -1,0 +1,51 @@
+"""Expressions that recipes share; the names in them are defined by `six_parts` or by the phrase itself."""
+
+from v2p_data.task.templates.variants import Variant
+
+LOW = "((obj_pos[:, 2] - obj_start[:, 2]).abs() < 0.02)"
+REF_STILL = "(ref_moved < 0.03)"
+REF_MOVED = "ref_moved = torch.norm((ref_pos - ref_start)[:, :2], dim=-1)"
+LEAVE_REF = ("leave_reference", "-1.0 * (ref_moved - 0.01).clamp(0.0, 0.3)")
+HEIGHT = "height = obj_pos[:, 2] - obj_start[:, 2]"
+_LEAN_SETUP = [
+    "vertical = torch.zeros_like(eef_pos)",
+    "vertical[:, 2] = 1",
+    "lean = torch.norm(in_world_frame(eef_quat, vertical)[:, :2], dim=-1)",
+]
+GRASP_SETUP = [
+    *_LEAN_SETUP,
+    "grasp_point = obj_pos.clone()",
+    "grasp_point[:, 2] = obj_pos[:, 2] + (half_height - 0.035).clamp(min=0.0)",
+    # The pads close along the gripper's own y axis.
+    "closing = torch.zeros_like(eef_pos)",
+    "closing[:, 1] = 1",
+    "closing = in_world_frame(eef_quat, closing)",
+    "pads_apart = 2 * obj_half(obj_quat, obj_size, closing)",
+]
+STILL_UPRIGHT = "(upright(obj_quat, obj_start_quat) > 0.9)"
+# Withholds what pushing earns once the object topples. A penalty instead teaches not to touch tall objects at all:
+# 0 % for a 5 x 8 cm cylinder.
+STANDING = "upright(obj_quat, obj_start_quat).clamp(0.0, 1.0)"
+# A leaning finger pushes at the object's upper edge and rolls it over: 4 cm cubes in one episode out of seven.
+LEVEL = ("level", "-0.4 * lean")
+
+
+def is_still(v: Variant) -> tuple[str, str]:
+    """Return the condition that the object has come to rest."""
+    return "is_still", f"torch.norm(obj_vel, dim=-1) < {v.still_m_s}"
+
+
+def shifted(point: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> str:
+    """Return a point, or a direction, moved by metres."""
+    return f"{point} + torch.tensor([{x!r}, {y!r}, {z!r}], device=obj_pos.device)"
+
+
+def push_point_setup(clearance_m: float) -> list[str]:
+    """Lines for the point behind the object, seen along `goal_direction`, at which fingers push it."""
+    return [
+        "behind = obj_half(obj_quat, obj_size, goal_direction)",
+        f"push_point = obj_pos - goal_direction * (behind + {clearance_m}).unsqueeze(-1)",
+        "push_point[:, 2] = table_height + half_height.clamp(0.02, 0.025)",
+        "distance_xy = torch.norm((push_point - eef_pos)[:, :2], dim=-1)",
+        *_LEAN_SETUP,
+    ]

@@ -1,0 +1,76 @@
+"""Which recipe a kind of task has, and the one for all others: as far from the start as in the video."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from v2p_data.task.templates import carrying, pushing
+from v2p_data.task.templates.draft import Draft, Measured
+from v2p_data.task.templates.phrases import GRASP_SETUP, is_still, push_point_setup, shifted
+from v2p_data.task.templates.variants import Variant
+
+Recipe = Callable[[Measured, Variant], Draft]
+_WITH_ONE_OBJECT: dict[str, Recipe] = {
+    "lift_up": carrying.lift,
+    "push_left": pushing.push,
+    "push_right": pushing.push,
+    "tip_over": pushing.tip_over,
+}
+_WITH_TWO_OBJECTS: dict[str, Recipe] = {
+    "push_next_to": pushing.push_next_to,
+    "slide_to": pushing.push_next_to,
+    "insert": carrying.insert,
+    "place_onto": carrying.place_onto,
+    "drop_in_front_of": carrying.drop_in_front_of,
+    "cover": carrying.cover,
+    "uncover": carrying.uncover,
+    "throw_into": carrying.throw_into,
+    "push_with": pushing.push_with,
+}
+
+
+def draft_of(measured: Measured, variant: Variant) -> Draft:
+    """Return the task in expressions; a kind that needs a second object follows the tracked motion where there is none."""
+    recipe = _WITH_ONE_OBJECT.get(measured.kind, _generic)
+    if measured.ref is not None:
+        recipe = _WITH_TWO_OBJECTS.get(measured.kind, recipe)
+    return recipe(measured, variant)
+
+
+def _generic(m: Measured, v: Variant) -> Draft:
+    """The object must come as far from its start as it did in the video."""
+    move = np.array(m.move_m)
+    distance = float(np.linalg.norm(move))
+    wanted = float(np.clip(distance, 0.08, 0.25))
+    move = move / distance * wanted if distance > 0.02 else np.array([0.0, 0.0, 0.1])
+    lifts = move[2] > 0.05
+    if not lifts:
+        move[2] = 0.0
+    x, y, z = (round(float(c), 3) for c in move)
+    tolerance = round(float(np.clip(0.4 * wanted, 0.04, 0.08)) / v.strictness, 3)
+    success = [
+        ("is_there", f"remaining < {tolerance}"),
+        (
+            "is_on_its_way",
+            f"((obj_pos - obj_start) * goal_direction).sum(dim=-1) > {0.5 * wanted:.3f}",
+        ),
+        is_still(v),
+    ]
+    if lifts:
+        success.insert(1, ("is_held", "obj_grasped > 0.5"))
+    return Draft(
+        thoughts=["Reach the object.", "Move it as in the video.", "Keep it there."],
+        setup=[
+            f"goal_point = {shifted('obj_start', x=x, y=y, z=z)}",
+            f"goal_direction = torch.nn.functional.normalize({shifted('torch.zeros_like(obj_pos)', x=x, y=y, z=z)}, dim=-1)",
+            "remaining = torch.norm(goal_point - obj_pos, dim=-1)",
+        ],
+        success=success,
+        reward_setup=GRASP_SETUP if lifts else push_point_setup(clearance_m=0.02),
+        target="grasp_point" if lifts else "push_point",
+        contact="obj_grasped * near" if lifts else "near",
+        pays_contact=bool(lifts),
+        progress=f"(1 - remaining / {wanted:.3f}).clamp(-1.0, 1.0)",
+        remaining="remaining",
+        goal="goal_point",
+    )
