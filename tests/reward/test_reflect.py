@@ -13,7 +13,7 @@ from v2p_data.reward.kernels import kernels_of
 from v2p_data.reward.reflect import proposals, reflect
 from v2p_data.reward.reward_code import Reward, UnreadableError, times
 from v2p_data.task.probes import random_states
-from v2p_data.task.reader import check_code
+from v2p_data.task.reader.check import check_code
 from v2p_data.task.sandbox import class_name, load_task
 from v2p_data.task.smoke_child import FakePlacer
 from v2p_data.task.task import TaskBundle

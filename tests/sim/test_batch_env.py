@@ -21,7 +21,7 @@ from v2p_data.sim.masks import FIRST_OBJECT, MaskRenderer
 from v2p_data.sim.randomize import RandomizationConfig
 from v2p_data.sim.robot import FINGER_TRAVEL_M
 from v2p_data.sim.world import CAMERA
-from v2p_data.task.sandbox import TaskCodeError
+from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.task import BASE_OBSERVATION_DIM, OBJECT_STATES, ROBOT_STATES, Task, TaskBundle
 
 CALM = without_randomization(SimConfig(fine=True))

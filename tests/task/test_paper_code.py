@@ -19,7 +19,8 @@ import torch
 
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.task.probes import at_rest
-from v2p_data.task.sandbox import check_code, load_task
+from v2p_data.task.reader.check import check_code
+from v2p_data.task.sandbox import load_task
 from v2p_data.task.smoke import smoke_run_all
 from v2p_data.task.smoke_child import FakePlacer
 from v2p_data.task.task import OBJECT_STATES, ROBOT_STATES, TaskBundle

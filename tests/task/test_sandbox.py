@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from v2p_data.task.sandbox import TaskCodeError, check_code, load_task
+from v2p_data.task.reader.check import check_code
+from v2p_data.task.reader.refusal import TaskCodeError
+from v2p_data.task.sandbox import load_task
 from v2p_data.task.smoke import _results
 from v2p_data.task.smoke_child import FakePlacer
 from v2p_data.task.watched import StatesChangedError

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from v2p_data.task.sandbox import TaskCodeError, check_code
+from v2p_data.task.reader.check import check_code
+from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.smoke import smoke_run_all
 
 sys.path.insert(0, str(Path(__file__).parent))

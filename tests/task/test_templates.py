@@ -1,6 +1,7 @@
 import pytest
 
-from v2p_data.task.sandbox import check_code, class_name
+from v2p_data.task.reader.check import check_code
+from v2p_data.task.sandbox import class_name
 from v2p_data.task.smoke import smoke_run_all
 from v2p_data.task.task import BASE_OBSERVATION_DIM
 from v2p_data.task.templates.draft import Measured

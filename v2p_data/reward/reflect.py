@@ -18,7 +18,8 @@ from v2p_data.reward.kernels import kernels_of
 from v2p_data.reward.reward_code import Reward, UnreadableError, function_of
 from v2p_data.seeds import rng_for
 from v2p_data.task.probes import random_states
-from v2p_data.task.reader import TaskCodeError, check_code
+from v2p_data.task.reader.check import check_code
+from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
 from v2p_data.task.task import TaskBundle
 

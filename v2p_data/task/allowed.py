@@ -1,4 +1,17 @@
-"""What task code may name: the allow-lists of `sandbox`. A name that is not here is refused."""
+"""What task code may name and write, and how much of it: the allow-lists of `reader` and `sandbox`.
+
+What is not here is refused.
+"""
+
+import ast
+
+MAX_SOURCE_CHARS = 40_000
+MAX_NODES = 10_000
+MAX_DEPTH = 40
+MAX_LOOP_DEPTH = 2
+MAX_STRING_CHARS = 4_000
+MAX_NUMBER = 1e6
+MAX_EXPONENT = 8
 
 
 def _words(text: str) -> frozenset[str]:
@@ -23,7 +36,15 @@ INSTEAD = {
     "open": "all that is known is in states",
 }
 """What to write for some builtins that are asked for without harm in mind."""
+MODULES = _words("torch math")
 TYPING = _words("Any Dict List Optional Tuple Union Sequence")
+TYPES = TYPING | _words("Tensor torch str int float bool dict list tuple")
+IMPORTS = {
+    "torch": _words("Tensor"),
+    "typing": TYPING,
+    "factory.tasks.task": _words("Task"),
+}
+"""What may be imported from where."""
 TASK_METHODS = _words(
     "__init__ reset_objects_states compute_observation_key get_observation_space compute_success compute_reward"
 )
@@ -78,3 +99,69 @@ ATTRIBUTES = (
 """)
 )
 """Attributes and methods of tensors, of lists and dicts, of the base class, and the environment's two."""
+
+AT_MODULE_LEVEL = (
+    ast.Import,
+    ast.ImportFrom,
+    ast.ClassDef,
+    ast.FunctionDef,
+    ast.Assign,
+    ast.AnnAssign,
+    ast.Expr,
+)
+IN_FUNCTIONS = (
+    ast.Return,
+    ast.Assign,
+    ast.AugAssign,
+    ast.AnnAssign,
+    ast.For,
+    ast.If,
+    ast.Expr,
+    ast.Pass,
+    ast.Break,
+    ast.Continue,
+    ast.arguments,
+    ast.arg,
+    ast.BoolOp,
+    ast.BinOp,
+    ast.UnaryOp,
+    ast.IfExp,
+    ast.Compare,
+    ast.Call,
+    ast.Constant,
+    ast.Attribute,
+    ast.Subscript,
+    ast.Name,
+    ast.List,
+    ast.Tuple,
+    ast.Dict,
+    ast.Slice,
+    ast.ListComp,
+    ast.comprehension,
+    ast.JoinedStr,
+    ast.FormattedValue,
+    ast.keyword,
+    ast.expr_context,
+    ast.operator,
+    ast.boolop,
+    ast.unaryop,
+    ast.cmpop,
+)
+"""Statements, their parts, expressions, their parts."""
+INSTEAD_OF_SYNTAX = {
+    "While": "while loops are not allowed; use tensor operations, or for with range",
+    "Lambda": "lambda is not allowed; write a function at module level",
+    "GeneratorExp": "generators are not allowed; use a list or a tensor operation",
+    "Try": "try is not allowed; an error should be seen",
+    "With": "with is not allowed; no gradients are kept anyway",
+    "Global": "global is not allowed; keep state in tensors",
+    "Nonlocal": "nonlocal is not allowed",
+    "NamedExpr": "':=' is not allowed; assign on a line of its own",
+    "Starred": "'*' is not allowed here; name the values",
+    "Assert": "assert is not allowed",
+    "Raise": "raise is not allowed",
+    "Delete": "del is not allowed",
+    "Yield": "yield is not allowed",
+    "Match": "match is not allowed; use if",
+}
+"""What to write for some kinds of statements and expressions, or why they are refused."""

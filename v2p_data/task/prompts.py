@@ -1,7 +1,7 @@
 """What is said to the model that writes task code: the interface, the guard's rules, the scene, and what to do.
 
 Everything that the code enforces is said from the same tables that it is enforced with: the states from `task`, the
-allow-lists from `allowed`, the limits from `reader`.
+allow-lists and limits from `allowed`.
 """
 
 import re
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.task import allowed, reader
+from v2p_data.task import allowed
 from v2p_data.task.audit import ACCEPTABLE_SCORE, Audit
 from v2p_data.task.example_tasks import Example
 from v2p_data.task.pictures import Picture
@@ -108,10 +108,10 @@ def rules() -> str:
     """Return the guard's allow-lists and limits in words."""
     names = sorted(allowed.ATTRIBUTES - allowed.TORCH)
     return RULES.format(
-        exponent=reader.MAX_EXPONENT,
-        loops=reader.MAX_LOOP_DEPTH,
-        number=reader.MAX_NUMBER,
-        chars=reader.MAX_SOURCE_CHARS,
+        exponent=allowed.MAX_EXPONENT,
+        loops=allowed.MAX_LOOP_DEPTH,
+        number=allowed.MAX_NUMBER,
+        chars=allowed.MAX_SOURCE_CHARS,
         builtins=_listed(allowed.BUILTINS),
         math=_listed(allowed.MATH),
         torch=_listed(allowed.TORCH),

@@ -2,7 +2,7 @@
 
 What it covers. Three walls, one behind the other:
 
-- `check_code` reads the code without running it and refuses everything that is not on an allow-list (`allowed`): imports
+- `reader` reads the code without running it and refuses everything that is not on an allow-list (`allowed`): imports
   other than torch, math, typing and the task base class; names, attributes and functions that are not tensor maths;
   every underscore name except `__init__`; assignment to anything but the task's own variables and attributes; while
   loops, generators, lambdas, `try`, `with`, `global`, starred calls, decorators other than `torch.jit.script` and
@@ -33,8 +33,8 @@ import torch
 
 from v2p_data.scene.scene import Scene
 from v2p_data.task import allowed
-from v2p_data.task.reader import TaskCodeError, checked_tree
-from v2p_data.task.reader import check_code as check_code
+from v2p_data.task.reader.check import checked_tree
+from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.task import Placer, Task
 from v2p_data.task.watched import watch
 

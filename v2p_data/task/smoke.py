@@ -23,7 +23,8 @@ from v2p_data.errors import V2PError
 from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
 from v2p_data.task.probes import States, at_rest, concatenated, random_states
-from v2p_data.task.sandbox import TaskCodeError, check_code
+from v2p_data.task.reader.check import check_code
+from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.source_text import shown
 
 BATCH = 16

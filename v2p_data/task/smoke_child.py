@@ -17,7 +17,8 @@ from typing import Any
 import torch
 
 from v2p_data.task.confine import confine, leave_the_network
-from v2p_data.task.sandbox import TaskCodeError, line_in_task_code, make_task
+from v2p_data.task.reader.refusal import TaskCodeError
+from v2p_data.task.sandbox import line_in_task_code, make_task
 from v2p_data.task.watched import StatesChangedError
 
 MEMORY_BYTES = 2 * 1024**3

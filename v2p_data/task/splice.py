@@ -8,7 +8,7 @@ task's success, reset and observations read is replaced or shared.
 import ast
 
 from v2p_data.errors import V2PError
-from v2p_data.task.reader import checked_tree
+from v2p_data.task.reader.check import checked_tree
 
 REWARD = "reward_function"
 
