@@ -101,6 +101,7 @@ def learn(
     num_threads: int = 1,
     device: str = "cuda:0",
     solved: Sequence[Solved] = (),
+    success_bonus: float = SimConfig.success_bonus,
     on_progress: Progress = lambda share, words: None,
 ) -> Learned:
     """Write the task's expert into `out`, with the curve of its training.
@@ -113,13 +114,14 @@ def learn(
         num_threads: for the physics; changes no result.
         device: of the backend `warp`.
         solved: experts of other tasks, see `ExpertConfig.warm_start`.
+        success_bonus: what a step of success earns in training, see `SimConfig`; nothing by RoboGen's method.
         on_progress: told the share that is done and a few words.
     """
 
     def worlds(num_envs: int, what: str, *, fine: bool = False) -> BatchEnv:
         return BatchEnv(
             bundle,
-            SimConfig(fine=fine),
+            SimConfig(fine=fine, success_bonus=success_bonus),
             num_envs=num_envs,
             seed=seed_for(seed, what),
             num_threads=num_threads,
@@ -164,6 +166,7 @@ def learn(
     start = 0.4 if taught else 0.0
     env = make_batch_env(
         bundle,
+        SimConfig(success_bonus=success_bonus),
         num_envs=cfg.num_envs,
         seed=seed_for(seed, "worlds"),
         num_threads=num_threads,

@@ -283,19 +283,23 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
     """Return the stage that learns one task.
 
     A killed training starts anew: it lasts a minute or two, and only then is its result the same as an
-    undisturbed one's.
+    undisturbed one's. It learns with the bonus for success that its reward was searched with; a usual one is not named.
     """
+    usual = RewardConfig().success_bonus
+    bonus = task.config.config.success_bonus if task.name == "reward" else usual
+    named = {} if bonus == usual else {"success bonus": f"{bonus:g}"}
     return Stage(
         name="expert",
         item=task.item,
         config=Seeded(config=replace(cfg.expert, warm_start=None), seed=cfg.seed),
         inputs={"task": task},
-        sources=solved_digests(cfg.expert.warm_start),
+        sources=solved_digests(cfg.expert.warm_start) | named,
         version=2,
         make=partial(
             make_expert,
             warm_start=cfg.expert.warm_start,
             teaches_model=cfg.task.writer == "vlm",
+            success_bonus=bonus,
         ),
     )
 
@@ -308,6 +312,7 @@ def make_expert(
     *,
     warm_start: Path | None,
     teaches_model: bool,
+    success_bonus: float,
 ) -> dict[str, Any]:
     """Find a teacher, imitate it, go on with PPO, all at the coarse time step; judge at the fine one with the independent referee."""
     from policies.ppo.policy import Expert
@@ -328,6 +333,7 @@ def make_expert(
         num_threads=runtime.num_threads,
         device=runtime.device,
         solved=find_solved(warm_start) if warm_start else (),
+        success_bonus=success_bonus,
         on_progress=lambda share, words: runtime.progress(0.95 * share, words),
     )
     expert = Expert.load(out)
