@@ -11,7 +11,8 @@ from markupsafe import Markup
 from v2p_data.episodes.features import ACTION_NAMES, FPS
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError
-from v2p_data.report.chart import NUM_STYLES, Line, line_chart
+from v2p_data.report.audits import AuditView, audit_view
+from v2p_data.report.chart import Line, line_chart
 from v2p_data.report.media import (
     MediaBudget,
     Medium,
@@ -27,11 +28,16 @@ from v2p_data.report.reading import (
     Rate,
     Result,
     Run,
+    as_dict,
+    as_dicts,
     number,
     rate_of,
     read_curve,
     read_json,
 )
+from v2p_data.report.rewards import RewardView, reward_view
+from v2p_data.report.searches import SEARCH_FOLDER
+from v2p_data.report.training import training_charts
 from v2p_data.scene.scene import Scene, SceneObject
 
 STRIP_MOMENTS = 6
@@ -58,15 +64,6 @@ class EpisodeView:
     num_frames: int
     greys: str
     referee: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckView:
-    """One question of the audit."""
-
-    asks: str
-    passed: bool
-    measured: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,9 +95,11 @@ class ItemView:
     objects: list[ObjectView] = field(default_factory=list[ObjectView])
     code: str = ""
     task: dict[str, Any] = field(default_factory=dict[str, Any])
-    audit_score: float | None = None
-    checks: list[CheckView] = field(default_factory=list[CheckView])
+    audit: AuditView | None = None
     samples: list[SampleView] = field(default_factory=list[SampleView])
+    pick: str = ""
+    """What picking one of the samples was good for, in a sentence."""
+    reward: RewardView | None = None
     rate: Rate | None = None
     charts: list[Markup] = field(default_factory=list[Markup])
     sheet: Medium | None = None
@@ -126,7 +125,9 @@ def item_view(
         _add_scene(view, scene, cfg, budget)
     if task is not None and is_shown:
         _add_task(view, task)
-    expert, episodes = view.results["expert"], view.results["episodes"]
+    reward, expert, episodes = (view.results[k] for k in ("reward", "expert", "episodes"))
+    if reward is not None and is_shown:
+        view.reward = reward_view(reward.folder / SEARCH_FOLDER)
     if expert is not None and is_shown:
         _add_expert(view, expert, cfg, budget)
     if episodes is not None and is_shown:
@@ -195,22 +196,21 @@ def _mesh_picture(folder: Path, obj: SceneObject, size_px: int) -> str | None:
 def _add_task(view: ItemView, result: Result) -> None:
     code = result.folder / "task.py"
     view.code = code.read_text(errors="replace") if code.is_file() else ""
-    view.task = _dict(read_json(result.folder / "task.json"))
+    view.task = as_dict(read_json(result.folder / "task.json"))
     view.kind = str(view.task.get("kind") or view.kind)
-    audit = _dict(view.task.get("audit"))
-    view.audit_score = number(audit.get("score"))
-    view.checks = [check_view(check) for check in _dicts(audit.get("checks"))]
-    table = _dict(read_json(result.folder / "audit.json"))
+    view.audit = audit_view(view.task.get("audit"))
+    table = as_dict(read_json(result.folder / "audit.json"))
     view.samples = [
         _sample_view(sample, k == table.get("picked"))
-        for k, sample in enumerate(_dicts(table.get("samples")))
+        for k, sample in enumerate(as_dicts(table.get("samples")))
     ]
+    view.pick = _pick_words(as_dict(table.get("rates")))
 
 
 def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
     counts = result.counts or read_json(result.folder / "evaluation.json") or {}
     view.rate = rate_of(counts.get("success"))
-    view.charts = expert_charts(read_curve(result.folder / "curve.csv"))
+    view.charts = training_charts(read_curve(result.folder / "curve.csv"))
     uri = budget.admit(
         picture_uri(result.folder / "sheet.png", cfg.sheet_width_px),
         f"contact sheet of {view.item}",
@@ -295,30 +295,10 @@ def _note_older_inputs(view: ItemView) -> None:
 # --- pieces --------------------------------------------------------------------------------------------------
 
 
-def check_view(check: Mapping[str, Any]) -> CheckView:
-    """Return a line of the audit with what was measured in words."""
-    name, share = check.get("name"), number(check.get("share"))
-    if share is None:
-        measured = ""
-    elif name == "becomes_true":
-        measured = f"after {100 * share:.1f} cm" if share >= 0 else "never"
-    elif name == "reward_rises":
-        measured = f"by {share:.3g}"
-    elif name == "no_warnings":
-        measured = f"{share:.0f} warnings" if share != 1 else "1 warning"
-    else:
-        measured = f"true in {100 * share:.0f} % of moments"
-    return CheckView(
-        asks=str(check.get("asks") or name or ""),
-        passed=check.get("passed") is True,
-        measured=measured,
-    )
-
-
 def _sample_view(sample: Mapping[str, Any], is_picked: bool) -> SampleView:
-    audit = _dict(sample.get("audit"))
+    audit = as_dict(sample.get("audit"))
     failed = [
-        str(c.get("asks")) for c in _dicts(audit.get("checks")) if c.get("passed") is not True
+        str(c.get("asks")) for c in as_dicts(audit.get("checks")) if c.get("passed") is not True
     ]
     return SampleView(
         is_picked=is_picked,
@@ -328,36 +308,15 @@ def _sample_view(sample: Mapping[str, Any], is_picked: bool) -> SampleView:
     )
 
 
-def _dict(data: Any) -> dict[str, Any]:
-    return data if isinstance(data, dict) else {}
-
-
-def _dicts(data: Any) -> list[dict[str, Any]]:
-    return [row for row in data if isinstance(row, dict)] if isinstance(data, list) else []
-
-
-def expert_charts(curve: Mapping[str, np.ndarray]) -> list[Markup]:
-    """Return success, return and reward parts over control steps."""
-    steps = curve.get("steps")
-    if steps is None or not len(steps):
-        return []
-
-    def lines(names: Mapping[str, str]) -> list[Line]:
-        return [Line(name=words, x=steps, y=curve[k]) for k, words in names.items() if k in curve]
-
-    parts = {
-        k: k.removeprefix("reward_").replace("_", " ") for k in curve if k.startswith("reward_")
-    }
-    charts = [
-        line_chart(
-            lines({"success_deterministic": "deterministic", "success_stochastic": "exploring"}),
-            title="Success while training", x_label="control steps", y_range=(0.0, 1.0),
-        ),
-        line_chart(
-            lines({"return": "mean return"}), title="Return per episode", x_label="control steps"
-        ),
-        line_chart(
-            lines(parts)[:NUM_STYLES], title="Reward parts, mean per step", x_label="control steps"
-        ),
-    ]  # fmt: skip
-    return [chart for chart in charts if chart]
+def _pick_words(rates: Mapping[str, Any]) -> str:
+    """Return which share of samples was of no use, before the pick and after it; nothing where it is not known."""
+    before, after = (
+        [number(as_dict(rates.get(when)).get(what)) for what in ("non_runnable", "zero_score")]
+        for when in ("before_pick", "after_pick")
+    )
+    if None in before or None in after:
+        return ""
+    words = "{:.0%} of task codes did not run and {:.0%} ran and scored nothing"
+    return (
+        f"Before the pick {words.format(*before)}; after it {'{:.0%} and {:.0%}'.format(*after)}."
+    )

@@ -21,6 +21,10 @@ JOINT_STAGES = ("dataset", "policy", "evaluation")
 STAGES = ITEM_STAGES + JOINT_STAGES
 RUN_FILE = "run.json"
 PARTIAL_SUFFIX = ".partial"
+MAX_READ_BYTES = 20_000_000
+"""Nothing that a stage writes for a page is larger; some of it comes from processes that ran generated code."""
+MAX_SIZE = 1e30
+"""Numbers beyond it are treated as not finite: charts subtract them from each other."""
 
 Status = Literal["made", "rejected", "failed", "unfinished", "not run"]
 Key = tuple[str, str]
@@ -197,7 +201,7 @@ def rate_of(data: Any) -> Rate | None:
 
 def read_curve(path: Path) -> dict[str, np.ndarray]:
     """Return a CSV's columns; what is no number is NaN, and a last line that a kill cut short is left out."""
-    if not path.is_file():
+    if not path.is_file() or path.stat().st_size > MAX_READ_BYTES:
         return {}
     with path.open(newline="", errors="replace") as stream:
         head, *rows = [*csv.reader(stream)] or [[]]
@@ -208,16 +212,28 @@ def read_curve(path: Path) -> dict[str, np.ndarray]:
 def read_json(path: Path) -> Any:
     """Return a JSON file's content, None if there is none that can be read."""
     try:
+        if not path.is_file() or path.stat().st_size > MAX_READ_BYTES:
+            return None
         return json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 
 def number(value: Any) -> float | None:
     """Return a finite number, None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_SIZE:
         return None
     return float(value)
+
+
+def as_dict(data: Any) -> dict[str, Any]:
+    """Return JSON that should be an object, an empty one if it is anything else."""
+    return data if isinstance(data, dict) else {}
+
+
+def as_dicts(data: Any) -> list[dict[str, Any]]:
+    """Return the objects in JSON that should be a list of them."""
+    return [row for row in data if isinstance(row, dict)] if isinstance(data, list) else []
 
 
 def span(values: Iterable[Any]) -> str:
@@ -288,9 +304,10 @@ def _from_partials(root: Path) -> list[Result]:
 
 def _float(text: str) -> float:
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
         return math.nan
+    return value if abs(value) <= MAX_SIZE else math.nan
 
 
 def _folders(parent: Path) -> list[Path]:
