@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from v2p_data.reward.reward_code import Part, Reward, constant, split_constant
+from v2p_data.reward.expressions import constant, split_constant
+from v2p_data.reward.reward_code import Reward
+from v2p_data.reward.summands import Part
 
 Kind = Literal["1 - tanh", "exp", "rational", "tanh", "sigmoid", "clamp"]
 

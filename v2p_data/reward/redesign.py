@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2p_data.reward.reward_code import FUNCTION, UnreadableError, number
+from v2p_data.reward.expressions import number
+from v2p_data.reward.function_body import FUNCTION, UnreadableError, rows_of
 from v2p_data.reward.soften import conditions, softened
 from v2p_data.scene.scene import Scene
 from v2p_data.task.templates.reward_text import paid_lines
@@ -181,7 +182,7 @@ def transplanted(code: str, donor: str) -> str:
     functions = {n.name: n for n in ast.parse(code).body if isinstance(n, ast.FunctionDef)}
     given = {n.name: n for n in ast.parse(donor).body if isinstance(n, ast.FunctionDef)}
     if FUNCTION in functions:
-        first, last = _rows_of(functions[FUNCTION])
+        first, last = rows_of(functions[FUNCTION])
         rows[first:last] = [_text_of(donor, given[FUNCTION]) + "\n"]
         text = "".join(rows)
     else:
@@ -210,7 +211,7 @@ def wrapped(code: str, scale: float, name: str, text: str) -> str:
     while inner in code:
         inner, i = f"inner_reward_{i}", i + 1
     rows = code.splitlines(keepends=True)
-    first, last = _rows_of(function)
+    _, last = rows_of(function)
     at = function.lineno - 1
     rows[at] = rows[at].replace(f"def {FUNCTION}", f"def {inner}", 1)
     added = ["extra = " + text, f'components["{name}"] = extra'] if name else []
@@ -224,7 +225,6 @@ def wrapped(code: str, scale: float, name: str, text: str) -> str:
         f"    return {total}{' + extra' if name else ''}, components",
     ]
     rows[last:last] = ["\n\n", *[f"{line}\n" for line in new]]
-    del first
     return "".join(rows)
 
 
@@ -303,13 +303,8 @@ def _function_text(lines: list[str], parts: list[tuple[str, str]]) -> str:
     return head + "".join(f"    {row}\n" for row in body)
 
 
-def _rows_of(node: ast.FunctionDef) -> tuple[int, int]:
-    first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
-    return first - 1, node.end_lineno or node.lineno
-
-
 def _text_of(source: str, node: ast.FunctionDef) -> str:
-    first, last = _rows_of(node)
+    first, last = rows_of(node)
     return "\n".join(source.splitlines()[first:last])
 
 

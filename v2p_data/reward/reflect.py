@@ -14,8 +14,9 @@ import numpy as np
 from v2p_data.errors import V2PError
 from v2p_data.reward import redesign, rules
 from v2p_data.reward.feedback import Feedback
+from v2p_data.reward.function_body import UnreadableError, function_of
 from v2p_data.reward.kernels import kernels_of
-from v2p_data.reward.reward_code import Reward, UnreadableError, function_of
+from v2p_data.reward.reward_code import Reward
 from v2p_data.seeds import rng_for
 from v2p_data.task.probes import random_states
 from v2p_data.task.reader.check import check_code

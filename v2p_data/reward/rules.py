@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from v2p_data.reward import redesign
+from v2p_data.reward.expressions import split_constant
 from v2p_data.reward.feedback import ComponentFeedback, Feedback
 from v2p_data.reward.kernels import centring_factor, kernels_of, simple_kind
-from v2p_data.reward.reward_code import Part, Reward, split_constant
+from v2p_data.reward.reward_code import Reward
 from v2p_data.reward.soften import gates_softened
+from v2p_data.reward.summands import Part
 from v2p_data.scene.scene import Scene
 
 DWARFS = 0.65
