@@ -1,6 +1,6 @@
 """A reward search as part of the page: each round's candidates, and of the best one training, audit, origin and code.
 
-Text and numbers only. A search of five rounds of eight adds about 40 kB to a page whose media may take 22 MB.
+Text and numbers only. A search of five rounds of eight adds about 50 kB to a page whose media may take 22 MB.
 """
 
 import difflib
@@ -26,7 +26,7 @@ from v2p_data.report.searches import (
     training_curve,
 )
 from v2p_data.report.training import training_charts
-from v2p_data.report.words import percent
+from v2p_data.report.words import NO_BREAK, percent
 
 UNTRAINED = {"prescreened": "turned away untrained", "refused": "refused untrained"}
 FAULTS = {
@@ -254,8 +254,11 @@ def _facts(feedback: dict[str, Any]) -> list[str]:
             + _if(
                 feedback.get("ever_success"), lambda x: f"; {percent(x)} had success at some step"
             )
-            + _if(feedback.get("time_to_success_s"), lambda x: f"; it took {x:.1f} s (median)")
-            + _if(feedback.get("episode_s"), lambda x: f", in episodes of {x:.1f} s")
+            + _if(
+                feedback.get("time_to_success_s"),
+                lambda x: f"; it took {x:.1f}{NO_BREAK}s (median)",
+            )
+            + _if(feedback.get("episode_s"), lambda x: f", in episodes of {x:.1f}{NO_BREAK}s")
             + "."
         )
     words = "A successful episode earned more generated reward than a failed one with probability"
@@ -267,7 +270,7 @@ def _facts(feedback: dict[str, Any]) -> list[str]:
             if (known := number(obj.get(name))) is not None
         ]
         name = str(obj.get("name"))[:MAX_NAME_CHARS].replace("_", " ")
-        moved = _if(obj.get("moved_m"), lambda x: f"; moved by {100 * x:.1f} cm (median)")
+        moved = _if(obj.get("moved_m"), lambda x: f"; moved by {100 * x:.1f}{NO_BREAK}cm (median)")
         facts.append(f"{name}: {', '.join(shares)} of episodes{moved}.")
     return [fact for fact in facts if fact]
 
