@@ -7,12 +7,14 @@ First the search runs. Then every candidate that it stopped goes on from its che
 of them would have come to, step for step. The final policy of the search's choice and that of the best of all are
 played on the same fresh episodes, which decided nothing. A candidate that has no result at all counts for neither.
 
-The last three lines are `cost_share: X` (control steps, evaluations included, of the search and its confirmation over those of
-all to the end), `cost_share_at_most: X` (what halving allows, however the candidates do) and `success_lost: X`.
+Among the lines are `cost_share: X` (control steps, evaluations included, of the search and its confirmation over those of
+all to the end), `cost_share_at_most: X` (what halving allows, however the candidates do), `success_lost_at_most: X` (what
+the choice lacks to 100 %; with `--bound` the end, for nothing trains after the search) and, last, `success_lost: X`.
 """
 
 import json
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -68,6 +70,8 @@ class Settings:
     workers: int = 1
     episodes: int = 128
     """Fresh ones, per policy."""
+    bound: bool = False
+    """Train nothing after the search: what it lost is then only bounded, by what its choice lacks to 100 %."""
     out: Path | None = None
     """Folder of the search, to go on with it later; by default a temporary one."""
 
@@ -95,38 +99,42 @@ def main() -> None:
         Jobs(workers=settings.workers) as jobs,
     ):
         out = settings.out or Path(folder)
-        print("\n".join(measure(bundle, cfg, out, jobs, settings.seed, settings.episodes)))
+        for line in measure(bundle, cfg, out, jobs, settings):
+            print(line, flush=True)
 
 
 def measure(
-    bundle: TaskBundle, cfg: RewardConfig, out: Path, jobs: Jobs, seed: int, episodes: int
-) -> list[str]:
-    """Return the comparison, line by line."""
+    bundle: TaskBundle, cfg: RewardConfig, out: Path, jobs: Jobs, settings: Settings
+) -> Iterator[str]:
+    """Yield the comparison, line by line."""
+    seed = settings.seed
     found = search_reward(bundle, cfg, out, seed=seed, how=How(workers=jobs.workers), jobs=jobs)
+    yield json.dumps({k: v for k, v in found.as_dict().items() if k != "per_seed"})
+    worlds = BatchEnv(
+        bundle,
+        num_envs=settings.episodes,
+        seed=seed_for(seed, "bench reward search"),
+        num_threads=1,
+    )
     candidates = load_candidates(out)
+    chosen = next(c for c in candidates if c.number == found.chosen)
+    rate = _rate(worlds, chosen)
+    yield f"search chose {chosen.number}: {rate} on fresh episodes"
+    yield f"cost_share: {found.cost_share:.3f}"
+    yield f"cost_share_at_most: {cfg.steps_at_most() / cfg.steps_without_halving():.3f}"
+    yield f"success_lost_at_most: {1 - rate.value:.3f}"
+    if settings.bound:
+        return
     stopped = [c for c in candidates if c.training().fault is None]
     jobs.run([_to_the_end(c, cfg.marks[-1]) for c in stopped])
     ended = [c for c in stopped if c.training().fault is None]
     best = max(ended, key=lambda c: (c.training().rank(cfg.evaluations), -c.number))
-    worlds = BatchEnv(
-        bundle, num_envs=episodes, seed=seed_for(seed, "bench reward search"), num_threads=1
-    )
-    chosen = next(c for c in candidates if c.number == found.chosen)
-    rates = {c.number: _rate(worlds, c) for c in (chosen, best)}
-    lost = rates[best.number].value - rates[chosen.number].value
-    return [
-        *(
-            f"candidate {c.number:2d}, round {c.iteration + 1}, {c.origin}: "
-            f"{c.training().success(cfg.evaluations):.2f} at the end"
-            for c in ended
-        ),
-        f"search chose {chosen.number}: {rates[chosen.number]} on fresh episodes",
-        f"best of all at the end {best.number}: {rates[best.number]} on fresh episodes",
-        json.dumps({k: v for k, v in found.as_dict().items() if k != "per_seed"}),
-        f"cost_share: {found.cost_share:.3f}",
-        f"cost_share_at_most: {cfg.steps_at_most() / cfg.steps_without_halving():.3f}",
-        f"success_lost: {lost:.3f}",
-    ]
+    for c in ended:
+        success = c.training().success(cfg.evaluations)
+        yield f"candidate {c.number:2d}, round {c.iteration + 1}, {c.origin}: {success:.2f} at the end"
+    best_rate = _rate(worlds, best)
+    yield f"best of all at the end {best.number}: {best_rate} on fresh episodes"
+    yield f"success_lost: {best_rate.value - rate.value:.3f}"
 
 
 def _to_the_end(candidate: Candidate, mark: int) -> Job:

@@ -212,11 +212,30 @@ def test_the_benchmark_trains_what_halving_stopped_to_the_end(
     out = tmp_path / "copy"
     shutil.copytree(searched[1], out)
 
-    lines = runpy.run_path(str(BENCH))["measure"](bundle, TINY, out, jobs, seed=7, episodes=4)
+    bench = runpy.run_path(str(BENCH))
+    settings = bench["Settings"](seed=7, episodes=4)
+    lines = list(bench["measure"](bundle, TINY, out, jobs, settings))
 
     assert [c.training().done for c in load_candidates(out)] == [2, 2]
-    assert lines[-3:-1] == ["cost_share: 0.750", "cost_share_at_most: 0.750"]
+    assert lines[2:4] == ["cost_share: 0.750", "cost_share_at_most: 0.750"]
     assert re.fullmatch(r"success_lost: -?\d\.\d{3}", lines[-1])
+
+
+def test_the_benchmark_can_stop_at_what_the_search_lost_at_most(
+    bundle: TaskBundle, searched: tuple[Found, Path], jobs: Jobs, tmp_path: Path
+):
+    out = tmp_path / "copy"
+    shutil.copytree(searched[1], out)
+    before = [c.training().done for c in load_candidates(out)]
+
+    bench = runpy.run_path(str(BENCH))
+    settings = bench["Settings"](seed=7, episodes=4, bound=True)
+    lines = list(bench["measure"](bundle, TINY, out, jobs, settings))
+
+    assert [c.training().done for c in load_candidates(out)] == before
+    rate = re.search(r"\((\d+) of 4\)", lines[1])
+    assert rate is not None
+    assert lines[-1] == f"success_lost_at_most: {1 - int(rate[1]) / 4:.3f}"
 
 
 # --- what is shown, and the chain ------------------------------------------------------------------------------
