@@ -207,10 +207,80 @@ def test_what_cannot_be_read_is_said_to_be_so(scenes, lines, why):
 
 
 def test_lines_that_double_each_other_do_not_explode(scenes):
-    lines = ['x0 = states["progress"]', *[f"x{i} = x{i - 1} * x{i - 1}" for i in range(1, 60)]]
+    lines = ['x0 = states["progress"]', *[f"x{i} = x{i - 1} * x{i - 1}" for i in range(1, 40)]]
 
     with pytest.raises(UnreadableError, match="too often"):
-        Reward(reward_of(scenes["lift_up"], [*lines, 'return x59, {"x": x59}']))
+        Reward(reward_of(scenes["lift_up"], [*lines, 'return x39, {"x": x39}']))
+
+
+def test_lines_in_a_long_chain_are_read_or_refused_in_a_sentence(scenes):
+    lines = ['x0 = states["progress"]', *[f"x{i} = x{i - 1} + 1.0" for i in range(1, 400)]]
+
+    with pytest.raises(UnreadableError, match="too many of its lines"):
+        Reward(reward_of(scenes["lift_up"], [*lines, 'return x399, {"x": x399}']))
+
+
+NEAR = 'p["near"] = torch.exp(-4.0 * d)'
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [NEAR, 'p["near"] = 2.0 * p["near"]', 'return p["near"], p'],
+        [NEAR, 'total = p["near"] + h', 'p["near"] = -p["near"]', 'p["h"] = h', "return total, p"],
+        [NEAR, 'u = p["near"] * h', 'p["near"] = p["near"] ** 2', 'p["u"] = u', 'return p["near"] + p["u"], p'],
+        [NEAR, 'p["h"] = h', 'p["off"] = h * d', 'return p["near"] - 2.0 * p["h"] + 0 * p["off"], p'],
+        [NEAR, 'p["h"] = 3.0 * h', "return sum(p.values()), p"],
+        ['reward_components = {"a": d}', 'return reward_components["a"], {"a": reward_components["a"]}'],
+    ],
+)  # fmt: skip
+def test_components_that_are_set_anew_or_come_to_nothing_pay_what_they_paid(scenes, lines):
+    scene = scenes["lift_up"]
+    code = reward_of(scene, [DISTANCE, HEIGHT, "p = {}", *lines])
+    before, components = paid(code, scene)
+
+    reward = Reward(code)
+
+    after, parts = paid(reward.code(), scene)
+    np.testing.assert_allclose(after, before, atol=1e-5)
+    summed = reward.scale * sum(parts[p.name] for p in reward.parts if p.is_paid)
+    np.testing.assert_allclose(summed, before, atol=1e-5)
+    for part in reward.parts:
+        if not part.is_paid:
+            np.testing.assert_allclose(parts[part.name], components[part.name], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("lines", "why"),
+    [
+        (['p["a"] = d', "d = 2.0 * d", 'p["a"] = p["a"] + d', 'return p["a"], p'], "'d' two meanings"),
+        (["t = d", "t = t + t * h", 'p["d"] = d', "return t, p"], "'t' two meanings"),
+        (['p["a"] = d', "for k in p:", "    d = d + p[k]", 'p["b"] = d', 'return p["b"], p'], "two meanings"),
+        (['p["a"] = 0 * d', 'return p["a"] * 0, p'], "none of its components"),
+        (['p["a"] = p["b"]', 'p["b"] = d', 'return p["a"], p'], "before it is set"),
+    ],
+)  # fmt: skip
+def test_what_would_mean_something_else_elsewhere_is_not_taken_apart(scenes, lines, why):
+    scene = scenes["lift_up"]
+    code = reward_of(scene, [DISTANCE, HEIGHT, "p = {}", *lines])
+
+    with pytest.raises(UnreadableError, match=why):
+        Reward(code)
+    told = feedback(x=noise(0, 1), scene=scene)
+    child = next(proposals(bundle_of(code, scene), code, told, np.random.default_rng(0)))
+    assert re.search(why, child.reasons[0])
+
+
+def test_a_number_inside_a_loop_or_between_tabs_can_be_changed(scenes):
+    scene = scenes["lift_up"]
+    lines = [DISTANCE, "a = d", "if len(d) > 3:", "    # nearer", "    a = torch.exp(-4.0 * d)"]
+    spaces = reward_of(scene, [*lines, 'return a, {"a": a}'])
+
+    for code in (spaces, spaces.replace("    #", "\t#").replace("\n    ", "\n\t")):
+        reward = Reward(code)
+        (kernel,) = kernels_of(reward, reward.parts[0])
+        new = kernel.changed(reward, "a", 2.0).code()
+        np.testing.assert_allclose(paid(new, scene)[0], paid(code, scene)[0] ** 2, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -416,6 +486,51 @@ def test_the_success_function_itself_becomes_a_reward(codes):
     assert (np.diff(parts["all_at_once"]) > 0).all()
 
 
+def test_a_success_that_goes_on_from_its_own_lines_becomes_a_reward_too(codes):
+    code, scene = codes["lift_up 0"]
+    body = """
+        up = states["box_pos"][:, 2] > 0.1
+        up = up & (states["box_grasped"] > 0.5)
+        return up
+
+    def """
+    own = re.compile(r"(def compute_success\(self, states\):).*?\n    def ", re.DOTALL)
+    code = own.sub(lambda m: m[1] + body, code)
+
+    design = redesign.from_success(code, scene)
+    goal = redesign.goal_text(code)
+
+    assert design is not None
+    assert goal is not None
+    low, high = (
+        paid(design.code, scene, box_pos=np.tile([[0.5, 0, z]], (32, 1))) for z in (0, 0.2)
+    )
+    assert (high[1]["all_at_once"] >= low[1]["all_at_once"]).all()
+    assert (high[1]["all_at_once"] > low[1]["all_at_once"]).any()
+
+
+def test_a_reward_of_more_arguments_that_cannot_be_read_is_called_with_them(scenes):
+    scene = scenes["lift_up"]
+    lines = ["p = {}", "for k in ['a']:", "    p[k] = s['progress']", "return p['a'], p"]
+    code = reward_of(scene, lines).replace(
+        "reward_function(actions, states)", "reward_function(actions, states, 2.0)"
+    )
+    code = code.replace(
+        "def reward_function(actions, states, 2.0)", "def  reward_function(actions, s, w)"
+    )
+    told = feedback(8, x=noise(0, 1), scene=scene, came=("reached", "grasped"))
+
+    children = proposals(bundle_of(code, scene), code, told, np.random.default_rng(0))
+    whole = [
+        c for c, _ in zip(children, range(6), strict=False) if "redesigned" not in c.reasons[0]
+    ]
+
+    assert len(whole) > 2
+    for child in whole:
+        assert "cannot be taken apart" in child.reasons[0]
+        assert not np.allclose(paid(child.code, scene)[0], paid(code, scene)[0])
+
+
 def test_children_have_run_in_the_sandbox_and_no_two_pay_the_same(codes):
     code, scene = codes["figure 8"]
 
@@ -424,6 +539,11 @@ def test_children_have_run_in_the_sandbox_and_no_two_pay_the_same(codes):
     )
 
     assert len(children) == 4
+    (other,) = reflect(
+        bundle_of(code, scene), code, some_feedback(code, 0, scene), np.random.default_rng(0), 1,
+        tried=[c.code for c in children],
+    )  # fmt: skip
+    children.append(other)
     totals = [paid(c.code, scene)[0] for c in children] + [paid(code, scene)[0]]
     for i, a in enumerate(totals):
         assert all(not np.allclose(a, b) for b in totals[:i])

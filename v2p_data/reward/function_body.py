@@ -8,13 +8,17 @@ import copy
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from textwrap import indent
+from typing import cast, override
 
 from v2p_data.errors import V2PError
 from v2p_data.reward.expressions import names_in, stored_names
 
 FUNCTION = "reward_function"
-MAX_INLINED_NODES = 20_000
+MAX_REPLACED_NODES = 20_000
 """Doubling lines (`b = a + a`) would otherwise grow without limit when names are replaced by what they stand for."""
+MAX_REPLACED_DEPTH = 100
+"""Python's own limit on recursion must not be what ends a long chain of lines (`b = a + 1`, `c = b + 1`, ...)."""
 _INERT = {"zeros_like", "ones_like", "full_like", "zeros", "ones", "full"}
 """Calls whose value does not depend on the values of their arguments."""
 
@@ -63,6 +67,7 @@ class Body:
         self.source = source
         self.function = function_of(source)
         self._rows = source.splitlines(keepends=True)
+        self.pad = self._indentation()
         self._header_end, self.lines = self._split()
         self._definitions: dict[str, list[tuple[int, ast.expr]]] = {}
         self._unclear: set[str] = set()
@@ -93,50 +98,52 @@ class Body:
 
     def inlined(self, expr: ast.expr, position: int) -> ast.expr:
         """Return a copy in which every name with a plain definition is replaced by it."""
-        result = _Inliner(self, position).visit(copy.deepcopy(expr))
-        assert isinstance(result, ast.expr)
-        return result
+        return _Inliner(self, position).replaced(expr)
+
+    def is_set_between(self, name: str, first: int, end: int) -> bool:
+        """Return whether a statement from `first` on, before `end`, sets a name or changes it in place."""
+        return any(name in stored_names(line.node) for line in self.lines[first:end])
 
     def followed(self, expr: ast.expr, position: int) -> Iterator[tuple[int, ast.AST]]:
         """Yield the nodes of all definitions that an expression builds on, each with its statement's position."""
-        yield from self._followed(expr, position, set())
+        seen: set[int] = set()
+        ahead = self._made_of(expr, position)
+        while ahead:
+            at, value = ahead.pop()
+            if id(value) not in seen:
+                seen.add(id(value))
+                yield from ((at, node) for node in ast.walk(value))
+                ahead += self._made_of(value, at)
 
-    def _followed(
-        self, node: ast.AST, position: int, seen: set[int]
-    ) -> Iterator[tuple[int, ast.AST]]:
-        for name in names_in(node):
-            for at, value in self.definitions(name, position):
-                if id(value) not in seen:
-                    seen.add(id(value))
-                    yield from ((at, n) for n in ast.walk(value))
-                    yield from self._followed(value, at, seen)
+    def _made_of(self, node: ast.AST, position: int) -> list[tuple[int, ast.AST]]:
+        """Return the definitions of the names in a node, the first name's last."""
+        return [d for name in names_in(node) for d in self.definitions(name, position)][::-1]
 
     def states_of(self, expr: ast.expr, position: int) -> set[str]:
         """Return the keys of `states` that an expression's value depends on, and `actions`."""
         keys: set[str] = set()
-        self._collect_states(expr, position, keys, set())
+        seen: set[int] = set()
+        ahead: list[tuple[int, ast.AST]] = [(position, expr)]
+        while ahead:
+            at, node = ahead.pop()
+            match node:
+                case ast.Call(func=ast.Attribute(attr=attr)) if attr in _INERT:
+                    continue
+                case ast.Subscript(value=ast.Name(id="states"), slice=key):
+                    keys.add(str(key.value) if isinstance(key, ast.Constant) else "?")
+                    continue
+                case ast.Attribute(attr="shape" | "device" | "dtype"):
+                    continue
+                case ast.Name(id="actions"):
+                    keys.add("actions")
+                case ast.Name(id=name, ctx=ast.Load()):
+                    made = [d for d in self.definitions(name, at) if id(d[1]) not in seen]
+                    seen |= {id(value) for _, value in made}
+                    ahead += made
+                case _:
+                    pass
+            ahead += [(at, child) for child in ast.iter_child_nodes(node)]
         return keys
-
-    def _collect_states(
-        self, node: ast.AST, position: int, keys: set[str], seen: set[int]
-    ) -> None:
-        match node:
-            case ast.Call(func=ast.Attribute(attr=attr)) if attr in _INERT:
-                return
-            case ast.Subscript(value=ast.Name(id="states"), slice=key):
-                keys.add(str(key.value) if isinstance(key, ast.Constant) else "?")
-                return
-            case ast.Attribute(attr="shape" | "device" | "dtype"):
-                return
-            case ast.Name(id="actions"):
-                keys.add("actions")
-            case ast.Name(id=name, ctx=ast.Load()):
-                for at, value in self.definitions(name, position):
-                    if id(value) not in seen:
-                        seen.add(id(value))
-                        self._collect_states(value, at, keys, seen)
-        for child in ast.iter_child_nodes(node):
-            self._collect_states(child, position, keys, seen)
 
     # -- text
 
@@ -172,12 +179,17 @@ class Body:
         first, end = rows_of(self.function)
         return "".join(self._rows[:first]) + function + "".join(self._rows[end:])
 
+    def code(self) -> str:
+        """Return the whole task code."""
+        head = "".join(self._rows[rows_of(self.function)[0] : self._header_end])
+        return self.code_with(head + "".join(line.text for line in self.lines))
+
     def with_statement(self, position: int, node: ast.stmt) -> "Body":
         """Return a copy with a statement's text renewed, comments before it kept; what names stand for stays."""
         old = self.lines[position]
         own_rows = (old.node.end_lineno or old.node.lineno) - old.node.lineno + 1
         comments = "".join(old.text.splitlines(keepends=True)[:-own_rows])
-        text = f"{comments}{' ' * old.node.col_offset}{ast.unparse(node)}\n"
+        text = f"{comments}{indent(ast.unparse(node), self.pad)}\n"
         other = copy.copy(self)
         other.lines = [*self.lines[:position], Line(old.node, text), *self.lines[position + 1 :]]
         return other
@@ -203,6 +215,13 @@ class Body:
             end = last
         return header_end, lines
 
+    def _indentation(self) -> str:
+        first = self.function.body[0]
+        before = self._rows[first.lineno - 1].encode()[: first.col_offset].decode()
+        if before.strip():
+            raise UnreadableError("its body begins on the line of its name")
+        return before
+
     def _read_statements(self) -> None:
         for position, line in enumerate(self.lines):
             match line.node:
@@ -224,18 +243,39 @@ class Body:
                     self._unclear |= stored_names(line.node)
 
 
-class _Inliner(ast.NodeTransformer):
+class Replacer(ast.NodeTransformer):
+    """Replaces nodes by what they stand for, and gives up before that outgrows what can be read."""
+
+    def __init__(self) -> None:
+        self.count = self.depth = 0
+
+    def replaced[N: (ast.expr, ast.stmt)](self, node: N) -> N:
+        """Return a copy of an expression or statement with everything in it replaced.
+
+        Raises:
+            UnreadableError: it grows too large.
+        """
+        return cast(N, self.visit(copy.deepcopy(node)))
+
+    @override
+    def visit(self, node: ast.AST) -> ast.AST:
+        self.count += 1
+        if self.count > MAX_REPLACED_NODES:
+            raise UnreadableError("its lines build on each other too often")
+        if self.depth == MAX_REPLACED_DEPTH:
+            raise UnreadableError("too many of its lines build on each other")
+        self.depth += 1
+        result = super().visit(node)
+        self.depth -= 1
+        return result
+
+
+class _Inliner(Replacer):
     """Replaces names by their definitions."""
 
     def __init__(self, body: Body, position: int) -> None:
+        super().__init__()
         self.body, self.position = body, position
-        self.count = 0
-
-    def visit(self, node: ast.AST) -> ast.AST:
-        self.count += 1
-        if self.count > MAX_INLINED_NODES:
-            raise UnreadableError("its lines build on each other too often")
-        return super().visit(node)
 
     def visit_Name(self, node: ast.Name) -> ast.AST:
         made = self.body.definition(node.id, self.position)

@@ -5,14 +5,20 @@ grasping before them.
 """
 
 import ast
-import copy
 import re
 from dataclasses import dataclass, replace
+from typing import override
 
 import numpy as np
 
-from v2p_data.reward.expressions import number
-from v2p_data.reward.function_body import FUNCTION, UnreadableError, rows_of
+from v2p_data.reward.expressions import names_in, number, stored_names
+from v2p_data.reward.function_body import (
+    FUNCTION,
+    Replacer,
+    UnreadableError,
+    function_of,
+    rows_of,
+)
 from v2p_data.reward.soften import conditions, softened
 from v2p_data.scene.scene import Scene
 from v2p_data.task.templates.reward_text import paid_lines
@@ -31,6 +37,8 @@ GRASPED_KINDS = {
 }
 GRIP_DEPTH_M = 0.035
 """Fingers reach about this far down from an object's top."""
+MAX_LOOKUPS = 200
+"""Names looked up for one slope; a success function says what it wants in far fewer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,18 +104,16 @@ def raise_text(scene: Scene) -> str:
 def goal_text(code: str) -> str | None:
     """Return the task's own success as a slope from 0 to 1, in terms of `states` alone; None where it has none."""
     try:
-        lines, expr = _success_of(code)
+        made, expr = _success_of(code)
+        soft = softened(expr, _Lookup(made))
+        if soft is None:
+            return None
+        soft = _Names(made).replaced(soft)
     except UnreadableError:
         return None
-    made = {n: v for n, v in lines.items() if v is not None}
-    soft = softened(expr, made.get)
-    if soft is None:
-        return None
-    for _ in range(len(lines) + 1):
-        soft = _Names(made).visit(soft)
     text = ast.unparse(ast.fix_missing_locations(soft))
     left = {n.id for n in ast.walk(soft) if isinstance(n, ast.Name)}
-    return None if left & set(lines) or "self" in left or len(text) > 4_000 else f"({text})"
+    return None if left & set(made) or "self" in left or len(text) > 4_000 else f"({text})"
 
 
 # --- whole rewards -------------------------------------------------------------------------------------------
@@ -135,16 +141,10 @@ def from_template(code: str, scene: Scene, rng: np.random.Generator, index: int)
 def from_success(code: str, scene: Scene, rng: np.random.Generator | None = None) -> Design | None:
     """Return the task code with a reward in stages that ends in its own success; None where that has no slope."""
     try:
-        lines, expr = _success_lines(code)
+        lines, _ = _success_lines(code)
+        slopes = _success_slopes(code)
     except UnreadableError:
         return None
-    known = {
-        node.targets[0].id: node.value
-        for node in lines
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
-    }
-    asked = [(name, softened(c, known.get)) for name, c in conditions(expr, known.get)]
-    slopes = [(name, soft) for name, soft in asked if soft is not None]
     if not slopes:
         return None
     jitter = (lambda: 1.0) if rng is None else (lambda: float(rng.uniform(0.6, 1.6)))
@@ -160,14 +160,11 @@ def from_success(code: str, scene: Scene, rng: np.random.Generator | None = None
     else:
         parts.append(("touch", f"{number(0.05 * jitter())} * {touch_text(scene)}"))
     share = 0.8 / len(slopes)
-    for i, (name, soft) in enumerate(slopes):
-        text = ast.unparse(ast.fix_missing_locations(soft))
-        if not _is_place(soft, known):
-            continue
-        parts.append(
-            (f"toward_{name or f'condition_{i + 1}'}", f"{number(share * jitter())} * ({text})")
-        )
-    every = " * ".join(f"({ast.unparse(ast.fix_missing_locations(s))})" for _, s in slopes)
+    for i, (name, text, is_place) in enumerate(slopes):
+        if is_place:
+            weight = number(share * jitter())
+            parts.append((f"toward_{name or f'condition_{i + 1}'}", f"{weight} * ({text})"))
+    every = " * ".join(f"({text})" for _, text, _ in slopes)
     if len(slopes) > 1:
         parts.append(("all_at_once", f"{number(0.6 * jitter())} * ({every})"))
     parts.append(("effort", "-0.005 * (actions**2).sum(dim=-1)"))
@@ -199,28 +196,29 @@ def wrapped(code: str, scale: float, name: str, text: str) -> str:
     """Return task code whose reward is the old one, scaled, plus one component if it has a name.
 
     Raises:
-        UnreadableError: it has no reward function of the usual name.
+        UnreadableError: it has no reward function of the usual name, or one without states.
     """
-    function = next(
-        (n for n in ast.parse(code).body if isinstance(n, ast.FunctionDef) and n.name == FUNCTION),
-        None,
-    )
-    if function is None or len(function.args.args) != 2:
-        raise UnreadableError(f"it has no function '{FUNCTION}' of actions and states")
+    function = function_of(code)
+    names = [a.arg for a in function.args.args]
+    if len(names) < 2:
+        raise UnreadableError(f"its function '{FUNCTION}' is not one of actions and states")
     inner, i = "inner_reward", 2
     while inner in code:
         inner, i = f"inner_reward_{i}", i + 1
     rows = code.splitlines(keepends=True)
     _, last = rows_of(function)
     at = function.lineno - 1
-    rows[at] = rows[at].replace(f"def {FUNCTION}", f"def {inner}", 1)
+    rows[at] = re.sub(rf"\bdef\s+{FUNCTION}\b", f"def {inner}", rows[at], count=1)
     added = ["extra = " + text, f'components["{name}"] = extra'] if name else []
+    if added and "states" not in names:
+        added.insert(0, f"states = {names[1]}")
+    types = "    # type: (Tensor, Dict[str, Tensor]) -> Tuple[Tensor, Dict[str, torch.Tensor]]"
     total = "total" if scale == 1 else f"{number(scale)} * total"
     new = [
         "@torch.jit.script",
-        f"def {FUNCTION}(actions, states):",
-        "    # type: (Tensor, Dict[str, Tensor]) -> Tuple[Tensor, Dict[str, torch.Tensor]]",
-        f"    total, components = {inner}(actions, states)",
+        f"def {FUNCTION}({ast.unparse(function.args)}):",
+        *([types] if names == ["actions", "states"] else []),
+        f"    total, components = {inner}({', '.join(names)})",
         *[f"    {line}" for line in added],
         f"    return {total}{' + extra' if name else ''}, components",
     ]
@@ -231,18 +229,57 @@ def wrapped(code: str, scale: float, name: str, text: str) -> str:
 # --- inside --------------------------------------------------------------------------------------------------
 
 
-class _Names(ast.NodeTransformer):
-    def __init__(self, made: dict[str, ast.expr]) -> None:
+Made = dict[str, ast.expr | None]
+"""What names stand for; None for what is changed in place."""
+
+
+class _Names(Replacer):
+    """Replaces names by what they stand for."""
+
+    def __init__(self, made: Made) -> None:
+        super().__init__()
         self.made = made
 
+    @override
     def visit_Name(self, node: ast.Name) -> ast.AST:
-        return self.made.get(node.id, node)
+        value = self.made.get(node.id)
+        return node if value is None else self.replaced(value)
 
 
-def _is_place(soft: ast.expr, known: dict[str, ast.expr]) -> bool:
+class _Lookup:
+    """Looks up what names stand for, and gives up where a success function builds on itself too often."""
+
+    def __init__(self, made: Made) -> None:
+        self.made, self.count = made, 0
+
+    def __call__(self, name: str) -> ast.expr | None:
+        self.count += 1
+        if self.count > MAX_LOOKUPS:
+            raise UnreadableError(
+                "the lines of its success function build on each other too often"
+            )
+        return self.made.get(name)
+
+
+def _success_slopes(code: str) -> list[tuple[str, str, bool]]:
+    """Return the conditions of `compute_success` as slopes: name, text, and whether it is about where things are.
+
+    Raises:
+        UnreadableError: it is not a list of assignments, or they build on each other too often.
+    """
+    made, expr = _success_of(code)
+    slopes: list[tuple[str, str, bool]] = []
+    for name, condition in conditions(expr, _Lookup(made)):
+        soft = softened(condition, _Lookup(made))
+        if soft is not None:
+            text = ast.unparse(ast.fix_missing_locations(soft))
+            slopes.append((name, text, _is_place(soft, made)))
+    return slopes
+
+
+def _is_place(soft: ast.expr, made: Made) -> bool:
     """Whether a slope is about where things are; being still or let go is worth something at the end only."""
-    for _ in range(len(known) + 1):
-        soft = _Names(known).visit(copy.deepcopy(soft))
+    soft = _Names(made).replaced(soft)
     keys = {
         n.value for n in ast.walk(soft) if isinstance(n, ast.Constant) and isinstance(n.value, str)
     }
@@ -273,18 +310,23 @@ def _success_lines(code: str) -> tuple[list[ast.stmt], ast.expr]:
     raise UnreadableError("its success function is more than a list of assignments")
 
 
-def _success_of(code: str) -> tuple[dict[str, ast.expr | None], ast.expr]:
-    """Return what each name of `compute_success` stands for, None where it is changed in place, and the result."""
+def _success_of(code: str) -> tuple[Made, ast.expr]:
+    """Return what each name of `compute_success` stands for in the end, and the result."""
     lines, expr = _success_lines(code)
-    made: dict[str, ast.expr | None] = {}
+    made: Made = {}
     for node in lines:
         match node:
+            case ast.Assign(targets=[ast.Name(id=name)], value=value) if name not in made:
+                made[name] = value
             case ast.Assign(targets=[ast.Name(id=name)], value=value):
-                made[name] = None if name in made else value
-            case ast.Assign(targets=targets):
-                for child in ast.walk(ast.Tuple(targets)):
-                    if isinstance(child, ast.Name) and child.id in made:
-                        made[child.id] = None
+                old = made.pop(name)
+                is_read = any(v is not None and name in names_in(v) for v in made.values())
+                # `ok = ok & more` goes on from the old value, which nothing else may mean then.
+                made[name] = (
+                    None if old is None or is_read else _Names({name: old}).replaced(value)
+                )
+            case other:
+                made |= dict.fromkeys(stored_names(other))
     return made, expr
 
 

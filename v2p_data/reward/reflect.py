@@ -5,8 +5,8 @@ alternate with redesigns (`redesign`), as the paper asks for. Nothing but the re
 read by the guard and has run in the sandbox, and no two pay the same.
 """
 
-import ast
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ from v2p_data.task.probes import random_states
 from v2p_data.task.reader.check import check_code
 from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.splice import reward_part
 from v2p_data.task.task import TaskBundle
 
 PROBES = 64
@@ -43,7 +44,13 @@ class Reflection:
 
 
 def reflect(
-    bundle: TaskBundle, code: str, feedback: Feedback, rng: np.random.Generator, count: int
+    bundle: TaskBundle,
+    code: str,
+    feedback: Feedback,
+    rng: np.random.Generator,
+    count: int,
+    *,
+    tried: Sequence[str] = (),
 ) -> list[Reflection]:
     """Return the next rewards, the most promising first.
 
@@ -53,12 +60,14 @@ def reflect(
         feedback: what came of it.
         rng: varies weights where the numbers leave them open.
         count: how many are wanted.
+        tried: task codes whose rewards are known already.
 
     Returns:
-        `count` rewards, or fewer where no more runnable ones were found that differ from the parent and each other.
+        `count` rewards, or fewer where no more runnable ones were found that differ from the parent, each other and
+        what was tried.
     """
     found: list[Reflection] = []
-    seen = {_shape(code)}
+    seen = {_shape(c) for c in (code, *tried)}
     paid: list[np.ndarray] = []
     candidates = proposals(bundle, code, feedback, rng)
     parent_is_run = False
@@ -98,7 +107,7 @@ def proposals(
         reward, trouble = None, str(error)
     if reward is None:
         streams = [
-            _wrapped(bundle, code, feedback, trouble),
+            _wrapped(bundle, code, feedback, trouble, rng),
             _redesigns(bundle, code, feedback, rng),
         ]
     elif feedback.num_successes == 0:
@@ -171,9 +180,10 @@ def _varied(reward: Reward, feedback: Feedback, rng: np.random.Generator) -> Ite
         if sloped and rng.random() < 0.5:
             name = str(rng.choice(sloped))
             part, factor = new.part(name), float(np.exp(rng.normal(0.0, 0.4)))
-            if part is not None:
-                new = kernels_of(new, part)[0].changed(new, name, factor)
-                reasons.append(f"temperature of '{name}' times {factor:.2f}")
+            with suppress(UnreadableError):  # then its temperature stays
+                if part is not None:
+                    new = kernels_of(new, part)[0].changed(new, name, factor)
+                    reasons.append(f"temperature of '{name}' times {factor:.2f}")
         if len(reasons) > 1:
             yield Reflection(code=new.code(), reasons=tuple(reasons))
 
@@ -202,21 +212,19 @@ def _as_reflection(design: redesign.Design, rate: str) -> Reflection:
 
 
 def _wrapped(
-    bundle: TaskBundle, code: str, feedback: Feedback, trouble: str
+    bundle: TaskBundle, code: str, feedback: Feedback, trouble: str, rng: np.random.Generator
 ) -> Iterator[Reflection]:
-    """Yield a reward that cannot be taken apart, scaled and with a stage added."""
+    """Yield a reward that cannot be taken apart, called by a new one that scales it and adds a stage."""
     sentence = f"the reward cannot be taken apart ({trouble}), so it stays whole"
     whole = feedback.reward.overall
     size = 0.0 if whole is None else max(abs(whole.mean), whole.std)
     scale = 50.0 / size if size > rules.MAX_TOTAL else 1.0
-    added = [
-        (name, share, text)
-        for name, share, text, _ in rules.stages(bundle.scene, code, feedback)
-        if share < rules.STAGE_REACHED
-    ][:1]
+    stages = rules.stages(bundle.scene, code, feedback)
+    added = [(name, share, text) for name, share, text, _ in stages if share < rules.STAGE_REACHED]
     goal = redesign.goal_text(code)
-    if goal and not added:
-        added = [("goal", feedback.success_rate, f"0.6 * {goal}")]
+    if goal:
+        added.append(("goal", feedback.success_rate, f"0.6 * {goal}"))
+    added = added[:1]
     plans = [
         (
             scale,
@@ -229,6 +237,13 @@ def _wrapped(
     if scale != 1.0:
         words = f"it is about {size:.3g} per step, the bonus for success is 100: times {scale:.2g}"
         plans.append((scale, "", "", words))
+    for _ in range(MAX_CANDIDATES // 4):
+        factor = scale * float(np.exp(rng.normal(0.0, 0.5)))
+        plans.append((factor, "", "", f"varied: all of it times {factor:.2f}"))
+        for name, _, text in added:
+            share = float(rng.uniform(0.4, 1.6))
+            words = f"{plans[-1][-1]}, with {share:.2f} times the stage '{name}'"
+            plans.append((factor, f"stage_{name}", f"{share:.2f} * ({text})", words))
     for factor, name, text, reason in plans:
         try:
             new = redesign.wrapped(code, factor, name, text)
@@ -264,14 +279,10 @@ def _is_accepted(code: str) -> bool:
 def _shape(code: str) -> str:
     """Return what is the same for codes whose rewards differ in comments only."""
     try:
-        function = function_of(code)
+        function_of(code)
     except UnreadableError:
         return code
-    tree = ast.parse(ast.unparse(function)).body[0]
-    assert isinstance(tree, ast.FunctionDef)
-    if ast.get_docstring(tree) is not None:
-        tree.body = tree.body[1:]
-    return ast.dump(tree)
+    return reward_part(code)
 
 
 def _run(codes: list[str], bundle: TaskBundle) -> list[SmokeResult]:

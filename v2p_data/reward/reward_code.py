@@ -36,11 +36,19 @@ class Reward:
 
     def __init__(self, source: str) -> None:
         self.source = source
-        self._body = Body(source)
-        total, holder = returned(self._body)
-        components = Components(self._body, holder)
-        self.dict_name = components.dict_name
-        self.scale, self.parts = taken_apart(self._body, total, components)
+        readers = [0]
+        while readers:
+            self._body = Body(source)
+            total, holder = returned(self._body)
+            components = Components(self._body, holder)
+            self.dict_name = components.dict_name
+            readers = components.stale_readers()
+            if not readers:
+                self.scale, self.parts = taken_apart(self._body, total, components)
+                # The dict is made anew below these lines.
+                readers = components.readers(self._needed())
+            if readers:
+                source = components.written_out(readers)
 
     # -- what it says
 
@@ -68,6 +76,15 @@ class Reward:
     def definition(self, name: str, position: int) -> tuple[int, ast.expr] | None:
         """Return the last definition before a statement; None for names that are changed in place."""
         return self._body.definition(name, position)
+
+    def lasting_definition(self, name: str, position: int) -> ast.expr | None:
+        """Return what a name stands for, if that can be said at a statement without it; None otherwise."""
+        made = self._body.definition(name, position)
+        if made is None:
+            return None
+        at, value = made
+        again = any(self._body.is_set_between(n, at, position) for n in names_in(value))
+        return None if again else value
 
     # -- changes
 
@@ -143,9 +160,8 @@ class Reward:
 
     def text(self) -> str:
         """Return the reward function."""
-        pad = " " * self._body.function.body[0].col_offset
-        used = [name for p in self.parts for name in names_in(p.expr)]
-        lines = self._body.lines_for(used, besides=self.dict_name)
+        pad = self._body.pad
+        lines = self._body.lines_for(self._needed(), besides=self.dict_name)
         rows = [self._body.header([p.name for p in self.parts])]
         rows += [line.text for line in lines]
         rows.append(f"{pad}{self.dict_name} = {{}}\n")
@@ -154,9 +170,13 @@ class Reward:
                 rows.append(f"{pad}# {part.note}\n")
             rows.append(f'{pad}{self.dict_name}["{part.name}"] = {part.text}\n')
         paid = " + ".join(f'{self.dict_name}["{p.name}"]' for p in self.parts if p.is_paid)
-        total = free_name("total", {n for line in lines for n in stored_names(line.node)})
+        taken = {n for line in lines for n in stored_names(line.node)} | {self.dict_name}
+        total = free_name("total", taken)
         rows.append(
             f"{pad}{total} = {paid if self.scale == 1 else f'{number(self.scale)} * ({paid})'}\n"
         )
         rows.append(f"{pad}return {total}, {self.dict_name}\n")
         return "".join(rows)
+
+    def _needed(self) -> list[str]:
+        return [name for p in self.parts for name in names_in(p.expr)]

@@ -350,8 +350,4 @@ def _dropping(part: Part, words: str) -> Change:
 
 
 def _definitions(reward: Reward, part: Part) -> Callable[[str], ast.expr | None]:
-    def definition(name: str) -> ast.expr | None:
-        made = reward.definition(name, part.position)
-        return None if made is None else made[1]
-
-    return definition
+    return lambda name: reward.lasting_definition(name, part.position)

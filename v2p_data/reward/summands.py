@@ -82,7 +82,7 @@ def taken_apart(
     rest = [t for t in terms if t.name is None]
     for i, term in enumerate(rest):
         name = free_name("rest" if i == 0 else f"rest_{i}", set(components.found))
-        text = components.text_of(term.node)
+        text = components.text_of(term.node, term.position)
         if constant(term.node) is not None and parts:
             text = f"torch.full_like({parts[0].text}, {text})"
         text = _weighted(text, term.factor / scale)
@@ -104,11 +104,11 @@ def _is_sum_of_others(
 
 def _component_part(name: str, terms: list[_Term], scale: float, components: Components) -> Part:
     position, expr = components.found[name]
-    mine = [t.factor for t in terms if t.name == name]
-    text = components.text_of(expr)
-    if mine:
-        text = _weighted(text, sum(mine) / scale)
-    return Part(name=name, text=text, position=position, is_paid=bool(mine))
+    share = sum(t.factor for t in terms if t.name == name) / scale
+    text = components.text_of(expr, position)
+    if share:
+        text = _weighted(text, share)
+    return Part(name=name, text=text, position=position, is_paid=share != 0)
 
 
 def _weighted(text: str, factor: float) -> str:
@@ -117,12 +117,11 @@ def _weighted(text: str, factor: float) -> str:
 
 def _demand_one_meaning(parts: list[Part], body: Body) -> None:
     """Refuse rewards in which a name means one thing to a part and another at the end."""
+    end = len(body.lines)
     for part in parts:
         for node in ast.walk(part.expr):
-            if isinstance(node, ast.Name):
-                later = [p for p, _ in body.definitions(node.id, len(body.lines))]
-                if any(p > part.position for p in later):
-                    raise UnreadableError(f"it gives '{node.id}' two meanings")
+            if isinstance(node, ast.Name) and body.is_set_between(node.id, part.position, end):
+                raise UnreadableError(f"it gives '{node.id}' two meanings")
 
 
 class _Sum:
@@ -140,8 +139,8 @@ class _Sum:
         self.body, self.components, self.known = body, components, known
 
     def terms(self, expr: ast.expr, position: int) -> list[_Term]:
-        """Return the summands of an expression, each with the component that it is."""
-        found = self._summands(expr, position, 1.0)
+        """Return the summands of an expression that are not always 0, each with the component that it is."""
+        found = [t for t in self._summands(expr, position, 1.0) if t.factor]
         return [t for t in found if not _is_zeros(self.body.inlined(t.node, t.position))]
 
     def _summands(self, node: ast.expr, at: int, factor: float) -> Iterator[_Term]:
@@ -194,6 +193,11 @@ class _Sum:
                 made = self.body.definition(name, at)
                 if made is not None and _is_worth_opening(made[1]):
                     return [(made[1], made[0], factor)]
+            case ast.Call(
+                func=ast.Name(id="sum"),
+                args=[ast.Call(func=ast.Attribute(value=ast.Name(id=name), attr="values"))],
+            ) if name == self.components.dict_name:
+                return [(expr, p, factor) for p, expr in self.components.settings_before(at)]
         return None
 
 
@@ -201,6 +205,8 @@ def _is_worth_opening(node: ast.expr) -> bool:
     """Whether what a name stands for is to be taken apart rather than called by the name."""
     match node:
         case ast.BinOp(op=ast.Add() | ast.Sub()) | ast.Name():
+            return True
+        case ast.Call(func=ast.Name(id="sum")):
             return True
         case ast.Subscript(slice=ast.Constant()):
             return True
