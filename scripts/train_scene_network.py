@@ -32,7 +32,9 @@ from v2p_data.scene.network import (
     SceneNetwork,
     inputs_of,
     net_size,
+    resized,
 )
+from v2p_data.scene.scale import table_width_m
 from v2p_data.seeds import rng_for
 from v2p_data.video.synthetic import (
     LABEL_HAND,
@@ -169,15 +171,17 @@ class Examples:
             for clip in clips:
                 n = len(clip["frames"])
                 size = net_size(*clip["early"].shape[:2])
-                stills = [np.repeat(_at(size, clip[key])[None], n, 0) for key in ("early", "late")]
-                frames = np.stack([_at(size, frame) for frame in clip["frames"]])
+                stills = [
+                    np.repeat(resized(clip[key], size)[None], n, 0) for key in ("early", "late")
+                ]
+                frames = np.stack([resized(frame, size) for frame in clip["frames"]])
                 early, late, frame = (x.transpose(0, 3, 1, 2) for x in (*stills, frames))
                 row = {
                     "frame": frame,
                     "early": early,
                     "late": late,
                     "labels": np.stack([_labels_at(size, one) for one in clip["labels"]]),
-                    "camera": np.repeat(clip["camera"][None], n, 0),
+                    "camera": np.repeat(known_of(clip["camera"])[None], n, 0),
                 }
                 out.append({k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in row.items()})
         return out
@@ -193,9 +197,12 @@ def _varied(
     if rng.random() < 0.5:
         pictures, labels = [p[:, ::-1] for p in pictures], labels[:, ::-1]
     size, is_part = net_size(*labels.shape), rng.random() < 0.6
+    camera = known_of(clip["camera"])
     if is_part:
-        pictures, labels = _nearer(pictures, labels, rng)
-    pictures, labels = [_at(size, p) for p in pictures], _labels_at(size, labels)
+        part = _nearer(labels, rng)
+        camera = known_of(clip["camera"], part, labels.shape)
+        pictures, labels = [p[part] for p in pictures], labels[part]
+    pictures, labels = [resized(p, size) for p in pictures], _labels_at(size, labels)
     mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
     if rng.random() < 0.1:
         mix = np.full((3, 3), 1 / 3) + 0.15 * mix
@@ -216,15 +223,12 @@ def _varied(
         "early": out[1],
         "late": out[2],
         "labels": np.ascontiguousarray(labels),
-        # Where a whole picture may be a part as well, its focal length is guessed too long.
-        "camera": np.full(3, np.nan, np.float32) if is_part else clip["camera"],
+        "camera": camera,
     }
 
 
-def _nearer(
-    pictures: list[np.ndarray], labels: np.ndarray, rng: np.random.Generator
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return a part of the pictures, mostly with something that moves in it."""
+def _nearer(labels: UInt8[np.ndarray, "h w"], rng: np.random.Generator) -> tuple[slice, slice]:
+    """Return a part of the picture, mostly with something that moves in it."""
     h, w = labels.shape
     zoom = rng.uniform(1.05, 2.5)
     ch, cw = int(h / zoom), int(w / zoom)
@@ -232,13 +236,29 @@ def _nearer(
     middle = spots[rng.integers(len(spots))] if len(spots) else np.array([h / 2, w / 2])
     y = int(np.clip(middle[0] - ch * rng.uniform(0.25, 0.75), 0, h - ch))
     x = int(np.clip(middle[1] - cw * rng.uniform(0.25, 0.75), 0, w - cw))
-    part = slice(y, y + ch), slice(x, x + cw)
-    return [p[part] for p in pictures], labels[part]
+    return slice(y, y + ch), slice(x, x + cw)
 
 
-def _at(size: tuple[int, int], image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b 3"]:
-    how = cv2.INTER_AREA if size[1] < image.shape[1] else cv2.INTER_LINEAR
-    return cv2.resize(np.ascontiguousarray(image), (size[1], size[0]), interpolation=how)
+def known_of(
+    camera: Float[np.ndarray, "3"],
+    part: tuple[slice, slice] | None = None,
+    shape: tuple[int, int] = (1, 1),
+) -> Float[np.ndarray, "3"]:
+    """Return what the network is to say of a camera (pitch [rad], log focal over width, log height [m]).
+
+    That is pitch and log focal as they are, and the logarithm of `table_width_m`. A part of a picture shows neither of
+    the first two: where a whole picture might be a part, its focal length would be guessed too long.
+    """
+    pitch, log_focal, log_height = (float(v) for v in camera)
+    focal, height = np.exp(log_focal), np.exp(log_height)
+    if part is None:
+        return np.array(
+            [pitch, log_focal, np.log(table_width_m(pitch, focal, height))], np.float32
+        )
+    rows, columns = part
+    below = ((rows.start + rows.stop) / 2 - shape[0] / 2) / shape[1]
+    width = table_width_m(pitch, focal, height, below) * (columns.stop - columns.start) / shape[1]
+    return np.array([np.nan, np.nan, np.log(width)], np.float32)
 
 
 def _labels_at(
@@ -262,10 +282,10 @@ def loss_of(
         common = (share[:, c] * truth).sum((1, 2))
         total = share[:, c].sum((1, 2)) + truth.sum((1, 2))
         dice = dice + (1 - (2 * common + 50) / (total + 50)).mean()
-    known = batch["camera"].isfinite().all(1)
-    off, log_sd = camera[known, :3] - batch["camera"][known], camera[known, 3:].clamp(-4, 1)
-    likelihood = (log_sd + 0.5 * (off / log_sd.exp()) ** 2).sum() / max(1, 3 * int(known.sum()))
-    return ce + 0.3 * dice + 0.1 * likelihood
+    known = batch["camera"].isfinite()
+    off, log_sd = (camera[:, :3] - batch["camera"])[known], camera[:, 3:].clamp(-4, 1)[known]
+    likelihood = (log_sd + 0.5 * (off / log_sd.exp()) ** 2).sum() / max(1, int(known.sum()))
+    return ce + 0.3 * dice + 0.2 * likelihood
 
 
 @torch.inference_mode()
@@ -286,11 +306,11 @@ def measure(net: SceneNetwork, held_out: list[dict[str, torch.Tensor]]) -> str:
         off.append((camera[:, :3] - row["camera"]).abs().mean(0).numpy())
     net.train()
     ious = ", ".join(f"{n} {i:.3f}" for n, i in zip(CLASSES, common / either, strict=True))
-    pitch, focal, height = np.median(off, axis=0)
+    pitch, focal, width = np.median(off, axis=0)
     good = float(np.mean(np.array(each) > 0.6))
     return (
         f"{ious}; moved per frame: median {np.median(each):.3f}, {good:.1%} above 0.6; "
-        f"pitch off {np.degrees(pitch):.1f} deg, focal {focal:.1%}, height {height:.1%}"
+        f"pitch off {np.degrees(pitch):.1f} deg, focal {focal:.1%}, width of the table {width:.1%}"
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.find import Watched, find_movers, standing
 from v2p_data.scene.footage import footage_of
+from v2p_data.scene.scale import SeenCamera
 from v2p_data.video.clip import Clip
 
 H, W = 90, 120
@@ -48,8 +49,10 @@ def watched_of(parts_by_frame):
     rows, columns = (np.arange(h) * H) // h, (np.arange(w) * W) // w
     large = shares[:, :, rows][..., columns]
     return footage, Watched(
-        idx=np.arange(len(frames)), shares=large, early=large[0], late=large[-1], pitch_rad=0.6,
-        pitch_sd_rad=0.1, focal_widths=0.9, focal_sd=0.2, height_m=0.5, height_sd=0.3,
+        idx=np.arange(len(frames)), shares=large, early=large[0], late=large[-1],
+        camera=SeenCamera(
+            pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.9, table_width_sd=0.2
+        ),
     )  # fmt: skip
 
 

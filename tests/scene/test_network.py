@@ -39,8 +39,8 @@ def test_shares_are_probabilities_at_the_frames_own_size():
 
     assert seen.shares.shape == (3, len(CLASSES), 90, 120)
     np.testing.assert_allclose(seen.shares.sum(1), 1, atol=1e-3)
-    assert seen.pitch_sd_rad > 0
-    assert 0.2 < seen.focal_widths < 5
+    assert seen.camera.pitch_sd_rad > 0
+    assert 0.2 < seen.camera.focal_widths < 5
 
 
 def test_the_batch_size_does_not_change_what_is_seen():

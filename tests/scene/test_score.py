@@ -98,6 +98,23 @@ def test_errors_are_distances_between_centres_in_metres():
     assert thing.position_last_m == pytest.approx(0.05)
 
 
+def test_a_depth_that_the_scene_does_not_claim_to_know_is_told_apart():
+    sight = np.array([0.1, 0, -0.48]) / np.hypot(
+        0.1, 0.48
+    )  # from the camera to where it truly ends
+    move = np.array([0.1, 0.01, 0]) + 0.06 * sight
+
+    claimed = scored(true_thing(), found_thing(move=move)).things[0]
+    open_ = scored(true_thing(), found_thing(move=move, last_depth_seen=False)).things[0]
+
+    assert claimed.position_last_m == pytest.approx(np.hypot(0.01, 0.06))
+    assert claimed.position_last_depth_m is None
+    assert "pose" in claimed.failures()
+    assert open_.position_last_m == pytest.approx(0.01)
+    assert open_.position_last_depth_m == pytest.approx(0.06)
+    assert "pose" not in open_.failures()
+
+
 def test_a_camera_that_is_taken_to_be_higher_shows_in_its_own_frame_only():
     true, found = true_thing(), found_thing()
     higher = CAMERA.copy()

@@ -58,7 +58,7 @@ class ShowReward:
 def reward_command(argv: list[str]) -> int:
     from v2p_data.commands.run import _up_to
 
-    return _up_to("reward", argv, lambda v, c: _stage_of(v, c), "v2p expert")
+    return _up_to("reward", argv, _stage_of, "v2p expert")
 
 
 def _stage_of(video: Any, cfg: Any) -> Any:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.ndimage import median_filter
 
 from v2p_data.scene.classes import HAND, LONG_SIDE_PX, MOVED, OTHER, TABLE
@@ -22,8 +22,9 @@ from v2p_data.scene.colour import (
     named_colours,
     similarity,
 )
-from v2p_data.scene.footage import Footage, still_of
+from v2p_data.scene.footage import Footage, end_quarters, still_of
 from v2p_data.scene.ground import Moved
+from v2p_data.scene.scale import SeenCamera, table_width_m
 from v2p_data.scene.segment import bounding_box, edge_contrast, grow, largest, refine, tidy
 from v2p_data.video.clip import Clip
 
@@ -55,12 +56,7 @@ class Watched:
     """In the still of the beginning."""
     late: Float32[np.ndarray, "5 h w"]
     """In the still of the end."""
-    pitch_rad: float
-    pitch_sd_rad: float
-    focal_widths: float
-    focal_sd: float
-    height_m: float
-    height_sd: float
+    camera: SeenCamera
 
     def at(self, i: int) -> Float32[np.ndarray, "5 h w"]:
         """Return the probabilities at the footage frame nearest to `i`."""
@@ -109,18 +105,13 @@ def watch(clip: Clip, footage: Footage) -> Watched:
         np.broadcast_to(footage.early, pictures.shape),
         np.broadcast_to(footage.late, pictures.shape),
     )
-    _look_closer(clip, footage, idx, seen.shares)
+    camera = _look_closer(clip, footage, idx, seen.shares, seen.camera)
     return Watched(
         idx=idx,
         shares=seen.shares[:-2],
         early=seen.shares[-2],
         late=seen.shares[-1],
-        pitch_rad=seen.pitch_rad,
-        pitch_sd_rad=seen.pitch_sd_rad,
-        focal_widths=seen.focal_widths,
-        focal_sd=seen.focal_sd,
-        height_m=seen.height_m,
-        height_sd=seen.height_sd,
+        camera=camera,
     )
 
 
@@ -129,36 +120,35 @@ def _look_closer(
     footage: Footage,
     idx: Int[np.ndarray, "n"],
     shares: Float32[np.ndarray, "n+2 5 h w"],
-) -> None:
+    camera: SeenCamera,
+) -> SeenCamera:
     """Replace the shares around what moves by what the network sees there at the clip's own resolution.
 
     The window keeps its size and goes along. The last two shares are those of the stills, of the beginning and the end.
+    Both looks say how much of the table the picture shows; the camera comes back with both in it.
     """
-    from v2p_data.scene.network import look
+    from v2p_data.scene.network import look, resized
 
     windows = _windows(shares[:-2, MOVED])
     if windows is None:
-        return
+        return camera
     w, h = windows.size
-    clip_w = clip.frames.shape[2]
     zoom = LONG_SIDE_PX / max(w, h)
-    size = (round(footage.shape[1] * zoom), round(footage.shape[0] * zoom))
-    how = cv2.INTER_AREA if size[0] < clip_w else cv2.INTER_LINEAR
+    size = (round(footage.shape[0] * zoom), round(footage.shape[1] * zoom))
 
     def large(picks: Int[np.ndarray, "k"]) -> UInt8[np.ndarray, "k y x 3"]:
         frames = (clip.frames[i] for i in footage.frame_idx[picks])
-        return np.stack([cv2.resize(frame, size, interpolation=how) for frame in frames])
+        return np.stack([resized(frame, size) for frame in frames])
 
     n = len(footage.rgb)
-    quarter = max(3, n // 4)
-    early, late = (still_of(large(p)) for p in (np.arange(n)[:quarter], np.arange(n)[-quarter:]))
+    early, late = (still_of(large(np.arange(n)[quarter])) for quarter in end_quarters(n))
     pictures = np.concatenate([large(idx), early[None], late[None]])
     corners = windows.corners[[*range(len(idx)), 0, -1]]
     spots = [
         (slice(y, y + round(h * zoom)), slice(x, x + round(w * zoom)))
         for x, y in (corners * zoom).astype(int)
     ]
-    seen = look(
+    near = look(
         np.stack([picture[spot] for picture, spot in zip(pictures, spots, strict=True)]),
         np.stack([early[spot] for spot in spots]),
         np.stack([late[spot] for spot in spots]),
@@ -166,10 +156,30 @@ def _look_closer(
     inside = np.zeros((h, w), np.float32)
     inside[_FADE_PX:-_FADE_PX, _FADE_PX:-_FADE_PX] = 1
     inside = cv2.blur(inside, (2 * _FADE_PX - 1, 2 * _FADE_PX - 1), borderType=cv2.BORDER_CONSTANT)
-    for whole, near, (x, y) in zip(shares, seen.shares, corners, strict=True):
+    for whole, part, (x, y) in zip(shares, near.shares, corners, strict=True):
         there = whole[:, y : y + h, x : x + w]
-        own = [cv2.resize(plane, (w, h), interpolation=cv2.INTER_AREA) for plane in near]
+        own = [cv2.resize(plane, (w, h), interpolation=cv2.INTER_AREA) for plane in part]
         there += inside * (np.stack(own) - there)
+    below = (corners[:, 1] + h / 2 - footage.shape[0] / 2) / footage.shape[1]
+    return _both(camera, near.camera, w / footage.shape[1], below)
+
+
+def _both(
+    whole: SeenCamera, part: SeenCamera, share: float, below: Float[np.ndarray, "n"]
+) -> SeenCamera:
+    """Return the camera of the whole picture, with what parts of it show of the table's width.
+
+    The parts are `share` of the picture's width wide, and lie `below` its middle, in picture widths.
+    """
+    # What a picture of a table that is one metre wide in the middle would show in the part's rows.
+    height = 1.0 / table_width_m(whole.pitch_rad, whole.focal_widths, 1.0)
+    rows = [table_width_m(whole.pitch_rad, whole.focal_widths, height, float(b)) for b in below]
+    ratio = float(np.nanmedian(rows)) * share
+    if not np.isfinite(ratio):
+        return whole
+    precise = np.array([whole.table_width_sd, part.table_width_sd]) ** -2
+    logs = np.log([whole.table_width_m, part.table_width_m / ratio])
+    return replace(whole, table_width_m=float(np.exp(precise @ logs / precise.sum())))
 
 
 @dataclass(frozen=True, kw_only=True)

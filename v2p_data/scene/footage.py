@@ -117,7 +117,7 @@ def footage_of(clip: Clip) -> Footage:
     how = cv2.INTER_AREA if w > WIDTH_PX else cv2.INTER_LINEAR
     rgb = np.stack([cv2.resize(clip.frames[i], size, interpolation=how) for i in frame_idx])
     lab = lab_of(rgb)
-    quarter = max(3, len(rgb) // 4)
+    first, last = end_quarters(len(rgb))
     always = still_of(rgb)
     moving = _passing(rgb, lab, always)
     skin = moving[skin_prior(moving[None])[0]] if len(moving) else moving
@@ -126,13 +126,19 @@ def footage_of(clip: Clip) -> Footage:
         lab=lab,
         frame_idx=frame_idx,
         px_scale=WIDTH_PX / w,
-        early=still_of(rgb[:quarter]),
-        late=still_of(rgb[-quarter:]),
+        early=still_of(rgb[first]),
+        late=still_of(rgb[last]),
         always=always,
         moving=moving,
         hand_hist=histogram(skin if len(skin) > 300 else skin[:0]),
         rest_hist=histogram(always.reshape(-1, 3)),
     )
+
+
+def end_quarters(n: int) -> tuple[slice, slice]:
+    """Return the first and the last quarter of `n` frames, of which the stills are made: three frames at least."""
+    quarter = max(3, n // 4)
+    return slice(0, quarter), slice(-quarter, None)
 
 
 def still_of(rgb: UInt8[np.ndarray, "time h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

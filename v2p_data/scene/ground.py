@@ -167,6 +167,9 @@ def find_other(
     words = colour_words(phrase)
     goal = moved.first if late else moved.last
     goal_zone = grow(goal, 6)
+    foot = goal_zone.copy()
+    top, tall = bounding_box(goal)[1::2]
+    foot[: top + tall // 2] = False
     distance = cv2.distanceTransform((~goal).astype(np.uint8), cv2.DIST_L2, 5)
     colour = _colour(still, words)
     quarter = max(3, len(footage.lab) // 5)
@@ -194,6 +197,8 @@ def find_other(
             score = -_border_sides((x, y, bw, bh), w, h) * 0.8
             if kind in _TOUCH_KINDS or late:
                 score += 3 * min(0.6, float((mask & goal_zone).sum() / goal_zone.sum()))
+            if late:  # what was under the cover stands where its foot was
+                score += 2.5 * float((mask & foot).sum() / area - 0.6)
             gap = float(distance[mask].min())
             near = 20 if kind in _NEAR_KINDS | _TOUCH_KINDS or late else 60
             score -= min(gap / near, 4.0)

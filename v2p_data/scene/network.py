@@ -19,6 +19,7 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.classes import CLASSES, LONG_SIDE_PX
+from v2p_data.scene.scale import SeenCamera
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 _STEP = 16
@@ -33,18 +34,7 @@ class Seen:
 
     shares: Float32[np.ndarray, "n 5 h w"]
     """Probability of each class, summing to one."""
-    pitch_rad: float
-    """How far the camera looks below the horizon."""
-    pitch_sd_rad: float
-    """Its standard deviation, as the network states it."""
-    focal_widths: float
-    """Focal length over picture width."""
-    focal_sd: float
-    """Standard deviation of its logarithm."""
-    height_m: float
-    """Of the camera over the table."""
-    height_sd: float
-    """Standard deviation of its logarithm."""
+    camera: SeenCamera
 
 
 def net_size(height_px: int, width_px: int) -> tuple[int, int]:
@@ -78,7 +68,7 @@ class SceneNetwork(nn.Module):
     def forward(
         self, x: Float[torch.Tensor, "n 15 h w"]
     ) -> tuple[Float[torch.Tensor, "n 5 h w"], Float[torch.Tensor, "n 6"]]:
-        """Return class logits, and the camera as (pitch [rad], log focal over width, log height [m], log sd of each)."""
+        """Return class logits, and the camera as (pitch [rad], log focal over width, log width of the table [m], log sd of each)."""
         x1 = self.enc1(self.stem(x))
         x2 = self.enc2(F.max_pool2d(x1, 2))
         x3 = self.enc3(F.max_pool2d(x2, 2))
@@ -152,11 +142,12 @@ def look(
     h, w = frames.shape[1:3]
     size = net_size(h, w)
     net = network()
-    shares, cameras = [], []
+    shares = np.empty((len(frames), len(CLASSES), h, w), np.float32)
+    cameras = []
     for start in range(0, len(frames), batch):
         part = slice(start, start + batch)
         now, before, after = (
-            torch.from_numpy(np.stack([_small(image, size) for image in images[part]])).permute(
+            torch.from_numpy(np.stack([resized(image, size) for image in images[part]])).permute(
                 0, 3, 1, 2
             )
             for images in (frames, early, late)
@@ -164,28 +155,27 @@ def look(
         logits, camera = net(
             inputs_of(now, before, after).contiguous(memory_format=torch.channels_last)
         )
-        shares.append(logits.softmax(1).numpy())
+        for full, small in zip(shares[part], logits.softmax(1).numpy(), strict=True):
+            for plane, own in zip(full, small, strict=True):
+                cv2.resize(own, (w, h), dst=plane, interpolation=cv2.INTER_LINEAR)
         cameras.append(camera.numpy())
-    small = np.concatenate(shares)
-    full = np.stack(
-        [
-            [cv2.resize(plane, (w, h), interpolation=cv2.INTER_LINEAR) for plane in one]
-            for one in small
-        ]
-    )
     camera = np.concatenate(cameras).mean(0)
     return Seen(
-        shares=full.astype(np.float32),
-        pitch_rad=float(camera[0]),
-        pitch_sd_rad=float(np.exp(camera[3])),
-        focal_widths=float(np.exp(camera[1])),
-        focal_sd=float(np.exp(camera[4])),
-        height_m=float(np.exp(camera[2])),
-        height_sd=float(np.exp(camera[5])),
+        shares=shares,
+        camera=SeenCamera(
+            pitch_rad=float(camera[0]),
+            pitch_sd_rad=float(np.exp(camera[3])),
+            focal_widths=float(np.exp(camera[1])),
+            table_width_m=float(np.exp(camera[2])),
+            table_width_sd=float(np.exp(camera[5])),
+        ),
     )
 
 
-def _small(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "a b 3"]:
+def resized(
+    image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]
+) -> UInt8[np.ndarray, "a b 3"]:
+    """Return a picture at (height, width), averaged where it shrinks."""
     how = cv2.INTER_AREA if size[1] < image.shape[1] else cv2.INTER_LINEAR
     return np.ascontiguousarray(cv2.resize(image, (size[1], size[0]), interpolation=how))
 

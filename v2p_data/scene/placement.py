@@ -26,7 +26,7 @@ from v2p_data.scene.pose import (
     orientations,
     yaw_of,
 )
-from v2p_data.scene.scale import SizeVote, camera_height_m
+from v2p_data.scene.scale import SizeVote, camera_height_m, table_width_m
 from v2p_data.scene.scene import Observed
 from v2p_data.scene.segment import bounding_box, grow, tidy
 from v2p_data.scene.sight import Sighting
@@ -53,6 +53,21 @@ class CameraGuess:
     """Over the table, where something measured it."""
     height_sd: float = 0.12
     """Standard deviation of its logarithm."""
+    table_width_m: float | None = None
+    """How much of the table the picture shows from left to right at its middle, where something saw it."""
+    table_width_sd: float = 0.2
+    """Standard deviation of its logarithm."""
+
+    def heights(self, pitch_rad: float) -> list[tuple[float, float]]:
+        """Return what this says of the height [m], with the logarithm's standard deviation, at a fitted pitch."""
+        out = []
+        if self.height_m is not None:
+            out.append((self.height_m, self.height_sd))
+        if self.table_width_m is not None:
+            focal_widths = 0.5 / np.tan(self.fov_rad / 2)
+            shown = table_width_m(pitch_rad, focal_widths, 1.0)
+            out.append((self.table_width_m / shown, self.table_width_sd))
+        return out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +141,7 @@ def place(
         upright_cost = cost if s is thing else upright_cost
     height_m, spread = camera_height_m(
         [vote_of(s, fit) for s, fit in zip(objects, firsts, strict=True)],
-        None if guess.height_m is None else (guess.height_m, guess.height_sd),
+        guess.heights(pitch_rad),
     )
     placed = []
     for k, s in enumerate(objects):

@@ -159,7 +159,8 @@ def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
         if noun.hollow and noun.taper < 0.9:
             ways.append((np.diag([1.0, -1.0, -1.0]), cost))
         if noun.size_m[2] > 0.9 * noun.size_m[0]:
-            ways.append((lying, cost))
+            # An upright vessel and its shadow have the outline of a lying one: vessels are seldom laid down.
+            ways.append((lying, 2 * cost if noun.hollow else cost))
         return ways
     on_side = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     smallest, largest = min(noun.size_m), max(noun.size_m)

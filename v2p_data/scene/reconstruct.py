@@ -54,8 +54,8 @@ _USUAL_FOV_RAD = 1.01
 """58 degrees, for web cameras and phones filming wide."""
 _MEASURED_SD = 0.02
 """Of a pitch [rad], or of the logarithm of a height, that the user gives."""
-_LEAST_HEIGHT_SD = 0.2
-"""Of the logarithm of the camera's height: rooms and hands that the network never saw make it surer than it may be."""
+_WIDTH_DOUBT = 1.4
+"""The network is surer of the table's width than it may be by this factor, on clips that it was not trained on."""
 _LEAST_QUALITY = 0.4
 """Masks that are believed less are left out of an object's track."""
 
@@ -64,7 +64,7 @@ _LEAST_QUALITY = 0.4
 class SceneConfig:
     """How a scene is rebuilt, and how sure we must be."""
 
-    min_confidence: float = 0.5
+    min_confidence: float = 0.6
     """Scenes below are rejected."""
     min_found: float = 0.5
     """Objects that are found less surely are rejected."""
@@ -244,7 +244,7 @@ def _check_change(footage: Footage) -> None:
 
 def _camera_guess(sights: Sights, cfg: SceneConfig) -> CameraGuess:
     """Return what is known of the camera: the user's word goes before the network's, that before what is usual."""
-    seen = sights.watched
+    seen = None if sights.watched is None else sights.watched.camera
     guess = CameraGuess(
         pitch_rad=_USUAL_PITCH_RAD, pitch_sd_rad=cfg.pitch_spread_rad, fov_rad=_USUAL_FOV_RAD
     )
@@ -253,8 +253,8 @@ def _camera_guess(sights: Sights, cfg: SceneConfig) -> CameraGuess:
             pitch_rad=seen.pitch_rad,
             pitch_sd_rad=float(np.clip(seen.pitch_sd_rad, 0.05, cfg.pitch_spread_rad)),
             fov_rad=float(2 * np.arctan(0.5 / seen.focal_widths)),
-            height_m=seen.height_m,
-            height_sd=max(seen.height_sd, _LEAST_HEIGHT_SD),
+            table_width_m=seen.table_width_m,
+            table_width_sd=_WIDTH_DOUBT * seen.table_width_sd,
         )
     if cfg.pitch_rad is not None:
         guess = replace(guess, pitch_rad=cfg.pitch_rad, pitch_sd_rad=_MEASURED_SD)

@@ -1,9 +1,11 @@
 """Camera heights become metres: every object's usual size votes for how high the camera stands.
 
 One view does not show scale. Nouns are within about 15-20 % of their usual size; several objects together do better
-than one, and a loose prior on the camera's height catches nouns that are not in the table.
+than one, the scene network says how much of the table the picture shows, and a loose prior on the camera's height
+catches what neither knows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +15,8 @@ from v2p_data.scene.nouns import Noun
 _USUAL_HEIGHT_M = 0.55
 _HEIGHT_SPREAD = 0.45
 """Cameras stand 0.25 to 1.2 m above tables, most of the time."""
+_FIT_SPREAD = 0.1
+"""How far a fitted size is off the true one in the picture: a pixel or two of the outline, a shadow taken along."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,17 +32,45 @@ class SizeVote:
     """The true size, where the user gave it."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SeenCamera:
+    """What the scene network says about a level camera above a table."""
+
+    pitch_rad: float
+    """How far the camera looks below the horizon."""
+    pitch_sd_rad: float
+    """Its standard deviation, as the network states it."""
+    focal_widths: float
+    """Focal length over picture width."""
+    table_width_m: float
+    """How much of the table the picture shows from left to right at its middle: hands and things tell that directly,
+    while a camera that is high with a long focal length sees what a low one with a short focal length does."""
+    table_width_sd: float
+    """Standard deviation of its logarithm."""
+
+
+def table_width_m(
+    pitch_rad: float, focal_widths: float, height_m: float, below: float = 0.0
+) -> float:
+    """Return how much of the table a level camera shows from left to right in one row of pixels.
+
+    `below` is how far that row lies under the picture's middle, in picture widths. NaN at and above the horizon.
+    """
+    down = np.sin(pitch_rad) + below / focal_widths * np.cos(pitch_rad)
+    return float(height_m / (focal_widths * down)) if down > 0.02 else float("nan")
+
+
 def camera_height_m(
-    votes: list[SizeVote], measured: tuple[float, float] | None = None
+    votes: list[SizeVote], measured: Sequence[tuple[float, float]] = ()
 ) -> tuple[float, float]:
     """Return the camera's height [m] and the standard deviation of its logarithm.
 
-    `measured` is such a pair from elsewhere, as from predicted depth.
+    `measured` are such pairs from elsewhere, as from predicted depth.
     """
     means, weights = [float(np.log(_USUAL_HEIGHT_M))], [_HEIGHT_SPREAD**-2]
-    if measured is not None:
-        means.append(float(np.log(measured[0])))
-        weights.append(measured[1] ** -2)
+    for height_m, spread in measured:
+        means.append(float(np.log(height_m)))
+        weights.append(spread**-2)
     for vote in votes:
         mean, spread = _implied(vote)
         means.append(mean)
@@ -65,4 +97,5 @@ def _implied(vote: SizeVote) -> tuple[float, float]:
         usual, seen = np.sort(usual), np.sort(seen)
     # Large extents are seen best: the thickness of a book says little about its scale.
     weight = usual / usual.sum()
-    return float(weight @ np.log(usual / seen)), 0.03 if vote.known_m else vote.noun.spread
+    spread = 0.03 if vote.known_m else float(np.hypot(vote.noun.spread, _FIT_SPREAD))
+    return float(weight @ np.log(usual / seen)), spread

@@ -103,6 +103,8 @@ class FoundThing:
     T_world_last: Float[np.ndarray, "4 4"]
     last_frame: int
     """Of the file."""
+    last_depth_seen: bool = True
+    """Whether the reconstruction says that it knows how far away the last pose is; in mid-air it does not."""
     masks: Mapping[int, Bool[np.ndarray, "h w"]] = field(repr=False)
     """By frame of the file, at working size."""
 
@@ -137,6 +139,9 @@ class ThingScore:
     position_first_m: float | None = None
     """Of the centre of the bounding box, in the scene frame."""
     position_last_m: float | None = None
+    """The same; of a last pose whose depth the scene declares unseen, across the line of sight."""
+    position_last_depth_m: float | None = None
+    """Of such a pose, along the line of sight: what it declares not to know."""
     position_first_cam_m: float | None = None
     """The same in the camera's frame, where a wrong distance to the whole scene shows."""
     position_last_cam_m: float | None = None
@@ -261,6 +266,7 @@ def found_of(reconstruction: Reconstruction) -> FoundClip:
                 T_world_first=thing.T_world_objs[0],
                 T_world_last=thing.T_world_objs[-1],
                 last_frame=int(file_frame[thing.frames[-1]]),
+                last_depth_seen=not thing.observed or thing.observed[-1] == "full",
                 masks=masks,
             )
         )
@@ -420,6 +426,13 @@ def _score_thing(
                 turn_between(true, found, T[:3, :3], T_found[:3, :3]),
             )
         )
+    across, along = ends[1][0], None
+    if not found.last_depth_seen:
+        across, along = _by_sight(
+            apply(T_last, centre_true)[0],
+            apply(found.T_world_last, centre_found)[0],
+            clip.T_world_cam[:3, 3],
+        )
     ious = _mask_ious(true, found)
     return ThingScore(
         phrase=true.phrase,
@@ -433,7 +446,8 @@ def _score_thing(
             ((ratio <= MAX_SIZE_RATIO) | (np.abs(sides - ours) <= SIZE_SLACK_M)).all()
         ),
         position_first_m=ends[0][0],
-        position_last_m=ends[1][0],
+        position_last_m=across,
+        position_last_depth_m=along,
         position_first_cam_m=ends[0][1],
         position_last_cam_m=ends[1][1],
         turn_first_rad=ends[0][2],
@@ -445,6 +459,15 @@ def _score_thing(
         volume_iou=volume_iou,
         shape_iou=shape_iou,
     )
+
+
+def _by_sight(
+    true: Float[np.ndarray, "3"], found: Float[np.ndarray, "3"], eye: Float[np.ndarray, "3"]
+) -> tuple[float, float]:
+    """Return how far two points are apart across and along the line of sight to the true one."""
+    sight = (true - eye) / np.linalg.norm(true - eye)
+    along = float((found - true) @ sight)
+    return float(np.linalg.norm(found - true - along * sight)), abs(along)
 
 
 def _travel_share(true: TrueThing, last: int) -> float | None:

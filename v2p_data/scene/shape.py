@@ -61,7 +61,7 @@ class ShapeConfig:
     revolution_margin: float = 0.025
     ball_margin: float = 0.06
     """For round fruit: a pear is no ball, but most outlines of balls are dented by noise."""
-    irregular_margin: float = 0.03
+    irregular_margin: float = 0.015
     """For an inflated silhouette of what is known to have no simple shape."""
     regular_margin: float = 0.15
     """For an inflated silhouette of anything else."""

@@ -1,0 +1,56 @@
+"""What the network is told of a camera is what the camera shows, in whole pictures and in parts of them."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from v2p_data.scene.pose import camera_above
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "train_scene_network.py"
+H, W = 240, 320
+PITCH_RAD, FOV_RAD, HEIGHT_M = 0.7, 0.9, 0.6
+CAMERA = np.array([PITCH_RAD, np.log(0.5 / np.tan(FOV_RAD / 2)), np.log(HEIGHT_M)])
+
+
+@pytest.fixture(scope="module")
+def trainer():
+    spec = importlib.util.spec_from_file_location("train_scene_network", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["train_scene_network"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["train_scene_network"]
+
+
+def _table_between(left: float, right: float, row: float) -> float:
+    ends = camera_above((H, W), PITCH_RAD, FOV_RAD, HEIGHT_M).on_plane(
+        np.array([[left, row], [right, row]])
+    )
+    return float(np.linalg.norm(ends[1] - ends[0]))
+
+
+def test_a_whole_picture_shows_pitch_focal_length_and_the_table_s_width(trainer):
+    known = trainer.known_of(CAMERA)
+
+    np.testing.assert_allclose(known[:2], CAMERA[:2], rtol=1e-6)
+    assert np.exp(known[2]) == pytest.approx(_table_between(0, W, H / 2))
+
+
+def test_a_part_shows_how_much_of_the_table_lies_across_its_own_middle(trainer):
+    part = slice(130, 230), slice(40, 180)
+
+    known = trainer.known_of(CAMERA, part, (H, W))
+
+    assert np.isnan(known[:2]).all()
+    assert np.exp(known[2]) == pytest.approx(_table_between(40, 180, 180.0))
+
+
+def test_a_part_in_the_sky_shows_no_table(trainer):
+    level = np.array([0.1, 0.0, 0.0])
+
+    assert np.isnan(trainer.known_of(level, (slice(0, 40), slice(0, 60)), (H, W))).all()
