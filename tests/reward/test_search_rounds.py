@@ -7,9 +7,11 @@ first of these, once with a reward that pays for failing, and for the second wit
 import json
 import re
 import runpy
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from v2p_data.candidate_worker import run_job
@@ -17,9 +19,11 @@ from v2p_data.cli import parse
 from v2p_data.pipeline.runner import Runtime, Stage, make_stage
 from v2p_data.report.page import NO_BREAK, write_page
 from v2p_data.report.reading import read_curve
-from v2p_data.reward.candidate import Candidate, load_candidates
+from v2p_data.reward.candidate import Candidate, Fault, load_candidates, read_json
+from v2p_data.reward.feedback import Feedback
 from v2p_data.reward.jobs import HEARTBEAT_FILE, Jobs
-from v2p_data.reward.methods import save_bundle
+from v2p_data.reward.methods import in_place_of_reward, save_bundle
+from v2p_data.reward.reflect import proposals
 from v2p_data.reward.search import search_reward
 from v2p_data.stages import REWARD_SEARCH_FOLDER, EngineConfig, chain
 from v2p_data.task.benchmark import load_benchmark
@@ -165,6 +169,56 @@ def test_who_is_written_by_rule_says_why(two_rounds: TwoRounds):
 
     assert len(by_rule) == 3
     assert all(row["reasons"] for row in by_rule)
+
+
+class Played(Jobs):
+    """Lets each candidate have come to what one of another search came to."""
+
+    def __init__(self, training: Path) -> None:
+        super().__init__()
+        self.training = training
+
+    def run(self, jobs, on_settled=lambda job: None, on_wait=lambda jobs: None):
+        for job in jobs:
+            shutil.copytree(
+                self.training,
+                job.folder,
+                ignore=shutil.ignore_patterns("trajectories.npz"),
+                dirs_exist_ok=True,
+            )
+
+
+def test_rounds_are_full_and_shared_also_where_an_elites_first_ideas_were_tried(
+    two_rounds: TwoRounds, tmp_path: Path
+):
+    flags = [*TINY, "--reward.iterations=2", "--reward.candidates=4", "--reward.elites=2"]
+    cfg = parse(EngineConfig, [*flags, "--reward.target-success=2.0"], "reward").reward
+    bundle = bundle_with(BY_CHANCE)
+    told = Feedback.from_dict(
+        read_json(folder(two_rounds, two_rounds.elites[0]) / "feedback.json")
+    )
+    first, second = (two_rounds.candidates[k].code for k in (1, 2))
+    offered = proposals(bundle, second, told, np.random.default_rng(0))
+    tried = [child.code for child, _ in zip(offered, range(6), strict=False)]
+    for number, code in enumerate([first, second, *tried]):
+        candidate = Candidate(
+            folder=tmp_path / "candidates" / f"{number:03d}", number=number, iteration=0,
+            code=in_place_of_reward(bundle.code, code), origin="template",
+        )  # fmt: skip
+        candidate.save()
+        if number > 1:
+            candidate.fail(Fault(kind="refused", reason="so that the first two are the best"))
+    (tmp_path / "rounds").mkdir()
+    (tmp_path / "rounds" / "0.json").write_text(json.dumps(list(range(2 + len(tried)))))
+
+    played = Played(folder(two_rounds, two_rounds.elites[0]))
+    search_reward(bundle, cfg, tmp_path, seed=3, jobs=played)
+
+    made = load_candidates(tmp_path)
+    children = [c for c in made if c.iteration == 1]
+    before = {reward_part(c.code) for c in made if c.iteration == 0}
+    assert [c.parent for c in children] == [0, 0, 1, 1]
+    assert len(before | {reward_part(c.code) for c in children}) == len(before) + 4
 
 
 # --- the model -------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ import numpy as np
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.pipeline.fingerprint import canonical
+from v2p_data.reward import redesign
 from v2p_data.reward.candidate import (
     DONE_FILE,
     FEEDBACK_FILE,
@@ -39,9 +40,10 @@ from v2p_data.reward.candidate import (
 )
 from v2p_data.reward.config import Limits, RewardConfig
 from v2p_data.reward.feedback import Feedback
+from v2p_data.reward.function_body import UnreadableError
 from v2p_data.reward.jobs import Job, Jobs
 from v2p_data.reward.methods import Prepared, in_place_of_reward, prepare, save_bundle
-from v2p_data.reward.prescreen import prescreen
+from v2p_data.reward.prescreen import PrescreenConfig, prescreen, stored_moments
 from v2p_data.reward.reflect import reflect
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.seeds import rng_for, seed_for
@@ -49,6 +51,7 @@ from v2p_data.task.sandbox import class_name
 from v2p_data.task.smoke import smoke_run_all
 from v2p_data.task.splice import SpliceError, reward_part
 from v2p_data.task.task import TaskBundle
+from v2p_data.task.templates.variants import NUM_VARIANTS
 
 logger = logging.getLogger(__name__)
 
@@ -163,6 +166,17 @@ class _Draft:
     reasons: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Family:
+    """One of the best rewards, and what its children are written from."""
+
+    told: TaskBundle
+    """The task as the writer sees it."""
+    parent: Candidate
+    feedback: Feedback
+    rng: np.random.Generator
+
+
 class _Search:
     def __init__(
         self,
@@ -216,7 +230,7 @@ class _Search:
         if isinstance(numbers, list):
             return [Candidate.load(folder / f"{n:03d}") for n in numbers]
         self._tell(f"round {iteration + 1}: writing rewards")
-        drafts = self._new_ones(self._first() if iteration == 0 else self._children(iteration))
+        drafts = self._first() if iteration == 0 else self._children(iteration)
         start = sum(len(r) for r in self.rounds)
         made: list[Candidate] = []
         faults = self._screened(drafts)
@@ -241,59 +255,93 @@ class _Search:
         return made
 
     def _first(self) -> list[_Draft]:
-        return [
+        """Return the first rewards: those of the method, filled up with templates whose weights vary."""
+        prepared, count = self.prepared, self.cfg.num_candidates
+        drafts = [
             _Draft(code=code, origin=origin)
-            for code, origin in zip(self.prepared.codes, self.prepared.origins, strict=True)
+            for code, origin in zip(prepared.codes, prepared.origins, strict=True)
         ]
+        new = self._new_ones(drafts)[:count]
+        rng = rng_for(self.seed, "more first rewards")
+        for index in range(NUM_VARIANTS, NUM_VARIANTS + 2 * count):
+            if len(new) == count:
+                break
+            with suppress(UnreadableError):
+                design = redesign.from_template(self.base.code, prepared.seen, rng, index)
+                more = _Draft(code=design.code, origin="template", reasons=(design.words,))
+                new += self._new_ones([more], besides=new)
+        return new
 
     def _children(self, iteration: int) -> list[_Draft]:
-        """Return rewards written from what the best ones so far did."""
-        parents = self._elites()
+        """Return rewards written from what the best ones so far did, as many from each of them as can be.
+
+        Where there is nothing more to be made of one, the others fill the round.
+        """
+        families = self._families(iteration)
         count = self.cfg.num_candidates
+        new: list[_Draft] = []
+        for rank, family in enumerate(families):
+            share = count // len(families) + (rank < count % len(families))
+            mine = self._new_ones(self._asked(family, (share + 1) // 2), besides=new)[:share]
+            new += mine
+            new += self._by_rule(family, share - len(mine), besides=new)
+        for family in families:
+            new += self._by_rule(family, count - len(new), besides=new)
+        return new
+
+    def _families(self, iteration: int) -> list[_Family]:
         told = replace(self.base, scene=self.prepared.seen)
-        drafts: list[_Draft] = []
-        for rank, standing in enumerate(parents):
+        families: list[_Family] = []
+        for standing in self._elites():
             parent = standing.candidate
-            share = count // len(parents) + (rank < count % len(parents))
             try:
                 feedback = Feedback.from_dict(read_json(standing.training.folder / FEEDBACK_FILE))
             except V2PError:  # its process ran generated code
                 logger.warning("candidate %d left no readable feedback", parent.number)
                 continue
-            written = self._asked(told, parent, feedback, (share + 1) // 2)
-            drafts += written
             rng = rng_for(self.seed, "reflect", iteration, parent.number)
-            # One more than needed: some will be rewards that were tried before.
-            drafts += [
-                _Draft(
-                    code=child.code,
-                    origin="reflection",
-                    parent=parent.number,
-                    reasons=tuple(child.reasons),
-                )
-                for child in reflect(told, parent.code, feedback, rng, share - len(written) + 1)
-            ]
-        return drafts
+            families.append(_Family(told=told, parent=parent, feedback=feedback, rng=rng))
+        return families
 
-    def _asked(
-        self, told: TaskBundle, parent: Candidate, feedback: Feedback, count: int
-    ) -> list[_Draft]:
+    def _by_rule(self, family: _Family, count: int, besides: Sequence[_Draft]) -> list[_Draft]:
+        """Return rewards that rules make of a parent's, other ones than all before and besides them."""
+        if count < 1:
+            return []
+        parent = family.parent
+        tried = [c.code for r in self.rounds for c in r] + [d.code for d in besides]
+        children = reflect(
+            family.told, parent.code, family.feedback, family.rng, count, tried=tried
+        )
+        drafts = [
+            _Draft(
+                code=child.code,
+                origin="reflection",
+                parent=parent.number,
+                reasons=tuple(child.reasons),
+            )
+            for child in children
+        ]
+        return self._new_ones(drafts, besides)
+
+    def _asked(self, family: _Family, count: int) -> list[_Draft]:
         """Return rewards that the model wrote, if there is one; where it fails, rules write all of them."""
         if self.ask_model is None:
             return []
+        parent = family.parent
         try:
-            codes = self.ask_model(told, parent.code, feedback.text(), count)
+            codes = self.ask_model(family.told, parent.code, family.feedback.text(), count)
         except V2PError as error:
             logger.warning("no reward from the model: %s", error)
             return []
         return [_Draft(code=c, origin="model", parent=parent.number) for c in codes]
 
-    def _new_ones(self, drafts: Sequence[_Draft]) -> list[_Draft]:
-        """Return the drafts without rewards that were tried before, as many as a round has.
+    def _new_ones(self, drafts: Sequence[_Draft], besides: Sequence[_Draft] = ()) -> list[_Draft]:
+        """Return the drafts without rewards that were tried before or are among the others of this round.
 
         Whoever wrote them, all they bring into the task is their reward.
         """
         known = {reward_part(c.code) for r in self.rounds for c in r}
+        known |= {reward_part(d.code) for d in besides}
         new: list[_Draft] = []
         for each in drafts:
             try:
@@ -305,27 +353,39 @@ class _Search:
             if part not in known:
                 known.add(part)
                 new.append(draft)
-        return new[: self.cfg.num_candidates]
+        return new
 
     def _screened(self, drafts: Sequence[_Draft]) -> list[Fault | None]:
         """Return per draft why it is not worth training, or None."""
         if not drafts:
             return []
-        faults: list[Fault | None] = [None] * len(drafts)
-        # Templates are ours, and what `reflect` gives has run already.
-        unknown = [k for k, d in enumerate(drafts) if d.origin == "model"]
-        results = smoke_run_all([drafts[k].code for k in unknown], self.base.scene)
-        for k, result in zip(unknown, results, strict=True):
-            if not result.runnable:
-                faults[k] = Fault(kind="refused", reason=result.error)
-        asked = [k for k, fault in enumerate(faults) if fault is None]
-        codes = [drafts[k].code for k in asked]
-        verdicts = prescreen(codes, self.base.scene, self._stored_trajectories())
-        for k, verdict in zip(asked, verdicts, strict=True):
-            if not verdict.accepted:
+        stored = self._stored_trajectories()
+        if stored_moments(stored, PrescreenConfig()) is None:
+            return self._refused(drafts)
+        faults: list[Fault | None] = []
+        for draft, verdict in zip(
+            drafts, prescreen([d.code for d in drafts], self.base.scene, stored), strict=True
+        ):
+            if verdict.accepted:
+                faults.append(None)
+            elif draft.origin == "model" and verdict.reason == "not_runnable":
+                faults.append(Fault(kind="refused", reason=verdict.detail))
+            else:
                 reason = f"{verdict.reason}: {verdict.detail}"
-                faults[k] = Fault(kind="prescreened", reason=reason)
+                faults.append(Fault(kind="prescreened", reason=reason))
         return faults
+
+    def _refused(self, drafts: Sequence[_Draft]) -> list[Fault | None]:
+        """Return per draft why it does not run, or None; on stored states the pre-screen finds that out."""
+        # Templates are ours, and what `reflect` gives has run already.
+        unknown = [d.code for d in drafts if d.origin == "model"]
+        results = iter(smoke_run_all(unknown, self.base.scene))
+        return [
+            None
+            if draft.origin != "model" or (result := next(results)).runnable
+            else Fault(kind="refused", reason=result.error)
+            for draft in drafts
+        ]
 
     def _stored_trajectories(self) -> list[Trajectories]:
         """Return what the elites' policies did, successes and failures."""
