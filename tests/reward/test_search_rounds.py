@@ -151,7 +151,8 @@ def test_the_second_round_descends_from_the_best_of_the_first(two_rounds: TwoRou
 
     assert [row["parent"] for row in two_rounds.rows(0)] == [None] * 5
     assert [row["state"] for row in two_rounds.rows(0)] == ["not_finite"] + ["finished"] * 4
-    assert {row["parent"] for row in children} == set(two_rounds.elites)
+    first, second = two_rounds.elites
+    assert [row["parent"] for row in children] == [first] * 3 + [second] * 2
     assert 0 not in two_rounds.elites
     assert json.loads((two_rounds.search / "rounds" / "1.json").read_text()) == [5, 6, 7, 8, 9]
     assert len(children) == 5
@@ -188,28 +189,28 @@ class Played(Jobs):
             )
 
 
-def test_rounds_are_full_and_shared_also_where_an_elites_first_ideas_were_tried(
+def test_a_round_is_full_also_where_its_parents_first_ideas_were_tried(
     two_rounds: TwoRounds, tmp_path: Path
 ):
-    flags = [*TINY, "--reward.iterations=2", "--reward.candidates=4", "--reward.elites=2"]
+    flags = [*TINY, "--reward.iterations=2", "--reward.candidates=2", "--reward.elites=1"]
     cfg = parse(EngineConfig, [*flags, "--reward.target-success=2.0"], "reward").reward
     bundle = bundle_with(BY_CHANCE)
     told = Feedback.from_dict(
         read_json(folder(two_rounds, two_rounds.elites[0]) / "feedback.json")
     )
-    first, second = (two_rounds.candidates[k].code for k in (1, 2))
-    offered = proposals(bundle, second, told, np.random.default_rng(0))
-    tried = [child.code for child, _ in zip(offered, range(6), strict=False)]
-    for number, code in enumerate([first, second, *tried]):
+    parent = two_rounds.candidates[1].code
+    offered = proposals(bundle, parent, told, np.random.default_rng(0))
+    tried = [child.code for child, _ in zip(offered, range(4), strict=False)]
+    for number, code in enumerate([parent, *tried]):
         candidate = Candidate(
             folder=tmp_path / "candidates" / f"{number:03d}", number=number, iteration=0,
             code=in_place_of_reward(bundle.code, code), origin="template",
         )  # fmt: skip
         candidate.save()
-        if number > 1:
-            candidate.fail(Fault(kind="refused", reason="so that the first two are the best"))
+        if number > 0:
+            candidate.fail(Fault(kind="refused", reason="so that the first is the best"))
     (tmp_path / "rounds").mkdir()
-    (tmp_path / "rounds" / "0.json").write_text(json.dumps(list(range(2 + len(tried)))))
+    (tmp_path / "rounds" / "0.json").write_text(json.dumps(list(range(1 + len(tried)))))
 
     played = Played(folder(two_rounds, two_rounds.elites[0]))
     search_reward(bundle, cfg, tmp_path, seed=3, jobs=played)
@@ -217,8 +218,8 @@ def test_rounds_are_full_and_shared_also_where_an_elites_first_ideas_were_tried(
     made = load_candidates(tmp_path)
     children = [c for c in made if c.iteration == 1]
     before = {reward_part(c.code) for c in made if c.iteration == 0}
-    assert [c.parent for c in children] == [0, 0, 1, 1]
-    assert len(before | {reward_part(c.code) for c in children}) == len(before) + 4
+    assert [c.parent for c in children] == [0, 0]
+    assert len(before | {reward_part(c.code) for c in children}) == len(before) + 2
 
 
 # --- the model -------------------------------------------------------------------------------------------------
