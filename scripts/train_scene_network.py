@@ -196,11 +196,10 @@ def _varied(
         pictures[1], pictures[2] = pictures[2], pictures[1]
     if rng.random() < 0.5:
         pictures, labels = [p[:, ::-1] for p in pictures], labels[:, ::-1]
-    size, is_part = net_size(*labels.shape), rng.random() < 0.6
-    camera = known_of(clip["camera"])
-    if is_part:
-        part = _nearer(labels, rng)
-        camera = known_of(clip["camera"], part, labels.shape)
+    size = net_size(*labels.shape)
+    part = _nearer(labels, rng) if rng.random() < 0.6 else None
+    camera = known_of(clip["camera"], part, labels.shape)
+    if part is not None:
         pictures, labels = [p[part] for p in pictures], labels[part]
     pictures, labels = [resized(p, size) for p in pictures], _labels_at(size, labels)
     mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))

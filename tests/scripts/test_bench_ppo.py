@@ -1,26 +1,14 @@
 """The race counts what it should: learning only, stopped runs with their time, the best peer."""
 
-import importlib.util
 import math
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "bench_ppo.py"
-
 
 @pytest.fixture(scope="module")
-def bench():
-    spec = importlib.util.spec_from_file_location("bench_ppo", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["bench_ppo"] = module  # its dataclasses look themselves up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["bench_ppo"]
+def bench(load_script):
+    return load_script("bench_ppo")
 
 
 def run_of(bench, learner: str, seed: int, seconds: float, success: float):

@@ -1,9 +1,5 @@
 """The benchmark of reconstruction counts as it says: seeds apart, a stage judged where the ones before were right."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -11,19 +7,10 @@ import trimesh
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.scene.score import TrueClip, TrueThing
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "bench_reconstruction.py"
-
 
 @pytest.fixture(scope="module")
-def bench():
-    spec = importlib.util.spec_from_file_location("bench_reconstruction", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["bench_reconstruction"] = module  # its dataclasses look themselves up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["bench_reconstruction"]
+def bench(load_script):
+    return load_script("bench_reconstruction")
 
 
 def row(*failures: str, slug: str | None = None, accepted: bool = False, size_m: float = 0.01):

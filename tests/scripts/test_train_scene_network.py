@@ -1,30 +1,18 @@
 """What the network is told of a camera is what the camera shows, in whole pictures and in parts of them."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from v2p_data.scene.pose import camera_above
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "train_scene_network.py"
 H, W = 240, 320
 PITCH_RAD, FOV_RAD, HEIGHT_M = 0.7, 0.9, 0.6
 CAMERA = np.array([PITCH_RAD, np.log(0.5 / np.tan(FOV_RAD / 2)), np.log(HEIGHT_M)])
 
 
 @pytest.fixture(scope="module")
-def trainer():
-    spec = importlib.util.spec_from_file_location("train_scene_network", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["train_scene_network"] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["train_scene_network"]
+def trainer(load_script):
+    return load_script("train_scene_network")
 
 
 def _table_between(left: float, right: float, row: float) -> float:

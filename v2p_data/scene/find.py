@@ -171,10 +171,10 @@ def _both(
 
     The parts are `share` of the picture's width wide, and lie `below` its middle, in picture widths.
     """
-    # What a picture of a table that is one metre wide in the middle would show in the part's rows.
-    height = 1.0 / table_width_m(whole.pitch_rad, whole.focal_widths, 1.0)
-    rows = [table_width_m(whole.pitch_rad, whole.focal_widths, height, float(b)) for b in below]
-    ratio = float(np.nanmedian(rows)) * share
+    middle, *rows = (
+        table_width_m(whole.pitch_rad, whole.focal_widths, 1.0, float(b)) for b in (0.0, *below)
+    )
+    ratio = float(np.nanmedian(rows)) / middle * share
     if not np.isfinite(ratio):
         return whole
     precise = np.array([whole.table_width_sd, part.table_width_sd]) ** -2
