@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from safetensors.torch import load_file, save_file
+from scipy.spatial.transform import Rotation
 from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
@@ -34,6 +35,7 @@ from v2p_data.scene.network import (
     net_size,
     resized,
 )
+from v2p_data.scene.pose import camera_above
 from v2p_data.scene.scale import table_width_m
 from v2p_data.seeds import rng_for
 from v2p_data.video.synthetic import (
@@ -52,6 +54,14 @@ DRAWN_OVER_SEEN = 1.5
 FRAMES_DRAWN = 14
 FRAMES_KEPT = 6
 BATCH = 12
+TURNED = 0.7
+"""Share of the examples that are shown as another camera at the same place would have seen them."""
+_MOST_ZOOM = 1.6
+"""Such a camera's focal length is at most so much longer, or it would see too little."""
+_MOST_BEYOND = 0.06
+"""So much of the picture's sides it may look beyond them."""
+PARTS = 0.5
+"""Share of the examples that are an enlarged part of a picture."""
 HELD_OUT = 20
 """Every so-manieth clip is for measuring."""
 CLASS_WEIGHTS = (0.6, 0.6, 1.0, 2.0, 1.5)
@@ -197,8 +207,15 @@ def _varied(
     if rng.random() < 0.5:
         pictures, labels = [p[:, ::-1] for p in pictures], labels[:, ::-1]
     size = net_size(*labels.shape)
-    part = _nearer(labels, rng) if rng.random() < 0.6 else None
-    camera = known_of(clip["camera"], part, labels.shape)
+    camera, is_turned = clip["camera"], rng.random() < TURNED
+    if is_turned:
+        pictures, labels, camera = turned(pictures, labels, camera, rng)
+    part = _nearer(labels, rng) if rng.random() < PARTS else None
+    camera = known_of(camera, part, labels.shape)
+    if (
+        is_turned
+    ):  # all of them have a longer focal length than the clips: the guess would be too long
+        camera[1] = np.nan
     if part is not None:
         pictures, labels = [p[part] for p in pictures], labels[part]
     pictures, labels = [resized(p, size) for p in pictures], _labels_at(size, labels)
@@ -224,6 +241,58 @@ def _varied(
         "labels": np.ascontiguousarray(labels),
         "camera": camera,
     }
+
+
+def turned(
+    pictures: list[UInt8[np.ndarray, "h w 3"]],
+    labels: UInt8[np.ndarray, "h w"],
+    camera: Float[np.ndarray, "3"],
+    rng: np.random.Generator,
+) -> tuple[list[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h w"], Float[np.ndarray, "3"]]:
+    """Return what another camera at the same place sees, turned and with a longer focal length, and that camera.
+
+    Where a camera stands decides what hides what; where it looks only moves pixels, by a homography. So few clips show many
+    pitches and focal lengths. A camera that would look far beyond the picture is not taken; if none is found, nothing changes.
+    """
+    h, w = labels.shape
+    pitch, log_focal, log_height = (float(v) for v in camera)
+    old = camera_above((h, w), pitch, float(2 * np.arctan(0.5 / np.exp(log_focal))))
+    corners = np.array([[0, 0], [w, 0], [0, h], [w, h]], float)
+    for _ in range(10):
+        zoom = float(np.exp(rng.uniform(0, np.log(_MOST_ZOOM))))
+        half_view = np.array([h, w]) / 2 / old.K[0, 0]
+        room = np.arctan(half_view) - np.arctan(half_view / zoom) + 0.03
+        tilt, pan = rng.uniform(-room, room)
+        new = camera_above(
+            (h, w), pitch + tilt, float(2 * np.arctan(0.5 / np.exp(log_focal) / zoom))
+        )
+        to_world = Rotation.from_euler("z", pan).as_matrix() @ new.T_world_cam[:3, :3]
+        to_old = old.K @ old.T_world_cam[:3, :3].T @ to_world @ np.linalg.inv(new.K)
+        seen = np.column_stack([corners, np.ones(4)]) @ to_old.T
+        spots = seen[:, :2] / seen[:, 2:]
+        over = np.maximum(-spots, spots - [w, h]) / [w, h]
+        if over.max() > _MOST_BEYOND:
+            continue
+        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from pixel centres
+        M = np.linalg.inv(half) @ to_old @ half
+        known = np.array([pitch + tilt, log_focal + np.log(zoom), log_height], np.float32)
+
+        def seen_by(image: UInt8[np.ndarray, "h w *c"], how: int, M: np.ndarray = M) -> np.ndarray:
+            flags = how | cv2.WARP_INVERSE_MAP
+            return cv2.warpPerspective(
+                np.ascontiguousarray(image),
+                M,
+                (w, h),
+                flags=flags,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+
+        return (
+            [seen_by(picture, cv2.INTER_LINEAR) for picture in pictures],
+            seen_by(labels, cv2.INTER_NEAREST),
+            known,
+        )
+    return pictures, labels, camera
 
 
 def _nearer(labels: UInt8[np.ndarray, "h w"], rng: np.random.Generator) -> tuple[slice, slice]:

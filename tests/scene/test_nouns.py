@@ -193,6 +193,8 @@ def test_a_handle_or_spout_takes_symmetry_away():
         ({"form": "cone"}, "form 'cone' is none of box, cylinder, sphere"),
         ({"form": "sphere", "symmetric": "sphere"}, "one diameter"),
         ({"hollow": "yes"}, "not 0 or 1"),
+        ({"hollow": "1.2"}, "not 0 or 1"),
+        ({"hollow": "0.6"}, "only a cylinder has a bore"),
         ({"taper": "0.5"}, "only solids of revolution taper"),
         ({"colour": "mauve"}, "'mauve' is no colour"),
         ({"symmetric": "round"}, "cannot have the symmetry 'round'"),

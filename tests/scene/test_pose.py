@@ -13,6 +13,7 @@ from v2p_data.scene.pose import (
     fit_shape,
     lowest,
     on_wall,
+    orientations,
 )
 from v2p_data.scene.scale import (
     SizeVote,
@@ -138,3 +139,28 @@ def test_nobody_films_a_table_from_the_ceiling():
     assert height_plausibility(1.0) == 1
     assert height_plausibility(2.5) < 0.3
     assert height_plausibility(0.08) < 0.3
+
+
+def test_a_tray_stands_with_its_mouth_up_and_an_eraser_seldom_on_its_edge():
+    tray, eraser, carton = (orientations(noun_for(w)) for w in ("tray", "eraser", "cereal box"))
+
+    assert len(tray) == 1
+    np.testing.assert_allclose(tray[0][0], np.eye(3))
+    assert eraser[0][1] == carton[0][1] == 0
+    assert min(cost for _, cost in eraser[1:]) > max(cost for _, cost in carton[1:]) > 0
+
+
+def test_a_ring_s_hole_says_nothing_against_its_outline():
+    camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("tape")
+    size = np.array(noun.size_m) * 2
+    T = transform(np.eye(3), np.array([1.2, 0.1, size[2] / 2]))
+    outside, hole = (
+        silhouette_of(outline_points("cylinder", tuple(size * s)) @ T[:3, :3].T + T[:3, 3], camera)
+        for s in (np.ones(3), np.array([0.5, 0.5, 0.1]))
+    )
+
+    fit = fit_shape(Silhouette(outside & ~hole, None, camera), noun, np.eye(3))
+
+    assert (outside & hole).sum() > 20
+    np.testing.assert_allclose(fit.size[0], size[0], rtol=0.04)
+    np.testing.assert_allclose(fit.T_world_obj[:3, 3], T[:3, 3], atol=0.02)

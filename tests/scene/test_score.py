@@ -349,3 +349,16 @@ def test_a_rejected_clip_fails_every_stage_with_its_slug():
 
     assert set(rejected(true, "camera_moves").failures.values()) == {"camera_moves"}
     assert not rejected(true, "camera_moves").usable
+
+
+def test_a_tool_is_compared_from_where_it_comes_into_the_picture():
+    """It moves 10 cm in nine frames and is seen from the fifth on."""
+    seen = {0: np.zeros_like(SEEN), 5: SEEN, 9: SEEN}
+    true = true_thing(masks=seen)
+    late = found_thing(T_world_first=transform(np.eye(3), np.array([0.1 * 5 / 9, 0, 0.02])))
+
+    at_its_own = scored(true, replace(late, first_frame=5)).things[0]
+    at_the_start = scored(true_thing(), replace(late, first_frame=5)).things[0]
+
+    assert at_its_own.position_first_m == pytest.approx(0, abs=1e-9)
+    assert at_the_start.position_first_m == pytest.approx(0.1 * 5 / 9)  # it was there all the time

@@ -10,12 +10,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
-from v2p_data.geometry.mesh import lathe
+from v2p_data.geometry.mesh import lathe, ring
 from v2p_data.geometry.pillow import pillow
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.pose import camera_above
-from v2p_data.scene.shape import ShapeChoice, View, best_shape
+from v2p_data.scene.shape import ShapeChoice, ShapeConfig, View, best_shape
 
 CAMERA = camera_above((240, 320), 0.6, 1.01, 0.5)
 AT = np.array([0.7, 0.05, 0.0])
@@ -283,3 +283,54 @@ def test_an_outline_with_a_line_one_pixel_wide_still_becomes_a_closed_mesh():
 
     assert mesh.is_watertight
     assert all(part.is_watertight for part in parts)
+
+
+def test_a_roll_of_tape_has_its_hole():
+    size, bore = (0.09, 0.09, 0.03), 0.6
+    mask = seen([placed(ring(0.09, 0.03, bore), AT + np.array([0, 0, 0.015]))])
+
+    choice = best_shape(
+        [View(mask=mask, T_world_obj=fit(size))],
+        CAMERA,
+        size,
+        noun("cylinder", symmetry="round", bore=bore),
+    )
+
+    check_solid(choice)
+    assert choice.mesh.volume == pytest.approx(np.pi * 0.045**2 * (1 - bore**2) * 0.03, rel=0.02)
+    through = np.array([[x, 0, z] for x in (0.0, 0.018) for z in (-0.01, 0.0, 0.01)])
+    assert not in_parts(through, choice.parts).any()
+
+
+def test_a_ball_with_its_shadow_stays_a_ball():
+    size = (0.07, 0.07, 0.07)
+    body = placed(ball(0.035, [0, 0, 0.035]))
+    shadow = placed(ball([0.03, 0.06, 0.001], [0, -0.05, 0]))
+
+    choice = best_shape(
+        [View(mask=seen([body, shadow]), T_world_obj=fit(size))],
+        CAMERA,
+        size,
+        noun("sphere", size_m=size, symmetry="sphere"),
+    )
+
+    assert choice.kind == "primitive"
+    assert choice.size_m == size
+
+
+def test_what_is_low_is_not_inflated_to_any_depth_that_its_outline_allows():
+    """Were it only for the outline, the block would come out twice as deep as it is."""
+    size, yaw_deg = (0.10, 0.07, 0.03), 60.0
+    low = camera_above((240, 320), 0.25, 1.01, 0.25)
+    body = trimesh.creation.box(size).apply_transform(fit(size, yaw_deg))
+
+    choice = best_shape(
+        [View(mask=seen([body], low), T_world_obj=fit(size, yaw_deg))],
+        low,
+        size,
+        noun("box", size_m=size),
+        ShapeConfig(irregular_margin=-1.0),
+    )
+
+    assert choice.kind == "primitive"
+    assert choice.size_m == size

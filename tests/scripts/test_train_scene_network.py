@@ -1,5 +1,6 @@
 """What the network is told of a camera is what the camera shows, in whole pictures and in parts of them."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -42,3 +43,30 @@ def test_a_part_in_the_sky_shows_no_table(trainer):
     level = np.array([0.1, 0.0, 0.0])
 
     assert np.isnan(trainer.known_of(level, (slice(0, 40), slice(0, 60)), (H, W))).all()
+
+
+def test_another_camera_at_the_same_place_sees_the_table_where_it_says(trainer):
+    """A black dot on a white table: found again in the turned picture, projected by the turned camera."""
+    camera = camera_above((H, W), PITCH_RAD, FOV_RAD, HEIGHT_M)
+    spots = camera.on_plane(np.array([[160.0, 120.0], [130.0, 135.0]]))
+    picture = np.full((H, W, 3), 255, np.uint8)
+    labels = np.zeros((H, W), np.uint8)
+    for x, y in camera.project(spots):
+        picture[int(y) - 2 : int(y) + 3, int(x) - 2 : int(x) + 3] = 0
+        labels[int(y) - 2 : int(y) + 3, int(x) - 2 : int(x) + 3] = 1
+    apart = []
+    for seed in range(6):
+        (seen,), classes, known = trainer.turned(
+            [picture], labels, CAMERA, np.random.default_rng(seed)
+        )
+        pitch, fov = float(known[0]), float(2 * np.arctan(0.5 / np.exp(known[1])))
+        new = camera_above((H, W), pitch, fov, HEIGHT_M)
+        count, _, _, middles = cv2.connectedComponentsWithStats(
+            (seen[..., 0] < 128).astype(np.uint8)
+        )
+        assert count == 3
+        on_table = new.on_plane(middles[1:] + 0.5)
+        apart.append(np.linalg.norm(on_table[0] - on_table[1]))
+        assert known[1] > CAMERA[1]
+        assert (seen[classes == 1] < 200).mean() > 0.9
+    np.testing.assert_allclose(apart, np.linalg.norm(spots[0] - spots[1]), rtol=0.06)

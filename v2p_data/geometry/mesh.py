@@ -113,6 +113,37 @@ def lathe_parts(
     return tuple(parts)
 
 
+def ring(diameter_m: float, height_m: float, bore: float) -> trimesh.Trimesh:
+    """Return a cylinder with a hole along its axis, whose diameter is the share `bore` of its own."""
+    r, half = diameter_m / 2, height_m / 2
+    turned = [(bore * r, -half), (r, -half), (r, half), (bore * r, half), (bore * r, -half)]
+    mesh = trimesh.creation.revolve(np.array(turned), sections=_AROUND)
+    if mesh.volume < 0:
+        mesh.invert()
+    mesh.vertices[:, :2] *= diameter_m / mesh.extents[:2]
+    return mesh
+
+
+def ring_parts(diameter_m: float, height_m: float, bore: float) -> tuple[trimesh.Trimesh, ...]:
+    """Return convex sectors that together are `ring` of the same arguments, the hole left free."""
+    step, half = 2 * np.pi / _PART_WALLS, height_m / 2
+    inner, outer = (
+        np.array([(share * diameter_m / 2, -half), (share * diameter_m / 2, half)])
+        for share in (bore / np.cos(step / 2), 1.0)
+    )
+    return tuple(
+        _hull(
+            np.concatenate(
+                [
+                    _rings(inner, k * step, (k + 1) * step, 1),
+                    _rings(outer, k * step, (k + 1) * step, 3),
+                ]
+            )
+        )
+        for k in range(_PART_WALLS)
+    )
+
+
 def mesh_for(
     form: str, size_m: Size, *, hollow: bool = False, taper: float = 1.0
 ) -> trimesh.Trimesh:

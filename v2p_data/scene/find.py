@@ -280,10 +280,10 @@ def find_held(
         found[i] = mask
         by_hand = (grow(mask, 5) & (shares[HAND] > _LIKELY)).any()
         worth = area * (1.0 if by_hand else 0.3) * (0.7 if _cut(mask) else 1.0)
-        if worth > value:
+        if worth > value and i < int(watched.idx[-1]):
             best, value = i, worth
             sure = float(shares[MOVED][mask].mean()) * (0.9 if by_hand else 0.6)
-    if not found:
+    if len(found) < 2:
         return None
     masks = np.zeros_like(mover)
     for i, mask in found.items():

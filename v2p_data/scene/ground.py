@@ -180,7 +180,7 @@ def find_other(
     stands_out = table.stands_out(still) & inner_hull & ~restless
     hand = footage.hand(still) & ~colour
     # Small patches are noise, unless the network takes them for things.
-    least, small = (0.0025, 0.5) if likely is None else (0.0008, 0.2)
+    least, small, most = (0.0025, 0.5, 0.2) if likely is None else (0.0008, 0.2, 0.35)
     sets = [stands_out, stands_out & ~hand] + ([colour & ~restless] if words else [])
     if likely is not None:
         seen = [likely > 0.5, likely > 0.25, (likely > 0.25) & stands_out]
@@ -191,7 +191,7 @@ def find_other(
     for pixels in sets:
         free = pixels & ~grow(moved.last, 2) if late else pixels & ~occupied
         free = free if taken is None else free & ~taken
-        for mask in _parts(tidy(free, 5), h * w, least, 0.2):
+        for mask in _parts(tidy(free, 5), h * w, least, most):
             x, y, bw, bh = bounding_box(mask)
             area = int(mask.sum())
             score = -_border_sides((x, y, bw, bh), w, h) * 0.8

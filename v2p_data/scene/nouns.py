@@ -6,7 +6,7 @@ standard deviation of log size within the noun. A word that is not in the table 
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -40,8 +40,9 @@ _ADJECTIVES = COLOURS | frozenset({
     "plum", "olive", "lemon", "cherry", "rose", "mint", "chocolate", "coffee", "tea", "milk", "juice", "cell", "foil", "nickel",
 })  # fmt: skip
 """Nouns that say what a thing is made of, or its colour, when another word follows them."""
+_FORMS = (*get_args(Form), "cylinder or box")
 _KINDS: dict[str, tuple[str, ...]] = {
-    "form": get_args(Form),
+    "form": _FORMS,
     "matter": get_args(Matter),
     "symmetric": get_args(Symmetry),
     "source": get_args(SourceKind),
@@ -62,8 +63,12 @@ class Noun:
     friction: float
     hollow: bool = False
     """Open at the top, so that something can be put in or it can be put over something."""
+    bore: float = 0.0
+    """Of a roll or a ring: the diameter of the hole through it, as a share of its own; 0 where there is none."""
     taper: float = 1.0
     """Base diameter over top diameter, for solids of revolution."""
+    other_form: Form | None = None
+    """What else things of that name may be: waste bins are round or square."""
     spread: float = 0.2
     matter: Matter = "rigid"
     known: bool = True
@@ -79,6 +84,12 @@ class Noun:
     def round_top(self) -> bool:
         """Whether its rim is a circle seen from above while it stands: an ellipse in the image, which gives the camera's pitch."""
         return self.form == "cylinder"
+
+    def as_other_form(self) -> "Noun":
+        """Return the same noun as a box, where it may be one."""
+        assert self.other_form == "box"
+        symmetry = "box" if self.symmetry == "round" else self.symmetry
+        return replace(self, form="box", other_form=None, taper=1.0, symmetry=symmetry)
 
     @property
     def source_kind(self) -> SourceKind:
@@ -155,18 +166,22 @@ def _noun(cells: list[str]) -> tuple[Noun, list[str]]:
     colours = tuple(word for word in row["colour"].split(",") if word)
     if unknown := set(colours) - COLOURS:
         raise ValueError(f"'{min(unknown)}' is no colour; known: {', '.join(sorted(COLOURS))}")
-    if row["hollow"] not in ("0", "1"):
-        raise ValueError(f"hollow is '{row['hollow']}', not 0 or 1")
+    if row["hollow"] not in ("0", "1") and not re.fullmatch(r"0\.\d*[1-9]\d*", row["hollow"]):
+        raise ValueError(f"hollow is '{row['hollow']}', not 0 or 1 or the share of a bore between")
+    bore = 0.0 if row["hollow"] == "1" else float(row["hollow"])
     value = {column: _positive(row, column) for column in (*COLUMNS[2:8], "taper")}
+    form, _, other_form = row["form"].partition(" or ")
     length, width, height = (round(value[side] / 100, 6) for side in COLUMNS[2:5])
     size_m = (length, width, height)
     noun = Noun(
         word=row["noun"],
-        form=row["form"],  # pyright: ignore[reportArgumentType]
+        form=form,  # pyright: ignore[reportArgumentType]
         size_m=size_m,
         mass_kg=round(value["mass_g"] / 1000, 9),
         friction=value["friction"],
         hollow=row["hollow"] == "1",
+        bore=bore,
+        other_form=other_form or None,  # pyright: ignore[reportArgumentType]
         taper=value["taper"],
         spread=value["spread"],
         matter=row["matter"],  # pyright: ignore[reportArgumentType]
@@ -177,6 +192,8 @@ def _noun(cells: list[str]) -> tuple[Noun, list[str]]:
     round_sides = size_m[:2] if noun.form == "cylinder" else size_m
     if noun.form != "box" and len(set(round_sides)) > 1:
         raise ValueError(f"a {noun.form} has one diameter, its size is {size_m} m")
+    if noun.bore and noun.form != "cylinder":
+        raise ValueError(f"only a cylinder has a bore, not a {noun.form}")
     if noun.form == "sphere" and noun.hollow:
         raise ValueError("a sphere cannot be open at the top")
     if noun.form != "cylinder" and noun.taper != 1:

@@ -32,9 +32,14 @@ from v2p_data.scene.segment import bounding_box, grow, tidy
 from v2p_data.scene.sight import Sighting
 
 _INSIDE_KINDS = ("insert", "throw_into", "place_onto")
+_SWALLOWING_KINDS = ("insert", "throw_into")
+_UNSEEN_IOU = 0.35
+"""An outline at the end that fits the object no better shows something else."""
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 _SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
 _TURN_COST = 0.02
+_OTHER_FORM_COST = 0.02
+"""By so much a noun's second form must cover an outline better: a box has a side and a turn more to choose."""
 _PITCH_RANGE_RAD = (0.15, 1.4)
 """From nearly level to nearly straight down: beyond, outlines on the table say nothing of places on it."""
 _MOUTH_DOWN = np.diag([1.0, -1.0, -1.0])
@@ -138,6 +143,8 @@ def place(
         if len(costs) > 1:
             rivals[k] = float(np.partition(costs, 1)[1] - min(costs))
         firsts[k], (lasts[k], cost) = options[best], found[best]
+        if kind in _SWALLOWING_KINDS and within is not None and lasts[k].iou < _UNSEEN_IOU:
+            lasts[k] = _inside(lasts[k], support, within)
         upright_cost = cost if s is thing else upright_cost
     height_m, spread = camera_height_m(
         [vote_of(s, fit) for s, fit in zip(objects, firsts, strict=True)],
@@ -173,6 +180,26 @@ def place(
         scale_spread=spread,
         upright_cost=upright_cost,
     )
+
+
+def with_forms(
+    footage: Footage, objects: tuple[Sighting, ...], guess: CameraGuess
+) -> tuple[Sighting, ...]:
+    """Return the sightings with their nouns in the form that their outlines fit, where a noun has two."""
+    camera = camera_above(footage.shape, guess.pitch_rad, guess.fov_rad)
+    out = []
+    for s in objects:
+        if s.noun.other_form is not None:
+            unknown = _others(objects, s, s.at)
+            silhouette = Silhouette(s.first, unknown, camera)
+            usual, other = (
+                fit_shape(silhouette, noun, np.eye(3)).cost
+                for noun in (s.noun, s.noun.as_other_form())
+            )
+            if other + _OTHER_FORM_COST < usual:
+                s = replace(s, noun=s.noun.as_other_form())
+        out.append(s)
+    return tuple(out)
 
 
 def _best_pitch(
@@ -252,6 +279,9 @@ def _end_of(s: Sighting, kind: str) -> tuple[int, Bool[np.ndarray, "h w"]]:
     if s.role == "manipulated" and kind == "lift_up":
         i = _peak(s)
         return i, s.masks[i]
+    if s.at > 0 and s.moves:  # a tool may be gone again before the clip ends
+        i = int(np.flatnonzero(s.masks.any((1, 2)))[-1])
+        return i, s.masks[i]
     return len(s.masks) - 1, s.last
 
 
@@ -305,8 +335,20 @@ def _goal(
         support = 0.0 if thing.hollow else float(there[2])
     else:
         room = max(0.2 * reach, reach - own.min() / 2)
-        support = 0.15 * float(there[2]) if other.hollow else float(there[2])
+        support = _floor(there) if other.hollow else float(there[2])
     return support, Within(xy=fits[1].T_world_obj[:2, 3], radius=float(room))
+
+
+def _inside(fit: Fit, support: float, within: Within) -> Fit:
+    """Return a pose in the middle of what swallowed it: deep bins hide what lies in them."""
+    rest = _rest_of(fit.T_world_obj[:3, :3])
+    height = support + float(np.abs(rest[2]) @ np.array(fit.size) / 2)
+    return replace(fit, T_world_obj=transform(rest, np.array([*within.xy, height])))
+
+
+def _floor(size: Float[np.ndarray, "3"]) -> float:
+    """Return how high the floor of a hollow thing lies above the table, in units of its size."""
+    return float(min(0.06 * size.min(), 0.15 * size[2]))
 
 
 @dataclass
@@ -340,11 +382,13 @@ def _course(
     """Return poses at well-tracked frames: position from the mask's centre, rotation blended."""
     first, last = first_fit.T_world_obj, last_fit.T_world_obj
     last_i, last_mask = end
-    course = _Course([0], [first], [float(np.clip(first_fit.iou, 0, 1))], ["full"])
-    spots = np.unique(np.linspace(0, last_i, min(max_poses, last_i + 1)).round().astype(int))
+    # What a hand brings has no pose before it comes.
+    course = _Course([s.at], [first], [float(np.clip(first_fit.iou, 0, 1))], ["full"])
+    count = min(max_poses, last_i - s.at + 1)
+    spots = np.unique(np.linspace(s.at, last_i, count).round().astype(int))
     on_table = kind in _SLIDING_KINDS
     turn = Rotation.from_matrix(last[:3, :3] @ first[:3, :3].T).as_rotvec()
-    ends = [_centre(s.masks[0]), _centre(last_mask)]
+    ends = [_centre(s.first), _centre(last_mask)]
     bias = [
         centre - camera.project(T[None, :3, 3])[0]
         for centre, T in zip(ends, (first, last), strict=True)

@@ -90,7 +90,7 @@ class Silhouette:
         if unknown is not None:
             known &= ~(cv2.warpAffine((unknown & ~mask).astype(np.float32), move, canvas) > 0.5)
         self._known = known
-        self._mask = (warped > 0.5) & known
+        self._mask = _filled(warped > 0.5) & known
         self._area = int(self._mask.sum())
 
     @property
@@ -148,6 +148,12 @@ class Silhouette:
         return np.array([x + w / 2, y + h / 2])
 
 
+def _filled(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the mask without holes: what is fitted is convex, a ring's hole says nothing against it."""
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.zeros(mask.shape, np.uint8), outlines, -1, 1, cv2.FILLED) > 0
+
+
 def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
     """Return the ways a noun's shape can rest, as rotations with what each costs: upright first."""
     upright, cost = np.eye(3), 0.15 if noun.spread < 0.3 else 0.1
@@ -162,11 +168,13 @@ def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
             # An upright vessel and its shadow have the outline of a lying one: vessels are seldom laid down.
             ways.append((lying, 2 * cost if noun.hollow else cost))
         return ways
+    smallest, middle, largest = sorted(noun.size_m)
+    if noun.hollow or largest <= 1.3 * smallest:  # trays and bins stand with their mouth up
+        return [(upright, 0.0)]
     on_side = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-    smallest, largest = min(noun.size_m), max(noun.size_m)
-    return [(upright, 0.0)] + (
-        [(lying, 0.03), (on_side, 0.03)] if largest > 1.3 * smallest else []
-    )
+    # What usually lies flat seldom stands on its edge; a box may stand on any side.
+    cost = 0.08 if noun.size_m[2] == smallest < 0.7 * middle else 0.03
+    return [(upright, 0.0), (lying, cost), (on_side, cost)]
 
 
 def fit_shape(

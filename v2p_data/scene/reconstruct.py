@@ -35,7 +35,7 @@ from v2p_data.scene.learned import (
     segmented,
 )
 from v2p_data.scene.nouns import Noun
-from v2p_data.scene.placement import CameraGuess, Placed, Placement, place
+from v2p_data.scene.placement import CameraGuess, Placed, Placement, place, with_forms
 from v2p_data.scene.scene import Observed, Role, Symmetry
 from v2p_data.scene.shape import View, best_shape
 from v2p_data.scene.sight import Sighting, Sights, sight
@@ -180,6 +180,7 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
             sights, objects=segmented(clip, sights.footage, sights.objects, cfg.segment)
         )
     guess = _camera_guess(sights, cfg)
+    sights = replace(sights, objects=with_forms(sights.footage, sights.objects, guess))
     if cfg.depth.backend != "none":
         guess = camera_from_depth(clip, sights.footage, sights.objects, guess, cfg.depth, rng)
     placement = place(sights.footage, sights.objects, meaning.kind, guess, cfg.max_poses)
@@ -292,7 +293,7 @@ def _estimates(
             s.noun,
         )
         size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
-        plain = shape.kind == "primitive" and not cfg.mesh.worker
+        plain = shape.kind == "primitive" and not s.noun.bore and not cfg.mesh.worker
         if s.known_m:  # the user's word on the size outranks the outline's
             size = (length, width, tall)
             mesh, parts = _stretched(size, mesh, *parts)

@@ -101,6 +101,8 @@ class FoundThing:
     """In its own frame [m]."""
     T_world_first: Float[np.ndarray, "4 4"]
     T_world_last: Float[np.ndarray, "4 4"]
+    first_frame: int = 0
+    """Of the file: later only for what a hand brings."""
     last_frame: int
     """Of the file."""
     last_depth_seen: bool = True
@@ -265,6 +267,7 @@ def found_of(reconstruction: Reconstruction) -> FoundClip:
                 mesh=mesh,
                 T_world_first=thing.T_world_objs[0],
                 T_world_last=thing.T_world_objs[-1],
+                first_frame=int(file_frame[thing.frames[0]]),
                 last_frame=int(file_frame[thing.frames[-1]]),
                 last_depth_seen=not thing.observed or thing.observed[-1] == "full",
                 masks=masks,
@@ -403,7 +406,8 @@ def _score_thing(
     true: TrueThing, found: FoundThing, clip: TrueClip, understood: FoundClip
 ) -> ThingScore:
     last = min(found.last_frame, len(true.T_world_objs) - 1)
-    T_first, T_last = true.T_world_objs[0], true.T_world_objs[last]
+    begins = 0 if _seen_at_first(true) else min(found.first_frame, last)
+    T_first, T_last = true.T_world_objs[begins], true.T_world_objs[last]
     sides, ours = size_sides(true, found)
     ratio = np.maximum(sides / ours, ours / sides)
     hollow_matters = true.hollow and clip.kind in HOLLOW_KINDS
@@ -480,6 +484,12 @@ def _seen_frames(true: TrueThing) -> list[int]:
     areas = {frame: int(mask.sum()) for frame, mask in true.masks.items()}
     least = max(MIN_SEEN_PX, MIN_SEEN_SHARE * max(areas.values(), default=0))
     return sorted(frame for frame, area in areas.items() if area >= least)
+
+
+def _seen_at_first(true: TrueThing) -> bool:
+    """Return whether it is in the picture when the clip begins; a tool comes later, or is hidden by what it lies under."""
+    frames = _seen_frames(true)
+    return not frames or frames[0] == min(true.masks)
 
 
 def _mask_ious(true: TrueThing, found: FoundThing) -> list[float]:

@@ -16,7 +16,15 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from v2p_data.geometry.camera import Camera
-from v2p_data.geometry.mesh import lathe, lathe_parts, mesh_for, parts_for, wall_m
+from v2p_data.geometry.mesh import (
+    lathe,
+    lathe_parts,
+    mesh_for,
+    parts_for,
+    ring,
+    ring_parts,
+    wall_m,
+)
 from v2p_data.geometry.pillow import inflated, pillow
 from v2p_data.geometry.pose import inverse, transform
 from v2p_data.scene.nouns import Form, Noun
@@ -38,6 +46,8 @@ _FLAT = 0.45
 _PLANE_PX = 200
 """Side of the square picture in which an outline is inflated."""
 _CORRECTIONS = 4
+_OTHER_SIDES = 1.8
+"""An inflated silhouette's sides are at most by this factor others than the fitted primitive's."""
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turns (right, towards the back, up) to an upright plane's (right, up, towards the camera)."""
 
@@ -135,6 +145,8 @@ def best_shape(
         reason += f"; {hidden:.0%} of it is hidden, so nothing finer was tried"
     else:
         for candidate, margin in _others(views[0], crops[0], size_m, noun, cfg):
+            if candidate.kind == "inflated" and not _as_large(candidate, size_m):
+                continue
             iou = _iou(candidate, views, crops)
             if iou - margin - plain > best_gain:
                 best, best_iou, best_gain = candidate, iou, iou - margin - plain
@@ -157,6 +169,14 @@ def best_shape(
 
 
 def _primitive(size_m: Size, noun: Noun) -> _Candidate:
+    if noun.bore:
+        diameter, _, height = size_m
+        return _Candidate(
+            kind="primitive",
+            mesh=ring(diameter, height, noun.bore),
+            parts=ring_parts(diameter, height, noun.bore),
+            T_obj_shape=np.eye(4),
+        )
     return _Candidate(
         kind="primitive",
         mesh=mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
@@ -169,18 +189,28 @@ def _others(
     view: View, crop: "_Crop", size_m: Size, noun: Noun, cfg: ShapeConfig
 ) -> list[tuple[_Candidate, float]]:
     """Return what else the object may be, with the margin by which each must win."""
+    if noun.bore:
+        return []
     found: list[tuple[_Candidate | None, float]] = []
     if noun.form != "box":
         margin = cfg.revolution_margin if noun.form == "cylinder" else cfg.ball_margin
         found.append((_revolution(view, crop, size_m, noun), margin))
-    if not noun.hollow and not crop.at_border:
+    if not noun.hollow and noun.symmetry != "sphere" and not crop.at_border:
         irregular = noun.form == "box" and noun.symmetry == "none"
         margin = cfg.irregular_margin if irregular else cfg.regular_margin
         found.append((_inflation(view, crop, size_m), margin))
     return [(candidate, margin) for candidate, margin in found if candidate is not None]
 
 
+def _as_large(shape: _Candidate, size_m: Size) -> bool:
+    """Return whether its sides are about the fit's: seen aslant, what is flat can be inflated to any depth."""
+    ratio = np.sort(shape.mesh.extents) / np.sort(size_m)
+    return bool((np.maximum(ratio, 1 / ratio) < _OTHER_SIDES).all())
+
+
 def _word(noun: Noun) -> str:
+    if noun.bore:
+        return "ring"
     hollow = "hollow " if noun.hollow else ""
     return hollow + {"box": "box", "cylinder": "cylinder", "sphere": "ball"}[noun.form]
 
