@@ -1,5 +1,6 @@
 """The network's word is drawn by hand here: what is made of it must not depend on how well it was trained."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.find import Watched, find_movers, standing
 from v2p_data.scene.footage import footage_of
+from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.scale import SeenCamera
+from v2p_data.scene.sight import Sighting, swallowed
 from v2p_data.video.clip import Clip
 
 H, W = 90, 120
@@ -143,3 +146,40 @@ def test_what_stands_is_apart_from_table_and_wall():
     likely = standing(watched, late=False)
 
     assert iou(likely > 0.5, square(60, 50)) > 0.8
+
+
+def put_into(bin_shows_at_the_end):
+    """A red square goes from the table to a blue bin and is gone, or is still seen there."""
+    bin_, frames = (square(70, 40, 36), BLUE, OTHER), []
+    for i in range(12):
+        inside = i > 8
+        thing = (square(10 + 8 * i if not inside else 80, 50), RED, MOVED)
+        frames.append([bin_] + ([thing] if not inside or bin_shows_at_the_end else []))
+    return frames
+
+
+@pytest.mark.parametrize("seen_at_the_end", [False, True])
+def test_what_goes_into_a_bin_and_is_gone_was_swallowed(seen_at_the_end):
+    footage, watched = watched_of(put_into(seen_at_the_end))
+    h, w = footage.shape
+    masks = watched.shares[:, MOVED] > 0.5
+    lost = np.zeros((h, w), bool)
+    lost[:5, :5] = True
+    masks[9:] = masks[9:] if seen_at_the_end else lost  # where the tracker went astray
+    common = {"moves": True, "at": 0, "known_m": None, "sure": 0.9, "why": ""}
+    thing = Sighting(
+        phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks,
+        quality=np.ones(12), **common,
+    )  # fmt: skip
+    bin_ = replace(
+        thing, role="container", noun=noun_for("bin"), moves=False,
+        masks=np.repeat((watched.early[OTHER] > 0.5)[None], 12, 0),
+    )  # fmt: skip
+
+    found = swallowed(watched, thing, bin_)
+
+    assert found.swallowed is not seen_at_the_end
+    if found.swallowed:
+        np.testing.assert_array_equal(found.last, masks[8])
+        assert (found.quality[9:] == 0).all()
+    assert not swallowed(watched, thing, replace(bin_, noun=noun_for("cereal box"))).swallowed

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
+from v2p_data.scene.nouns import Noun
 from v2p_data.scene.placement import CameraGuess
 from v2p_data.scene.pose import camera_above
-from v2p_data.scene.scale import table_width_m
+from v2p_data.scene.scale import SizeVote, camera_height_m, table_width_m
 
 H, W = 240, 320
 
@@ -51,3 +52,16 @@ def test_a_known_height_and_a_seen_width_both_vote():
 
     assert guess.heights(0.6)[0] == (0.5, 0.02)
     assert len(guess.heights(0.6)) == 2
+
+
+def test_a_noun_that_contradicts_all_others_counts_little():
+    """Three things say 0.5 m; what was taken for a pen, and is none, says 5 m."""
+    cube = Noun(word="cube", form="box", size_m=(0.1, 0.1, 0.1), mass_kg=0.1, friction=0.5)
+    right = SizeVote(size=(0.2, 0.2, 0.2), noun=cube)
+    wrong = SizeVote(size=(0.02, 0.02, 0.02), noun=cube)
+
+    agreed, _ = camera_height_m([right] * 3)
+    with_wrong, _ = camera_height_m([right] * 3 + [wrong])
+
+    assert agreed == pytest.approx(0.5, rel=0.02)
+    assert with_wrong == pytest.approx(agreed, rel=0.05)

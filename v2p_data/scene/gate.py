@@ -18,6 +18,8 @@ from v2p_data.scene.sight import Sights, stands_on
 
 _COLOURED = 0.25
 """Share of a thing's pixels that need its colour: few things are one colour all over."""
+_OUT_OF_SIGHT = 0.8
+"""What went into a bin lies in it, but nobody sees where."""
 _NEARING_KINDS = ("push_next_to", "slide_to", "drop_in_front_of")
 _ENDING_AT_KINDS = ("insert", "throw_into", "place_onto", "cover")
 
@@ -52,6 +54,9 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
         add("size", f"size of {which}", np.exp(-0.5 * (max(0.0, off - 1.5) / 1.5) ** 2))
         add("shape", f"outline of {which}", max(0.1, 0.5 + (placed.first.iou - 0.6) / 0.6))
         if not s.moves:
+            continue
+        if s.swallowed:
+            add("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
             continue
         add(
             "pose",

@@ -24,6 +24,7 @@ from v2p_data.scene.scale import SeenCamera
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 _STEP = 16
 _WIDTHS = (24, 48, 80, 128)
+_MIRROR_EVERY = 3
 _QUESTIONS = 4
 """Learned queries that gather from all places what tells of the camera: how large the hand is and where, say."""
 
@@ -68,25 +69,34 @@ class SceneNetwork(nn.Module):
     def forward(
         self, x: Float[torch.Tensor, "n 15 h w"]
     ) -> tuple[Float[torch.Tensor, "n 5 h w"], Float[torch.Tensor, "n 6"]]:
-        """Return class logits, and the camera as (pitch [rad], log focal over width, log width of the table [m], log sd of each)."""
-        x1 = self.enc1(self.stem(x))
-        x2 = self.enc2(F.max_pool2d(x1, 2))
-        x3 = self.enc3(F.max_pool2d(x2, 2))
-        x4 = self.enc4(F.max_pool2d(x3, 2))
-        n, d, h, w = x4.shape
-        tokens = self.compare(x4.flatten(2).transpose(1, 2))
+        """Return class logits, and the camera as `camera_of` does."""
+        x1, x2, x3, tokens = self._levels(x)
+        n, d, h, w = *tokens.shape[::2], *(side // 2 for side in x3.shape[2:])
         x4 = tokens.transpose(1, 2).reshape(n, d, h, w)
         up = self.dec3(torch.cat([x3, _twice(x4)], 1))
         up = self.dec2(torch.cat([x2, _twice(up)], 1))
         up = self.dec1(torch.cat([x1, _twice(up)], 1))
-        with torch.autocast(
-            x.device.type, enabled=False
-        ):  # half precision is too coarse for angles
+        return self.head(up), self._camera(tokens, w / h)
+
+    def camera_of(self, x: Float[torch.Tensor, "n 15 h w"]) -> Float[torch.Tensor, "n 6"]:
+        """Return (pitch [rad], log focal over width, log width of the table [m], log sd of each): half of the work."""
+        tokens = self._levels(x)[-1]
+        return self._camera(tokens, x.shape[3] / x.shape[2])
+
+    def _levels(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        x1 = self.enc1(self.stem(x))
+        x2 = self.enc2(F.max_pool2d(x1, 2))
+        x3 = self.enc3(F.max_pool2d(x2, 2))
+        x4 = self.enc4(F.max_pool2d(x3, 2))
+        return x1, x2, x3, self.compare(x4.flatten(2).transpose(1, 2))
+
+    def _camera(self, tokens: torch.Tensor, aspect: float) -> torch.Tensor:
+        n, device = len(tokens), tokens.device
+        with torch.autocast(device.type, enabled=False):  # half precision is too coarse for angles
             tokens = tokens.float()
             gathered = self.answer(self.ask.expand(n, -1, -1), tokens, tokens)[0].flatten(1)
-            aspect = torch.full((n, 1), float(np.log(w / h)), device=x.device)
-            camera = self.camera(torch.cat([gathered, aspect], 1))
-        return self.head(up), camera
+            shape = torch.full((n, 1), float(np.log(aspect)), device=device)
+            return self.camera(torch.cat([gathered, shape], 1))
 
 
 def inputs_of(
@@ -143,7 +153,7 @@ def look(
     size = net_size(h, w)
     net = network()
     shares = np.empty((len(frames), len(CLASSES), h, w), np.float32)
-    cameras = []
+    cameras, mirrored = [], []
     for start in range(0, len(frames), batch):
         part = slice(start, start + batch)
         now, before, after = (
@@ -152,14 +162,16 @@ def look(
             )
             for images in (frames, early, late)
         )
-        logits, camera = net(
-            inputs_of(now, before, after).contiguous(memory_format=torch.channels_last)
-        )
+        x = inputs_of(now, before, after).contiguous(memory_format=torch.channels_last)
+        logits, camera = net(x)
         for full, small in zip(shares[part], logits.softmax(1).numpy(), strict=True):
             for plane, own in zip(full, small, strict=True):
                 cv2.resize(own, (w, h), dst=plane, interpolation=cv2.INTER_LINEAR)
         cameras.append(camera.numpy())
-    camera = np.concatenate(cameras).mean(0)
+        flipped = inputs_of(*(y[::_MIRROR_EVERY].flip(-1) for y in (now, before, after)))
+        mirrored.append(net.camera_of(flipped.contiguous(memory_format=torch.channels_last)))
+    # A mirrored picture shows the same camera; what is guessed otherwise there is chance.
+    camera = (np.concatenate(cameras).mean(0) + torch.cat(mirrored).numpy().mean(0)) / 2
     return Seen(
         shares=shares,
         camera=SeenCamera(

@@ -29,10 +29,9 @@ from v2p_data.scene.pose import (
 from v2p_data.scene.scale import SizeVote, camera_height_m, table_width_m
 from v2p_data.scene.scene import Observed
 from v2p_data.scene.segment import bounding_box, grow, tidy
-from v2p_data.scene.sight import Sighting
+from v2p_data.scene.sight import SWALLOWING_KINDS, Sighting
 
 _INSIDE_KINDS = ("insert", "throw_into", "place_onto")
-_SWALLOWING_KINDS = ("insert", "throw_into")
 _UNSEEN_IOU = 0.35
 """An outline at the end that fits the object no better shows something else."""
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
@@ -143,7 +142,8 @@ def place(
         if len(costs) > 1:
             rivals[k] = float(np.partition(costs, 1)[1] - min(costs))
         firsts[k], (lasts[k], cost) = options[best], found[best]
-        if kind in _SWALLOWING_KINDS and within is not None and lasts[k].iou < _UNSEEN_IOU:
+        unseen = kind in SWALLOWING_KINDS and (s.swallowed or lasts[k].iou < _UNSEEN_IOU)
+        if unseen and within is not None:
             lasts[k] = _inside(lasts[k], support, within)
         upright_cost = cost if s is thing else upright_cost
     height_m, spread = camera_height_m(
@@ -497,7 +497,8 @@ def _centre(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
 
 def vote_of(s: Sighting, fit: Fit) -> SizeVote:
     """Return what a fitted object says about the scale."""
-    return SizeVote(size=fit.size, noun=s.noun, trust=max(0.1, fit.iou), known_m=s.known_m)
+    trust = max(0.1, fit.iou) * max(0.1, s.sure)
+    return SizeVote(size=fit.size, noun=s.noun, trust=trust, known_m=s.known_m)
 
 
 def _tuple3(values: np.ndarray) -> tuple[float, float, float]:

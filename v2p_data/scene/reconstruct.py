@@ -368,14 +368,17 @@ def _mask_track(
         if s.quality[i] > _LEAST_QUALITY and s.masks[i].any()
     }
     masks[int(footage.frame_idx[s.at])] = s.first
-    if s.moves:
+    if s.moves and not s.swallowed:
         masks[int(footage.frame_idx[placed.last_i])] = placed.last_mask
     return dict(sorted(masks.items()))
 
 
 def _remarks(kind: str, sights: Sights, placement: Placement, num_frames: int) -> list[str]:
     spread = placement.scale_spread
-    out = [f"scale comes from usual sizes: all lengths may be off by {spread:.0%} together"]
+    by_network = " and from what the network makes of the picture" if sights.watched else ""
+    out = [
+        f"scale comes from usual sizes{by_network}: all lengths may be off by {spread:.0%} together"
+    ]
     out += [
         f"'{s.phrase}' is no known noun; its size is a guess"
         for s in sights.objects

@@ -25,7 +25,14 @@ from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Moved, find_moved, find_other
 from v2p_data.scene.nouns import Noun, noun_for
 from v2p_data.scene.scene import Role
-from v2p_data.scene.segment import bounding_box, from_box, from_points, grow, solidity
+from v2p_data.scene.segment import (
+    bounding_box,
+    from_box,
+    from_points,
+    grow,
+    largest,
+    solidity,
+)
 from v2p_data.scene.table import Table, find_table
 from v2p_data.scene.track import track
 from v2p_data.video.clip import Clip
@@ -38,6 +45,10 @@ _NO_OPINION = 0.75
 """What the finding of the network alone counts where those cues have none."""
 _LEAST_HAND = 0.002
 """Share of the picture that a hand covers when it is seen best."""
+SWALLOWING_KINDS = ("insert", "throw_into")
+_LITTLE = 0.2
+"""Of a thing's first outline: when no more than this is seen of it, it is hidden."""
+_TOUCH_PX = 6
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
 """What the caption says of other objects is an aside here: such a scene makes sense without them."""
 
@@ -65,6 +76,8 @@ class Sighting:
     meets: float = 1.0
     """How well the track from the start agrees with the one from the end, 0 to 1."""
     hinted: bool = False
+    swallowed: bool = False
+    """Whether it was last seen going into what hides it at the end; the masks from then on repeat the last one seen."""
 
     @property
     def first(self) -> Bool[np.ndarray, "h w"]:
@@ -165,6 +178,8 @@ def sight(
         if not seen.moves:
             taken |= grow(seen.first, 2)
         objects.append(seen)
+    if watched is not None and meaning.kind in SWALLOWING_KINDS and len(objects) > 1:
+        objects[0] = swallowed(watched, objects[0], objects[1])
     return Sights(
         objects=tuple(objects),
         footage=footage,
@@ -214,6 +229,25 @@ def _mover(
         why=why,
         hinted=mark is not None,
     )
+
+
+def swallowed(watched: Watched, thing: Sighting, other: Sighting) -> Sighting:
+    """Return the thing as last seen, where it goes into the other and nothing that moved is seen at the end: bins are deep."""
+    little = _LITTLE * float(thing.first.sum())
+    if not other.noun.hollow or (watched.at(len(thing.masks) - 1)[MOVED] > 0.5).sum() > little:
+        return thing
+    goal = grow(other.first, _TOUCH_PX)
+    entering = [
+        (int(i), mask)
+        for i in watched.idx[len(watched.idx) // 3 :]
+        if (mask := (watched.at(int(i))[MOVED] > 0.5) & goal).sum() > little
+    ]
+    if not entering:
+        return thing
+    i, mask = entering[-1]
+    masks, quality = thing.masks.copy(), thing.quality.copy()
+    masks[i:], quality[i + 1 :] = largest(mask), 0.0
+    return replace(thing, masks=masks, quality=quality, swallowed=True)
 
 
 def _brought(scene: _Scene, thing: Sighting) -> Sighting | None:
