@@ -183,3 +183,14 @@ def test_what_goes_into_a_bin_and_is_gone_was_swallowed(seen_at_the_end):
         np.testing.assert_array_equal(found.last, masks[8])
         assert (found.quality[9:] == 0).all()
     assert not swallowed(watched, thing, replace(bin_, noun=noun_for("cereal box"))).swallowed
+
+
+def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen():
+    footage, watched = watched_of(put_into(bin_shows_at_the_end=False))
+
+    found = find_movers(footage, watched, "red cube", "insert")
+
+    assert found is not None
+    assert iou(found[0].first, square(10, 50)) > 0.7
+    assert iou(found[0].last, square(10 + 8 * 8, 50)) > 0.7
+    assert find_movers(footage, watched, "red cube", "push_right") is None

@@ -39,6 +39,8 @@ _MOST_ZOOM = 2.5
 """As far as the network was trained on enlarged parts."""
 _GAP_PX = 7
 """Of a picture 320 px wide: parts of one thing lie as near as this."""
+SWALLOWING_KINDS = ("insert", "throw_into")
+"""What is moved so may be hidden at the end."""
 _END_WEIGHT = {"insert": 0.4, "throw_into": 0.4, "place_onto": 0.5, "cover": 0.5}
 """How much the last outline counts: a rim, or the hand that still holds it, hides part of what was put there."""
 _LEAST_SHARE = 0.0007
@@ -231,6 +233,8 @@ def find_movers(
     """
     starts = _ends(footage, watched, phrase, 0, first)
     stops = _ends(footage, watched, phrase, len(footage.rgb) - 1, last)
+    if starts and not stops and kind in SWALLOWING_KINDS:
+        stops = _last_seen(footage, watched, phrase, starts[0].area)
     stops = [_hidden_end(blob, _END_WEIGHT.get(kind, 0.7)) for blob in stops]
     pairs = sorted(
         (
@@ -367,6 +371,15 @@ def _ends(
                 )
             )
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
+
+
+def _last_seen(footage: Footage, watched: Watched, phrase: str, area: int) -> list[_Blob]:
+    """Return the blobs of the last frame that shows half of something this large, before all is hidden."""
+    for i in watched.idx[: len(watched.idx) // 3 : -1].tolist():
+        blobs = _ends(footage, watched, phrase, i, None)
+        if any(blob.area > area / 2 for blob in blobs):
+            return blobs
+    return []
 
 
 def _hidden_end(blob: _Blob, weight: float) -> _Blob:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.colour import lab_of
+from v2p_data.scene.find import SWALLOWING_KINDS
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.pose import (
     Fit,
@@ -29,7 +30,7 @@ from v2p_data.scene.pose import (
 from v2p_data.scene.scale import SizeVote, camera_height_m, table_width_m
 from v2p_data.scene.scene import Observed
 from v2p_data.scene.segment import bounding_box, grow, tidy
-from v2p_data.scene.sight import SWALLOWING_KINDS, Sighting
+from v2p_data.scene.sight import Sighting
 
 _INSIDE_KINDS = ("insert", "throw_into", "place_onto")
 _UNSEEN_IOU = 0.35

@@ -14,6 +14,7 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.classes import HAND, MOVED, OTHER
 from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
+    SWALLOWING_KINDS,
     Watched,
     find_held,
     find_movers,
@@ -45,7 +46,6 @@ _NO_OPINION = 0.75
 """What the finding of the network alone counts where those cues have none."""
 _LEAST_HAND = 0.002
 """Share of the picture that a hand covers when it is seen best."""
-SWALLOWING_KINDS = ("insert", "throw_into")
 _LITTLE = 0.2
 """Of a thing's first outline: when no more than this is seen of it, it is hidden."""
 _TOUCH_PX = 6
