@@ -51,7 +51,7 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
         if s.moves:
             add("segmentation", f"track of {which} from start to end", 0.65 + 0.7 * s.meets)
         off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
-        add("size", f"size of {which}", np.exp(-0.5 * (max(0.0, off - 1.5) / 1.5) ** 2))
+        add("size", f"size of {which}", np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2))
         add("shape", f"outline of {which}", max(0.1, 0.5 + (placed.first.iou - 0.6) / 0.6))
         if not s.moves:
             continue
