@@ -194,7 +194,9 @@ def boxes_of(true: TrueClip, camera: Camera, rng: np.random.Generator) -> dict[s
         shown = [frame for frame in sorted(thing.masks) if thing.masks[frame].sum() >= 12]
         if not shown:
             continue
-        frame = shown[0] if shown[0] == min(thing.masks) else shown[-1]
+        # A person marks what comes later, a tool or what was covered, where it shows best.
+        best = max(shown, key=lambda frame: thing.masks[frame].sum())
+        frame = shown[0] if shown[0] == min(thing.masks) else best
         y, x = np.nonzero(thing.masks[frame])
         scale = camera.width_px / WIDTH_PX
         corners = np.array([[x.min(), y.min()], [x.max() + 1, y.max() + 1]]) * scale

@@ -12,6 +12,7 @@ from v2p_data.scene.footage import footage_of
 from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.scale import SeenCamera
 from v2p_data.scene.sight import Sighting, swallowed
+from v2p_data.scene.track import carried
 from v2p_data.video.clip import Clip
 
 H, W = 90, 120
@@ -194,3 +195,18 @@ def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen():
     assert iou(found[0].first, square(10, 50)) > 0.7
     assert iou(found[0].last, square(10 + 8 * 8, 50)) > 0.7
     assert find_movers(footage, watched, "red cube", "push_right") is None
+
+
+def test_a_tool_marked_in_one_frame_is_followed_both_ways_until_it_is_gone():
+    path = [None, None, *((20 + 6 * i, 40) for i in range(8)), None, None]
+    footage, watched = watched_of([[(square(*at), RED, MOVED)] if at else [] for at in path])
+    mask = watched.shares[5, MOVED] > 0.5
+
+    course = carried(footage, mask, 5, moving=lambda i: watched.at(i)[MOVED])
+
+    for i, at in enumerate(path):
+        if at is None:
+            assert not course.masks[i].any(), i
+        else:
+            assert iou(course.masks[i], square(*at)) > 0.6, i
+    assert course.quality[5] == 1

@@ -41,6 +41,8 @@ _MIN_SHARE, _MAX_SHARE = 0.0015, 0.16
 """An object's share of the picture; smaller is noise, larger is a person."""
 _WHOLE = 0.9
 """Solidity from which an outline is taken for that of one thing."""
+_LARGE = 0.01
+"""Of the picture: the outlines of smaller things are ragged."""
 _NECKS = (0.4, 0.6, 0.8)
 _NEAR_KINDS = {"push_next_to", "drop_in_front_of", "push_with", "slide_to"}
 _TOUCH_KINDS = {"cover", "insert", "throw_into", "place_onto"}
@@ -195,10 +197,8 @@ def find_other(
         free = pixels & ~grow(moved.last, 2) if late else pixels & ~occupied
         free = free if taken is None else free & ~taken
         wholes = _parts(tidy(free, 5), h * w, least, most)
-        for mask in [
-            *wholes,
-            *(part for whole in wholes for part in _pieces(whole, least * h * w)),
-        ]:
+        pieces = [part for whole in wholes for part in _pieces(whole, _LARGE * h * w)]
+        for mask in [*wholes, *pieces]:
             x, y, bw, bh = bounding_box(mask)
             area = int(mask.sum())
             score = -_border_sides((x, y, bw, bh), w, h) * 0.8
@@ -215,7 +215,8 @@ def find_other(
             score += 1.5 * (float(likely[mask].mean()) - 0.4) if likely is not None else 0.0
             score += 0.8 * area / (bw * bh)
             # Things that touch, or pieces of one, are no thing.
-            score += 2 * float(np.clip(solidity(mask) - _WHOLE, -0.2, 0))
+            if area > _LARGE * h * w:
+                score += 2 * float(np.clip(solidity(mask) - _WHOLE, -0.2, 0))
             score += 0.02 * min(40.0, edge_contrast(lab, mask))
             score -= small * max(0.0, float(np.log(0.008 * h * w / area)))
             if best is None or score > best.score:
@@ -229,7 +230,7 @@ def find_other(
 
 def _pieces(mask: Bool[np.ndarray, "h w"], least_px: float) -> list[Bool[np.ndarray, "h w"]]:
     """Return the parts of a mask that only a neck joins, as openings with discs of its own width leave them."""
-    if solidity(mask) > _WHOLE:
+    if mask.sum() < least_px or solidity(mask) > _WHOLE:
         return []
     inner = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
     out: list[Bool[np.ndarray, "h w"]] = []

@@ -35,7 +35,7 @@ from v2p_data.scene.segment import (
     solidity,
 )
 from v2p_data.scene.table import Table, find_table
-from v2p_data.scene.track import track
+from v2p_data.scene.track import carried, track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
 
@@ -169,8 +169,8 @@ def sight(
         seen: Sighting | None = None
         if role == "tool" and held is not None:
             seen = _mover(thing, footage, watched, held, mark)
-        elif role == "tool" and mark is None:
-            seen = _brought(scene, thing)
+        elif role == "tool":
+            seen = _brought(scene, thing) if mark is None else _held(scene, thing, mark)
         seen = seen or _stander(scene, thing, mark, taken)
         if seen is None:
             warnings.append(f"the '{phrase}' was not found and is left out")
@@ -265,6 +265,31 @@ def _brought(scene: _Scene, thing: Sighting) -> Sighting | None:
         at=at,
         sure=sure,
         why="it comes with the hand",
+    )
+
+
+def _held(scene: _Scene, thing: Sighting, mark: _Marked) -> Sighting | None:
+    """Return a marked tool, followed from that frame on; None where the mark is empty."""
+    if not mark.mask.any():
+        return None
+    footage, watched = scene.footage, scene.watched
+    course = carried(
+        footage,
+        mark.mask,
+        mark.frame,
+        every=1 if len(footage.rgb) < 80 else 2,
+        moving=None
+        if watched is None
+        else lambda i: watched.at(i)[MOVED] + 0.5 * watched.at(i)[HAND],
+    )
+    return replace(
+        thing,
+        masks=course.masks,
+        quality=course.quality,
+        moves=True,
+        at=mark.frame,
+        sure=mark.sure,
+        hinted=True,
     )
 
 

@@ -17,6 +17,8 @@ from v2p_data.scene.ground import Moved
 from v2p_data.scene.segment import bounding_box, convex_hull, grow, tidy
 
 _SAME_LAB = 6.0
+_LOST = 0.4
+"""Likeness below which what is followed from one frame alone is taken to be gone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +78,31 @@ def track(
             masks[i] = masks[i - 1]
     meets = max(_iou(forward[-1], moved.last), _iou(backward[0], moved.first))
     return Track(masks=masks, quality=quality, meets=meets)
+
+
+def carried(
+    footage: Footage,
+    mask: Bool[np.ndarray, "h w"],
+    at: int,
+    *,
+    every: int = 1,
+    moving: Moving | None = None,
+) -> Track:
+    """Return the mask over time of what is known in one frame only: carried forwards and backwards from there.
+
+    Where the mask looks little like the object any more, it is taken to be out of the picture: the mask is empty.
+    """
+    n = len(footage.rgb)
+    look, area = histogram(footage.rgb[at][mask]), float(mask.sum())
+    masks, quality = np.zeros((n, *footage.shape), bool), np.zeros(n)
+    for steps in ([*range(at, n, every)], [*range(at, -1, -every)]):
+        for i, found in zip(steps, _follow(footage, steps, mask, look, at, moving), strict=True):
+            likeness = _likeness(footage, i, found, look, area)
+            if likeness < _LOST:
+                break
+            masks[i], quality[i] = found, likeness
+    masks[at], quality[at] = mask, 1.0
+    return Track(masks=masks, quality=quality, meets=1.0)
 
 
 def _follow(
