@@ -39,10 +39,12 @@ from v2p_data.scene.table import Table
 
 _MIN_SHARE, _MAX_SHARE = 0.0015, 0.16
 """An object's share of the picture; smaller is noise, larger is a person."""
-_WHOLE = 0.9
+_WHOLE = 0.8
 """Solidity from which an outline is taken for that of one thing."""
 _LARGE = 0.01
 """Of the picture: the outlines of smaller things are ragged."""
+_SPLIT_COST = 0.6
+"""A piece of an outline must score so much better than the whole: light and print cut things into pieces, too."""
 _NECKS = (0.4, 0.6, 0.8)
 _NEAR_KINDS = {"push_next_to", "drop_in_front_of", "push_with", "slide_to"}
 _TOUCH_KINDS = {"cover", "insert", "throw_into", "place_onto"}
@@ -198,10 +200,11 @@ def find_other(
         free = free if taken is None else free & ~taken
         wholes = _parts(tidy(free, 5), h * w, least, most)
         pieces = [part for whole in wholes for part in _pieces(whole, _LARGE * h * w)]
-        for mask in [*wholes, *pieces]:
+        for k, mask in enumerate([*wholes, *pieces]):
             x, y, bw, bh = bounding_box(mask)
             area = int(mask.sum())
             score = -_border_sides((x, y, bw, bh), w, h) * 0.8
+            score -= _SPLIT_COST if k >= len(wholes) else 0.0
             if kind in _TOUCH_KINDS or late:
                 score += 3 * min(0.6, float((mask & goal_zone).sum() / goal_zone.sum()))
             if late:  # what was under the cover stands where its foot was

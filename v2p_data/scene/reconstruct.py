@@ -64,7 +64,7 @@ _LEAST_QUALITY = 0.4
 class SceneConfig:
     """How a scene is rebuilt, and how sure we must be."""
 
-    min_confidence: float = 0.6
+    min_confidence: float = 0.55
     """Scenes below are rejected."""
     min_found: float = 0.5
     """Objects that are found less surely are rejected."""
