@@ -212,9 +212,8 @@ def _varied(
         pictures, labels, camera = turned(pictures, labels, camera, rng)
     part = _nearer(labels, rng) if rng.random() < PARTS else None
     camera = known_of(camera, part, labels.shape)
-    if (
-        is_turned
-    ):  # all of them have a longer focal length than the clips: the guess would be too long
+    if is_turned:
+        # All of them have a longer focal length than the clips: the guess would be too long.
         camera[1] = np.nan
     if part is not None:
         pictures, labels = [p[part] for p in pictures], labels[part]

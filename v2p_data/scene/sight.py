@@ -146,8 +146,8 @@ def sight(
     marked = _marked(clip, footage, watched, boxes or {})
     tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
     moved, held = _find_movers(footage, table, watched, meaning, tool, marked)
-    mark = marked.get(meaning.manipulated)
-    sure, why = _sureness(moved, watched, mark)
+    own = marked.get(meaning.manipulated)
+    sure, why = _sureness(moved, watched, own)
     if sure < min_found:
         raise ItemRejectedError(
             "object_not_found",
@@ -158,7 +158,7 @@ def sight(
     if watched is None:
         footage = footage.knowing(moved.look)
     thing = _mover(
-        _sighting(clip, meaning.manipulated, "manipulated"), footage, watched, moved, mark
+        _sighting(clip, meaning.manipulated, "manipulated"), footage, watched, moved, own
     )
     moved = replace(moved, last=thing.masks[-1])
     scene = _Scene(clip, footage, table, watched, meaning, moved, thing.masks, min_found)
@@ -178,7 +178,8 @@ def sight(
         if not seen.moves:
             taken |= grow(seen.first, 2)
         objects.append(seen)
-    if watched is not None and meaning.kind in SWALLOWING_KINDS and len(objects) > 1:
+    may_be_hidden = own is None or not _at_end(own, footage)
+    if watched is not None and meaning.kind in SWALLOWING_KINDS and may_be_hidden and objects[1:]:
         objects[0] = swallowed(watched, objects[0], objects[1])
     return Sights(
         objects=tuple(objects),
@@ -413,7 +414,7 @@ def _find_movers(
     marked: dict[str, _Marked],
 ) -> tuple[Moved, Moved | None]:
     mark = marked.get(meaning.manipulated)
-    at_end = mark is not None and mark.frame > 0.5 * (len(footage.rgb) - 1)
+    at_end = mark is not None and _at_end(mark, footage)
     first = mark.mask if mark and not at_end else None
     last = mark.mask if mark and at_end else None
     moved, held = None, None
@@ -432,6 +433,10 @@ def _find_movers(
             "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
         )
     return moved, held
+
+
+def _at_end(mark: _Marked, footage: Footage) -> bool:
+    return mark.frame > 0.5 * (len(footage.rgb) - 1)
 
 
 def _agreed(moved: Moved, by_change: Moved | None, watched: Watched) -> Moved:
