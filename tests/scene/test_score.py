@@ -362,3 +362,16 @@ def test_a_tool_is_compared_from_where_it_comes_into_the_picture():
 
     assert at_its_own.position_first_m == pytest.approx(0, abs=1e-9)
     assert at_the_start.position_first_m == pytest.approx(0.1 * 5 / 9)  # it was there all the time
+
+
+def test_what_goes_out_and_comes_half_way_back_has_gone_all_its_way_at_the_end():
+    true = true_thing()
+    T = true.T_world_objs.copy()
+    T[:, 0, 3] = [0.0, 0.05, 0.1, 0.15, 0.2, 0.2, 0.16, 0.12, 0.1, 0.1]
+    true = replace(true, T_world_objs=T)
+
+    thing = scored(true, found_thing()).things[0]
+    early = scored(true, found_thing(last_frame=5, move=(0.2, 0, 0))).things[0]
+
+    assert thing.travel_share == pytest.approx(1)
+    assert early.travel_share == pytest.approx(2 / 3)

@@ -475,9 +475,12 @@ def _by_sight(
 
 
 def _travel_share(true: TrueThing, last: int) -> float | None:
-    """Return how far it had gone by that frame, of the farthest it went; None for what stays."""
-    gone = np.linalg.norm(true.T_world_objs[:, :3, 3] - true.T_world_objs[0, :3, 3], axis=1)
-    return None if gone.max() < 0.02 else float(gone[last] / gone.max())
+    """Return how much of its way it had gone by that frame; None for what stays. A way may lead out and back."""
+    places = true.T_world_objs[:, :3, 3]
+    if np.linalg.norm(places - places[0], axis=1).max() < 0.02:
+        return None
+    way = np.concatenate([[0.0], np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum()])
+    return float(way[last] / way[-1])
 
 
 def _seen_frames(true: TrueThing) -> list[int]:
