@@ -168,6 +168,7 @@ def look(
             for plane, own in zip(full, small, strict=True):
                 cv2.resize(own, (w, h), dst=plane, interpolation=cv2.INTER_LINEAR)
         cameras.append(camera.numpy())
+        del x, logits
         flipped = inputs_of(*(y[::_MIRROR_EVERY].flip(-1) for y in (now, before, after)))
         mirrored.append(net.camera_of(flipped.contiguous(memory_format=torch.channels_last)))
     # A mirrored picture shows the same camera; what is guessed otherwise there is chance.
