@@ -195,7 +195,7 @@ def boxes_of(true: TrueClip, camera: Camera, rng: np.random.Generator) -> dict[s
         if not shown:
             continue
         # A person marks what comes later, a tool or what was covered, where it shows best.
-        best = max(shown, key=lambda frame: thing.masks[frame].sum())
+        best = max(shown, key=lambda frame: (thing.masks[frame].sum(), frame))
         frame = shown[0] if shown[0] == min(thing.masks) else best
         y, x = np.nonzero(thing.masks[frame])
         scale = camera.width_px / WIDTH_PX

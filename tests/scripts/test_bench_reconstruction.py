@@ -103,8 +103,9 @@ def test_the_kept_half_shares_no_seed_with_the_other(bench):
 
 
 def test_a_hint_is_a_box_in_the_files_pixels_where_the_object_shows(bench):
-    hidden, shown = np.zeros((2, 240, 320), bool)
+    hidden, shown, leaving = np.zeros((3, 240, 320), bool)
     shown[100:140, 50:90] = True
+    leaving[100:140, 50:60] = True
     things = tuple(
         TrueThing(
             phrase=phrase,
@@ -114,9 +115,13 @@ def test_a_hint_is_a_box_in_the_files_pixels_where_the_object_shows(bench):
             symmetry="box",
             mesh=trimesh.creation.box((0.1, 0.1, 0.1)),
             T_world_objs=np.tile(np.eye(4), (60, 1, 1)),
-            masks={0: first, 30: shown, 59: shown},
+            masks={0: first, 30: shown, 59: last},
         )
-        for phrase, first in (("box", shown), ("ball", hidden))
+        for phrase, first, last in (
+            ("box", shown, shown),
+            ("ball", hidden, shown),
+            ("stick", hidden, leaving),
+        )
     )
     camera = Camera(
         width_px=640, height_px=480, K=intrinsics(640, 480, 0.7), T_world_cam=np.eye(4)
@@ -124,6 +129,6 @@ def test_a_hint_is_a_box_in_the_files_pixels_where_the_object_shows(bench):
     true = TrueClip(kind="uncover", things=things, T_world_cam=np.eye(4))
     hints = bench.boxes_of(true, camera, np.random.default_rng(0))
 
-    assert (hints["box"]["frame"], hints["ball"]["frame"]) == (0, 59)
+    assert [hints[phrase]["frame"] for phrase in ("box", "ball", "stick")] == [0, 59, 30]
     for hint in hints.values():
         assert np.abs(np.array(hint["box"]) - [100, 200, 180, 280]).max() < 4 * bench.JITTER_PX
