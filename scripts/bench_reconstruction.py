@@ -194,9 +194,9 @@ def boxes_of(true: TrueClip, camera: Camera, rng: np.random.Generator) -> dict[s
         shown = [frame for frame in sorted(thing.masks) if thing.masks[frame].sum() >= 12]
         if not shown:
             continue
-        # A person marks what comes later, a tool or what was covered, where it shows best.
-        best = max(shown, key=lambda frame: (thing.masks[frame].sum(), frame))
-        frame = shown[0] if shown[0] == min(thing.masks) else best
+        frame = shown[0]
+        if frame > min(thing.masks):  # what comes later, a person marks where it shows best
+            frame = max(shown, key=lambda k: (thing.masks[k].sum(), k))
         y, x = np.nonzero(thing.masks[frame])
         scale = camera.width_px / WIDTH_PX
         corners = np.array([[x.min(), y.min()], [x.max() + 1, y.max() + 1]]) * scale

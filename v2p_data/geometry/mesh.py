@@ -72,11 +72,7 @@ def lathe(profile: Float[np.ndarray, "k 2"], wall: float = 0.0) -> trimesh.Trime
     if wall > 0:
         outline.append(_inside(profile, wall)[::-1])
     outline.append(np.array([(0.0, outline[-1][-1, 1])]))
-    mesh = trimesh.creation.revolve(np.concatenate(outline), sections=_AROUND)
-    if mesh.volume < 0:
-        mesh.invert()
-    mesh.vertices[:, :2] *= 2 * r.max() / mesh.extents[:2]
-    return mesh
+    return _turned(np.concatenate(outline), 2 * float(r.max()))
 
 
 def lathe_parts(
@@ -107,21 +103,15 @@ def lathe_parts(
         outer = np.array([_at(profile, low), _at(profile, high)])
         inner = np.array([_at(inside, low), _at(inside, high)]) * [reach, 1.0]
         inner[:, 0] = np.minimum(inner[:, 0], outer[:, 0] - 0.2 * wall)
-        for k in range(_PART_WALLS):
-            ends = _rings(inner, k * step, (k + 1) * step, 1)
-            parts.append(_hull(np.concatenate([ends, _rings(outer, k * step, (k + 1) * step, 3)])))
+        parts += _sectors(inner, outer)
     return tuple(parts)
 
 
 def ring(diameter_m: float, height_m: float, bore: float) -> trimesh.Trimesh:
     """Return a cylinder with a hole along its axis, whose diameter is the share `bore` of its own."""
     r, half = diameter_m / 2, height_m / 2
-    turned = [(bore * r, -half), (r, -half), (r, half), (bore * r, half), (bore * r, -half)]
-    mesh = trimesh.creation.revolve(np.array(turned), sections=_AROUND)
-    if mesh.volume < 0:
-        mesh.invert()
-    mesh.vertices[:, :2] *= diameter_m / mesh.extents[:2]
-    return mesh
+    outline = [(bore * r, -half), (r, -half), (r, half), (bore * r, half), (bore * r, -half)]
+    return _turned(np.array(outline), diameter_m)
 
 
 def ring_parts(diameter_m: float, height_m: float, bore: float) -> tuple[trimesh.Trimesh, ...]:
@@ -131,23 +121,18 @@ def ring_parts(diameter_m: float, height_m: float, bore: float) -> tuple[trimesh
         np.array([(share * diameter_m / 2, -half), (share * diameter_m / 2, half)])
         for share in (bore / np.cos(step / 2), 1.0)
     )
-    return tuple(
-        _hull(
-            np.concatenate(
-                [
-                    _rings(inner, k * step, (k + 1) * step, 1),
-                    _rings(outer, k * step, (k + 1) * step, 3),
-                ]
-            )
-        )
-        for k in range(_PART_WALLS)
-    )
+    return tuple(_sectors(inner, outer))
 
 
 def mesh_for(
-    form: str, size_m: Size, *, hollow: bool = False, taper: float = 1.0
+    form: str, size_m: Size, *, hollow: bool = False, taper: float = 1.0, bore: float = 0.0
 ) -> trimesh.Trimesh:
-    """Return the mesh of a `box`, `cylinder` (any solid of revolution) or `sphere` with these full extents."""
+    """Return the mesh of a `box`, `cylinder` (any solid of revolution) or `sphere` with these full extents.
+
+    A cylinder with a `bore` is a `ring`.
+    """
+    if bore:
+        return ring(size_m[0], size_m[2], bore)
     if form == "box":
         return box(size_m, hollow=hollow)
     if form == "sphere":
@@ -156,9 +141,11 @@ def mesh_for(
 
 
 def parts_for(
-    form: str, size_m: Size, *, hollow: bool = False, taper: float = 1.0
+    form: str, size_m: Size, *, hollow: bool = False, taper: float = 1.0, bore: float = 0.0
 ) -> tuple[trimesh.Trimesh, ...]:
     """Return convex solids that together are `mesh_for` of the same arguments, its inside left free."""
+    if bore:
+        return ring_parts(size_m[0], size_m[2], bore)
     if not hollow or form == "sphere":
         return (mesh_for(form, size_m, taper=taper),)
     if form == "cylinder":
@@ -247,6 +234,33 @@ def _inside(profile: Float[np.ndarray, "k 2"], wall: float) -> Float[np.ndarray,
 
 def _at(profile: Float[np.ndarray, "k 2"], height: float) -> Float[np.ndarray, "2"]:
     return np.array([np.interp(height, profile[:, 1], profile[:, 0]), height])
+
+
+def _turned(outline: Float[np.ndarray, "k 2"], diameter_m: float) -> trimesh.Trimesh:
+    """Return what a closed outline (radius, z) encloses when it turns about z, turned outwards, of that diameter."""
+    mesh = trimesh.creation.revolve(outline, sections=_AROUND)
+    if mesh.volume < 0:
+        mesh.invert()
+    mesh.vertices[:, :2] *= diameter_m / mesh.extents[:2]
+    return mesh
+
+
+def _sectors(
+    inner: Float[np.ndarray, "2 2"], outer: Float[np.ndarray, "2 2"]
+) -> list[trimesh.Trimesh]:
+    """Return the wall between two profiles, cut into convex sectors."""
+    step = 2 * np.pi / _PART_WALLS
+    return [
+        _hull(
+            np.concatenate(
+                [
+                    _rings(inner, k * step, (k + 1) * step, 1),
+                    _rings(outer, k * step, (k + 1) * step, 3),
+                ]
+            )
+        )
+        for k in range(_PART_WALLS)
+    ]
 
 
 def _rings(

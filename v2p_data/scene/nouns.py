@@ -67,8 +67,8 @@ class Noun:
     """Of a roll or a ring: the diameter of the hole through it, as a share of its own; 0 where there is none."""
     taper: float = 1.0
     """Base diameter over top diameter, for solids of revolution."""
-    other_form: Form | None = None
-    """What else things of that name may be: waste bins are round or square."""
+    may_be_box: bool = False
+    """Whether things of that name may be boxes as well: waste bins are round or square."""
     spread: float = 0.2
     matter: Matter = "rigid"
     known: bool = True
@@ -85,11 +85,10 @@ class Noun:
         """Whether its rim is a circle seen from above while it stands: an ellipse in the image, which gives the camera's pitch."""
         return self.form == "cylinder"
 
-    def as_other_form(self) -> "Noun":
-        """Return the same noun as a box, where it may be one."""
-        assert self.other_form == "box"
+    def as_box(self) -> "Noun":
+        """Return the same noun as a box."""
         symmetry = "box" if self.symmetry == "round" else self.symmetry
-        return replace(self, form="box", other_form=None, taper=1.0, symmetry=symmetry)
+        return replace(self, form="box", may_be_box=False, taper=1.0, symmetry=symmetry)
 
     @property
     def source_kind(self) -> SourceKind:
@@ -170,7 +169,7 @@ def _noun(cells: list[str]) -> tuple[Noun, list[str]]:
         raise ValueError(f"hollow is '{row['hollow']}', not 0 or 1 or the share of a bore between")
     bore = 0.0 if row["hollow"] == "1" else float(row["hollow"])
     value = {column: _positive(row, column) for column in (*COLUMNS[2:8], "taper")}
-    form, _, other_form = row["form"].partition(" or ")
+    form, _, or_box = row["form"].partition(" or ")
     length, width, height = (round(value[side] / 100, 6) for side in COLUMNS[2:5])
     size_m = (length, width, height)
     noun = Noun(
@@ -181,7 +180,7 @@ def _noun(cells: list[str]) -> tuple[Noun, list[str]]:
         friction=value["friction"],
         hollow=row["hollow"] == "1",
         bore=bore,
-        other_form=other_form or None,  # pyright: ignore[reportArgumentType]
+        may_be_box=or_box == "box",
         taper=value["taper"],
         spread=value["spread"],
         matter=row["matter"],  # pyright: ignore[reportArgumentType]

@@ -32,7 +32,7 @@ from v2p_data.scene.scene import Observed
 from v2p_data.scene.segment import bounding_box, grow, tidy
 from v2p_data.scene.sight import Sighting
 
-_INSIDE_KINDS = ("insert", "throw_into", "place_onto")
+_INSIDE_KINDS = (*SWALLOWING_KINDS, "place_onto")
 _UNSEEN_IOU = 0.35
 """An outline at the end that fits the object no better shows something else."""
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
@@ -190,15 +190,14 @@ def with_forms(
     camera = camera_above(footage.shape, guess.pitch_rad, guess.fov_rad)
     out = []
     for s in objects:
-        if s.noun.other_form is not None:
+        if s.noun.may_be_box:
             unknown = _others(objects, s, s.at)
             silhouette = Silhouette(s.first, unknown, camera)
             usual, other = (
-                fit_shape(silhouette, noun, np.eye(3)).cost
-                for noun in (s.noun, s.noun.as_other_form())
+                fit_shape(silhouette, noun, np.eye(3)).cost for noun in (s.noun, s.noun.as_box())
             )
             if other + _OTHER_FORM_COST < usual:
-                s = replace(s, noun=s.noun.as_other_form())
+                s = replace(s, noun=s.noun.as_box())
         out.append(s)
     return tuple(out)
 

@@ -508,7 +508,7 @@ def _grounding_iou(true: TrueThing, found: FoundThing) -> float:
     frames = _seen_frames(true)
     if not frames or not found.masks:
         return 0.0
-    frame = frames[0] if frames[0] == min(true.masks) else frames[-1]
+    frame = frames[0] if _seen_at_first(true) else frames[-1]
     near = _nearest(found, frame)
     assert near is not None
     return _box_iou(true.masks[frame], found.masks[near])

@@ -21,8 +21,6 @@ from v2p_data.geometry.mesh import (
     lathe_parts,
     mesh_for,
     parts_for,
-    ring,
-    ring_parts,
     wall_m,
 )
 from v2p_data.geometry.pillow import inflated, pillow
@@ -169,18 +167,10 @@ def best_shape(
 
 
 def _primitive(size_m: Size, noun: Noun) -> _Candidate:
-    if noun.bore:
-        diameter, _, height = size_m
-        return _Candidate(
-            kind="primitive",
-            mesh=ring(diameter, height, noun.bore),
-            parts=ring_parts(diameter, height, noun.bore),
-            T_obj_shape=np.eye(4),
-        )
     return _Candidate(
         kind="primitive",
-        mesh=mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
-        parts=parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
+        mesh=mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
+        parts=parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
         T_obj_shape=np.eye(4),
     )
 

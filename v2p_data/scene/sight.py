@@ -217,7 +217,7 @@ def _mover(
     course = track(
         footage,
         moved,
-        every=1 if len(footage.rgb) < 80 else 2,
+        every=_every(footage),
         moving=None if watched is None else lambda i: watched.at(i)[MOVED],
     )
     return replace(
@@ -230,6 +230,11 @@ def _mover(
         why=why,
         hinted=mark is not None,
     )
+
+
+def _every(footage: Footage) -> int:
+    """Return every how-manieth frame is tracked."""
+    return 1 if len(footage.rgb) < 80 else 2
 
 
 def swallowed(watched: Watched, thing: Sighting, other: Sighting) -> Sighting:
@@ -278,7 +283,7 @@ def _held(scene: _Scene, thing: Sighting, mark: _Marked) -> Sighting | None:
         footage,
         mark.mask,
         mark.frame,
-        every=1 if len(footage.rgb) < 80 else 2,
+        every=_every(footage),
         moving=None
         if watched is None
         else lambda i: watched.at(i)[MOVED] + 0.5 * watched.at(i)[HAND],
