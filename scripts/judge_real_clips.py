@@ -140,7 +140,7 @@ def _compare(verdict: Verdict, clip: Clip, scene: Reconstruction, drawn: dict[st
         thing = found.get(phrase.lower())
         if thing is None:
             continue
-        ours = {end: _box_at(clip, thing, end) for end in ("first", "last")}
+        ours = {end: _box_at(clip, scene, thing, end) for end in ("first", "last")}
         ious = {e: _iou(ours[e], there[e]) for e in ours if there[e] is not None}
         if thing.role != "manipulated":
             # what stands still has one outline, taken where least hides it
@@ -150,13 +150,20 @@ def _compare(verdict: Verdict, clip: Clip, scene: Reconstruction, drawn: dict[st
     verdict.right = not verdict.missing and min(overlaps, default=0.0) >= RIGHT_IOU
 
 
-def _mask_at(thing: Estimate, frame: int) -> Bool[np.ndarray, "h w"]:
-    """Return the object's outline at a clip frame, or at the nearest one that has any."""
-    return thing.masks[min(thing.masks, key=lambda there: abs(there - frame))]
+def _mask_at(scene: Reconstruction, thing: Estimate, frame: int) -> Bool[np.ndarray, "h w"]:
+    """Return the object's outline at a clip frame as it was filmed, or at the nearest one that has any."""
+    at = min(thing.masks, key=lambda there: abs(there - frame))
+    mask, to_filmed = thing.masks[at], scene.clip.to_filmed
+    if to_filmed is None:
+        return mask
+    h, w = mask.shape
+    to_mask = np.diag([w / scene.clip.width_px, h / scene.clip.height_px, 1.0])
+    H = to_mask @ to_filmed[at] @ np.linalg.inv(to_mask)
+    return cv2.warpPerspective(mask.astype(np.uint8), H, (w, h), flags=cv2.INTER_NEAREST) > 0
 
 
-def _box_at(clip: Clip, thing: Estimate, end: str) -> Box | None:
-    mask = _mask_at(thing, 0 if end == "first" else len(clip.frames) - 1)
+def _box_at(clip: Clip, scene: Reconstruction, thing: Estimate, end: str) -> Box | None:
+    mask = _mask_at(scene, thing, 0 if end == "first" else len(clip.frames) - 1)
     if not mask.any():
         return None
     y, x = np.nonzero(mask)
@@ -279,7 +286,7 @@ def _half(
     if scene is None:
         return image
     for thing in scene.objects:
-        mask = _mask_at(thing, frame).astype(np.uint8)
+        mask = _mask_at(scene, thing, frame).astype(np.uint8)
         large = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
         outline, _ = cv2.findContours(large, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(image, outline, -1, _RED, 1, cv2.LINE_AA)

@@ -22,7 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 from safetensors.torch import load_file, save_file
 from scipy.spatial.transform import Rotation
 from torch.nn import functional as F  # noqa: N812  (the usual name)
@@ -51,15 +51,17 @@ from v2p_data.video.synthetic import (
 
 DRAWN_OVER_SEEN = 1.5
 """Clips are drawn larger than the network sees them, so that a part of a picture can be shown enlarged and still sharp."""
-FRAMES_DRAWN = 14
+FRAMES_DRAWN = 12
 FRAMES_KEPT = 6
 BATCH = 12
-TURNED = 0.7
+TURNED = 0.5
 """Share of the examples that are shown as another camera at the same place would have seen them."""
 _MOST_ZOOM = 1.6
 """Such a camera's focal length is at most so much longer, or it would see too little."""
 _MOST_BEYOND = 0.06
 """So much of the picture's sides it may look beyond them."""
+UNEVEN = 0.4
+"""Share of the examples that are lit unevenly."""
 PARTS = 0.5
 """Share of the examples that are an enlarged part of a picture."""
 HELD_OUT = 20
@@ -221,13 +223,16 @@ def _varied(
     mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
     if rng.random() < 0.1:
         mix = np.full((3, 3), 1 / 3) + 0.15 * mix
-    gain, bias, gamma = rng.uniform(0.75, 1.25), rng.normal(0, 8), np.exp(rng.normal(0, 0.2))
+    gain, bias, gamma = np.exp(rng.normal(0, 0.25)), rng.normal(0, 8), np.exp(rng.normal(0, 0.2))
+    light = _light(size, rng) if rng.random() < UNEVEN else None
     blur, noise = rng.choice([0, 0, 0.7, 1.1]), rng.uniform(0, 4)
     out = []
     curve = 255 * (np.arange(256) / 255) ** gamma
     for k, picture in enumerate(pictures):
         toned = curve * (gain * (1 + rng.normal(0, 0.012))) + bias + rng.normal(0, 0.8)
         x = cv2.LUT(cv2.transform(picture, mix), np.clip(toned, 0, 255).astype(np.uint8))
+        if light is not None:
+            x = np.clip(x * light, 0, 255)
         if blur:
             x = cv2.GaussianBlur(x, (0, 0), blur)
         if k == 0:
@@ -240,6 +245,12 @@ def _varied(
         "labels": np.ascontiguousarray(labels),
         "camera": camera,
     }
+
+
+def _light(size: tuple[int, int], rng: np.random.Generator) -> Float32[np.ndarray, "h w 1"]:
+    """Return how bright each place is: windows and lamps light a room unevenly, and cameras overexpose white tables."""
+    coarse = np.exp(rng.normal(0, 0.25, (2, 3))).astype(np.float32)
+    return cv2.resize(coarse, (size[1], size[0]), interpolation=cv2.INTER_CUBIC)[..., None]
 
 
 def turned(
@@ -352,7 +363,7 @@ def loss_of(
     known = batch["camera"].isfinite()
     off, log_sd = (camera[:, :3] - batch["camera"])[known], camera[:, 3:].clamp(-4, 1)[known]
     likelihood = (log_sd + 0.5 * (off / log_sd.exp()) ** 2).sum() / max(1, int(known.sum()))
-    return ce + 0.3 * dice + 0.2 * likelihood
+    return ce + 0.3 * dice + 0.4 * likelihood
 
 
 @torch.inference_mode()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
-from v2p_data.scene.find import Watched, find_movers, standing
+from v2p_data.scene.find import Watched, find_movers, rated, standing
 from v2p_data.scene.footage import footage_of
 from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.scale import SeenCamera
@@ -78,6 +78,12 @@ def iou(mask, truth):
     )
     truth = truth[rows][:, columns]
     return (mask & truth).sum() / (mask | truth).sum()
+
+
+def large(mask, footage):
+    """Return a mask of the drawn frames at working size."""
+    h, w = footage.shape
+    return mask[(np.arange(h) * H) // h][:, (np.arange(w) * W) // w]
 
 
 @pytest.mark.parametrize(("phrase", "y"), [("red box", 20), ("blue box", 60)])
@@ -210,3 +216,31 @@ def test_a_tool_marked_in_one_frame_is_followed_both_ways_until_it_is_gone():
         else:
             assert iou(course.masks[i], square(*at)) > 0.6, i
     assert course.quality[5] == 1
+
+
+def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal():
+    frames = pushed(RED, RED)
+    footage, watched = watched_of(frames)
+    start, near, far = square(15, 20), square(44, 14, 26), square(44, 54, 26)
+    first, goals = large(start, footage), [large(goal, footage) for goal in (near, far)]
+
+    ends = [
+        find_movers(footage, watched, "red box", "insert", first=first, goal=goal)[0].last
+        for goal in goals
+    ]
+
+    assert iou(ends[0], square(48, 20)) > 0.8
+    assert iou(ends[1], square(48, 60)) > 0.8
+
+
+def test_outlines_from_elsewhere_are_rated_like_the_networks_own():
+    footage, watched = watched_of(pushed(RED, BLUE))
+    own, _ = find_movers(footage, watched, "red box", "push_right")
+
+    same = rated(footage, watched, "red box", "push_right", own)
+    other = replace(own, first=large(square(15, 60), footage), last=large(square(48, 60), footage))
+    blue = rated(footage, watched, "red box", "push_right", other)
+
+    alike = {cue: value for cue, value in own.cues.items() if cue != "no rival"}
+    assert same.cues == pytest.approx({**alike, "no rival": 1.0}, abs=0.02)
+    assert blue.score < 0.7 * same.score

@@ -4,6 +4,7 @@ The network says of every pixel what it is; this module cuts that into things, t
 says from 0 to 1 how sure that is and why not surer.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -226,16 +227,21 @@ def find_movers(
     tool: str = "",
     first: Bool[np.ndarray, "h w"] | None = None,
     last: Bool[np.ndarray, "h w"] | None = None,
+    goal: Bool[np.ndarray, "h w"] | None = None,
 ) -> tuple[Moved, Moved | None] | None:
     """Return the manipulated object and, where the caption names one that a hand holds, the tool.
 
-    A mask given by the user for either end is taken as it is. None where nothing that moved was seen.
+    A mask given by the user for either end is taken as it is; `goal` is what the user marked as that into, onto or over
+    which it goes. None where nothing that moved was seen.
     """
     starts = _ends(footage, watched, phrase, 0, first)
     stops = _ends(footage, watched, phrase, len(footage.rgb) - 1, last)
     if starts and not stops and kind in SWALLOWING_KINDS:
         stops = _last_seen(footage, watched, phrase, starts[0].area)
     stops = [_hidden_end(blob, _END_WEIGHT.get(kind, 0.7)) for blob in stops]
+    if goal is not None and kind in _END_WEIGHT:
+        near = grow(goal, _GAP_PX)
+        stops = [_at_goal(blob, near) for blob in stops]
     pairs = sorted(
         (
             _Pair(a, b, _pair_parts(a, b, kind, footage.shape))
@@ -334,43 +340,73 @@ def _ends(
     i: int,
     given: Bool[np.ndarray, "h w"] | None,
 ) -> list[_Blob]:
-    image = footage.rgb[i]
     if given is not None:
-        hist = histogram(image[given])
+        hist = histogram(footage.rgb[i][given])
         return [_Blob(mask=given, area=int(given.sum()), hist=hist, parts={"given": 1.0})]
     moved = watched.at(i)[MOVED]
-    words = colour_words(phrase)
-    match = colour_match(balance(image), words) if words else None
     h, w = footage.shape
-    lab, gone = lab_of(image), lab_of(footage.late if i == 0 else footage.early)
-    blobs: list[_Blob] = []
+    cores: list[Bool[np.ndarray, "h w"]] = []
+    masks: list[Bool[np.ndarray, "h w"]] = []
     hand = hand_at(watched, i)
     for level in (_LIKELY, _POSSIBLE):
         # Print on a thing and what lies in it break it up: gaps are closed, but not over the hand.
         whole = tidy(moved > level, _GAP_PX) & ~(hand & (moved < _POSSIBLE))
         count, parts, stats, _ = cv2.connectedComponentsWithStats(whole.astype(np.uint8))
         for k in range(1, count):
-            area = int(stats[k, cv2.CC_STAT_AREA])
             mask = parts == k
-            if area < _LEAST_SHARE * h * w or any((mask & b.mask).any() for b in blobs):
+            if stats[k, cv2.CC_STAT_AREA] < _LEAST_SHARE * h * w or any(
+                (mask & other).any() for other in masks
+            ):
                 continue
-            mask = mask_of_mover(footage, watched, i, largest(_grown_to(mask, moved)))
-            blobs.append(
-                _Blob(
-                    mask=mask,
-                    area=int(mask.sum()),
-                    hist=histogram(image[mask]),
-                    parts={
-                        "moved": min(1.0, 0.4 + 0.75 * float(moved[mask].mean())),
-                        "size": float(1 - np.exp(-area / (0.002 * h * w))),
-                        "colour": _named_by(match, mask)
-                        ** (1.0 if named_colours(phrase) else 0.3),
-                        "whole": 0.75 if _cut(mask) else 1.0,
-                        "vanishing": _vanishing(lab, gone, mask),
-                    },
-                )
-            )
+            cores.append(mask)
+            masks.append(mask_of_mover(footage, watched, i, largest(_grown_to(mask, moved))))
+    blobs = _rated(footage, watched, phrase, i, masks, cores)
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
+
+
+def _rated(
+    footage: Footage,
+    watched: Watched,
+    phrase: str,
+    i: int,
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    cores: Sequence[Bool[np.ndarray, "h w"]],
+) -> list[_Blob]:
+    """Return what speaks for each mask being what the phrase names, at footage frame `i`, the first or one near the end.
+
+    `cores` are what the network saw of each before its outline was refined: noise is small there.
+    """
+    image, moved = footage.rgb[i], watched.at(i)[MOVED]
+    words = colour_words(phrase)
+    match = colour_match(balance(image), words) if words else None
+    lab, gone = lab_of(image), lab_of(footage.late if i == 0 else footage.early)
+    return [
+        _Blob(
+            mask=mask,
+            area=int(mask.sum()),
+            hist=histogram(image[mask]),
+            parts={
+                "moved": min(1.0, 0.4 + 0.75 * float(moved[mask].mean())),
+                "size": float(1 - np.exp(-core.mean() / 0.002)),
+                "colour": _named_by(match, mask) ** (1.0 if named_colours(phrase) else 0.3),
+                "whole": 0.75 if _cut(mask) else 1.0,
+                "vanishing": _vanishing(lab, gone, mask),
+            },
+        )
+        for mask, core in zip(masks, cores, strict=True)
+    ]
+
+
+def rated(footage: Footage, watched: Watched, phrase: str, kind: str, moved: Moved) -> Moved:
+    """Return outlines found in another way, with the cues that the network's own are judged by."""
+    stop = len(footage.rgb) - 1
+    (a,), (b,) = (
+        _rated(footage, watched, phrase, i, [mask], [mask])
+        for i, mask in ((0, moved.first), (stop, moved.last))
+    )
+    b = _hidden_end(b, _END_WEIGHT.get(kind, 0.7))
+    pair = _Pair(a, b, _pair_parts(a, b, kind, footage.shape))
+    return _moved([pair], pair)
 
 
 def _last_seen(footage: Footage, watched: Watched, phrase: str, area: int) -> list[_Blob]:
@@ -385,6 +421,12 @@ def _last_seen(footage: Footage, watched: Watched, phrase: str, area: int) -> li
 def _hidden_end(blob: _Blob, weight: float) -> _Blob:
     """Return a blob of the last frame with ratings that count by this exponent."""
     return replace(blob, parts={name: part**weight for name, part in blob.parts.items()})
+
+
+def _at_goal(blob: _Blob, goal: Bool[np.ndarray, "h w"]) -> _Blob:
+    """Return a blob of the last frame that counts little where it is not at the goal: hands uncover other things."""
+    share = float((blob.mask & goal).sum()) / blob.area
+    return replace(blob, parts={**blob.parts, "at the goal": min(1.0, 0.2 + 2 * share)})
 
 
 def _grown_to(

@@ -10,10 +10,11 @@ from jaxtyping import Float
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.colour import balance, colour_match, named_colours
+from v2p_data.scene.find import SWALLOWING_KINDS
 from v2p_data.scene.nouns import is_clear
 from v2p_data.scene.placement import Placement, vote_of
 from v2p_data.scene.scale import disagreement, height_plausibility
-from v2p_data.scene.segment import grow
+from v2p_data.scene.segment import attainable_iou, grow
 from v2p_data.scene.sight import Sights, stands_on
 
 _COLOURED = 0.25
@@ -49,22 +50,22 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
             match = float(colour_match(balance(image), words)[s.first].mean())
             add("grounding", f"colour of {which}", 0.4 + 0.6 * match / _COLOURED)
         if s.moves:
-            add("segmentation", f"track of {which} from start to end", 0.65 + 0.7 * s.meets)
+            add("segmentation", f"track of {which} from start to end", 0.8 + 0.7 * s.meets)
         off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
         add("size", f"size of {which}", np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2))
-        add("shape", f"outline of {which}", max(0.1, 0.5 + (placed.first.iou - 0.6) / 0.6))
+        covers = placed.first.iou / attainable_iou(s.first)
+        add("shape", f"outline of {which}", max(0.1, 0.5 + (covers - 0.6) / 0.6))
         if not s.moves:
             continue
         if s.swallowed:
             add("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
             continue
-        add(
-            "pose",
-            f"outline of {which} at the end",
-            max(0.1, 0.6 + (placed.last.iou - 0.45) / 0.875),
-        )
+        covers = placed.last.iou / attainable_iou(placed.last_mask)
+        add("pose", f"outline of {which} at the end", max(0.1, 0.6 + (covers - 0.45) / 0.875))
         seen = placed.last.visible / max(0.2, placed.first.visible)
-        add("pose", f"{which} seen at the end", max(0.1, 0.5 + seen))
+        # Of what is put into something only the upper part is left to see.
+        least = 0.8 if kind in SWALLOWING_KINDS else 0.5
+        add("pose", f"{which} seen at the end", max(0.1, least + seen))
     thing = sights.objects[0]
     add("camera", "camera height", height_plausibility(placement.height_m))
     if not stands_on(sights.table, thing.first):

@@ -39,6 +39,7 @@ from v2p_data.scene.placement import CameraGuess, Placed, Placement, place, with
 from v2p_data.scene.scene import Observed, Role, Symmetry
 from v2p_data.scene.shape import View, best_shape
 from v2p_data.scene.sight import Sighting, Sights, sight
+from v2p_data.scene.steady import steadied
 from v2p_data.video.captions import parse_caption
 from v2p_data.video.clip import Clip
 
@@ -169,6 +170,9 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     meaning = parse_caption(clip.caption, clip.objects)
     footage = footage_of(clip)
     _check_change(footage)
+    steady = steadied(clip, footage)
+    if steady is not clip:
+        clip, footage = steady, footage_of(steady)
     watched = watch(clip, footage) if cfg.ground.backend == "network" else None
     _check_still(footage, watched, cfg)
     boxes = None
@@ -226,8 +230,8 @@ def _check_still(footage: Footage, watched: Watched | None, cfg: SceneConfig) ->
     if shift > cfg.max_camera_shift_px:
         raise ItemRejectedError(
             "camera_moves",
-            f"the camera moves by {shift:.1f} px of 320; at most {cfg.max_camera_shift_px:.0f} px can be "
-            "understood: film from a stand",
+            f"the camera moves by {shift:.1f} px of 320, at most {cfg.max_camera_shift_px:.0f} px can be understood, and its "
+            "frames could not be aligned: film from a stand, or hold it stiller",
             round(shift, 2),
         )
 

@@ -42,6 +42,7 @@ def from_box(
 
     Several methods run and the best-looking one is kept: GrabCut from a centred ellipse, what differs from the colours
     of the ring around the box, and where `thing` (how likely each pixel is some object) is given, GrabCut from that.
+    None is kept that fills less than half of the box: people draw boxes tightly.
     """
     h, w = image.shape[:2]
     x0, y0 = max(0, round(box[0])), max(0, round(box[1]))
@@ -52,12 +53,31 @@ def from_box(
     if thing is not None and ((thing > 0.5) & inside).sum() > 0.2 * inside.sum():
         core = largest(tidy((thing > 0.5) & inside))
         candidates += [core, refine(image, core, never=~grow(inside, 2))]
-    masks = [mask for mask in candidates if mask is not None and mask.sum() > 12]
+    masks = [
+        mask
+        for mask in candidates
+        if mask is not None and mask.sum() > 12 and _spans(mask, (x0, y0, x1, y1)) > 0.5
+    ]
     if not masks:
         ellipse = np.zeros((h, w), np.uint8)
         centre, axes = ((x0 + x1) // 2, (y0 + y1) // 2), ((x1 - x0) // 2, (y1 - y0) // 2)
         return cv2.ellipse(ellipse, centre, axes, 0, 0, 360, 1, -1) > 0
     return max(masks, key=lambda mask: _plausibility(image, mask, (x0, y0, x1, y1)))
+
+
+def _spans(mask: Bool[np.ndarray, "h w"], box: tuple[int, int, int, int]) -> float:
+    """Return how much of a box the mask's own bounding box covers, and it of that (intersection over union)."""
+    x, y, w, h = bounding_box(mask)
+    x0, y0, x1, y1 = box
+    common = max(0, min(x + w, x1) - max(x, x0)) * max(0, min(y + h, y1) - max(y, y0))
+    return common / (w * h + (x1 - x0) * (y1 - y0) - common)
+
+
+def attainable_iou(mask: Bool[np.ndarray, "h w"]) -> float:
+    """Return the overlap that the best of shapes can be expected to have: half of the outline's pixels may be wrong."""
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+    edge = float(mask.sum()) - float(inner.sum())
+    return 1 - 0.5 * edge / max(1.0, float(mask.sum()))
 
 
 def from_points(
@@ -222,10 +242,7 @@ def _unlike_ring(image: np.ndarray, inside: np.ndarray) -> np.ndarray | None:
 
 
 def _plausibility(image: np.ndarray, mask: np.ndarray, box: tuple[int, int, int, int]) -> float:
-    x, y, w, h = bounding_box(mask)
     x0, y0, x1, y1 = box
-    common = max(0, min(x + w, x1) - max(x, x0)) * max(0, min(y + h, y1) - max(y, y0))
-    iou = common / (w * h + (x1 - x0) * (y1 - y0) - common)
     everything = 0.5 if mask.sum() > 0.93 * (x1 - x0) * (y1 - y0) else 0.0
     contrast = min(40.0, edge_contrast(lab_of(image), mask))
-    return iou + 0.5 * solidity(mask) + 0.008 * contrast - everything
+    return _spans(mask, box) + 0.5 * solidity(mask) + 0.008 * contrast - everything

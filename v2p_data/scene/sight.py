@@ -19,6 +19,7 @@ from v2p_data.scene.find import (
     find_held,
     find_movers,
     hand_at,
+    rated,
     standing,
     table_seen,
 )
@@ -42,6 +43,7 @@ from v2p_data.video.meaning import Meaning
 _HINTED_SURE = 0.97
 _CHANGE_TELLS = 4.0
 """Score of the hand-written cues from which their finding is an opinion."""
+_CLEARLY_BETTER = 1.6
 _NO_OPINION = 0.75
 """What the finding of the network alone counts where those cues have none."""
 _LEAST_HAND = 0.002
@@ -424,14 +426,26 @@ def _find_movers(
     last = mark.mask if mark and at_end else None
     moved, held = None, None
     if watched is not None:
-        found = find_movers(footage, watched, meaning.manipulated, meaning.kind, tool, first, last)
+        goals = [marked[phrase].mask for phrase, _ in meaning.others if phrase in marked]
+        found = find_movers(
+            footage,
+            watched,
+            meaning.manipulated,
+            meaning.kind,
+            tool,
+            first,
+            last,
+            goals[0] if goals else None,
+        )
         moved, held = found or (None, None)
     if moved is None or (mark is None and not tool):
         by_change = find_moved(
             footage, table, meaning.manipulated, meaning.kind, first=first, last=last
         )
         moved = (
-            by_change if moved is None or watched is None else _agreed(moved, by_change, watched)
+            by_change
+            if moved is None or watched is None
+            else _agreed(footage, watched, meaning, moved, by_change)
         )
     if moved is None:
         raise ItemRejectedError(
@@ -444,11 +458,14 @@ def _at_end(mark: _Marked, footage: Footage) -> bool:
     return mark.frame > 0.5 * (len(footage.rgb) - 1)
 
 
-def _agreed(moved: Moved, by_change: Moved | None, watched: Watched) -> Moved:
+def _agreed(
+    footage: Footage, watched: Watched, meaning: Meaning, moved: Moved, by_change: Moved | None
+) -> Moved:
     """Return what the network found, completed and weighed by what colours and vanishing edges say.
 
-    The two ways err differently: the network loses parts of things that look like none it knows, the other takes
-    shadows and hands along.
+    The two ways err differently: the network loses parts of things that look like none it knows, and takes people who
+    move for things; the other takes shadows and hands along. What the other found is preferred where it is clearly
+    better by the network's own cues.
     """
     if by_change is None or by_change.score < _CHANGE_TELLS:
         return replace(
@@ -456,6 +473,12 @@ def _agreed(moved: Moved, by_change: Moved | None, watched: Watched) -> Moved:
             cues={**moved.cues, "second opinion": _NO_OPINION},
             score=_NO_OPINION * moved.score,
         )
+    if by_change.first.any() and by_change.last.any():
+        other = rated(footage, watched, meaning.manipulated, meaning.kind, by_change)
+        if other.score > _CLEARLY_BETTER * moved.score:
+            rivalry = float(1 / (1 + (moved.score / other.score) ** 2))
+            cues = {**other.cues, "no rival": rivalry}
+            return replace(other, score=other.score * rivalry, cues=cues)
     ends = []
     overlaps = []
     for i, own, other in (

@@ -49,6 +49,8 @@ class Clip:
     """When each frame was shown, from the first one [s]."""
     source_size_px: tuple[int, int]
     """Width and height as shown, before scaling."""
+    to_filmed: Float[ndarray, "time 3 3"] | None = field(default=None, repr=False)
+    """By frame: homography from its pixels to those that were filmed, where a swaying camera's frames were aligned."""
     warnings: tuple[str, ...] = ()
     """Sentences for a person: what was odd about the file though it could be used."""
 
