@@ -375,3 +375,11 @@ def test_what_goes_out_and_comes_half_way_back_has_gone_all_its_way_at_the_end()
 
     assert thing.travel_share == pytest.approx(1)
     assert early.travel_share == pytest.approx(2 / 3)
+
+
+def test_of_a_mug_with_its_handle_and_a_round_one_the_open_side_is_compared():
+    handled = true_thing(size=(0.074, 0.106, 0.078), hollow=True, symmetry="none")
+    plain = found_thing(size=(0.065, 0.065, 0.075), form="cylinder", hollow=True)
+
+    assert turn_between(handled, plain, about("z", 75), np.eye(3)) == pytest.approx(0, abs=1e-6)
+    assert np.degrees(turn_between(handled, plain, np.eye(3), about("x", 90))) == pytest.approx(90)

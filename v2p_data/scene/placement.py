@@ -39,7 +39,7 @@ _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 _SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
 _TURN_COST = 0.02
 _OTHER_FORM_COST = 0.02
-"""By so much a noun's second form must cover an outline better: a box has a side and a turn more to choose."""
+"""By so much a noun's second form must cover an outline better: a box has a side and a turn more to choose than a cylinder."""
 _PITCH_RANGE_RAD = (0.15, 1.4)
 """From nearly level to nearly straight down: beyond, outlines on the table say nothing of places on it."""
 _MOUTH_DOWN = np.diag([1.0, -1.0, -1.0])
@@ -190,14 +190,13 @@ def with_forms(
     camera = camera_above(footage.shape, guess.pitch_rad, guess.fov_rad)
     out = []
     for s in objects:
-        if s.noun.may_be_box:
+        if s.noun.other is not None:
             unknown = _others(objects, s, s.at)
             silhouette = Silhouette(s.first, unknown, camera)
             usual, other = (
-                fit_shape(silhouette, noun, np.eye(3)).cost for noun in (s.noun, s.noun.as_box())
+                fit_shape(silhouette, noun, np.eye(3)).cost for noun in (s.noun, s.noun.other)
             )
-            if other + _OTHER_FORM_COST < usual:
-                s = replace(s, noun=s.noun.as_box())
+            s = replace(s, noun=s.noun.other if other + _OTHER_FORM_COST < usual else s.noun)
         out.append(s)
     return tuple(out)
 

@@ -354,6 +354,10 @@ def turn_between(
         else:
             cosine = abs(float(R_true[:, 2] @ R_found[:, _round_axis(true, found)]))
         return float(np.arccos(np.clip(cosine, -1, 1)))
+    if found.is_round and open_true is not None and open_found is not None:
+        # A mug with its handle is longer than high, the round one found for it is not: sides do not tell the axis.
+        cosine = float((R_true @ open_true) @ (R_found @ open_found))
+        return float(np.arccos(np.clip(cosine, -1, 1)))
     angles: list[float] = []
     for order, signs in _fitting_turns(true.size_m, found.size_m):
         rename = np.zeros((3, 3))  # true axis i is the found axis order[i], with its sign
