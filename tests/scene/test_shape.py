@@ -94,7 +94,7 @@ def turned(profile):
     return inside
 
 
-def check_solid(choice: ShapeChoice) -> None:
+def check_solid(choice: ShapeChoice, slack_m: float = 0.002) -> None:
     assert choice.mesh.is_watertight
     assert choice.mesh.is_winding_consistent
     assert choice.mesh.volume > 0
@@ -103,8 +103,7 @@ def check_solid(choice: ShapeChoice) -> None:
     assert all(part.is_convex for part in choice.parts)
     # The parts cover the mesh, to the accuracy of their few corners.
     assert (
-        in_parts(np.asarray(choice.mesh.sample(1500, seed=0)), choice.parts, slack_m=0.002).mean()
-        > 0.97
+        in_parts(np.asarray(choice.mesh.sample(1500, seed=0)), choice.parts, slack_m).mean() > 0.97
     )
 
 
@@ -334,3 +333,49 @@ def test_what_is_low_is_not_inflated_to_any_depth_that_its_outline_allows():
 
     assert choice.kind == "primitive"
     assert choice.size_m == size
+
+
+PAN = np.array([(0.1, 0.0), (0.11, 0.045)])
+MUG_LOOP_M, STICK_M = (0.03, 0.012, 0.06), (0.16, 0.02, 0.012)
+
+
+@pytest.mark.parametrize("degrees", [70, 140, 250, 300])
+@pytest.mark.parametrize(
+    ("profile", "handle_m", "up_m"), [(PAN, STICK_M, 0.035), (MUG, MUG_LOOP_M, 0.05)]
+)
+def test_vessels_get_the_handle_that_sticks_out_of_their_outline(profile, handle_m, up_m, degrees):
+    wide, tall = 2 * float(profile[:, 0].max()), float(profile[-1, 1])
+    at = [profile[:, 0].mean() + handle_m[0] / 2, 0, up_m]
+    handle = trimesh.creation.box(extents=handle_m, transform=transform(np.eye(3), np.array(at)))
+    handle.apply_transform(fit((0, 0, 0), degrees, np.zeros(3)))
+    mask = seen([placed(lathe(profile)), placed(handle)])
+    size = (wide, wide, tall)
+    vessel = noun("cylinder", hollow=True, size_m=size)
+    view = View(mask=mask, T_world_obj=fit(size))
+
+    with_handle = best_shape([view], CAMERA, size, vessel)
+    round_one = best_shape([view], CAMERA, size, replace(vessel, symmetry="round"))
+    without = best_shape([view], CAMERA, size, vessel, ShapeConfig(handles=False))
+
+    check_solid(with_handle, slack_m=0.02 * wide)
+    T = view.T_world_obj @ with_handle.T_obj_shape
+    ahead = (Rotation.from_euler("z", degrees, degrees=True).as_matrix() @ [1, 0, 0])[:2]
+    assert "with a handle" in with_handle.reason
+    assert "handle" not in round_one.reason + without.reason
+    assert float(T[:2, 0] @ ahead) > np.cos(np.radians(15))
+    length = at[0] + handle_m[0] / 2 + wide / 2
+    assert with_handle.size_m[0] == pytest.approx(length, rel=0.12)
+    assert T[:2, 3] == pytest.approx(AT[:2] + (length - wide) / 2 * ahead, abs=0.012)
+    assert with_handle.iou > round_one.iou
+
+
+def test_a_vessel_without_a_handle_gets_none():
+    size = (0.22, 0.22, 0.045)
+    choice = best_shape(
+        [View(mask=seen([placed(lathe(PAN))]), T_world_obj=fit(size))],
+        CAMERA,
+        size,
+        noun("cylinder", hollow=True, size_m=size),
+    )
+
+    assert "handle" not in choice.reason

@@ -37,7 +37,7 @@ from v2p_data.scene.learned import (
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.placement import CameraGuess, Placed, Placement, place, with_forms
 from v2p_data.scene.scene import Observed, Role, Symmetry
-from v2p_data.scene.shape import View, best_shape
+from v2p_data.scene.shape import ShapeConfig, View, best_shape
 from v2p_data.scene.sight import Sighting, Sights, sight
 from v2p_data.scene.steady import steadied
 from v2p_data.video.captions import parse_caption
@@ -295,6 +295,7 @@ def _estimates(
             work,
             (length, width, tall),
             s.noun,
+            ShapeConfig(handles=s.known_m is None),
         )
         size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
         plain = shape.kind == "primitive" and not s.noun.bore and not cfg.mesh.worker

@@ -26,7 +26,7 @@ from v2p_data.geometry.mesh import (
 from v2p_data.geometry.pillow import inflated, pillow
 from v2p_data.geometry.pose import inverse, transform
 from v2p_data.scene.nouns import Form, Noun
-from v2p_data.scene.segment import bounding_box
+from v2p_data.scene.segment import bounding_box, largest
 
 Kind = Literal["primitive", "revolution", "inflated"]
 Size = tuple[float, float, float]
@@ -46,6 +46,14 @@ _PLANE_PX = 200
 _CORRECTIONS = 4
 _OTHER_SIDES = 1.8
 """An inflated silhouette's sides are at most by this factor others than the fitted primitive's."""
+_LOW = 0.6
+"""Of its diameter: a lower vessel is a pan, with a stick for a handle; a higher one a mug."""
+_HANDLE_AREA = 0.03
+"""Of the body's outline: what sticks out must be so large, or it is a shadow."""
+_HANDLE_LENGTHS = (0.12, 1.1)
+"""Of the body's diameter: the least and the most."""
+_HANDLE_GAIN = 0.03
+"""In units of IoU."""
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turns (right, towards the back, up) to an upright plane's (right, up, towards the camera)."""
 
@@ -75,6 +83,8 @@ class ShapeConfig:
     """For an inflated silhouette of anything else."""
     min_px: int = 80
     """Of the mask, below which an outline has no form."""
+    handles: bool = True
+    """Whether vessels get the handle that their outline shows."""
     max_hidden: float = 0.25
     """Where more of the primitive than this is hidden, its outline is not trusted to say more."""
 
@@ -151,6 +161,10 @@ def best_shape(
         if best is not primitive:
             what = {"revolution": "a solid of revolution", "inflated": "the inflated silhouette"}
             reason = f"{what[best.kind]} covers the outline to {best_iou:.2f}, the {_word(noun)} to {plain:.2f}"
+        handled = _handled(best, views[0], crops[0]) if cfg.handles and _may_have(noun) else None
+        if handled is not None and (iou := _iou(handled, views, crops)) > best_iou + _HANDLE_GAIN:
+            best, best_iou = handled, iou
+            reason += f"; with a handle to {iou:.2f}"
     confidence = float(np.clip((best_iou - 0.4) / 0.5, 0.05, 1) * (1 - 0.6 * hidden))
     x, y, z = (float(v) for v in best.mesh.extents)
     return ShapeChoice(
@@ -190,6 +204,86 @@ def _others(
         margin = cfg.irregular_margin if irregular else cfg.regular_margin
         found.append((_inflation(view, crop, size_m), margin))
     return [(candidate, margin) for candidate, margin in found if candidate is not None]
+
+
+def _may_have(noun: Noun) -> bool:
+    """Return whether things of that name are vessels with a handle or a spout: nothing else keeps them from being round."""
+    return noun.form == "cylinder" and noun.hollow and noun.symmetry == "none"
+
+
+def _handled(body: _Candidate, view: View, crop: "_Crop") -> _Candidate | None:
+    """Return the vessel with the handle that its outline shows; None where it shows none, or does not stand upright.
+
+    Low vessels have a stick near the rim, tall ones a plate at half height, whose own height hides how far back it reaches:
+    there directions and lengths are tried.
+    """
+    T = view.T_world_obj @ body.T_obj_shape
+    if T[2, 2] < 0.9:
+        return None
+    diameter, height = float(body.mesh.extents[:2].mean()), float(body.mesh.extents[2])
+    low = height < _LOW * diameter
+    z = (0.35 if low else 0.0) * height
+    drawn = crop.drawn(body.mesh, T)
+    around = cv2.dilate(drawn.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    spare = largest(crop.mask & ~around)
+    if spare.sum() < _HANDLE_AREA * drawn.sum():
+        return None
+    onto = crop.matrix @ T @ np.array([[1, 0, 0], [0, 1, 0], [0, 0, z], [0, 0, 1.0]])
+    rows, columns = np.nonzero(spare)
+    spots = np.linalg.solve(onto, np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))]))
+    spots = (spots[:2] / spots[2]).T
+    way = spots.mean(0) / np.linalg.norm(spots.mean(0))
+    inner = _radius_at(body.mesh, z)
+    if low:
+        along, across = spots @ way, spots @ np.array([-way[1], way[0]])
+        length = float(np.percentile(along, 97)) - inner
+        wide = float(np.clip(2 * np.sqrt(3) * across.std(), 0.06 * diameter, 0.25 * diameter))
+        tries = [(way, (length, wide, min(wide, 0.4 * height)))]
+    else:
+        facing = np.arctan2(way[1], way[0]) + np.radians(np.arange(-75, 76, 15))
+        tries = [
+            (np.array([np.cos(a), np.sin(a)]), (share * diameter, 0.15 * diameter, 0.6 * height))
+            for a in facing
+            for share in (0.2, 0.3, 0.4, 0.5)
+        ]
+    least, most = _HANDLE_LENGTHS
+    made = [
+        _with_handle(body, way, inner, extents, z)
+        for way, extents in tries
+        if least * diameter < extents[0] < most * diameter
+    ]
+    return max(made, key=lambda one: _iou(one, [view], [crop]), default=None)
+
+
+def _with_handle(
+    body: _Candidate, way: Float[np.ndarray, "2"], inner: float, extents: Size, z: float
+) -> _Candidate:
+    """Return a vessel with a block beside it, `inner` from its axis and at height `z`, towards `way`; x then points there.
+
+    The block touches the wall and goes no further in: two closed surfaces side by side are one closed surface.
+    """
+    at = trimesh.transformations.translation_matrix([inner + extents[0] / 2, 0.0, z])
+    handle = trimesh.creation.box(extents=extents, transform=at)
+    turn = np.array([[way[0], way[1], 0.0], [-way[1], way[0], 0.0], [0.0, 0.0, 1.0]])
+    mesh, *parts = (_turned(solid, turn) for solid in (body.mesh, *body.parts))
+    mesh = trimesh.util.concatenate([mesh, handle])
+    middle = mesh.bounds.mean(axis=0)
+    for solid in (mesh, *parts, handle):
+        solid.vertices -= middle
+    return _Candidate(
+        kind="revolution",
+        mesh=mesh,
+        parts=(*parts, handle),
+        T_obj_shape=body.T_obj_shape @ transform(turn.T, turn.T @ middle),
+    )
+
+
+def _radius_at(mesh: trimesh.Trimesh, z: float) -> float:
+    """Return the outer radius of a body of revolution at a height in its own frame."""
+    heights, row = np.unique(mesh.vertices[:, 2].round(6), return_inverse=True)
+    radii = np.zeros(len(heights))
+    np.maximum.at(radii, row, np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]))
+    return float(np.interp(z, heights, radii))
 
 
 def _as_large(shape: _Candidate, size_m: Size) -> bool:
