@@ -50,10 +50,10 @@ _LOW = 0.6
 """Of its diameter: a lower vessel is a pan, with a stick for a handle; a higher one a mug."""
 _HANDLE_AREA = 0.03
 """Of the body's outline: what sticks out must be so large, or it is a shadow."""
-_HANDLE_LENGTHS = (0.12, 1.1)
-"""Of the body's diameter: the least and the most."""
-_HANDLE_GAIN = 0.03
-"""In units of IoU."""
+_STICK, _PLATE = (0.3, 1.1), (0.12, 0.6)
+"""Of the body's diameter: the least and the greatest length of a low and of a high vessel's handle."""
+_HANDLE_GAIN = {True: 0.015, False: 0.03}
+"""In units of IoU, for low and for high vessels: what sticks out far is no dent of the body's."""
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turns (right, towards the back, up) to an upright plane's (right, up, towards the camera)."""
 
@@ -162,7 +162,8 @@ def best_shape(
             what = {"revolution": "a solid of revolution", "inflated": "the inflated silhouette"}
             reason = f"{what[best.kind]} covers the outline to {best_iou:.2f}, the {_word(noun)} to {plain:.2f}"
         handled = _handled(best, views[0], crops[0]) if cfg.handles and _may_have(noun) else None
-        if handled is not None and (iou := _iou(handled, views, crops)) > best_iou + _HANDLE_GAIN:
+        gain = _HANDLE_GAIN[_is_low(best)]
+        if handled is not None and (iou := _iou(handled, views, crops)) > best_iou + gain:
             best, best_iou = handled, iou
             reason += f"; with a handle to {iou:.2f}"
     confidence = float(np.clip((best_iou - 0.4) / 0.5, 0.05, 1) * (1 - 0.6 * hidden))
@@ -221,7 +222,7 @@ def _handled(body: _Candidate, view: View, crop: "_Crop") -> _Candidate | None:
     if T[2, 2] < 0.9:
         return None
     diameter, height = float(body.mesh.extents[:2].mean()), float(body.mesh.extents[2])
-    low = height < _LOW * diameter
+    low = _is_low(body)
     z = (0.35 if low else 0.0) * height
     drawn = crop.drawn(body.mesh, T)
     around = cv2.dilate(drawn.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
@@ -246,7 +247,7 @@ def _handled(body: _Candidate, view: View, crop: "_Crop") -> _Candidate | None:
             for a in facing
             for share in (0.2, 0.3, 0.4, 0.5)
         ]
-    least, most = _HANDLE_LENGTHS
+    least, most = _STICK if low else _PLATE
     made = [
         _with_handle(body, way, inner, extents, z)
         for way, extents in tries
@@ -265,8 +266,12 @@ def _with_handle(
     at = trimesh.transformations.translation_matrix([inner + extents[0] / 2, 0.0, z])
     handle = trimesh.creation.box(extents=extents, transform=at)
     turn = np.array([[way[0], way[1], 0.0], [-way[1], way[0], 0.0], [0.0, 0.0, 1.0]])
-    mesh, *parts = (_turned(solid, turn) for solid in (body.mesh, *body.parts))
-    mesh = trimesh.util.concatenate([mesh, handle])
+    vessel, *parts = (_turned(solid, turn) for solid in (body.mesh, *body.parts))
+    mesh = trimesh.Trimesh(
+        np.vstack([vessel.vertices, handle.vertices]),
+        np.vstack([vessel.faces, handle.faces + len(vessel.vertices)]),
+        process=False,
+    )
     middle = mesh.bounds.mean(axis=0)
     for solid in (mesh, *parts, handle):
         solid.vertices -= middle
@@ -276,6 +281,10 @@ def _with_handle(
         parts=(*parts, handle),
         T_obj_shape=body.T_obj_shape @ transform(turn.T, turn.T @ middle),
     )
+
+
+def _is_low(body: _Candidate) -> bool:
+    return float(body.mesh.extents[2]) < _LOW * float(body.mesh.extents[:2].mean())
 
 
 def _radius_at(mesh: trimesh.Trimesh, z: float) -> float:
