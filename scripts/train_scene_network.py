@@ -4,6 +4,7 @@
     python scripts/train_scene_network.py train DATA --out a.safetensors --minutes 30
     python scripts/train_scene_network.py train DATA --out b.safetensors --minutes 30 --start-from a.safetensors --seed 1
     python scripts/train_scene_network.py average a.safetensors b.safetensors --out v2p_data/scene/network.safetensors
+    python scripts/train_scene_network.py camera b.safetensors --out v2p_data/scene/camera.safetensors
 
 `data` renders clips of all kinds at low resolution and keeps six frames of each with the two stills that the scene room
 makes of the whole clip. `train` prints the intersection over union of each class on clips that it does not train on. No real
@@ -30,6 +31,7 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.footage import still_of
 from v2p_data.scene.network import (
+    CameraNetwork,
     SceneNetwork,
     inputs_of,
     net_size,
@@ -224,7 +226,7 @@ def _varied(
     if rng.random() < 0.1:
         mix = np.full((3, 3), 1 / 3) + 0.15 * mix
     gain, bias, gamma = np.exp(rng.normal(0, 0.25)), rng.normal(0, 8), np.exp(rng.normal(0, 0.2))
-    light = _light(size, rng) if rng.random() < UNEVEN else None
+    light = light_over(size, rng) if rng.random() < UNEVEN else None
     blur, noise = rng.choice([0, 0, 0.7, 1.1]), rng.uniform(0, 4)
     out = []
     curve = 255 * (np.arange(256) / 255) ** gamma
@@ -247,7 +249,7 @@ def _varied(
     }
 
 
-def _light(size: tuple[int, int], rng: np.random.Generator) -> Float32[np.ndarray, "h w 1"]:
+def light_over(size: tuple[int, int], rng: np.random.Generator) -> Float32[np.ndarray, "h w 1"]:
     """Return how bright each place is: windows and lamps light a room unevenly, and cameras overexpose white tables."""
     coarse = np.exp(rng.normal(0, 0.25, (2, 3))).astype(np.float32)
     return cv2.resize(coarse, (size[1], size[0]), interpolation=cv2.INTER_CUBIC)[..., None]
@@ -461,6 +463,12 @@ def average(files: list[Path], out: Path) -> None:
     save_file({k: v.contiguous() for k, v in mean.items()}, out)
 
 
+def only_camera(file: Path, out: Path) -> None:
+    """Write the weights of the part that says the camera."""
+    wanted = CameraNetwork().state_dict()
+    save_file({k: v for k, v in load_file(file).items() if k in wanted}, out)
+
+
 def write(net: SceneNetwork, out: Path) -> None:
     """Write the weights in half precision, in one move."""
     partial = out.with_suffix(".partial")
@@ -487,6 +495,9 @@ def main() -> None:
     learn.add_argument("--seed", type=int, default=0)
     learn.add_argument("--lr", type=float, default=2e-3)
     learn.add_argument("--start-from", type=Path)
+    eye = commands.add_parser("camera", help="write the part that says the camera")
+    eye.add_argument("weights", type=Path)
+    eye.add_argument("--out", type=Path, required=True)
     merge = commands.add_parser("average", help="average the weights of runs")
     merge.add_argument("weights", type=Path, nargs="+")
     merge.add_argument("--out", type=Path, required=True)
@@ -495,6 +506,8 @@ def main() -> None:
         make_data(args.out, args.clips, args.jobs, args.start)
     elif args.command == "average":
         average(args.weights, args.out)
+    elif args.command == "camera":
+        only_camera(args.weights, args.out)
     else:
         train(args.data, args.out, args.minutes, args.seed, args.start_from, args.lr)
 

@@ -62,18 +62,36 @@ def test_the_input_holds_the_three_pictures_and_how_much_they_differ():
     assert torch.equal(x[0, 10], torch.full((16, 16), 2.0))  # frame against late
 
 
-def test_missing_weights_are_one_clear_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(network, "WEIGHTS", tmp_path / "network.safetensors")
-    network.network.cache_clear()
+@pytest.mark.parametrize(
+    ("which", "load"),
+    [("WEIGHTS", network.network), ("CAMERA_WEIGHTS", network.camera_network)],
+)
+def test_missing_weights_are_one_clear_sentence(which, load, tmp_path, monkeypatch):
+    monkeypatch.setattr(network, which, tmp_path / "some.safetensors")
+    load.cache_clear()
 
-    with pytest.raises(V2PError, match=r"train_scene_network.py"):
-        network.network()
+    with pytest.raises(V2PError, match=r"some\.safetensors .*train_scene_network\.py"):
+        load()
 
-    network.network.cache_clear()
+    load.cache_clear()
+
+
+def test_the_camera_does_not_depend_on_what_the_other_network_sees(monkeypatch):
+    rng = np.random.default_rng(2)
+    frames = rng.integers(0, 255, (3, 48, 64, 3), dtype=np.uint8)
+    before = look(frames, *_stills(frames))
+
+    with torch.random.fork_rng():
+        torch.random.default_generator.manual_seed(0)
+        monkeypatch.setattr(network, "network", SceneNetwork().eval)
+    after = look(frames, *_stills(frames))
+
+    assert after.camera == before.camera
+    assert np.abs(after.shares - before.shares).max() > 0.05
 
 
 def test_the_weights_are_small_enough_to_travel_with_the_code():
-    assert network.WEIGHTS.stat().st_size < 5_000_000
+    assert network.WEIGHTS.stat().st_size + network.CAMERA_WEIGHTS.stat().st_size < 5_000_000
     assert sum(p.numel() for p in SceneNetwork().parameters()) < 2_500_000
 
 

@@ -3,6 +3,8 @@
 import cv2
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from v2p_data.scene.pose import camera_above
 
@@ -70,3 +72,30 @@ def test_another_camera_at_the_same_place_sees_the_table_where_it_says(trainer):
         assert known[1] > CAMERA[1]
         assert (seen[classes == 1] < 200).mean() > 0.9
     np.testing.assert_allclose(apart, np.linalg.norm(spots[0] - spots[1]), rtol=0.06)
+
+
+def test_the_camera_s_part_of_the_weights_says_the_same_camera(trainer, tmp_path):
+    with torch.random.fork_rng():
+        torch.random.default_generator.manual_seed(3)
+        whole = trainer.SceneNetwork().eval()
+    trainer.write(whole, tmp_path / "whole.safetensors")
+    trainer.only_camera(tmp_path / "whole.safetensors", tmp_path / "camera.safetensors")
+
+    part = trainer.CameraNetwork().eval()
+    part.load_state_dict(
+        {k: v.float() for k, v in load_file(tmp_path / "camera.safetensors").items()}
+    )
+
+    x = torch.linspace(-1, 1, 15 * 32 * 48).reshape(1, 15, 32, 48)
+    with torch.inference_mode():
+        torch.testing.assert_close(part.camera_of(x), whole(x)[1], atol=0.01, rtol=0.01)
+    sizes = [(tmp_path / f"{n}.safetensors").stat().st_size for n in ("whole", "camera")]
+    assert sizes[1] < 0.8 * sizes[0]
+
+
+def test_uneven_light_changes_a_picture_smoothly(trainer):
+    light = trainer.light_over((120, 160), np.random.default_rng(0))
+
+    assert light.shape == (120, 160, 1)
+    assert light.min() > 0
+    assert np.abs(np.diff(light, axis=1)).max() < 0.05

@@ -22,9 +22,12 @@ from v2p_data.scene.classes import CLASSES, LONG_SIDE_PX
 from v2p_data.scene.scale import SeenCamera
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
+CAMERA_WEIGHTS = Path(__file__).with_name("camera.safetensors")
+"""Of the network that is asked for the camera: it learned that longer than how real things look, and sees those less well."""
 _STEP = 16
 _WIDTHS = (24, 48, 80, 128)
-_MIRROR_EVERY = 3
+_CAMERA_EVERY = 3
+"""Of the frames: one clip has one camera."""
 _QUESTIONS = 4
 """Learned queries that gather from all places what tells of the camera: how large the hand is and where, say."""
 
@@ -44,8 +47,8 @@ def net_size(height_px: int, width_px: int) -> tuple[int, int]:
     return max(1, round(height_px / step_px)) * _STEP, max(1, round(width_px / step_px)) * _STEP
 
 
-class SceneNetwork(nn.Module):
-    """U-Net whose coarsest level compares all places with each other (one attention layer)."""
+class CameraNetwork(nn.Module):
+    """What a picture shows of its camera: an encoder whose coarsest level compares all places with each other."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -58,28 +61,12 @@ class SceneNetwork(nn.Module):
         self.compare = nn.TransformerEncoderLayer(
             d, 4, 2 * d, dropout=0.0, batch_first=True, norm_first=True
         )
-        self.dec3 = _pair(c + d, c)
-        self.dec2 = _pair(b + c, b)
-        self.dec1 = _pair(a + b, a)
-        self.head = nn.Sequential(nn.Conv2d(a, len(CLASSES) * 4, 3, padding=1), nn.PixelShuffle(2))
         self.ask = nn.Parameter(0.02 * torch.randn(1, _QUESTIONS, d))
         self.answer = nn.MultiheadAttention(d, 4, batch_first=True)
         self.camera = nn.Sequential(nn.Linear(_QUESTIONS * d + 1, 64), nn.ReLU(), nn.Linear(64, 6))
 
-    def forward(
-        self, x: Float[torch.Tensor, "n 15 h w"]
-    ) -> tuple[Float[torch.Tensor, "n 5 h w"], Float[torch.Tensor, "n 6"]]:
-        """Return class logits, and the camera as `camera_of` does."""
-        x1, x2, x3, tokens = self._levels(x)
-        n, d, h, w = *tokens.shape[::2], *(side // 2 for side in x3.shape[2:])
-        x4 = tokens.transpose(1, 2).reshape(n, d, h, w)
-        up = self.dec3(torch.cat([x3, _twice(x4)], 1))
-        up = self.dec2(torch.cat([x2, _twice(up)], 1))
-        up = self.dec1(torch.cat([x1, _twice(up)], 1))
-        return self.head(up), self._camera(tokens, w / h)
-
     def camera_of(self, x: Float[torch.Tensor, "n 15 h w"]) -> Float[torch.Tensor, "n 6"]:
-        """Return (pitch [rad], log focal over width, log width of the table [m], log sd of each): half of the work."""
+        """Return (pitch [rad], log focal over width, log width of the table [m], log sd of each)."""
         tokens = self._levels(x)[-1]
         return self._camera(tokens, x.shape[3] / x.shape[2])
 
@@ -97,6 +84,39 @@ class SceneNetwork(nn.Module):
             gathered = self.answer(self.ask.expand(n, -1, -1), tokens, tokens)[0].flatten(1)
             shape = torch.full((n, 1), float(np.log(aspect)), device=device)
             return self.camera(torch.cat([gathered, shape], 1))
+
+
+class SceneNetwork(CameraNetwork):
+    """U-Net on the camera's encoder: the class of every pixel."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        a, b, c, d = _WIDTHS
+        self.dec3 = _pair(c + d, c)
+        self.dec2 = _pair(b + c, b)
+        self.dec1 = _pair(a + b, a)
+        self.head = nn.Sequential(nn.Conv2d(a, len(CLASSES) * 4, 3, padding=1), nn.PixelShuffle(2))
+
+    def forward(
+        self, x: Float[torch.Tensor, "n 15 h w"]
+    ) -> tuple[Float[torch.Tensor, "n 5 h w"], Float[torch.Tensor, "n 6"]]:
+        """Return class logits, and the camera as `camera_of` does: learning the one helps the other."""
+        x1, x2, x3, tokens = self._levels(x)
+        return self._classes(x1, x2, x3, tokens), self._camera(tokens, x.shape[3] / x.shape[2])
+
+    def classes_of(self, x: Float[torch.Tensor, "n 15 h w"]) -> Float[torch.Tensor, "n 5 h w"]:
+        """Return class logits."""
+        return self._classes(*self._levels(x))
+
+    def _classes(
+        self, x1: torch.Tensor, x2: torch.Tensor, x3: torch.Tensor, tokens: torch.Tensor
+    ) -> torch.Tensor:
+        n, d, h, w = *tokens.shape[::2], *(side // 2 for side in x3.shape[2:])
+        x4 = tokens.transpose(1, 2).reshape(n, d, h, w)
+        up = self.dec3(torch.cat([x3, _twice(x4)], 1))
+        up = self.dec2(torch.cat([x2, _twice(up)], 1))
+        up = self.dec1(torch.cat([x1, _twice(up)], 1))
+        return self.head(up)
 
 
 def inputs_of(
@@ -119,22 +139,35 @@ def inputs_of(
 
 @lru_cache(maxsize=1)
 def network() -> SceneNetwork:
-    """Return the trained network, on the CPU.
+    """Return the trained network that says what each pixel is, on the CPU.
 
     Raises:
         V2PError: its weights are missing or belong to another version.
     """
-    if not WEIGHTS.is_file():
+    return _trained(SceneNetwork(), WEIGHTS)
+
+
+@lru_cache(maxsize=1)
+def camera_network() -> CameraNetwork:
+    """Return the trained network that is asked for the camera, on the CPU.
+
+    Raises:
+        V2PError: its weights are missing or belong to another version.
+    """
+    return _trained(CameraNetwork(), CAMERA_WEIGHTS)
+
+
+def _trained[N: nn.Module](net: N, weights: Path) -> N:
+    if not weights.is_file():
         raise V2PError(
-            f"the scene network's weights are not at {WEIGHTS.name} beside network.py; reinstall the package, train "
+            f"the scene network's weights are not at {weights.name} beside network.py; reinstall the package, train "
             "them with scripts/train_scene_network.py, or use --scene.ground.backend=heuristic"
         )
-    net = SceneNetwork()
     try:
-        net.load_state_dict({k: v.float() for k, v in load_file(WEIGHTS).items()})
+        net.load_state_dict({k: v.float() for k, v in load_file(weights).items()})
     except (RuntimeError, ValueError, OSError) as error:
         raise V2PError(
-            f"{WEIGHTS.name} does not fit this version's network; train it anew with "
+            f"{weights.name} does not fit this version's network; train it anew with "
             f"scripts/train_scene_network.py ({type(error).__name__})"
         ) from error
     net.eval()
@@ -151,28 +184,26 @@ def look(
     """Return what the network sees in frames of one clip, given the stills of beginning and end that go with each."""
     h, w = frames.shape[1:3]
     size = net_size(h, w)
-    net = network()
+    net, eye = network(), camera_network()
     shares = np.empty((len(frames), len(CLASSES), h, w), np.float32)
-    cameras, mirrored = [], []
+    cameras = []
     for start in range(0, len(frames), batch):
         part = slice(start, start + batch)
-        now, before, after = (
+        three = [
             torch.from_numpy(np.stack([resized(image, size) for image in images[part]])).permute(
                 0, 3, 1, 2
             )
             for images in (frames, early, late)
-        )
-        x = inputs_of(now, before, after).contiguous(memory_format=torch.channels_last)
-        logits, camera = net(x)
-        for full, small in zip(shares[part], logits.softmax(1).numpy(), strict=True):
+        ]
+        x = inputs_of(*three).contiguous(memory_format=torch.channels_last)
+        for full, small in zip(shares[part], net.classes_of(x).softmax(1).numpy(), strict=True):
             for plane, own in zip(full, small, strict=True):
                 cv2.resize(own, (w, h), dst=plane, interpolation=cv2.INTER_LINEAR)
-        cameras.append(camera.numpy())
-        del x, logits
-        flipped = inputs_of(*(y[::_MIRROR_EVERY].flip(-1) for y in (now, before, after)))
-        mirrored.append(net.camera_of(flipped.contiguous(memory_format=torch.channels_last)))
-    # A mirrored picture shows the same camera; what is guessed otherwise there is chance.
-    camera = (np.concatenate(cameras).mean(0) + torch.cat(mirrored).numpy().mean(0)) / 2
+        # A mirrored picture shows the same camera; what is guessed otherwise there is chance.
+        flipped = inputs_of(*(y[::_CAMERA_EVERY].flip(-1) for y in three))
+        for some in (x[::_CAMERA_EVERY], flipped):
+            cameras.append(eye.camera_of(some.contiguous(memory_format=torch.channels_last)))
+    camera = torch.cat(cameras).numpy().mean(0)
     return Seen(
         shares=shares,
         camera=SeenCamera(
