@@ -44,6 +44,7 @@ _HINTED_SURE = 0.97
 _CHANGE_TELLS = 4.0
 """Score of the hand-written cues from which their finding is an opinion."""
 _CLEARLY_BETTER = 1.6
+"""What those cues found is preferred where the network's own measures rate it so many times as high."""
 _NO_OPINION = 0.75
 """What the finding of the network alone counts where those cues have none."""
 _LEAST_HAND = 0.002
