@@ -25,6 +25,7 @@ from jaxtyping import Bool, UInt8
 from policies.evaluation.rate import wilson
 from v2p_data.cli import parse
 from v2p_data.errors import ItemRejectedError
+from v2p_data.geometry.camera import between_centres
 from v2p_data.scene.reconstruct import Estimate, Reconstruction, reconstruct
 from v2p_data.seeds import rng_for
 from v2p_data.stages import EngineConfig
@@ -158,7 +159,7 @@ def _mask_at(scene: Reconstruction, thing: Estimate, frame: int) -> Bool[np.ndar
         return mask
     h, w = mask.shape
     to_mask = np.diag([w / scene.clip.width_px, h / scene.clip.height_px, 1.0])
-    H = to_mask @ to_filmed[at] @ np.linalg.inv(to_mask)
+    H = between_centres(to_mask @ to_filmed[at] @ np.linalg.inv(to_mask))
     return cv2.warpPerspective(mask.astype(np.uint8), H, (w, h), flags=cv2.INTER_NEAREST) > 0
 
 

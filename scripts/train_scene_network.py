@@ -28,6 +28,7 @@ from safetensors.torch import load_file, save_file
 from scipy.spatial.transform import Rotation
 from torch.nn import functional as F  # noqa: N812  (the usual name)
 
+from v2p_data.geometry.camera import between_centres
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.footage import still_of
 from v2p_data.scene.network import (
@@ -285,8 +286,7 @@ def turned(
         over = np.maximum(-spots, spots - [w, h]) / [w, h]
         if over.max() > _MOST_BEYOND:
             continue
-        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from pixel centres
-        M = np.linalg.inv(half) @ to_old @ half
+        M = between_centres(to_old)
         known = np.array([pitch + tilt, log_focal + np.log(zoom), log_height], np.float32)
 
         def seen_by(image: UInt8[np.ndarray, "h w *c"], how: int, M: np.ndarray = M) -> np.ndarray:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from v2p_data.geometry.camera import between_centres
 from v2p_data.scene.footage import camera_shift_px, footage_of
 from v2p_data.scene.steady import steadied
 from v2p_data.video.clip import Clip, Hint
@@ -75,3 +76,11 @@ def test_a_picture_without_anything_to_follow_is_left_alone(draw):
     plain = replace(clip, frames=np.full_like(clip.frames, 120))
 
     assert steadied(plain, footage_of(plain)) is plain
+
+
+def test_doubling_a_picture_takes_pixel_centres_to_pixel_centres():
+    doubled = between_centres(np.diag([2.0, 2.0, 1.0]))
+
+    # The first pixel spreads over the first two: from centre 0 to the middle of 0 and 1.
+    np.testing.assert_allclose(doubled @ [0, 0, 1], [0.5, 0.5, 1])
+    np.testing.assert_allclose(between_centres(np.eye(3)), np.eye(3), atol=1e-12)

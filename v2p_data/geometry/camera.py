@@ -65,3 +65,9 @@ def mujoco_xyaxes(T_world_cam: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6
     """Return the `xyaxes` attribute of the MuJoCo camera with this pose."""
     R_gl = T_world_cam[:3, :3] @ CV_FROM_GL
     return np.concatenate([R_gl[:, 0], R_gl[:, 1]])
+
+
+def between_centres(H: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return a homography between pixels as OpenCV's warps want it: they count from pixel centres, we from the picture's corner."""
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    return np.linalg.inv(half) @ H @ half

@@ -20,6 +20,7 @@ _LEAST_STILL = 0.8
 """Of a tile, for it to tell of the camera."""
 _STILL_FRAMES = 24
 """At most so many frames make a still."""
+_THERE_AND_BACK_PX = 0.7
 _FEW_CORNERS = 12
 """With fewer corners to follow nothing is said about the camera."""
 
@@ -187,14 +188,29 @@ def _corner_shift(
         return None
     worst = None
     for image in grey[1:]:
-        there, found, _ = cv2.calcOpticalFlowPyrLK(grey[0], image, corners, np.empty(0))
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(image, grey[0], there, np.empty(0))
-        sure = (found[:, 0] > 0) & (found_back[:, 0] > 0)
-        sure &= np.linalg.norm((back - corners)[:, 0], axis=-1) < 0.7
+        there, sure = followed(grey[0], image, corners)
         if sure.sum() >= _FEW_CORNERS:
             shifts = np.linalg.norm((there - corners)[sure, 0], axis=-1)
             worst = max(worst or 0.0, float(np.percentile(shifts, 16)))
     return worst
+
+
+def followed(
+    first: UInt8[np.ndarray, "h w"],
+    image: UInt8[np.ndarray, "h w"],
+    corners: Float32[np.ndarray, "n 1 2"],
+    start: Float32[np.ndarray, "n 1 2"] | None = None,
+) -> tuple[Float32[np.ndarray, "n 1 2"], Bool[np.ndarray, "n"]]:
+    """Return where one picture's corners are in another, and which of them are found again on the way back.
+
+    `start` is where they are expected, where that is known.
+    """
+    flags = 0 if start is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+    ahead, home = (np.empty(0),) * 2 if start is None else (start.copy(), corners.copy())
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, image, corners, ahead, flags=flags)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(image, first, there, home, flags=flags)
+    sure = (found[:, 0] > 0) & (found_back[:, 0] > 0)
+    return there, sure & (np.linalg.norm((back - corners)[:, 0], axis=-1) < _THERE_AND_BACK_PX)
 
 
 def _tile_shift(

@@ -15,7 +15,7 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
-from v2p_data.geometry.camera import Camera
+from v2p_data.geometry.camera import Camera, between_centres
 from v2p_data.geometry.mesh import (
     lathe,
     lathe_parts,
@@ -50,10 +50,6 @@ _LOW = 0.6
 """Of its diameter: a lower vessel is a pan, with a stick for a handle; a higher one a mug."""
 _HANDLE_AREA = 0.03
 """Of the body's outline: what sticks out must be so large, or it is a shadow."""
-_STICK, _PLATE = (0.3, 1.1), (0.12, 0.6)
-"""Of the body's diameter: the least and the greatest length of a low and of a high vessel's handle."""
-_HANDLE_GAIN = {True: 0.015, False: 0.03}
-"""In units of IoU, for low and for high vessels: what sticks out far is no dent of the body's."""
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turns (right, towards the back, up) to an upright plane's (right, up, towards the camera)."""
 
@@ -124,6 +120,21 @@ class _Candidate:
     T_obj_shape: Float[np.ndarray, "4 4"]
 
 
+@dataclass(frozen=True)
+class _Handle:
+    """How a kind of handle is told from a dent of the body's."""
+
+    shortest: float
+    longest: float
+    """Of the body's diameter."""
+    gain: float
+    """In units of IoU: what sticks out far need not cover much more."""
+
+
+_STICK, _PLATE = _Handle(0.3, 1.1, 0.015), _Handle(0.12, 0.6, 0.03)
+"""Of a low vessel, and of a high one."""
+
+
 def best_shape(
     views: Sequence[View],
     camera: Camera,
@@ -161,11 +172,13 @@ def best_shape(
         if best is not primitive:
             what = {"revolution": "a solid of revolution", "inflated": "the inflated silhouette"}
             reason = f"{what[best.kind]} covers the outline to {best_iou:.2f}, the {_word(noun)} to {plain:.2f}"
-        handled = _handled(best, views[0], crops[0]) if cfg.handles and _may_have(noun) else None
-        gain = _HANDLE_GAIN[_is_low(best)]
-        if handled is not None and (iou := _iou(handled, views, crops)) > best_iou + gain:
-            best, best_iou = handled, iou
-            reason += f"; with a handle to {iou:.2f}"
+        if cfg.handles and _may_have_handle(noun):
+            handle = _STICK if _is_low(best) else _PLATE
+            handled = _handled(best, handle, views[0], crops[0])
+            iou = -1.0 if handled is None else _iou(handled, views, crops)
+            if handled is not None and iou > best_iou + handle.gain:
+                best, best_iou = handled, iou
+                reason += f"; with a handle to {iou:.2f}"
     confidence = float(np.clip((best_iou - 0.4) / 0.5, 0.05, 1) * (1 - 0.6 * hidden))
     x, y, z = (float(v) for v in best.mesh.extents)
     return ShapeChoice(
@@ -207,12 +220,12 @@ def _others(
     return [(candidate, margin) for candidate, margin in found if candidate is not None]
 
 
-def _may_have(noun: Noun) -> bool:
+def _may_have_handle(noun: Noun) -> bool:
     """Return whether things of that name are vessels with a handle or a spout: nothing else keeps them from being round."""
     return noun.form == "cylinder" and noun.hollow and noun.symmetry == "none"
 
 
-def _handled(body: _Candidate, view: View, crop: "_Crop") -> _Candidate | None:
+def _handled(body: _Candidate, kind: _Handle, view: View, crop: "_Crop") -> _Candidate | None:
     """Return the vessel with the handle that its outline shows; None where it shows none, or does not stand upright.
 
     Low vessels have a stick near the rim, tall ones a plate at half height, whose own height hides how far back it reaches:
@@ -222,7 +235,7 @@ def _handled(body: _Candidate, view: View, crop: "_Crop") -> _Candidate | None:
     if T[2, 2] < 0.9:
         return None
     diameter, height = float(body.mesh.extents[:2].mean()), float(body.mesh.extents[2])
-    low = _is_low(body)
+    low = kind is _STICK
     z = (0.35 if low else 0.0) * height
     drawn = crop.drawn(body.mesh, T)
     around = cv2.dilate(drawn.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
@@ -247,11 +260,10 @@ def _handled(body: _Candidate, view: View, crop: "_Crop") -> _Candidate | None:
             for a in facing
             for share in (0.2, 0.3, 0.4, 0.5)
         ]
-    least, most = _STICK if low else _PLATE
     made = [
         _with_handle(body, way, inner, extents, z)
         for way, extents in tries
-        if least * diameter < extents[0] < most * diameter
+        if kind.shortest * diameter < extents[0] < kind.longest * diameter
     ]
     return max(made, key=lambda one: _iou(one, [view], [crop]), default=None)
 
@@ -322,9 +334,7 @@ class _Crop:
         """World to crop pixels."""
 
         def cropped(picture: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "i j"]:
-            # Pixel centres lie at one half; OpenCV counts them as whole numbers.
-            shift = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
-            affine = (shift @ move @ np.linalg.inv(shift))[:2]
+            affine = between_centres(move)[:2]
             return cv2.warpAffine(picture.astype(np.float32), affine, canvas) > 0.5
 
         self.mask = cropped(view.mask)

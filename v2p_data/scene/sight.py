@@ -427,7 +427,9 @@ def _find_movers(
     last = mark.mask if mark and at_end else None
     moved, held = None, None
     if watched is not None:
-        goals = [marked[phrase].mask for phrase, _ in meaning.others if phrase in marked]
+        goal = next(
+            (marked[phrase].mask for phrase, _ in meaning.others if phrase in marked), None
+        )
         found = find_movers(
             footage,
             watched,
@@ -436,7 +438,7 @@ def _find_movers(
             tool,
             first,
             last,
-            goals[0] if goals else None,
+            goal,
         )
         moved, held = found or (None, None)
     if moved is None or (mark is None and not tool):

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from v2p_data.scene.footage import WIDTH_PX, Footage, camera_shift_px
+from v2p_data.geometry.camera import between_centres
+from v2p_data.scene.footage import WIDTH_PX, Footage, camera_shift_px, followed
 from v2p_data.video.clip import Clip, Hint
 
 MAX_SWAY = 0.1
@@ -22,7 +23,6 @@ _FEWEST = 20
 """Corners in agreement; with fewer, a frame goes as the one before went."""
 _MOST_LOST = 0.1
 """Share of the frames that may go so: blurred ones."""
-_THERE_AND_BACK_PX = 0.7
 _AGREES_PX = 1.0
 """At working size."""
 _CLEARLY_MORE = 1.5
@@ -33,8 +33,6 @@ _ALL_AGREE = 0.95
 """unless hardly any corner moves otherwise."""
 _STANDS_PX = 1.0
 """A camera whose picture moves less than this at working size stands still."""
-_HALF = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-"""OpenCV counts from pixel centres, we from the picture's corner."""
 
 
 def steadied(clip: Clip, footage: Footage) -> Clip:
@@ -88,7 +86,7 @@ def _moves(grey: list[UInt8[np.ndarray, "h w"]]) -> Float[np.ndarray, "time 3 3"
     moves, tellings = [np.eye(3)], []
     for image in grey[1:]:
         start = cv2.perspectiveTransform(corners, moves[-1]).astype(np.float32)
-        there, sure = _followed(grey[0], image, corners, start)
+        there, sure = followed(grey[0], image, corners, start)
         here, there = corners[sure, 0] + 0.5, there[sure, 0] + 0.5
         found = _motion(here, there, image.shape)
         if found is None:
@@ -126,22 +124,6 @@ def _extent(points: Float32[np.ndarray, "n 2"], shape: tuple[int, ...]) -> float
     return float((np.ptp(points, axis=0) / shape[1::-1]).min())
 
 
-def _followed(
-    first: UInt8[np.ndarray, "h w"],
-    image: UInt8[np.ndarray, "h w"],
-    corners: Float32[np.ndarray, "n 1 2"],
-    start: Float32[np.ndarray, "n 1 2"],
-) -> tuple[Float32[np.ndarray, "n 1 2"], Bool[np.ndarray, "n"]]:
-    """Return where the first frame's corners are in another one, and which of them are found again on the way back."""
-    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, image, corners, start.copy(), flags=flags)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        image, first, there, corners.copy(), flags=flags
-    )
-    sure = (found[:, 0] > 0) & (found_back[:, 0] > 0)
-    return there, sure & (np.linalg.norm((back - corners)[:, 0], axis=-1) < _THERE_AND_BACK_PX)
-
-
 def _aligned(
     frames: UInt8[np.ndarray, "time h w 3"], to_filmed: Float[np.ndarray, "time 3 3"]
 ) -> UInt8[np.ndarray, "time h w 3"]:
@@ -151,7 +133,7 @@ def _aligned(
         own[:] = frames[0]
         cv2.warpPerspective(
             frame,
-            np.linalg.inv(_HALF) @ H @ _HALF,
+            between_centres(H),
             (w, h),
             dst=own,
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
