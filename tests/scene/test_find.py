@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import Watched, find_movers, rated, standing
 from v2p_data.scene.footage import footage_of
+from v2p_data.scene.ground import Moved
 from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.scale import SeenCamera
 from v2p_data.scene.sight import Sighting, swallowed
-from v2p_data.scene.track import carried
+from v2p_data.scene.track import carried, track
 from v2p_data.video.clip import Clip
 
 H, W = 90, 120
-TABLE_RGB, RED, BLUE = (150, 140, 120), (190, 40, 40), (40, 60, 190)
+TABLE_RGB, RED, BLUE, SKIN = (150, 140, 120), (190, 40, 40), (40, 60, 190), (224, 172, 140)
 
 
 def square(x, y, size=14):
@@ -190,6 +192,41 @@ def test_what_goes_into_a_bin_and_is_gone_was_swallowed(seen_at_the_end):
         np.testing.assert_array_equal(found.last, masks[8])
         assert (found.quality[9:] == 0).all()
     assert not swallowed(watched, thing, replace(bin_, noun=noun_for("cereal box"))).swallowed
+
+
+def test_what_a_leg_uncovers_elsewhere_does_not_hide_that_the_marked_bin_swallowed_it():
+    frames = put_into(bin_shows_at_the_end=False)
+    plug = (square(3, 3), BLUE, MOVED)
+    _, watched = watched_of([*frames[:10], [*frames[10], plug], [*frames[11], plug]])
+    thing = Sighting(
+        phrase="red cube", role="manipulated", noun=noun_for("cube"),
+        masks=watched.shares[:, MOVED] > 0.5, quality=np.ones(12), moves=True, at=0, known_m=None, sure=0.9, why="",
+    )  # fmt: skip
+    bin_ = replace(
+        thing, role="container", noun=noun_for("bin"), moves=False,
+        masks=np.repeat((watched.early[OTHER] > 0.5)[None], 12, 0),
+    )  # fmt: skip
+
+    assert not swallowed(watched, thing, bin_).swallowed
+    assert swallowed(watched, thing, replace(bin_, hinted=True)).swallowed
+
+
+def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours():
+    frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
+    arm = square(76, 54, 30)
+    frames[-1] = [(arm, SKIN, MOVED), (square(76, 40), RED, MOVED)]
+    footage, watched = watched_of(frames)
+    hand = replace(footage, hand_hist=histogram(np.tile(np.array(SKIN, np.uint8), (400, 1))))
+    first, thing = large(square(10, 40), footage), large(square(76, 40), footage)
+    last = thing | large(arm, footage)
+    moved = Moved(
+        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+    )
+
+    course = track(hand, moved, moving=lambda i: watched.at(i)[MOVED])
+
+    assert (course.masks[-1] & thing).sum() > 0.85 * thing.sum()
+    assert (course.masks[-1] & ~thing).sum() < 0.15 * thing.sum()
 
 
 def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen():

@@ -141,7 +141,8 @@ def check_motion(
         value, least, said = gaps[0] - gaps[1], 0.02, "comes nearer to the other"
     elif kind in _ENDING_AT_KINDS and several:
         goal, last = grow(sights.objects[1].first, 6), sights.objects[0].last
-        value, least = float((goal & last).sum() / max(1, last.sum())), 0.25
+        # What is covered may be far smaller than what covers it.
+        value, least = float((goal & last).sum() / max(1, min(last.sum(), goal.sum()))), 0.25
         said = "ends at the other"
     else:
         value, least, said = float(np.linalg.norm(move)), 0.02, "moves"

@@ -33,7 +33,7 @@ from v2p_data.scene.segment import bounding_box, grow, tidy
 from v2p_data.scene.sight import Sighting
 
 _INSIDE_KINDS = (*SWALLOWING_KINDS, "place_onto")
-_UNSEEN_IOU = 0.35
+UNSEEN_IOU = 0.35
 """An outline at the end that fits the object no better shows something else."""
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 _SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
@@ -86,6 +86,8 @@ class Placed:
     last_mask: Bool[np.ndarray, "h w"]
     hidden: Bool[np.ndarray, "h w"]
     """Where something may stand in front of it at first."""
+    last_hidden: Bool[np.ndarray, "h w"]
+    """The same at the last pose."""
     frames: tuple[int, ...]
     """Footage frames with a pose, the first and the last among them."""
     T_world_objs: Float[np.ndarray, "pose 4 4"]
@@ -125,14 +127,16 @@ def place(
     pitch_rad, firsts = _best_pitch(shape, objects, unknown, rests, guess)
     camera = camera_above(shape, pitch_rad, guess.fov_rad)
     ends = [_end_of(s, kind) for s in objects]
-    upright_cost, lasts = 0.0, list(firsts)
+    upright_cost, lasts, last_unknown = 0.0, list(firsts), list(unknown)
     rivals: list[float | None] = [None] * len(objects)
     for k, s in enumerate(objects):
         if not s.moves:
             continue
         last_i, last_mask = ends[k]
-        hidden = _hidden(footage, last_i, last_mask, s.first) | _others(objects, s, last_i)
-        silhouette = Silhouette(last_mask, hidden, camera)
+        last_unknown[k] = _hidden(footage, last_i, last_mask, s.first) | _others(
+            objects, s, last_i
+        )
+        silhouette = Silhouette(last_mask, last_unknown[k], camera)
         # One outline often fits a standing and a lying box alike; both ends together seldom do.
         options = _options(s, unknown[k], camera, rests[k], thorough=True)
         role = kind if s is thing else "push_with"
@@ -143,12 +147,12 @@ def place(
         if len(costs) > 1:
             rivals[k] = float(np.partition(costs, 1)[1] - min(costs))
         firsts[k], (lasts[k], cost) = options[best], found[best]
-        unseen = kind in SWALLOWING_KINDS and (s.swallowed or lasts[k].iou < _UNSEEN_IOU)
+        unseen = kind in SWALLOWING_KINDS and (s.swallowed or lasts[k].iou < UNSEEN_IOU)
         if unseen and within is not None:
             lasts[k] = _inside(lasts[k], support, within)
         upright_cost = cost if s is thing else upright_cost
     height_m, spread = camera_height_m(
-        [vote_of(s, fit) for s, fit in zip(objects, firsts, strict=True)],
+        [vote_of(s, fit) for s, fit in zip(objects, firsts, strict=True) if not _in_hand(s)],
         guess.heights(pitch_rad),
     )
     placed = []
@@ -166,6 +170,7 @@ def place(
                 last_i=last_i,
                 last_mask=last_mask,
                 hidden=unknown[k],
+                last_hidden=last_unknown[k],
                 frames=tuple(course.frames),
                 T_world_objs=np.stack(course.poses),
                 confidences=tuple(course.sure),
@@ -492,6 +497,11 @@ def _tipped_along(fit: Fit, T_first: Float[np.ndarray, "4 4"]) -> Fit:
 def _centre(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
     y, x = np.nonzero(mask)
     return np.array([x.mean() + 0.5, y.mean() + 0.5]) if len(x) else np.array([np.nan, np.nan])
+
+
+def _in_hand(s: Sighting) -> bool:
+    """Return whether it is first seen in a hand, which hides how long it is, and nearer to the camera than the table."""
+    return s.role == "tool" and s.at > 0 and s.known_m is None
 
 
 def vote_of(s: Sighting, fit: Fit) -> SizeVote:

@@ -23,6 +23,7 @@ from v2p_data.scene.backends.config import (
     PoseConfig,
     SegmentConfig,
 )
+from v2p_data.scene.crop import View
 from v2p_data.scene.find import Watched, passed, watch
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
 from v2p_data.scene.gate import Cue, by_stage, check_confidence, check_motion, cues_of
@@ -35,9 +36,10 @@ from v2p_data.scene.learned import (
     segmented,
 )
 from v2p_data.scene.nouns import Noun
-from v2p_data.scene.placement import CameraGuess, Placed, Placement, place, with_forms
+from v2p_data.scene.placement import UNSEEN_IOU, CameraGuess, Placed, Placement, place, with_forms
+from v2p_data.scene.refit import bent, refit
 from v2p_data.scene.scene import Observed, Role, Symmetry
-from v2p_data.scene.shape import ShapeConfig, View, best_shape
+from v2p_data.scene.shape import ShapeChoice, ShapeConfig, best_shape
 from v2p_data.scene.sight import Sighting, Sights, sight
 from v2p_data.scene.steady import steadied
 from v2p_data.video.captions import parse_caption
@@ -188,7 +190,8 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     if cfg.depth.backend != "none":
         guess = camera_from_depth(clip, sights.footage, sights.objects, guess, cfg.depth, rng)
     placement = place(sights.footage, sights.objects, meaning.kind, guess, cfg.max_poses)
-    objects = _estimates(clip, sights, placement, meaning.kind, cfg)
+    placement, shaped = _shaped(sights, placement)
+    objects = _estimates(clip, sights, placement, shaped, meaning.kind, cfg)
     contradiction = None
     try:
         poses = [thing.T_world_objs for thing in objects]
@@ -275,21 +278,24 @@ def _origin(placement: Placement) -> Float[np.ndarray, "3"]:
     return placement.objects[0].first.T_world_obj[:3, 3] * np.array([1, 1, 0])
 
 
-def _estimates(
-    clip: Clip, sights: Sights, placement: Placement, kind: str, cfg: SceneConfig
-) -> list[Estimate]:
-    footage, origin, height = sights.footage, _origin(placement), placement.height_m
+@dataclass(frozen=True, kw_only=True)
+class _Shaped:
+    """An object's mesh, and its poses in the scene frame [m]."""
+
+    shape: ShapeChoice
+    T_world_objs: Float[np.ndarray, "pose 4 4"]
+
+
+def _shaped(sights: Sights, placement: Placement) -> tuple[Placement, list[_Shaped]]:
+    """Return the objects' meshes and poses, and the placement knowing how well the meshes cover the last outlines."""
+    origin, height = _origin(placement), placement.height_m
     work = _metric(placement.camera, origin, height)
-    taken: set[str] = set()
-    out = []
-    for s, placed in zip(sights.objects, placement.objects, strict=True):
-        name = slug_for(s.phrase, taken)
-        taken.add(name)
+    objects, out = list(placement.objects), []
+    for k, (s, placed) in enumerate(zip(sights.objects, placement.objects, strict=True)):
         length, width, tall = (float(v) * height for v in placed.first.size)
         poses = np.stack(
             [transform(T[:3, :3], (T[:3, 3] - origin) * height) for T in placed.T_world_objs]
         )
-        frames, sure, observed = placed.frames, placed.confidences, placed.observed
         shape = best_shape(
             [View(mask=s.first, T_world_obj=poses[0], hidden=placed.hidden)],
             work,
@@ -297,12 +303,41 @@ def _estimates(
             s.noun,
             ShapeConfig(handles=s.known_m is None),
         )
+        poses = poses @ shape.T_obj_shape
+        shows_it = s.moves and not s.swallowed and placed.last.iou > UNSEEN_IOU
+        if shows_it and shape.kind != "primitive":
+            view = View(mask=placed.last_mask, T_world_obj=poses[-1], hidden=placed.last_hidden)
+            in_air = placed.observed[-1] == "no_depth"
+            found = refit(view, poses[0], shape.mesh, work, in_air=in_air)
+            if found is not None:
+                poses = bent(poses, found.T_world_mesh)
+                last = replace(placed.last, iou=max(placed.last.iou, found.iou))
+                objects[k] = replace(placed, last=last)
+        out.append(_Shaped(shape=shape, T_world_objs=poses))
+    return replace(placement, objects=tuple(objects)), out
+
+
+def _estimates(
+    clip: Clip,
+    sights: Sights,
+    placement: Placement,
+    shaped: list[_Shaped],
+    kind: str,
+    cfg: SceneConfig,
+) -> list[Estimate]:
+    footage, height = sights.footage, placement.height_m
+    taken: set[str] = set()
+    out = []
+    for s, placed, made in zip(sights.objects, placement.objects, shaped, strict=True):
+        name = slug_for(s.phrase, taken)
+        taken.add(name)
+        shape, poses = made.shape, made.T_world_objs
+        frames, sure, observed = placed.frames, placed.confidences, placed.observed
         size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
         plain = shape.kind == "primitive" and not s.noun.bore and not cfg.mesh.worker
         if s.known_m:  # the user's word on the size outranks the outline's
-            size = (length, width, tall)
+            size = _size3(height * np.array(placed.first.size))
             mesh, parts = _stretched(size, mesh, *parts)
-        poses = poses @ shape.T_obj_shape
         if s.noun.hollow and s.role in ("manipulated", "cover") and kind in ("cover", "uncover"):
             # A cover's own frame has its mouth below, as it lies: so the simulator builds it.
             plain = False
@@ -315,7 +350,7 @@ def _estimates(
                 how += f"; its mesh was not closed and was mended ({repair})"
             size = _size3(mesh.extents)
         if cfg.pose.worker and s.moves:
-            camera = _clip_camera(clip, placement, origin)
+            camera = _clip_camera(clip, placement, _origin(placement))
             poses, marks = poses_by_worker(clip, footage, s.masks, mesh, camera, cfg.pose)
             frames, sure = tuple(range(len(poses))), tuple(float(c) for c in marks)
             observed = ("full",) * len(poses)

@@ -15,7 +15,7 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
-from v2p_data.geometry.camera import Camera, between_centres
+from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import (
     lathe,
     lathe_parts,
@@ -25,13 +25,12 @@ from v2p_data.geometry.mesh import (
 )
 from v2p_data.geometry.pillow import inflated, pillow
 from v2p_data.geometry.pose import inverse, transform
+from v2p_data.scene.crop import Crop, View
 from v2p_data.scene.nouns import Form, Noun
 from v2p_data.scene.segment import bounding_box, largest
 
 Kind = Literal["primitive", "revolution", "inflated"]
 Size = tuple[float, float, float]
-_CROP_PX = 160
-"""Longer side of the mask's crop, in which outlines are compared."""
 _RINGS, _RADII, _AROUND = 48, 44, 30
 _MAX_RADIUS = 0.8
 """Of the fitted diameter: rings are tried up to here."""
@@ -52,18 +51,6 @@ _HANDLE_AREA = 0.03
 """Of the body's outline: what sticks out must be so large, or it is a shadow."""
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turns (right, towards the back, up) to an upright plane's (right, up, towards the camera)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """The object in one frame."""
-
-    mask: Bool[np.ndarray, "h w"]
-    """Its visible pixels, at the camera's size."""
-    T_world_obj: Float[np.ndarray, "4 4"]
-    """Of the fitted primitive [m]."""
-    hidden: Bool[np.ndarray, "h w"] | None = None
-    """Pixels that say nothing, because something may stand in front."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +139,10 @@ def best_shape(
         cfg: how clearly the primitive must be beaten.
     """
     cfg = cfg or ShapeConfig()
-    crops = [_Crop(view, camera) for view in views]
+    crops = [Crop(view, camera) for view in views]
     primitive = _primitive(size_m, noun)
-    plain, hidden = _iou(primitive, views, crops), crops[0].hidden_share(primitive, views[0])
+    plain = _iou(primitive, views, crops)
+    hidden = crops[0].hidden_share(crops[0].drawn(primitive.mesh, views[0].T_world_obj))
     best, best_iou, best_gain = primitive, plain, 0.0
     reason = f"the {_word(noun)} covers the outline to {plain:.2f}"
     pixels = int(views[0].mask.sum())
@@ -204,7 +192,7 @@ def _primitive(size_m: Size, noun: Noun) -> _Candidate:
 
 
 def _others(
-    view: View, crop: "_Crop", size_m: Size, noun: Noun, cfg: ShapeConfig
+    view: View, crop: Crop, size_m: Size, noun: Noun, cfg: ShapeConfig
 ) -> list[tuple[_Candidate, float]]:
     """Return what else the object may be, with the margin by which each must win."""
     if noun.bore:
@@ -225,7 +213,7 @@ def _may_have_handle(noun: Noun) -> bool:
     return noun.form == "cylinder" and noun.hollow and noun.symmetry == "none"
 
 
-def _handled(body: _Candidate, kind: _Handle, view: View, crop: "_Crop") -> _Candidate | None:
+def _handled(body: _Candidate, kind: _Handle, view: View, crop: Crop) -> _Candidate | None:
     """Return the vessel with the handle that its outline shows; None where it shows none, or does not stand upright.
 
     Low vessels have a stick near the rim, tall ones a plate at half height, whose own height hides how far back it reaches:
@@ -320,73 +308,7 @@ def _word(noun: Noun) -> str:
     return hollow + {"box": "box", "cylinder": "cylinder", "sphere": "ball"}[noun.form]
 
 
-class _Crop:
-    """One view's mask, cropped and brought to one size."""
-
-    def __init__(self, view: View, camera: Camera) -> None:
-        x, y, w, h = bounding_box(view.mask)
-        pad = int(0.3 * max(w, h)) + 3
-        zoom = _CROP_PX / (max(w, h) + 2 * pad)
-        move = np.array([[zoom, 0, zoom * (pad - x)], [0, zoom, zoom * (pad - y)], [0, 0, 1.0]])
-        canvas = (max(8, round(zoom * (w + 2 * pad))), max(8, round(zoom * (h + 2 * pad))))
-        self.camera = camera
-        self.matrix = move @ camera.K @ inverse(camera.T_world_cam)[:3]
-        """World to crop pixels."""
-
-        def cropped(picture: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "i j"]:
-            affine = between_centres(move)[:2]
-            return cv2.warpAffine(picture.astype(np.float32), affine, canvas) > 0.5
-
-        self.mask = cropped(view.mask)
-        self.known = cropped(np.ones_like(view.mask))
-        if view.hidden is not None:
-            self.known &= ~cropped(view.hidden & ~view.mask)
-        height, width = view.mask.shape
-        self.at_border = x <= 1 or y <= 1 or x + w >= width - 1 or y + h >= height - 1
-        self.may = self.mask | ~self.known
-        """Where the object can be."""
-
-    def pixels(self, points_world: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-        """Return crop pixels, NaN behind the camera."""
-        uvw = points_world @ self.matrix[:, :3].T + self.matrix[:, 3]
-        return uvw[..., :2] / np.where(uvw[..., 2:] > 1e-6, uvw[..., 2:], np.nan)
-
-    def looked_up(
-        self, picture: Bool[np.ndarray, "i j"], points_world: Float[np.ndarray, "*n 3"]
-    ) -> Bool[np.ndarray, "*n"]:
-        """Return the picture's value where each point appears; False outside it."""
-        pixels = np.nan_to_num(self.pixels(points_world), nan=-1.0).astype(int)
-        h, w = picture.shape
-        x, y = pixels[..., 0], pixels[..., 1]
-        inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
-        return inside & picture[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)]
-
-    def drawn(self, mesh: trimesh.Trimesh, T_world_mesh: np.ndarray) -> Bool[np.ndarray, "i j"]:
-        """Return the mesh's silhouette."""
-        points = mesh.vertices @ T_world_mesh[:3, :3].T + T_world_mesh[:3, 3]
-        pixels = self.pixels(points)
-        picture = np.zeros(self.mask.shape, np.uint8)
-        if not np.isfinite(pixels).all() or np.abs(pixels).max() > 8 * _CROP_PX:
-            return picture > 0
-        a, b, c = (pixels[mesh.faces[:, k]] for k in range(3))
-        turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-        # Of a closed surface the faces that look this way cover all.
-        for triangle in ((np.stack([a, b, c], axis=1)[turn < 0] - 0.5) * 16).astype(np.int32):
-            cv2.fillConvexPoly(picture, triangle, 1, cv2.LINE_8, 4)
-        return picture > 0
-
-    def iou(self, drawn: Bool[np.ndarray, "i j"]) -> float:
-        """Return the overlap with the mask, where the object could be seen."""
-        seen = drawn & self.known
-        return float((seen & self.mask).sum() / max(1, (seen | self.mask).sum()))
-
-    def hidden_share(self, shape: _Candidate, view: View) -> float:
-        """Return how much of the shape's silhouette cannot be seen."""
-        drawn = self.drawn(shape.mesh, view.T_world_obj @ shape.T_obj_shape)
-        return float((drawn & ~self.known).sum() / max(1, drawn.sum()))
-
-
-def _iou(shape: _Candidate, views: Sequence[View], crops: list[_Crop]) -> float:
+def _iou(shape: _Candidate, views: Sequence[View], crops: list[Crop]) -> float:
     return float(
         np.mean(
             [
@@ -397,7 +319,7 @@ def _iou(shape: _Candidate, views: Sequence[View], crops: list[_Crop]) -> float:
     )
 
 
-def _revolution(view: View, crop: _Crop, size_m: Size, noun: Noun) -> _Candidate | None:
+def _revolution(view: View, crop: Crop, size_m: Size, noun: Noun) -> _Candidate | None:
     """Return what the outline leaves of a body of revolution about the fit's z: at each height the largest disc in it.
 
     The silhouette of such a body is the union of its discs' silhouettes, so nothing larger can be right. Discs at the
@@ -442,7 +364,7 @@ def _revolution(view: View, crop: _Crop, size_m: Size, noun: Noun) -> _Candidate
 
 
 def _carved(
-    crop: _Crop,
+    crop: Crop,
     T_world_obj: Float[np.ndarray, "4 4"],
     z: Float[np.ndarray, "k"],
     radii: Float[np.ndarray, "j"],
@@ -466,7 +388,7 @@ def _carved(
 
 
 def _needed(
-    crop: _Crop,
+    crop: Crop,
     T_world_obj: Float[np.ndarray, "4 4"],
     centre: Float[np.ndarray, "3"],
     z: Float[np.ndarray, "k"],
@@ -508,7 +430,7 @@ def _needed(
     return int(rows[first]), int(rows[max(last, first)])
 
 
-def _inflation(view: View, crop: _Crop, size_m: Size) -> _Candidate | None:
+def _inflation(view: View, crop: Crop, size_m: Size) -> _Candidate | None:
     """Return the outline, seen in a plane through the object and inflated to the fit's thickness.
 
     What lies is seen in a plane along the table, what stands in the upright plane that faces the camera.
@@ -578,7 +500,7 @@ def _inflation(view: View, crop: _Crop, size_m: Size) -> _Candidate | None:
 
 
 def _settled(
-    crop: _Crop, mesh: trimesh.Trimesh, T_world_mesh: Float[np.ndarray, "4 4"]
+    crop: Crop, mesh: trimesh.Trimesh, T_world_mesh: Float[np.ndarray, "4 4"]
 ) -> tuple[float, Float[np.ndarray, "4 4"]]:
     """Return by how much to scale the mesh, and its pose on the table, so that its outline lies over the mask."""
     grown, T = 1.0, T_world_mesh.copy()
@@ -614,7 +536,7 @@ def _plane_points(
 
 
 def _ground_shift(
-    crop: _Crop, drawn: Bool[np.ndarray, "i j"], forward: Float[np.ndarray, "3"]
+    crop: Crop, drawn: Bool[np.ndarray, "i j"], forward: Float[np.ndarray, "3"]
 ) -> float:
     """Return how much further along the table a thing stands whose foot is drawn too high or too low in the picture [m]."""
     onto = crop.matrix[:, [0, 1, 3]]

@@ -241,11 +241,15 @@ def _every(footage: Footage) -> int:
 
 
 def swallowed(watched: Watched, thing: Sighting, other: Sighting) -> Sighting:
-    """Return the thing as last seen, where it goes into the other and nothing that moved is seen at the end: bins are deep."""
+    """Return the thing as last seen, where it goes into the other and nothing that moved is seen at the end: bins are deep.
+
+    Where the user marked the other, only what is seen there counts: hands and legs uncover things elsewhere.
+    """
     little = _LITTLE * float(thing.first.sum())
-    if not other.noun.hollow or (watched.at(len(thing.masks) - 1)[MOVED] > 0.5).sum() > little:
-        return thing
     goal = grow(other.first, _TOUCH_PX)
+    left = watched.at(len(thing.masks) - 1)[MOVED] > 0.5
+    if not other.noun.hollow or (left & goal if other.hinted else left).sum() > little:
+        return thing
     entering = [
         (int(i), mask)
         for i in watched.idx[len(watched.idx) // 3 :]

@@ -14,11 +14,14 @@ from jaxtyping import Bool, Float
 from v2p_data.scene.colour import histogram, likelihood, similarity
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Moved
-from v2p_data.scene.segment import bounding_box, convex_hull, grow, tidy
+from v2p_data.scene.segment import bounding_box, convex_hull, grow, largest, tidy
 
 _SAME_LAB = 6.0
 _LOST = 0.4
 """Likeness below which what is followed from one frame alone is taken to be gone."""
+_HAND_RATIO = 1.5
+"""Logarithm of how much better the hand's colours explain a pixel of the last outline: more, and it is hand."""
+_MOSTLY = 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +60,7 @@ def track(
         if carried > found + 0.05 and _iou(forward[-1], moved.last) > 0.05
         else moved.last
     )
+    end = _less_hand(footage, n - 1, end, moved.look)
     backward = _follow(footage, steps[::-1], end, moved.look, n - 1, moving)[::-1]
     area_last = float(end.sum())
     masks = np.zeros((n, *footage.shape), bool)
@@ -198,6 +202,20 @@ def _find_again(
         if likeness > value:
             best, value = part, likeness
     return best
+
+
+def _less_hand(
+    footage: Footage, i: int, mask: Bool[np.ndarray, "h w"], look: Float[np.ndarray, "l a b"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the mask without what has the colours of the hand rather than the object's, unless that is most of it."""
+    image = footage.rgb[i]
+    ratio = np.log(likelihood(footage.hand_hist, image) + 1e-6) - np.log(
+        likelihood(look, image) + 1e-6
+    )
+    rest = tidy(mask & (cv2.GaussianBlur(ratio.astype(np.float32), (0, 0), 2) < _HAND_RATIO))
+    if rest.sum() < _MOSTLY * mask.sum():
+        return mask
+    return largest(rest)
 
 
 def _likeness(
