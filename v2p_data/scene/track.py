@@ -76,7 +76,9 @@ def track(
         masks[i] = (forward[k], backward[k])[best]
         quality[i] = max(0.0, marks[best])
     masks[0], masks[-1] = moved.first, end
-    quality[0] = quality[-1] = 1.0
+    # An outline at the end that does not look like the object is not it: it is hidden there.
+    alike = _likeness(footage, n - 1, end, moved.look, area_first)
+    quality[0], quality[-1] = 1.0, 1.0 if alike > _LOST else alike
     for i in range(1, n):
         if not masks[i].any():
             masks[i] = masks[i - 1]
