@@ -211,6 +211,22 @@ def test_what_a_leg_uncovers_elsewhere_does_not_hide_that_the_marked_bin_swallow
     assert swallowed(watched, thing, replace(bin_, hinted=True)).swallowed
 
 
+def test_an_outline_at_the_end_that_shows_something_else_is_not_believed():
+    frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
+    frames[-1] = [(square(76, 40), BLUE, MOVED)]
+    footage, watched = watched_of(frames)
+    first, last = large(square(10, 40), footage), large(square(76, 40), footage)
+    moved = Moved(
+        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+    )
+
+    course = track(footage, moved, moving=lambda i: watched.at(i)[MOVED])
+
+    assert course.quality[0] == 1
+    assert course.quality[5] > 0.5
+    assert course.quality[-1] < 0.4
+
+
 def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours():
     frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
     arm = square(76, 54, 30)

@@ -45,7 +45,8 @@ _LARGE = 0.01
 """Of the picture: the outlines of smaller things are ragged."""
 _SPLIT_COST = 0.6
 """A piece of an outline must score so much better than the whole: light and print cut things into pieces, too."""
-_LIKELY_WEIGHT = 1.5
+_LIKELY_WEIGHT = 2.5
+"""Of how surely the network sees a thing there."""
 _NECKS = (0.4, 0.6, 0.8)
 _NEAR_KINDS = {"push_next_to", "drop_in_front_of", "push_with", "slide_to"}
 _TOUCH_KINDS = {"cover", "insert", "throw_into", "place_onto"}
@@ -216,7 +217,8 @@ def find_other(
             ring = grow(mask, 3) & ~mask
             score += float(table.seen[ring].mean()) if ring.any() else 0.0
             score += 1.6 * float(colour[mask].mean()) if words else 0.0
-            score += _LIKELY_WEIGHT * (float(likely[mask].mean()) - 0.4) if likely is not None else 0.0
+            if likely is not None:
+                score += _LIKELY_WEIGHT * (float(likely[mask].mean()) - 0.4)
             score += 0.8 * area / (bw * bh)
             # Things that touch, or pieces of one, are no thing.
             if area > _LARGE * h * w:

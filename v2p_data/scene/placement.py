@@ -15,7 +15,6 @@ from v2p_data.geometry.pose import transform
 from v2p_data.scene.colour import lab_of
 from v2p_data.scene.find import SWALLOWING_KINDS
 from v2p_data.scene.footage import Footage
-from v2p_data.scene.nouns import Noun
 from v2p_data.scene.pose import (
     Fit,
     Silhouette,
@@ -38,9 +37,8 @@ UNSEEN_IOU = 0.35
 """An outline at the end that fits the object no better shows something else."""
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 _SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
-_STAYS_ON_TABLE_KINDS = (*_SLIDING_KINDS, "drop_in_front_of")
-_AGAIN_WEIGHT = 1.0
-_TURN_COST = 0.02
+_TURN_COST = 0.007
+"""Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
 _OTHER_FORM_COST = 0.02
 """By so much a noun's second form must cover an outline better: a box has a side and a turn more to choose than a cylinder."""
 _PITCH_RANGE_RAD = (0.15, 1.4)
@@ -134,10 +132,7 @@ def place(
         else hidden
         for s, (last_i, last_mask), hidden in zip(objects, ends, unknown, strict=True)
     ]
-    again = None
-    if kind in _STAYS_ON_TABLE_KINDS and not thing.swallowed:
-        again = _Again(mask=ends[0][1], unknown=last_unknown[0])
-    pitch_rad, firsts = _best_pitch(shape, objects, unknown, rests, guess, again)
+    pitch_rad, firsts = _best_pitch(shape, objects, unknown, rests, guess)
     camera = camera_above(shape, pitch_rad, guess.fov_rad)
     upright_cost, lasts = 0.0, list(firsts)
     rivals: list[float | None] = [None] * len(objects)
@@ -218,28 +213,12 @@ def with_forms(
     return tuple(out)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Again:
-    """The manipulated object's outline elsewhere on the table: how much smaller it is there tells how the table lies."""
-
-    mask: Bool[np.ndarray, "h w"]
-    unknown: Bool[np.ndarray, "h w"]
-
-    def cost(self, noun: Noun, first: Fit, camera: Camera) -> float:
-        """Return how badly the object as fitted at first covers this outline, for this camera."""
-        rest = _rest_of(first.T_world_obj[:3, :3])
-        yaw = yaw_of(first.T_world_obj[:3, :3], rest)
-        silhouette = Silhouette(self.mask, self.unknown, camera)
-        return fit_pose(silhouette, noun, first.size, rest, yaw_near=yaw).cost
-
-
 def _best_pitch(
     shape: tuple[int, int],
     objects: tuple[Sighting, ...],
     unknown: list[Bool[np.ndarray, "h w"]],
     rests: list[_Rests],
     guess: CameraGuess,
-    again: _Again | None,
 ) -> tuple[float, list[Fit]]:
     """Try pitches around the guess; the silhouettes decide, as far as the guess lets them."""
     best: tuple[float, float, list[Fit]] | None = None
@@ -272,9 +251,6 @@ def _best_pitch(
             fits = fits_at(pitch, thorough=False)
             off = (pitch - guess.pitch_rad) / sd
             cost = sum(fit.cost for fit in fits) + _TURN_COST * off**2
-            if again is not None:
-                camera = camera_above(shape, pitch, guess.fov_rad)
-                cost += _AGAIN_WEIGHT * again.cost(objects[0].noun, fits[0], camera)
             if best is None or cost < best[0]:
                 best = cost, pitch, fits
     assert best is not None
