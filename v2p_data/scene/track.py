@@ -19,7 +19,7 @@ from v2p_data.scene.segment import bounding_box, convex_hull, grow, largest, tid
 _SAME_LAB = 6.0
 _LOST = 0.4
 """Likeness below which what is followed from one frame alone is taken to be gone."""
-_HAND_RATIO = 1.5
+_HAND_RATIO = 3.0
 """Logarithm of how much better the hand's colours explain a pixel of the last outline: more, and it is hand."""
 _MOSTLY = 0.4
 
