@@ -90,3 +90,9 @@ class Crop:
     def hidden_share(self, drawn: Bool[np.ndarray, "i j"]) -> float:
         """Return how much of a silhouette cannot be seen."""
         return float((drawn & ~self.known).sum() / max(1, drawn.sum()))
+
+
+def middle_of(picture: Bool[np.ndarray, "i j"]) -> Float[np.ndarray, "2"]:
+    """Return the middle of a silhouette's bounding box [px]."""
+    x, y, w, h = bounding_box(picture)
+    return np.array([x + w / 2, y + h / 2])

@@ -140,9 +140,6 @@ def place(
         if not s.moves:
             continue
         last_i, last_mask = ends[k]
-        last_unknown[k] = _hidden(footage, last_i, last_mask, s.first) | _others(
-            objects, s, last_i
-        )
         silhouette = Silhouette(last_mask, last_unknown[k], camera)
         # One outline often fits a standing and a lying box alike; both ends together seldom do.
         options = _options(s, unknown[k], camera, rests[k], thorough=True)

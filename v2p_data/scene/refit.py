@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import angle_between, transform
-from v2p_data.scene.crop import Crop, View
-from v2p_data.scene.segment import bounding_box
+from v2p_data.scene.crop import Crop, View, middle_of
 
 _LEAST_PX = 80
 """Of the last outline, below which it has no form."""
@@ -141,11 +140,8 @@ def _aligned(
         if not drawn.any():
             break
         onto = np.column_stack([crop.matrix[:, :3] @ ways, crop.matrix @ np.append(out[:3, 3], 1)])
-        ends = []
-        for picture in (drawn, crop.mask):
-            x, y, w, h = bounding_box(picture)
-            ends.append([x + w / 2, y + h / 2, 1.0])
-        spots = np.linalg.solve(onto, np.array(ends).T)
+        ends = [np.append(middle_of(picture), 1.0) for picture in (drawn, crop.mask)]
+        spots = np.linalg.lstsq(onto, np.stack(ends).T, rcond=None)[0]
         here, there = (spots[:2] / spots[2]).T
         out[:3, 3] += ways @ (there - here)
     return out

@@ -25,7 +25,7 @@ from v2p_data.geometry.mesh import (
 )
 from v2p_data.geometry.pillow import inflated, pillow
 from v2p_data.geometry.pose import inverse, transform
-from v2p_data.scene.crop import Crop, View
+from v2p_data.scene.crop import Crop, View, middle_of
 from v2p_data.scene.nouns import Form, Noun
 from v2p_data.scene.segment import bounding_box, largest
 
@@ -512,18 +512,13 @@ def _settled(
             break
         height = T[2, 3]
         onto = crop.matrix[:, [0, 1, 3]] + np.outer(crop.matrix[:, 2], [0.0, 0.0, height])
-        ends = [np.append(_middle(picture), 1.0) for picture in (drawn, crop.mask)]
+        ends = [np.append(middle_of(picture), 1.0) for picture in (drawn, crop.mask)]
         here, there = (spot[:2] / spot[2] for spot in np.linalg.solve(onto, np.stack(ends).T).T)
         T[:2, 3] += there - here
         grown *= float(np.clip(np.sqrt(crop.mask.sum() / drawn.sum()), 0.85, 1.18))
     grown = float(np.clip(grown, 0.75, 1.33))
     T[2, 3] = grown * float(mesh.extents[2]) / 2
     return grown, T
-
-
-def _middle(picture: Bool[np.ndarray, "i j"]) -> Float[np.ndarray, "2"]:
-    x, y, w, h = bounding_box(picture)
-    return np.array([x + w / 2, y + h / 2])
 
 
 def _plane_points(

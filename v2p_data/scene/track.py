@@ -21,7 +21,8 @@ _LOST = 0.4
 """Likeness below which what is followed from one frame alone is taken to be gone."""
 _HAND_RATIO = 3.0
 """Logarithm of how much better the hand's colours explain a pixel of the last outline: more, and it is hand."""
-_MOSTLY = 0.4
+_MOSTLY, _LITTLE = 0.4, 0.05
+"""Of an outline: what must be left of it without the hand, and what is not worth cutting off."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,8 +215,9 @@ def _less_hand(
     ratio = np.log(likelihood(footage.hand_hist, image) + 1e-6) - np.log(
         likelihood(look, image) + 1e-6
     )
-    rest = tidy(mask & (cv2.GaussianBlur(ratio.astype(np.float32), (0, 0), 2) < _HAND_RATIO))
-    if rest.sum() < _MOSTLY * mask.sum():
+    hand = mask & (cv2.GaussianBlur(ratio.astype(np.float32), (0, 0), 2) > _HAND_RATIO)
+    rest, area = tidy(mask & ~hand), float(mask.sum())
+    if hand.sum() < _LITTLE * area or rest.sum() < _MOSTLY * area:
         return mask
     return largest(rest)
 
