@@ -5,6 +5,7 @@ import pytest
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import quat_from_yaw, transform, transform_from_pose
 from v2p_data.scene.nouns import noun_for
+from v2p_data.scene.placement import _peak
 from v2p_data.scene.pose import (
     Silhouette,
     camera_above,
@@ -21,6 +22,7 @@ from v2p_data.scene.scale import (
     disagreement,
     height_plausibility,
 )
+from v2p_data.scene.sight import Sighting
 
 PITCH, FOV = 0.61, 1.01
 
@@ -164,3 +166,19 @@ def test_a_ring_s_hole_says_nothing_against_its_outline():
     assert (outside & hole).sum() > 20
     np.testing.assert_allclose(fit.size[0], size[0], rtol=0.04)
     np.testing.assert_allclose(fit.T_world_obj[:3, 3], T[:3, 3], atol=0.02)
+
+
+@pytest.mark.parametrize(("believed", "ends_at"), [(8, 8), (3, 3)])
+def test_a_lift_ends_where_the_thing_was_last_seen_highest(believed, ends_at):
+    """It rises from frame 4 on; what is not believed is not seen, be it drawn as high as you like."""
+    masks = np.zeros((9, 40, 40), bool)
+    for i in range(9):
+        top = 30 - 3 * max(0, i - 3)
+        masks[i, top : top + 6, 10:16] = True
+    quality = np.where(np.arange(9) <= believed, 1.0, 0.3)
+    thing = Sighting(
+        phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks, quality=quality,
+        moves=True, at=0, known_m=None, sure=0.9, why="",
+    )  # fmt: skip
+
+    assert _peak(thing) == ends_at

@@ -430,7 +430,10 @@ def _course(
 
 
 def _peak(s: Sighting) -> int:
-    """Return the footage frame at which a lift is highest in the picture, among the believable ones."""
+    """Return the footage frame at which a lift is highest in the picture, among the believable ones.
+
+    Where it is never higher than at first, that is the last believable one: a sleeve hides it from then on.
+    """
     n = len(s.masks)
     heights = np.full(n, -np.inf)
     start = _centre(s.first)[1]
@@ -439,8 +442,8 @@ def _peak(s: Sighting) -> int:
             heights[i] = start - _centre(s.masks[i])[1]
     top = heights.max()
     # The end of the clip counts as the peak when it is nearly as high: a hand that holds still trembles.
-    near = np.flatnonzero(heights >= 0.93 * top)
-    return int(near[-1]) if len(near) and top > 0 else n - 1
+    near = heights >= 0.93 * top if top > 0 else np.isfinite(heights)
+    return int(np.flatnonzero(near)[-1]) if near.any() else n - 1
 
 
 def _hidden(
