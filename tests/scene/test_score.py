@@ -364,6 +364,45 @@ def test_a_tool_is_compared_from_where_it_comes_into_the_picture():
     assert at_the_start.position_first_m == pytest.approx(0.1 * 5 / 9)  # it was there all the time
 
 
+def test_a_tool_need_not_be_followed_out_of_the_picture():
+    """What it pushes rests from the fifth frame on; the tool goes on for half of its way."""
+    pushed = true_thing()
+    T = pushed.T_world_objs.copy()
+    T[:, 0, 3] = [0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.1, 0.1, 0.1, 0.1]
+    pushed = replace(pushed, T_world_objs=T)
+    tool = true_thing(phrase="stick", manipulated=False, move=(0.2, 0, 0))
+
+    def share_at(last_frame):
+        found = (found_thing(), replace(found_thing(), phrase="stick", last_frame=last_frame))
+        return (
+            score_clip(
+                TrueClip(kind="push_with", things=(pushed, tool), T_world_cam=CAMERA),
+                FoundClip(kind="push_with", things=found, T_world_cam=CAMERA),
+            )
+            .things[1]
+            .travel_share
+        )
+
+    assert share_at(5) == pytest.approx(1)
+    assert share_at(9) == pytest.approx(1)
+    assert share_at(2) == pytest.approx(0.4)
+
+
+def test_of_a_pose_whose_depth_is_declared_unseen_only_what_is_seen_counts():
+    """The camera looks straight down: 3 cm too high is depth, 2 cm aside is not."""
+    off = found_thing(T_world_first=transform(np.eye(3), np.array([0.02, 0, 0.05])))
+
+    seen, unseen = (
+        scored(true_thing(), replace(off, first_depth_seen=known)).things[0]
+        for known in (True, False)
+    )
+
+    assert seen.position_first_m == pytest.approx(np.hypot(0.02, 0.03))
+    assert seen.position_first_depth_m is None
+    assert unseen.position_first_m == pytest.approx(0.02, abs=2e-3)
+    assert unseen.position_first_depth_m == pytest.approx(0.03, abs=2e-3)
+
+
 def test_what_goes_out_and_comes_half_way_back_has_gone_all_its_way_at_the_end():
     true = true_thing()
     T = true.T_world_objs.copy()

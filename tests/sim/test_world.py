@@ -1,10 +1,12 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
@@ -158,6 +160,26 @@ def test_an_object_lying_in_the_video_lies_in_the_world(
     mujoco.mju_quat2Mat(R, np.asarray(obj.rest_quat))
     height = np.ptp(obj.hull @ R.reshape(3, 3).T, axis=0)[2]
     assert height == pytest.approx(0.02)  # turned about y: its x axis is vertical
+
+
+def test_a_pen_held_steeply_in_the_video_lies_on_its_side_in_the_world(
+    make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
+):
+    """It points to +y and up by 60 degrees: nearer to standing than to lying."""
+    R = Rotation.from_euler("zy", [90, -60], degrees=True)
+    pen = make_object("pen", "box", (0.14, 0.02, 0.01), quat=R.as_quat(scalar_first=True))
+    held = replace(pen, observed=("no_depth",) * len(pen.poses_world))
+
+    obj = build_world(make_scene(held), COARSE).objects[0]
+    laid = Rotation.from_quat(held.laid_pose[3:], scalar_first=True).as_matrix()
+
+    rest = Rotation.from_quat(obj.rest_quat, scalar_first=True).as_matrix()
+    assert np.ptp(obj.hull @ rest.T, axis=0)[2] == pytest.approx(0.01)
+    np.testing.assert_allclose(laid[:, 0], [0, 1, 0], atol=1e-9)
+    assert abs(laid[2, 2]) == pytest.approx(1)
+    assert np.linalg.det(laid) == pytest.approx(1)
+    assert held.laid_pose[2] == pytest.approx(0.005)
+    np.testing.assert_array_equal(pen.laid_pose, pen.first_pose)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,15 @@ from v2p_data.scene.colour import (
 from v2p_data.scene.footage import Footage, end_quarters, still_of
 from v2p_data.scene.ground import Moved
 from v2p_data.scene.scale import SeenCamera, table_width_m
-from v2p_data.scene.segment import bounding_box, edge_contrast, grow, largest, refine, tidy
+from v2p_data.scene.segment import (
+    bounding_box,
+    edge_contrast,
+    grow,
+    is_cut,
+    largest,
+    refine,
+    tidy,
+)
 from v2p_data.video.clip import Clip
 
 MOST_FRAMES = 50
@@ -271,37 +279,6 @@ def find_movers(
     return _moved(pairs, best), _moved(pairs, second)
 
 
-def find_held(
-    watched: Watched, mover: Bool[np.ndarray, "time h w"]
-) -> tuple[int, Bool[np.ndarray, "time h w"], float] | None:
-    """Return what a hand brings along: the footage frame that shows it best, its masks and how sure that is.
-
-    A tool is often not in the first picture: the hand comes with it. `mover` is the manipulated object's track.
-    """
-    found: dict[int, Bool[np.ndarray, "h w"]] = {}
-    best, value, sure = 0, 0.0, 0.0
-    h, w = mover.shape[1:]
-    for k, i in enumerate(watched.idx.tolist()):
-        shares = watched.shares[k]
-        mask = largest(tidy((shares[MOVED] > _LIKELY) & ~grow(mover[i], 3)))
-        area = float(mask.sum())
-        if area < _LEAST_SHARE * h * w:
-            continue
-        found[i] = mask
-        by_hand = (grow(mask, 5) & (shares[HAND] > _LIKELY)).any()
-        worth = area * (1.0 if by_hand else 0.3) * (0.7 if _cut(mask) else 1.0)
-        if worth > value and i < int(watched.idx[-1]):
-            best, value = i, worth
-            sure = float(shares[MOVED][mask].mean()) * (0.9 if by_hand else 0.6)
-    if len(found) < 2:
-        return None
-    masks = np.zeros_like(mover)
-    for i, mask in found.items():
-        if mask.sum() > 0.3 * found[best].sum():
-            masks[i] = mask
-    return best, masks, sure
-
-
 def standing(watched: Watched, *, late: bool) -> Float32[np.ndarray, "h w"]:
     """Return how likely each pixel of the still of the beginning (or end) belongs to something that stands there."""
     shares = watched.late if late else watched.early
@@ -389,7 +366,7 @@ def _rated(
                 "moved": min(1.0, 0.4 + 0.75 * float(moved[mask].mean())),
                 "size": float(1 - np.exp(-core.mean() / 0.002)),
                 "colour": _named_by(match, mask) ** (1.0 if named_colours(phrase) else 0.3),
-                "whole": 0.75 if _cut(mask) else 1.0,
+                "whole": 0.75 if is_cut(mask) else 1.0,
                 "vanishing": _vanishing(lab, gone, mask),
             },
         )
@@ -508,8 +485,3 @@ def _named_by(match: Float32[np.ndarray, "h w"] | None, mask: Bool[np.ndarray, "
     if match is None or not mask.any():
         return 1.0
     return 0.4 + 0.6 * min(1.0, float(match[mask].mean()) / 0.4)
-
-
-def _cut(mask: Bool[np.ndarray, "h w"]) -> bool:
-    x, y, w, h = bounding_box(mask)
-    return x <= 1 or y <= 1 or x + w >= mask.shape[1] - 1 or y + h >= mask.shape[0] - 1

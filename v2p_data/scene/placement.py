@@ -20,11 +20,13 @@ from v2p_data.scene.pose import (
     Silhouette,
     Within,
     camera_above,
+    fit_held,
     fit_lifted,
     fit_pose,
     fit_shape,
     on_wall,
     orientations,
+    three,
     yaw_of,
 )
 from v2p_data.scene.scale import SizeVote, camera_height_m, table_width_m
@@ -39,6 +41,11 @@ _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 _SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
 _TURN_COST = 0.007
 """Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
+_TOUCH_PX = 5
+"""A tool is at work as long as it is so near to what it pushes; then it is in the air."""
+_NO_SPREAD = 0.01
+_GRIP_HEIGHT_M = 0.08
+"""Over the table, of a hand that pushes with something: the fist must clear the table."""
 _OTHER_FORM_COST = 0.02
 """By so much a noun's second form must cover an outline better: a box has a side and a turn more to choose than a cylinder."""
 _PITCH_RANGE_RAD = (0.15, 1.4)
@@ -125,18 +132,27 @@ def place(
     ]
     shape = footage.shape
     rests = [_rests(s, kind if s is thing else "generic") for s in objects]
-    ends = [_end_of(s, kind) for s in objects]
+    ends = [_end_of(s, kind, thing) for s in objects]
     last_unknown = [
         _hidden(footage, last_i, last_mask, s.first) | _others(objects, s, last_i)
         if s.moves
         else hidden
         for s, (last_i, last_mask), hidden in zip(objects, ends, unknown, strict=True)
     ]
-    pitch_rad, firsts = _best_pitch(shape, objects, unknown, rests, guess)
+    resting = [k for k, s in enumerate(objects) if not s.in_hand]
+    pitch_rad, fits = _best_pitch(
+        shape,
+        tuple(objects[k] for k in resting),
+        [unknown[k] for k in resting],
+        [rests[k] for k in resting],
+        guess,
+    )
+    firsts = dict(zip(resting, fits, strict=True))
     camera = camera_above(shape, pitch_rad, guess.fov_rad)
-    upright_cost, lasts = 0.0, list(firsts)
+    upright_cost, lasts = 0.0, dict(firsts)
     rivals: list[float | None] = [None] * len(objects)
-    for k, s in enumerate(objects):
+    for k in resting:
+        s = objects[k]
         if not s.moves:
             continue
         last_i, last_mask = ends[k]
@@ -144,7 +160,8 @@ def place(
         # One outline often fits a standing and a lying box alike; both ends together seldom do.
         options = _options(s, unknown[k], camera, rests[k], thorough=True)
         role = kind if s is thing else "push_with"
-        support, within = _goal(kind, objects, firsts) if s is thing else (0.0, None)
+        goal = firsts.get(1) if s is thing else None
+        support, within = _goal(kind, objects, firsts[0], goal) if goal else (0.0, None)
         found = [_fit_last(silhouette, s, role, first, support, within) for first in options]
         costs = [a.cost + b.cost for a, (b, _) in zip(options, found, strict=True)]
         best = int(np.argmin(costs))
@@ -156,9 +173,21 @@ def place(
             lasts[k] = _inside(lasts[k], support, within)
         upright_cost = cost if s is thing else upright_cost
     height_m, spread = camera_height_m(
-        [vote_of(s, fit) for s, fit in zip(objects, firsts, strict=True) if not _in_hand(s)],
-        guess.heights(pitch_rad),
+        [vote_of(objects[k], firsts[k]) for k in resting], guess.heights(pitch_rad)
     )
+    for k, s in enumerate(objects):
+        if s.in_hand:
+            firsts[k], lasts[k] = _fit_in_hand(
+                [
+                    (Silhouette(mask, hidden, camera), thing.masks[i])
+                    for i, mask, hidden in (
+                        (s.at, s.first, unknown[k]),
+                        (*ends[k], last_unknown[k]),
+                    )
+                ],
+                s,
+                height_m,
+            )
     placed = []
     for k, s in enumerate(objects):
         last_i, last_mask = ends[k]
@@ -282,13 +311,17 @@ def _options(
     return fits
 
 
-def _end_of(s: Sighting, kind: str) -> tuple[int, Bool[np.ndarray, "h w"]]:
-    """Return the footage frame of an object's last pose, and its mask there."""
+def _end_of(s: Sighting, kind: str, thing: Sighting) -> tuple[int, Bool[np.ndarray, "h w"]]:
+    """Return the footage frame of an object's last pose, and its mask there; `thing` is what is manipulated."""
     if s.role == "manipulated" and kind == "lift_up":
         i = _peak(s)
         return i, s.masks[i]
-    if s.at > 0 and s.moves:  # a tool may be gone again before the clip ends
-        i = int(np.flatnonzero(s.masks.any((1, 2)))[-1])
+    if s.in_hand or (s.at > 0 and s.moves):  # a tool may be gone again before the clip ends
+        seen = np.flatnonzero(s.masks.any((1, 2)))
+        touching = [
+            i for i in seen[seen > s.at] if (grow(s.masks[i], _TOUCH_PX) & thing.masks[i]).any()
+        ]
+        i = int(touching[-1] if s.in_hand and touching else seen[-1])
         return i, s.masks[i]
     return len(s.masks) - 1, s.last
 
@@ -329,14 +362,30 @@ def _fit_last(
     return min(turned, key=lambda fit: fit.cost), same.cost
 
 
+def _fit_in_hand(
+    seen: list[tuple[Silhouette, Bool[np.ndarray, "h w"]]], s: Sighting, height_m: float
+) -> list[Fit]:
+    """Return the poses of a tool in a hand, whose outline is seen beside that of what it pushes."""
+    grip = _GRIP_HEIGHT_M / height_m
+
+    def fits(size: tuple[float, float, float], spread: float) -> list[Fit]:
+        return [fit_held(mask, s.noun, size, spread, pushed, grip) for mask, pushed in seen]
+
+    if s.known_m:
+        return fits(three(np.array(s.known_m) / height_m), _NO_SPREAD)
+    free = fits(three(np.array(s.noun.size_m) / height_m), s.noun.spread)
+    # It has one length: as long as it is seen.
+    return fits(max((fit.size for fit in free), key=max), _NO_SPREAD)
+
+
 def _goal(
-    kind: str, objects: tuple[Sighting, ...], fits: list[Fit]
+    kind: str, objects: tuple[Sighting, ...], own_fit: Fit, goal_fit: Fit
 ) -> tuple[float, Within | None]:
     """Return how high above the table the manipulated object comes to rest, and over which disc [camera heights]."""
     if kind not in (*_INSIDE_KINDS, "cover") or len(objects) < 2:
         return 0.0, None
     thing, other = objects[0].noun, objects[1].noun
-    own, there = np.array(fits[0].size), np.array(fits[1].size)
+    own, there = np.array(own_fit.size), np.array(goal_fit.size)
     reach = there[:2].max() / 2
     if kind == "cover":
         room = max(0.2 * reach, (own[:2].max() - there[:2].max()) / 2)
@@ -344,7 +393,7 @@ def _goal(
     else:
         room = max(0.2 * reach, reach - own.min() / 2)
         support = _floor(there) if other.hollow else float(there[2])
-    return support, Within(xy=fits[1].T_world_obj[:2, 3], radius=float(room))
+    return support, Within(xy=goal_fit.T_world_obj[:2, 3], radius=float(room))
 
 
 def _inside(fit: Fit, support: float, within: Within) -> Fit:
@@ -390,8 +439,9 @@ def _course(
     """Return poses at well-tracked frames: position from the mask's centre, rotation blended."""
     first, last = first_fit.T_world_obj, last_fit.T_world_obj
     last_i, last_mask = end
+    depth: Observed = "no_depth" if s.in_hand else "full"
     # What a hand brings has no pose before it comes.
-    course = _Course([s.at], [first], [float(np.clip(first_fit.iou, 0, 1))], ["full"])
+    course = _Course([s.at], [first], [float(np.clip(first_fit.iou, 0, 1))], [depth])
     count = min(max_poses, last_i - s.at + 1)
     spots = np.unique(np.linspace(s.at, last_i, count).round().astype(int))
     on_table = kind in _SLIDING_KINDS
@@ -423,9 +473,9 @@ def _course(
             i,
             transform(rotation, position),
             0.7 * float(s.quality[i]),
-            "no_depth" if free else "full",
+            "no_depth" if free else depth,
         )
-    in_air = kind == "lift_up"
+    in_air = kind == "lift_up" or s.in_hand
     return course.then(last_i, last, last_fit.iou, "no_depth" if in_air else "full")
 
 
@@ -477,7 +527,7 @@ def _upright_axes(fit: Fit) -> Fit:
     size = np.abs(rest) @ np.array(fit.size)
     yawed = fit.T_world_obj[:3, :3] @ rest.T
     T = transform(yawed, fit.T_world_obj[:3, 3])
-    return replace(fit, size=_tuple3(size), T_world_obj=T)
+    return replace(fit, size=three(size), T_world_obj=T)
 
 
 def _rest_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -506,17 +556,7 @@ def _centre(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
     return np.array([x.mean() + 0.5, y.mean() + 0.5]) if len(x) else np.array([np.nan, np.nan])
 
 
-def _in_hand(s: Sighting) -> bool:
-    """Return whether it is first seen in a hand, which hides how long it is, and nearer to the camera than the table."""
-    return s.role == "tool" and s.at > 0 and s.known_m is None
-
-
 def vote_of(s: Sighting, fit: Fit) -> SizeVote:
     """Return what a fitted object says about the scale."""
     trust = max(0.1, fit.iou) * max(0.1, s.sure)
     return SizeVote(size=fit.size, noun=s.noun, trust=trust, known_m=s.known_m)
-
-
-def _tuple3(values: np.ndarray) -> tuple[float, float, float]:
-    a, b, c = (float(v) for v in values)
-    return a, b, c

@@ -105,6 +105,22 @@ class SceneObject:
         return np.asarray(self.poses_world[0], float)
 
     @property
+    def laid_pose(self) -> Float[np.ndarray, "7"]:
+        """The first pose, for what starts from there: what a hand holds then lies on its broadest side, the same way round."""
+        if self.observed[:1] != ("no_depth",):
+            return self.first_pose
+        R = Rotation.from_quat(self.first_pose[3:], scalar_first=True).as_matrix()
+        long, middle, short = np.argsort(self.size_m)[::-1]
+        level = np.array([*R[:2, long], 0.0])
+        laid = np.zeros((3, 3))
+        laid[:, long] = level / np.linalg.norm(level)
+        laid[2, short] = 1.0 if R[2, short] >= 0 else -1.0
+        laid[:, middle] = np.cross(laid[:, short], laid[:, long])
+        laid[:, middle] *= np.linalg.det(laid)
+        quat = Rotation.from_matrix(laid).as_quat(canonical=True, scalar_first=True)
+        return np.array([*self.first_pose[:2], self.size_m[short] / 2, *quat])
+
+    @property
     def last_pose(self) -> Float[np.ndarray, "7"]:
         return np.asarray(self.poses_world[-1], float)
 

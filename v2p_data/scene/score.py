@@ -50,6 +50,7 @@ MIN_CAVITY = 0.1
 """Of the convex hull; with less room inside a thing is not hollow."""
 SAME_SIDES = 1.15
 """Two orders of a box's sides are alike where the worse fits no more than by this factor worse."""
+_AT_REST_M = 0.002
 FRAME_SLACK = 2
 """File frames between two masks that still show the same moment, for clips thinned out while decoding."""
 HOLLOW_KINDS = ("insert", "throw_into", "throw", "cover", "uncover")
@@ -105,8 +106,10 @@ class FoundThing:
     """Of the file: later only for what a hand brings."""
     last_frame: int
     """Of the file."""
+    first_depth_seen: bool = True
+    """Whether the reconstruction says that it knows how far away the first pose is; of what is in a hand it does not."""
     last_depth_seen: bool = True
-    """Whether the reconstruction says that it knows how far away the last pose is; in mid-air it does not."""
+    """The same for the last pose; in mid-air it does not."""
     masks: Mapping[int, Bool[np.ndarray, "h w"]] = field(repr=False)
     """By frame of the file, at working size."""
 
@@ -139,11 +142,12 @@ class ThingScore:
     size_right: bool = False
     """Every side within MAX_SIZE_RATIO or SIZE_SLACK_M."""
     position_first_m: float | None = None
-    """Of the centre of the bounding box, in the scene frame."""
+    """Of the centre of the bounding box, in the scene frame; of a pose whose depth the scene declares unseen, across the
+    line of sight."""
     position_last_m: float | None = None
-    """The same; of a last pose whose depth the scene declares unseen, across the line of sight."""
-    position_last_depth_m: float | None = None
+    position_first_depth_m: float | None = None
     """Of such a pose, along the line of sight: what it declares not to know."""
+    position_last_depth_m: float | None = None
     position_first_cam_m: float | None = None
     """The same in the camera's frame, where a wrong distance to the whole scene shows."""
     position_last_cam_m: float | None = None
@@ -269,6 +273,7 @@ def found_of(reconstruction: Reconstruction) -> FoundClip:
                 T_world_last=thing.T_world_objs[-1],
                 first_frame=int(file_frame[thing.frames[0]]),
                 last_frame=int(file_frame[thing.frames[-1]]),
+                first_depth_seen=not thing.observed or thing.observed[0] == "full",
                 last_depth_seen=not thing.observed or thing.observed[-1] == "full",
                 masks=masks,
             )
@@ -423,23 +428,23 @@ def _score_thing(
     )
     centre_true, centre_found = (m.bounds.mean(axis=0)[None] for m in (true.mesh, found.mesh))
     ends = []
-    for T, T_found in ((T_first, found.T_world_first), (T_last, found.T_world_last)):
+    for T, T_found, depth_seen in (
+        (T_first, found.T_world_first, found.first_depth_seen),
+        (T_last, found.T_world_last, found.last_depth_seen),
+    ):
         here, there = apply(T, centre_true), apply(T_found, centre_found)
+        away, along = float(np.linalg.norm(here - there)), None
+        if not depth_seen:
+            away, along = _by_sight(here[0], there[0], clip.T_world_cam[:3, 3])
         in_camera = apply(inverse(clip.T_world_cam), here)
         in_camera_found = apply(inverse(understood.T_world_cam), there)
         ends.append(
             (
-                float(np.linalg.norm(here - there)),
+                away,
+                along,
                 float(np.linalg.norm(in_camera - in_camera_found)),
                 turn_between(true, found, T[:3, :3], T_found[:3, :3]),
             )
-        )
-    across, along = ends[1][0], None
-    if not found.last_depth_seen:
-        across, along = _by_sight(
-            apply(T_last, centre_true)[0],
-            apply(found.T_world_last, centre_found)[0],
-            clip.T_world_cam[:3, 3],
         )
     ious = _mask_ious(true, found)
     return ThingScore(
@@ -454,13 +459,14 @@ def _score_thing(
             ((ratio <= MAX_SIZE_RATIO) | (np.abs(sides - ours) <= SIZE_SLACK_M)).all()
         ),
         position_first_m=ends[0][0],
-        position_last_m=across,
-        position_last_depth_m=along,
-        position_first_cam_m=ends[0][1],
-        position_last_cam_m=ends[1][1],
-        turn_first_rad=ends[0][2],
-        turn_last_rad=ends[1][2],
-        travel_share=_travel_share(true, last),
+        position_last_m=ends[1][0],
+        position_first_depth_m=ends[0][1],
+        position_last_depth_m=ends[1][1],
+        position_first_cam_m=ends[0][2],
+        position_last_cam_m=ends[1][2],
+        turn_first_rad=ends[0][3],
+        turn_last_rad=ends[1][3],
+        travel_share=_travel_share(true, last, clip.things[0]),
         watertight=bool(found.mesh.is_watertight),
         hollow_agrees=true.hollow == found.hollow,
         hollow_matters=hollow_matters,
@@ -478,13 +484,21 @@ def _by_sight(
     return float(np.linalg.norm(found - true - along * sight)), abs(along)
 
 
-def _travel_share(true: TrueThing, last: int) -> float | None:
-    """Return how much of its way it had gone by that frame; None for what stays. A way may lead out and back."""
+def _travel_share(true: TrueThing, last: int, manipulated: TrueThing) -> float | None:
+    """Return how much of its way it had gone by that frame; None for what stays. A way may lead out and back.
+
+    A tool's way ends where what it moves comes to rest: then it is taken away, out of the picture.
+    """
     places = true.T_world_objs[:, :3, 3]
+    if not true.manipulated:
+        goal = manipulated.T_world_objs[-1, :3, 3]
+        ahead_m = np.linalg.norm(manipulated.T_world_objs[:, :3, 3] - goal, axis=1)
+        under_way = np.flatnonzero(ahead_m > _AT_REST_M)
+        places = places[: under_way[-1] + 2] if len(under_way) else places
     if np.linalg.norm(places - places[0], axis=1).max() < 0.02:
         return None
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum()])
-    return float(way[last] / way[-1])
+    return float(way[min(last, len(way) - 1)] / way[-1])
 
 
 def _seen_frames(true: TrueThing) -> list[int]:

@@ -152,6 +152,12 @@ def bounding_box(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:
     return int(x), int(y), int(w), int(h)
 
 
+def is_cut(mask: Bool[np.ndarray, "h w"]) -> bool:
+    """Return whether the picture's edge may cut the mask."""
+    x, y, w, h = bounding_box(mask)
+    return x <= 1 or y <= 1 or x + w >= mask.shape[1] - 1 or y + h >= mask.shape[0] - 1
+
+
 def edge_contrast(lab: np.ndarray, mask: Bool[np.ndarray, "h w"]) -> float:
     """Return the median Lab step between just inside and just outside the mask's outline."""
     x, y, w, h = bounding_box(mask)

@@ -16,7 +16,6 @@ from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
     SWALLOWING_KINDS,
     Watched,
-    find_held,
     find_movers,
     hand_at,
     rated,
@@ -36,6 +35,7 @@ from v2p_data.scene.segment import (
     solidity,
 )
 from v2p_data.scene.table import Table, find_table
+from v2p_data.scene.tool import find_tool
 from v2p_data.scene.track import carried, track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
@@ -81,6 +81,8 @@ class Sighting:
     hinted: bool = False
     swallowed: bool = False
     """Whether it was last seen going into what hides it at the end; the masks from then on repeat the last one seen."""
+    in_hand: bool = False
+    """Whether a hand brings it and takes it away: it never rests on the table."""
 
     @property
     def first(self) -> Bool[np.ndarray, "h w"]:
@@ -124,6 +126,8 @@ class _Marked:
     frame: int
     """Footage frame."""
     sure: float
+    box: Bool[np.ndarray, "h w"]
+    """What was drawn, or the box around the mask."""
 
 
 def sight(
@@ -170,10 +174,8 @@ def sight(
     for phrase, role in meaning.others:
         thing, mark = _sighting(clip, phrase, role), marked.get(phrase)
         seen: Sighting | None = None
-        if role == "tool" and held is not None:
-            seen = _mover(thing, footage, watched, held, mark)
-        elif role == "tool":
-            seen = _brought(scene, thing) if mark is None else _held(scene, thing, mark)
+        if role == "tool":
+            seen = _tool(scene, thing, mark, held)
         seen = seen or _stander(scene, thing, mark, taken)
         if seen is None:
             warnings.append(f"the '{phrase}' was not found and is left out")
@@ -263,22 +265,29 @@ def swallowed(watched: Watched, thing: Sighting, other: Sighting) -> Sighting:
     return replace(thing, masks=masks, quality=quality, swallowed=True)
 
 
-def _brought(scene: _Scene, thing: Sighting) -> Sighting | None:
-    """Return a tool that comes with the hand, or None."""
-    if scene.watched is None:
-        return None
-    brought = find_held(scene.watched, scene.mover)
-    if brought is None or brought[2] < scene.min_found:
-        return None
-    at, masks, sure = brought
-    return replace(
-        thing,
-        masks=masks,
-        quality=masks.any((1, 2)).astype(float),
-        at=at,
-        sure=sure,
-        why="it comes with the hand",
-    )
+def _tool(
+    scene: _Scene, thing: Sighting, mark: _Marked | None, held: Moved | None
+) -> Sighting | None:
+    """Return a tool, or None: in a hand that brings it, else what moves as well, or what is marked, followed."""
+    found = None
+    if scene.watched is not None:
+        box = None if mark is None else (mark.frame, mark.box)
+        found = find_tool(scene.footage, scene.watched, scene.mover, thing.noun, box)
+    if found is not None and (mark is not None or found.sure >= scene.min_found or held is None):
+        return replace(
+            thing,
+            masks=found.masks,
+            quality=found.quality,
+            moves=True,
+            at=found.at,
+            sure=found.sure if mark is None else mark.sure,
+            why=found.why,
+            hinted=mark is not None,
+            in_hand=True,
+        )
+    if mark is not None:
+        return _held(scene, thing, mark)
+    return None if held is None else _mover(thing, scene.footage, scene.watched, held, mark)
 
 
 def _held(scene: _Scene, thing: Sighting, mark: _Marked) -> Sighting | None:
@@ -303,6 +312,7 @@ def _held(scene: _Scene, thing: Sighting, mark: _Marked) -> Sighting | None:
         at=mark.frame,
         sure=mark.sure,
         hinted=True,
+        in_hand=True,
     )
 
 
@@ -395,7 +405,8 @@ def _marked(
         i = int(np.abs(footage.frame_idx - box.frame).argmin())
         x0, y0, x1, y1 = (v * footage.px_scale for v in box.box_xyxy)
         mask = from_box(footage.rgb[i], (x0, y0, x1, y1), _thing_at(watched, i))
-        out[phrase] = _Marked(mask=mask, frame=i, sure=box.score)
+        inside = _inside_of((x0, y0, x1, y1), footage.shape)
+        out[phrase] = _Marked(mask=mask, frame=i, sure=box.score, box=inside)
     for phrase, hint in clip.hints.items():
         if not ("box" in hint or "points" in hint):
             continue
@@ -406,8 +417,20 @@ def _marked(
             mask = from_box(image, (x0, y0, x1, y1), _thing_at(watched, i))
         else:
             mask = from_points(image, [(x * scale, y * scale) for x, y in hint["points"]])
-        out[phrase] = _Marked(mask=mask, frame=i, sure=_HINTED_SURE)
+            x0, y0, w, h = bounding_box(mask)
+            x1, y1 = x0 + w, y0 + h
+        inside = _inside_of((x0, y0, x1, y1), footage.shape)
+        out[phrase] = _Marked(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
     return out
+
+
+def _inside_of(
+    box_xyxy: tuple[float, float, float, float], shape: tuple[int, int]
+) -> Bool[np.ndarray, "h w"]:
+    x0, y0, x1, y1 = (max(0, round(v)) for v in box_xyxy)
+    inside = np.zeros(shape, bool)
+    inside[y0:y1, x0:x1] = True
+    return inside
 
 
 def _thing_at(watched: Watched | None, i: int) -> Float[np.ndarray, "h w"] | None:

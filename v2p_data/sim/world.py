@@ -363,7 +363,7 @@ def _rest_quat(obj: SceneObject, kind: str) -> tuple[float, float, float, float]
     """
     if kind.endswith("_hollow") or kind == "sphere" or not obj.poses_world:
         return (1.0, 0.0, 0.0, 0.0)
-    R = Rotation.from_quat(obj.first_pose[3:], scalar_first=True).as_matrix()
+    R = Rotation.from_quat(obj.laid_pose[3:], scalar_first=True).as_matrix()
     axis = int(np.argmax(np.abs(R[2])))
     sign = 1.0 if R[2, axis] > 0 else -1.0
     if kind == "mesh" and abs(R[2, axis]) < np.cos(np.radians(30)):

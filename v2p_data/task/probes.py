@@ -121,10 +121,10 @@ def at_rest(scene: Scene, count: int = 1, centre: tuple[float, float] = (0.5, 0.
 
 
 def first_pose(obj: SceneObject) -> Float[np.ndarray, "7"]:
-    """Return its first pose in the video; upright at the origin where it has none."""
+    """Return its first pose in the video, laid down where a hand held it; upright at the origin where it has none."""
     if not obj.poses_world:
         return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    return obj.first_pose.copy()
+    return obj.laid_pose.copy()
 
 
 def random_states(scene: Scene, count: int, rng: np.random.Generator) -> States:
