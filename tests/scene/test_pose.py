@@ -169,6 +169,34 @@ def test_a_ring_s_hole_says_nothing_against_its_outline():
     np.testing.assert_allclose(fit.T_world_obj[:3, 3], T[:3, 3], atol=0.02)
 
 
+@pytest.mark.parametrize("yaw_deg", [38, 50, 65])
+def test_the_edges_between_its_faces_tell_how_a_cube_is_turned(yaw_deg):
+    """Its outline, with some shadow taken along, hardly does: one that is turned otherwise and wider covers that as well."""
+    camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("cube")
+    side = 0.13
+    T = transform_from_pose(np.r_[1.3, 0.1, side / 2, quat_from_yaw(np.radians(yaw_deg))])
+    image = np.full((240, 320, 3), 150, np.uint8)
+    mask = np.zeros((240, 320), np.uint8)
+    eye = camera.T_world_cam[:3, 3]
+    for axis, shade in enumerate((70, 110, 190)):
+        for sign in (-1, 1):
+            normal = sign * T[:3, axis]
+            middle = T[:3, 3] + normal * side / 2
+            if (eye - middle) @ normal > 0:
+                u, v = T[:3, :3].T[axis - 1] * side / 2, T[:3, :3].T[axis - 2] * side / 2
+                corners = camera.project(middle + np.array([u + v, u - v, -u - v, v - u]))
+                for canvas, paint in ((image, (shade, shade // 2, 40)), (mask, 1)):
+                    cv2.fillConvexPoly(canvas, corners.round().astype(np.int32), paint)
+    y, x = np.nonzero(mask)
+    cv2.ellipse(mask, (int(x.max()) - 4, int(y.max()) - 6), (12, 6), 0, 0, 360, 1, -1)
+
+    fit = fit_shape(Silhouette(mask > 0, None, camera, image), noun, np.eye(3))
+
+    found = np.degrees(np.arctan2(fit.T_world_obj[1, 0], fit.T_world_obj[0, 0]))
+    off = (found - yaw_deg + 45) % 90 - 45
+    assert abs(off) < 5
+
+
 @pytest.mark.parametrize(("believed", "ends_at"), [(8, 8), (3, 3)])
 def test_a_lift_ends_where_the_thing_was_last_seen_highest(believed, ends_at):
     """It rises from frame 4 on; what is not believed is not seen, be it drawn as high as you like."""

@@ -120,13 +120,20 @@ def similarity(a: Float[np.ndarray, "l a b"], b: Float[np.ndarray, "l a b"]) -> 
 
 
 def shadow(
-    lab: Float32[np.ndarray, "h w 3"], bare: Float32[np.ndarray, "h w 3"]
+    lab: Float32[np.ndarray, "h w 3"],
+    bare: Float32[np.ndarray, "h w 3"],
+    darkest: float = 0.22,
+    drift: float = 0.0,
 ) -> Bool[np.ndarray, "h w"]:
-    """Return where `lab` is `bare` with less light: darker in proportion, of the same hue."""
+    """Return where `lab` is `bare` with less light: darker in proportion, of the same hue.
+
+    Nothing is as dark as the share `darkest`; the hue may be off by `drift` more for each step of lightness that is missing.
+    """
     lab, bare = cv2.GaussianBlur(lab, (0, 0), 1.0), cv2.GaussianBlur(bare, (0, 0), 1.0)
     ratio = lab[..., 0] / np.maximum(bare[..., 0], 1)
     tint = np.linalg.norm(lab[..., 1:] - bare[..., 1:] * ratio[..., None], axis=-1)
-    return (ratio > 0.22) & (ratio < 0.96) & (tint < 6)
+    missing = bare[..., 0] - lab[..., 0]
+    return (ratio > darkest) & (ratio < 0.96) & (tint < 6 + drift * missing)
 
 
 def skin_prior(image: UInt8[np.ndarray, "*time h w 3"]) -> Bool[np.ndarray, "*time h w"]:

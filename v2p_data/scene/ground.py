@@ -49,6 +49,9 @@ _LIKELY_WEIGHT = 2.5
 """Of how surely the network sees a thing there."""
 _NECKS = (0.4, 0.6, 0.8)
 _NEAR_KINDS = {"push_next_to", "drop_in_front_of", "push_with", "slide_to"}
+_APPROACHING_KINDS = {"push_next_to", "drop_in_front_of", "slide_to"}
+_APPROACH_WEIGHT = 1.0
+"""Of coming straight towards something."""
 _TOUCH_KINDS = {"cover", "insert", "throw_into", "place_onto"}
 
 
@@ -180,6 +183,9 @@ def find_other(
     top, tall = bounding_box(goal)[1::2]
     foot[: top + tall // 2] = False
     distance = cv2.distanceTransform((~goal).astype(np.uint8), cv2.DIST_L2, 5)
+    before = cv2.distanceTransform((~moved.first).astype(np.uint8), cv2.DIST_L2, 5)
+    ends = [np.argwhere(mask).mean(0) for mask in (moved.first, moved.last) if mask.any()]
+    way = float(np.linalg.norm(ends[-1] - ends[0])) if ends else 0.0
     colour = _colour(still, words)
     quarter = max(3, len(footage.lab) // 5)
     stack = footage.lab[-quarter:] if late else footage.lab[:quarter]
@@ -212,6 +218,9 @@ def find_other(
             if late:  # what was under the cover stands where its foot was
                 score += 2.5 * float((mask & foot).sum() / area - 0.6)
             gap = float(distance[mask].min())
+            if kind in _APPROACHING_KINDS:
+                nearer = float(before[mask].min()) - gap
+                score += _APPROACH_WEIGHT * float(np.clip(nearer / max(8.0, way), -1, 1))
             near = 20 if kind in _NEAR_KINDS | _TOUCH_KINDS or late else 60
             score -= min(gap / near, 4.0)
             ring = grow(mask, 3) & ~mask

@@ -7,7 +7,7 @@ are held; how far away something in mid-air is cannot be seen from one side and 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
@@ -130,7 +130,7 @@ def place(
         _hidden(footage, s.at, s.first, s.last if s.moves else None) | _others(objects, s, s.at)
         for s in objects
     ]
-    shape = footage.shape
+    images = [footage.rgb[s.at] for s in objects]
     rests = [_rests(s, kind if s is thing else "generic") for s in objects]
     ends = [_end_of(s, kind, thing) for s in objects]
     last_unknown = [
@@ -141,14 +141,14 @@ def place(
     ]
     resting = [k for k, s in enumerate(objects) if not s.in_hand]
     pitch_rad, fits = _best_pitch(
-        shape,
+        [images[k] for k in resting],
         tuple(objects[k] for k in resting),
         [unknown[k] for k in resting],
         [rests[k] for k in resting],
         guess,
     )
     firsts = dict(zip(resting, fits, strict=True))
-    camera = camera_above(shape, pitch_rad, guess.fov_rad)
+    camera = camera_above(footage.shape, pitch_rad, guess.fov_rad)
     upright_cost, lasts = 0.0, dict(firsts)
     rivals: list[float | None] = [None] * len(objects)
     for k in resting:
@@ -156,9 +156,9 @@ def place(
         if not s.moves:
             continue
         last_i, last_mask = ends[k]
-        silhouette = Silhouette(last_mask, last_unknown[k], camera)
+        silhouette = Silhouette(last_mask, last_unknown[k], camera, footage.rgb[last_i])
         # One outline often fits a standing and a lying box alike; both ends together seldom do.
-        options = _options(s, unknown[k], camera, rests[k], thorough=True)
+        options = _options(s, unknown[k], camera, rests[k], images[k])
         role = kind if s is thing else "push_with"
         goal = firsts.get(1) if s is thing else None
         support, within = _goal(kind, objects, firsts[0], goal) if goal else (0.0, None)
@@ -240,7 +240,7 @@ def with_forms(
 
 
 def _best_pitch(
-    shape: tuple[int, int],
+    images: list[UInt8[np.ndarray, "h w 3"]],
     objects: tuple[Sighting, ...],
     unknown: list[Bool[np.ndarray, "h w"]],
     rests: list[_Rests],
@@ -251,7 +251,7 @@ def _best_pitch(
     tried: list[float] = []
 
     def fits_at(pitch: float, *, thorough: bool) -> list[Fit]:
-        camera = camera_above(shape, pitch, guess.fov_rad)
+        camera = camera_above(images[0].shape[:2], pitch, guess.fov_rad)
         return [
             min(
                 _options(
@@ -259,6 +259,7 @@ def _best_pitch(
                     unknown[k],
                     camera,
                     rests[k][: None if thorough or k == 0 else 1],
+                    images[k],
                     thorough=thorough,
                 ),
                 key=lambda fit: fit.cost,
@@ -297,11 +298,12 @@ def _options(
     unknown: Bool[np.ndarray, "h w"],
     camera: Camera,
     rests: _Rests,
+    image: UInt8[np.ndarray, "h w 3"],
     *,
-    thorough: bool,
+    thorough: bool = True,
 ) -> list[Fit]:
     """Return the best fit for every way in which the object may rest."""
-    silhouette = Silhouette(s.first, unknown, camera)
+    silhouette = Silhouette(s.first, unknown, camera, image)
     fits = []
     for rest, extra in rests:
         fit = fit_shape(silhouette, s.noun, rest, thorough=thorough)

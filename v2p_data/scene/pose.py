@@ -9,19 +9,27 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import inverse, transform
+from v2p_data.scene.colour import lab_of
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.segment import bounding_box
 
 _WORK_PX = 110
 """Longer side of the crop in which silhouettes are compared."""
 _HIDDEN_WEIGHT = 0.15
+_EDGE_WEIGHT = 0.06
+"""What a box gains whose inner edges are all edges in the picture, in units of IoU: outlines hardly tell a cube's yaw."""
+_EDGE_BLUR_PX = 1.5
+_LEAST_STEP = 60.0
+"""Of Lab by Scharr's operator (32 per step of one): what is fainter is noise."""
+_LEAST_FACE_PX = 10
+"""Smaller boxes show no edges."""
 _GRIP_AT = 0.7
 """From its tip, as a share of its length: where a hand holds what it pushes with."""
 _TILTS = (0.34, 0.81)
@@ -80,7 +88,9 @@ class Silhouette:
         mask: Bool[np.ndarray, "h w"],
         unknown: Bool[np.ndarray, "h w"] | None,
         camera: Camera,
+        image: UInt8[np.ndarray, "h w 3"] | None = None,
     ) -> None:
+        """Crop the mask; `unknown` is what may hide the object, `image` shows its inner edges, where that is asked."""
         x, y, w, h = bounding_box(mask)
         pad = int(0.35 * max(w, h)) + 3
         self.camera, self.box, self.mask = camera, (x, y, w, h), mask
@@ -97,6 +107,10 @@ class Silhouette:
         self._known = known
         self._mask = _filled(warped > 0.5) & known
         self._area = int(self._mask.sum())
+        self._steps = None
+        if image is not None and min(w, h) >= _LEAST_FACE_PX:
+            flags = cv2.INTER_CUBIC if zoom > 1 else cv2.INTER_AREA
+            self._steps = _steps(cv2.warpAffine(image, move, canvas, flags=flags), self._mask)
 
     @property
     def at_border(self) -> bool:
@@ -119,6 +133,38 @@ class Silhouette:
             return -1.0
         common, wrong, hidden, _ = overlap
         return common / max(1.0, self._area + wrong + hidden_weight * hidden)
+
+    def inner_edges(
+        self,
+        form: str,
+        size: Float[np.ndarray, "3"] | tuple[float, float, float],
+        T_world_obj: Float[np.ndarray, "4 4"],
+    ) -> float:
+        """Return what a box gains whose edges between visible faces are edges in the picture, in units of IoU.
+
+        Nothing without a picture, and for other forms.
+        """
+        if self._steps is None or form != "box":
+            return 0.0
+        corner, ends = _inner_edges(size, T_world_obj, self.camera.T_world_cam[:3, 3])
+        if not len(ends):
+            return 0.0
+        share = np.linspace(0.12, 0.88, 12)[:, None, None]
+        points = (corner + share * (ends - corner)).reshape(-1, 3)
+        homogeneous = points @ self._matrix[:, :3].T + self._matrix[:, 3]
+        pixels = (homogeneous[:, :2] / homogeneous[:, 2:]).reshape(len(share), -1, 2)
+        if not np.isfinite(pixels).all():
+            return 0.0
+        way = pixels[-1] - pixels[0]
+        length = np.linalg.norm(way, axis=1)
+        across = np.stack([-way[:, 1], way[:, 0]], 1) / np.maximum(length, 1e-6)[:, None]
+        h, w = self._mask.shape
+        x, y = (pixels - 0.5).round().astype(int).reshape(-1, 2).T
+        inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
+        found = np.zeros((len(x), 2), np.float32)
+        found[inside] = self._steps[y[inside], x[inside]]
+        step = np.abs((found.reshape(len(share), -1, 2) * across).sum(-1)).mean(0)
+        return _EDGE_WEIGHT * float(step @ length / max(length.sum(), 1e-6))
 
     def visible(self, points_world: Float[np.ndarray, "n 3"]) -> float:
         """Return the share of the projected hull that the mask confirms."""
@@ -158,6 +204,41 @@ class Silhouette:
         y, x = np.nonzero(self.mask)
         k = int(away[y, x].argmin())
         return np.array([x[k] + 0.5, y[k] + 0.5])
+
+
+def _steps(
+    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w 2"]:
+    """Return the change of colour along x and y, as a share of what is much inside this mask, at most 1."""
+    lab = cv2.GaussianBlur(lab_of(image), (0, 0), _EDGE_BLUR_PX)
+    change = np.stack([cv2.Scharr(lab, cv2.CV_32F, 1, 0), cv2.Scharr(lab, cv2.CV_32F, 0, 1)], -1)
+    change = change.reshape(*mask.shape, 3, 2)
+    strongest = np.linalg.norm(change, axis=-1).argmax(-1)
+    step = np.take_along_axis(change, strongest[..., None, None], 2)[:, :, 0]
+    size = np.linalg.norm(step, axis=-1)
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((9, 9))) > 0
+    much = float(np.percentile(size[inner], 90)) if inner.any() else 0.0
+    return step / np.maximum(size, max(much, _LEAST_STEP))[..., None]
+
+
+def _inner_edges(
+    size: Float[np.ndarray, "3"] | tuple[float, float, float],
+    T_world_obj: Float[np.ndarray, "4 4"],
+    eye: Float[np.ndarray, "3"],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "edge 3"]]:
+    """Return the corner of a box that is nearest to the eye, and the other ends of its edges between visible faces."""
+    local = T_world_obj[:3, :3].T @ (eye - T_world_obj[:3, 3])
+    half = np.array(size) / 2
+    towards = np.where(local >= 0, half, -half)
+    faces = np.abs(local) > half
+    ends = []
+    for k in range(3):
+        if faces[k - 1] and faces[k - 2]:
+            end = towards.copy()
+            end[k] *= -1
+            ends.append(end)
+    corners = np.array([towards, *ends]) @ T_world_obj[:3, :3].T + T_world_obj[:3, 3]
+    return corners[0], corners[1:]
 
 
 def _filled(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -208,15 +289,22 @@ def fit_shape(
         return prior * scale0 * np.exp(logs)
 
     def cost(v: np.ndarray) -> float:
-        points = place(v)
+        size = size_of(v)
+        T = posed(v, size)
+        points = (unit * size) @ T[:3, :3].T + T[:3, 3]
         off = (v[3:] - v[3:].mean()) / spread
-        return 1 - silhouette.iou(points, _HIDDEN_WEIGHT) + _PRIOR_WEIGHT * float((off**2).sum())
+        edges = silhouette.inner_edges(noun.form, size, T)
+        held = _PRIOR_WEIGHT * float((off**2).sum())
+        return 1 - silhouette.iou(points, _HIDDEN_WEIGHT) + held - edges
+
+    def posed(v: np.ndarray, size: np.ndarray) -> np.ndarray:
+        return _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
 
     unit = outline_points(noun.form, (1.0, 1.0, 1.0), noun.taper)
 
     def place(v: np.ndarray) -> np.ndarray:
         size = size_of(v)
-        T = _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
+        T = posed(v, size)
         return (unit * size) @ T[:3, :3].T + T[:3, 3]
 
     turns = _yaw_starts(noun, rest, thorough)
@@ -230,9 +318,11 @@ def fit_shape(
         for yaw in turns
         for grow in ((0.0, 0.25) if thorough else (0.1,))
     ]
-    best = _search(cost, starts, np.array([0.25, 0.25, 0.3, *[0.25] * len(free)]))
+    steps = np.array([0.25, 0.25, 0.3, *[0.25] * len(free)])
+    # Outlines of a box at two yaws are nearly as good as each other.
+    best = _search(cost, starts, steps, kept=4 if thorough and noun.form == "box" else 2)
     size = size_of(best)
-    T = _resting(ground + best[:2] * scale0 * prior.max(), best[2], rest, size)
+    T = posed(best, size)
     points = outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
     return Fit(
         size=three(size),
@@ -274,7 +364,9 @@ def fit_pose(
         if within is not None:
             outside = float(np.linalg.norm(T[:2, 3] - within.xy)) - within.radius
             held += max(0.0, outside) / max(within.radius, 0.5 * float(extents.max()))
-        return 1 - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3], _HIDDEN_WEIGHT) + held
+        edges = silhouette.inner_edges(noun.form, extents, T)
+        outline = points0 @ T[:3, :3].T + T[:3, 3]
+        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + held - edges
 
     turns = _yaw_starts(noun, rest, thorough=True)
     if yaw_near is not None:
@@ -326,11 +418,10 @@ def fit_lifted(
 
     def cost(v: np.ndarray) -> float:
         T = place(v)
-        return (
-            1
-            - silhouette.iou(points0 @ T[:3, :3].T + T[:3, 3], _HIDDEN_WEIGHT)
-            + 0.01 * (1 - np.cos(v[2]))
-        )
+        edges = silhouette.inner_edges(noun.form, size, T)
+        outline = points0 @ T[:3, :3].T + T[:3, 3]
+        turned = 0.01 * (1 - np.cos(v[2]))
+        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + turned - edges
 
     best = _search(
         cost,
@@ -502,9 +593,12 @@ def _aligned(
 
 
 def _search(
-    cost: Callable[[np.ndarray], float], starts: list[np.ndarray], step: np.ndarray
+    cost: Callable[[np.ndarray], float],
+    starts: list[np.ndarray],
+    step: np.ndarray,
+    kept: int = 2,
 ) -> np.ndarray:
-    """Return the best of short Nelder-Mead runs, the best two of them carried to the end."""
+    """Return the best of short Nelder-Mead runs, the `kept` best of them carried to the end."""
 
     def run(start: np.ndarray, iterations: int, reach: float) -> tuple[float, np.ndarray]:
         simplex = np.array([start, *(start + np.diag(step * reach))])
@@ -517,5 +611,5 @@ def _search(
         found = minimize(cost, start, method="Nelder-Mead", options=options)
         return float(found.fun), found.x
 
-    short = sorted((run(start, 40, 1.0) for start in starts), key=lambda r: r[0])[:2]
+    short = sorted((run(start, 40, 1.0) for start in starts), key=lambda r: r[0])[:kept]
     return min((run(x, 220, 0.5) for _, x in short), key=lambda r: r[0])[1]

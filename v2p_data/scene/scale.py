@@ -61,6 +61,17 @@ def table_width_m(
     return float(height_m / (focal_widths * down)) if down > 0.02 else float("nan")
 
 
+def px_per_m(camera: SeenCamera, shape: tuple[int, int], row_px: float) -> float:
+    """Return how many pixels wide a metre across the view is, on the table where a picture of this shape shows that row."""
+    h, w = shape
+    middle, there = (
+        table_width_m(camera.pitch_rad, camera.focal_widths, 1.0, below)
+        for below in (0.0, (row_px - h / 2) / w)
+    )
+    ratio = there / middle
+    return w / camera.table_width_m / (ratio if np.isfinite(ratio) else 1.0)
+
+
 def camera_height_m(
     votes: list[SizeVote], measured: Sequence[tuple[float, float]] = ()
 ) -> tuple[float, float]:

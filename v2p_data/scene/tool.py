@@ -13,15 +13,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.scene.classes import HAND, MOVED
-from v2p_data.scene.colour import histogram, lab_of, likelihood, similarity
+from v2p_data.scene.colour import histogram, lab_of, likelihood, shadow, similarity
 from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.nouns import Noun
-from v2p_data.scene.scale import SeenCamera, table_width_m
+from v2p_data.scene.scale import px_per_m
 from v2p_data.scene.segment import bounding_box, grow, is_cut, tidy
 
 _PASSING_LAB = 10.0
 """A pixel that differs so much from what is there for good shows something that passes."""
+_DARKEST_SHADOW = 0.38
+"""Of the bare table's lightness: what a room reflects lights even shadows; dark tools are darker."""
+_HUE_LOST = 0.1
+"""Lab per step of lightness: overexposed tables have lost the hue that their shadows show."""
 _HALF_WIDTHS_PX = (2, 3, 5, 8, 12)
 """Of what is cut off what passes, so that thinner things are left, at working size."""
 _COLOURS = (2, 3, 4)
@@ -107,8 +111,8 @@ def find_tool(
         marked: a footage frame and the box there, as a mask, in which a user says it is.
     """
     background = lab_of(_background(footage, watched, pushed))
-    px_per_m = _px_per_m(watched.camera, pushed[0])
-    usual_px = tuple(side * px_per_m for side in sorted(noun.size_m)[:0:-1])
+    metre_px = px_per_m(watched.camera, footage.shape, float(np.nonzero(pushed[0])[0].mean()))
+    usual_px = tuple(side * metre_px for side in sorted(noun.size_m)[:0:-1])
     picks = set(watched.idx[:: max(1, len(watched.idx) // _LOOKS)].tolist())
     frames = sorted(picks | ({marked[0]} if marked else set()))
     pieces = []
@@ -161,17 +165,6 @@ def _area_beside(piece: _Piece, best: _Piece) -> float:
     return max(own, other) if is_cut(piece.mask) else own
 
 
-def _px_per_m(camera: SeenCamera, mask: Bool[np.ndarray, "h w"]) -> float:
-    """Return how large a metre of the table is in the picture where the mask is."""
-    h, w = mask.shape
-    below = (float(np.nonzero(mask)[0].mean()) - h / 2) / w
-    middle, there = (
-        table_width_m(camera.pitch_rad, camera.focal_widths, 1.0, b) for b in (0.0, below)
-    )
-    ratio = there / middle
-    return w / camera.table_width_m / (ratio if np.isfinite(ratio) else 1.0)
-
-
 def _background(
     footage: Footage, watched: Watched, pushed: Bool[np.ndarray, "time h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
@@ -195,26 +188,12 @@ def _frame(
         rgb=footage.rgb[i],
         lab=lab,
         passing=passing & ~grow(pushed[i], 1),
-        shaded=_shaded(lab, background),
+        shaded=shadow(lab, background, darkest=_DARKEST_SHADOW, drift=_HUE_LOST),
         hand=shares[HAND],
         moved=shares[MOVED],
         pushed=pushed[i],
         away_px=cv2.distanceTransform((~pushed[i]).astype(np.uint8), cv2.DIST_L2, 5),
     )
-
-
-def _shaded(
-    lab: Float32[np.ndarray, "h w 3"], bare: Float32[np.ndarray, "h w 3"]
-) -> Bool[np.ndarray, "h w"]:
-    """Return where a shadow may lie: of the bare table's hue, and lit by no less than what a room reflects.
-
-    Looser than `colour.shadow` where much light is missing: on overexposed tables the bare one has lost its hue.
-    """
-    lab, bare = cv2.GaussianBlur(lab, (0, 0), 1.0), cv2.GaussianBlur(bare, (0, 0), 1.0)
-    ratio = lab[..., 0] / np.maximum(bare[..., 0], 1)
-    tint = np.linalg.norm(lab[..., 1:] - bare[..., 1:] * ratio[..., None], axis=-1)
-    darker = bare[..., 0] - lab[..., 0]
-    return (ratio > 0.38) & (ratio < 0.96) & (tint < 6 + 0.1 * darker)
 
 
 def _best_pieces(
