@@ -6,12 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
+from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.classes import CLASSES, HAND, MOVED, TABLE
 from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import footage_of
 from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.scale import SeenCamera
+from v2p_data.scene.sight import sight
 from v2p_data.scene.tool import find_tool
+from v2p_data.video.captions import parse_caption
 from v2p_data.video.clip import Clip
 
 H, W, FRAMES = 240, 320, 24
@@ -21,7 +24,7 @@ SKIN, SLEEVE, BLOCK, GREEN = (214, 160, 130), (60, 60, 150), (190, 40, 40), (40,
 
 
 def drawn(colour=GREEN, shadow=True, with_stick=True):
-    """Return footage, what the network says of it, the block's masks and the stick's.
+    """Return clip, what the network says of it, the block's masks and the stick's.
 
     The block goes from x 200 to 150. Right of it comes the stick, then the hand; both come from the right and leave again.
     """
@@ -59,7 +62,7 @@ def drawn(colour=GREEN, shadow=True, with_stick=True):
         sticks.append((stick > 0) & (hand == 0) & (arm == 0))
     shares = [0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None]) for label in labels]
     clip = Clip(
-        item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=np.stack(frames), fps=12.0,
+        item="drawn", path=Path("drawn.mp4"), caption="Pushing red block with stick", objects=(), hints={}, frames=np.stack(frames), fps=12.0,
         total_frames=FRAMES, source_fps=12.0, source_frame=np.arange(FRAMES), times_s=np.arange(FRAMES) / 12,
         source_size_px=(W, H), warnings=(),
     )  # fmt: skip
@@ -70,7 +73,7 @@ def drawn(colour=GREEN, shadow=True, with_stick=True):
     watched = Watched(
         idx=np.arange(FRAMES), shares=shares, early=shares[0], late=shares[-1], camera=camera
     )
-    return footage_of(clip), watched, np.stack(blocks), np.stack(sticks)
+    return clip, watched, np.stack(blocks), np.stack(sticks)
 
 
 def iou(a, b):
@@ -78,9 +81,9 @@ def iou(a, b):
 
 
 def test_a_stick_that_the_network_takes_for_hand_is_found_and_followed():
-    footage, watched, blocks, sticks = drawn()
+    clip, watched, blocks, sticks = drawn()
 
-    tool = find_tool(footage, watched, blocks, noun_for("stick"))
+    tool = find_tool(footage_of(clip), watched, blocks, noun_for("stick"))
 
     assert tool.sure > 0.5
     seen = np.flatnonzero(tool.masks.any((1, 2)))
@@ -91,15 +94,16 @@ def test_a_stick_that_the_network_takes_for_hand_is_found_and_followed():
 
 
 def test_a_bare_hand_is_no_tool():
-    footage, watched, blocks, _ = drawn(with_stick=False, shadow=False)
+    clip, watched, blocks, _ = drawn(with_stick=False, shadow=False)
 
-    tool = find_tool(footage, watched, blocks, noun_for("stick"))
+    tool = find_tool(footage_of(clip), watched, blocks, noun_for("stick"))
 
     assert tool is None or tool.sure < 0.5
 
 
 def test_nothing_that_passes_is_no_tool():
-    footage, watched, blocks, _ = drawn()
+    clip, watched, blocks, _ = drawn()
+    footage = footage_of(clip)
     still = np.repeat(footage.rgb[:1], FRAMES, 0)
     lab = np.repeat(footage.lab[:1], FRAMES, 0)
     bare = type(footage)(
@@ -112,24 +116,26 @@ def test_nothing_that_passes_is_no_tool():
 @pytest.mark.parametrize("frame", [7, 12])
 def test_a_box_around_the_tool_decides_which_piece_it_is(frame):
     """The sleeve is marked: nobody would take it for a stick otherwise."""
-    footage, watched, blocks, sticks = drawn()
+    clip, watched, blocks, sticks = drawn()
     y, x = np.nonzero(sticks[frame])
     box = np.zeros((H, W), bool)
     box[y.min() : y.max() + 1, x.min() : x.max() + 1] = True
     elsewhere = np.zeros((H, W), bool)
     elsewhere[200:230, 20:60] = True
 
-    tool = find_tool(footage, watched, blocks, noun_for("stick"), (frame, box))
+    tool = find_tool(footage_of(clip), watched, blocks, noun_for("stick"), (frame, box))
 
     assert tool.at == frame
     assert iou(tool.masks[frame], sticks[frame]) > 0.6
-    assert find_tool(footage, watched, blocks, noun_for("stick"), (frame, elsewhere)) is None
+    assert (
+        find_tool(footage_of(clip), watched, blocks, noun_for("stick"), (frame, elsewhere)) is None
+    )
 
 
 def test_the_picture_edge_may_cut_the_tool():
     """Cut off at the right, so that no hand is seen until late: what is seen of it grows."""
-    footage, watched, blocks, sticks = drawn()
-    cut = 260
+    clip, watched, blocks, sticks = drawn()
+    footage, cut = footage_of(clip), 260
     narrow = type(footage)(
         **{
             **vars(footage),
@@ -150,3 +156,18 @@ def test_the_picture_edge_may_cut_the_tool():
     at = [i for i in range(9, 18) if tool.masks[i].any()]
     assert len(at) > 5
     assert np.median([iou(tool.masks[i], sticks[i][:, :cut]) for i in at]) > 0.6
+
+
+def test_a_scene_holds_the_tool_in_the_hand_and_makes_no_sense_without_it():
+    clip, watched, _, sticks = drawn()
+    bare, seen, _, _ = drawn(with_stick=False, shadow=False)
+    meaning = parse_caption(clip.caption, ())
+
+    block, stick = sight(clip, footage_of(clip), meaning, watched, 0.5).objects
+
+    assert (block.role, block.in_hand) == ("manipulated", False)
+    assert (stick.role, stick.in_hand, stick.moves) == ("tool", True, True)
+    assert iou(stick.masks[12], sticks[12]) > 0.6
+    with pytest.raises(ItemRejectedError, match="the 'stick' was not found") as error:
+        sight(bare, footage_of(bare), meaning, seen, 0.5)
+    assert error.value.reason == "reference_not_found"

@@ -173,10 +173,10 @@ def sight(
     taken = np.zeros(footage.shape, bool)
     for phrase, role in meaning.others:
         thing, mark = _sighting(clip, phrase, role), marked.get(phrase)
-        seen: Sighting | None = None
-        if role == "tool":
+        if role == "tool" and (watched is not None or mark is not None):
             seen = _tool(scene, thing, mark, held)
-        seen = seen or _stander(scene, thing, mark, taken)
+        else:
+            seen = _stander(scene, thing, mark, taken)
         if seen is None:
             warnings.append(f"the '{phrase}' was not found and is left out")
             continue
@@ -268,26 +268,39 @@ def swallowed(watched: Watched, thing: Sighting, other: Sighting) -> Sighting:
 def _tool(
     scene: _Scene, thing: Sighting, mark: _Marked | None, held: Moved | None
 ) -> Sighting | None:
-    """Return a tool, or None: in a hand that brings it, else what moves as well, or what is marked, followed."""
-    found = None
+    """Return a tool: in a hand that brings it, else what moves as well, or what is marked, followed.
+
+    None where it is not found and the caption can do without.
+
+    Raises:
+        ItemRejectedError: `reference_not_found`.
+    """
+    found, sure = None, 0.0
     if scene.watched is not None:
         box = None if mark is None else (mark.frame, mark.box)
         found = find_tool(scene.footage, scene.watched, scene.mover, thing.noun, box)
-    if found is not None and (mark is not None or found.sure >= scene.min_found or held is None):
+    if found is not None:
+        sure = found.sure if mark is None else mark.sure
+    if found is not None and sure >= scene.min_found:
         return replace(
             thing,
             masks=found.masks,
             quality=found.quality,
             moves=True,
             at=found.at,
-            sure=found.sure if mark is None else mark.sure,
+            sure=sure,
             why=found.why,
             hinted=mark is not None,
             in_hand=True,
         )
+    seen = None
     if mark is not None:
-        return _held(scene, thing, mark)
-    return None if held is None else _mover(thing, scene.footage, scene.watched, held, mark)
+        seen = _held(scene, thing, mark)
+    elif held is not None:
+        seen = _mover(thing, scene.footage, scene.watched, held, mark)
+    if seen is None:
+        _check_needed(scene, thing.phrase, sure)
+    return seen
 
 
 def _held(scene: _Scene, thing: Sighting, mark: _Marked) -> Sighting | None:
@@ -334,13 +347,7 @@ def _stander(
         sure = _rise(found.score, 1.0, 0.5) if found else 0.0
         mask = found.mask if found else np.zeros_like(taken)
     if sure < scene.min_found or not mask.any():
-        if phrase.lower() in scene.clip.caption.lower() and kind not in _OPTIONAL_KINDS:
-            raise ItemRejectedError(
-                "reference_not_found",
-                f"the '{phrase}' was not found in {scene.clip.item} (sure to {sure:.2f}); mark it with a box in "
-                "captions.json",
-                round(sure, 3),
-            )
+        _check_needed(scene, phrase, sure)
         return None
     masks = _less_what_passes(scene, mask)
     at = len(masks) - 1 if late else 0
@@ -354,6 +361,17 @@ def _stander(
         why="" if mark else "what stands there fits the words only so far",
         hinted=mark is not None,
     )
+
+
+def _check_needed(scene: _Scene, phrase: str, sure: float) -> None:
+    """Turn away a clip whose task makes no sense without an object that was not found."""
+    clip = scene.clip
+    if phrase.lower() in clip.caption.lower() and scene.meaning.kind not in _OPTIONAL_KINDS:
+        raise ItemRejectedError(
+            "reference_not_found",
+            f"the '{phrase}' was not found in {clip.item} (sure to {sure:.2f}); mark it with a box in captions.json",
+            round(sure, 3),
+        )
 
 
 def _sighting(clip: Clip, phrase: str, role: Role) -> Sighting:
