@@ -44,6 +44,7 @@ _TURN_COST = 0.007
 _TOUCH_PX = 5
 """A tool is at work as long as it is so near to what it pushes; then it is in the air."""
 _NO_SPREAD = 0.01
+"""Of the logarithm of a length that is known."""
 _GRIP_HEIGHT_M = 0.08
 """Over the table, of a hand that pushes with something: the fist must clear the table."""
 _OTHER_FORM_COST = 0.02

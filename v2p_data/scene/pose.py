@@ -109,7 +109,7 @@ class Silhouette:
         self._area = int(self._mask.sum())
         self._steps = None
         if image is not None and min(w, h) >= _LEAST_FACE_PX:
-            flags = cv2.INTER_CUBIC if zoom > 1 else cv2.INTER_AREA
+            flags = cv2.INTER_CUBIC if zoom > 1 else cv2.INTER_LINEAR
             self._steps = _steps(cv2.warpAffine(image, move, canvas, flags=flags), self._mask)
 
     @property
