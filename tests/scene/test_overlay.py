@@ -131,6 +131,25 @@ def test_what_lies_behind_the_camera_is_left_out(pushed):
     assert not drawn_over(away, 0).any()
 
 
+def test_a_tool_is_drawn_only_while_the_hand_holds_it(pushed):
+    box = pushed.objects[0]
+    some = slice(5, 10)
+    held = replace(
+        box, frames=box.frames[some], T_world_objs=box.T_world_objs[some], masks={},
+        confidences=box.confidences[some], observed=("no_depth",) * 5,
+    )  # fmt: skip
+    unheld = replace(held, observed=("full",) * 5)
+
+    drawn = {
+        name: [
+            drawn_over(replace(pushed, objects=(thing,) * 2), frame).any() for frame in (0, 7, 19)
+        ]
+        for name, thing in (("held", held), ("unheld", unheld))
+    }
+
+    assert drawn == {"held": [False, True, False], "unheld": [True, True, True]}
+
+
 def test_the_video_has_every_frame_and_its_first_and_last_as_pictures(pushed, tmp_path):
     write_overlay(pushed, tmp_path)
 

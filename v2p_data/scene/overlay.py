@@ -93,6 +93,7 @@ def draw(
     shown = [
         (thing, colour, _draw_shape(image, camera, thing, _pose_at(thing, frame), colour))
         for thing, colour in things[::-1]
+        if _has_pose(thing, frame)
     ]
     taken: list[Box] = []
     for thing, colour, extent in shown[::-1]:
@@ -246,8 +247,11 @@ def _object_row(width: int, thing: Estimate, frame: int, colour: Colour) -> np.n
     name = thing.name.replace("_", " ")
     nearest = int(np.abs(np.array(thing.frames) - frame).argmin())
     unseen = thing.observed[nearest : nearest + 1] == ("no_depth",)
-    where = f"at {x:+.0f} {y:+.0f} {z:+.0f} cm{', depth unseen' if unseen else ''}"
-    _row(row, f"{name}  {sides} cm", f"{where}, pose {sure:.2f}", colour)
+    where = (
+        f"at {x:+.0f} {y:+.0f} {z:+.0f} cm{', depth unseen' if unseen else ''}, pose {sure:.2f}"
+    )
+    there = _has_pose(thing, frame)
+    _row(row, f"{name}  {sides} cm", where if there else "no pose in this frame", colour)
     return row
 
 
@@ -267,6 +271,13 @@ def _row(band: UInt8[np.ndarray, "h w 3"], left: str, right: str, colour: Colour
     needed = _text_size(right)[0]
     if at + _text_size(left)[0] + 16 + needed <= width - 8:
         _text(band, right, (width - 8 - needed, base), (170, 176, 182))
+
+
+def _has_pose(thing: Estimate, frame: int) -> bool:
+    """Return whether it is known where a thing is: a tool in a hand is nowhere before it comes and once it is gone."""
+    if thing.observed[:1] != ("no_depth",):
+        return True
+    return thing.frames[0] - _MASK_GAP <= frame <= thing.frames[-1] + _MASK_GAP
 
 
 def _mask_at(thing: Estimate, frame: int) -> Bool[np.ndarray, "h w"] | None:
