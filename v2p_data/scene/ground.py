@@ -29,6 +29,7 @@ from v2p_data.scene.segment import (
     convex_hull,
     edge_contrast,
     grow,
+    iou,
     main_parts,
     refine,
     shrink,
@@ -378,7 +379,7 @@ def _blobs(
     for pixels, whole in views:
         for mask in _parts(pixels, h * w, _MIN_SHARE, _MAX_SHARE):
             share = float(changed[mask].mean())
-            if share < 0.3 or any(_iou(mask, other.mask) > 0.92 for other in blobs):
+            if share < 0.3 or any(iou(mask, other.mask) > 0.92 for other in blobs):
                 continue
             x, y, bw, bh = bounding_box(mask)
             area = int(mask.sum())
@@ -505,7 +506,3 @@ def _colour(image: UInt8[np.ndarray, "h w 3"], words: tuple[str, ...]) -> Bool[n
 def _border_sides(box: tuple[int, int, int, int], w: int, h: int) -> float:
     x, y, bw, bh = box
     return float(x <= 1) + float(x + bw >= w - 1) + float(y <= 1) + 0.3 * float(y + bh >= h - 1)
-
-
-def _iou(a: np.ndarray, b: np.ndarray) -> float:
-    return float((a & b).sum() / max(1, (a | b).sum()))

@@ -18,7 +18,7 @@ from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import inverse, transform
 from v2p_data.scene.colour import lab_of
 from v2p_data.scene.nouns import Noun
-from v2p_data.scene.segment import bounding_box
+from v2p_data.scene.segment import bounding_box, is_cut
 
 _WORK_PX = 110
 """Longer side of the crop in which silhouettes are compared."""
@@ -107,21 +107,11 @@ class Silhouette:
         self._known = known
         self._mask = _filled(warped > 0.5) & known
         self._area = int(self._mask.sum())
+        self._at_border = is_cut(mask)
         self._steps = None
         if image is not None and min(w, h) >= _LEAST_FACE_PX:
             flags = cv2.INTER_CUBIC if zoom > 1 else cv2.INTER_LINEAR
             self._steps = _steps(cv2.warpAffine(image, move, canvas, flags=flags), self._mask)
-
-    @property
-    def at_border(self) -> bool:
-        """Whether the picture's edge cuts the mask."""
-        x, y, w, h = self.box
-        return (
-            x <= 1
-            or y <= 1
-            or x + w >= self.camera.width_px - 1
-            or y + h >= self.camera.height_px - 1
-        )
 
     def iou(self, points_world: Float[np.ndarray, "n 3"], hidden_weight: float = 0.0) -> float:
         """Return how well the convex hull of the projected points covers the mask, where it could be seen.
@@ -189,7 +179,7 @@ class Silhouette:
         total = float(covered.sum())
         seen = covered & self._known
         common, hidden = float((seen & self._mask).sum()), total - float(seen.sum())
-        beyond = 0.0 if self.at_border else max(0.0, cv2.contourArea(hull) / 256 - total)
+        beyond = 0.0 if self._at_border else max(0.0, cv2.contourArea(hull) / 256 - total)
         return common, float(seen.sum()) - common + beyond, hidden, total + beyond
 
     @property

@@ -37,6 +37,7 @@ from v2p_data.scene.learned import (
 )
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.placement import UNSEEN_IOU, CameraGuess, Placed, Placement, place, with_forms
+from v2p_data.scene.pose import three
 from v2p_data.scene.refit import bent, refit
 from v2p_data.scene.scene import Observed, Role, Symmetry
 from v2p_data.scene.shape import ShapeChoice, ShapeConfig, best_shape
@@ -336,7 +337,7 @@ def _estimates(
         size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
         plain = shape.kind == "primitive" and not s.noun.bore and not cfg.mesh.worker
         if s.known_m:  # the user's word on the size outranks the outline's
-            size = _size3(height * np.array(placed.first.size))
+            size = three(height * np.array(placed.first.size))
             mesh, parts = _stretched(size, mesh, *parts)
         if s.noun.hollow and s.role in ("manipulated", "cover") and kind in ("cover", "uncover"):
             # A cover's own frame has its mouth below, as it lies: so the simulator builds it.
@@ -348,7 +349,7 @@ def _estimates(
             parts, how = (), "made by the mesh worker from one picture, scaled to the outline"
             if repair != "none":
                 how += f"; its mesh was not closed and was mended ({repair})"
-            size = _size3(mesh.extents)
+            size = three(mesh.extents)
         if cfg.pose.worker and s.moves:
             camera = _clip_camera(clip, placement, _origin(placement))
             poses, marks = poses_by_worker(clip, footage, s.masks, mesh, camera, cfg.pose)
@@ -460,8 +461,3 @@ def _sources(s: Sighting) -> dict[str, str]:
 def _mass(noun: Noun, size: tuple[float, float, float]) -> float:
     ratio = float(np.prod(size) / np.prod(noun.size_m))
     return round(noun.mass_kg * float(np.clip(ratio, 0.4, 2.5)), 4)
-
-
-def _size3(extents: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in extents)
-    return x, y, z

@@ -152,6 +152,11 @@ def bounding_box(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:
     return int(x), int(y), int(w), int(h)
 
 
+def iou(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
+    """Return two masks' intersection over their union; 0 where both are empty."""
+    return float((a & b).sum() / max(1, (a | b).sum()))
+
+
 def is_cut(mask: Bool[np.ndarray, "h w"]) -> bool:
     """Return whether the picture's edge may cut the mask."""
     x, y, w, h = bounding_box(mask)

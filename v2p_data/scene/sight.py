@@ -4,7 +4,7 @@ A user's box, points or a detector's box say where an object is in one frame; wi
 there decides. Everything works at the footage's size.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -421,25 +421,31 @@ def _marked(
     out = {}
     for phrase, box in boxes.items():
         i = int(np.abs(footage.frame_idx - box.frame).argmin())
-        x0, y0, x1, y1 = (v * footage.px_scale for v in box.box_xyxy)
-        mask = from_box(footage.rgb[i], (x0, y0, x1, y1), _thing_at(watched, i))
-        inside = _inside_of((x0, y0, x1, y1), footage.shape)
-        out[phrase] = _Marked(mask=mask, frame=i, sure=box.score, box=inside)
+        out[phrase] = _boxed(footage, watched, i, box.box_xyxy, box.score)
     for phrase, hint in clip.hints.items():
-        if not ("box" in hint or "points" in hint):
-            continue
         i = int(np.abs(footage.frame_idx - hint.get("frame", 0)).argmin())
-        image, scale = footage.rgb[i], footage.px_scale
         if "box" in hint:
-            x0, y0, x1, y1 = (v * scale for v in hint["box"])
-            mask = from_box(image, (x0, y0, x1, y1), _thing_at(watched, i))
-        else:
-            mask = from_points(image, [(x * scale, y * scale) for x, y in hint["points"]])
-            x0, y0, w, h = bounding_box(mask)
-            x1, y1 = x0 + w, y0 + h
-        inside = _inside_of((x0, y0, x1, y1), footage.shape)
-        out[phrase] = _Marked(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
+            out[phrase] = _boxed(footage, watched, i, hint["box"], _HINTED_SURE)
+        elif "points" in hint:
+            spots = [(x * footage.px_scale, y * footage.px_scale) for x, y in hint["points"]]
+            mask = from_points(footage.rgb[i], spots)
+            x, y, w, h = bounding_box(mask)
+            inside = _inside_of((x, y, x + w, y + h), footage.shape)
+            out[phrase] = _Marked(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
     return out
+
+
+def _boxed(
+    footage: Footage, watched: Watched | None, i: int, box_xyxy: Sequence[float], sure: float
+) -> _Marked:
+    """Return what a box in the clip's pixels means at footage frame `i`."""
+    x0, y0, x1, y1 = (v * footage.px_scale for v in box_xyxy)
+    return _Marked(
+        mask=from_box(footage.rgb[i], (x0, y0, x1, y1), _thing_at(watched, i)),
+        frame=i,
+        sure=sure,
+        box=_inside_of((x0, y0, x1, y1), footage.shape),
+    )
 
 
 def _inside_of(

@@ -18,7 +18,7 @@ from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.scale import px_per_m
-from v2p_data.scene.segment import bounding_box, grow, is_cut, tidy
+from v2p_data.scene.segment import bounding_box, grow, iou, is_cut, tidy
 
 _PASSING_LAB = 10.0
 """A pixel that differs so much from what is there for good shows something that passes."""
@@ -365,12 +365,11 @@ def _parts(
 
 def _likeness(before: _Piece, after: _Piece, moved: Bool[np.ndarray, "h w"]) -> float:
     """Return how much two frames' pieces look like one thing, 0 to 1; `moved` is the first where flow takes it."""
-    common = float((after.mask & moved).sum() / max(1, (after.mask | moved).sum()))
     ratio = float(np.log(after.mask.sum() / before.mask.sum()))
     if is_cut(before.mask) or is_cut(after.mask):
         ratio /= 2
     size = float(np.exp(-0.5 * (ratio / 0.5) ** 2))
-    return similarity(before.hist, after.hist) * size * (0.2 + 0.8 * common)
+    return similarity(before.hist, after.hist) * size * (0.2 + 0.8 * iou(after.mask, moved))
 
 
 def _flow(footage: Footage, before: int, now: int) -> Float32[np.ndarray, "h w 2"]:
@@ -393,7 +392,7 @@ def _fills(mask: Bool[np.ndarray, "h w"], box: Bool[np.ndarray, "h w"]) -> float
     own = np.zeros_like(box)
     x, y, w, h = bounding_box(mask)
     own[y : y + h, x : x + w] = True
-    return float((own & box).sum() / max(1, (own | box).sum()))
+    return iou(own, box)
 
 
 def _within(ratio: float, free: float, sd: float) -> float:

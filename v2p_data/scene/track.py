@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from v2p_data.scene.colour import histogram, likelihood, similarity
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Moved
-from v2p_data.scene.segment import bounding_box, convex_hull, grow, largest, tidy
+from v2p_data.scene.segment import bounding_box, convex_hull, grow, iou, largest, tidy
 
 _SAME_LAB = 6.0
 _LOST = 0.4
@@ -58,7 +58,7 @@ def track(
     # The hand often breaks the object into pieces at the end; the mask carried there may be the better one.
     end = (
         forward[-1]
-        if carried > found + 0.05 and _iou(forward[-1], moved.last) > 0.05
+        if carried > found + 0.05 and iou(forward[-1], moved.last) > 0.05
         else moved.last
     )
     end = _less_hand(footage, n - 1, end, moved.look)
@@ -83,7 +83,7 @@ def track(
     for i in range(1, n):
         if not masks[i].any():
             masks[i] = masks[i - 1]
-    meets = max(_iou(forward[-1], moved.last), _iou(backward[0], moved.first))
+    meets = max(iou(forward[-1], moved.last), iou(backward[0], moved.first))
     return Track(masks=masks, quality=quality, meets=meets)
 
 
@@ -230,7 +230,3 @@ def _likeness(
         return 0.0
     alike = similarity(look, histogram(footage.rgb[i][mask]))
     return alike * float(np.exp(-0.5 * np.log(size / area) ** 2))
-
-
-def _iou(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
-    return float((a & b).sum() / max(1, (a | b).sum()))
