@@ -56,6 +56,7 @@ from v2p_data.scene.score import (
     found_of,
     rejected,
     score_clip,
+    shown_at,
 )
 from v2p_data.seeds import rng_for
 from v2p_data.video import synthetic
@@ -191,12 +192,9 @@ def boxes_of(true: TrueClip, camera: Camera, rng: np.random.Generator) -> dict[s
     hints: dict[str, Any] = {}
     size = np.array([camera.width_px, camera.height_px])
     for thing in true.things:
-        shown = [frame for frame in sorted(thing.masks) if thing.masks[frame].sum() >= 12]
-        if not shown:
+        frame = shown_at(thing)
+        if frame is None:
             continue
-        frame = shown[0]
-        if frame > min(thing.masks):  # what comes later, a person marks where it shows best
-            frame = max(shown, key=lambda k: (thing.masks[k].sum(), k))
         y, x = np.nonzero(thing.masks[frame])
         scale = camera.width_px / WIDTH_PX
         corners = np.array([[x.min(), y.min()], [x.max() + 1, y.max() + 1]]) * scale

@@ -8,7 +8,7 @@ import pytest
 
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.colour import histogram
-from v2p_data.scene.find import Watched, find_movers, rated, standing
+from v2p_data.scene.find import Watched, apart, find_movers, rated, standing
 from v2p_data.scene.footage import footage_of
 from v2p_data.scene.ground import Moved
 from v2p_data.scene.nouns import noun_for
@@ -243,6 +243,29 @@ def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours():
 
     assert (course.masks[-1] & thing).sum() > 0.85 * thing.sum()
     assert (course.masks[-1] & ~thing).sum() < 0.15 * thing.sum()
+
+
+def test_where_a_thing_will_stand_is_not_part_of_its_first_outline():
+    footage, _ = watched_of([[(square(30 + 2 * i, 40), RED, MOVED)] for i in range(10)])
+    first, last = large(square(30, 40), footage), large(square(48, 40), footage)
+    moved = Moved(first=first | last, last=last, score=1.0, look=np.zeros((12, 24, 24)))
+
+    freed = apart(footage, moved)
+
+    assert iou(freed.first, square(30, 40)) > 0.9
+    assert (freed.last == last).all()
+    assert freed.look.sum() == pytest.approx(1)
+    assert (apart(footage, moved, keep=(0,)).first == (first | last)).all()
+
+
+def test_what_is_covered_by_both_outlines_stays_with_both_where_it_shows_the_thing_twice():
+    footage, _ = watched_of([[(square(30 + i, 40), RED, MOVED)] for i in range(8)])
+    first, last = large(square(30, 40), footage), large(square(37, 40), footage)
+
+    same = apart(footage, Moved(first=first, last=last, score=1.0, look=np.zeros((12, 24, 24))))
+
+    assert (same.first == first).all()
+    assert (same.last == last).all()
 
 
 def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen():

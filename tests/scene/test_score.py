@@ -18,6 +18,7 @@ from v2p_data.scene.score import (
     rejected,
     score_clip,
     shape_ious,
+    shown_at,
     size_sides,
     turn_between,
 )
@@ -267,6 +268,17 @@ def test_what_is_hidden_at_first_is_looked_for_at_the_end():
     thing = scored(true, found).things[0]
     assert thing.box_iou == 1
     assert thing.iou_mean == 1
+
+
+def test_what_comes_and_goes_is_looked_for_where_it_shows_most():
+    hidden, leaving = np.zeros_like(SEEN), mask(slice(10, 20), slice(0, 4))
+    masks = {0: hidden, 4: SEEN, 6: SEEN, 9: leaving}
+    true = true_thing(masks=masks)
+
+    assert shown_at(true) == 6
+    assert scored(true, found_thing(masks={6: SEEN, 9: ~SEEN})).things[0].box_iou == 1
+    assert scored(true, found_thing(masks={6: leaving, 9: leaving})).things[0].box_iou == 0
+    assert shown_at(true_thing(masks=dict.fromkeys(masks, hidden))) is None
 
 
 def test_a_reconstruction_that_stops_before_the_motion_fails_its_pose():

@@ -52,6 +52,12 @@ SWALLOWING_KINDS = ("insert", "throw_into")
 """What is moved so may be hidden at the end."""
 _END_WEIGHT = {"insert": 0.4, "throw_into": 0.4, "place_onto": 0.5, "cover": 0.5}
 """How much the last outline counts: a rim, or the hand that still holds it, hides part of what was put there."""
+_AROUND_PX = 10
+_LEAST_OWN, _LEAST_WRONG, _LEAST_LEFT = 0.25, 0.1, 0.3
+"""Shares of an outline: what must not lie in the other's place to tell how the thing looks, what is worth cutting off, and
+what must be left."""
+_BARE_RATIO = 1.0
+"""Logarithm of how much better what lies around explains a pixel than the thing does."""
 _LEAST_SHARE = 0.0007
 """Of the picture: smaller things cannot be measured."""
 
@@ -277,6 +283,43 @@ def find_movers(
     if by_colour[1] * (0.3 + held[0]) > by_colour[0] * (0.3 + held[1]):
         best, second = second, best
     return _moved(pairs, best), _moved(pairs, second)
+
+
+def apart(footage: Footage, moved: Moved, keep: Sequence[int] = ()) -> Moved:
+    """Return the two outlines without what each has of the other's place: both change, but only one shows the thing.
+
+    A part that both have is bare in one of them where it looks there like what lies around the two, rather than like the rest
+    of that outline; where there is hardly a rest, rather than in the other picture.
+
+    Args:
+        footage: frames.
+        moved: both outlines.
+        keep: 0 for a first one, 1 for a last one that is taken as it is.
+    """
+    masks, images = [moved.first, moved.last], [footage.rgb[0], footage.rgb[-1]]
+    both = masks[0] & masks[1]
+    around = grow(masks[0] | masks[1], _AROUND_PX) & ~grow(masks[0] | masks[1], 2)
+    if not both.any():
+        return moved
+    bare = [_log_likelihood(image, around) for image in images]
+    for k, image in enumerate(images):
+        own = masks[k] & ~both
+        tells = own.sum() > _LEAST_OWN * masks[k].sum()
+        ratio = bare[k] - (_log_likelihood(image, own) if tells else bare[1 - k])
+        least = _BARE_RATIO if tells else 2 * _BARE_RATIO
+        wrong = both & (cv2.GaussianBlur(ratio, (0, 0), 2) > least)
+        rest, area = largest(tidy(masks[k] & ~wrong)), masks[k].sum()
+        if k not in keep and wrong.sum() > _LEAST_WRONG * area and rest.sum() > _LEAST_LEFT * area:
+            masks[k] = rest
+    first, last = masks
+    return replace(moved, first=first, last=last, look=histogram(images[0][first]))
+
+
+def _log_likelihood(
+    image: UInt8[np.ndarray, "h w 3"], region: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """Return how likely each pixel's colour is in a region of the same picture."""
+    return np.log(likelihood(histogram(image[region]), image) + 1e-6).astype(np.float32)
 
 
 def standing(watched: Watched, *, late: bool) -> Float32[np.ndarray, "h w"]:

@@ -130,7 +130,7 @@ class ThingScore:
 
     phrase: str
     box_iou: float = 0.0
-    """Of the bounding boxes at the first frame, or at the last for what is hidden at first."""
+    """Of the bounding boxes at the first frame, or for what is not seen there, in the one that shows most of it."""
     iou_first: float | None = None
     iou_last: float | None = None
     iou_mean: float | None = None
@@ -522,11 +522,22 @@ def _mask_ious(true: TrueThing, found: FoundThing) -> list[float]:
     return out
 
 
+def shown_at(true: TrueThing) -> int | None:
+    """Return the frame of the file in which a person would point at it: the first, or the one that shows most of what comes later.
+
+    None where it is never seen. Of equals the latest: what is uncovered lies free at the end.
+    """
+    if not _seen_frames(true):
+        return None
+    if _seen_at_first(true):
+        return min(true.masks)
+    return max(true.masks, key=lambda frame: (int(true.masks[frame].sum()), frame))
+
+
 def _grounding_iou(true: TrueThing, found: FoundThing) -> float:
-    frames = _seen_frames(true)
-    if not frames or not found.masks:
+    frame = shown_at(true)
+    if frame is None or not found.masks:
         return 0.0
-    frame = frames[0] if _seen_at_first(true) else frames[-1]
     near = _nearest(found, frame)
     assert near is not None
     return _box_iou(true.masks[frame], found.masks[near])

@@ -16,6 +16,7 @@ from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
     SWALLOWING_KINDS,
     Watched,
+    apart,
     find_movers,
     hand_at,
     rated,
@@ -505,7 +506,8 @@ def _find_movers(
         raise ItemRejectedError(
             "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
         )
-    return moved, held
+    given = [end for end, mask in enumerate((first, last)) if mask is not None]
+    return apart(footage, moved, given), held
 
 
 def _at_end(mark: _Marked, footage: Footage) -> bool:
