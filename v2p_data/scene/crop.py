@@ -22,7 +22,7 @@ class View:
     mask: Bool[np.ndarray, "h w"]
     """Its visible pixels, at the camera's size."""
     T_world_obj: Float[np.ndarray, "4 4"]
-    """Of the fitted primitive [m]."""
+    """Of the shape that is compared with the mask: the fitted primitive, or a mesh [m]."""
     hidden: Bool[np.ndarray, "h w"] | None = None
     """Pixels that say nothing, because something may stand in front."""
 

@@ -6,6 +6,7 @@ outline alone is ambiguous (faces swap, flat things thicken), so the noun's prop
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -108,10 +109,16 @@ class Silhouette:
         self._mask = _filled(warped > 0.5) & known
         self._area = int(self._mask.sum())
         self._at_border = is_cut(mask)
-        self._steps = None
+        self._picture = None
         if image is not None and min(w, h) >= _LEAST_FACE_PX:
             flags = cv2.INTER_CUBIC if zoom > 1 else cv2.INTER_LINEAR
-            self._steps = _steps(cv2.warpAffine(image, move, canvas, flags=flags), self._mask)
+            self._picture = cv2.warpAffine(image, move, canvas, flags=flags)
+
+    @cached_property
+    def _edges(self) -> Float32[np.ndarray, "h w 2"]:
+        """Changes of colour in the crop, worked out where a box asks for them."""
+        assert self._picture is not None
+        return _changes(self._picture, self._mask)
 
     def iou(self, points_world: Float[np.ndarray, "n 3"], hidden_weight: float = 0.0) -> float:
         """Return how well the convex hull of the projected points covers the mask, where it could be seen.
@@ -134,7 +141,7 @@ class Silhouette:
 
         Nothing without a picture, and for other forms.
         """
-        if self._steps is None or form != "box":
+        if self._picture is None or form != "box":
             return 0.0
         corner, ends = _inner_edges(size, T_world_obj, self.camera.T_world_cam[:3, 3])
         if not len(ends):
@@ -152,7 +159,7 @@ class Silhouette:
         x, y = (pixels - 0.5).round().astype(int).reshape(-1, 2).T
         inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
         found = np.zeros((len(x), 2), np.float32)
-        found[inside] = self._steps[y[inside], x[inside]]
+        found[inside] = self._edges[y[inside], x[inside]]
         step = np.abs((found.reshape(len(share), -1, 2) * across).sum(-1)).mean(0)
         return _EDGE_WEIGHT * float(step @ length / max(length.sum(), 1e-6))
 
@@ -196,7 +203,7 @@ class Silhouette:
         return np.array([x[k] + 0.5, y[k] + 0.5])
 
 
-def _steps(
+def _changes(
     image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 2"]:
     """Return the change of colour along x and y, as a share of what is much inside this mask, at most 1."""
