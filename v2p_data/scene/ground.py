@@ -6,7 +6,7 @@ strongest cue, the vanishing edge second. The best score is also the gate: below
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -46,6 +46,8 @@ _LARGE = 0.01
 """Of the picture: the outlines of smaller things are ragged."""
 _SPLIT_COST = 0.6
 """A piece of an outline must score so much better than the whole: light and print cut things into pieces, too."""
+_SEEN_AS_THING = 0.35
+"""Mean of what the network says, from which on the outline keeps to what it takes for a thing."""
 _LIKELY_WEIGHT = 2.5
 """Of how surely the network sees a thing there."""
 _NECKS = (0.4, 0.6, 0.8)
@@ -239,9 +241,22 @@ def find_other(
                 best = Found(mask=mask, score=score)
     if best is None:
         return None
-    refined = refine(still, best.mask, never=None if late else moved.first)
-    grew = refined.sum() / best.mask.sum()
-    return Found(mask=refined if 0.5 <= grew <= 1.8 else best.mask, score=best.score)
+    never = np.zeros((h, w), bool) if late else moved.first
+    return replace(best, mask=_outlined(still, best.mask, never, likely))
+
+
+def _outlined(
+    still: UInt8[np.ndarray, "h w 3"],
+    blob: Bool[np.ndarray, "h w"],
+    never: Bool[np.ndarray, "h w"],
+    likely: Float32[np.ndarray, "h w"] | None,
+) -> Bool[np.ndarray, "h w"]:
+    """Return the outline around a thing that stands there, or the blob where there is no clear one."""
+    if likely is not None and float(likely[blob].mean()) > _SEEN_AS_THING:
+        # Print on the table has clearer edges than a thing may have; to the network it is table.
+        never = never | ~grow(likely > 0.25, 3)
+    mask = refine(still, blob, never)
+    return mask if 0.5 <= mask.sum() / blob.sum() <= 1.8 else blob
 
 
 def _pieces(mask: Bool[np.ndarray, "h w"], least_px: float) -> list[Bool[np.ndarray, "h w"]]:
