@@ -46,8 +46,8 @@ _LARGE = 0.01
 """Of the picture: the outlines of smaller things are ragged."""
 _SPLIT_COST = 0.6
 """A piece of an outline must score so much better than the whole: light and print cut things into pieces, too."""
-_SEEN_AS_THING = 0.35
-"""Mean of what the network says, from which on the outline keeps to what it takes for a thing."""
+_SEEN_AS_THING, _NO_THING = 0.35, 0.15
+"""What the network says, in the mean, of what it takes for a thing, and of each pixel around it that is none."""
 _LIKELY_WEIGHT = 2.5
 """Of how surely the network sees a thing there."""
 _NECKS = (0.4, 0.6, 0.8)
@@ -254,7 +254,7 @@ def _outlined(
     """Return the outline around a thing that stands there, or the blob where there is no clear one."""
     if likely is not None and float(likely[blob].mean()) > _SEEN_AS_THING:
         # Print on the table has clearer edges than a thing may have; to the network it is table.
-        never = never | ~grow(likely > 0.25, 3)
+        never = never | ~grow(likely > _NO_THING, 3)
     mask = refine(still, blob, never)
     return mask if 0.5 <= mask.sum() / blob.sum() <= 1.8 else blob
 
