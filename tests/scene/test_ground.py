@@ -12,7 +12,7 @@ from v2p_data.scene.table import find_table
 from v2p_data.video.clip import Clip
 
 H, W = 240, 320
-TABLE_RGB, RED, BLUE, PRINT = (150, 140, 120), (190, 40, 40), (70, 85, 130), (70, 85, 130)
+TABLE_RGB, RED, BLUE = (150, 140, 120), (190, 40, 40), (70, 85, 130)
 
 
 def block(x: int, y: int, w: int, h: int) -> np.ndarray:
@@ -31,7 +31,7 @@ def footage() -> Footage:
     frames = []
     for i in range(16):
         image = np.tile(np.array(TABLE_RGB, float), (H, W, 1))
-        image[PRINTED], image[STANDS], image[block(40 + 8 * i, 105, 30, 30)] = PRINT, BLUE, RED
+        image[PRINTED | STANDS], image[block(40 + 8 * i, 105, 30, 30)] = BLUE, RED
         frames.append(np.clip(image + noise, 0, 255).astype(np.uint8))
     clip = Clip(
         item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=np.stack(frames), fps=12.0,
@@ -41,7 +41,7 @@ def footage() -> Footage:
     return footage_of(clip)
 
 
-def found(footage: Footage, likely: np.ndarray | None) -> np.ndarray:
+def found(footage: Footage, likely: np.ndarray) -> np.ndarray:
     moved = Moved(
         first=block(40, 105, 30, 30), last=block(160, 105, 30, 30), score=1.0, look=np.zeros((12, 24, 24))
     )  # fmt: skip

@@ -297,19 +297,21 @@ def apart(footage: Footage, moved: Moved, keep: Sequence[int] = ()) -> Moved:
         keep: 0 for a first one, 1 for a last one that is taken as it is.
     """
     masks, images = [moved.first, moved.last], [footage.rgb[0], footage.rgb[-1]]
-    both = masks[0] & masks[1]
-    around = grow(masks[0] | masks[1], _AROUND_PX) & ~grow(masks[0] | masks[1], 2)
+    both, either = masks[0] & masks[1], masks[0] | masks[1]
     if not both.any():
         return moved
+    around = grow(either, _AROUND_PX) & ~grow(either, 2)
     bare = [_log_likelihood(image, around) for image in images]
     for k, image in enumerate(images):
-        own = masks[k] & ~both
-        tells = own.sum() > _LEAST_OWN * masks[k].sum()
+        if k in keep:
+            continue
+        own, area = masks[k] & ~both, masks[k].sum()
+        tells = own.sum() > _LEAST_OWN * area
         ratio = bare[k] - (_log_likelihood(image, own) if tells else bare[1 - k])
         least = _BARE_RATIO if tells else 2 * _BARE_RATIO
         wrong = both & (cv2.GaussianBlur(ratio, (0, 0), 2) > least)
-        rest, area = largest(tidy(masks[k] & ~wrong)), masks[k].sum()
-        if k not in keep and wrong.sum() > _LEAST_WRONG * area and rest.sum() > _LEAST_LEFT * area:
+        rest = largest(tidy(masks[k] & ~wrong))
+        if wrong.sum() > _LEAST_WRONG * area and rest.sum() > _LEAST_LEFT * area:
             masks[k] = rest
     first, last = masks
     return replace(moved, first=first, last=last, look=histogram(images[0][first]))
