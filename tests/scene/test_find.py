@@ -8,7 +8,15 @@ import pytest
 
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.colour import histogram
-from v2p_data.scene.find import Watched, apart, find_movers, rated, standing
+from v2p_data.scene.find import (
+    Watched,
+    apart,
+    completed,
+    find_movers,
+    rated,
+    settled,
+    standing,
+)
 from v2p_data.scene.footage import footage_of
 from v2p_data.scene.ground import Moved
 from v2p_data.scene.nouns import noun_for
@@ -266,6 +274,37 @@ def test_what_is_covered_by_both_outlines_stays_with_both_where_it_shows_the_thi
 
     assert (same.first == first).all()
     assert (same.last == last).all()
+
+
+def seen_as(**sure):
+    """Return what the network says of every pixel: each class where its mask is, `table` elsewhere, 0.95 sure."""
+    label = np.full((H, W), TABLE)
+    for what, mask in sure.items():
+        label[mask] = {"moved": MOVED, "other": OTHER}[what]
+    return (0.0125 + 0.9375 * (label == np.arange(len(CLASSES))[:, None, None])).astype(np.float32)
+
+
+def test_a_shadow_in_the_outline_that_the_network_sees_as_table_is_cut_off():
+    thing, shadow = square(40, 30, 20), square(60, 36, 14)
+
+    found = settled(thing | shadow, seen_as(moved=thing))
+
+    assert np.array_equal(found, thing)
+
+
+def test_where_the_network_does_not_know_the_thing_its_outline_stays():
+    thing = square(40, 30, 20)
+
+    assert np.array_equal(settled(thing, seen_as(moved=square(40, 30, 6))), thing)
+
+
+def test_what_adjoins_an_outline_and_surely_is_a_thing_belongs_to_it():
+    whole, part = square(40, 30, 20), square(40, 30, 20) & ~square(56, 30, 20)
+    far = square(80, 30, 10)
+    shares = seen_as(other=whole | far)
+
+    assert np.array_equal(completed(part, shares[OTHER]), whole)
+    assert np.array_equal(completed(part, 0.9 * shares[OTHER]), part), "not sure enough"
 
 
 def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen():

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.classes import HAND, MOVED, OTHER
@@ -17,9 +17,11 @@ from v2p_data.scene.find import (
     SWALLOWING_KINDS,
     Watched,
     apart,
+    completed,
     find_movers,
     hand_at,
     rated,
+    settled,
     standing,
     table_seen,
 )
@@ -53,6 +55,8 @@ _LEAST_HAND = 0.002
 _LITTLE = 0.2
 """Of a thing's first outline: when no more than this is seen of it, it is hidden."""
 _TOUCH_PX = 6
+_BOX_ERROR_PX = 3
+"""As far a box drawn by hand may be off, in a picture 320 px wide."""
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
 """What the caption says of other objects is an aside here: such a scene makes sense without them."""
 
@@ -441,12 +445,12 @@ def _boxed(
 ) -> _Marked:
     """Return what a box in the clip's pixels means at footage frame `i`."""
     x0, y0, x1, y1 = (v * footage.px_scale for v in box_xyxy)
-    return _Marked(
-        mask=from_box(footage.rgb[i], (x0, y0, x1, y1), _thing_at(watched, i)),
-        frame=i,
-        sure=sure,
-        box=_inside_of((x0, y0, x1, y1), footage.shape),
-    )
+    thing = _thing_at(watched, i)
+    mask = from_box(footage.rgb[i], (x0, y0, x1, y1), thing)
+    inside = _inside_of((x0, y0, x1, y1), footage.shape)
+    if thing is not None:
+        mask = completed(mask, np.where(grow(inside, _BOX_ERROR_PX), thing, 0))
+    return _Marked(mask=mask, frame=i, sure=sure, box=inside)
 
 
 def _inside_of(
@@ -458,7 +462,7 @@ def _inside_of(
     return inside
 
 
-def _thing_at(watched: Watched | None, i: int) -> Float[np.ndarray, "h w"] | None:
+def _thing_at(watched: Watched | None, i: int) -> Float32[np.ndarray, "h w"] | None:
     if watched is None:
         return None
     shares = watched.at(i)
@@ -507,7 +511,18 @@ def _find_movers(
             "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
         )
     given = [end for end, mask in enumerate((first, last)) if mask is not None]
+    if watched is not None:
+        moved = _settled(footage, watched, moved, given)
     return apart(footage, moved, given), held
+
+
+def _settled(footage: Footage, watched: Watched, moved: Moved, keep: Sequence[int]) -> Moved:
+    """Return both outlines without what the network surely sees as table; those in `keep` are taken as they are."""
+    first, last = (
+        mask if end in keep else settled(mask, watched.at(i))
+        for end, (mask, i) in enumerate(((moved.first, 0), (moved.last, int(watched.idx[-1]))))
+    )
+    return replace(moved, first=first, last=last, look=histogram(footage.rgb[0][first]))
 
 
 def _at_end(mark: _Marked, footage: Footage) -> bool:
