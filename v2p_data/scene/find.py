@@ -64,6 +64,8 @@ _BESIDE_PX = 12
 """Of a picture 320 px wide: as far the network's word completes an outline."""
 _MOST_CUT = 0.6
 """Of an outline: where the network sees more of it as table, it does not know the thing."""
+_LEAST_CHANGE = 0.05
+"""Of an outline: what is not worth mending."""
 _LEAST_SHARE = 0.0007
 """Of the picture: smaller things cannot be measured."""
 
@@ -335,7 +337,7 @@ def settled(
     kept = mask & ~(shares[TABLE] > _SURELY_TABLE)
     if kept.sum() < (1 - _MOST_CUT) * mask.sum():
         kept = mask
-    return completed(kept, shares[MOVED])
+    return _if_worth(completed(kept, shares[MOVED]), mask)
 
 
 def completed(
@@ -343,7 +345,14 @@ def completed(
 ) -> Bool[np.ndarray, "h w"]:
     """Return an outline with what adjoins it and surely belongs to a thing; `thing` is how likely each pixel does."""
     whole = tidy(mask | ((thing > _SURELY) & grow(mask, _BESIDE_PX)))
-    return largest(whole) if whole.any() else mask
+    return _if_worth(largest(whole), mask) if whole.any() else mask
+
+
+def _if_worth(
+    new: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the new outline where it is another one, the old one where they differ by no more than an edge's noise."""
+    return new if (new ^ mask).sum() > _LEAST_CHANGE * mask.sum() else mask
 
 
 def _log_likelihood(

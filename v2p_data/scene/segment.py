@@ -56,7 +56,7 @@ def from_box(
     masks = [
         mask
         for mask in candidates
-        if mask is not None and mask.sum() > 12 and _spans(mask, (x0, y0, x1, y1)) > 0.5
+        if mask is not None and mask.sum() > 12 and spans(mask, (x0, y0, x1, y1)) > 0.5
     ]
     if not masks:
         ellipse = np.zeros((h, w), np.uint8)
@@ -65,7 +65,7 @@ def from_box(
     return max(masks, key=lambda mask: _plausibility(image, mask, (x0, y0, x1, y1)))
 
 
-def _spans(mask: Bool[np.ndarray, "h w"], box: tuple[int, int, int, int]) -> float:
+def spans(mask: Bool[np.ndarray, "h w"], box: tuple[int, int, int, int]) -> float:
     """Return how much of a box the mask's own bounding box covers, and it of that (intersection over union)."""
     x, y, w, h = bounding_box(mask)
     x0, y0, x1, y1 = box
@@ -256,4 +256,4 @@ def _plausibility(image: np.ndarray, mask: np.ndarray, box: tuple[int, int, int,
     x0, y0, x1, y1 = box
     everything = 0.5 if mask.sum() > 0.93 * (x1 - x0) * (y1 - y0) else 0.0
     contrast = min(40.0, edge_contrast(lab_of(image), mask))
-    return _spans(mask, box) + 0.5 * solidity(mask) + 0.008 * contrast - everything
+    return spans(mask, box) + 0.5 * solidity(mask) + 0.008 * contrast - everything

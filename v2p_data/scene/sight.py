@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.classes import HAND, MOVED, OTHER
@@ -36,6 +36,7 @@ from v2p_data.scene.segment import (
     grow,
     largest,
     solidity,
+    spans,
 )
 from v2p_data.scene.table import Table, find_table
 from v2p_data.scene.tool import find_tool
@@ -55,8 +56,8 @@ _LEAST_HAND = 0.002
 _LITTLE = 0.2
 """Of a thing's first outline: when no more than this is seen of it, it is hidden."""
 _TOUCH_PX = 6
-_BOX_ERROR_PX = 3
-"""As far a box drawn by hand may be off, in a picture 320 px wide."""
+_FILLED = 0.85
+"""People draw boxes tightly: of an outline that spans less of its box a part is missing."""
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
 """What the caption says of other objects is an aside here: such a scene makes sense without them."""
 
@@ -445,11 +446,14 @@ def _boxed(
 ) -> _Marked:
     """Return what a box in the clip's pixels means at footage frame `i`."""
     x0, y0, x1, y1 = (v * footage.px_scale for v in box_xyxy)
-    thing = _thing_at(watched, i)
-    mask = from_box(footage.rgb[i], (x0, y0, x1, y1), thing)
-    inside = _inside_of((x0, y0, x1, y1), footage.shape)
-    if thing is not None:
-        mask = completed(mask, np.where(grow(inside, _BOX_ERROR_PX), thing, 0))
+    box = (x0, y0, x1, y1)
+    mask = from_box(footage.rgb[i], box, _thing_at(watched, i))
+    inside = _inside_of(box, footage.shape)
+    drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
+    if watched is not None and spans(mask, drawn) < _FILLED:
+        shares = watched.at(i)  # what moves may stand before something that does not
+        own = max((MOVED, OTHER), key=lambda what: float(shares[what][mask].mean()))
+        mask = completed(mask, np.where(inside, shares[own], 0))
     return _Marked(mask=mask, frame=i, sure=sure, box=inside)
 
 
@@ -462,7 +466,7 @@ def _inside_of(
     return inside
 
 
-def _thing_at(watched: Watched | None, i: int) -> Float32[np.ndarray, "h w"] | None:
+def _thing_at(watched: Watched | None, i: int) -> Float[np.ndarray, "h w"] | None:
     if watched is None:
         return None
     shares = watched.at(i)
