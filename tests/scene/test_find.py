@@ -12,6 +12,7 @@ from v2p_data.scene.find import (
     Watched,
     apart,
     completed,
+    filled,
     find_movers,
     rated,
     settled,
@@ -305,6 +306,15 @@ def test_what_adjoins_an_outline_and_surely_is_a_thing_belongs_to_it():
 
     assert np.array_equal(completed(part, shares[OTHER]), whole)
     assert np.array_equal(completed(part, 0.9 * shares[OTHER]), part), "not sure enough"
+
+
+def test_an_outline_is_completed_within_its_box_and_by_its_own_kind():
+    whole, inside = square(40, 30, 20), square(40, 30, 30)
+    part, behind = whole & ~square(54, 30, 20), square(40, 20, 30) & ~whole
+    shares = seen_as(other=behind, moved=whole)
+
+    assert np.array_equal(filled(part, shares, inside), whole)
+    assert np.array_equal(filled(part, shares, part), part), "nothing beyond the box"
 
 
 def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen():

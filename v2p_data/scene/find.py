@@ -348,6 +348,19 @@ def completed(
     return _if_worth(largest(whole), mask) if whole.any() else mask
 
 
+def filled(
+    mask: Bool[np.ndarray, "h w"],
+    shares: Float32[np.ndarray, "5 h w"],
+    inside: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    """Return an outline completed `inside` of the box that somebody drew around it.
+
+    Only by what is seen as the same kind, moved or not: what moves may stand before something that does not.
+    """
+    own = max((MOVED, OTHER), key=lambda what: float(shares[what][mask].mean()))
+    return completed(mask, np.where(inside, shares[own], 0))
+
+
 def _if_worth(
     new: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:

@@ -17,7 +17,7 @@ from v2p_data.scene.find import (
     SWALLOWING_KINDS,
     Watched,
     apart,
-    completed,
+    filled,
     find_movers,
     hand_at,
     rated,
@@ -451,9 +451,7 @@ def _boxed(
     inside = _inside_of(box, footage.shape)
     drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
     if watched is not None and spans(mask, drawn) < _FILLED:
-        shares = watched.at(i)  # what moves may stand before something that does not
-        own = max((MOVED, OTHER), key=lambda what: float(shares[what][mask].mean()))
-        mask = completed(mask, np.where(inside, shares[own], 0))
+        mask = filled(mask, watched.at(i), inside)
     return _Marked(mask=mask, frame=i, sure=sure, box=inside)
 
 
