@@ -69,6 +69,8 @@ from v2p_data.video.synthetic_truth import Truth, load_truth, write
 ROOT = Path(__file__).parents[1]
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 FINAL_RUNS = "final_runs.jsonl"
+_IMPORTED_ONCE = ("v2p_data.scene.network", "v2p_data.scene.reconstruct", "v2p_data.video.synthetic")
+"""By the process that all others are forked from: importing torch takes as long as half a clip."""
 JITTER_PX = 3.0
 """Standard deviation of each side of a box drawn by hand, in a picture 640 px wide."""
 FPS = 12
@@ -118,15 +120,14 @@ def main() -> None:
     os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
     args.out.mkdir(parents=True, exist_ok=True)
     runs = _note_final_run(args) if args.split == "final" else []
-    folders = dict(
-        _each(
-            args.jobs, _drawn, [(job, args.out / "clips", args.old_clips) for job in jobs], "drawn"
-        )
-    )
+    folders = {job.name: _folder(job, args.out / "clips", args.old_clips) for job in jobs}
+    missing = [(job, folders[job.name]) for job in jobs if not folders[job.name].is_dir()]
+    for _ in _each(args.jobs, _draw_clip, missing, "drawn"):
+        pass
     name = f"{args.split}{'_quick' if args.quick else ''}{'_boxes' if args.boxes else ''}"
     pictures = args.out / f"pictures_{name}"
     tasks = [(job, folders[job.name], args.boxes, pictures) for job in jobs]
-    rows = [row for _, row in _each(args.jobs, _reconstructed, tasks, "reconstructed")]
+    rows = list(_each(args.jobs, _reconstructed, tasks, "reconstructed"))
     rows.sort(key=lambda row: (KINDS.index(row["kind"]), row["seed"]))
     summary = summarised(rows)
     result = {
@@ -423,7 +424,8 @@ def _commit() -> str:
 
 def _each(jobs: int, function: Any, tasks: list[tuple[Any, ...]], done: str) -> Iterator[Any]:
     """Run tasks in fresh processes, a few at a time, so that each has its own peak of memory."""
-    context = multiprocessing.get_context("forkserver")  # a child starts with the imports done
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(_IMPORTED_ONCE))
     with ProcessPoolExecutor(jobs, mp_context=context, max_tasks_per_child=1) as pool:
         futures: list[Future[Any]] = [pool.submit(function, *task) for task in tasks]
         for i, future in enumerate(as_completed(futures), 1):
@@ -432,30 +434,28 @@ def _each(jobs: int, function: Any, tasks: list[tuple[Any, ...]], done: str) -> 
             yield future.result()
 
 
-def _drawn(job: Job, cache: Path, old_code: bool) -> tuple[str, Path]:
-    """Return the clip's folder, and draw it if this very clip was not drawn before by the same code."""
-    spec = job.spec()
-    recipe = _digest(json.dumps(asdict(spec), sort_keys=True, default=str).encode())
+def _folder(job: Job, cache: Path, old_code: bool) -> Path:
+    """Return where the clip is, or where it belongs if this very clip was not drawn before by the same code."""
+    recipe = _digest(json.dumps(asdict(job.spec()), sort_keys=True, default=str).encode())
     sources = sorted(Path(synthetic.__file__).parent.glob("synthetic*.py"))
     code = _digest(b"".join(source.read_bytes() for source in sources))
-    folder = cache / f"{job.name}-{recipe}-{code}"
     older = sorted(cache.glob(f"{job.name}-{recipe}-{'[0-9a-f]' * len(code)}"))
-    if old_code and older:
-        return job.name, older[-1]
-    if not folder.is_dir():
-        partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        write(render(spec), partial)
-        partial.rename(folder)
-    return job.name, folder
+    return older[-1] if old_code and older else cache / f"{job.name}-{recipe}-{code}"
+
+
+def _draw_clip(job: Job, folder: Path) -> None:
+    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    write(render(job.spec()), partial)
+    partial.rename(folder)
 
 
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:8]
 
 
-def _reconstructed(job: Job, folder: Path, boxes: bool, pictures: Path) -> tuple[str, Row]:
+def _reconstructed(job: Job, folder: Path, boxes: bool, pictures: Path) -> Row:
     truth = load_truth(folder, job.name)
     true = true_of(truth)
     said: Row = {"caption": truth.caption}
@@ -519,7 +519,7 @@ def _reconstructed(job: Job, folder: Path, boxes: bool, pictures: Path) -> tuple
     }
     if clip is not None:
         _draw(row, true, found, made, clip, pictures)
-    return job.name, row
+    return row
 
 
 def _accepted(made: Reconstruction) -> tuple[bool, str | None]:
