@@ -69,7 +69,11 @@ from v2p_data.video.synthetic_truth import Truth, load_truth, write
 ROOT = Path(__file__).parents[1]
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 FINAL_RUNS = "final_runs.jsonl"
-_IMPORTED_ONCE = ("v2p_data.scene.network", "v2p_data.scene.reconstruct", "v2p_data.video.synthetic")
+_IMPORTED_ONCE = (
+    "v2p_data.scene.network",
+    "v2p_data.scene.reconstruct",
+    "v2p_data.video.synthetic",
+)
 """By the process that all others are forked from: importing torch takes as long as half a clip."""
 JITTER_PX = 3.0
 """Standard deviation of each side of a box drawn by hand, in a picture 640 px wide."""
