@@ -50,8 +50,10 @@ def named_colours(phrase: str) -> tuple[str, ...]:
 
 def lab_of(image: UInt8[np.ndarray, "*time h w 3"]) -> Float32[np.ndarray, "*time h w 3"]:
     """Return Lab of an RGB image or of a stack of them."""
-    flat = image.reshape(-1, image.shape[-2], 3)
-    lab = cv2.cvtColor(flat.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    stack = image.reshape(-1, *image.shape[-3:])
+    lab = np.empty(stack.shape, np.float32)
+    for frame, out in zip(stack, lab, strict=True):  # one at a time: a clip takes much memory
+        cv2.cvtColor(frame.astype(np.float32) / 255, cv2.COLOR_RGB2LAB, dst=out)
     return lab.reshape(image.shape)
 
 

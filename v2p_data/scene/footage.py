@@ -20,6 +20,7 @@ _LEAST_STILL = 0.8
 """Of a tile, for it to tell of the camera."""
 _STILL_FRAMES = 24
 """At most so many frames make a still."""
+_ROWS = 32
 _THERE_AND_BACK_PX = 0.7
 _FEW_CORNERS = 12
 """With fewer corners to follow nothing is said about the camera."""
@@ -145,15 +146,20 @@ def end_quarters(n: int) -> tuple[slice, slice]:
 def still_of(rgb: UInt8[np.ndarray, "time h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return per pixel the colour that is there most of the time (mode seeking from the median)."""
     pick = np.unique(np.linspace(0, len(rgb) - 1, min(_STILL_FRAMES, len(rgb))).astype(int))
-    colours, lab = rgb[pick].astype(np.float32), lab_of(rgb[pick])
-    centre = np.median(lab, axis=0)
-    weight = np.ones(lab.shape[:3], np.float32)
-    for _ in range(3):
-        distance = np.linalg.norm(lab - centre, axis=-1)
-        weight = np.exp(-((distance / 8) ** 2)) + 1e-4
-        centre = (weight[..., None] * lab).sum(0) / weight.sum(0)[..., None]
-    mean = (weight[..., None] * colours).sum(0) / weight.sum(0)[..., None]
-    return np.clip(mean.round(), 0, 255).astype(np.uint8)
+    still = np.empty(rgb.shape[1:], np.uint8)
+    for top in range(0, len(still), _ROWS):  # a few rows at a time: large frames take much memory
+        rows = slice(top, top + _ROWS)
+        colours = rgb[pick, rows].astype(np.float32)
+        lab = lab_of(rgb[pick, rows])
+        centre = np.median(lab, axis=0)
+        weight = np.ones(lab.shape[:3], np.float32)
+        for _ in range(3):
+            distance = np.linalg.norm(lab - centre, axis=-1)
+            weight = np.exp(-((distance / 8) ** 2)) + 1e-4
+            centre = (weight[..., None] * lab).sum(0) / weight.sum(0)[..., None]
+        mean = (weight[..., None] * colours).sum(0) / weight.sum(0)[..., None]
+        still[rows] = np.clip(mean.round(), 0, 255)
+    return still
 
 
 def camera_shift_px(footage: Footage, passed: Bool[np.ndarray, "h w"] | None = None) -> float:

@@ -241,7 +241,9 @@ def _check_still(footage: Footage, watched: Watched | None, cfg: SceneConfig) ->
 
 
 def _check_change(footage: Footage) -> None:
-    change = np.linalg.norm(footage.lab[1:] - footage.lab[:1], axis=-1).max(0)
+    change = np.zeros(footage.shape, np.float32)
+    for lab in footage.lab[1:]:
+        np.maximum(change, np.linalg.norm(lab - footage.lab[0], axis=-1), out=change)
     share = float((change > 15).mean())
     if share < 0.003:
         raise ItemRejectedError(
