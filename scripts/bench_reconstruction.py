@@ -33,6 +33,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -74,7 +75,7 @@ _IMPORTED_ONCE = (
     "v2p_data.scene.reconstruct",
     "v2p_data.video.synthetic",
 )
-"""By the process that all others are forked from: importing torch takes as long as half a clip."""
+"""By the process that all others are forked from: importing torch anew for each takes seconds."""
 JITTER_PX = 3.0
 """Standard deviation of each side of a box drawn by hand, in a picture 640 px wide."""
 FPS = 12
@@ -438,16 +439,24 @@ def _each(jobs: int, function: Any, tasks: list[tuple[Any, ...]], done: str) -> 
             yield future.result()
 
 
-def _folder(job: Job, cache: Path, old_code: bool) -> Path:
+def _folder(job: Job, clips: Path, old_code: bool) -> Path:
     """Return where the clip is, or where it belongs if this very clip was not drawn before by the same code."""
     recipe = _digest(json.dumps(asdict(job.spec()), sort_keys=True, default=str).encode())
+    code = _drawing_code()
+    older = sorted(clips.glob(f"{job.name}-{recipe}-{'[0-9a-f]' * len(code)}"))
+    return older[-1] if old_code and older else clips / f"{job.name}-{recipe}-{code}"
+
+
+@cache
+def _drawing_code() -> str:
+    """Return a digest of the code that draws clips."""
     sources = sorted(Path(synthetic.__file__).parent.glob("synthetic*.py"))
-    code = _digest(b"".join(source.read_bytes() for source in sources))
-    older = sorted(cache.glob(f"{job.name}-{recipe}-{'[0-9a-f]' * len(code)}"))
-    return older[-1] if old_code and older else cache / f"{job.name}-{recipe}-{code}"
+    return _digest(b"".join(source.read_bytes() for source in sources))
 
 
 def _draw_clip(job: Job, folder: Path) -> None:
+    if folder.is_dir():  # a run beside this one drew it meanwhile
+        return
     partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

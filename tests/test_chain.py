@@ -23,8 +23,7 @@ expert:
   ppo: {total_steps: 60000, window_episodes: 16, min_window_episodes: 8, num_deterministic: 16}
 episodes: {num_episodes: 3, batch_worlds: 32, size_px: 64}
 """
-PATIENCE_S = 420
-"""For one run, on a busy machine: what takes longer hangs. It bounds no speed."""
+PATIENCE_S = 300
 
 
 @pytest.fixture(scope="module")

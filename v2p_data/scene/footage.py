@@ -149,8 +149,8 @@ def still_of(rgb: UInt8[np.ndarray, "time h w 3"]) -> UInt8[np.ndarray, "h w 3"]
     still = np.empty(rgb.shape[1:], np.uint8)
     for top in range(0, len(still), _ROWS):  # a few rows at a time: large frames take much memory
         rows = slice(top, top + _ROWS)
-        colours = rgb[pick, rows].astype(np.float32)
-        lab = lab_of(rgb[pick, rows])
+        part = rgb[pick, rows]
+        colours, lab = part.astype(np.float32), lab_of(part)
         centre = np.median(lab, axis=0)
         weight = np.ones(lab.shape[:3], np.float32)
         for _ in range(3):
