@@ -88,6 +88,18 @@ def test_a_vase_has_a_wall_of_even_thickness_and_room_inside():
     assert depth_in_parts(axis, parts).min() > 0.001
 
 
+@pytest.mark.parametrize("scale", [0.1, 1.0])
+@pytest.mark.parametrize("above_m", [2e-7, 2e-6, 1e-5, 1e-4])
+def test_a_vessel_is_closed_where_a_ring_of_its_profile_all_but_lies_on_its_floor(above_m, scale):
+    wall = 0.004
+    profile = np.array([(0.045, 0.0), (0.0451, wall + above_m), (0.05, 0.06)])
+
+    bowl = lathe(scale * profile, scale * wall)
+
+    assert bowl.is_watertight
+    assert bowl.is_volume
+
+
 @pytest.mark.parametrize(("form", "size", "hollow", "taper"), SHAPES)
 def test_a_mesh_fills_its_bounding_box_around_the_origin(form, size, hollow, taper):
     mesh = mesh_for(form, size, hollow=hollow, taper=taper)

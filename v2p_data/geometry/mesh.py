@@ -223,7 +223,8 @@ def _inside(profile: Float[np.ndarray, "k 2"], wall: float) -> Float[np.ndarray,
     r, z = profile.T
     wall = min(wall, 0.4 * float(np.ptp(z)))
     floor = z[0] + wall
-    heights = np.concatenate([[floor], z[z > floor + 1e-6]])
+    # Rings that all but touch would be merged into one, and leave a gap.
+    heights = np.concatenate([[floor], z[z > floor + 1e-3 * np.ptp(z)]])
     if len(heights) == 2:  # straight sides: the ends say all
         heights = np.linspace(floor, z[-1], 2)
     angles = np.linspace(-np.pi / 2, np.pi / 2, 13)
@@ -238,7 +239,9 @@ def _at(profile: Float[np.ndarray, "k 2"], height: float) -> Float[np.ndarray, "
 
 def _turned(outline: Float[np.ndarray, "k 2"], diameter_m: float) -> trimesh.Trimesh:
     """Return what a closed outline (radius, z) encloses when it turns about z, turned outwards, of that diameter."""
-    mesh = trimesh.creation.revolve(outline, sections=_AROUND)
+    # trimesh leaves out triangles below a fixed area: in metres these may be a small thing's.
+    mesh = trimesh.creation.revolve(outline / diameter_m, sections=_AROUND)
+    mesh.vertices *= diameter_m
     if mesh.volume < 0:
         mesh.invert()
     mesh.vertices[:, :2] *= diameter_m / mesh.extents[:2]
