@@ -99,7 +99,7 @@ def make_clip(job: tuple[int, Path]) -> str:
         rgb, labels = render_views(spec, steps.tolist(), with_hand=True)
     except (ValueError, RuntimeError) as error:
         return f"{number} {kind}: {type(error).__name__} {error}"
-    rgb = np.stack([_compressed(image, rng) for image in rgb])
+    rgb = np.stack([compressed(image, rng) for image in rgb])
     quarter = FRAMES_DRAWN // 4
     keep = np.unique([0, FRAMES_DRAWN - 1, *rng.integers(1, FRAMES_DRAWN - 1, FRAMES_KEPT - 2)])
     camera = spec.view.camera()
@@ -137,7 +137,10 @@ def _classes(labels: UInt8[np.ndarray, "n h w"], moved: list[int]) -> UInt8[np.n
     return to[labels]
 
 
-def _compressed(image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> np.ndarray:
+def compressed(
+    image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a picture as it comes out of a file of random quality."""
     quality = int(rng.integers(35, 95))
     _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1]
@@ -481,7 +484,7 @@ def only_camera(file: Path, out: Path) -> None:
     save_file({k: v for k, v in load_file(file).items() if k in wanted}, out)
 
 
-def write(net: SceneNetwork, out: Path) -> None:
+def write(net: torch.nn.Module, out: Path) -> None:
     """Write the weights in half precision, in one move."""
     partial = out.with_suffix(".partial")
     state = {

@@ -1,11 +1,15 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import quat_from_yaw, transform, transform_from_pose
+from v2p_data.scene.classes import CLASSES, HAND
+from v2p_data.scene.find import Watched
 from v2p_data.scene.nouns import noun_for
-from v2p_data.scene.placement import _peak
+from v2p_data.scene.placement import _carried, _Course, _course_in_hand, _peak
 from v2p_data.scene.pose import (
     Silhouette,
     camera_above,
@@ -18,6 +22,7 @@ from v2p_data.scene.pose import (
     orientations,
 )
 from v2p_data.scene.scale import (
+    SeenCamera,
     SizeVote,
     camera_height_m,
     disagreement,
@@ -211,6 +216,65 @@ def test_a_lift_ends_where_the_thing_was_last_seen_highest(believed, ends_at):
     )  # fmt: skip
 
     assert _peak(thing) == ends_at
+
+
+def lifted_in_a_fist(rises_px: int, *, seen_rising: bool = False) -> tuple[Sighting, Watched]:
+    """Ten frames: a hand comes from the right, takes hold of a cube at (40, 90), stays, and goes up; it hides the cube."""
+    tips = [(110, 90), (70, 96), (40, 90), (40, 90), (40, 90)]
+    tips += [(40, 90 - rises_px * k // 5) for k in range(1, 6)]
+    masks, shares = (
+        np.zeros((10, 120, 160), bool),
+        np.zeros((10, len(CLASSES), 120, 160), np.float32),
+    )
+    for i, tip in enumerate(tips):
+        up = rises_px * max(0, i - 4) // 5 if seen_rising else 0
+        masks[i, 84 - up : 96 - up, 34:46] = True
+        shares[i, HAND] = cv2.line(np.zeros((120, 160), np.uint8), (159, tip[1]), tip, 1, 16)
+    quality = np.where((np.arange(10) < 2) | seen_rising, 1.0, 0.2)
+    thing = Sighting(
+        phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks, quality=quality,
+        moves=True, at=0, known_m=None, sure=0.9, why="",
+    )  # fmt: skip
+    seen = SeenCamera(
+        pitch_rad=PITCH, pitch_sd_rad=0.1, focal_widths=1.0, table_width_m=0.8, table_width_sd=0.2
+    )
+    none = shares[0]
+    return thing, Watched(idx=np.arange(10), shares=shares, early=none, late=none, camera=seen)
+
+
+def test_what_a_fist_hides_goes_up_with_it():
+    thing, watched = lifted_in_a_fist(50)
+    camera = camera_above((120, 160), PITCH, FOV)
+    start = transform(np.eye(3), np.array([*camera.on_plane(np.array([[40.0, 90.0]]), 0.05)[0]]))
+
+    carried = _carried(thing, watched)
+    course = _course_in_hand(_Course([0], [start], [0.9], ["full"]), carried, camera)
+
+    assert carried[-1][0] == 9
+    np.testing.assert_allclose(carried[-1][1], (0, -50), atol=2)
+    assert course.frames[0] == 0
+    assert course.frames[-1] == 9
+    assert set(course.observed[1:]) == {"no_depth"}
+    heights = [T[2, 3] for T in course.poses]
+    assert heights == sorted(heights)
+    pixel = camera.project(course.poses[-1][None, :3, 3])[0]
+    np.testing.assert_allclose(pixel, (40, 40), atol=2)
+    assert course.poses[-1][0, 3] == pytest.approx(start[0, 3])
+
+
+@pytest.mark.parametrize(
+    ("rises_px", "seen_rising"), [(0, False), (3, False), (50, True)],
+    ids=["it stays", "it trembles", "the thing itself is seen"],
+)  # fmt: skip
+def test_nothing_goes_with_a_fist_that_does_not_lift_it_out_of_sight(rises_px, seen_rising):
+    assert _carried(*lifted_in_a_fist(rises_px, seen_rising=seen_rising)) == []
+
+
+def test_nothing_goes_with_a_hand_that_does_not_come_to_it():
+    thing, watched = lifted_in_a_fist(50)
+    away = np.roll(watched.shares, 60, axis=2)
+
+    assert _carried(thing, replace(watched, shares=away)) == []
 
 
 @pytest.mark.parametrize(("longer", "yaw", "tilt"), [(1.0, 2.4, 0.45), (1.35, -2.6, 0.3)])

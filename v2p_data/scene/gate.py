@@ -20,7 +20,7 @@ from v2p_data.scene.sight import Sights, stands_on
 _COLOURED = 0.25
 """Share of a thing's pixels that need its colour: few things are one colour all over."""
 _OUT_OF_SIGHT = 0.8
-"""What went into a bin lies in it, but nobody sees where."""
+"""What went into a bin lies in it, and what a fist lifts goes with it, but nobody sees where."""
 _NEARING_KINDS = ("push_next_to", "slide_to", "drop_in_front_of")
 _ENDING_AT_KINDS = ("insert", "throw_into", "place_onto", "cover")
 
@@ -57,7 +57,7 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
         add("shape", f"outline of {which}", max(0.1, 0.5 + (covers - 0.6) / 0.6))
         if not s.moves:
             continue
-        if s.swallowed:
+        if s.swallowed or placed.in_fist:
             add("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
             continue
         covers = placed.last.iou / attainable_iou(placed.last_mask)

@@ -47,13 +47,13 @@ def net_size(height_px: int, width_px: int) -> tuple[int, int]:
     return max(1, round(height_px / step_px)) * _STEP, max(1, round(width_px / step_px)) * _STEP
 
 
-class CameraNetwork(nn.Module):
-    """What a picture shows of its camera: an encoder whose coarsest level compares all places with each other."""
+class Encoder(nn.Module):
+    """Four levels of a picture, each half as large as the one before; the coarsest compares all places with each other."""
 
-    def __init__(self) -> None:
+    def __init__(self, n_in: int, widths: tuple[int, int, int, int]) -> None:
         super().__init__()
-        a, b, c, d = _WIDTHS
-        self.stem = nn.Sequential(nn.Conv2d(15, a, 4, 2, 1), nn.BatchNorm2d(a), nn.ReLU())
+        a, b, c, d = widths
+        self.stem = nn.Sequential(nn.Conv2d(n_in, a, 4, 2, 1), nn.BatchNorm2d(a), nn.ReLU())
         self.enc1 = _pair(a, a)
         self.enc2 = _pair(a, b)
         self.enc3 = _pair(b, c)
@@ -61,21 +61,30 @@ class CameraNetwork(nn.Module):
         self.compare = nn.TransformerEncoderLayer(
             d, 4, 2 * d, dropout=0.0, batch_first=True, norm_first=True
         )
+
+    def levels(self, x: Float[torch.Tensor, "n c h w"]) -> tuple[torch.Tensor, ...]:
+        """Return the three finer levels as planes, and the coarsest as tokens (n, places, channels)."""
+        x1 = self.enc1(self.stem(x))
+        x2 = self.enc2(F.max_pool2d(x1, 2))
+        x3 = self.enc3(F.max_pool2d(x2, 2))
+        x4 = self.enc4(F.max_pool2d(x3, 2))
+        return x1, x2, x3, self.compare(x4.flatten(2).transpose(1, 2))
+
+
+class CameraNetwork(Encoder):
+    """What a picture shows of its camera."""
+
+    def __init__(self) -> None:
+        super().__init__(15, _WIDTHS)
+        d = _WIDTHS[-1]
         self.ask = nn.Parameter(0.02 * torch.randn(1, _QUESTIONS, d))
         self.answer = nn.MultiheadAttention(d, 4, batch_first=True)
         self.camera = nn.Sequential(nn.Linear(_QUESTIONS * d + 1, 64), nn.ReLU(), nn.Linear(64, 6))
 
     def camera_of(self, x: Float[torch.Tensor, "n 15 h w"]) -> Float[torch.Tensor, "n 6"]:
         """Return (pitch [rad], log focal over width, log width of the table [m], log sd of each)."""
-        tokens = self._levels(x)[-1]
+        tokens = self.levels(x)[-1]
         return self._camera(tokens, x.shape[3] / x.shape[2])
-
-    def _levels(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        x1 = self.enc1(self.stem(x))
-        x2 = self.enc2(F.max_pool2d(x1, 2))
-        x3 = self.enc3(F.max_pool2d(x2, 2))
-        x4 = self.enc4(F.max_pool2d(x3, 2))
-        return x1, x2, x3, self.compare(x4.flatten(2).transpose(1, 2))
 
     def _camera(self, tokens: torch.Tensor, aspect: float) -> torch.Tensor:
         n, device = len(tokens), tokens.device
@@ -101,12 +110,12 @@ class SceneNetwork(CameraNetwork):
         self, x: Float[torch.Tensor, "n 15 h w"]
     ) -> tuple[Float[torch.Tensor, "n 5 h w"], Float[torch.Tensor, "n 6"]]:
         """Return class logits, and the camera as `camera_of` does: learning the one helps the other."""
-        x1, x2, x3, tokens = self._levels(x)
+        x1, x2, x3, tokens = self.levels(x)
         return self._classes(x1, x2, x3, tokens), self._camera(tokens, x.shape[3] / x.shape[2])
 
     def classes_of(self, x: Float[torch.Tensor, "n 15 h w"]) -> Float[torch.Tensor, "n 5 h w"]:
         """Return class logits."""
-        return self._classes(*self._levels(x))
+        return self._classes(*self.levels(x))
 
     def _classes(
         self, x1: torch.Tensor, x2: torch.Tensor, x3: torch.Tensor, tokens: torch.Tensor
@@ -144,7 +153,7 @@ def network() -> SceneNetwork:
     Raises:
         V2PError: its weights are missing or belong to another version.
     """
-    return _trained(SceneNetwork(), WEIGHTS)
+    return trained(SceneNetwork(), WEIGHTS)
 
 
 @lru_cache(maxsize=1)
@@ -154,21 +163,27 @@ def camera_network() -> CameraNetwork:
     Raises:
         V2PError: its weights are missing or belong to another version.
     """
-    return _trained(CameraNetwork(), CAMERA_WEIGHTS)
+    return trained(CameraNetwork(), CAMERA_WEIGHTS)
 
 
-def _trained[N: nn.Module](net: N, weights: Path) -> N:
+def trained[N: nn.Module](
+    net: N, weights: Path, script: str = "scripts/train_scene_network.py"
+) -> N:
+    """Return a network with the weights that the script wrote, ready to be asked, on the CPU.
+
+    Raises:
+        V2PError: the weights are missing or belong to another version.
+    """
     if not weights.is_file():
         raise V2PError(
-            f"the scene network's weights are not at {weights.name} beside network.py; reinstall the package, train "
-            "them with scripts/train_scene_network.py, or use --scene.ground.backend=heuristic"
+            f"the weights {weights.name} are not beside network.py; reinstall the package, train them with {script}, or "
+            "use --scene.ground.backend=heuristic"
         )
     try:
         net.load_state_dict({k: v.float() for k, v in load_file(weights).items()})
     except (RuntimeError, ValueError, OSError) as error:
         raise V2PError(
-            f"{weights.name} does not fit this version's network; train it anew with "
-            f"scripts/train_scene_network.py ({type(error).__name__})"
+            f"{weights.name} does not fit this version's network; train it anew with {script} ({type(error).__name__})"
         ) from error
     net.eval()
     return net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # five times as fast on a CPU

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.colour import lab_of
-from v2p_data.scene.find import SWALLOWING_KINDS
+from v2p_data.scene.find import SWALLOWING_KINDS, Watched, hand_at
 from v2p_data.scene.footage import Footage
+from v2p_data.scene.hand import hand_end
 from v2p_data.scene.pose import (
     Fit,
     Silhouette,
@@ -43,6 +44,10 @@ _TURN_COST = 0.007
 """Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
 _TOUCH_PX = 5
 """A tool is at work as long as it is so near to what it pushes; then it is in the air."""
+_SEEN_RISING = 0.5
+"""Of its height in the picture: a thing that is seen to rise less than this is hidden by the hand that lifts it."""
+_GOES_WITH_HAND = 0.5
+"""How sure a pose is of what a hand hides."""
 _NO_SPREAD = 0.01
 """Of the logarithm of a length that is known."""
 _GRIP_HEIGHT_M = 0.08
@@ -104,6 +109,8 @@ class Placed:
     observed: tuple[Observed, ...]
     rival: float | None
     """By how much the next best way of lying covers the outlines worse; None where there is no other."""
+    in_fist: bool = False
+    """Whether the hand that lifts it hides it from the camera: then its poses go with the hand."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,9 +130,17 @@ class Placement:
 
 
 def place(
-    footage: Footage, objects: tuple[Sighting, ...], kind: str, guess: CameraGuess, max_poses: int
+    footage: Footage,
+    objects: tuple[Sighting, ...],
+    kind: str,
+    guess: CameraGuess,
+    max_poses: int,
+    watched: Watched | None = None,
 ) -> Placement:
-    """Return camera, shapes and poses such that all outlines fit their masks, the manipulated object's at both ends."""
+    """Return camera, shapes and poses such that all outlines fit their masks, the manipulated object's at both ends.
+
+    `watched` is what the network sees, where it was asked: then the hand helps to tell the scale.
+    """
     thing = objects[0]
     unknown = [
         _hidden(footage, s.at, s.first, s.last if s.moves else None) | _others(objects, s, s.at)
@@ -150,11 +165,14 @@ def place(
     )
     firsts = dict(zip(resting, fits, strict=True))
     camera = camera_above(footage.shape, pitch_rad, guess.fov_rad)
+    carried = _carried(thing, watched) if kind == "lift_up" and watched is not None else ()
     upright_cost, lasts = 0.0, dict(firsts)
     rivals: list[float | None] = [None] * len(objects)
     for k in resting:
         s = objects[k]
         if not s.moves:
+            continue
+        if s is thing and carried:
             continue
         last_i, last_mask = ends[k]
         silhouette = Silhouette(last_mask, last_unknown[k], camera, footage.rgb[last_i])
@@ -173,9 +191,20 @@ def place(
         if unseen and within is not None:
             lasts[k] = _inside(lasts[k], support, within)
         upright_cost = cost if s is thing else upright_cost
-    height_m, spread = camera_height_m(
-        [vote_of(objects[k], firsts[k]) for k in resting], guess.heights(pitch_rad)
-    )
+    votes = [vote_of(objects[k], firsts[k]) for k in resting]
+    known = guess.heights(pitch_rad)
+    height_m, spread = camera_height_m(votes, known)
+    if watched is not None and not any(s.in_hand for s in objects):
+        from v2p_data.scene.ruler import height_by_hand  # torch takes a second to import
+
+        stands = [(thing.first, firsts[0].T_world_obj[:3, 3])]
+        if kind != "lift_up":
+            stands.append((ends[0][1], lasts[0].T_world_obj[:3, 3]))
+        by_hand = height_by_hand(
+            footage, watched, thing.masks, stands, camera, pitch_rad, height_m
+        )
+        if by_hand is not None:
+            height_m, spread = camera_height_m(votes, [*known, by_hand])
     for k, s in enumerate(objects):
         if s.in_hand:
             firsts[k], lasts[k] = _fit_in_hand(
@@ -193,7 +222,11 @@ def place(
     for k, s in enumerate(objects):
         last_i, last_mask = ends[k]
         course = _Course([0], [firsts[k].T_world_obj], [firsts[k].iou], ["full"])
-        if s.moves:
+        if s is thing and carried:
+            last_i, last_mask = carried[-1][0], np.zeros_like(s.last)
+            course = _course_in_hand(course, carried, camera)
+            lasts[k] = replace(firsts[k], T_world_obj=course.poses[-1], iou=0.0, visible=0.0)
+        elif s.moves:
             course = _course(s, kind, firsts[k], lasts[k], ends[k], camera, max_poses)
         else:
             course = course.then(len(s.masks) - 1, firsts[k].T_world_obj, firsts[k].iou, "full")
@@ -210,6 +243,7 @@ def place(
                 confidences=tuple(course.sure),
                 observed=tuple(course.observed),
                 rival=rivals[k],
+                in_fist=s is thing and bool(carried),
             )
         )
     return Placement(
@@ -497,6 +531,52 @@ def _peak(s: Sighting) -> int:
     # The end of the clip counts as the peak when it is nearly as high: a hand that holds still trembles.
     near = heights >= 0.93 * top if top > 0 else np.isfinite(heights)
     return int(np.flatnonzero(near)[-1]) if near.any() else n - 1
+
+
+def _carried(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.ndarray, "2"]]]:
+    """Return by how far the hand has moved in the picture since it took hold of a thing that it hides, in the frames since.
+
+    It takes hold where its end stays longest, low and beside the thing. Nothing where the thing itself is seen going up, where
+    no hand comes to it, or where that hand does not rise.
+    """
+    i, (_, _, _, tall) = _peak(s), bounding_box(s.first)
+    if _centre(s.first)[1] - _centre(s.masks[i])[1] > _SEEN_RISING * tall:
+        return []
+    home = grow(s.first, _TOUCH_PX)
+    tips, holding = {}, []
+    for at in watched.idx.tolist():
+        hand = hand_at(watched, at)
+        end = hand_end(hand)
+        if end is not None:
+            tips[at] = np.array(end.tip_px)
+            holding += [at] if (hand & home).any() else []
+    if not holding:
+        return []
+    middle = np.mean([max(tips[at][1] for at in holding), min(tip[1] for tip in tips.values())])
+    order = list(tips)
+
+    def haste(at: int) -> float:
+        k = order.index(at)
+        beside = [tips[other] for other in order[max(0, k - 1) : k + 2]]
+        return float(np.linalg.norm(np.ptp(beside, axis=0)))
+
+    grip = min((at for at in holding if tips[at][1] >= middle), key=haste)
+    since = [(at, tip - tips[grip]) for at, tip in tips.items() if at > grip]
+    risen = [k for k, (_, by) in enumerate(since) if -by[1] > _SEEN_RISING * tall]
+    return since[: risen[-1] + 1] if risen else []
+
+
+def _course_in_hand(
+    course: "_Course", carried: list[tuple[int, Float[np.ndarray, "2"]]], camera: Camera
+) -> "_Course":
+    """Return the course of what goes with a hand, as far away as it stood."""
+    T_first = course.poses[0]
+    start = camera.project(T_first[None, :3, 3])[0]
+    for i, by in carried:
+        position = on_wall(camera, start + by, float(T_first[0, 3]))
+        position[2] = max(position[2], T_first[2, 3])
+        course.then(i, transform(T_first[:3, :3], position), _GOES_WITH_HAND, "no_depth")
+    return course
 
 
 def _hidden(

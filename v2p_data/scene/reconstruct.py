@@ -190,7 +190,9 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     sights = replace(sights, objects=with_forms(sights.footage, sights.objects, guess))
     if cfg.depth.backend != "none":
         guess = camera_from_depth(clip, sights.footage, sights.objects, guess, cfg.depth, rng)
-    placement = place(sights.footage, sights.objects, meaning.kind, guess, cfg.max_poses)
+    placement = place(
+        sights.footage, sights.objects, meaning.kind, guess, cfg.max_poses, sights.watched
+    )
     placement, shaped = _shaped(sights, placement)
     objects = _estimates(clip, sights, placement, shaped, meaning.kind, cfg)
     contradiction = None
@@ -411,7 +413,7 @@ def _mask_track(
         if s.quality[i] > _LEAST_QUALITY and s.masks[i].any()
     }
     masks[int(footage.frame_idx[s.at])] = s.first
-    if s.moves and not s.swallowed:
+    if s.moves and not (s.swallowed or placed.in_fist):
         masks[int(footage.frame_idx[placed.last_i])] = placed.last_mask
     return dict(sorted(masks.items()))
 
@@ -435,6 +437,8 @@ def _remarks(kind: str, sights: Sights, placement: Placement, num_frames: int) -
     last_frame = int(sights.footage.frame_idx[placement.objects[0].last_i])
     if kind == "lift_up":
         out.append("one view shows no depth in mid-air: the lift is taken to go straight up")
+        if placement.objects[0].in_fist:
+            out.append("the hand hides what it lifts: it is taken to go with the hand")
         if last_frame < num_frames - 1:
             out.append(f"the lift is highest at frame {last_frame}; what comes after is left out")
     return out

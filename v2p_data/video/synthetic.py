@@ -134,7 +134,11 @@ def render(spec: VideoSpec, *, frames: Sequence[int] | None = None) -> Synthetic
 
 
 def render_views(
-    spec: VideoSpec, frames: Sequence[int], *, with_hand: bool
+    spec: VideoSpec,
+    frames: Sequence[int],
+    *,
+    with_hand: bool,
+    views: Sequence[View] | None = None,
 ) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
     """Draw only these frames, and their labels.
 
@@ -142,12 +146,18 @@ def render_views(
         spec: the clip.
         frames: which frames.
         with_hand: without it hand and arm are not drawn, as in a still picture of the same moment.
+        views: from where each is seen, with the size and the field of view of the clip's; the clip's own if not given.
 
     Raises:
         V2PError: there is no OpenGL.
     """
+    pictures, labels = [], []
     with _stage(spec, motion_of(spec), with_hand=with_hand) as stage:
-        return np.stack([stage.shot(i) for i in frames]), np.stack([stage.mask(i) for i in frames])
+        for i, view in zip(frames, views or [spec.view] * len(frames), strict=True):
+            stage.camera = view.camera()
+            pictures.append(stage.shot(i))
+            labels.append(stage.mask(i))
+    return np.stack(pictures), np.stack(labels)
 
 
 def random_spec(

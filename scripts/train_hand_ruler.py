@@ -1,0 +1,357 @@
+"""Train the hand ruler (`v2p_data/scene/ruler.py`) on rendered hands, from nothing, on a CPU.
+
+    python scripts/train_hand_ruler.py data --out DATA --scenes 1500 --jobs 2
+    python scripts/train_hand_ruler.py train DATA --out v2p_data/scene/ruler.safetensors --minutes 30
+
+`data` draws random scenes in moments at which a hand touches a thing at rest, each through twelve cameras, and keeps what
+lies within half a metre around the hand's end. `train` shows windows that are too large or too small by chance, prints how well
+the network says by how much on scenes that it does not train on, and writes the weights every two minutes. Scenes are drawn
+from seeds of their own (`hand network`), so that no clip of `bench_reconstruction.py` is among them.
+"""
+
+import argparse
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from safetensors.torch import load_file
+from train_scene_network import compressed, write
+
+from v2p_data.scene.hand import gap_px, hand_end
+from v2p_data.scene.ruler import (
+    GUESS_SPREAD,
+    REACH_M,
+    TOUCHING_M,
+    TOWARDS_ARM,
+    WINDOW_M,
+    RulerNetwork,
+    planes_of,
+    window,
+)
+from v2p_data.scene.scale import table_width_m
+from v2p_data.seeds import rng_for
+from v2p_data.video.synthetic import (
+    LABEL_HAND,
+    LABEL_THING,
+    MOTION_KINDS,
+    VideoSpec,
+    motion_of,
+    random_spec,
+    render_views,
+)
+from v2p_data.video.synthetic_camera import View
+from v2p_data.video.synthetic_motion import Motion
+
+KINDS = tuple(kind for kind in MOTION_KINDS if kind != "push_with")
+"""A hand that pushes with something touches nothing that rests."""
+CAMERAS = 12
+KEPT_M, KEPT_PX = 0.52, 208
+SIZES = ((480, 360), (480, 360), (480, 270), (360, 480))
+"""(width, height) [px] of what is drawn."""
+MOST_TRIES = CAMERAS + 4
+HEIGHTS_M, PITCHES_RAD = (0.25, 0.9), (float(np.radians(20)), float(np.radians(62)))
+AT_REST_M, SAME_HEIGHT_M, NEAR_M = 0.015, 0.01, 0.2
+LEAST_PX, LEAST_SIDE_PX = 12, 40
+HAND, THING, MOST_THINGS = 1, 2, 8
+"""Labels in the files: hand, and any thing."""
+MOST_OFF = 0.7
+BATCH = 48
+HELD_OUT = 20
+"""Every so-manieth scene is for measuring."""
+TAIL = 4.0
+"""Degrees of freedom of the errors' t distribution."""
+
+
+def make_scene(job: tuple[int, Path]) -> str:
+    """Draw one scene through some cameras and write what training needs; return an error's words, or nothing."""
+    number, out = job
+    path = out / f"{number:05d}.npz"
+    if path.is_file():
+        return ""
+    rng = rng_for(number, "hand network")
+    kind = KINDS[number % len(KINDS)]
+    try:
+        spec = random_spec(f"clip{number}", kind, rng)
+        w, h = SIZES[int(rng.integers(len(SIZES)))]
+        fovy_rad = float(np.radians(rng.uniform(35, 60)))
+        view = replace(spec.view, width_px=w, height_px=h, fovy_rad=fovy_rad)
+        spec = replace(spec, view=view)
+        motion = motion_of(spec)
+        moments = touching(motion)
+        rows = views_of(spec, motion, moments, rng) if len(moments) else []
+    except (ValueError, RuntimeError) as error:
+        return f"{number} {kind}: {type(error).__name__} {error}"
+    if not rows:
+        return f"{number} {kind}: no hand is seen that touches the thing at rest"
+    np.savez(path, **{key: np.stack([row[key] for row in rows]) for key in rows[0]})
+    return ""
+
+
+def touching(motion: Motion) -> Int[np.ndarray, "n"]:
+    """Return the frames in which the hand is at what it moves, and that is still, or again, at rest on the table."""
+    thing, hand = motion.T_world_things[0, :, :3, 3], motion.T_world_hand[:, :3, 3]
+    at_rest = np.linalg.norm(thing - thing[0], axis=1) < AT_REST_M
+    if abs(thing[-1, 2] - thing[0, 2]) < SAME_HEIGHT_M:
+        at_rest |= np.linalg.norm(thing - thing[-1], axis=1) < AT_REST_M
+    return np.flatnonzero(at_rest & (np.linalg.norm(hand - thing, axis=1) < NEAR_M))
+
+
+def views_of(
+    spec: VideoSpec, motion: Motion, moments: Int[np.ndarray, "n"], rng: np.random.Generator
+) -> list[dict[str, np.ndarray]]:
+    """Return what random cameras see around the hand's end, as far as the hand is seen to touch the thing."""
+    frames = rng.choice(moments, MOST_TRIES).tolist()
+    views = []
+    for i in frames:
+        hand, thing = motion.T_world_hand[i, :2, 3], motion.T_world_things[0, i, :2, 3]
+        aim = 0.5 * (hand + thing) + rng.normal(0, 0.12, 2)
+        height, pitch = float(np.exp(rng.uniform(*np.log(HEIGHTS_M)))), rng.uniform(*PITCHES_RAD)
+        views.append(
+            replace(
+                spec.view,
+                height_m=height,
+                pitch_rad=float(pitch),
+                roll_rad=float(np.radians(rng.normal(0, 0.9))),
+                back_m=float(height / np.tan(pitch) - aim[0]),
+                side_m=float(aim[1]),
+            )
+        )
+    pictures, labels = render_views(spec, frames, with_hand=True, views=views)
+    rows = []
+    for i, view, rgb, own in zip(frames, views, pictures, labels, strict=True):
+        row = _view(view, motion.T_world_things[0, i, :3, 3], compressed(rgb, rng), own)
+        if row is not None and len(rows) < CAMERAS:
+            rows.append(row)
+    return rows
+
+
+def _view(
+    view: View,
+    thing: Float[np.ndarray, "3"],
+    rgb: UInt8[np.ndarray, "h w 3"],
+    labels: UInt8[np.ndarray, "h w"],
+) -> dict[str, np.ndarray] | None:
+    """Return the part of a picture around the hand's end; None where no hand is seen to touch the thing."""
+    camera, (h, w) = view.camera(), labels.shape
+    hand, outline = labels == LABEL_HAND, labels == LABEL_THING
+    if not 0.004 < hand.mean() < 0.4 or outline.sum() < LEAST_PX:
+        return None
+    foot = camera.project((thing * [1, 1, 0])[None])[0]
+    if not (0 < foot[0] < w and 0 < foot[1] < h):
+        return None
+    below, focal_widths = (foot[1] - h / 2) / w, float(camera.K[0, 0]) / w
+    px_per_m = w / table_width_m(view.pitch_rad, focal_widths, view.height_m, below)
+    end = hand_end(hand)
+    if not KEPT_M * px_per_m > LEAST_SIDE_PX or end is None:
+        return None
+    reach_m = (foot - end.tip_px) / px_per_m
+    if gap_px(hand, outline) > TOUCHING_M * px_per_m or np.linalg.norm(reach_m) > REACH_M:
+        return None
+    kinds = np.zeros(256, np.uint8)
+    kinds[LABEL_HAND], kinds[LABEL_THING : LABEL_THING + MOST_THINGS] = HAND, THING
+    step = KEPT_M * px_per_m / KEPT_PX
+    if step > 1.3:
+        rgb = cv2.GaussianBlur(rgb, (0, 0), 0.4 * step)
+    M = np.column_stack([np.eye(2) * step, np.array(end.tip_px) - KEPT_PX * step / 2])
+    size, back = (KEPT_PX, KEPT_PX), cv2.WARP_INVERSE_MAP
+    return {
+        "rgb": cv2.warpAffine(
+            rgb, M, size, flags=cv2.INTER_LINEAR | back, borderMode=cv2.BORDER_REPLICATE
+        ),
+        "labels": cv2.warpAffine(
+            kinds[labels], M, size, flags=cv2.INTER_NEAREST | back, borderMode=cv2.BORDER_CONSTANT
+        ),
+        "known": np.array([view.pitch_rad, below, *end.way, *reach_m], np.float32),
+    }
+
+
+def make_data(out: Path, scenes: int, jobs: int, start: int) -> None:
+    """Draw the scenes that are not there yet."""
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
+    out.mkdir(parents=True, exist_ok=True)
+    began = time.time()
+    with ProcessPoolExecutor(jobs) as pool:
+        work = [(number, out) for number in range(start, start + scenes)]
+        for done, words in enumerate(pool.map(make_scene, work, chunksize=4), 1):
+            if words:
+                print(f"left out {words}", file=sys.stderr)
+            if done % 50 == 0:
+                print(f"{done} scenes, {(time.time() - began) / done:.2f} s each", flush=True)
+
+
+def varied(
+    scene: dict[str, np.ndarray], k: int, rng: np.random.Generator
+) -> tuple[Float32[np.ndarray, "4 112 112"], Float32[np.ndarray, "4"], np.float32]:
+    """Return a view of a scene through a window that is too large or small by chance, changed in ways that keep it true.
+
+    The last value is the logarithm of true over pretended pixels per metre.
+    """
+    pitch, below, *pairs = (float(v) for v in scene["known"][k])
+    way, reach_m = np.array(pairs[:2]), np.array(pairs[2:])
+    off = float(np.clip(rng.normal(0, GUESS_SPREAD), -MOST_OFF, MOST_OFF))
+    side_px = WINDOW_M / KEPT_M * KEPT_PX * np.exp(-off)
+    centre = KEPT_PX / 2 + (TOWARDS_ARM * way + rng.normal(0, 0.05, 2)) * side_px
+    rgb, hand = window(scene["rgb"][k], _badly_cut(scene["labels"][k], rng), centre, side_px)
+    how = rng.integers(5)
+    if how < 2:
+        hand = (cv2.dilate, cv2.erode)[how](hand, np.ones((3, 3), np.uint8))
+    hand = cv2.GaussianBlur(hand, (0, 0), float(rng.uniform(0.6, 2.0)))
+    mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
+    gain, bias, gamma = np.exp(rng.normal(0, 0.25)), rng.normal(0, 8), np.exp(rng.normal(0, 0.2))
+    curve = np.clip(255 * (np.arange(256) / 255) ** gamma * gain + bias, 0, 255).astype(np.uint8)
+    rgb = cv2.LUT(cv2.transform(rgb, mix), curve)
+    if blur := float(rng.choice([0, 0, 0.6, 1.2])):
+        rgb = cv2.GaussianBlur(rgb, (0, 0), blur)
+    planes = planes_of(rgb, hand)
+    noise = rng.standard_normal(planes[:3].shape, np.float32)
+    planes[:3] += np.float32(rng.uniform(0, 0.03)) * noise
+    offset = (reach_m + rng.normal(0, 0.012, 2)) / (WINDOW_M * np.exp(-off))
+    if rng.random() < 0.5:
+        planes, offset = planes[..., ::-1], offset * [-1, 1]
+    known = np.array([pitch + rng.normal(0, 0.08), below, *offset], np.float32)
+    return np.ascontiguousarray(planes), known, np.float32(off)
+
+
+def _badly_cut(
+    labels: UInt8[np.ndarray, "s s"], rng: np.random.Generator
+) -> Float32[np.ndarray, "s s"]:
+    """Return the hand as the scene network may see it: with a bit of a thing, or without a bit of itself."""
+    hand = labels == HAND
+    chance = rng.random()
+    if chance < 0.25:
+        where = (cv2.dilate(hand.astype(np.uint8), np.ones((5, 5))) > 0) & (labels == THING)
+        return (hand | (_disc_at(where, 4, 16, rng) & (labels == THING))).astype(np.float32)
+    if chance < 0.4:
+        return (hand & ~_disc_at(hand, 4, 14, rng)).astype(np.float32)
+    return hand.astype(np.float32)
+
+
+def _disc_at(
+    where: Bool[np.ndarray, "s s"], least_px: int, most_px: int, rng: np.random.Generator
+) -> Bool[np.ndarray, "s s"]:
+    disc = np.zeros(where.shape, np.uint8)
+    spots = np.argwhere(where)
+    if len(spots):
+        y, x = spots[rng.integers(len(spots))].tolist()
+        cv2.circle(disc, (x, y), int(rng.integers(least_px, most_px)), 1, -1)
+    return disc > 0
+
+
+def loss_of(said: Float[torch.Tensor, "n 2"], off: Float[torch.Tensor, "n"]) -> torch.Tensor:
+    """Return the negative logarithm of the likelihood of Student's t."""
+    log_sd = said[:, 1].clamp(-3.5, 0.5)
+    away = (said[:, 0] - off) / log_sd.exp()
+    return (log_sd + (TAIL + 1) / 2 * torch.log1p(away**2 / TAIL)).mean()
+
+
+@torch.inference_mode()
+def measure(net: RulerNetwork, held_out: list[dict[str, np.ndarray]]) -> str:
+    """Return how far the network is off on views of scenes held out, all changed the same way each time, in words."""
+    net.eval()
+    rng, off, stated = rng_for(0, "hand network", "held out"), [], []
+    for scene in held_out:
+        planes, known, truth = batch_of([(scene, k) for k in range(len(scene["known"]))], rng)
+        said = net(planes, known)
+        off += (said[:, 0] - truth).tolist()
+        stated += said[:, 1].exp().tolist()
+    net.train()
+    sure = np.array(stated) < np.median(stated)
+    return (
+        f"off by {np.std(off):.3f} (standard deviation of the logarithm; {np.mean(off):+.3f} in the mean), the surer half "
+        f"by {np.std(np.array(off)[sure]):.3f}, stated {np.mean(stated):.3f}"
+    )
+
+
+def batch_of(
+    views: list[tuple[dict[str, np.ndarray], int]], rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return inputs and truth of these views."""
+    columns = zip(*(varied(scene, k, rng) for scene, k in views), strict=True)
+    planes, known, off = (torch.from_numpy(np.stack(column)) for column in columns)
+    return planes, known, off
+
+
+def train(
+    data: Path, out: Path, minutes: float, seed: int, start_from: Path | None, lr: float
+) -> None:
+    """Train for so many minutes, writing the weights (half precision) every two minutes."""
+    scenes: dict[Path, dict[str, np.ndarray]] = {}
+
+    def read() -> tuple[list[dict[str, np.ndarray]], list[dict[str, np.ndarray]]]:
+        for file in sorted(set(data.glob("*.npz")) - set(scenes)):  # more may still be drawn
+            with np.load(file) as arrays:
+                scenes[file] = {key: arrays[key] for key in arrays.files}
+        held = {file for file in scenes if int(file.stem) % HELD_OUT == 0}
+        return [s for f, s in scenes.items() if f not in held], [scenes[f] for f in sorted(held)]
+
+    own, held_out = read()
+    print(f"{len(own)} scenes to train on, {len(held_out)} held out", flush=True)
+    rng = rng_for(seed, "hand network", "batches")
+    with torch.random.fork_rng():
+        torch.random.default_generator.manual_seed(seed)
+        net = RulerNetwork()
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if start_from:
+        net.load_state_dict({k: v.float() for k, v in load_file(start_from).items()})
+    optimiser = torch.optim.AdamW(net.parameters(), lr, weight_decay=1e-3)
+    began, saved, step, losses = time.time(), time.time(), 0, []
+    while (share := (time.time() - began) / (60 * minutes)) < 1:
+        for group in optimiser.param_groups:
+            group["lr"] = lr * min(1, (step + 1) / 100) * (0.02 + 0.98 * np.cos(np.pi / 2 * share))
+        some = [own[k] for k in rng.integers(len(own), size=BATCH)]
+        planes, known, off = batch_of(
+            [(scene, int(rng.integers(len(scene["known"])))) for scene in some], rng
+        )
+        with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
+            said = net(planes.contiguous(memory_format=torch.channels_last), known)
+        loss = loss_of(said.float(), off)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimiser.step()
+        losses.append(loss.item())
+        step += 1
+        if time.time() - saved > 120:
+            saved = time.time()
+            write(net, out)
+            own, held_out = read()
+            words = f"{len(own)} scenes, {measure(net, held_out)}"
+            print(
+                f"{saved - began:5.0f} s step {step} loss {np.mean(losses[-100:]):.3f}: {words}",
+                flush=True,
+            )
+    write(net, out)
+    print(f"{step} steps of {BATCH}: {measure(net, held_out)}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    data = commands.add_parser("data", help="draw training scenes")
+    data.add_argument("--out", type=Path, required=True)
+    data.add_argument("--scenes", type=int, default=1500)
+    data.add_argument("--start", type=int, default=0, help="number of the first scene")
+    data.add_argument("--jobs", type=int, default=2)
+    learn = commands.add_parser("train", help="train on them")
+    learn.add_argument("data", type=Path)
+    learn.add_argument("--out", type=Path, required=True)
+    learn.add_argument("--minutes", type=float, default=30)
+    learn.add_argument("--seed", type=int, default=0)
+    learn.add_argument("--lr", type=float, default=2e-3)
+    learn.add_argument("--start-from", type=Path)
+    args = parser.parse_args()
+    if args.command == "data":
+        make_data(args.out, args.scenes, args.jobs, args.start)
+    else:
+        train(args.data, args.out, args.minutes, args.seed, args.start_from, args.lr)
+
+
+if __name__ == "__main__":
+    main()
