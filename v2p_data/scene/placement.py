@@ -170,9 +170,7 @@ def place(
     rivals: list[float | None] = [None] * len(objects)
     for k in resting:
         s = objects[k]
-        if not s.moves:
-            continue
-        if s is thing and carried:
+        if not s.moves or (s is thing and carried):
             continue
         last_i, last_mask = ends[k]
         silhouette = Silhouette(last_mask, last_unknown[k], camera, footage.rgb[last_i])
@@ -195,11 +193,11 @@ def place(
     known = guess.heights(pitch_rad)
     height_m, spread = camera_height_m(votes, known)
     if watched is not None and not any(s.in_hand for s in objects):
+        stands = [(thing.first, firsts[0].T_world_obj[:3, 3])]
+        if kind != "lift_up":  # it ends in mid-air
+            stands.append((ends[0][1], lasts[0].T_world_obj[:3, 3]))
         from v2p_data.scene.ruler import height_by_hand  # torch takes a second to import
 
-        stands = [(thing.first, firsts[0].T_world_obj[:3, 3])]
-        if kind != "lift_up":
-            stands.append((ends[0][1], lasts[0].T_world_obj[:3, 3]))
         by_hand = height_by_hand(
             footage, watched, thing.masks, stands, camera, pitch_rad, height_m
         )
