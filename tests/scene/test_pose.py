@@ -6,7 +6,7 @@ import pytest
 
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import quat_from_yaw, transform, transform_from_pose
-from v2p_data.scene.classes import CLASSES, HAND
+from v2p_data.scene.classes import CLASSES, HAND, MOVED
 from v2p_data.scene.find import Watched
 from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.placement import _carried, _Course, _course_in_hand, _peak
@@ -275,6 +275,15 @@ def test_nothing_goes_with_a_hand_that_does_not_come_to_it():
     away = np.roll(watched.shares, 60, axis=2)
 
     assert _carried(thing, replace(watched, shares=away)) == []
+
+
+def test_what_is_still_in_sight_is_not_in_the_fist():
+    """A pen is picked up and put down elsewhere, where its track does not follow it."""
+    thing, watched = lifted_in_a_fist(50)
+    shares = watched.shares.copy()
+    shares[8:, MOVED, 20:32, 100:112] = 1
+
+    assert _carried(thing, replace(watched, shares=shares)) == []
 
 
 @pytest.mark.parametrize(("longer", "yaw", "tilt"), [(1.0, 2.4, 0.45), (1.35, -2.6, 0.3)])

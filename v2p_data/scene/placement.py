@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
+from v2p_data.scene.classes import MOVED
 from v2p_data.scene.colour import lab_of
 from v2p_data.scene.find import SWALLOWING_KINDS, Watched, hand_at
 from v2p_data.scene.footage import Footage
@@ -46,6 +47,8 @@ _TOUCH_PX = 5
 """A tool is at work as long as it is so near to what it pushes; then it is in the air."""
 _SEEN_RISING = 0.5
 """Of its height in the picture: a thing that is seen to rise less than this is hidden by the hand that lifts it."""
+_LEFT_IN_SIGHT = 0.3
+"""Of its area: where so much that moved is in sight, no hand hides it."""
 _GOES_WITH_HAND = 0.5
 """How sure a pose is of what a hand hides."""
 _NO_SPREAD = 0.01
@@ -535,7 +538,7 @@ def _carried(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.ndarray,
     """Return by how far the hand has moved in the picture since it took hold of a thing that it hides, in the frames since.
 
     It takes hold where its end stays longest, low and beside the thing. Nothing where the thing itself is seen going up, where
-    no hand comes to it, or where that hand does not rise.
+    no hand comes to it, where that hand does not rise, or where in the end something that moved is in sight.
     """
     i, (_, _, _, tall) = _peak(s), bounding_box(s.first)
     if _centre(s.first)[1] - _centre(s.masks[i])[1] > _SEEN_RISING * tall:
@@ -561,7 +564,12 @@ def _carried(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.ndarray,
     grip = min((at for at in holding if tips[at][1] >= middle), key=haste)
     since = [(at, tip - tips[grip]) for at, tip in tips.items() if at > grip]
     risen = [k for k, (_, by) in enumerate(since) if -by[1] > _SEEN_RISING * tall]
-    return since[: risen[-1] + 1] if risen else []
+    if not risen:
+        return []
+    since = since[: risen[-1] + 1]
+    ending = since[-max(1, len(since) // 3) :]
+    in_sight = np.median([(watched.at(at)[MOVED] > 0.5).sum() for at, _ in ending])
+    return [] if in_sight > _LEFT_IN_SIGHT * s.first.sum() else since
 
 
 def _course_in_hand(
