@@ -7,9 +7,9 @@ import pytest
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import quat_from_yaw, transform, transform_from_pose
 from v2p_data.scene.classes import CLASSES, HAND, MOVED
+from v2p_data.scene.course import Course, carried_by_hand, course_in_hand, peak
 from v2p_data.scene.find import Watched
 from v2p_data.scene.nouns import noun_for
-from v2p_data.scene.placement import _carried, _Course, _course_in_hand, _peak
 from v2p_data.scene.pose import (
     Silhouette,
     camera_above,
@@ -215,7 +215,7 @@ def test_a_lift_ends_where_the_thing_was_last_seen_highest(believed, ends_at):
         moves=True, at=0, known_m=None, sure=0.9, why="",
     )  # fmt: skip
 
-    assert _peak(thing) == ends_at
+    assert peak(thing) == ends_at
 
 
 def lifted_in_a_fist(rises_px: int, *, seen_rising: bool = False) -> tuple[Sighting, Watched]:
@@ -247,8 +247,8 @@ def test_what_a_fist_hides_goes_up_with_it():
     camera = camera_above((120, 160), PITCH, FOV)
     start = transform(np.eye(3), np.array([*camera.on_plane(np.array([[40.0, 90.0]]), 0.05)[0]]))
 
-    carried = _carried(thing, watched)
-    course = _course_in_hand(_Course([0], [start], [0.9], ["full"]), carried, camera)
+    carried = carried_by_hand(thing, watched)
+    course = course_in_hand(Course([0], [start], [0.9], ["full"]), carried, camera)
 
     assert carried[-1][0] == 9
     np.testing.assert_allclose(carried[-1][1], (0, -50), atol=2)
@@ -267,14 +267,14 @@ def test_what_a_fist_hides_goes_up_with_it():
     ids=["it stays", "it trembles", "the thing itself is seen"],
 )  # fmt: skip
 def test_nothing_goes_with_a_fist_that_does_not_lift_it_out_of_sight(rises_px, seen_rising):
-    assert _carried(*lifted_in_a_fist(rises_px, seen_rising=seen_rising)) == []
+    assert carried_by_hand(*lifted_in_a_fist(rises_px, seen_rising=seen_rising)) == []
 
 
 def test_nothing_goes_with_a_hand_that_does_not_come_to_it():
     thing, watched = lifted_in_a_fist(50)
     away = np.roll(watched.shares, 60, axis=2)
 
-    assert _carried(thing, replace(watched, shares=away)) == []
+    assert carried_by_hand(thing, replace(watched, shares=away)) == []
 
 
 def test_what_is_still_in_sight_is_not_in_the_fist():
@@ -283,7 +283,7 @@ def test_what_is_still_in_sight_is_not_in_the_fist():
     shares = watched.shares.copy()
     shares[8:, MOVED, 20:32, 100:112] = 1
 
-    assert _carried(thing, replace(watched, shares=shares)) == []
+    assert carried_by_hand(thing, replace(watched, shares=shares)) == []
 
 
 @pytest.mark.parametrize(("longer", "yaw", "tilt"), [(1.0, 2.4, 0.45), (1.35, -2.6, 0.3)])

@@ -12,11 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
-from v2p_data.scene.classes import MOVED
 from v2p_data.scene.colour import lab_of
-from v2p_data.scene.find import SWALLOWING_KINDS, Watched, hand_at
+from v2p_data.scene.course import (
+    TOUCH_PX,
+    Course,
+    carried_by_hand,
+    course_between,
+    course_in_hand,
+    peak,
+)
+from v2p_data.scene.find import SWALLOWING_KINDS, Watched
 from v2p_data.scene.footage import Footage
-from v2p_data.scene.hand import hand_end
 from v2p_data.scene.pose import (
     Fit,
     Silhouette,
@@ -26,7 +32,6 @@ from v2p_data.scene.pose import (
     fit_lifted,
     fit_pose,
     fit_shape,
-    on_wall,
     orientations,
     three,
     yaw_of,
@@ -40,17 +45,8 @@ _INSIDE_KINDS = (*SWALLOWING_KINDS, "place_onto")
 UNSEEN_IOU = 0.35
 """An outline at the end that fits the object no better shows something else."""
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
-_SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
 _TURN_COST = 0.007
 """Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
-_TOUCH_PX = 5
-"""A tool is at work as long as it is so near to what it pushes; then it is in the air."""
-_SEEN_RISING = 0.5
-"""Of its height in the picture: a thing that is seen to rise less than this is hidden by the hand that lifts it."""
-_LEFT_IN_SIGHT = 0.3
-"""Of its area: where so much that moved is in sight, no hand hides it."""
-_GOES_WITH_HAND = 0.5
-"""How sure a pose is of what a hand hides."""
 _NO_SPREAD = 0.01
 """Of the logarithm of a length that is known."""
 _GRIP_HEIGHT_M = 0.08
@@ -132,6 +128,32 @@ class Placement:
     """What standing as at first would have cost the manipulated object at the end."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Shown:
+    """An object as it is seen at both ends, and what may hide it there."""
+
+    s: Sighting
+    image: UInt8[np.ndarray, "h w 3"]
+    rests: _Rests
+    """How it may rest at first."""
+    hidden: Bool[np.ndarray, "h w"]
+    last_i: int
+    last_image: UInt8[np.ndarray, "h w 3"]
+    last_mask: Bool[np.ndarray, "h w"]
+    last_hidden: Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fits:
+    """An object at both ends."""
+
+    first: Fit
+    last: Fit
+    rival: float | None = None
+    as_before: float = 0.0
+    """What standing as at first would have cost at the end."""
+
+
 def place(
     footage: Footage,
     objects: tuple[Sighting, ...],
@@ -145,115 +167,139 @@ def place(
     `watched` is what the network sees, where it was asked: then the hand helps to tell the scale.
     """
     thing = objects[0]
-    unknown = [
-        _hidden(footage, s.at, s.first, s.last if s.moves else None) | _others(objects, s, s.at)
-        for s in objects
-    ]
-    images = [footage.rgb[s.at] for s in objects]
-    rests = [_rests(s, kind if s is thing else "generic") for s in objects]
-    ends = [_end_of(s, kind, thing) for s in objects]
-    last_unknown = [
-        _hidden(footage, last_i, last_mask, s.first) | _others(objects, s, last_i)
-        if s.moves
-        else hidden
-        for s, (last_i, last_mask), hidden in zip(objects, ends, unknown, strict=True)
-    ]
+    shown = [_shown(footage, objects, s, kind) for s in objects]
     resting = [k for k, s in enumerate(objects) if not s.in_hand]
-    pitch_rad, fits = _best_pitch(
-        [images[k] for k in resting],
-        tuple(objects[k] for k in resting),
-        [unknown[k] for k in resting],
-        [rests[k] for k in resting],
-        guess,
-    )
-    firsts = dict(zip(resting, fits, strict=True))
+    pitch_rad, firsts = _best_pitch([shown[k] for k in resting], guess)
     camera = camera_above(footage.shape, pitch_rad, guess.fov_rad)
-    carried = _carried(thing, watched) if kind == "lift_up" and watched is not None else ()
-    upright_cost, lasts = 0.0, dict(firsts)
-    rivals: list[float | None] = [None] * len(objects)
+    carried = carried_by_hand(thing, watched) if kind == "lift_up" and watched is not None else []
+    fits = {k: _Fits(first=fit, last=fit) for k, fit in zip(resting, firsts, strict=True)}
     for k in resting:
-        s = objects[k]
-        if not s.moves or (s is thing and carried):
-            continue
-        last_i, last_mask = ends[k]
-        silhouette = Silhouette(last_mask, last_unknown[k], camera, footage.rgb[last_i])
-        # One outline often fits a standing and a lying box alike; both ends together seldom do.
-        options = _options(s, unknown[k], camera, rests[k], images[k])
-        role = kind if s is thing else "push_with"
-        goal = firsts.get(1) if s is thing else None
-        support, within = _goal(kind, objects, firsts[0], goal) if goal else (0.0, None)
-        found = [_fit_last(silhouette, s, role, first, support, within) for first in options]
-        costs = [a.cost + b.cost for a, (b, _) in zip(options, found, strict=True)]
-        best = int(np.argmin(costs))
-        if len(costs) > 1:
-            rivals[k] = float(np.partition(costs, 1)[1] - min(costs))
-        firsts[k], (lasts[k], cost) = options[best], found[best]
-        unseen = kind in SWALLOWING_KINDS and (s.swallowed or lasts[k].iou < UNSEEN_IOU)
-        if unseen and within is not None:
-            lasts[k] = _inside(lasts[k], support, within)
-        upright_cost = cost if s is thing else upright_cost
-    votes = [vote_of(objects[k], firsts[k]) for k in resting]
+        if objects[k].moves and not (k == 0 and carried):
+            role = kind if k == 0 else "push_with"
+            support, within = 0.0, None
+            if k == 0 and 1 in fits:
+                support, within = _goal(kind, objects, fits[0].first, fits[1].first)
+            fits[k] = _fit_both_ends(shown[k], role, camera, support, within)
+    votes = [vote_of(objects[k], fits[k].first) for k in resting]
     known = guess.heights(pitch_rad)
     height_m, spread = camera_height_m(votes, known)
-    if watched is not None and not any(s.in_hand for s in objects):
-        stands = [(thing.first, firsts[0].T_world_obj[:3, 3])]
-        if kind != "lift_up":  # it ends in mid-air
-            stands.append((ends[0][1], lasts[0].T_world_obj[:3, 3]))
-        from v2p_data.scene.ruler import height_by_hand  # torch takes a second to import
-
-        by_hand = height_by_hand(
-            footage, watched, thing.masks, stands, camera, pitch_rad, height_m
-        )
+    if watched is not None and len(resting) == len(objects):
+        guessed = (pitch_rad, height_m)
+        by_hand = _height_by_hand(footage, watched, shown[0], fits[0], kind, camera, guessed)
         if by_hand is not None:
             height_m, spread = camera_height_m(votes, [*known, by_hand])
     for k, s in enumerate(objects):
         if s.in_hand:
-            firsts[k], lasts[k] = _fit_in_hand(
-                [
-                    (Silhouette(mask, hidden, camera), thing.masks[i])
-                    for i, mask, hidden in (
-                        (s.at, s.first, unknown[k]),
-                        (*ends[k], last_unknown[k]),
-                    )
-                ],
-                s,
-                height_m,
-            )
+            fits[k] = _fit_in_hand(shown[k], thing, camera, height_m)
     placed = []
-    for k, s in enumerate(objects):
-        last_i, last_mask = ends[k]
-        course = _Course([0], [firsts[k].T_world_obj], [firsts[k].iou], ["full"])
-        if s is thing and carried:
-            last_i, last_mask = carried[-1][0], np.zeros_like(s.last)
-            course = _course_in_hand(course, carried, camera)
-            lasts[k] = replace(firsts[k], T_world_obj=course.poses[-1], iou=0.0, visible=0.0)
-        elif s.moves:
-            course = _course(s, kind, firsts[k], lasts[k], ends[k], camera, max_poses)
+    for k, see in enumerate(shown):
+        if k == 0 and carried:
+            placed.append(_in_fist(see, fits[k], carried, camera))
         else:
-            course = course.then(len(s.masks) - 1, firsts[k].T_world_obj, firsts[k].iou, "full")
-        placed.append(
-            Placed(
-                first=firsts[k],
-                last=lasts[k],
-                last_i=last_i,
-                last_mask=last_mask,
-                hidden=unknown[k],
-                last_hidden=last_unknown[k],
-                frames=tuple(course.frames),
-                T_world_objs=np.stack(course.poses),
-                confidences=tuple(course.sure),
-                observed=tuple(course.observed),
-                rival=rivals[k],
-                in_fist=s is thing and bool(carried),
-            )
-        )
+            course = _course(see, fits[k], kind, camera, max_poses)
+            placed.append(_placed(see, fits[k], course))
     return Placement(
         camera=camera,
         pitch_rad=pitch_rad,
         objects=tuple(placed),
         height_m=height_m,
         scale_spread=spread,
-        upright_cost=upright_cost,
+        upright_cost=fits[0].as_before,
+    )
+
+
+def _shown(footage: Footage, objects: tuple[Sighting, ...], s: Sighting, kind: str) -> _Shown:
+    thing = objects[0]
+    hidden = _hidden(footage, s.at, s.first, s.last if s.moves else None)
+    hidden |= _others(objects, s, s.at)
+    last_i, last_mask = _end_of(s, kind, thing)
+    last_hidden = hidden
+    if s.moves:
+        last_hidden = _hidden(footage, last_i, last_mask, s.first) | _others(objects, s, last_i)
+    return _Shown(
+        s=s,
+        image=footage.rgb[s.at],
+        rests=_rests(s, kind if s is thing else "generic"),
+        hidden=hidden,
+        last_i=last_i,
+        last_image=footage.rgb[last_i],
+        last_mask=last_mask,
+        last_hidden=last_hidden,
+    )
+
+
+def _fit_both_ends(
+    see: _Shown, kind: str, camera: Camera, support: float, within: Within | None
+) -> _Fits:
+    """Return the pair of poses that costs least: one outline often fits a standing and a lying box alike, both ends seldom do.
+
+    The last pose is `support` above the table [camera heights], over the disc `within`.
+    """
+    options = _options(see, camera)
+    silhouette = Silhouette(see.last_mask, see.last_hidden, camera, see.last_image)
+    found = [_fit_last(silhouette, see.s, kind, first, support, within) for first in options]
+    costs = [a.cost + b.cost for a, (b, _) in zip(options, found, strict=True)]
+    best = int(np.argmin(costs))
+    last, as_before = found[best]
+    unseen = kind in SWALLOWING_KINDS and (see.s.swallowed or last.iou < UNSEEN_IOU)
+    return _Fits(
+        first=options[best],
+        last=_inside(last, support, within) if unseen and within is not None else last,
+        rival=float(np.partition(costs, 1)[1] - min(costs)) if len(costs) > 1 else None,
+        as_before=as_before,
+    )
+
+
+def _height_by_hand(
+    footage: Footage,
+    watched: Watched,
+    see: _Shown,
+    fits: _Fits,
+    kind: str,
+    camera: Camera,
+    known: tuple[float, float],
+) -> tuple[float, float] | None:
+    """Return the camera's height by the hand that moves the object, as `ruler.height_by_hand` does; `known` is pitch and height."""
+    from v2p_data.scene.ruler import height_by_hand  # torch takes a second to import
+
+    stands = [(see.s.first, fits.first.T_world_obj[:3, 3])]
+    if kind != "lift_up":  # it ends in mid-air
+        stands.append((see.last_mask, fits.last.T_world_obj[:3, 3]))
+    return height_by_hand(footage, watched, see.s.masks, stands, camera, *known)
+
+
+def _course(see: _Shown, fits: _Fits, kind: str, camera: Camera, max_poses: int) -> Course:
+    if see.s.moves:
+        end = (see.last_i, see.last_mask)
+        return course_between(see.s, kind, fits.first, fits.last, end, camera, max_poses)
+    pose, iou = fits.first.T_world_obj, fits.first.iou
+    return Course([0], [pose], [iou], ["full"]).then(len(see.s.masks) - 1, pose, iou, "full")
+
+
+def _in_fist(
+    see: _Shown, fits: _Fits, carried: list[tuple[int, Float[np.ndarray, "2"]]], camera: Camera
+) -> Placed:
+    """Return what a hand hides and carries as far in the picture."""
+    start = Course([0], [fits.first.T_world_obj], [fits.first.iou], ["full"])
+    course = course_in_hand(start, carried, camera)
+    last = replace(fits.first, T_world_obj=course.poses[-1], iou=0.0, visible=0.0)
+    see = replace(see, last_i=carried[-1][0], last_mask=np.zeros_like(see.last_mask))
+    return replace(_placed(see, replace(fits, last=last), course), in_fist=True)
+
+
+def _placed(see: _Shown, fits: _Fits, course: Course) -> Placed:
+    return Placed(
+        first=fits.first,
+        last=fits.last,
+        last_i=see.last_i,
+        last_mask=see.last_mask,
+        hidden=see.hidden,
+        last_hidden=see.last_hidden,
+        frames=tuple(course.frames),
+        T_world_objs=np.stack(course.poses),
+        confidences=tuple(course.sure),
+        observed=tuple(course.observed),
+        rival=fits.rival,
     )
 
 
@@ -275,33 +321,19 @@ def with_forms(
     return tuple(out)
 
 
-def _best_pitch(
-    images: list[UInt8[np.ndarray, "h w 3"]],
-    objects: tuple[Sighting, ...],
-    unknown: list[Bool[np.ndarray, "h w"]],
-    rests: list[_Rests],
-    guess: CameraGuess,
-) -> tuple[float, list[Fit]]:
+def _best_pitch(shown: list[_Shown], guess: CameraGuess) -> tuple[float, list[Fit]]:
     """Try pitches around the guess; the silhouettes decide, as far as the guess lets them."""
     best: tuple[float, float, list[Fit]] | None = None
     tried: list[float] = []
 
     def fits_at(pitch: float, *, thorough: bool) -> list[Fit]:
-        camera = camera_above(images[0].shape[:2], pitch, guess.fov_rad)
-        return [
-            min(
-                _options(
-                    s,
-                    unknown[k],
-                    camera,
-                    rests[k][: None if thorough or k == 0 else 1],
-                    images[k],
-                    thorough=thorough,
-                ),
-                key=lambda fit: fit.cost,
-            )
-            for k, s in enumerate(objects)
-        ]
+        camera = camera_above(shown[0].hidden.shape, pitch, guess.fov_rad)
+        out = []
+        for k, see in enumerate(shown):
+            usual = see if thorough or k == 0 else replace(see, rests=see.rests[:1])
+            options = _options(usual, camera, thorough=thorough)
+            out.append(min(options, key=lambda fit: fit.cost))
+        return out
 
     sd = guess.pitch_sd_rad
     for offsets in ((-1.8 * sd, -0.9 * sd, 0.0, 0.9 * sd, 1.8 * sd), (-0.4 * sd, 0.4 * sd)):
@@ -317,7 +349,7 @@ def _best_pitch(
             if best is None or cost < best[0]:
                 best = cost, pitch, fits
     assert best is not None
-    return best[1], fits_at(best[1], thorough=len(objects) > 1)
+    return best[1], fits_at(best[1], thorough=len(shown) > 1)
 
 
 def _rests(s: Sighting, kind: str) -> _Rests:
@@ -329,22 +361,15 @@ def _rests(s: Sighting, kind: str) -> _Rests:
     return orientations(s.noun)
 
 
-def _options(
-    s: Sighting,
-    unknown: Bool[np.ndarray, "h w"],
-    camera: Camera,
-    rests: _Rests,
-    image: UInt8[np.ndarray, "h w 3"],
-    *,
-    thorough: bool = True,
-) -> list[Fit]:
+def _options(see: _Shown, camera: Camera, *, thorough: bool = True) -> list[Fit]:
     """Return the best fit for every way in which the object may rest."""
-    silhouette = Silhouette(s.first, unknown, camera, image)
+    noun = see.s.noun
+    silhouette = Silhouette(see.s.first, see.hidden, camera, see.image)
     fits = []
-    for rest, extra in rests:
-        fit = fit_shape(silhouette, s.noun, rest, thorough=thorough)
+    for rest, extra in see.rests:
+        fit = fit_shape(silhouette, noun, rest, thorough=thorough)
         fit = replace(fit, cost=fit.cost + extra)
-        upright = s.noun.form == "box" and rest is not _MOUTH_DOWN
+        upright = noun.form == "box" and rest is not _MOUTH_DOWN
         fits.append(_upright_axes(fit) if upright else fit)
     return fits
 
@@ -352,12 +377,12 @@ def _options(
 def _end_of(s: Sighting, kind: str, thing: Sighting) -> tuple[int, Bool[np.ndarray, "h w"]]:
     """Return the footage frame of an object's last pose, and its mask there; `thing` is what is manipulated."""
     if s.role == "manipulated" and kind == "lift_up":
-        i = _peak(s)
+        i = peak(s)
         return i, s.masks[i]
     if s.in_hand or (s.at > 0 and s.moves):  # a tool may be gone again before the clip ends
         seen = np.flatnonzero(s.masks.any((1, 2)))
         touching = [
-            i for i in seen[seen > s.at] if (grow(s.masks[i], _TOUCH_PX) & thing.masks[i]).any()
+            i for i in seen[seen > s.at] if (grow(s.masks[i], TOUCH_PX) & thing.masks[i]).any()
         ]
         i = int(touching[-1] if s.in_hand and touching else seen[-1])
         return i, s.masks[i]
@@ -400,20 +425,24 @@ def _fit_last(
     return min(turned, key=lambda fit: fit.cost), same.cost
 
 
-def _fit_in_hand(
-    seen: list[tuple[Silhouette, Bool[np.ndarray, "h w"]]], s: Sighting, height_m: float
-) -> list[Fit]:
+def _fit_in_hand(see: _Shown, thing: Sighting, camera: Camera, height_m: float) -> _Fits:
     """Return the poses of a tool in a hand, whose outline is seen beside that of what it pushes."""
-    grip = _GRIP_HEIGHT_M / height_m
+    s, grip = see.s, _GRIP_HEIGHT_M / height_m
+    seen = (
+        (Silhouette(s.first, see.hidden, camera), thing.masks[s.at]),
+        (Silhouette(see.last_mask, see.last_hidden, camera), thing.masks[see.last_i]),
+    )
 
     def fits(size: tuple[float, float, float], spread: float) -> list[Fit]:
         return [fit_held(mask, s.noun, size, spread, pushed, grip) for mask, pushed in seen]
 
     if s.known_m:
-        return fits(three(np.array(s.known_m) / height_m), _NO_SPREAD)
-    free = fits(three(np.array(s.noun.size_m) / height_m), s.noun.spread)
-    # It has one length: as long as it is seen.
-    return fits(max((fit.size for fit in free), key=max), _NO_SPREAD)
+        first, last = fits(three(np.array(s.known_m) / height_m), _NO_SPREAD)
+    else:
+        free = fits(three(np.array(s.noun.size_m) / height_m), s.noun.spread)
+        # It has one length: as long as it is seen.
+        first, last = fits(max((fit.size for fit in free), key=max), _NO_SPREAD)
+    return _Fits(first=first, last=last)
 
 
 def _goal(
@@ -444,145 +473,6 @@ def _inside(fit: Fit, support: float, within: Within) -> Fit:
 def _floor(size: Float[np.ndarray, "3"]) -> float:
     """Return how high the floor of a hollow thing lies above the table, in units of its size."""
     return float(min(0.06 * size.min(), 0.15 * size[2]))
-
-
-@dataclass
-class _Course:
-    frames: list[int]
-    poses: list[Float[np.ndarray, "4 4"]]
-    sure: list[float]
-    observed: list[Observed]
-
-    def then(
-        self, frame: int, pose: Float[np.ndarray, "4 4"], sure: float, observed: Observed
-    ) -> "_Course":
-        """Return the course with one pose more, unless it has one at that frame."""
-        if frame > self.frames[-1]:
-            self.frames.append(frame)
-            self.poses.append(pose)
-            self.sure.append(float(np.clip(sure, 0, 1)))
-            self.observed.append(observed)
-        return self
-
-
-def _course(
-    s: Sighting,
-    kind: str,
-    first_fit: Fit,
-    last_fit: Fit,
-    end: tuple[int, Bool[np.ndarray, "h w"]],
-    camera: Camera,
-    max_poses: int,
-) -> _Course:
-    """Return poses at well-tracked frames: position from the mask's centre, rotation blended."""
-    first, last = first_fit.T_world_obj, last_fit.T_world_obj
-    last_i, last_mask = end
-    depth: Observed = "no_depth" if s.in_hand else "full"
-    # What a hand brings has no pose before it comes.
-    course = _Course([s.at], [first], [float(np.clip(first_fit.iou, 0, 1))], [depth])
-    count = min(max_poses, last_i - s.at + 1)
-    spots = np.unique(np.linspace(s.at, last_i, count).round().astype(int))
-    on_table = kind in _SLIDING_KINDS
-    turn = Rotation.from_matrix(last[:3, :3] @ first[:3, :3].T).as_rotvec()
-    ends = [_centre(s.first), _centre(last_mask)]
-    bias = [
-        centre - camera.project(T[None, :3, 3])[0]
-        for centre, T in zip(ends, (first, last), strict=True)
-    ]
-    travel = ends[1] - ends[0]
-    for i in spots.tolist()[1:-1]:
-        if s.quality[i] < 0.5 or not s.masks[i].any():
-            continue
-        centre = _centre(s.masks[i])
-        share = float(np.clip((centre - ends[0]) @ travel / max(1.0, travel @ travel), 0, 1))
-        pixel = centre - (1 - share) * bias[0] - share * bias[1]
-        if on_table:
-            position = camera.on_plane(pixel[None], float(first[2, 3]))[0]
-        else:
-            position = on_wall(
-                camera, pixel, float((1 - share) * first[0, 3] + share * last[0, 3])
-            )
-            position[2] = max(position[2], min(first[2, 3], last[2, 3]))
-        if not np.isfinite(position).all():
-            continue
-        rotation = Rotation.from_rotvec(share * turn).as_matrix() @ first[:3, :3]
-        free = position[2] > max(first[2, 3], last[2, 3]) + 0.02
-        course.then(
-            i,
-            transform(rotation, position),
-            0.7 * float(s.quality[i]),
-            "no_depth" if free else depth,
-        )
-    in_air = kind == "lift_up" or s.in_hand
-    return course.then(last_i, last, last_fit.iou, "no_depth" if in_air else "full")
-
-
-def _peak(s: Sighting) -> int:
-    """Return the footage frame at which a lift is highest in the picture, among the believable ones.
-
-    Where it is never higher than at first, that is the last believable one: a sleeve hides it from then on.
-    """
-    n = len(s.masks)
-    heights = np.full(n, -np.inf)
-    start = _centre(s.first)[1]
-    for i in range(n):
-        if s.quality[i] >= 0.5 and s.masks[i].any():
-            heights[i] = start - _centre(s.masks[i])[1]
-    top = heights.max()
-    # The end of the clip counts as the peak when it is nearly as high: a hand that holds still trembles.
-    near = heights >= 0.93 * top if top > 0 else np.isfinite(heights)
-    return int(np.flatnonzero(near)[-1]) if near.any() else n - 1
-
-
-def _carried(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.ndarray, "2"]]]:
-    """Return by how far the hand has moved in the picture since it took hold of a thing that it hides, in the frames since.
-
-    It takes hold where its end stays longest, low and beside the thing. Nothing where the thing itself is seen going up, where
-    no hand comes to it, where that hand does not rise, or where in the end something that moved is in sight.
-    """
-    i, (_, _, _, tall) = _peak(s), bounding_box(s.first)
-    if _centre(s.first)[1] - _centre(s.masks[i])[1] > _SEEN_RISING * tall:
-        return []
-    home = grow(s.first, _TOUCH_PX)
-    tips, holding = {}, []
-    for at in watched.idx.tolist():
-        hand = hand_at(watched, at)
-        end = hand_end(hand)
-        if end is not None:
-            tips[at] = np.array(end.tip_px)
-            holding += [at] if (hand & home).any() else []
-    if not holding:
-        return []
-    middle = np.mean([max(tips[at][1] for at in holding), min(tip[1] for tip in tips.values())])
-    order = list(tips)
-
-    def haste(at: int) -> float:
-        k = order.index(at)
-        beside = [tips[other] for other in order[max(0, k - 1) : k + 2]]
-        return float(np.linalg.norm(np.ptp(beside, axis=0)))
-
-    grip = min((at for at in holding if tips[at][1] >= middle), key=haste)
-    since = [(at, tip - tips[grip]) for at, tip in tips.items() if at > grip]
-    risen = [k for k, (_, by) in enumerate(since) if -by[1] > _SEEN_RISING * tall]
-    if not risen:
-        return []
-    since = since[: risen[-1] + 1]
-    ending = since[-max(1, len(since) // 3) :]
-    in_sight = np.median([(watched.at(at)[MOVED] > 0.5).sum() for at, _ in ending])
-    return [] if in_sight > _LEFT_IN_SIGHT * s.first.sum() else since
-
-
-def _course_in_hand(
-    course: "_Course", carried: list[tuple[int, Float[np.ndarray, "2"]]], camera: Camera
-) -> "_Course":
-    """Return the course of what goes with a hand, as far away as it stood."""
-    T_first = course.poses[0]
-    start = camera.project(T_first[None, :3, 3])[0]
-    for i, by in carried:
-        position = on_wall(camera, start + by, float(T_first[0, 3]))
-        position[2] = max(position[2], T_first[2, 3])
-        course.then(i, transform(T_first[:3, :3], position), _GOES_WITH_HAND, "no_depth")
-    return course
 
 
 def _hidden(
@@ -638,11 +528,6 @@ def _tipped_along(fit: Fit, T_first: Float[np.ndarray, "4 4"]) -> Fit:
     T = fit.T_world_obj.copy()
     T[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ T[:3, :3]
     return replace(fit, T_world_obj=T)
-
-
-def _centre(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
-    y, x = np.nonzero(mask)
-    return np.array([x.mean() + 0.5, y.mean() + 0.5]) if len(x) else np.array([np.nan, np.nan])
 
 
 def vote_of(s: Sighting, fit: Fit) -> SizeVote:
