@@ -210,12 +210,11 @@ def place(
 
 def _shown(footage: Footage, objects: tuple[Sighting, ...], s: Sighting, kind: str) -> _Shown:
     thing = objects[0]
-    hidden = _hidden(footage, s.at, s.first, s.last if s.moves else None)
-    hidden |= _others(objects, s, s.at)
+    hidden = _hidden(footage, objects, s.first, s.at) | _others(objects, s, s.at)
     last_i, last_mask = _end_of(s, kind, thing)
     last_hidden = hidden
     if s.moves:
-        last_hidden = _hidden(footage, last_i, last_mask, s.first) | _others(objects, s, last_i)
+        last_hidden = _hidden(footage, objects, last_mask, last_i) | _others(objects, s, last_i)
     return _Shown(
         s=s,
         image=footage.rgb[s.at],
@@ -364,7 +363,7 @@ def _rests(s: Sighting, kind: str) -> _Rests:
 def _options(see: _Shown, camera: Camera, *, thorough: bool = True) -> list[Fit]:
     """Return the best fit for every way in which the object may rest."""
     noun = see.s.noun
-    silhouette = Silhouette(see.s.first, see.hidden, camera, see.image)
+    silhouette = Silhouette(see.s.first, see.hidden, camera, see.image, see.s.drawn_xyxy)
     fits = []
     for rest, extra in see.rests:
         fit = fit_shape(silhouette, noun, rest, thorough=thorough)
@@ -476,17 +475,19 @@ def _floor(size: Float[np.ndarray, "3"]) -> float:
 
 
 def _hidden(
-    footage: Footage,
-    i: int,
-    mask: Bool[np.ndarray, "h w"],
-    other_end: Bool[np.ndarray, "h w"] | None = None,
+    footage: Footage, objects: tuple[Sighting, ...], mask: Bool[np.ndarray, "h w"], i: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Return pixels near the mask that say nothing: what passes there (the hand, a shadow) may hide the object."""
-    background = footage.late if i < len(footage.rgb) / 2 else footage.early
+    """Return pixels near a mask of frame `i` that say nothing: what passes there (the hand, a shadow) may hide the object.
+
+    What passes differs from the still of the other end, except where that shows what has moved.
+    """
+    early = i < len(footage.rgb) / 2
+    background = footage.late if early else footage.early
     passing = np.linalg.norm(footage.lab[i] - lab_of(background), axis=-1) > 12
     hidden = tidy(passing) & ~mask
-    if other_end is not None:
-        hidden &= ~grow(other_end, 2)
+    for s in objects:
+        if s.moves and not s.in_hand:
+            hidden &= ~grow(s.last if early else s.first, 2)
     x, y, w, h = bounding_box(mask)
     near = np.zeros_like(mask)
     pad = max(4, int(0.3 * max(w, h)))
