@@ -363,7 +363,7 @@ def _rests(s: Sighting, kind: str) -> _Rests:
 def _options(see: _Shown, camera: Camera, *, thorough: bool = True) -> list[Fit]:
     """Return the best fit for every way in which the object may rest."""
     noun = see.s.noun
-    silhouette = Silhouette(see.s.first, see.hidden, camera, see.image, see.s.drawn_xyxy)
+    silhouette = Silhouette(see.s.first, see.hidden, camera, see.image)
     fits = []
     for rest, extra in see.rests:
         fit = fit_shape(silhouette, noun, rest, thorough=thorough)
