@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from safetensors.torch import load_file
-from train_scene_network import compressed, write
+from train_scene_network import compressed, descend, write
 
 from v2p_data.scene.hand import gap_px, hand_end
 from v2p_data.scene.ruler import (
@@ -300,35 +300,25 @@ def train(
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if start_from:
         net.load_state_dict({k: v.float() for k, v in load_file(start_from).items()})
-    optimiser = torch.optim.AdamW(net.parameters(), lr, weight_decay=1e-3)
-    began, saved, step, losses = time.time(), time.time(), 0, []
-    while (share := (time.time() - began) / (60 * minutes)) < 1:
-        for group in optimiser.param_groups:
-            group["lr"] = lr * min(1, (step + 1) / 100) * (0.02 + 0.98 * np.cos(np.pi / 2 * share))
+
+    def loss() -> torch.Tensor:
         some = [own[k] for k in rng.integers(len(own), size=BATCH)]
         planes, known, off = batch_of(
             [(scene, int(rng.integers(len(scene["known"])))) for scene in some], rng
         )
         with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
             said = net(planes.contiguous(memory_format=torch.channels_last), known)
-        loss = loss_of(said.float(), off)
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        optimiser.step()
-        losses.append(loss.item())
-        step += 1
-        if time.time() - saved > 120:
-            saved = time.time()
-            write(net, out)
-            own, held_out = read()
-            words = f"{len(own)} scenes, {measure(net, held_out)}"
-            print(
-                f"{saved - began:5.0f} s step {step} loss {np.mean(losses[-100:]):.3f}: {words}",
-                flush=True,
-            )
+        return loss_of(said.float(), off)
+
+    def state() -> str:
+        nonlocal own, held_out
+        write(net, out)
+        own, held_out = read()
+        return f"{len(own)} scenes, {measure(net, held_out)}"
+
+    steps = descend(net, minutes, lr, loss, state)
     write(net, out)
-    print(f"{step} steps of {BATCH}: {measure(net, held_out)}", flush=True)
+    print(f"{steps} steps of {BATCH}: {measure(net, held_out)}", flush=True)
 
 
 def main() -> None:

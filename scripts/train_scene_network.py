@@ -17,6 +17,7 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import count, islice
@@ -437,33 +438,55 @@ def train(
                 for k, v in fresh.items()
             }
         )
-    optimiser = torch.optim.AdamW(net.parameters(), lr, weight_decay=1e-3)
-    began, saved, step, losses = time.time(), time.time(), 0, []
-    while (share := (time.time() - began) / (60 * minutes)) < 1:
-        for group in optimiser.param_groups:
-            group["lr"] = lr * min(1, (step + 1) / 100) * (0.02 + 0.98 * np.cos(np.pi / 2 * share))
+
+    def loss() -> torch.Tensor:
         batch = examples.batch(rng, BATCH)
         x = inputs_of(batch["frame"], batch["early"], batch["late"])
         with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
             logits, camera = net(x.contiguous(memory_format=torch.channels_last))
-        loss = loss_of(logits.float(), camera, batch)
+        return loss_of(logits.float(), camera, batch)
+
+    def state() -> str:
+        write(net, out)
+        read()
+        return f"{len(examples.files)} clips, {measure(net, held_out[::3])}"
+
+    steps = descend(net, minutes, lr, loss, state)
+    write(net, out)
+    print(f"{steps} steps of {BATCH}: {measure(net, held_out)}", flush=True)
+
+
+def descend(
+    net: torch.nn.Module,
+    minutes: float,
+    lr: float,
+    loss: Callable[[], torch.Tensor],
+    state: Callable[[], str],
+) -> int:
+    """Make a network better for so many minutes, and return in how many steps; `state` is printed every two minutes.
+
+    The learning rate rises to `lr` over a hundred steps and falls along a quarter of a cosine as time runs out.
+    """
+    optimiser = torch.optim.AdamW(net.parameters(), lr, weight_decay=1e-3)
+    began = spoken = time.time()
+    losses: list[float] = []
+    while (share := (time.time() - began) / (60 * minutes)) < 1:
+        warm = min(1, (len(losses) + 1) / 100)
+        for group in optimiser.param_groups:
+            group["lr"] = lr * warm * (0.02 + 0.98 * np.cos(np.pi / 2 * share))
+        lost = loss()
         optimiser.zero_grad()
-        loss.backward()
+        lost.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimiser.step()
-        losses.append(loss.item())
-        step += 1
-        if time.time() - saved > 120:
-            saved = time.time()
-            write(net, out)
-            read()
-            words = f"{len(examples.files)} clips, {measure(net, held_out[::3])}"
+        losses.append(lost.item())
+        if time.time() - spoken > 120:
+            spoken = time.time()
             print(
-                f"{saved - began:5.0f} s step {step} loss {np.mean(losses[-100:]):.3f}: {words}",
+                f"{spoken - began:5.0f} s step {len(losses)} loss {np.mean(losses[-100:]):.3f}: {state()}",
                 flush=True,
             )
-    write(net, out)
-    print(f"{step} steps of {BATCH}: {measure(net, held_out)}", flush=True)
+    return len(losses)
 
 
 def average(files: list[Path], out: Path) -> None:
