@@ -11,7 +11,8 @@ written down beside its result with the commit that ran it.
     python scripts/bench_reconstruction.py --quick
 
 The caption is all that a clip comes with. With `--boxes` each named object has one box more, as a person would draw it:
-around what is visible at the first frame, or at the last for what is hidden at first, a few pixels off at each side.
+around what is visible at the first frame, or at the last for what is hidden at first, a few pixels off at each side. With
+`--size` the manipulated object's length, width and height are given as well, as somebody measured them.
 """
 
 import argparse
@@ -129,15 +130,16 @@ def main() -> None:
     missing = [(job, folders[job.name]) for job in jobs if not folders[job.name].is_dir()]
     for _ in _each(args.jobs, _draw_clip, missing, "drawn"):
         pass
-    name = f"{args.split}{'_quick' if args.quick else ''}{'_boxes' if args.boxes else ''}"
+    name = args.split + "".join(f"_{way}" for way in ("quick", "boxes", "size") if vars(args)[way])
     pictures = args.out / f"pictures_{name}"
-    tasks = [(job, folders[job.name], args.boxes, pictures) for job in jobs]
+    tasks = [(job, folders[job.name], args.boxes, args.size, pictures) for job in jobs]
     rows = list(_each(args.jobs, _reconstructed, tasks, "reconstructed"))
     rows.sort(key=lambda row: (KINDS.index(row["kind"]), row["seed"]))
     summary = summarised(rows)
     result = {
         "split": args.split,
         "boxes": args.boxes,
+        "size": args.size,
         "commit": _commit(),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "load": round(os.getloadavg()[0], 2),
@@ -378,6 +380,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--split", choices=["tune", "final"], default="tune")
     parser.add_argument("--quick", action="store_true", help="one clip per kind, few frames")
     parser.add_argument("--boxes", action="store_true", help="one box per named object as a hint")
+    parser.add_argument(
+        "--size", action="store_true", help="the manipulated object's size as a hint"
+    )
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
     parser.add_argument(
@@ -402,6 +407,7 @@ def _note_final_run(args: argparse.Namespace) -> list[dict[str, Any]]:
         "commit": _commit(),
         "clips": args.clips,
         "boxes": args.boxes,
+        "size": args.size,
     }
     with path.open("a") as file:
         file.write(json.dumps(run) + "\n")
@@ -468,13 +474,16 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:8]
 
 
-def _reconstructed(job: Job, folder: Path, boxes: bool, pictures: Path) -> Row:
+def _reconstructed(job: Job, folder: Path, boxes: bool, size: bool, pictures: Path) -> Row:
     truth = load_truth(folder, job.name)
     true = true_of(truth)
     said: Row = {"caption": truth.caption}
-    if boxes:
-        said["hints"] = boxes_of(true, truth.camera, rng_for(job.seed, "boxes"))
-        said["objects"] = list(truth.objects)
+    hints = boxes_of(true, truth.camera, rng_for(job.seed, "boxes")) if boxes else {}
+    if size:
+        thing = true.things[0]
+        hints.setdefault(thing.phrase, {})["size_m"] = [round(side, 3) for side in thing.size_m]
+    if hints:
+        said |= {"hints": hints, "objects": list(truth.objects)}
     row: Row = {
         "name": job.name,
         "kind": job.kind,

@@ -59,6 +59,12 @@ def test_an_unknown_command_gets_a_suggestion(capsys):
     assert "Did you mean 'generate'" in said(capsys, "generat")
 
 
+def test_fewer_than_no_workers_are_refused(capsys, videos, tmp_path):
+    message = said(capsys, "scene", videos, "--out", tmp_path / "run", "--workers", "-3")
+
+    assert "--workers is at least 0" in message
+
+
 def test_an_unknown_option_gets_a_suggestion(capsys, videos, tmp_path):
     message = said(capsys, *generate(videos, tmp_path / "out", "--expert.num-evs", "3"))
 

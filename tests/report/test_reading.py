@@ -19,6 +19,20 @@ def test_the_newest_complete_result_counts(run):
     assert found.get("scene", "a").counts == {"kind": "new"}
 
 
+def test_what_the_last_command_kept_counts_though_something_newer_was_tried_between(run):
+    """A hint was tried, rejected, and taken out again."""
+    kept = run.record(
+        run.folder("scene", "a", "11111111"), time="2026-01-01T00:00:00Z", counts={"kind": "kept"}
+    )
+    run.record(
+        run.folder("scene", "a", "00000000"), time="2026-02-01T00:00:00Z", counts={"kind": "tried"}
+    )
+    outcome = {"stage": "scene", "item": "a", "status": "kept", "folder": kept.name}
+    (run.root / "run.json").write_text(json.dumps([outcome]))
+
+    assert read_run(run.root).get("scene", "a").counts == {"kind": "kept"}
+
+
 def test_a_partial_folder_never_hides_a_complete_one(run):
     run.record(run.folder("scene", "a"))
     (run.root / "scene" / "a-99999999.partial").mkdir()

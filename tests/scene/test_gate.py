@@ -29,7 +29,7 @@ def test_each_stage_says_what_made_it_unsure():
 
 def test_an_unsure_scene_is_turned_away_with_its_weakest_cue():
     with pytest.raises(
-        ItemRejectedError, match=r"0\.76, below 0\.90; weakest is finding 'cup'"
+        ItemRejectedError, match=r"0\.760, below 0\.9; weakest is finding 'cup'"
     ) as caught:
         check_confidence(CUES, 0.9)
 

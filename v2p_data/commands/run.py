@@ -50,6 +50,10 @@ class How:
     """Where the policy trains: cpu, cuda, mps."""
 
     def runtime(self, root: Path) -> Runtime:
+        if self.workers < 0 or self.threads < 1:
+            raise V2PError(
+                f"--workers is at least 0 and --threads at least 1, got {self.workers} and {self.threads}"
+            )
         workers = self.workers or os.cpu_count() or 1
         return Runtime(root=root, workers=workers, num_threads=self.threads, device=self.device)
 

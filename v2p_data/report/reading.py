@@ -80,9 +80,13 @@ class Run:
 
 
 def read_run(root: Path) -> Run:
-    """Return a run's newest complete results, and what failed or is unfinished where there is none."""
+    """Return a run's complete results, and what failed or is unfinished where there is none.
+
+    Of several the one that the last command made or kept counts, else the newest.
+    """
     results: dict[Key, Result] = {}
-    ages: dict[Key, tuple[str, float]] = {}
+    ages: dict[Key, tuple[bool, str, float]] = {}
+    asked = _asked_last(root)
     unreadable: list[str] = []
     for stage in STAGES:
         for folder in sorted(_folders(root / stage)):
@@ -97,6 +101,7 @@ def read_run(root: Path) -> Run:
                 continue
             key = (stage, str(record.item))
             age = (
+                folder.name == asked.get(key),
                 str((record.provenance or {}).get("time", "")),
                 (folder / RECORD_FILE).stat().st_mtime,
             )
@@ -258,22 +263,41 @@ def _from_record(stage: str, folder: Path, record: Record) -> Result:
     )
 
 
+def _outcomes(root: Path) -> list[dict[str, Any]]:
+    """Return what became of each result that the last command asked for."""
+    outcomes = read_json(root / RUN_FILE)
+    return [
+        o
+        for o in (outcomes if isinstance(outcomes, list) else [])
+        if isinstance(o, dict) and o.get("stage") in STAGES and "item" in o
+    ]
+
+
+def _asked_last(root: Path) -> dict[Key, str]:
+    """Return the folders of what the last command made, kept or turned away."""
+    return {
+        (str(o["stage"]), str(o["item"])): Path(str(o.get("folder", ""))).name
+        for o in _outcomes(root)
+    }
+
+
 def _from_run_file(root: Path) -> list[Result]:
     """Return what the last command could not finish; failures leave no record."""
-    outcomes = read_json(root / RUN_FILE)
     words: dict[str, Status] = {"failed": "failed", "blocked": "not run"}
     return [
         Result(
             stage=str(o["stage"]),
             item=str(o["item"]),
             status=words[o["status"]],
-            folder=root / str(o["stage"]) / f"{Path(str(o.get('folder', ''))).name}{PARTIAL_SUFFIX}",
+            folder=root
+            / str(o["stage"])
+            / f"{Path(str(o.get('folder', ''))).name}{PARTIAL_SUFFIX}",
             reason=str(o.get("reason", "")),
             detail=str(o.get("detail", "")),
         )
-        for o in (outcomes if isinstance(outcomes, list) else [])
-        if isinstance(o, dict) and o.get("stage") in STAGES and o.get("status") in words and "item" in o
-    ]  # fmt: skip
+        for o in _outcomes(root)
+        if o.get("status") in words
+    ]
 
 
 def _from_partials(root: Path) -> list[Result]:

@@ -102,8 +102,8 @@ def check_confidence(cues: tuple[Cue, ...], least: float) -> float:
         weakest = min(cues, key=lambda cue: cue.value)
         raise ItemRejectedError(
             "low_confidence",
-            f"the scene is sure to {confidence:.2f}, below {least:.2f}; weakest is {weakest.what} with "
-            f"{weakest.value:.2f}; a box around the object in captions.json helps",
+            f"the scene is sure to {confidence:.3f}, below {least:g}; weakest is {weakest.what} with "
+            f"{weakest.value:.2f}; in captions.json a box around each object helps, or a known size",
             round(confidence, 3),
         )
     return confidence

@@ -164,8 +164,8 @@ def sight(
     if sure < min_found:
         raise ItemRejectedError(
             "object_not_found",
-            f"the best match for '{meaning.manipulated}' in {clip.item} is sure to {sure:.2f}, below {min_found:.2f} "
-            f"({why}); mark it with a box in captions.json",
+            f"the best match for '{meaning.manipulated}' in {clip.item} is sure to {sure:.3f}, below {min_found:g} "
+            f"({why}); mark it, and each other object of the caption, with a box in captions.json",
             round(sure, 3),
         )
     if watched is None:
@@ -375,7 +375,7 @@ def _check_needed(scene: _Scene, phrase: str, sure: float) -> None:
     if phrase.lower() in clip.caption.lower() and scene.meaning.kind not in _OPTIONAL_KINDS:
         raise ItemRejectedError(
             "reference_not_found",
-            f"the '{phrase}' was not found in {clip.item} (sure to {sure:.2f}); mark it with a box in captions.json",
+            f"the '{phrase}' was not found in {clip.item} (sure to {sure:.3f}, below {scene.min_found:g}); mark it with a box in captions.json",
             round(sure, 3),
         )
 
