@@ -65,6 +65,16 @@ def test_fewer_than_no_workers_are_refused(capsys, videos, tmp_path):
     assert "--workers is at least 0" in message
 
 
+def test_where_no_video_was_understood_the_review_page_comes_next(capsys, tmp_path):
+    videos = tmp_path / "videos"
+    videos.mkdir()
+    (videos / "lift_up__mug.mp4").write_bytes(b"no video")
+
+    assert run(["scene", str(videos), "--out", str(tmp_path / "run")]) == 2
+
+    assert f"Next: v2p scene review {tmp_path / 'run'}" in capsys.readouterr().out
+
+
 def test_an_unknown_option_gets_a_suggestion(capsys, videos, tmp_path):
     message = said(capsys, *generate(videos, tmp_path / "out", "--expert.num-evs", "3"))
 

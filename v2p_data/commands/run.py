@@ -316,11 +316,16 @@ def _up_to(
     print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
     counts = tally(list(outcomes.values()), name)
     rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
+    out = shlex.quote(str(args.out))
+    goes_on = f"{then} {shlex.quote(str(args.videos))} --out {out}"
+    if name == "scene" and not counts["usable"]:
+        goes_on = f"v2p scene review {out}   (to mark what was not found)"
+    elif then == "v2p generate":
+        goes_on += " --repo-id USER/NAME"
     _say(
         f"Made {root / name}",
         f"{counts['usable']} of {len(stages)} videos{f' ({rest})' if rest else ''}; page: {page}",
-        f"{then} {shlex.quote(str(args.videos))} --out {shlex.quote(str(args.out))}"
-        + (" --repo-id USER/NAME" if then == "v2p generate" else ""),
+        goes_on,
     )
     return 0 if counts["usable"] else 2
 
