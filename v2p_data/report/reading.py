@@ -86,7 +86,11 @@ def read_run(root: Path) -> Run:
     """
     results: dict[Key, Result] = {}
     ages: dict[Key, tuple[bool, str, float]] = {}
-    asked = _asked_last(root)
+    outcomes = _outcomes(root)
+    # The folders of what the last command made, kept or turned away.
+    asked = {
+        (str(o["stage"]), str(o["item"])): Path(str(o.get("folder", ""))).name for o in outcomes
+    }
     unreadable: list[str] = []
     for stage in STAGES:
         for folder in sorted(_folders(root / stage)):
@@ -108,7 +112,7 @@ def read_run(root: Path) -> Run:
             if key not in ages or age > ages[key]:
                 ages[key] = age
                 results[key] = _from_record(stage, folder, record)
-    for result in (*_from_run_file(root), *_from_partials(root)):
+    for result in (*_unfinished(root, outcomes), *_from_partials(root)):
         results.setdefault((result.stage, result.item), result)
     return Run(root=root, results=results, unreadable=unreadable)
 
@@ -273,15 +277,7 @@ def _outcomes(root: Path) -> list[dict[str, Any]]:
     ]
 
 
-def _asked_last(root: Path) -> dict[Key, str]:
-    """Return the folders of what the last command made, kept or turned away."""
-    return {
-        (str(o["stage"]), str(o["item"])): Path(str(o.get("folder", ""))).name
-        for o in _outcomes(root)
-    }
-
-
-def _from_run_file(root: Path) -> list[Result]:
+def _unfinished(root: Path, outcomes: list[dict[str, Any]]) -> list[Result]:
     """Return what the last command could not finish; failures leave no record."""
     words: dict[str, Status] = {"failed": "failed", "blocked": "not run"}
     return [
@@ -295,7 +291,7 @@ def _from_run_file(root: Path) -> list[Result]:
             reason=str(o.get("reason", "")),
             detail=str(o.get("detail", "")),
         )
-        for o in _outcomes(root)
+        for o in outcomes
         if o.get("status") in words
     ]
 

@@ -110,6 +110,8 @@ class Placed:
     """By how much the next best way of lying covers the outlines worse; None where there is no other."""
     in_fist: bool = False
     """Whether the hand that lifts it hides it from the camera: then its poses go with the hand."""
+    unseen: bool = False
+    """Whether nothing shows where it ends: then it lies in the middle of what swallowed it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +154,7 @@ class _Fits:
     rival: float | None = None
     as_before: float = 0.0
     """What standing as at first would have cost at the end."""
+    unseen: bool = False
 
 
 def place(
@@ -241,11 +244,14 @@ def _fit_both_ends(
     best = int(np.argmin(costs))
     last, as_before = found[best]
     unseen = kind in SWALLOWING_KINDS and (see.s.swallowed or last.iou < UNSEEN_IOU)
+    if unseen and within is not None:
+        last = _inside(last, support, within)
     return _Fits(
         first=options[best],
-        last=_inside(last, support, within) if unseen and within is not None else last,
+        last=last,
         rival=float(np.partition(costs, 1)[1] - min(costs)) if len(costs) > 1 else None,
         as_before=as_before,
+        unseen=unseen and within is not None,
     )
 
 
@@ -299,6 +305,7 @@ def _placed(see: _Shown, fits: _Fits, course: Course) -> Placed:
         confidences=tuple(course.sure),
         observed=tuple(course.observed),
         rival=fits.rival,
+        unseen=fits.unseen,
     )
 
 

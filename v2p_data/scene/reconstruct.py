@@ -24,7 +24,7 @@ from v2p_data.scene.backends.config import (
     SegmentConfig,
 )
 from v2p_data.scene.crop import View
-from v2p_data.scene.find import SWALLOWING_KINDS, Watched, passed, watch
+from v2p_data.scene.find import Watched, passed, watch
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
 from v2p_data.scene.gate import Cue, by_stage, check_confidence, check_motion, cues_of
 from v2p_data.scene.learned import (
@@ -434,11 +434,11 @@ def _remarks(kind: str, sights: Sights, placement: Placement, num_frames: int) -
         for s, placed in zip(sights.objects, placement.objects, strict=True)
         if placed.rival is not None and placed.rival < _CLOSE_RIVAL
     ]
-    thing, goal = placement.objects[0], sights.objects[1:2]
-    unseen = sights.objects[0].swallowed or thing.last.iou < UNSEEN_IOU
-    if kind in SWALLOWING_KINDS and unseen and goal:
+    thing = placement.objects[0]
+    if thing.unseen:
+        phrase, goal = (s.phrase for s in sights.objects[:2])
         out.append(
-            f"nothing shows where '{sights.objects[0].phrase}' ends: it is taken to lie in the middle of '{goal[0].phrase}'"
+            f"nothing shows where '{phrase}' ends: it is taken to lie in the middle of '{goal}'"
         )
     last_frame = int(sights.footage.frame_idx[thing.last_i])
     if kind == "lift_up":
