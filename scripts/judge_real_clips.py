@@ -1,6 +1,7 @@
 """Judge the reconstruction of real clips against boxes that a person drew: the table of `docs/reconstruction.md`.
 
-Each clip is decoded and rebuilt as `v2p scene` does it, without hints, or with `--boxes` with one box per object.
+Each clip is decoded and rebuilt as `v2p scene` does it, without hints, with `--boxes` with one box per object, or with
+`--boxes manipulated` with a box around what is moved and nothing else, as a person in a hurry marks it.
 A clip is right when every outline's box overlaps the drawn one by half or more (intersection over union), at the
 first and at the last frame. Whatever follows the options goes to the engine's settings, e.g. `--scene.min-confidence 0.6`.
 
@@ -16,7 +17,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ from v2p_data.stages import EngineConfig
 from v2p_data.video.captions import VideoItem, find_videos
 from v2p_data.video.clip import Clip, Hint
 from v2p_data.video.decode import read_clip
+from v2p_data.video.meaning import parse_caption
 
 DRAWN = Path(__file__).parents[1] / "docs" / "real_clip_boxes.json"
 RIGHT_IOU = 0.5
@@ -42,6 +44,8 @@ _LEAST = (0.0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _PICTURE_PX = 400
 _RED, _GREEN, _WHITE = (235, 30, 30), (40, 220, 40), (255, 255, 255)
 
+Hinted = Literal["none", "all", "manipulated"]
+"""Which objects' drawn boxes are given as hints."""
 Box = list[float]
 """`[x0, y0, x1, y1]` [px of the file as shown]."""
 
@@ -76,7 +80,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("videos", type=Path, help="folder of the clips, or one clip")
     parser.add_argument(
-        "--boxes", action="store_true", help="give one drawn box per object as hint"
+        "--boxes",
+        nargs="?",
+        choices=get_args(Hinted),
+        const="all",
+        default="none",
+        help="give drawn boxes as hints: one per object, or one for the manipulated object alone",
     )
     parser.add_argument("--no-gate", action="store_true", help="reject nothing for low confidence")
     parser.add_argument("--out", type=Path, help="folder for judged.json and the pictures")
@@ -113,11 +122,16 @@ def main() -> None:
 
 
 def judge(
-    video: VideoItem, drawn: dict[str, Any], cfg: EngineConfig, boxes: bool
+    video: VideoItem, drawn: dict[str, Any], cfg: EngineConfig, boxes: Hinted
 ) -> tuple[Verdict, UInt8[np.ndarray, "h w 3"]]:
     """Rebuild one clip and compare it with what was drawn; return the verdict and its picture."""
     hints = {phrase: Hint(**thing["hint"]) for phrase, thing in drawn["objects"].items()}
-    video = replace(video, hints=hints if boxes else {})
+    if boxes == "none":
+        hints = {}
+    elif boxes == "manipulated":
+        manipulated = parse_caption(video.caption, video.objects).manipulated.lower()
+        hints = {phrase: hint for phrase, hint in hints.items() if phrase.lower() == manipulated}
+    video = replace(video, hints=hints)
     verdict = Verdict(clip=video.path.stem, rating=drawn["rating"])
     start, clip, scene = time.monotonic(), None, None
     try:
@@ -183,7 +197,7 @@ def _iou(a: Box | None, b: Box | None) -> float:
     return both / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both)
 
 
-def _each(work: list[tuple[VideoItem, dict[str, Any], EngineConfig, bool]], jobs: int):  # noqa: ANN202
+def _each(work: list[tuple[VideoItem, dict[str, Any], EngineConfig, Hinted]], jobs: int):  # noqa: ANN202
     if jobs <= 1:
         yield from (judge(*one) for one in work)
         return

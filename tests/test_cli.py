@@ -59,6 +59,11 @@ def test_an_unknown_command_gets_a_suggestion(capsys):
     assert "Did you mean 'generate'" in said(capsys, "generat")
 
 
+def test_a_mistyped_second_word_gets_a_suggestion_and_a_folder_does_not(capsys):
+    assert "Did you mean 'v2p scene review'? See" in said(capsys, "scene", "reviw", "outputs/x")
+    assert "mean" not in said(capsys, "scene", "my_videos")
+
+
 def test_fewer_than_no_workers_are_refused(capsys, videos, tmp_path):
     message = said(capsys, "scene", videos, "--out", tmp_path / "run", "--workers", "-3")
 

@@ -4,12 +4,14 @@ Only light modules are imported here, so that `v2p --help` answers at once; each
 """
 
 import contextlib
+import difflib
 import io
 import logging
 import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError, did_you_mean
@@ -104,15 +106,24 @@ def parse[T](kind: type[T], argv: list[str], command: str, default: T | None = N
     except SystemExit as error:
         if wants_help or not error.code:
             raise
-        raise V2PError(_one_sentence(words.getvalue(), command)) from error
+        wrong = _one_sentence(words.getvalue())
+        raise V2PError(f"{wrong}.{_meant(argv, command)} See 'v2p {command} --help'") from error
 
 
-def _one_sentence(box: str, command: str) -> str:
+def _meant(argv: list[str], command: str) -> str:
+    """Return the command of two words that may have been meant, where the first argument is no path."""
+    if not argv or argv[0].startswith("-") or Path(argv[0]).exists():
+        return ""
+    close = difflib.get_close_matches(f"{command} {argv[0]}", SUBCOMMANDS, n=1, cutoff=0.8)
+    return f" Did you mean 'v2p {close[0]}'?" if close else ""
+
+
+def _one_sentence(box: str) -> str:
     text = re.sub(r"[╭╮╰╯│─]+", " ", box)
     text = re.sub(r"\s+", " ", text).strip()
     text = re.sub(r"^(Unrecognized options|Parsing error|Required options)\s+", "", text)
-    text = re.sub(r"For full helptext, run .*$", "", text).strip()
-    return f"{text}. See 'v2p {command} --help'"
+    text = re.sub(r"For full helptext, run:? .*$", "", text)
+    return text.strip().removesuffix(".")
 
 
 def _command(name: str) -> Callable[[list[str]], int]:

@@ -45,6 +45,8 @@ _INSIDE_KINDS = (*SWALLOWING_KINDS, "place_onto")
 UNSEEN_IOU = 0.35
 """An outline at the end that fits the object no better shows something else."""
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
+_LEAVING_TABLE = ("lift_up", "tip_over")
+"""Kinds after which it does not rest as it did."""
 _TURN_COST = 0.007
 """Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
 _NO_SPREAD = 0.01
@@ -112,6 +114,9 @@ class Placed:
     """Whether the hand that lifts it hides it from the camera: then its poses go with the hand."""
     unseen: bool = False
     """Whether nothing shows where it ends: then it lies in the middle of what swallowed it."""
+    grown: float = 0.0
+    """Logarithm of how much larger it seems where it starts than where it ends, if it lies on the table at both: what is held
+    in the air is nearer to the camera, and seems larger."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +160,7 @@ class _Fits:
     as_before: float = 0.0
     """What standing as at first would have cost at the end."""
     unseen: bool = False
+    grown: float = 0.0
 
 
 def place(
@@ -183,6 +189,8 @@ def place(
             if k == 0 and 1 in fits:
                 support, within = _goal(kind, objects, fits[0].first, fits[1].first)
             fits[k] = _fit_both_ends(shown[k], role, camera, support, within)
+            if k == 0 and kind not in _LEAVING_TABLE and not fits[k].unseen:
+                fits[k] = replace(fits[k], grown=_grown(shown[k], fits[k], camera))
     votes = [vote_of(objects[k], fits[k].first) for k in resting]
     known = guess.heights(pitch_rad)
     height_m, spread = camera_height_m(votes, known)
@@ -255,6 +263,14 @@ def _fit_both_ends(
     )
 
 
+def _grown(see: _Shown, fits: _Fits, camera: Camera) -> float:
+    """Return the logarithm of how much larger an object is at first than its last outline says by itself."""
+    rest = _rest_of(fits.last.T_world_obj[:3, :3])
+    silhouette = Silhouette(see.last_mask, see.last_hidden, camera)
+    alone = fit_shape(silhouette, see.s.noun, rest, thorough=False)
+    return float(np.log(np.array(fits.first.size) / np.array(alone.size)).mean())
+
+
 def _height_by_hand(
     footage: Footage,
     watched: Watched,
@@ -306,6 +322,7 @@ def _placed(see: _Shown, fits: _Fits, course: Course) -> Placed:
         observed=tuple(course.observed),
         rival=fits.rival,
         unseen=fits.unseen,
+        grown=fits.grown,
     )
 
 

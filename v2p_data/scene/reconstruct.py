@@ -26,7 +26,14 @@ from v2p_data.scene.backends.config import (
 from v2p_data.scene.crop import View
 from v2p_data.scene.find import Watched, passed, watch
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
-from v2p_data.scene.gate import Cue, by_stage, check_confidence, check_motion, cues_of
+from v2p_data.scene.gate import (
+    Cue,
+    by_stage,
+    check_confidence,
+    check_motion,
+    cues_of,
+    held_at_first,
+)
 from v2p_data.scene.learned import (
     DETECTORS,
     camera_from_depth,
@@ -58,6 +65,8 @@ _USUAL_FOV_RAD = 1.01
 """58 degrees, for web cameras and phones filming wide."""
 _MEASURED_SD = 0.02
 """Of a pitch [rad], or of the logarithm of a height, that the user gives."""
+_HELD_SURE = 0.3
+"""How far to believe a first pose on the table of what a hand seems to hold in the air."""
 _WIDTH_DOUBT = 1.4
 """The network is surer of the table's width than it may be by this factor, on clips that it was not trained on."""
 _LEAST_QUALITY = 0.4
@@ -338,6 +347,8 @@ def _estimates(
         taken.add(name)
         shape, poses = made.shape, made.T_world_objs
         frames, sure, observed = placed.frames, placed.confidences, placed.observed
+        if not out and held_at_first(sights, placement):
+            sure = (min(sure[0], _HELD_SURE), *sure[1:])
         size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
         plain = shape.kind == "primitive" and not s.noun.bore and not cfg.mesh.worker
         if s.known_m:  # the user's word on the size outranks the outline's
@@ -439,6 +450,11 @@ def _remarks(kind: str, sights: Sights, placement: Placement, num_frames: int) -
         phrase, goal = (s.phrase for s in sights.objects[:2])
         out.append(
             f"nothing shows where '{phrase}' ends: it is taken to lie in the middle of '{goal}'"
+        )
+    if held_at_first(sights, placement):
+        out.append(
+            f"'{sights.objects[0].phrase}' seems {np.expm1(thing.grown):.0%} larger at first than at the end, as if a hand held it in the "
+            "air: its first pose is where it would stand on the table"
         )
     last_frame = int(sights.footage.frame_idx[thing.last_i])
     if kind == "lift_up":
