@@ -27,6 +27,7 @@ def make_clip(
     hints: dict | None = None,
     num_frames: int = 36,
     with_hand: bool = True,
+    comes_at: float = 0.0,
 ) -> Clip:
     camera = camera_above((240, 320), 0.61, 1.01, HEIGHT_M)
     rng = np.random.default_rng(0)
@@ -41,7 +42,7 @@ def make_clip(
         centre = np.array([x, y, SIZE_M[2] / 2 + lift_m * share])
         corners = camera.project(outline_points("box", SIZE_M) + centre)
         order = sorted(range(5), key=lambda k: k == 4)
-        for k, face in zip(order, [FACES[k] for k in order], strict=True):
+        for k, face in zip(order, [FACES[k] for k in order], strict=True) if t >= comes_at else ():
             shade = (0.75, 1.0, 0.85, 0.8, 1.1)[k]
             colour = tuple(min(255.0, shade * c) for c in (25, 60, 190))
             cv2.fillPoly(image, [corners[list(face)].astype(np.int32)], colour, cv2.LINE_AA)

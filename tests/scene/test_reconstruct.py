@@ -93,6 +93,17 @@ def test_what_moves_without_a_hand_is_turned_away(draw):
     assert caught.value.value < 0.002
 
 
+@pytest.mark.parametrize(
+    "hints", [{}, {"blue box": {"frame": 35, "box": [90.0, 60.0, 200.0, 160.0]}}]
+)
+def test_what_comes_into_the_picture_later_is_turned_away_for_that(draw, hints):
+    with pytest.raises(ItemRejectedError, match="not in the picture when it begins") as caught:
+        rebuild(draw(comes_at=0.4, hints=hints))
+
+    assert caught.value.reason == "not_there_at_first"
+    assert caught.value.value < 0.0007
+
+
 def test_a_camera_that_travels_is_turned_away(draw):
     with pytest.raises(ItemRejectedError) as caught:
         rebuild(draw(shake_px=40.0))

@@ -66,7 +66,7 @@ _MOST_CUT = 0.6
 """Of an outline: where the network sees more of it as table, it does not know the thing."""
 _LEAST_CHANGE = 0.05
 """Of an outline: what is not worth mending."""
-_LEAST_SHARE = 0.0007
+LEAST_SHARE = 0.0007
 """Of the picture: smaller things cannot be measured."""
 
 
@@ -223,7 +223,7 @@ def _windows(moved: Float32[np.ndarray, "n h w"]) -> _Windows | None:
         count, parts, stats, _ = cv2.connectedComponentsWithStats(
             tidy(plane > _LIKELY).astype(np.uint8)
         )
-        large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] > _LEAST_SHARE * h * w]
+        large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] > LEAST_SHARE * h * w]
         if large:
             boxes[k] = bounding_box(np.isin(parts, large))
     seen = np.flatnonzero(np.isfinite(boxes[:, 0]))
@@ -382,6 +382,18 @@ def standing(watched: Watched, *, late: bool) -> Float32[np.ndarray, "h w"]:
     return shares[OTHER] + shares[MOVED] if late else shares[OTHER]
 
 
+def seen_at_first(watched: Watched) -> float | None:
+    """Return how much of the picture what moves covers at the beginning, where it only comes into the picture later.
+
+    None where it is there from the beginning, or not seen at the end.
+    """
+    early, late = (
+        float(tidy(still[MOVED] > least).mean())
+        for still, least in ((watched.early, _POSSIBLE), (watched.late, _LIKELY))
+    )
+    return early if early < LEAST_SHARE <= late else None
+
+
 def hand_at(watched: Watched, i: int) -> Bool[np.ndarray, "h w"]:
     """Return the pixels that are hand or arm at a footage frame."""
     return watched.at(i)[HAND] > _LIKELY
@@ -427,7 +439,7 @@ def _ends(
         count, parts, stats, _ = cv2.connectedComponentsWithStats(whole.astype(np.uint8))
         for k in range(1, count):
             mask = parts == k
-            if stats[k, cv2.CC_STAT_AREA] < _LEAST_SHARE * h * w or any(
+            if stats[k, cv2.CC_STAT_AREA] < LEAST_SHARE * h * w or any(
                 (mask & other).any() for other in masks
             ):
                 continue

@@ -176,7 +176,7 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     """Return the scene that the clip shows.
 
     Raises:
-        ItemRejectedError: `camera_moves`, `nothing_moves`, `no_hand`, `object_not_found`, `reference_not_found`,
+        ItemRejectedError: `camera_moves`, `nothing_moves`, `no_hand`, `not_there_at_first`, `object_not_found`, `reference_not_found`,
             `motion_contradicts_caption` or `low_confidence`, with the number that decided.
     """
     meaning = parse_caption(clip.caption, clip.objects)

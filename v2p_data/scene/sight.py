@@ -14,6 +14,7 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.classes import HAND, MOVED, OTHER
 from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
+    LEAST_SHARE,
     SWALLOWING_KINDS,
     Watched,
     apart,
@@ -21,6 +22,7 @@ from v2p_data.scene.find import (
     find_movers,
     hand_at,
     rated,
+    seen_at_first,
     settled,
     standing,
     table_seen,
@@ -150,7 +152,7 @@ def sight(
     for the phrase goes before it.
 
     Raises:
-        ItemRejectedError: `no_hand`, `object_not_found` or `reference_not_found`, with the number that decided.
+        ItemRejectedError: `no_hand`, `not_there_at_first`, `object_not_found` or `reference_not_found`, with the number that decided.
     """
     if watched is not None:
         _check_hand(clip, watched)
@@ -158,10 +160,13 @@ def sight(
     table = find_table(footage.always, table_seen(watched) if watched else None)
     marked = _marked(clip, footage, watched, boxes or {})
     tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
-    moved, held = _find_movers(footage, table, watched, meaning, tool, marked)
     own = marked.get(meaning.manipulated)
+    if own is not None and _at_end(own, footage):
+        _check_there_at_first(clip, meaning.manipulated, watched)
+    moved, held = _find_movers(clip, footage, table, watched, meaning, tool, marked)
     sure, why = _sureness(moved, watched, own)
     if sure < min_found:
+        _check_there_at_first(clip, meaning.manipulated, watched)
         raise ItemRejectedError(
             "object_not_found",
             f"the best match for '{meaning.manipulated}' in {clip.item} is sure to {sure:.3f}, below {min_found:g} "
@@ -409,6 +414,17 @@ def _check_hand(clip: Clip, watched: Watched) -> None:
         )
 
 
+def _check_there_at_first(clip: Clip, phrase: str, watched: Watched | None) -> None:
+    seen = None if watched is None else seen_at_first(watched)
+    if seen is not None:
+        raise ItemRejectedError(
+            "not_there_at_first",
+            f"what moves in {clip.item} is not in the picture when it begins (it covers {seen:.2%} of it, at least {LEAST_SHARE:.2%} "
+            f"needed): let the clip begin where '{phrase}' lies on the table",
+            round(seen, 5),
+        )
+
+
 def _knowing_hand(footage: Footage, watched: Watched) -> Footage:
     """Return the footage with the colours of the hand that the network saw."""
     pixels = [footage.rgb[i][hand_at(watched, int(i))] for i in watched.idx]
@@ -472,6 +488,7 @@ def _thing_at(watched: Watched | None, i: int) -> Float[np.ndarray, "h w"] | Non
 
 
 def _find_movers(
+    clip: Clip,
     footage: Footage,
     table: Table,
     watched: Watched | None,
@@ -509,6 +526,7 @@ def _find_movers(
             else _agreed(footage, watched, meaning, moved, by_change)
         )
     if moved is None:
+        _check_there_at_first(clip, meaning.manipulated, watched)
         raise ItemRejectedError(
             "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
         )
