@@ -47,6 +47,8 @@ UNSEEN_IOU = 0.35
 _CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
 _LEAVING_TABLE = ("lift_up", "tip_over")
 """Kinds after which it does not rest as it did."""
+_HAS_ITS_SHAPE = 0.8
+"""IoU: an outline that is covered no better tells no size."""
 _TURN_COST = 0.007
 """Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
 _NO_SPREAD = 0.01
@@ -264,10 +266,12 @@ def _fit_both_ends(
 
 
 def _grown(see: _Shown, fits: _Fits, camera: Camera) -> float:
-    """Return the logarithm of how much larger an object is at first than its last outline says by itself."""
+    """Return the logarithm of how much larger an object is at first than its last outline says by itself, as far as that has its shape."""
     rest = _rest_of(fits.last.T_world_obj[:3, :3])
     silhouette = Silhouette(see.last_mask, see.last_hidden, camera)
     alone = fit_shape(silhouette, see.s.noun, rest, thorough=False)
+    if alone.iou < _HAS_ITS_SHAPE:
+        return 0.0
     return float(np.log(np.array(fits.first.size) / np.array(alone.size)).mean())
 
 
