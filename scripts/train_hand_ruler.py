@@ -10,19 +10,14 @@ from seeds of their own (`hand network`), so that no clip of `bench_reconstructi
 """
 
 import argparse
-import os
-import sys
-import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int, UInt8
-from safetensors.torch import load_file
-from train_scene_network import compressed, descend, write
+from jaxtyping import Float, Float32, Int, UInt8
+from training import Scene, add_commands, compressed, disc_at, draw_all, learn, recoloured
 
 from v2p_data.scene.hand import gap_px, hand_end
 from v2p_data.scene.ruler import (
@@ -63,8 +58,6 @@ HAND, THING, MOST_THINGS = 1, 2, 8
 """Labels in the files: hand, and any thing."""
 MOST_OFF = 0.7
 BATCH = 48
-HELD_OUT = 20
-"""Every so-manieth scene is for measuring."""
 TAIL = 4.0
 """Degrees of freedom of the errors' t distribution."""
 
@@ -172,22 +165,8 @@ def _view(
     }
 
 
-def make_data(out: Path, scenes: int, jobs: int, start: int) -> None:
-    """Draw the scenes that are not there yet."""
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
-    out.mkdir(parents=True, exist_ok=True)
-    began = time.time()
-    with ProcessPoolExecutor(jobs) as pool:
-        work = [(number, out) for number in range(start, start + scenes)]
-        for done, words in enumerate(pool.map(make_scene, work, chunksize=4), 1):
-            if words:
-                print(f"left out {words}", file=sys.stderr)
-            if done % 50 == 0:
-                print(f"{done} scenes, {(time.time() - began) / done:.2f} s each", flush=True)
-
-
 def varied(
-    scene: dict[str, np.ndarray], k: int, rng: np.random.Generator
+    scene: Scene, k: int, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "4 112 112"], Float32[np.ndarray, "4"], np.float32]:
     """Return a view of a scene through a window that is too large or small by chance, changed in ways that keep it true.
 
@@ -203,12 +182,7 @@ def varied(
     if how < 2:
         hand = (cv2.dilate, cv2.erode)[how](hand, np.ones((3, 3), np.uint8))
     hand = cv2.GaussianBlur(hand, (0, 0), float(rng.uniform(0.6, 2.0)))
-    mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
-    gain, bias, gamma = np.exp(rng.normal(0, 0.25)), rng.normal(0, 8), np.exp(rng.normal(0, 0.2))
-    curve = np.clip(255 * (np.arange(256) / 255) ** gamma * gain + bias, 0, 255).astype(np.uint8)
-    rgb = cv2.LUT(cv2.transform(rgb, mix), curve)
-    if blur := float(rng.choice([0, 0, 0.6, 1.2])):
-        rgb = cv2.GaussianBlur(rgb, (0, 0), blur)
+    rgb = recoloured(rgb, rng)
     planes = planes_of(rgb, hand)
     noise = rng.standard_normal(planes[:3].shape, np.float32)
     planes[:3] += np.float32(rng.uniform(0, 0.03)) * noise
@@ -227,21 +201,10 @@ def _badly_cut(
     chance = rng.random()
     if chance < 0.25:
         where = (cv2.dilate(hand.astype(np.uint8), np.ones((5, 5))) > 0) & (labels == THING)
-        return (hand | (_disc_at(where, 4, 16, rng) & (labels == THING))).astype(np.float32)
+        return (hand | (disc_at(where, 4, 16, rng) & (labels == THING))).astype(np.float32)
     if chance < 0.4:
-        return (hand & ~_disc_at(hand, 4, 14, rng)).astype(np.float32)
+        return (hand & ~disc_at(hand, 4, 14, rng)).astype(np.float32)
     return hand.astype(np.float32)
-
-
-def _disc_at(
-    where: Bool[np.ndarray, "s s"], least_px: int, most_px: int, rng: np.random.Generator
-) -> Bool[np.ndarray, "s s"]:
-    disc = np.zeros(where.shape, np.uint8)
-    spots = np.argwhere(where)
-    if len(spots):
-        y, x = spots[rng.integers(len(spots))].tolist()
-        cv2.circle(disc, (x, y), int(rng.integers(least_px, most_px)), 1, -1)
-    return disc > 0
 
 
 def loss_of(said: Float[torch.Tensor, "n 2"], off: Float[torch.Tensor, "n"]) -> torch.Tensor:
@@ -252,7 +215,7 @@ def loss_of(said: Float[torch.Tensor, "n 2"], off: Float[torch.Tensor, "n"]) -> 
 
 
 @torch.inference_mode()
-def measure(net: RulerNetwork, held_out: list[dict[str, np.ndarray]]) -> str:
+def measure(net: RulerNetwork, held_out: list[Scene]) -> str:
     """Return how far the network is off on views of scenes held out, all changed the same way each time, in words."""
     net.eval()
     rng, off, stated = rng_for(0, "hand network", "held out"), [], []
@@ -270,7 +233,7 @@ def measure(net: RulerNetwork, held_out: list[dict[str, np.ndarray]]) -> str:
 
 
 def batch_of(
-    views: list[tuple[dict[str, np.ndarray], int]], rng: np.random.Generator
+    views: list[tuple[Scene, int]], rng: np.random.Generator
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return inputs and truth of these views."""
     columns = zip(*(varied(scene, k, rng) for scene, k in views), strict=True)
@@ -278,69 +241,25 @@ def batch_of(
     return planes, known, off
 
 
-def train(
-    data: Path, out: Path, minutes: float, seed: int, start_from: Path | None, lr: float
-) -> None:
-    """Train for so many minutes, writing the weights (half precision) every two minutes."""
-    scenes: dict[Path, dict[str, np.ndarray]] = {}
-
-    def read() -> tuple[list[dict[str, np.ndarray]], list[dict[str, np.ndarray]]]:
-        for file in sorted(set(data.glob("*.npz")) - set(scenes)):  # more may still be drawn
-            with np.load(file) as arrays:
-                scenes[file] = {key: arrays[key] for key in arrays.files}
-        held = {file for file in scenes if int(file.stem) % HELD_OUT == 0}
-        return [s for f, s in scenes.items() if f not in held], [scenes[f] for f in sorted(held)]
-
-    own, held_out = read()
-    print(f"{len(own)} scenes to train on, {len(held_out)} held out", flush=True)
-    rng = rng_for(seed, "hand network", "batches")
-    with torch.random.fork_rng():
-        torch.random.default_generator.manual_seed(seed)
-        net = RulerNetwork()
-    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    if start_from:
-        net.load_state_dict({k: v.float() for k, v in load_file(start_from).items()})
-
-    def loss() -> torch.Tensor:
-        some = [own[k] for k in rng.integers(len(own), size=BATCH)]
-        planes, known, off = batch_of(
-            [(scene, int(rng.integers(len(scene["known"])))) for scene in some], rng
-        )
-        with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
-            said = net(planes.contiguous(memory_format=torch.channels_last), known)
-        return loss_of(said.float(), off)
-
-    def state() -> str:
-        nonlocal own, held_out
-        write(net, out)
-        own, held_out = read()
-        return f"{len(own)} scenes, {measure(net, held_out)}"
-
-    steps = descend(net, minutes, lr, loss, state)
-    write(net, out)
-    print(f"{steps} steps of {BATCH}: {measure(net, held_out)}", flush=True)
+def loss_on(
+    net: RulerNetwork, views: list[tuple[Scene, int]], rng: np.random.Generator
+) -> torch.Tensor:
+    """Return the loss of a batch."""
+    planes, known, off = batch_of(views, rng)
+    with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
+        said = net(planes.contiguous(memory_format=torch.channels_last), known)
+    return loss_of(said.float(), off)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    commands = parser.add_subparsers(dest="command", required=True)
-    data = commands.add_parser("data", help="draw training scenes")
-    data.add_argument("--out", type=Path, required=True)
-    data.add_argument("--scenes", type=int, default=1500)
-    data.add_argument("--start", type=int, default=0, help="number of the first scene")
-    data.add_argument("--jobs", type=int, default=2)
-    learn = commands.add_parser("train", help="train on them")
-    learn.add_argument("data", type=Path)
-    learn.add_argument("--out", type=Path, required=True)
-    learn.add_argument("--minutes", type=float, default=30)
-    learn.add_argument("--seed", type=int, default=0)
-    learn.add_argument("--lr", type=float, default=2e-3)
-    learn.add_argument("--start-from", type=Path)
+    add_commands(parser, "scene", 1500)
     args = parser.parse_args()
     if args.command == "data":
-        make_data(args.out, args.scenes, args.jobs, args.start)
+        numbers = range(args.start, args.start + args.scenes)
+        draw_all(make_scene, numbers, args.out, args.jobs)
     else:
-        train(args.data, args.out, args.minutes, args.seed, args.start_from, args.lr)
+        learn(RulerNetwork, loss_on, measure, BATCH, "hand network", args)
 
 
 if __name__ == "__main__":

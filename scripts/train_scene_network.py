@@ -14,11 +14,6 @@ video is used for training. Clips here are drawn from seeds of their own (`netwo
 """
 
 import argparse
-import os
-import sys
-import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import count, islice
 from pathlib import Path
@@ -30,6 +25,7 @@ from jaxtyping import Float, Float32, UInt8
 from safetensors.torch import load_file, save_file
 from scipy.spatial.transform import Rotation
 from torch.nn import functional as F  # noqa: N812  (the usual name)
+from training import HELD_OUT, add_commands, compressed, descend, draw_all, write
 
 from v2p_data.geometry.camera import between_centres
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
@@ -70,8 +66,6 @@ UNEVEN = 0.4
 """Share of the examples that are lit unevenly."""
 PARTS = 0.5
 """Share of the examples that are an enlarged part of a picture."""
-HELD_OUT = 20
-"""Every so-manieth clip is for measuring."""
 CLASS_WEIGHTS = (0.6, 0.6, 1.0, 2.0, 1.5)
 
 
@@ -136,30 +130,6 @@ def _classes(labels: UInt8[np.ndarray, "n h w"], moved: list[int]) -> UInt8[np.n
     to[0], to[LABEL_HAND], to[LABEL_TABLE] = BACKGROUND, HAND, TABLE
     to[moved] = MOVED
     return to[labels]
-
-
-def compressed(
-    image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a picture as it comes out of a file of random quality."""
-    quality = int(rng.integers(35, 95))
-    _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1]
-
-
-def make_data(out: Path, clips: int, jobs: int, start: int, kind: str | None) -> None:
-    """Render the clips that are not there yet: of all kinds in turn, or of one."""
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
-    out.mkdir(parents=True, exist_ok=True)
-    began = time.time()
-    with ProcessPoolExecutor(jobs) as pool:
-        numbers = (n for n in count(start) if kind in (None, kind_of(n)))
-        work = [(number, out) for number in islice(numbers, clips)]
-        for done, words in enumerate(pool.map(make_clip, work, chunksize=4), 1):
-            if words:
-                print(f"left out {words}", file=sys.stderr)
-            if done % 50 == 0:
-                print(f"{done} clips, {(time.time() - began) / done:.2f} s each", flush=True)
 
 
 class Examples:
@@ -456,39 +426,6 @@ def train(
     print(f"{steps} steps of {BATCH}: {measure(net, held_out)}", flush=True)
 
 
-def descend(
-    net: torch.nn.Module,
-    minutes: float,
-    lr: float,
-    loss: Callable[[], torch.Tensor],
-    state: Callable[[], str],
-) -> int:
-    """Make a network better for so many minutes, and return in how many steps; `state` is printed every two minutes.
-
-    The learning rate rises to `lr` over a hundred steps and falls along a quarter of a cosine as time runs out.
-    """
-    optimiser = torch.optim.AdamW(net.parameters(), lr, weight_decay=1e-3)
-    began = spoken = time.time()
-    losses: list[float] = []
-    while (share := (time.time() - began) / (60 * minutes)) < 1:
-        warm = min(1, (len(losses) + 1) / 100)
-        for group in optimiser.param_groups:
-            group["lr"] = lr * warm * (0.02 + 0.98 * np.cos(np.pi / 2 * share))
-        lost = loss()
-        optimiser.zero_grad()
-        lost.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        optimiser.step()
-        losses.append(lost.item())
-        if time.time() - spoken > 120:
-            spoken = time.time()
-            print(
-                f"{spoken - began:5.0f} s step {len(losses)} loss {np.mean(losses[-100:]):.3f}: {state()}",
-                flush=True,
-            )
-    return len(losses)
-
-
 def average(files: list[Path], out: Path) -> None:
     """Write the mean of the weights of runs that went on from one another: it sees more than either."""
     states = [load_file(file) for file in files]
@@ -507,33 +444,10 @@ def only_camera(file: Path, out: Path) -> None:
     save_file({k: v for k, v in load_file(file).items() if k in wanted}, out)
 
 
-def write(net: torch.nn.Module, out: Path) -> None:
-    """Write the weights in half precision, in one move."""
-    partial = out.with_suffix(".partial")
-    state = {
-        k: (v.half() if v.is_floating_point() else v).contiguous()
-        for k, v in net.state_dict().items()
-    }
-    save_file(state, partial)
-    partial.replace(out)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    commands = parser.add_subparsers(dest="command", required=True)
-    data = commands.add_parser("data", help="render training clips")
-    data.add_argument("--out", type=Path, required=True)
-    data.add_argument("--clips", type=int, default=1500)
-    data.add_argument("--start", type=int, default=0, help="number of the first clip")
+    commands, data = add_commands(parser, "clip", 1500, minutes=60)
     data.add_argument("--kind", choices=MOTION_KINDS, help="of task; all in turn if not given")
-    data.add_argument("--jobs", type=int, default=2)
-    learn = commands.add_parser("train", help="train on them")
-    learn.add_argument("data", type=Path)
-    learn.add_argument("--out", type=Path, required=True)
-    learn.add_argument("--minutes", type=float, default=60)
-    learn.add_argument("--seed", type=int, default=0)
-    learn.add_argument("--lr", type=float, default=2e-3)
-    learn.add_argument("--start-from", type=Path)
     eye = commands.add_parser("camera", help="write the part that says the camera")
     eye.add_argument("weights", type=Path)
     eye.add_argument("--out", type=Path, required=True)
@@ -542,7 +456,8 @@ def main() -> None:
     merge.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     if args.command == "data":
-        make_data(args.out, args.clips, args.jobs, args.start, args.kind)
+        numbers = (n for n in count(args.start) if args.kind in (None, kind_of(n)))
+        draw_all(make_clip, islice(numbers, args.clips), args.out, args.jobs)
     elif args.command == "average":
         average(args.weights, args.out)
     elif args.command == "camera":

@@ -7,6 +7,7 @@ outline alone is ambiguous (faces swap, flat things thicken), so the noun's prop
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -21,11 +22,16 @@ from v2p_data.scene.colour import lab_of
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.segment import bounding_box, is_cut
 
+if TYPE_CHECKING:
+    from v2p_data.scene.boxes import BoxGuess
+
 _WORK_PX = 110
 """Longer side of the crop in which silhouettes are compared."""
 _HIDDEN_WEIGHT = 0.15
 _EDGE_WEIGHT = 0.06
 """What a box gains whose inner edges are all edges in the picture, in units of IoU: outlines hardly tell a cube's yaw."""
+_LOOK_WEIGHT, _MOST_BY_LOOK = 0.01, 0.15
+"""What a box costs per nat that the box network finds it less likely, and at most, in units of IoU."""
 _EDGE_BLUR_PX = 1.5
 _LEAST_STEP = 60.0
 """Of Lab by Scharr's operator (32 per step of one): what is fainter is noise."""
@@ -109,10 +115,19 @@ class Silhouette:
         self._mask = _filled(warped > 0.5) & known
         self._area = int(self._mask.sum())
         self._at_border = is_cut(mask)
+        self._image = image
         self._picture = None
         if image is not None and min(w, h) >= _LEAST_FACE_PX:
             flags = cv2.INTER_CUBIC if zoom > 1 else cv2.INTER_LINEAR
             self._picture = cv2.warpAffine(image, move, canvas, flags=flags)
+
+    @cached_property
+    def _guess(self) -> "BoxGuess":
+        """What the box network says, asked where a box is fitted."""
+        from v2p_data.scene.boxes import box_guess  # torch takes a second to import
+
+        assert self._image is not None
+        return box_guess(self._image, self.mask, self.camera)
 
     @cached_property
     def _edges(self) -> Float32[np.ndarray, "h w 2"]:
@@ -131,18 +146,27 @@ class Silhouette:
         common, wrong, hidden, _ = overlap
         return common / max(1.0, self._area + wrong + hidden_weight * hidden)
 
-    def inner_edges(
+    def unlike(
         self,
         form: str,
         size: Float[np.ndarray, "3"] | tuple[float, float, float],
         T_world_obj: Float[np.ndarray, "4 4"],
     ) -> float:
-        """Return what a box gains whose edges between visible faces are edges in the picture, in units of IoU.
+        """Return what a box costs that is not turned, or whose sides are not, as it looks, in units of IoU; it can be a gain.
 
         Nothing without a picture, and for other forms.
         """
         if self._picture is None or form != "box":
             return 0.0
+        looks = _LOOK_WEIGHT * self._guess.cost(size, T_world_obj)
+        return min(_MOST_BY_LOOK, looks) - self._inner_edges(size, T_world_obj)
+
+    def _inner_edges(
+        self,
+        size: Float[np.ndarray, "3"] | tuple[float, float, float],
+        T_world_obj: Float[np.ndarray, "4 4"],
+    ) -> float:
+        """Return what a box gains whose edges between visible faces are edges in the picture, in units of IoU."""
         corner, ends = _inner_edges(size, T_world_obj, self.camera.T_world_cam[:3, 3])
         if not len(ends):
             return 0.0
@@ -290,9 +314,9 @@ def fit_shape(
         T = posed(v, size)
         points = (unit * size) @ T[:3, :3].T + T[:3, 3]
         off = (v[3:] - v[3:].mean()) / spread
-        edges = silhouette.inner_edges(noun.form, size, T)
+        look = silhouette.unlike(noun.form, size, T)
         held = _PRIOR_WEIGHT * float((off**2).sum())
-        return 1 - silhouette.iou(points, _HIDDEN_WEIGHT) + held - edges
+        return 1 - silhouette.iou(points, _HIDDEN_WEIGHT) + held + look
 
     def posed(v: np.ndarray, size: np.ndarray) -> np.ndarray:
         return _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
@@ -361,9 +385,9 @@ def fit_pose(
         if within is not None:
             outside = float(np.linalg.norm(T[:2, 3] - within.xy)) - within.radius
             held += max(0.0, outside) / max(within.radius, 0.5 * float(extents.max()))
-        edges = silhouette.inner_edges(noun.form, extents, T)
+        look = silhouette.unlike(noun.form, extents, T)
         outline = points0 @ T[:3, :3].T + T[:3, 3]
-        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + held - edges
+        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + held + look
 
     turns = _yaw_starts(noun, rest, thorough=True)
     if yaw_near is not None:
@@ -415,10 +439,10 @@ def fit_lifted(
 
     def cost(v: np.ndarray) -> float:
         T = place(v)
-        edges = silhouette.inner_edges(noun.form, size, T)
+        look = silhouette.unlike(noun.form, size, T)
         outline = points0 @ T[:3, :3].T + T[:3, 3]
         turned = 0.01 * (1 - np.cos(v[2]))
-        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + turned - edges
+        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + turned + look
 
     best = _search(
         cost,
