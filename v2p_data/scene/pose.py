@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import inverse, transform
-from v2p_data.scene.colour import lab_of
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.segment import bounding_box, is_cut
 
@@ -28,15 +27,10 @@ if TYPE_CHECKING:
 _WORK_PX = 110
 """Longer side of the crop in which silhouettes are compared."""
 _HIDDEN_WEIGHT = 0.15
-_EDGE_WEIGHT = 0.06
-"""What a box gains whose inner edges are all edges in the picture, in units of IoU: outlines hardly tell a cube's yaw."""
 _LOOK_WEIGHT, _MOST_BY_LOOK = 0.01, 0.15
-"""What a box costs per nat that the box network finds it less likely, and at most, in units of IoU."""
-_EDGE_BLUR_PX = 1.5
-_LEAST_STEP = 60.0
-"""Of Lab by Scharr's operator (32 per step of one): what is fainter is noise."""
+"""Outlines hardly tell a cube's yaw. What a box costs per nat that the box network finds it less likely, and at most, in units of IoU."""
 _LEAST_FACE_PX = 10
-"""Smaller boxes show no edges."""
+"""Smaller boxes show nothing of how they are turned."""
 _GRIP_AT = 0.7
 """From its tip, as a share of its length: where a hand holds what it pushes with."""
 _TILTS = (0.34, 0.81)
@@ -97,7 +91,7 @@ class Silhouette:
         camera: Camera,
         image: UInt8[np.ndarray, "h w 3"] | None = None,
     ) -> None:
-        """Crop the mask; `unknown` is what may hide the object, `image` shows its inner edges, where that is asked."""
+        """Crop the mask; `unknown` is what may hide the object, `image` shows how a box is turned, where that is asked."""
         x, y, w, h = bounding_box(mask)
         pad = int(0.35 * max(w, h)) + 3
         self.camera, self.box, self.mask = camera, (x, y, w, h), mask
@@ -115,25 +109,15 @@ class Silhouette:
         self._mask = _filled(warped > 0.5) & known
         self._area = int(self._mask.sum())
         self._at_border = is_cut(mask)
-        self._image = image
-        self._picture = None
-        if image is not None and min(w, h) >= _LEAST_FACE_PX:
-            flags = cv2.INTER_CUBIC if zoom > 1 else cv2.INTER_LINEAR
-            self._picture = cv2.warpAffine(image, move, canvas, flags=flags)
+        self._picture = image if min(w, h) >= _LEAST_FACE_PX else None
 
     @cached_property
     def _guess(self) -> "BoxGuess":
         """What the box network says, asked where a box is fitted."""
         from v2p_data.scene.boxes import box_guess  # torch takes a second to import
 
-        assert self._image is not None
-        return box_guess(self._image, self.mask, self.camera)
-
-    @cached_property
-    def _edges(self) -> Float32[np.ndarray, "h w 2"]:
-        """Changes of colour in the crop, worked out where a box asks for them."""
         assert self._picture is not None
-        return _changes(self._picture, self._mask)
+        return box_guess(self._picture, self.mask, self.camera)
 
     def iou(self, points_world: Float[np.ndarray, "n 3"], hidden_weight: float = 0.0) -> float:
         """Return how well the convex hull of the projected points covers the mask, where it could be seen.
@@ -152,40 +136,13 @@ class Silhouette:
         size: Float[np.ndarray, "3"] | tuple[float, float, float],
         T_world_obj: Float[np.ndarray, "4 4"],
     ) -> float:
-        """Return what a box costs that is not turned, or whose sides are not, as it looks, in units of IoU; it can be a gain.
+        """Return what a box costs that is not turned, or whose sides are not, as it looks, in units of IoU.
 
         Nothing without a picture, and for other forms.
         """
         if self._picture is None or form != "box":
             return 0.0
-        looks = _LOOK_WEIGHT * self._guess.cost(size, T_world_obj)
-        return min(_MOST_BY_LOOK, looks) - self._inner_edges(size, T_world_obj)
-
-    def _inner_edges(
-        self,
-        size: Float[np.ndarray, "3"] | tuple[float, float, float],
-        T_world_obj: Float[np.ndarray, "4 4"],
-    ) -> float:
-        """Return what a box gains whose edges between visible faces are edges in the picture, in units of IoU."""
-        corner, ends = _inner_edges(size, T_world_obj, self.camera.T_world_cam[:3, 3])
-        if not len(ends):
-            return 0.0
-        share = np.linspace(0.12, 0.88, 12)[:, None, None]
-        points = (corner + share * (ends - corner)).reshape(-1, 3)
-        homogeneous = points @ self._matrix[:, :3].T + self._matrix[:, 3]
-        pixels = (homogeneous[:, :2] / homogeneous[:, 2:]).reshape(len(share), -1, 2)
-        if not np.isfinite(pixels).all():
-            return 0.0
-        way = pixels[-1] - pixels[0]
-        length = np.linalg.norm(way, axis=1)
-        across = np.stack([-way[:, 1], way[:, 0]], 1) / np.maximum(length, 1e-6)[:, None]
-        h, w = self._mask.shape
-        x, y = (pixels - 0.5).round().astype(int).reshape(-1, 2).T
-        inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
-        found = np.zeros((len(x), 2), np.float32)
-        found[inside] = self._edges[y[inside], x[inside]]
-        step = np.abs((found.reshape(len(share), -1, 2) * across).sum(-1)).mean(0)
-        return _EDGE_WEIGHT * float(step @ length / max(length.sum(), 1e-6))
+        return min(_MOST_BY_LOOK, _LOOK_WEIGHT * self._guess.cost(size, T_world_obj))
 
     def visible(self, points_world: Float[np.ndarray, "n 3"]) -> float:
         """Return the share of the projected hull that the mask confirms."""
@@ -225,41 +182,6 @@ class Silhouette:
         y, x = np.nonzero(self.mask)
         k = int(away[y, x].argmin())
         return np.array([x[k] + 0.5, y[k] + 0.5])
-
-
-def _changes(
-    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "h w 2"]:
-    """Return the change of colour along x and y, as a share of what is much inside this mask, at most 1."""
-    lab = cv2.GaussianBlur(lab_of(image), (0, 0), _EDGE_BLUR_PX)
-    change = np.stack([cv2.Scharr(lab, cv2.CV_32F, 1, 0), cv2.Scharr(lab, cv2.CV_32F, 0, 1)], -1)
-    change = change.reshape(*mask.shape, 3, 2)
-    strongest = np.linalg.norm(change, axis=-1).argmax(-1)
-    step = np.take_along_axis(change, strongest[..., None, None], 2)[:, :, 0]
-    size = np.linalg.norm(step, axis=-1)
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((9, 9))) > 0
-    much = float(np.percentile(size[inner], 90)) if inner.any() else 0.0
-    return step / np.maximum(size, max(much, _LEAST_STEP))[..., None]
-
-
-def _inner_edges(
-    size: Float[np.ndarray, "3"] | tuple[float, float, float],
-    T_world_obj: Float[np.ndarray, "4 4"],
-    eye: Float[np.ndarray, "3"],
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "edge 3"]]:
-    """Return the corner of a box that is nearest to the eye, and the other ends of its edges between visible faces."""
-    local = T_world_obj[:3, :3].T @ (eye - T_world_obj[:3, 3])
-    half = np.array(size) / 2
-    towards = np.where(local >= 0, half, -half)
-    faces = np.abs(local) > half
-    ends = []
-    for k in range(3):
-        if faces[k - 1] and faces[k - 2]:
-            end = towards.copy()
-            end[k] *= -1
-            ends.append(end)
-    corners = np.array([towards, *ends]) @ T_world_obj[:3, :3].T + T_world_obj[:3, 3]
-    return corners[0], corners[1:]
 
 
 def _filled(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
