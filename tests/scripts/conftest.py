@@ -14,6 +14,7 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 @pytest.fixture(scope="module")
 def load_script() -> Iterator[Callable[[str], ModuleType]]:
     loaded = []
+    sys.path.insert(0, str(SCRIPTS))  # as for a script that is run: its neighbours can be imported
 
     def load(name: str) -> ModuleType:
         spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
@@ -26,5 +27,6 @@ def load_script() -> Iterator[Callable[[str], ModuleType]]:
         return module
 
     yield load
+    sys.path.remove(str(SCRIPTS))
     for name in loaded:
         del sys.modules[name]
