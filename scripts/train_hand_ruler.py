@@ -17,7 +17,16 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, UInt8
-from training import Scene, add_commands, compressed, disc_at, draw_all, learn, recoloured
+from training import (
+    Scene,
+    add_commands,
+    batch_of,
+    compressed,
+    disc_at,
+    draw_all,
+    learn,
+    recoloured,
+)
 
 from v2p_data.scene.hand import gap_px, hand_end
 from v2p_data.scene.ruler import (
@@ -220,7 +229,9 @@ def measure(net: RulerNetwork, held_out: list[Scene]) -> str:
     net.eval()
     rng, off, stated = rng_for(0, "hand network", "held out"), [], []
     for scene in held_out:
-        planes, known, truth = batch_of([(scene, k) for k in range(len(scene["known"]))], rng)
+        planes, known, truth = batch_of(
+            varied, [(scene, k) for k in range(len(scene["known"]))], rng
+        )
         said = net(planes, known)
         off += (said[:, 0] - truth).tolist()
         stated += said[:, 1].exp().tolist()
@@ -232,25 +243,6 @@ def measure(net: RulerNetwork, held_out: list[Scene]) -> str:
     )
 
 
-def batch_of(
-    views: list[tuple[Scene, int]], rng: np.random.Generator
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return inputs and truth of these views."""
-    columns = zip(*(varied(scene, k, rng) for scene, k in views), strict=True)
-    planes, known, off = (torch.from_numpy(np.stack(column)) for column in columns)
-    return planes, known, off
-
-
-def loss_on(
-    net: RulerNetwork, views: list[tuple[Scene, int]], rng: np.random.Generator
-) -> torch.Tensor:
-    """Return the loss of a batch."""
-    planes, known, off = batch_of(views, rng)
-    with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
-        said = net(planes.contiguous(memory_format=torch.channels_last), known)
-    return loss_of(said.float(), off)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add_commands(parser, "scene", 1500)
@@ -259,7 +251,7 @@ def main() -> None:
         numbers = range(args.start, args.start + args.scenes)
         draw_all(make_scene, numbers, args.out, args.jobs)
     else:
-        learn(RulerNetwork, loss_on, measure, BATCH, "hand network", args)
+        learn(RulerNetwork, varied, loss_of, measure, BATCH, "hand network", args)
 
 
 if __name__ == "__main__":

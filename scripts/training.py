@@ -111,9 +111,21 @@ class Scenes:
             (self.held_out if int(file.stem) % HELD_OUT == 0 else self.own).append(scene)
 
 
+def batch_of(
+    varied: Callable[[Scene, int, np.random.Generator], tuple[np.ndarray, ...]],
+    views: list[tuple[Scene, int]],
+    rng: np.random.Generator,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return inputs and truth of these views, each changed at random by `varied`."""
+    columns = zip(*(varied(scene, k, rng) for scene, k in views), strict=True)
+    planes, known, truth = (torch.from_numpy(np.stack(column)) for column in columns)
+    return planes.contiguous(memory_format=torch.channels_last), known, truth
+
+
 def learn[N: torch.nn.Module](
     new: Callable[[], N],
-    loss: Callable[[N, list[tuple[Scene, int]], np.random.Generator], torch.Tensor],
+    varied: Callable[[Scene, int, np.random.Generator], tuple[np.ndarray, ...]],
+    loss_of: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
     measure: Callable[[N, list[Scene]], str],
     batch: int,
     stream: str,
@@ -123,7 +135,8 @@ def learn[N: torch.nn.Module](
 
     Args:
         new: makes the network.
-        loss: of so many views, each a scene and its number in there.
+        varied: planes, what is known, and the truth of a scene's view, changed at random.
+        loss_of: what the network says, and the truth.
         measure: says how good it is on the scenes held out.
         batch: number of views.
         stream: name of the random stream.
@@ -142,7 +155,10 @@ def learn[N: torch.nn.Module](
     def some() -> torch.Tensor:
         chosen = [scenes.own[k] for k in rng.integers(len(scenes.own), size=batch)]
         views = [(scene, int(rng.integers(len(scene["known"])))) for scene in chosen]
-        return loss(net, views, rng)
+        planes, known, truth = batch_of(varied, views, rng)
+        with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
+            said = net(planes, known)
+        return loss_of(said.float(), truth)
 
     def state() -> str:
         write(net, args.out)

@@ -26,7 +26,7 @@ WINDOW_SHARE = 1.45
 _WIDTHS = (16, 32, 56, 96)
 _MOST_KAPPA = 10.0
 """Drawn boxes have clearer edges than real ones: surer than this it is not believed to be."""
-_LEAST_SD = (0.12, 0.12)
+_LEAST_SD = 0.12
 """The same for the ratio of the sides and for the height."""
 _UPRIGHT = 0.99
 LOG_SD = (-3.5, 1.0)
@@ -173,7 +173,7 @@ def box_guess(
         azimuth_rad=aim.azimuth_rad,
         fourfold=(less * x, less * y),
         twofold=(u, v),
-        twofold_sd=max(_LEAST_SD[0], math.exp(np.clip(twofold, *LOG_SD))),
+        twofold_sd=max(_LEAST_SD, math.exp(np.clip(twofold, *LOG_SD))),
         height=height,
-        height_sd=max(_LEAST_SD[1], math.exp(np.clip(height_sd, *LOG_SD))),
+        height_sd=max(_LEAST_SD, math.exp(np.clip(height_sd, *LOG_SD))),
     )
