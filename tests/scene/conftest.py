@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from v2p_data.geometry.mesh import outline_points
+from v2p_data.scene.classes import CLASSES, TABLE
+from v2p_data.scene.find import Watched
+from v2p_data.scene.footage import Footage, footage_of
 from v2p_data.scene.pose import camera_above
+from v2p_data.scene.scale import SeenCamera
 from v2p_data.video.clip import Clip
 
 SIZE_M = (0.09, 0.07, 0.05)
@@ -79,3 +83,46 @@ def make_clip(
 @pytest.fixture(scope="session")
 def draw() -> Callable[..., Clip]:
     return make_clip
+
+
+PARTS_PX, PARTS_TABLE = (90, 120), (150, 140, 120)
+"""(height, width) and table colour of what `watched_of` draws."""
+type Parts = list[tuple[np.ndarray, tuple[int, int, int], int]]
+"""Per thing in one frame its mask, colour and class, drawn in order."""
+
+
+@pytest.fixture(scope="session")
+def watched_of() -> Callable[[list[Parts]], tuple[Footage, Watched]]:
+    """Return what makes footage of coloured masks on a table, and the word of a network that sees their classes."""
+
+    def make(parts_by_frame: list[Parts]) -> tuple[Footage, Watched]:
+        frames, planes = [], []
+        for parts in parts_by_frame:
+            image = np.full((*PARTS_PX, 3), PARTS_TABLE, np.uint8)
+            label = np.full(PARTS_PX, TABLE)
+            for mask, colour, what in parts:
+                image[mask], label[mask] = colour, what
+            frames.append(image)
+            planes.append(0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None]))
+        n, (h0, w0) = len(frames), PARTS_PX
+        clip = Clip(
+            item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=np.stack(frames), fps=12.0,
+            total_frames=n, source_fps=12.0, source_frame=np.arange(n), times_s=np.arange(n) / 12,
+            source_size_px=(w0, h0), warnings=(),
+        )  # fmt: skip
+        footage = footage_of(clip)
+        h, w = footage.shape
+        rows, columns = (np.arange(h) * h0) // h, (np.arange(w) * w0) // w
+        large = np.stack(planes).astype(np.float32)[:, :, rows][..., columns]
+        camera = SeenCamera(
+            pitch_rad=0.6,
+            pitch_sd_rad=0.1,
+            focal_widths=0.9,
+            table_width_m=0.9,
+            table_width_sd=0.2,
+        )
+        return footage, Watched(
+            idx=np.arange(n), shares=large, early=large[0], late=large[-1], camera=camera
+        )
+
+    return make

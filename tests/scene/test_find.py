@@ -1,30 +1,24 @@
 """The network's word is drawn by hand here: what is made of it must not depend on how well it was trained."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.classes import CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
-    Watched,
     apart,
     completed,
     filled,
     find_movers,
     rated,
     settled,
-    standing,
 )
-from v2p_data.scene.footage import footage_of
 from v2p_data.scene.ground import Moved
 from v2p_data.scene.nouns import noun_for
-from v2p_data.scene.scale import SeenCamera
 from v2p_data.scene.sight import Sighting, swallowed
 from v2p_data.scene.track import carried, track
-from v2p_data.video.clip import Clip
 
 H, W = 90, 120
 TABLE_RGB, RED, BLUE, SKIN = (150, 140, 120), (190, 40, 40), (40, 60, 190), (224, 172, 140)
@@ -34,41 +28,6 @@ def square(x, y, size=14):
     mask = np.zeros((H, W), bool)
     mask[y : y + size, x : x + size] = True
     return mask
-
-
-def scene(parts_by_frame):
-    """Return a clip whose frames show coloured masks on a table, with the class of every pixel.
-
-    `parts_by_frame` holds per frame `(mask, colour, class)` tuples, drawn in order.
-    """
-    frames, shares = [], []
-    for parts in parts_by_frame:
-        image = np.full((H, W, 3), TABLE_RGB, np.uint8)
-        label = np.full((H, W), TABLE)
-        for mask, colour, what in parts:
-            image[mask], label[mask] = colour, what
-        frames.append(image)
-        shares.append(0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None]))
-    return np.stack(frames), np.stack(shares).astype(np.float32)
-
-
-def watched_of(parts_by_frame):
-    frames, shares = scene(parts_by_frame)
-    clip = Clip(
-        item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=frames, fps=12.0,
-        total_frames=len(frames), source_fps=12.0, source_frame=np.arange(len(frames)),
-        times_s=np.arange(len(frames)) / 12, source_size_px=(W, H), warnings=(),
-    )  # fmt: skip
-    footage = footage_of(clip)
-    h, w = footage.shape
-    rows, columns = (np.arange(h) * H) // h, (np.arange(w) * W) // w
-    large = shares[:, :, rows][..., columns]
-    return footage, Watched(
-        idx=np.arange(len(frames)), shares=large, early=large[0], late=large[-1],
-        camera=SeenCamera(
-            pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.9, table_width_sd=0.2
-        ),
-    )  # fmt: skip
 
 
 def pushed(colour_a, colour_b):
@@ -98,7 +57,7 @@ def large(mask, footage):
 
 
 @pytest.mark.parametrize(("phrase", "y"), [("red box", 20), ("blue box", 60)])
-def test_of_two_things_that_move_the_one_of_the_named_colour_is_taken(phrase, y):
+def test_of_two_things_that_move_the_one_of_the_named_colour_is_taken(watched_of, phrase, y):
     footage, watched = watched_of(pushed(RED, BLUE))
 
     found, _ = find_movers(footage, watched, phrase, "push_right")
@@ -107,7 +66,7 @@ def test_of_two_things_that_move_the_one_of_the_named_colour_is_taken(phrase, y)
     assert iou(found.last, square(48, y)) > 0.8
 
 
-def test_a_rival_makes_the_finding_less_sure():
+def test_a_rival_makes_the_finding_less_sure(watched_of):
     footage, watched = watched_of(pushed(RED, BLUE))
     alone, seen = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
 
@@ -118,7 +77,7 @@ def test_a_rival_makes_the_finding_less_sure():
     assert between_two.score < only_one.score
 
 
-def test_the_wrong_direction_makes_the_finding_less_sure():
+def test_the_wrong_direction_makes_the_finding_less_sure(watched_of):
     footage, watched = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
 
     right, _ = find_movers(footage, watched, "red box", "push_right")
@@ -127,7 +86,7 @@ def test_the_wrong_direction_makes_the_finding_less_sure():
     assert left.score < 0.3 * right.score
 
 
-def test_the_tool_is_what_the_hand_holds():
+def test_the_tool_is_what_the_hand_holds(watched_of):
     frames = pushed(RED, BLUE)
     for i, parts in enumerate(frames):
         if 2 < i < 10:
@@ -141,13 +100,13 @@ def test_the_tool_is_what_the_hand_holds():
     assert iou(tool.first, square(15, 60)) > 0.8
 
 
-def test_nothing_that_moved_is_nothing_found():
+def test_nothing_that_moved_is_nothing_found(watched_of):
     footage, watched = watched_of([[(square(40, 40), RED, OTHER)] for _ in range(12)])
 
     assert find_movers(footage, watched, "red box", "push_right") is None
 
 
-def test_a_mask_given_by_hand_is_taken_as_it_is():
+def test_a_mask_given_by_hand_is_taken_as_it_is(watched_of):
     footage, watched = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
     given = np.zeros(footage.shape, bool)
     given[60:100, 50:90] = True
@@ -155,15 +114,6 @@ def test_a_mask_given_by_hand_is_taken_as_it_is():
     found, _ = find_movers(footage, watched, "box", "push_right", first=given)
 
     np.testing.assert_array_equal(found.first, given)
-
-
-def test_what_stands_is_apart_from_table_and_wall():
-    parts = [(square(0, 0, 30), (90, 90, 90), BACKGROUND), (square(60, 50), RED, OTHER)]
-    _, watched = watched_of([parts for _ in range(12)])
-
-    likely = standing(watched, late=False)
-
-    assert iou(likely > 0.5, square(60, 50)) > 0.8
 
 
 def put_into(bin_shows_at_the_end):
@@ -177,7 +127,7 @@ def put_into(bin_shows_at_the_end):
 
 
 @pytest.mark.parametrize("seen_at_the_end", [False, True])
-def test_what_goes_into_a_bin_and_is_gone_was_swallowed(seen_at_the_end):
+def test_what_goes_into_a_bin_and_is_gone_was_swallowed(watched_of, seen_at_the_end):
     footage, watched = watched_of(put_into(seen_at_the_end))
     h, w = footage.shape
     masks = watched.shares[:, MOVED] > 0.5
@@ -203,7 +153,7 @@ def test_what_goes_into_a_bin_and_is_gone_was_swallowed(seen_at_the_end):
     assert not swallowed(watched, thing, replace(bin_, noun=noun_for("cereal box"))).swallowed
 
 
-def test_what_a_leg_uncovers_elsewhere_does_not_hide_that_the_marked_bin_swallowed_it():
+def test_what_a_leg_uncovers_elsewhere_does_not_hide_that_the_marked_bin_swallowed_it(watched_of):
     frames = put_into(bin_shows_at_the_end=False)
     plug = (square(3, 3), BLUE, MOVED)
     _, watched = watched_of([*frames[:10], [*frames[10], plug], [*frames[11], plug]])
@@ -220,7 +170,7 @@ def test_what_a_leg_uncovers_elsewhere_does_not_hide_that_the_marked_bin_swallow
     assert swallowed(watched, thing, replace(bin_, hinted=True)).swallowed
 
 
-def test_an_outline_at_the_end_that_shows_something_else_is_not_believed():
+def test_an_outline_at_the_end_that_shows_something_else_is_not_believed(watched_of):
     frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
     frames[-1] = [(square(76, 40), BLUE, MOVED)]
     footage, watched = watched_of(frames)
@@ -236,7 +186,7 @@ def test_an_outline_at_the_end_that_shows_something_else_is_not_believed():
     assert course.quality[-1] < 0.4
 
 
-def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours():
+def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours(watched_of):
     frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
     arm = square(76, 54, 30)
     frames[-1] = [(arm, SKIN, MOVED), (square(76, 40), RED, MOVED)]
@@ -254,7 +204,7 @@ def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours():
     assert (course.masks[-1] & ~thing).sum() < 0.15 * thing.sum()
 
 
-def test_where_a_thing_will_stand_is_not_part_of_its_first_outline():
+def test_where_a_thing_will_stand_is_not_part_of_its_first_outline(watched_of):
     footage, _ = watched_of([[(square(30 + 2 * i, 40), RED, MOVED)] for i in range(10)])
     first, last = large(square(30, 40), footage), large(square(48, 40), footage)
     moved = Moved(first=first | last, last=last, score=1.0, look=np.zeros((12, 24, 24)))
@@ -267,7 +217,9 @@ def test_where_a_thing_will_stand_is_not_part_of_its_first_outline():
     assert (apart(footage, moved, keep=(0,)).first == (first | last)).all()
 
 
-def test_what_is_covered_by_both_outlines_stays_with_both_where_it_shows_the_thing_twice():
+def test_what_is_covered_by_both_outlines_stays_with_both_where_it_shows_the_thing_twice(
+    watched_of,
+):
     footage, _ = watched_of([[(square(30 + i, 40), RED, MOVED)] for i in range(8)])
     first, last = large(square(30, 40), footage), large(square(37, 40), footage)
 
@@ -317,7 +269,7 @@ def test_an_outline_is_completed_within_its_box_and_by_its_own_kind():
     assert np.array_equal(filled(part, shares, part), part), "nothing beyond the box"
 
 
-def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen():
+def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen(watched_of):
     footage, watched = watched_of(put_into(bin_shows_at_the_end=False))
 
     found = find_movers(footage, watched, "red cube", "insert")
@@ -328,7 +280,7 @@ def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen():
     assert find_movers(footage, watched, "red cube", "push_right") is None
 
 
-def test_a_tool_marked_in_one_frame_is_followed_both_ways_until_it_is_gone():
+def test_a_tool_marked_in_one_frame_is_followed_both_ways_until_it_is_gone(watched_of):
     path = [None, None, *((20 + 6 * i, 40) for i in range(8)), None, None]
     footage, watched = watched_of([[(square(*at), RED, MOVED)] if at else [] for at in path])
     mask = watched.shares[5, MOVED] > 0.5
@@ -343,7 +295,7 @@ def test_a_tool_marked_in_one_frame_is_followed_both_ways_until_it_is_gone():
     assert course.quality[5] == 1
 
 
-def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal():
+def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(watched_of):
     frames = pushed(RED, RED)
     footage, watched = watched_of(frames)
     start, near, far = square(15, 20), square(44, 14, 26), square(44, 54, 26)
@@ -358,7 +310,7 @@ def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal():
     assert iou(ends[1], square(48, 60)) > 0.8
 
 
-def test_outlines_from_elsewhere_are_rated_like_the_networks_own():
+def test_outlines_from_elsewhere_are_rated_like_the_networks_own(watched_of):
     footage, watched = watched_of(pushed(RED, BLUE))
     own, _ = find_movers(footage, watched, "red box", "push_right")
 

@@ -375,13 +375,6 @@ def _log_likelihood(
     return np.log(likelihood(histogram(image[region]), image) + 1e-6).astype(np.float32)
 
 
-def standing(watched: Watched, *, late: bool) -> Float32[np.ndarray, "h w"]:
-    """Return how likely each pixel of the still of the beginning (or end) belongs to something that stands there."""
-    shares = watched.late if late else watched.early
-    # What is uncovered was not there before: the network may call it moved.
-    return shares[OTHER] + shares[MOVED] if late else shares[OTHER]
-
-
 def seen_at_first(watched: Watched) -> float | None:
     """Return how much of the picture what moves covers at the beginning, where it only comes into the picture later.
 

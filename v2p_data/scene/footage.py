@@ -97,7 +97,7 @@ class Footage:
 
         How much of what passes is object follows from the object's own colours (their weighted median ratio).
         """
-        if len(self.moving) < 300:
+        if len(self.moving) < 300 or not look.any():
             return self
         passing = histogram(self.moving)
         cells = look > 0.02 * look.max()

@@ -46,10 +46,8 @@ _LARGE = 0.01
 """Of the picture: the outlines of smaller things are ragged."""
 _SPLIT_COST = 0.6
 """A piece of an outline must score so much better than the whole: light and print cut things into pieces, too."""
-_SEEN_AS_THING, _NO_THING = 0.35, 0.15
-"""What the network says, in the mean, of what it takes for a thing, and of each pixel around it that is none."""
-_LIKELY_WEIGHT = 2.5
-"""Of how surely the network sees a thing there."""
+_LEAST_STANDING, _MOST_STANDING = 0.0025, 0.2
+"""The same of a thing that stands still."""
 _NECKS = (0.4, 0.6, 0.8)
 _NEAR_KINDS = {"push_next_to", "drop_in_front_of", "push_with", "slide_to"}
 _APPROACHING_KINDS = {"push_next_to", "drop_in_front_of", "slide_to"}
@@ -169,12 +167,10 @@ def find_other(
     kind: str,
     moved: Moved,
     taken: Bool[np.ndarray, "h w"] | None = None,
-    likely: Float32[np.ndarray, "h w"] | None = None,
 ) -> Found | None:
     """Return the thing that stays, or None where the still shows no candidate.
 
-    For `uncover` the late still is searched, for all others the early one. `likely` is how probable it is that
-    a pixel belongs to something that stands there, if anyone knows.
+    For `uncover` the late still is searched, for all others the early one.
     """
     late = kind == "uncover"
     still = footage.late if late else footage.early
@@ -197,20 +193,15 @@ def find_other(
     inner_hull = shrink(table.hull, 1)
     stands_out = table.stands_out(still) & inner_hull & ~restless
     hand = footage.hand(still) & ~colour
-    # Small patches are noise, unless the network takes them for things.
-    least, small, most = (0.0025, 0.5, 0.2) if likely is None else (0.0008, 0.2, 0.35)
     sets = [stands_out, stands_out & ~hand] + ([colour & ~restless] if words else [])
-    if likely is not None:
-        seen = [likely > 0.5, likely > 0.25, (likely > 0.25) & stands_out]
-        sets += seen + ([pixels & colour for pixels in seen[:2]] if words else [])
     lab = lab_of(still)
     occupied = grow(moved.first, 3)
     best: Found | None = None
     for pixels in sets:
         free = pixels & ~grow(moved.last, 2) if late else pixels & ~occupied
         free = free if taken is None else free & ~taken
-        wholes = _parts(tidy(free, 5), h * w, least, most)
-        pieces = [part for whole in wholes for part in _pieces(whole, _LARGE * h * w)]
+        wholes = _parts(tidy(free, 5), h * w, _LEAST_STANDING, _MOST_STANDING)
+        pieces = [part for whole in wholes for part in pieces_of(whole, _LARGE * h * w)]
         for k, mask in enumerate([*wholes, *pieces]):
             x, y, bw, bh = bounding_box(mask)
             area = int(mask.sum())
@@ -229,37 +220,31 @@ def find_other(
             ring = grow(mask, 3) & ~mask
             score += float(table.seen[ring].mean()) if ring.any() else 0.0
             score += 1.6 * float(colour[mask].mean()) if words else 0.0
-            if likely is not None:
-                score += _LIKELY_WEIGHT * (float(likely[mask].mean()) - 0.4)
             score += 0.8 * area / (bw * bh)
             # Things that touch, or pieces of one, are no thing.
             if area > _LARGE * h * w:
                 score += 2 * float(np.clip(solidity(mask) - _WHOLE, -0.2, 0))
             score += 0.02 * min(40.0, edge_contrast(lab, mask))
-            score -= small * max(0.0, float(np.log(0.008 * h * w / area)))
+            score -= 0.5 * max(0.0, float(np.log(0.008 * h * w / area)))
             if best is None or score > best.score:
                 best = Found(mask=mask, score=score)
     if best is None:
         return None
     never = np.zeros((h, w), bool) if late else moved.first
-    return replace(best, mask=_outlined(still, best.mask, never, likely))
+    return replace(best, mask=_outlined(still, best.mask, never))
 
 
 def _outlined(
     still: UInt8[np.ndarray, "h w 3"],
     blob: Bool[np.ndarray, "h w"],
     never: Bool[np.ndarray, "h w"],
-    likely: Float32[np.ndarray, "h w"] | None,
 ) -> Bool[np.ndarray, "h w"]:
     """Return the outline around a thing that stands there, or the blob where there is no clear one."""
-    if likely is not None and float(likely[blob].mean()) > _SEEN_AS_THING:
-        # Print on the table has clearer edges than a thing may have; to the network it is table.
-        never = never | ~grow(likely > _NO_THING, 3)
     mask = refine(still, blob, never)
     return mask if 0.5 <= mask.sum() / blob.sum() <= 1.8 else blob
 
 
-def _pieces(mask: Bool[np.ndarray, "h w"], least_px: float) -> list[Bool[np.ndarray, "h w"]]:
+def pieces_of(mask: Bool[np.ndarray, "h w"], least_px: float) -> list[Bool[np.ndarray, "h w"]]:
     """Return the parts of a mask that only a neck joins, as openings with discs of its own width leave them."""
     if mask.sum() < least_px or solidity(mask) > _WHOLE:
         return []

@@ -85,6 +85,11 @@ class Noun:
         return self.form == "cylinder"
 
     @property
+    def handled(self) -> bool:
+        """Whether things of that name are vessels with a handle or a spout: nothing else keeps them from being round."""
+        return self.form == "cylinder" and self.hollow and self.symmetry == "none"
+
+    @property
     def source_kind(self) -> SourceKind:
         """The class of the source, from a standard down to a guess."""
         return self.source.partition(":")[0]  # pyright: ignore[reportReturnType]  # read_nouns checks it

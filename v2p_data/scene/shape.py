@@ -160,7 +160,7 @@ def best_shape(
         if best is not primitive:
             what = {"revolution": "a solid of revolution", "inflated": "the inflated silhouette"}
             reason = f"{what[best.kind]} covers the outline to {best_iou:.2f}, the {_word(noun)} to {plain:.2f}"
-        if cfg.handles and _may_have_handle(noun):
+        if cfg.handles and noun.handled:
             handle = _STICK if _is_low(best) else _PLATE
             handled = _handled(best, handle, views[0], crops[0])
             iou = -1.0 if handled is None else _iou(handled, views, crops)
@@ -206,11 +206,6 @@ def _others(
         margin = cfg.irregular_margin if irregular else cfg.regular_margin
         found.append((_inflation(view, crop, size_m), margin))
     return [(candidate, margin) for candidate, margin in found if candidate is not None]
-
-
-def _may_have_handle(noun: Noun) -> bool:
-    """Return whether things of that name are vessels with a handle or a spout: nothing else keeps them from being round."""
-    return noun.form == "cylinder" and noun.hollow and noun.symmetry == "none"
 
 
 def _handled(body: _Candidate, kind: _Handle, view: View, crop: Crop) -> _Candidate | None:

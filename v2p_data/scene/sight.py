@@ -24,7 +24,6 @@ from v2p_data.scene.find import (
     rated,
     seen_at_first,
     settled,
-    standing,
     table_seen,
 )
 from v2p_data.scene.footage import Footage
@@ -37,9 +36,9 @@ from v2p_data.scene.segment import (
     from_points,
     grow,
     largest,
-    solidity,
     spans,
 )
+from v2p_data.scene.stand import find_standing
 from v2p_data.scene.table import Table, find_table
 from v2p_data.scene.tool import find_tool
 from v2p_data.scene.track import carried, track
@@ -51,6 +50,8 @@ _CHANGE_TELLS = 4.0
 """Score of the hand-written cues from which their finding is an opinion."""
 _CLEARLY_BETTER = 1.6
 """What those cues found is preferred where the network's own measures rate it so many times as high."""
+_LIES_WITHIN = 0.8
+"""Share of the one outline in the other from which both see the same thing, one of them with something beside it."""
 _NO_OPINION = 0.75
 """What the finding of the network alone counts where those cues have none."""
 _LEAST_HAND = 0.002
@@ -353,9 +354,13 @@ def _stander(
     if mark is not None:
         mask, sure = mark.mask, mark.sure
     else:
-        there = standing(watched, late=late) if watched else None
-        found = find_other(scene.footage, scene.table, phrase, kind, scene.moved, taken, there)
-        sure = _rise(found.score, 1.0, 0.5) if found else 0.0
+        if watched is not None:
+            ends = scene.moved.first, scene.moved.last
+            found = find_standing(scene.footage, scene.table, watched, phrase, kind, ends, taken)
+            sure = found.score if found else 0.0
+        else:
+            found = find_other(scene.footage, scene.table, phrase, kind, scene.moved, taken)
+            sure = _rise(found.score, 1.0, 0.5) if found else 0.0
         mask = found.mask if found else np.zeros_like(taken)
     if sure < scene.min_found or not mask.any():
         _check_needed(scene, phrase, sure)
@@ -552,11 +557,10 @@ def _at_end(mark: _Marked, footage: Footage) -> bool:
 def _agreed(
     footage: Footage, watched: Watched, meaning: Meaning, moved: Moved, by_change: Moved | None
 ) -> Moved:
-    """Return what the network found, completed and weighed by what colours and vanishing edges say.
+    """Return what the network found, weighed by what colours and vanishing edges say.
 
-    The two ways err differently: the network loses parts of things that look like none it knows, and takes people who
-    move for things; the other takes shadows and hands along. What the other found is preferred where it is clearly
-    better by the network's own cues.
+    The two ways err differently: the network takes people who move for things; the other takes shadows and hands along.
+    What the other found is preferred where it is clearly better by the network's own cues.
     """
     if by_change is None or by_change.score < _CHANGE_TELLS:
         return replace(
@@ -570,29 +574,16 @@ def _agreed(
             rivalry = float(1 / (1 + (moved.score / other.score) ** 2))
             cues = {**other.cues, "no rival": rivalry}
             return replace(other, score=other.score * rivalry, cues=cues)
-    ends = []
     overlaps = []
-    for i, own, other in (
-        (0, moved.first, by_change.first),
-        (int(watched.idx[-1]), moved.last, by_change.last),
-    ):
+    for own, other in ((moved.first, by_change.first), (moved.last, by_change.last)):
         common = float((own & other).sum())
-        overlaps.append(common / max(1.0, float((own | other).sum())))
-        surplus = other & ~own
-        fuller = (
-            common > 0.8 * own.sum()
-            and 1.15 * own.sum() < other.sum() < 6 * own.sum()
-            and solidity(other) > max(0.85, solidity(own) - 0.05)
-            and watched.at(i)[HAND][surplus].mean() < 0.25
-        )
-        ends.append(other if fuller else own)
-        if fuller:
-            overlaps[-1] = max(overlaps[-1], 0.5)
+        overlap = common / max(1.0, float((own | other).sum()))
+        overlaps.append(max(overlap, 0.5) if common > _LIES_WITHIN * own.sum() else overlap)
     opinion = float(np.clip(0.55 + 0.75 * max(0.0, overlaps[0]), 0, 1)) * float(
         np.clip(0.75 + 0.5 * overlaps[1], 0, 1)
     )
     cues = {**moved.cues, "second opinion": opinion}
-    return replace(moved, first=ends[0], last=ends[1], score=moved.score * opinion, cues=cues)
+    return replace(moved, score=moved.score * opinion, cues=cues)
 
 
 def _sureness(moved: Moved, watched: Watched | None, mark: _Marked | None) -> tuple[float, str]:

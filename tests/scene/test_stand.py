@@ -1,0 +1,162 @@
+"""Which of the things that stand there is meant: the network's word is drawn by hand here, the weights are the learned ones."""
+
+import json
+
+import numpy as np
+import pytest
+
+from v2p_data.scene.classes import HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.nouns import noun_for
+from v2p_data.scene.scale import SeenCamera
+from v2p_data.scene.segment import iou
+from v2p_data.scene.stand import WEIGHTS, candidates, find_standing, seen_standing, usual_area_px
+from v2p_data.scene.table import find_table
+
+RED, BLUE, GREEN, SKIN = (190, 40, 40), (40, 60, 190), (40, 150, 60), (224, 172, 140)
+CAMERA = SeenCamera(
+    pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.9, table_width_sd=0.2
+)
+
+
+def square(x, y, size=14):
+    mask = np.zeros((90, 120), bool)
+    mask[y : y + size, x : x + size] = True
+    return mask
+
+
+def large(mask, footage):
+    """Return a mask at working size."""
+    h, w = footage.shape
+    return mask[(np.arange(h) * 90) // h][:, (np.arange(w) * 120) // w]
+
+
+def pushed_to(x, others):
+    """A red square goes along y = 40 from x = 5 to x; others stand there."""
+    return [
+        [*((mask, rgb, OTHER) for mask, rgb in others), (square(round(5 + (x - 5) * i / 11), 40), RED, MOVED)]
+        for i in range(12)
+    ]  # fmt: skip
+
+
+def meant(watched_of, frames, phrase, kind, ends):
+    footage, watched = watched_of(frames)
+    table = find_table(footage.always, watched.early[TABLE] > 0.5)
+    sized = tuple(large(mask, footage) for mask in ends)
+    found = find_standing(
+        footage, table, watched, phrase, kind, sized, np.zeros(footage.shape, bool)
+    )
+    return found, footage
+
+
+def test_of_two_things_the_one_that_was_pushed_to_is_meant(watched_of):
+    near, far = square(70, 40), square(100, 5)
+    frames = pushed_to(52, [(near, BLUE), (far, BLUE)])
+
+    found, footage = meant(
+        watched_of, frames, "box", "push_next_to", (square(5, 40), square(52, 40))
+    )
+
+    assert iou(found.mask, large(near, footage)) > 0.8
+
+
+def test_a_named_colour_outweighs_a_little_distance(watched_of):
+    near, far = square(60, 62), square(70, 15)
+    frames = pushed_to(60, [(near, BLUE), (far, GREEN)])
+    ends = square(5, 40), square(60, 40)
+
+    blue, footage = meant(watched_of, frames, "blue box", "push_next_to", ends)
+    green, _ = meant(watched_of, frames, "green box", "push_next_to", ends)
+
+    assert iou(blue.mask, large(near, footage)) > 0.8
+    assert iou(green.mask, large(far, footage)) > 0.8
+
+
+def test_one_alone_is_surer_than_one_of_two_that_are_alike(watched_of):
+    ends = square(5, 40), square(50, 40)
+    one, two = square(72, 28), square(72, 52)
+
+    alone, _ = meant(watched_of, pushed_to(50, [(one, BLUE)]), "box", "push_next_to", ends)
+    either, _ = meant(
+        watched_of, pushed_to(50, [(one, BLUE), (two, BLUE)]), "box", "push_next_to", ends
+    )
+
+    assert either.score < alone.score - 0.1
+
+
+def test_what_an_arm_hides_at_first_is_found_where_it_is_seen_later(watched_of):
+    bin_, arm = square(70, 30, 24), square(60, 20, 40)
+    frames = pushed_to(30, [(bin_, BLUE)])
+    for parts in frames[:4]:
+        parts.append((arm, SKIN, HAND))
+    found, footage = meant(
+        watched_of, frames, "blue bin", "throw_into", (square(5, 40), square(72, 34, 10))
+    )
+
+    assert iou(found.mask, large(bin_, footage)) > 0.8
+
+
+def test_where_nothing_stands_nothing_is_believed(watched_of):
+    """The edge of the moved thing's trace may stand out from the table."""
+    ends = square(5, 40), square(50, 40)
+    found, _ = meant(watched_of, pushed_to(50, []), "box", "push_next_to", ends)
+
+    assert found is None or found.score < 0.2
+
+
+def test_print_on_the_table_is_no_part_of_what_stands_beside_it(watched_of):
+    thing, print_ = square(70, 40), square(72, 54, 10)
+    frames = [[(print_, BLUE, TABLE), *parts] for parts in pushed_to(52, [(thing, BLUE)])]
+
+    found, footage = meant(
+        watched_of, frames, "blue box", "push_next_to", (square(5, 40), square(52, 40))
+    )
+
+    assert iou(found.mask, large(thing, footage)) > 0.8
+
+
+def test_what_is_uncovered_is_looked_for_where_the_cover_stood(watched_of):
+    under, beside = square(22, 44, 8), square(90, 60, 8)
+    frames = [
+        [(beside, BLUE, OTHER), (under, BLUE, MOVED), (square(18 + 4 * i, 36, 20), RED, MOVED)]
+        for i in range(12)
+    ]
+    found, footage = meant(
+        watched_of, frames, "box", "uncover", (square(18, 36, 20), square(62, 36, 20))
+    )
+
+    assert iou(found.mask, large(under, footage)) > 0.6
+
+
+def test_pixels_count_in_the_frames_that_show_them(watched_of):
+    bin_ = square(70, 30, 24)
+    frames = pushed_to(30, [(bin_, BLUE)])
+    for parts in frames[:8]:
+        parts.append((bin_, SKIN, HAND))
+    footage, watched = watched_of(frames)
+
+    assert seen_standing(watched, "insert")[large(bin_, footage)].min() > 0.7
+
+
+def test_every_candidate_has_the_cues_that_were_learned(watched_of):
+    footage, watched = watched_of(pushed_to(50, [(square(72, 28), BLUE)]))
+    table = find_table(footage.always, watched.early[TABLE] > 0.5)
+    ends = tuple(large(mask, footage) for mask in (square(5, 40), square(50, 40)))
+    none = np.zeros(footage.shape, bool)
+    learned = json.loads(WEIGHTS.read_text())
+    assert set(learned["sure"]) == {"offset", "odds", *learned["choice"]}
+    for kind in ("insert", "slide_to", "uncover", "lift_up"):
+        for one in candidates(footage, table, watched, "blue box", kind, ends, none):
+            assert set(one.cues) == set(learned["choice"])
+
+
+@pytest.mark.parametrize(("phrase", "far"), [("ball", False), ("plate", False), ("box", True)])
+def test_usual_things_cover_as_many_pixels_as_their_size_says(phrase, far):
+    noun = noun_for(phrase)
+    row = 40.0 if far else 120.0
+    area = usual_area_px(noun, CAMERA, (240, 320), row)
+
+    # The middle row shows 0.9 m of the table on 320 pixels; things above it are farther away, and smaller.
+    across_px = 320 / 0.9 * np.array(noun.size_m)
+    most, least = across_px[0] * (across_px[1] + across_px[2]), 0.4 * across_px.min() ** 2
+    assert least < area < most
+    assert far == (area < usual_area_px(noun, CAMERA, (240, 320), 120.0) * 0.9)

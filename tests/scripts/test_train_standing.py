@@ -1,0 +1,73 @@
+"""What is learned of candidates is what tells the right one from the others."""
+
+import json
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="module")
+def trainer(load_script):
+    return load_script("train_standing")
+
+
+def group(rng, n=6):
+    """Return candidates of which the one with the largest first cue is right; the second is chance, the third the same for all."""
+    cues = np.column_stack([rng.normal(size=n), rng.normal(size=n), np.full(n, 0.7)])
+    right = np.full(n, 0.02)
+    right[cues[:, 0].argmax()] = 0.95
+    return cues, right, np.eye(n)
+
+
+@pytest.fixture
+def groups():
+    rng = np.random.default_rng(0)
+    return [group(rng) for _ in range(60)]
+
+
+def test_the_cue_that_tells_gets_the_weight(trainer, groups):
+    telling, chance, constant = trainer.choosing(groups)
+
+    assert telling > 5 * abs(chance)
+    assert constant == pytest.approx(0, abs=1e-6)
+
+
+def test_what_is_left_when_the_right_one_is_taken_away_is_believed_less(trainer, groups):
+    weights = trainer.choosing(groups)
+    there = [trainer.found(g, weights) for g in groups]
+    away = [trainer.missed(g, weights) for g in groups]
+    doubt = trainer.doubting([*there, *away])
+
+    def trust(findings):
+        return np.median([doubt[0] + doubt[1:] @ f.cues for f in findings])
+
+    assert np.mean([f.right for f in there]) > 0.9
+    assert not any(f.right for f in away)
+    assert trust(there) > 0.5 > 0 > trust(away)
+
+
+def test_without_another_candidate_nothing_can_be_missed(trainer):
+    alone = (np.zeros((1, 3)), np.array([0.9]), np.eye(1))
+
+    assert trainer.missed(alone, np.zeros(3)) is None
+
+
+def test_better_cut_candidates_count_more(trainer):
+    np.testing.assert_allclose(trainer.worth(np.array([0.4, 0.7, 0.95])), [0, 0.5, 1])
+
+
+def test_the_weights_of_all_cues_are_written(trainer, groups, tmp_path, monkeypatch, capsys):
+    for i, (cues, right, alike) in enumerate(groups):
+        np.savez(
+            tmp_path / f"{i:05d}.npz", names=["a", "b", "c"], cues=cues, right=right, alike=alike
+        )
+    out = tmp_path / "standing.json"
+    monkeypatch.setattr("sys.argv", ["train", "train", str(tmp_path), "--out", str(out)])
+
+    trainer.main()
+
+    learned = json.loads(out.read_text())
+    assert list(learned["choice"]) == ["a", "b", "c"]
+    assert list(learned["sure"]) == ["offset", "a", "b", "c", "odds"]
+    assert list(learned["aside"]) == ["offset", "odds"]
+    assert "60 clips" in capsys.readouterr().out

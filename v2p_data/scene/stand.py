@@ -1,0 +1,286 @@
+"""Which of the things that stand there is the one that the caption names, from what the scene network sees.
+
+The network says of every pixel in every frame whether it shows a thing that never moved. That is cut into candidates, and
+cues - how large each is, of which colour, where - say which of them is meant. How much each cue counts was learned from
+drawn clips (`scripts/train_standing.py`); the weights lie beside this file.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from v2p_data.scene.classes import HAND, MOVED, OTHER
+from v2p_data.scene.colour import balance, colour_match, colour_words, lab_of, named_colours
+from v2p_data.scene.find import Watched
+from v2p_data.scene.footage import Footage
+from v2p_data.scene.ground import Found, pieces_of
+from v2p_data.scene.nouns import Noun, noun_for
+from v2p_data.scene.scale import SeenCamera, px_per_m
+from v2p_data.scene.segment import bounding_box, edge_contrast, grow, iou, refine, solidity, tidy
+from v2p_data.scene.table import Table
+
+WEIGHTS = Path(__file__).with_name("standing.json")
+TOUCHING_KINDS = ("cover", "insert", "throw_into", "place_onto")
+"""What is moved ends in, on or over the other."""
+NEARING_KINDS = ("push_next_to", "drop_in_front_of", "slide_to")
+TELLING_KINDS = (*TOUCHING_KINDS, *NEARING_KINDS, "uncover")
+"""Tasks that tell where the other stands. What the captions of others mention may stand anywhere: how sure it is follows from its
+rivals alone."""
+_LEVELS = (0.75, 0.5, 0.25)
+"""Probabilities at which what the network sees is cut into things."""
+_LEAST_SHARE, _MOST_SHARE = 0.0005, 0.2
+"""Of the picture."""
+_LEAST_FREE = 2.0
+"""Frames in which nothing passes in front of a pixel, for what is seen there to count in full."""
+_SAME = 0.9
+"""IoU from which two candidates are one."""
+_ALIKE = 0.5
+"""IoU from which two candidates are the same thing, cut out differently."""
+_LEAST_CHANCE = 0.01
+"""No candidate is likelier or less likely than by this."""
+_MOST_WITH_HANDLE = 1.5
+"""How much larger than its body a pan is in the picture."""
+_MOST_GAP = 3.0
+"""Of the moved thing's extent: how much farther away something is says nothing."""
+_SEEN_AS_THING = 0.35
+"""What the network says in the mean of a thing that it knows as one; of others it knows no pixel."""
+_SURELY, _NO_THING = 0.9, 0.08
+"""What the network says of pixels that are part of an outline, and are not, whatever the edges say."""
+_LESS_HIDDEN = 0.1
+"""The late still shows a thing better, if so much less of it is hidden there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """A thing that may be the one that is meant."""
+
+    mask: Bool[np.ndarray, "h w"]
+    cues: dict[str, float]
+
+
+def find_standing(
+    footage: Footage,
+    table: Table,
+    watched: Watched,
+    phrase: str,
+    kind: str,
+    ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]],
+    taken: Bool[np.ndarray, "h w"],
+) -> Found | None:
+    """Return the thing that the phrase means, its score being how likely it is the right one; None where nothing stands.
+
+    Args:
+        footage: frames and stills.
+        table: the table.
+        watched: what the network sees.
+        phrase: what the caption calls it.
+        kind: of the task.
+        ends: the manipulated object's first and last outline.
+        taken: what other phrases mean.
+    """
+    found = candidates(footage, table, watched, phrase, kind, ends, taken)
+    if not found:
+        return None
+    learned = _learned()
+    rating = np.array([_sum(learned["choice"], one.cues) for one in found])
+    likely = np.exp(rating - rating.max())
+    likely /= likely.sum()
+    best = found[int(likely.argmax())]
+    mask = best.mask
+    alike = np.array([iou(one.mask, mask) for one in found])
+    said = {"offset": 1.0, "odds": odds_of(likely, alike)}
+    if kind in TELLING_KINDS:
+        odds = _sum(learned["sure"], {**said, **best.cues})
+    else:
+        odds = _sum(learned["aside"], said)
+    if noun_for(phrase).handled:
+        mask = max((c.mask for c in found if _is_with_handle(c.mask, mask)), key=np.sum)
+    mask = _outlined(footage, watched, kind, mask, ends[1])
+    return Found(mask=mask, score=float(1 / (1 + np.exp(-odds))))
+
+
+def odds_of(likely: Float[np.ndarray, "n"], alike: Float[np.ndarray, "n"]) -> float:
+    """Return the log odds of the likeliest candidate and those like it among all; `alike` is how far each overlaps it."""
+    share = float(np.clip(likely[alike > _ALIKE].sum(), _LEAST_CHANCE, 1 - _LEAST_CHANCE))
+    return float(np.log(share / (1 - share)))
+
+
+def seen_standing(watched: Watched, kind: str) -> Float32[np.ndarray, "h w"]:
+    """Return how likely each pixel shows a thing that stands there, over all frames in which nothing passes before it.
+
+    What is uncovered is only seen at the end, and the network may say that it moved.
+    """
+    if kind == "uncover":
+        return watched.late[OTHER] + watched.late[MOVED]
+    free = 1 - watched.shares[:, HAND] - watched.shares[:, MOVED]
+    return watched.shares[:, OTHER].sum(0) / np.maximum(free.sum(0), _LEAST_FREE)
+
+
+def usual_area_px(noun: Noun, camera: SeenCamera, shape: tuple[int, int], row_px: float) -> float:
+    """Return how many pixels a thing of the noun's usual size covers, its foot in that row of a picture of this shape.
+
+    Its top seen from above and its side, the mean over all yaws (of a convex outline the mean width is its girth over pi).
+    """
+    per_m = px_per_m(camera, shape, row_px)
+    below = (row_px - shape[0] / 2) / shape[1]
+    down = max(0.05, camera.pitch_rad + float(np.arctan(below / camera.focal_widths)))
+    length, width, height = noun.size_m
+    if noun.form == "sphere":
+        return per_m**2 * np.pi / 4 * length**2
+    if noun.form == "cylinder":
+        top, side = np.pi / 4 * length * width, length * height * (1 + noun.taper) / 2
+    else:
+        top, side = length * width, 2 / np.pi * (length + width) * height
+    return per_m**2 * float(top * np.sin(down) + side * np.cos(down))
+
+
+def candidates(
+    footage: Footage,
+    table: Table,
+    watched: Watched,
+    phrase: str,
+    kind: str,
+    ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]],
+    taken: Bool[np.ndarray, "h w"],
+) -> list[Candidate]:
+    """Return all that may be meant by the phrase, with its cues; arguments as those of `find_standing`."""
+    late = kind == "uncover"
+    first, last = ends
+    still, here = (footage.late, watched.late) if late else (footage.early, watched.early)
+    h, w = first.shape
+    words, named, noun = colour_words(phrase), bool(named_colours(phrase)), noun_for(phrase)
+    stands = seen_standing(watched, kind)
+    colour = colour_match(balance(still), words) if words else np.zeros((h, w), np.float32)
+    usual = float(colour[table.seen].mean()) if table.seen.any() else 0.0
+    goal, own = (first, last) if late else (last, first)
+    reach_px = float(np.sqrt(max(1, goal.sum())))
+    goal_zone = grow(goal, 6)
+    foot = goal_zone.copy()
+    top, tall = bounding_box(goal)[1::2]
+    foot[: top + tall // 2] = False
+    from_goal, from_first = (
+        cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) for mask in (goal, first)
+    )
+    spots = [np.argwhere(mask).mean(0) for mask in ends if mask.any()]
+    way_px = max(8.0, float(np.linalg.norm(spots[-1] - spots[0])) if spots else 0.0)
+    lab = lab_of(still)
+    apart = table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5)
+    free = ~taken & ~grow(last, 2) if late else ~taken
+    out = []
+    for mask, is_part in _masks(stands, apart, free, colour if words else None):
+        x, y, bw, bh = bounding_box(mask)
+        area = float(mask.sum())
+        ring = grow(mask, 4) & ~grow(mask, 1)
+        larger = [
+            float(np.log(area / usual_area_px(one, watched.camera, (h, w), y + 0.8 * bh))) / 2
+            for one in (noun, noun.other)
+            if one is not None
+        ]
+        off = min(larger, key=abs)
+        gap = min(_MOST_GAP, float(from_goal[mask].min()) / reach_px)
+        nearer = (float(from_first[mask].min()) - float(from_goal[mask].min())) / way_px
+        at_goal = float((mask & goal_zone).sum() / max(1.0, min(float(goal_zone.sum()), area)))
+        fits = float(colour[mask].mean()) - usual if words else 0.0
+        cues = {
+            "seen": float(stands[mask].mean()),
+            "seen around": float(stands[ring].mean()) if ring.any() else 0.0,
+            "part": float(is_part),
+            "sides cut": float(sum((x <= 1, x + bw >= w - 1, y <= 1, y + bh >= h - 1))),
+            "larger than usual": max(0.0, off),
+            "smaller than usual": max(0.0, -off),
+            "area": float(np.log(area / (h * w))),
+            "solidity": solidity(mask),
+            "fill": area / (bw * bh),
+            "edge": min(40.0, edge_contrast(lab, mask)) / 40,
+            "table around": float(table.seen[ring].mean()) if ring.any() else 0.0,
+            "named colour": fits if named else 0.0,
+            "usual colour": 0.0 if named else fits,
+            "moved": float((mask & own).sum() / area),
+            "gap": gap,
+        }
+        for name, kinds in (("into", TOUCHING_KINDS), ("towards", NEARING_KINDS)):
+            there = kind in kinds
+            cues[f"{name}: gap"] = gap if there else 0.0
+            cues[f"{name}: at the end"] = at_goal if there else 0.0
+            cues[f"{name}: nearer"] = float(np.clip(nearer, -1, 1)) if there else 0.0
+        cues["under: gap"] = gap if late else 0.0
+        cues["under: foot"] = float((mask & foot).sum() / area) if late else 0.0
+        out.append(Candidate(mask=mask, cues=cues))
+    return out
+
+
+def _is_with_handle(mask: Bool[np.ndarray, "h w"], body: Bool[np.ndarray, "h w"]) -> bool:
+    """Return whether a mask is that body, alone or with no more beside it than a handle."""
+    return (
+        mask & body
+    ).sum() >= _SAME * body.sum() and mask.sum() <= _MOST_WITH_HANDLE * body.sum()
+
+
+@cache
+def _learned() -> dict[str, dict[str, float]]:
+    """Return what a unit of each cue counts, for which candidate it is and for whether that is right."""
+    return json.loads(WEIGHTS.read_text())
+
+
+def _sum(weights: dict[str, float], cues: dict[str, float]) -> float:
+    return sum(weights[cue] * value for cue, value in cues.items())
+
+
+def _masks(
+    stands: Float32[np.ndarray, "h w"],
+    apart: Bool[np.ndarray, "h w"],
+    free: Bool[np.ndarray, "h w"],
+    colour: Float32[np.ndarray, "h w"] | None,
+) -> Iterator[tuple[Bool[np.ndarray, "h w"], bool]]:
+    """Yield candidates, each with whether it is cut out of a larger one: by a neck, or by its colour."""
+    sets = [(tidy((stands > level) & free), False) for level in _LEVELS]
+    sets.append((tidy(apart & free, 5), False))
+    if colour is not None:
+        named = free & (colour > 0.5)
+        sets += [
+            (tidy(pixels & named, 5), True)
+            for pixels in (apart, *(stands > level for level in _LEVELS[1:]))
+        ]
+    known: list[Bool[np.ndarray, "h w"]] = []
+    least, most = _LEAST_SHARE * free.size, _MOST_SHARE * free.size
+    for pixels, is_part in sets:
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(pixels.astype(np.uint8))
+        for k in range(1, count):
+            if not least <= stats[k, cv2.CC_STAT_AREA] <= most:
+                continue
+            whole = parts == k
+            for mask in (whole, *pieces_of(whole, least)):
+                if all(iou(mask, other) < _SAME for other in known):
+                    known.append(mask)
+                    yield mask, is_part or mask is not whole
+
+
+def _outlined(
+    footage: Footage,
+    watched: Watched,
+    kind: str,
+    mask: Bool[np.ndarray, "h w"],
+    last: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    """Return the outline that follows the edges around a thing, as far as the network lets it."""
+    stands = seen_standing(watched, kind)
+    late = kind == "uncover"
+    never = last
+    if not late:
+        passes = [shares[HAND] + shares[MOVED] for shares in (watched.early, watched.late)]
+        hidden = [float(plane[mask].mean()) for plane in passes]
+        late = hidden[1] + _LESS_HIDDEN < hidden[0]
+        never = passes[int(late)] > 0.5
+    still: UInt8[np.ndarray, "h w 3"] = footage.late if late else footage.early
+    tells = stands[mask].mean() > _SEEN_AS_THING
+    none = (stands < _NO_THING) if tells else np.zeros_like(mask)
+    fine = refine(still, mask, never | none)
+    if not 0.5 <= fine.sum() / mask.sum() <= 1.8:
+        fine = mask
+    return (fine & ~none) | (mask & (stands > _SURELY))
