@@ -134,7 +134,8 @@ def usual_area_px(noun: Noun, camera: SeenCamera, shape: tuple[int, int], row_px
     if noun.form == "sphere":
         return per_m**2 * np.pi / 4 * length**2
     if noun.form == "cylinder":
-        top, side = np.pi / 4 * length * width, length * height * (1 + noun.taper) / 2
+        narrow = min(noun.taper, 1 / noun.taper)
+        top, side = np.pi / 4 * length * width, length * height * (1 + narrow) / 2
     else:
         top, side = length * width, 2 / np.pi * (length + width) * height
     return per_m**2 * float(top * np.sin(down) + side * np.cos(down))
