@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.scene.classes import HAND, MOVED, OTHER
-from v2p_data.scene.colour import balance, colour_match, colour_words, lab_of, named_colours
+from v2p_data.scene.colour import balance, colour_match, colour_words, lab_of
 from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Found, pieces_of
@@ -155,7 +155,7 @@ def candidates(
     first, last = ends
     still, here = (footage.late, watched.late) if late else (footage.early, watched.early)
     h, w = first.shape
-    words, named, noun = colour_words(phrase), bool(named_colours(phrase)), noun_for(phrase)
+    words, noun = colour_words(phrase), noun_for(phrase)
     stands = seen_standing(watched, kind)
     colour = colour_match(balance(still), words) if words else np.zeros((h, w), np.float32)
     usual = float(colour[table.seen].mean()) if table.seen.any() else 0.0
@@ -187,7 +187,6 @@ def candidates(
         gap = min(_MOST_GAP, float(from_goal[mask].min()) / reach_px)
         nearer = (float(from_first[mask].min()) - float(from_goal[mask].min())) / way_px
         at_goal = float((mask & goal_zone).sum() / max(1.0, min(float(goal_zone.sum()), area)))
-        fits = float(colour[mask].mean()) - usual if words else 0.0
         cues = {
             "seen": float(stands[mask].mean()),
             "seen around": float(stands[ring].mean()) if ring.any() else 0.0,
@@ -200,8 +199,7 @@ def candidates(
             "fill": area / (bw * bh),
             "edge": min(40.0, edge_contrast(lab, mask)) / 40,
             "table around": float(table.seen[ring].mean()) if ring.any() else 0.0,
-            "named colour": fits if named else 0.0,
-            "usual colour": 0.0 if named else fits,
+            "colour": float(colour[mask].mean()) - usual if words else 0.0,
             "moved": float((mask & own).sum() / area),
             "gap": gap,
         }
