@@ -1,15 +1,15 @@
 """Learn from drawn clips which of the things that stand there a caption means (`v2p_data/scene/stand.py`).
 
-    python scripts/train_standing.py data --out DATA --clips 240 --jobs 2
+    python scripts/train_standing.py data --out DATA --clips 120 --jobs 2
     python scripts/train_standing.py train DATA --out v2p_data/scene/standing.json
 
 `data` draws clips with a second object, lets the scene network watch them, and keeps the cues of all candidates with how
 well each overlaps the thing that is meant. `train` fits a conditional logit (McFadden 1974): the odds between candidates are
 exponential in the sums of their weighted cues. Then it fits, by logistic regression on clips left out in turn, how sure one may
 be of the likeliest candidate: once with all candidates, once without those that show the thing that is meant, as where it was
-not seen; both are taken to be as frequent. Of what a caption mentions by the way the task does not tell the place: there the odds among the candidates alone
-say how sure that is. Clips are drawn from seeds of their own (`standing things`), so that
-no clip of `bench_reconstruction.py` is among them.
+not seen; both are taken to be as frequent. Where a caption mentions something by the way the task does not tell its place:
+there the odds among the candidates alone say how sure that is. Clips are drawn from seeds of their own (`standing things`), so
+that no clip of `bench_reconstruction.py` is among them.
 """
 
 import argparse
@@ -116,7 +116,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     data = commands.add_parser("data", help="draw and watch clips")
     data.add_argument("--out", type=Path, required=True)
-    data.add_argument("--clips", type=int, default=240)
+    data.add_argument("--clips", type=int, default=120)
     data.add_argument("--start", type=int, default=0, help="number of the first clip")
     data.add_argument("--jobs", type=int, default=2)
     train = commands.add_parser("train", help="fit the weights")

@@ -12,6 +12,7 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.colour import balance, colour_match, named_colours
 from v2p_data.scene.course import TOUCH_PX
 from v2p_data.scene.find import SWALLOWING_KINDS, hand_at
+from v2p_data.scene.ground import NEARING_KINDS, TOUCHING_KINDS
 from v2p_data.scene.nouns import is_clear
 from v2p_data.scene.placement import Placement, vote_of
 from v2p_data.scene.scale import disagreement, height_plausibility
@@ -24,8 +25,6 @@ _OUT_OF_SIGHT = 0.8
 """What went into a bin lies in it, and what a fist lifts goes with it, but nobody sees where."""
 _GROWN = 0.2
 """Logarithm: of twelve drawn things that a hand touches at first where they rest, none seems so much larger there than at the end."""
-_NEARING_KINDS = ("push_next_to", "slide_to", "drop_in_front_of")
-_ENDING_AT_KINDS = ("insert", "throw_into", "place_onto", "cover")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,13 +149,13 @@ def check_motion(
     elif kind == "tip_over":
         value, least = placement.upright_cost - placement.objects[0].last.cost, -0.03
         said = "fits the picture better tipped than upright"
-    elif kind in _NEARING_KINDS and several and not sights.objects[1].moves:
+    elif kind in NEARING_KINDS and several and not sights.objects[1].moves:
         gaps = [
             float(np.linalg.norm((T[:3, 3] - T_world_objs[1][0][:3, 3])[:2]))
             for T in (own[0], own[-1])
         ]
         value, least, said = gaps[0] - gaps[1], 0.02, "comes nearer to the other"
-    elif kind in _ENDING_AT_KINDS and several:
+    elif kind in TOUCHING_KINDS and several:
         goal, last = grow(sights.objects[1].first, 6), sights.objects[0].last
         # What is covered may be far smaller than what covers it.
         value, least = float((goal & last).sum() / max(1, min(last.sum(), goal.sum()))), 0.25

@@ -47,13 +47,15 @@ _LARGE = 0.01
 _SPLIT_COST = 0.6
 """A piece of an outline must score so much better than the whole: light and print cut things into pieces, too."""
 _LEAST_STANDING, _MOST_STANDING = 0.0025, 0.2
-"""The same of a thing that stands still."""
+"""Shares of the picture, of a thing that stands still."""
 _NECKS = (0.4, 0.6, 0.8)
-_NEAR_KINDS = {"push_next_to", "drop_in_front_of", "push_with", "slide_to"}
-_APPROACHING_KINDS = {"push_next_to", "drop_in_front_of", "slide_to"}
+NEARING_KINDS = ("push_next_to", "drop_in_front_of", "slide_to")
+"""What is moved comes nearer to the other."""
 _APPROACH_WEIGHT = 1.0
 """Of coming straight towards something."""
-_TOUCH_KINDS = {"cover", "insert", "throw_into", "place_onto"}
+TOUCHING_KINDS = ("cover", "insert", "throw_into", "place_onto")
+"""What is moved ends in, on or over the other."""
+_NEAR_KINDS = (*NEARING_KINDS, *TOUCHING_KINDS, "push_with")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,15 +209,15 @@ def find_other(
             area = int(mask.sum())
             score = -_border_sides((x, y, bw, bh), w, h) * 0.8
             score -= _SPLIT_COST if k >= len(wholes) else 0.0
-            if kind in _TOUCH_KINDS or late:
+            if kind in TOUCHING_KINDS or late:
                 score += 3 * min(0.6, float((mask & goal_zone).sum() / goal_zone.sum()))
             if late:  # what was under the cover stands where its foot was
                 score += 2.5 * float((mask & foot).sum() / area - 0.6)
             gap = float(distance[mask].min())
-            if kind in _APPROACHING_KINDS:
+            if kind in NEARING_KINDS:
                 nearer = float(before[mask].min()) - gap
                 score += _APPROACH_WEIGHT * float(np.clip(nearer / max(8.0, way), -1, 1))
-            near = 20 if kind in _NEAR_KINDS | _TOUCH_KINDS or late else 60
+            near = 20 if kind in _NEAR_KINDS or late else 60
             score -= min(gap / near, 4.0)
             ring = grow(mask, 3) & ~mask
             score += float(table.seen[ring].mean()) if ring.any() else 0.0
@@ -398,7 +400,9 @@ def _blobs(
                 "fleeting": 0.0 if words else -0.8 * float(fleeting[mask].mean()),
                 "ragged": -float(np.std(stays[mask])),
                 "small": -0.4 * max(0.0, float(np.log(0.004 * h * w / area))),
-                "ring": 0.5 if at_end and kind in _TOUCH_KINDS else float(table.seen[ring].mean()),
+                "ring": 0.5
+                if at_end and kind in TOUCHING_KINDS
+                else float(table.seen[ring].mean()),
                 "whole": (whole * share - 0.4) if whole else 0.0,
                 "off table": -1.2 if on_table < 0.5 and not at_end else 0.0,
             }

@@ -19,16 +19,13 @@ from v2p_data.scene.classes import HAND, MOVED, OTHER
 from v2p_data.scene.colour import balance, colour_match, colour_words, lab_of
 from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import Footage
-from v2p_data.scene.ground import Found, pieces_of
+from v2p_data.scene.ground import NEARING_KINDS, TOUCHING_KINDS, Found, pieces_of
 from v2p_data.scene.nouns import Noun, noun_for
 from v2p_data.scene.scale import SeenCamera, px_per_m
 from v2p_data.scene.segment import bounding_box, edge_contrast, grow, iou, refine, solidity, tidy
 from v2p_data.scene.table import Table
 
 WEIGHTS = Path(__file__).with_name("standing.json")
-TOUCHING_KINDS = ("cover", "insert", "throw_into", "place_onto")
-"""What is moved ends in, on or over the other."""
-NEARING_KINDS = ("push_next_to", "drop_in_front_of", "slide_to")
 TELLING_KINDS = (*TOUCHING_KINDS, *NEARING_KINDS, "uncover")
 """Tasks that tell where the other stands. What the captions of others mention may stand anywhere: how sure it is follows from its
 rivals alone."""
