@@ -30,7 +30,7 @@ from v2p_data.scene.find import watch
 from v2p_data.scene.footage import footage_of
 from v2p_data.scene.segment import iou
 from v2p_data.scene.sight import sight
-from v2p_data.scene.stand import TELLING_KINDS, Candidate, candidates, odds_of
+from v2p_data.scene.stand import TELLING_KINDS, Candidate, Search, candidates, odds_of
 from v2p_data.scene.steady import steadied
 from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos, parse_caption
@@ -105,9 +105,16 @@ def candidates_in(clip: Clip, phrase: str) -> list[Candidate]:
         clip, footage = steady, footage_of(steady)
     seen = sight(clip, footage, meaning, watch(clip, footage), min_found=0.0)
     assert seen.watched is not None
-    ends = seen.objects[0].first, seen.objects[0].last
-    nothing = np.zeros(footage.shape, bool)
-    return candidates(seen.footage, seen.table, seen.watched, phrase, meaning.kind, ends, nothing)
+    search = Search(
+        footage=seen.footage,
+        table=seen.table,
+        watched=seen.watched,
+        phrase=phrase,
+        kind=meaning.kind,
+        ends=(seen.objects[0].first, seen.objects[0].last),
+        taken=np.zeros(footage.shape, bool),
+    )
+    return candidates(search)
 
 
 def main() -> None:

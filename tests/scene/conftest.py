@@ -63,20 +63,30 @@ def make_clip(
             shift = np.array([[1, 0, shake_px * t], [0, 1, 0.5 * shake_px * t]])
             image = cv2.warpAffine(image, shift, (320, 240), borderMode=cv2.BORDER_REPLICATE)
         frames.append(np.clip(image + rng.normal(0, 1, image.shape), 0, 255).astype(np.uint8))
-    n = len(frames)
+    return _clip(np.stack(frames), caption, objects, hints)
+
+
+def _clip(
+    frames: np.ndarray,
+    caption: str = "",
+    objects: tuple[str, ...] = (),
+    hints: dict | None = None,
+) -> Clip:
+    """Return frames, twelve a second, as if they had been read from a file of their size."""
+    n, h, w = frames.shape[:3]
     return Clip(
         item="drawn",
         path=Path("drawn.mp4"),
         caption=caption,
         objects=objects,
         hints=hints or {},
-        frames=np.stack(frames),
+        frames=frames,
         fps=12.0,
         total_frames=n,
         source_fps=12.0,
         source_frame=np.arange(n),
         times_s=np.arange(n) / 12.0,
-        source_size_px=(320, 240),
+        source_size_px=(w, h),
     )
 
 
@@ -105,12 +115,7 @@ def watched_of() -> Callable[[list[Parts]], tuple[Footage, Watched]]:
             frames.append(image)
             planes.append(0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None]))
         n, (h0, w0) = len(frames), PARTS_PX
-        clip = Clip(
-            item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=np.stack(frames), fps=12.0,
-            total_frames=n, source_fps=12.0, source_frame=np.arange(n), times_s=np.arange(n) / 12,
-            source_size_px=(w0, h0), warnings=(),
-        )  # fmt: skip
-        footage = footage_of(clip)
+        footage = footage_of(_clip(np.stack(frames)))
         h, w = footage.shape
         rows, columns = (np.arange(h) * h0) // h, (np.arange(w) * w0) // w
         large = np.stack(planes).astype(np.float32)[:, :, rows][..., columns]

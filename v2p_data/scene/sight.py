@@ -38,7 +38,7 @@ from v2p_data.scene.segment import (
     largest,
     spans,
 )
-from v2p_data.scene.stand import find_standing
+from v2p_data.scene.stand import Search, find_standing
 from v2p_data.scene.table import Table, find_table
 from v2p_data.scene.tool import find_tool
 from v2p_data.scene.track import carried, track
@@ -355,8 +355,16 @@ def _stander(
         mask, sure = mark.mask, mark.sure
     else:
         if watched is not None:
-            ends = scene.moved.first, scene.moved.last
-            found = find_standing(scene.footage, scene.table, watched, phrase, kind, ends, taken)
+            search = Search(
+                footage=scene.footage,
+                table=scene.table,
+                watched=watched,
+                phrase=phrase,
+                kind=kind,
+                ends=(scene.moved.first, scene.moved.last),
+                taken=taken,
+            )
+            found = find_standing(search)
             sure = found.score if found else 0.0
         else:
             found = find_other(scene.footage, scene.table, phrase, kind, scene.moved, taken)

@@ -8,7 +8,7 @@ drawn clips (`scripts/train_standing.py`); the weights lie beside this file.
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import cv2
@@ -61,27 +61,31 @@ class Candidate:
     cues: dict[str, float]
 
 
-def find_standing(
-    footage: Footage,
-    table: Table,
-    watched: Watched,
-    phrase: str,
-    kind: str,
-    ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]],
-    taken: Bool[np.ndarray, "h w"],
-) -> Found | None:
-    """Return the thing that the phrase means, its score being how likely it is the right one; None where nothing stands.
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """What is looked for, and where."""
 
-    Args:
-        footage: frames and stills.
-        table: the table.
-        watched: what the network sees.
-        phrase: what the caption calls it.
-        kind: of the task.
-        ends: the manipulated object's first and last outline.
-        taken: what other phrases mean.
-    """
-    found = candidates(footage, table, watched, phrase, kind, ends, taken)
+    footage: Footage
+    table: Table
+    watched: Watched
+    phrase: str
+    """What the caption calls it."""
+    kind: str
+    """Of the task."""
+    ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]
+    """The manipulated object's first and last outline."""
+    taken: Bool[np.ndarray, "h w"]
+    """What other phrases mean."""
+
+    @cached_property
+    def stands(self) -> Float32[np.ndarray, "h w"]:
+        """How likely each pixel shows a thing that stands there."""
+        return seen_standing(self.watched, self.kind)
+
+
+def find_standing(search: Search) -> Found | None:
+    """Return the thing that the phrase means, its score being how likely it is the right one; None where nothing stands."""
+    found = candidates(search)
     if not found:
         return None
     learned = _learned()
@@ -92,13 +96,13 @@ def find_standing(
     mask = best.mask
     alike = np.array([iou(one.mask, mask) for one in found])
     said = {"offset": 1.0, "odds": odds_of(likely, alike)}
-    if kind in TELLING_KINDS:
+    if search.kind in TELLING_KINDS:
         odds = _sum(learned["sure"], {**said, **best.cues})
     else:
         odds = _sum(learned["aside"], said)
-    if noun_for(phrase).handled:
+    if noun_for(search.phrase).handled:
         mask = max((c.mask for c in found if _is_with_handle(c.mask, mask)), key=np.sum)
-    mask = _outlined(footage, watched, kind, mask, ends[1])
+    mask = _outlined(search, mask)
     return Found(mask=mask, score=float(1 / (1 + np.exp(-odds))))
 
 
@@ -138,22 +142,15 @@ def usual_area_px(noun: Noun, camera: SeenCamera, shape: tuple[int, int], row_px
     return per_m**2 * float(top * np.sin(down) + side * np.cos(down))
 
 
-def candidates(
-    footage: Footage,
-    table: Table,
-    watched: Watched,
-    phrase: str,
-    kind: str,
-    ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]],
-    taken: Bool[np.ndarray, "h w"],
-) -> list[Candidate]:
-    """Return all that may be meant by the phrase, with its cues; arguments as those of `find_standing`."""
+def candidates(search: Search) -> list[Candidate]:
+    """Return all that may be meant by the phrase, with its cues."""
+    footage, table, watched, kind = search.footage, search.table, search.watched, search.kind
     late = kind == "uncover"
-    first, last = ends
+    first, last = search.ends
     still, here = (footage.late, watched.late) if late else (footage.early, watched.early)
     h, w = first.shape
-    words, noun = colour_words(phrase), noun_for(phrase)
-    stands = seen_standing(watched, kind)
+    words, noun = colour_words(search.phrase), noun_for(search.phrase)
+    stands = search.stands
     colour = colour_match(balance(still), words) if words else np.zeros((h, w), np.float32)
     usual = float(colour[table.seen].mean()) if table.seen.any() else 0.0
     goal, own = (first, last) if late else (last, first)
@@ -165,11 +162,11 @@ def candidates(
     from_goal, from_first = (
         cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) for mask in (goal, first)
     )
-    spots = [np.argwhere(mask).mean(0) for mask in ends if mask.any()]
+    spots = [np.argwhere(mask).mean(0) for mask in search.ends if mask.any()]
     way_px = max(8.0, float(np.linalg.norm(spots[-1] - spots[0])) if spots else 0.0)
     lab = lab_of(still)
     apart = table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5)
-    free = ~taken & ~grow(last, 2) if late else ~taken
+    free = ~search.taken & ~grow(last, 2) if late else ~search.taken
     out = []
     for mask, is_part in _masks(stands, apart, free, colour if words else None):
         x, y, bw, bh = bounding_box(mask)
@@ -257,17 +254,11 @@ def _masks(
                     yield mask, is_part or mask is not whole
 
 
-def _outlined(
-    footage: Footage,
-    watched: Watched,
-    kind: str,
-    mask: Bool[np.ndarray, "h w"],
-    last: Bool[np.ndarray, "h w"],
-) -> Bool[np.ndarray, "h w"]:
+def _outlined(search: Search, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Return the outline that follows the edges around a thing, as far as the network lets it."""
-    stands = seen_standing(watched, kind)
-    late = kind == "uncover"
-    never = last
+    footage, watched, stands = search.footage, search.watched, search.stands
+    late = search.kind == "uncover"
+    never = search.ends[1]
     if not late:
         passes = [shares[HAND] + shares[MOVED] for shares in (watched.early, watched.late)]
         hidden = [float(plane[mask].mean()) for plane in passes]
