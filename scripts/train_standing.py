@@ -110,6 +110,7 @@ def candidates_in(clip: Clip, phrase: str) -> list[Candidate]:
         table=seen.table,
         watched=seen.watched,
         phrase=phrase,
+        moved=seen.objects[0].noun,
         kind=meaning.kind,
         ends=(seen.objects[0].first, seen.objects[0].last),
         taken=np.zeros(footage.shape, bool),

@@ -12,6 +12,7 @@ from v2p_data.scene.find import (
     completed,
     filled,
     find_movers,
+    less_table,
     rated,
     settled,
 )
@@ -245,6 +246,16 @@ def test_a_shadow_in_the_outline_that_the_network_sees_as_table_is_cut_off():
     assert np.array_equal(found, thing)
 
 
+def test_a_marked_outline_loses_what_surely_is_table_but_no_part_of_the_thing():
+    body, beside, handle = square(40, 30, 20), square(60, 36, 8), square(60, 48, 14)
+
+    found = less_table(body | beside | handle, seen_as(other=body | handle & ~square(60, 48, 2)))
+
+    assert not found[beside & ~handle].any()
+    assert found[body].all()
+    assert found[handle].mean() > 0.9
+
+
 def test_where_the_network_does_not_know_the_thing_its_outline_stays():
     thing = square(40, 30, 20)
 
@@ -308,6 +319,20 @@ def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(wa
 
     assert iou(ends[0], square(48, 20)) > 0.8
     assert iou(ends[1], square(48, 60)) > 0.8
+
+
+def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(watched_of):
+    """Of two that move alike the blue one is meant: a mark in the middle says so, and is no outline of either end."""
+    frames = pushed(RED, BLUE)
+    footage, watched = watched_of(frames)
+    there = large(square(15 + 3 * 6, 60), footage)
+
+    moved, _ = find_movers(
+        footage, watched, "thing", "push_right", look=histogram(footage.rgb[6][there])
+    )
+
+    assert iou(moved.first, square(15, 60)) > 0.8
+    assert iou(moved.last, square(15 + 33, 60)) > 0.8
 
 
 def test_outlines_from_elsewhere_are_rated_like_the_networks_own(watched_of):

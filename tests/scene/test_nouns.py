@@ -47,7 +47,7 @@ def density(noun: Noun) -> float:
         ("dark blue mug", "mug"),
         ("a red cup", "cup"),
         ("white watering can", "watering can"),
-        ("blue and yellow can", "yellow can"),
+        ("blue and yellow can", "can"),
         ("remote control", "remote"),
         ("mobile phone", "phone"),
         ("cell phone charger", "charger"),

@@ -10,7 +10,7 @@ from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import footage_of
 from v2p_data.scene.gate import held_at_first
 from v2p_data.scene.nouns import noun_for
-from v2p_data.scene.placement import CameraGuess, _hidden, place
+from v2p_data.scene.placement import CameraGuess, _body, _hidden, place, with_forms
 from v2p_data.scene.pose import camera_above
 from v2p_data.scene.scale import SeenCamera
 from v2p_data.scene.sight import Sighting, Sights
@@ -105,3 +105,90 @@ def test_a_cup_that_a_hand_holds_in_the_air_at_first_is_told_from_one_that_stand
 
     assert (placement.objects[0].grown > 0.2) == (above > 0)
     assert held_at_first(sights, placement) == held
+
+
+def outline_of(noun, size, x: float, y: float, above: float = 0.0) -> np.ndarray:
+    """Return the outline of something upright, in camera heights."""
+    camera = camera_above((H, W), PITCH, FOV)
+    points = outline_points(noun.form, size, noun.taper) + np.array([x, y, above + size[2] / 2])
+    hull = cv2.convexHull(camera.project(points).astype(np.float32))
+    return cv2.fillConvexPoly(np.zeros((H, W), np.uint8), hull.round().astype(np.int32), 1) > 0
+
+
+def resting(phrase: str, role: str, masks: np.ndarray, **given) -> Sighting:
+    common = {
+        "quality": np.ones(len(masks)),
+        "at": 0,
+        "known_m": None,
+        "sure": 0.9,
+        "why": "",
+        "moves": False,
+    }
+    return Sighting(
+        phrase=phrase, role=role, noun=noun_for(phrase), masks=masks, **(common | given)
+    )  # fmt: skip
+
+
+def test_a_pan_is_fitted_without_its_handle():
+    pan = noun_for("frying pan")
+    body = outline_of(pan, (0.4, 0.4, 0.08), 1.15, 0.1)
+    rows, columns = np.nonzero(body)
+    handle = np.zeros_like(body)
+    middle = int(rows.mean())
+    handle[middle - 3 : middle + 4, columns.max() - 4 : columns.max() + 60] = True
+    hidden = np.zeros_like(body)
+
+    kept, unknown = _body(body | handle, hidden, pan)
+    bowl, nothing = _body(body | handle, hidden, noun_for("bowl"))
+
+    assert (kept & body).sum() > 0.97 * body.sum()
+    assert unknown[handle & ~body].mean() > 0.9
+    assert (bowl == body | handle).all()
+    assert not nothing.any()
+
+
+@pytest.mark.parametrize(("across_m", "word"), [(0.09, "lid"), (0.21, "pot lid")])
+def test_lids_of_jars_and_of_pots_are_told_by_their_size(across_m: float, word: str):
+    height_m = 0.5
+    flat, domed = noun_for("lid"), noun_for("pot lid")
+    seen = flat if word == "lid" else domed
+    size = tuple(float(v) for v in across_m / height_m * np.array(seen.size_m) / seen.size_m[0])
+    mask = outline_of(seen, size, 1.1, 0.0)
+    frames = np.full((12, H, W, 3), 150, np.uint8)
+    guess = CameraGuess(
+        pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=height_m, height_sd=0.12
+    )
+
+    (told,) = with_forms(
+        footage_of(filmed(frames)), (resting("lid", "manipulated", np.stack([mask] * 12)),), guess
+    )
+
+    assert told.noun.size_m == noun_for(word).size_m
+
+
+def test_a_lid_that_is_taken_off_lay_on_what_it_covered():
+    lid, pot = noun_for("pot lid"), noun_for("pot")
+    size, under = (0.36, 0.36, 0.08), (0.34, 0.34, 0.2)
+    there = (1.15, 0.3)
+    first = outline_of(lid, size, *there, above=under[2])
+    last = outline_of(lid, size, 1.1, -0.3)
+    masks = np.stack([first] * 12 + [last] * 12)
+    frames = np.full((24, H, W, 3), 150, np.uint8)
+    frames[:12, first] = frames[12:, last] = 200, 30, 30
+    below = outline_of(pot, under, *there)
+    frames[12:, below] = 30, 40, 200
+    stands = np.stack([below & ~first] * 12 + [below] * 12)
+    objects = (
+        resting("pot lid", "manipulated", masks, moves=True),
+        resting("pot", "reference", stands, at=23),
+    )
+    guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV)
+
+    placed, other = place(footage_of(filmed(frames)), objects, "uncover", guess, 10).objects
+
+    start, stop = placed.T_world_objs[0][:3, 3], placed.T_world_objs[-1][:3, 3]
+    assert placed.taken_off
+    assert start[2] - stop[2] == pytest.approx(other.first.size[2], rel=0.01)
+    assert start[:2] == pytest.approx(there, abs=0.06)
+    assert stop[:2] == pytest.approx((1.1, -0.3), abs=0.06)
+    assert placed.first.size == pytest.approx(size, rel=0.25)

@@ -136,6 +136,21 @@ def test_an_object_that_is_not_there_is_not_found(draw):
     assert caught.value.reason == "reference_not_found"
 
 
+def test_what_the_caption_does_not_speak_of_is_left_out_rather_than_the_whole_scene(draw):
+    clip = draw(objects=("blue box", "bowl"))
+    clip.frames[:, 150:190, 40:80] = 30, 120, 40
+    both = rebuild(clip, min_found=0.0, min_confidence=0.0)
+    assert [thing.label for thing in both.objects] == ["blue box", "bowl"]
+
+    scene = rebuild(clip, min_found=0.0, min_confidence=both.confidence + 0.001)
+    spoken = replace(clip, caption="Pushing blue box from right to left next to bowl")
+
+    assert [thing.label for thing in scene.objects] == ["blue box"]
+    assert any("'bowl'" in warning and "left out" in warning for warning in scene.warnings)
+    with pytest.raises(ItemRejectedError, match="low_confidence|sure to"):
+        rebuild(spoken, min_found=0.0, min_confidence=0.99)
+
+
 def test_a_box_around_the_object_leads_to_the_same_place(draw, pushed):
     x, y = np.nonzero(pushed.objects[0].masks[0])[::-1]
     box = [float(x.min()) - 2, float(y.min()) - 2, float(x.max()) + 3, float(y.max()) + 3]

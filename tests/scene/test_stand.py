@@ -45,7 +45,7 @@ def pushed_to(x, others):
     ]  # fmt: skip
 
 
-def searched(watched_of, frames, phrase, kind, ends):
+def searched(watched_of, frames, phrase, kind, ends, moved="thing"):
     footage, watched = watched_of(frames)
     first, last = (large(mask, footage) for mask in ends)
     return Search(
@@ -53,6 +53,7 @@ def searched(watched_of, frames, phrase, kind, ends):
         table=find_table(footage.always, watched.early[TABLE] > 0.5),
         watched=watched,
         phrase=phrase,
+        moved=noun_for(moved),
         kind=kind,
         ends=(first, last),
         taken=np.zeros(footage.shape, bool),
@@ -151,6 +152,23 @@ def test_pixels_count_in_the_frames_that_show_them(watched_of):
     footage, watched = watched_of(frames)
 
     assert seen_standing(watched, "insert")[large(bin_, footage)].min() > 0.7
+
+
+def test_where_all_seems_too_small_things_are_compared_with_what_moves(watched_of):
+    """The camera is taken to be near, and the scene is far away: then the box that is pushed looks like a matchbox."""
+    frames, ends = pushed_to(50, [(square(72, 28), BLUE)]), (square(5, 40), square(50, 40))
+
+    alone, beside = (
+        searched(watched_of, frames, "blue suitcase", "slide_to", ends, moved)
+        for moved in ("thing", "suitcase")
+    )
+
+    assert alone.log_scale == 0
+    assert beside.log_scale < -0.3
+    cues = [max(candidates(one), key=lambda c: c.cues["seen"]).cues for one in (alone, beside)]
+    assert cues[1]["smaller than usual"] == pytest.approx(
+        cues[0]["smaller than usual"] + beside.log_scale
+    )
 
 
 @pytest.mark.parametrize("kind", ["insert", "slide_to", "uncover", "lift_up"])

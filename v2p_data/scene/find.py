@@ -250,14 +250,17 @@ def find_movers(
     first: Bool[np.ndarray, "h w"] | None = None,
     last: Bool[np.ndarray, "h w"] | None = None,
     goal: Bool[np.ndarray, "h w"] | None = None,
+    look: Float[np.ndarray, "l a b"] | None = None,
 ) -> tuple[Moved, Moved | None] | None:
     """Return the manipulated object and, where the caption names one that a hand holds, the tool.
 
     A mask given by the user for either end is taken as it is; `goal` is what the user marked as that into, onto or over
-    which it goes. None where nothing that moved was seen.
+    which it goes; `look` its colours, where the user marked it on its way. None where nothing that moved was seen.
     """
     starts = _ends(footage, watched, phrase, 0, first)
     stops = _ends(footage, watched, phrase, len(footage.rgb) - 1, last)
+    if look is not None:
+        starts, stops = ([_alike(blob, look) for blob in ends] for ends in (starts, stops))
     if starts and not stops and kind in SWALLOWING_KINDS:
         stops = _last_seen(footage, watched, phrase, starts[0].area)
     stops = [_hidden_end(blob, _END_WEIGHT.get(kind, 0.7)) for blob in stops]
@@ -334,10 +337,27 @@ def settled(
         mask: the outline.
         shares: what the network sees in the picture that it was drawn in.
     """
+    return _if_worth(completed(_less_table(mask, shares), shares[MOVED]), mask)
+
+
+def less_table(
+    mask: Bool[np.ndarray, "h w"], shares: Float32[np.ndarray, "5 h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the outline without what to the network surely is bare table; `shares` is what it sees in the same picture.
+
+    It may leave several parts: the root of a handle is easily taken for table.
+    """
+    kept = tidy(_less_table(mask, shares))
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(kept.astype(np.uint8))
+    large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] > _LEAST_CHANGE * kept.sum())
+    return _if_worth(kept & np.isin(parts, large), mask)
+
+
+def _less_table(
+    mask: Bool[np.ndarray, "h w"], shares: Float32[np.ndarray, "5 h w"]
+) -> Bool[np.ndarray, "h w"]:
     kept = mask & ~(shares[TABLE] > _SURELY_TABLE)
-    if kept.sum() < (1 - _MOST_CUT) * mask.sum():
-        kept = mask
-    return _if_worth(completed(kept, shares[MOVED]), mask)
+    return kept if kept.sum() >= (1 - _MOST_CUT) * mask.sum() else mask
 
 
 def completed(
@@ -499,6 +519,12 @@ def _last_seen(footage: Footage, watched: Watched, phrase: str, area: int) -> li
 def _hidden_end(blob: _Blob, weight: float) -> _Blob:
     """Return a blob of the last frame with ratings that count by this exponent."""
     return replace(blob, parts={name: part**weight for name, part in blob.parts.items()})
+
+
+def _alike(blob: _Blob, look: Float[np.ndarray, "l a b"]) -> _Blob:
+    """Return a blob that counts little where it has other colours than what the user marked."""
+    likeness = 0.2 + 0.8 * similarity(blob.hist, look)
+    return replace(blob, parts={**blob.parts, "alike what is marked": likeness})
 
 
 def _at_goal(blob: _Blob, goal: Bool[np.ndarray, "h w"]) -> _Blob:

@@ -107,13 +107,18 @@ def by_stage(cues: tuple[Cue, ...]) -> dict[str, tuple[float, str]]:
     return out
 
 
+def confidence_of(cues: tuple[Cue, ...]) -> float:
+    """Return the scene's confidence, 0 to 1."""
+    return float(np.prod([cue.value for cue in cues]))
+
+
 def check_confidence(cues: tuple[Cue, ...], least: float) -> float:
     """Return the scene's confidence.
 
     Raises:
         ItemRejectedError: `low_confidence`, where it is below `least`.
     """
-    confidence = float(np.prod([cue.value for cue in cues]))
+    confidence = confidence_of(cues)
     if confidence < least:
         weakest = min(cues, key=lambda cue: cue.value)
         raise ItemRejectedError(
@@ -129,7 +134,7 @@ def check_motion(
     kind: str,
     sights: Sights,
     placement: Placement,
-    T_world_objs: list[Float[np.ndarray, "pose 4 4"]],
+    T_world_objs: list[Float[np.ndarray, "_ 4 4"]],
     size_m: tuple[float, float, float],
 ) -> None:
     """Turn away what does not do what its caption says: then something else was followed.

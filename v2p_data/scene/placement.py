@@ -6,6 +6,7 @@ are held; how far away something in mid-air is cannot be seen from one side and 
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
@@ -23,6 +24,7 @@ from v2p_data.scene.course import (
 )
 from v2p_data.scene.find import SWALLOWING_KINDS, Watched
 from v2p_data.scene.footage import Footage
+from v2p_data.scene.nouns import Noun
 from v2p_data.scene.pose import (
     Fit,
     Silhouette,
@@ -57,6 +59,14 @@ _GRIP_HEIGHT_M = 0.08
 """Over the table, of a hand that pushes with something: the fist must clear the table."""
 _OTHER_FORM_COST = 0.02
 """By so much a noun's second form must cover an outline better: a box has a side and a turn more to choose than a cylinder."""
+_HANDLE_WIDTH = 0.45
+"""A handle is narrower than this share of its vessel's outline."""
+_LEAST_HANDLE = 0.02
+"""Of an outline: what sticks out less is a corner."""
+_LYING_TELLS = 0.1
+"""A lid that is taken off lies on the table at first if that fits so much better, in units of IoU."""
+_SIZE_TELLS, _MOST_OFF = 0.01, 3.0
+"""Of a form whose size is one standard deviation off, in units of IoU, and from where on it counts no more."""
 _PITCH_RANGE_RAD = (0.15, 1.4)
 """From nearly level to nearly straight down: beyond, outlines on the table say nothing of places on it."""
 _MOUTH_DOWN = np.diag([1.0, -1.0, -1.0])
@@ -119,6 +129,8 @@ class Placed:
     grown: float = 0.0
     """Logarithm of how much larger it seems where it starts than where it ends, if it lies on the table at both: what is held
     in the air is nearer to the camera, and seems larger."""
+    taken_off: bool = False
+    """Whether it lies on something at first: then its last outline, on the table, shows its shape."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +175,7 @@ class _Fits:
     """What standing as at first would have cost at the end."""
     unseen: bool = False
     grown: float = 0.0
+    taken_off: bool = False
 
 
 def place(
@@ -191,6 +204,8 @@ def place(
             if k == 0 and 1 in fits:
                 support, within = _goal(kind, objects, fits[0].first, fits[1].first)
             fits[k] = _fit_both_ends(shown[k], role, camera, support, within)
+            if k == 0 and kind == "uncover" and 1 in fits and _is_lid(thing.noun):
+                fits[0] = _fit_taken_off(shown[0], fits[0], fits[1].first, camera)
             if k == 0 and kind not in _LEAVING_TABLE and not fits[k].unseen:
                 fits[k] = replace(fits[k], grown=_grown(shown[k], fits[k], camera))
     votes = [vote_of(objects[k], fits[k].first) for k in resting]
@@ -248,7 +263,8 @@ def _fit_both_ends(
     The last pose is `support` above the table [camera heights], over the disc `within`.
     """
     options = _options(see, camera)
-    silhouette = Silhouette(see.last_mask, see.last_hidden, camera, see.last_image)
+    body, unknown = _body(see.last_mask, see.last_hidden, see.s.noun)
+    silhouette = Silhouette(body, unknown, camera, see.last_image)
     found = [_fit_last(silhouette, see.s, kind, first, support, within) for first in options]
     costs = [a.cost + b.cost for a, (b, _) in zip(options, found, strict=True)]
     best = int(np.argmin(costs))
@@ -265,10 +281,31 @@ def _fit_both_ends(
     )
 
 
+def _is_lid(noun: Noun) -> bool:
+    """Return whether what covers something lies on top of it: cups and bowls stand around it, cloths hang down."""
+    return not noun.hollow and noun.matter == "rigid"
+
+
+def _fit_taken_off(see: _Shown, lying: _Fits, other_fit: Fit, camera: Camera) -> _Fits:
+    """Return the poses of a lid that lies on the other thing at first and on the table at the end.
+
+    `lying` are its poses if it lay on the table at both ends: they stay where they fit much better.
+    """
+    noun = see.s.noun
+    start = Silhouette(see.s.first, see.hidden, camera, see.image)
+    stop = Silhouette(see.last_mask, see.last_hidden, camera, see.last_image)
+    last = fit_shape(stop, noun, np.eye(3))
+    support, within = _top_of(np.array(last.size), other_fit)
+    first = fit_pose(start, noun, last.size, np.eye(3), support=support, within=within)
+    if first.cost + last.cost > lying.first.cost + lying.last.cost + _LYING_TELLS:
+        return lying
+    return replace(lying, first=first, last=last, taken_off=True)
+
+
 def _grown(see: _Shown, fits: _Fits, camera: Camera) -> float:
     """Return the logarithm of how much larger an object is at first than its last outline says by itself, as far as that has its shape."""
     rest = _rest_of(fits.last.T_world_obj[:3, :3])
-    silhouette = Silhouette(see.last_mask, see.last_hidden, camera)
+    silhouette = Silhouette(*_body(see.last_mask, see.last_hidden, see.s.noun), camera)
     alone = fit_shape(silhouette, see.s.noun, rest, thorough=False)
     if alone.iou < _HAS_ITS_SHAPE:
         return 0.0
@@ -327,6 +364,7 @@ def _placed(see: _Shown, fits: _Fits, course: Course) -> Placed:
         rival=fits.rival,
         unseen=fits.unseen,
         grown=fits.grown,
+        taken_off=fits.taken_off,
     )
 
 
@@ -341,11 +379,22 @@ def with_forms(
             unknown = _others(objects, s, s.at)
             silhouette = Silhouette(s.first, unknown, camera)
             usual, other = (
-                fit_shape(silhouette, noun, np.eye(3)).cost for noun in (s.noun, s.noun.other)
+                _cost_of(fit_shape(silhouette, noun, np.eye(3)), noun, guess)
+                for noun in (s.noun, s.noun.other)
             )
             s = replace(s, noun=s.noun.other if other + _OTHER_FORM_COST < usual else s.noun)
         out.append(s)
     return tuple(out)
+
+
+def _cost_of(fit: Fit, noun: Noun, guess: CameraGuess) -> float:
+    """Return what a fit costs as one of a noun's two forms: jar lids and pot lids are alike but for their size."""
+    sizes = np.log(np.array(fit.size) / np.array(noun.size_m)).mean()
+    offs = [
+        (sizes + np.log(height_m)) / np.hypot(noun.spread, sd)
+        for height_m, sd in guess.heights(guess.pitch_rad)
+    ]
+    return fit.cost + _SIZE_TELLS * float(np.square(np.clip(offs, -_MOST_OFF, _MOST_OFF)).sum())
 
 
 def _best_pitch(shown: list[_Shown], guess: CameraGuess) -> tuple[float, list[Fit]]:
@@ -391,7 +440,8 @@ def _rests(s: Sighting, kind: str) -> _Rests:
 def _options(see: _Shown, camera: Camera, *, thorough: bool = True) -> list[Fit]:
     """Return the best fit for every way in which the object may rest."""
     noun = see.s.noun
-    silhouette = Silhouette(see.s.first, see.hidden, camera, see.image)
+    body, unknown = _body(see.s.first, see.hidden, noun)
+    silhouette = Silhouette(body, unknown, camera, see.image)
     fits = []
     for rest, extra in see.rests:
         fit = fit_shape(silhouette, noun, rest, thorough=thorough)
@@ -399,6 +449,25 @@ def _options(see: _Shown, camera: Camera, *, thorough: bool = True) -> list[Fit]
         upright = noun.form == "box" and rest is not _MOUTH_DOWN
         fits.append(_upright_axes(fit) if upright else fit)
     return fits
+
+
+def _body(
+    mask: Bool[np.ndarray, "h w"], hidden: Bool[np.ndarray, "h w"], noun: Noun
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Return the outline that a noun's round shape is fitted to, and what says nothing: a handle is neither.
+
+    A handle is narrower than its vessel: a disc that fits into the one does not fit into the other.
+    """
+    if not (noun.handled and mask.any()):
+        return mask, hidden
+    inner = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    radius = _HANDLE_WIDTH * float(inner.max())
+    core = (inner <= radius).astype(np.uint8)
+    body = mask & (cv2.distanceTransform(core, cv2.DIST_L2, 5) <= radius)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats((mask & ~body).astype(np.uint8))
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] > _LEAST_HANDLE * mask.sum()]
+    handle = np.isin(parts, large)
+    return mask & ~handle, hidden | handle
 
 
 def _end_of(s: Sighting, kind: str, thing: Sighting) -> tuple[int, Bool[np.ndarray, "h w"]]:
@@ -480,14 +549,20 @@ def _goal(
         return 0.0, None
     thing, other = objects[0].noun, objects[1].noun
     own, there = np.array(own_fit.size), np.array(goal_fit.size)
-    reach = there[:2].max() / 2
     if kind == "cover":
-        room = max(0.2 * reach, (own[:2].max() - there[:2].max()) / 2)
-        support = 0.0 if thing.hollow else float(there[2])
-    else:
-        room = max(0.2 * reach, reach - own.min() / 2)
-        support = _floor(there) if other.hollow else float(there[2])
+        support, within = _top_of(own, goal_fit)
+        return (0.0 if thing.hollow else support), within
+    reach = there[:2].max() / 2
+    room = max(0.2 * reach, reach - own.min() / 2)
+    support = _floor(there) if other.hollow else float(there[2])
     return support, Within(xy=goal_fit.T_world_obj[:2, 3], radius=float(room))
+
+
+def _top_of(own: Float[np.ndarray, "3"], other_fit: Fit) -> tuple[float, Within]:
+    """Return how high above the table a lid of a size lies on another thing, and over which disc [camera heights]."""
+    there = np.array(other_fit.size)
+    room = max(0.1 * there[:2].max(), (own[:2].max() - there[:2].max()) / 2)
+    return float(there[2]), Within(xy=other_fit.T_world_obj[:2, 3], radius=float(room))
 
 
 def _inside(fit: Fit, support: float, within: Within) -> Fit:

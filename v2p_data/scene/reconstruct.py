@@ -31,6 +31,7 @@ from v2p_data.scene.gate import (
     by_stage,
     check_confidence,
     check_motion,
+    confidence_of,
     cues_of,
     held_at_first,
 )
@@ -48,7 +49,7 @@ from v2p_data.scene.pose import three
 from v2p_data.scene.refit import bent, refit
 from v2p_data.scene.scene import Observed, Role, Symmetry
 from v2p_data.scene.shape import ShapeChoice, ShapeConfig, best_shape
-from v2p_data.scene.sight import Sighting, Sights, sight
+from v2p_data.scene.sight import Sighting, Sights, sight, without_asides
 from v2p_data.scene.steady import steadied
 from v2p_data.video.captions import parse_caption
 from v2p_data.video.clip import Clip
@@ -213,6 +214,16 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
             raise
         contradiction = error.detail
     cues = cues_of(sights, placement, meaning.kind)
+    if confidence_of(cues) < cfg.min_confidence:
+        kept, warnings = without_asides(sights, meaning, clip)
+        objects = [objects[k] for k in kept]
+        placement = replace(placement, objects=tuple(placement.objects[k] for k in kept))
+        sights = replace(
+            sights,
+            objects=tuple(sights.objects[k] for k in kept),
+            warnings=(*sights.warnings, *warnings),
+        )
+        cues = cues_of(sights, placement, meaning.kind)
     origin = _origin(placement)
     return Reconstruction(
         clip=clip,
@@ -310,8 +321,10 @@ def _shaped(sights: Sights, placement: Placement) -> tuple[Placement, list[_Shap
         poses = np.stack(
             [transform(T[:3, :3], (T[:3, 3] - origin) * height) for T in placed.T_world_objs]
         )
+        first = View(mask=s.first, T_world_obj=poses[0], hidden=placed.hidden)
+        last = View(mask=placed.last_mask, T_world_obj=poses[-1], hidden=placed.last_hidden)
         shape = best_shape(
-            [View(mask=s.first, T_world_obj=poses[0], hidden=placed.hidden)],
+            [last if placed.taken_off else first],
             work,
             (length, width, tall),
             s.noun,
@@ -319,14 +332,14 @@ def _shaped(sights: Sights, placement: Placement) -> tuple[Placement, list[_Shap
         )
         poses = poses @ shape.T_obj_shape
         shows_it = s.moves and not s.swallowed and placed.last.iou > UNSEEN_IOU
-        if shows_it and shape.kind != "primitive":
-            view = View(mask=placed.last_mask, T_world_obj=poses[-1], hidden=placed.last_hidden)
+        if shows_it and shape.kind != "primitive" and not placed.taken_off:
             in_air = placed.observed[-1] == "no_depth"
+            view = replace(last, T_world_obj=poses[-1])
             found = refit(view, poses[0], shape.mesh, work, in_air=in_air)
             if found is not None:
                 poses = bent(poses, found.T_world_mesh)
-                last = replace(placed.last, iou=max(placed.last.iou, found.iou))
-                objects[k] = replace(placed, last=last)
+                covered = replace(placed.last, iou=max(placed.last.iou, found.iou))
+                objects[k] = replace(placed, last=covered)
         out.append(_Shaped(shape=shape, T_world_objs=poses))
     return replace(placement, objects=tuple(objects)), out
 

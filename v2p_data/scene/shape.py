@@ -116,9 +116,12 @@ class _Handle:
     """Of the body's diameter."""
     gain: float
     """In units of IoU: what sticks out far need not cover much more."""
+    heights: tuple[float, ...]
+    """At which it may stick out, over the middle, in units of the body's height."""
 
 
-_STICK, _PLATE = _Handle(0.3, 1.1, 0.015), _Handle(0.12, 0.6, 0.03)
+_STICK = _Handle(0.3, 1.1, 0.015, (0.2, 0.35, 0.5, 0.7))
+_PLATE = _Handle(0.12, 0.6, 0.03, (0.0,))
 """Of a low vessel, and of a high one."""
 
 
@@ -218,37 +221,48 @@ def _handled(body: _Candidate, kind: _Handle, view: View, crop: Crop) -> _Candid
     if T[2, 2] < 0.9:
         return None
     diameter, height = float(body.mesh.extents[:2].mean()), float(body.mesh.extents[2])
-    low = kind is _STICK
-    z = (0.35 if low else 0.0) * height
     drawn = crop.drawn(body.mesh, T)
     around = cv2.dilate(drawn.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     spare = largest(crop.mask & ~around)
     if spare.sum() < _HANDLE_AREA * drawn.sum():
         return None
-    onto = crop.matrix @ T @ np.array([[1, 0, 0], [0, 1, 0], [0, 0, z], [0, 0, 1.0]])
-    rows, columns = np.nonzero(spare)
-    spots = np.linalg.solve(onto, np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))]))
-    spots = (spots[:2] / spots[2]).T
-    way = spots.mean(0) / np.linalg.norm(spots.mean(0))
-    inner = _radius_at(body.mesh, z)
-    if low:
-        along, across = spots @ way, spots @ np.array([-way[1], way[0]])
-        length = float(np.percentile(along, 97)) - inner
-        wide = float(np.clip(2 * np.sqrt(3) * across.std(), 0.06 * diameter, 0.25 * diameter))
-        tries = [(way, (length, wide, min(wide, 0.4 * height)))]
-    else:
-        facing = np.arctan2(way[1], way[0]) + np.radians(np.arange(-75, 76, 15))
-        tries = [
-            (np.array([np.cos(a), np.sin(a)]), (share * diameter, 0.15 * diameter, 0.6 * height))
-            for a in facing
-            for share in (0.2, 0.3, 0.4, 0.5)
+    made = []
+    for z in (share * height for share in kind.heights):
+        spots = _spots(spare, crop.matrix @ T, z)
+        way = spots.mean(0) / np.linalg.norm(spots.mean(0))
+        inner = _radius_at(body.mesh, z)
+        if kind is _STICK:
+            along, across = spots @ way, spots @ np.array([-way[1], way[0]])
+            length = float(np.percentile(along, 97)) - inner
+            seen = 2 * np.sqrt(3) * across.std()
+            widths = np.clip([0.7 * seen, seen], 0.06 * diameter, 0.25 * diameter).tolist()
+            tries = [(way, (length, wide, min(wide, 0.4 * height))) for wide in widths]
+        else:
+            facing = np.arctan2(way[1], way[0]) + np.radians(np.arange(-75, 76, 15))
+            tries = [
+                (
+                    np.array([np.cos(a), np.sin(a)]),
+                    (share * diameter, 0.15 * diameter, 0.6 * height),
+                )
+                for a in facing
+                for share in (0.2, 0.3, 0.4, 0.5)
+            ]
+        made += [
+            _with_handle(body, way, inner, extents, z)
+            for way, extents in tries
+            if kind.shortest * diameter < extents[0] < kind.longest * diameter
         ]
-    made = [
-        _with_handle(body, way, inner, extents, z)
-        for way, extents in tries
-        if kind.shortest * diameter < extents[0] < kind.longest * diameter
-    ]
     return max(made, key=lambda one: _iou(one, [view], [crop]), default=None)
+
+
+def _spots(
+    picture: Bool[np.ndarray, "i j"], matrix: Float[np.ndarray, "3 4"], z: float
+) -> Float[np.ndarray, "n 2"]:
+    """Return where the pixels of a picture lie at height `z`; `matrix` takes points to pixels."""
+    onto = matrix @ np.array([[1, 0, 0], [0, 1, 0], [0, 0, z], [0, 0, 1.0]])
+    rows, columns = np.nonzero(picture)
+    spots = np.linalg.solve(onto, np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))]))
+    return (spots[:2] / spots[2]).T
 
 
 def _with_handle(

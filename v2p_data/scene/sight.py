@@ -21,6 +21,7 @@ from v2p_data.scene.find import (
     filled,
     find_movers,
     hand_at,
+    less_table,
     rated,
     seen_at_first,
     settled,
@@ -59,6 +60,8 @@ _LEAST_HAND = 0.002
 _LITTLE = 0.2
 """Of a thing's first outline: when no more than this is seen of it, it is hidden."""
 _TOUCH_PX = 6
+_ELSEWHERE_LAB = 12.0
+"""Where a thing is, and where it is not, a picture differs by so much and more."""
 _FILLED = 0.85
 """People draw boxes tightly: of an outline that spans less of its box a part is missing."""
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
@@ -207,6 +210,28 @@ def sight(
     )
 
 
+def without_asides(
+    sights: Sights, meaning: Meaning, clip: Clip
+) -> tuple[list[int], tuple[str, ...]]:
+    """Return the numbers of the objects without those of which the caption does not speak, and a warning for each of these.
+
+    What is only listed beside the caption of a lift, push or tip is no part of the task: such a scene makes sense without it.
+    """
+    left_out = [
+        k
+        for k, s in enumerate(sights.objects)
+        if k and meaning.kind in _OPTIONAL_KINDS and not (s.hinted or _is_said(s.phrase, clip))
+    ]
+    return [k for k in range(len(sights.objects)) if k not in left_out], tuple(
+        f"the '{sights.objects[k].phrase}', of which the caption does not speak, was not found surely enough and is left out"
+        for k in left_out
+    )
+
+
+def _is_said(phrase: str, clip: Clip) -> bool:
+    return phrase.lower() in clip.caption.lower()
+
+
 @dataclass(frozen=True)
 class _Scene:
     """What the search for the other objects goes by."""
@@ -237,6 +262,8 @@ def _mover(
         every=_every(footage),
         moving=None if watched is None else lambda i: watched.at(i)[MOVED],
     )
+    if mark is not None and mark.mask.any() and _is_on_its_way(mark, footage):
+        course.masks[mark.frame], course.quality[mark.frame] = mark.mask, 1.0
     return replace(
         thing,
         masks=course.masks,
@@ -360,6 +387,7 @@ def _stander(
                 table=scene.table,
                 watched=watched,
                 phrase=phrase,
+                moved=_sighting(scene.clip, scene.meaning.manipulated, "manipulated").noun,
                 kind=kind,
                 ends=(scene.moved.first, scene.moved.last),
                 taken=taken,
@@ -390,7 +418,7 @@ def _stander(
 def _check_needed(scene: _Scene, phrase: str, sure: float) -> None:
     """Turn away a clip whose task makes no sense without an object that was not found."""
     clip = scene.clip
-    if phrase.lower() in clip.caption.lower() and scene.meaning.kind not in _OPTIONAL_KINDS:
+    if _is_said(phrase, clip) and scene.meaning.kind not in _OPTIONAL_KINDS:
         raise ItemRejectedError(
             "reference_not_found",
             f"the '{phrase}' was not found in {clip.item} (sure to {sure:.3f}, below {scene.min_found:g}); mark it with a box in captions.json",
@@ -479,8 +507,10 @@ def _boxed(
     mask = from_box(footage.rgb[i], box, _thing_at(watched, i))
     inside = _inside_of(box, footage.shape)
     drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
-    if watched is not None and spans(mask, drawn) < _FILLED:
-        mask = filled(mask, watched.at(i), inside)
+    if watched is not None:
+        if spans(mask, drawn) < _FILLED:
+            mask = filled(mask, watched.at(i), inside)
+        mask = less_table(mask, watched.at(i))
     return _Marked(mask=mask, frame=i, sure=sure, box=inside)
 
 
@@ -513,6 +543,9 @@ def _find_movers(
     at_end = mark is not None and _at_end(mark, footage)
     first = mark.mask if mark and not at_end else None
     last = mark.mask if mark and at_end else None
+    look = None
+    if mark is not None and watched is not None and _is_on_its_way(mark, footage):
+        first, last, look = None, None, histogram(footage.rgb[mark.frame][mark.mask])
     moved, held = None, None
     if watched is not None:
         goal = next(
@@ -527,6 +560,7 @@ def _find_movers(
             first,
             last,
             goal,
+            look,
         )
         moved, held = found or (None, None)
     if moved is None or (mark is None and not tool):
@@ -556,6 +590,13 @@ def _settled(footage: Footage, watched: Watched, moved: Moved, keep: Sequence[in
         for end, (mask, i) in enumerate(((moved.first, 0), (moved.last, int(watched.idx[-1]))))
     )
     return replace(moved, first=first, last=last, look=histogram(footage.rgb[0][first]))
+
+
+def _is_on_its_way(mark: _Marked, footage: Footage) -> bool:
+    """Return whether what is marked is elsewhere at the nearer end of the clip: then the mark shows how it looks, not where it ends."""
+    end = -1 if _at_end(mark, footage) else 0
+    off = np.linalg.norm(footage.lab[mark.frame] - footage.lab[end], axis=-1)[mark.mask]
+    return bool(off.size and np.median(off) > _ELSEWHERE_LAB)
 
 
 def _at_end(mark: _Marked, footage: Footage) -> bool:

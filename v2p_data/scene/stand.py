@@ -33,6 +33,10 @@ _LEVELS = (0.75, 0.5, 0.25)
 """Probabilities at which what the network sees is cut into things."""
 _LEAST_SHARE, _MOST_SHARE = 0.0005, 0.2
 """Of the picture."""
+_KINDS_VARY = 0.3
+"""Logarithm: what moves may be so much larger or smaller than usual without anybody's doubting the camera."""
+_FOOT = 0.8
+"""Of a thing's height in the picture, from the top: there it stands on the table, as far as its width is concerned."""
 _LEAST_FREE = 2.0
 """Frames in which nothing passes in front of a pixel, for what is seen there to count in full."""
 _SAME = 0.9
@@ -70,6 +74,8 @@ class Search:
     watched: Watched
     phrase: str
     """What the caption calls it."""
+    moved: Noun
+    """What the manipulated object is."""
     kind: str
     """Of the task."""
     ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]
@@ -81,6 +87,15 @@ class Search:
     def stands(self) -> Float32[np.ndarray, "h w"]:
         """How likely each pixel shows a thing that stands there."""
         return seen_standing(self.watched, self.kind)
+
+    @cached_property
+    def log_scale(self) -> float:
+        """By how much all seems larger than it is, as far as what moves seems too large for its kind by more than kinds vary."""
+        mask = self.ends[0]
+        if not (self.moved.known and mask.any()):
+            return 0.0
+        off = larger_than_usual(self.moved, self.watched.camera, mask)
+        return float(np.sign(off) * max(0.0, abs(off) - _KINDS_VARY))
 
 
 def find_standing(search: Search) -> Found | None:
@@ -142,6 +157,17 @@ def usual_area_px(noun: Noun, camera: SeenCamera, shape: tuple[int, int], row_px
     return per_m**2 * float(top * np.sin(down) + side * np.cos(down))
 
 
+def larger_than_usual(noun: Noun, camera: SeenCamera, mask: Bool[np.ndarray, "h w"]) -> float:
+    """Return the logarithm of how much larger a mask's object seems than its kind usually is, of its forms the likelier."""
+    y, tall = bounding_box(mask)[1::2]
+    area, row_px = float(mask.sum()), y + _FOOT * tall
+    forms = [one for one in (noun, noun.other) if one is not None]
+    offs = [
+        float(np.log(area / usual_area_px(one, camera, mask.shape, row_px))) / 2 for one in forms
+    ]
+    return min(offs, key=abs)
+
+
 def candidates(search: Search) -> list[Candidate]:
     """Return all that may be meant by the phrase, with its cues."""
     footage, table, watched, kind = search.footage, search.table, search.watched, search.kind
@@ -172,12 +198,7 @@ def candidates(search: Search) -> list[Candidate]:
         x, y, bw, bh = bounding_box(mask)
         area = float(mask.sum())
         ring = grow(mask, 4) & ~grow(mask, 1)
-        larger = [
-            float(np.log(area / usual_area_px(one, watched.camera, (h, w), y + 0.8 * bh))) / 2
-            for one in (noun, noun.other)
-            if one is not None
-        ]
-        off = min(larger, key=abs)
+        off = larger_than_usual(noun, watched.camera, mask) - search.log_scale
         gap = min(_MOST_GAP, float(from_goal[mask].min()) / reach_px)
         nearer = (float(from_first[mask].min()) - float(from_goal[mask].min())) / way_px
         at_goal = float((mask & goal_zone).sum() / max(1.0, min(float(goal_zone.sum()), area)))
