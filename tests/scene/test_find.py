@@ -335,6 +335,24 @@ def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(watched
     assert iou(moved.last, square(15 + 33, 60)) > 0.8
 
 
+def test_a_thing_is_cut_by_its_colour_from_the_arm_that_was_taken_along(watched_of):
+    """At first the network takes the arm for a part of what moves; it comes from outside of the picture."""
+    arm = np.zeros((H, W), bool)
+    arm[26:36, :30] = True
+    frames = pushed(RED, RED)
+    frames = [parts[:1] for parts in frames]
+    frames[0] = [(arm | square(15, 20), SKIN, MOVED), (square(15, 20), RED, MOVED)]
+    frames[1] = [(arm, SKIN, HAND), *frames[1]]
+    footage, watched = watched_of(frames)
+
+    red, _ = find_movers(footage, watched, "red box", "push_right")
+    any_, _ = find_movers(footage, watched, "box", "push_right")
+
+    assert iou(red.first, square(15, 20)) > 0.8
+    assert any_.first[large(arm & ~square(13, 18, 18), footage)].mean() > 0.5, "nothing says which"
+    assert red.score > 0.3, "the whole is no rival of its piece"
+
+
 def test_outlines_from_elsewhere_are_rated_like_the_networks_own(watched_of):
     footage, watched = watched_of(pushed(RED, BLUE))
     own, _ = find_movers(footage, watched, "red box", "push_right")

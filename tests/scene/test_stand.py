@@ -1,6 +1,7 @@
 """Which of the things that stand there is meant: the network's word is drawn by hand here, the weights are the learned ones."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from v2p_data.scene.classes import BACKGROUND, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.scale import SeenCamera
 from v2p_data.scene.segment import iou
+from v2p_data.scene.sight import stands_on
 from v2p_data.scene.stand import (
     WEIGHTS,
     Search,
@@ -187,6 +189,18 @@ def test_what_stands_is_apart_from_table_and_wall(watched_of):
     footage, watched = watched_of([parts for _ in range(12)])
 
     assert iou(seen_standing(watched, "push_left") > 0.5, large(thing, footage)) > 0.8
+
+
+def test_what_has_table_beneath_it_stands_on_the_table_whatever_its_colours_say(watched_of):
+    on, off = square(60, 50), square(5, 5)
+    wall = square(0, 0, 40)
+    parts = [(wall, (90, 90, 90), BACKGROUND), (on, RED, OTHER), (off, RED, OTHER)]
+    footage, watched = watched_of([parts for _ in range(12)])
+    nowhere = replace(find_table(footage.always), hull=np.zeros(footage.shape, bool))
+
+    assert not stands_on(nowhere, large(on, footage))
+    assert stands_on(nowhere, large(on, footage), watched)
+    assert not stands_on(nowhere, large(off, footage), watched)
 
 
 @pytest.mark.parametrize(("phrase", "far"), [("ball", False), ("plate", False), ("box", True)])

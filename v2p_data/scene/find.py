@@ -60,6 +60,12 @@ _BARE_RATIO = 1.0
 """Logarithm of how much better what lies around explains a pixel than the thing does."""
 _SURELY, _SURELY_TABLE = 0.9, 0.8
 """From this on the network's word goes before the edges that an outline follows: they may be those of a shadow or of print."""
+_SAME_THING = 0.5
+"""Share of the smaller outline in the larger, from which both are the same thing."""
+_PIECE = 0.85
+"""What a piece of an outline counts: it must be clearly better than the whole."""
+_MOSTLY_OTHER = 0.5
+"""Share of an outline: with less of the named colour it is taken along with something else."""
 _BESIDE_PX = 12
 """Of a picture 320 px wide: as far the network's word completes an outline."""
 _MOST_CUT = 0.6
@@ -281,7 +287,7 @@ def find_movers(
         return _moved(pairs, pairs[0]), None
     # The tool is what the hand holds; the object is pushed by it and lies farther from the hand.
     best = pairs[0]
-    rest = [p for p in pairs[1:] if p.first is not best.first and p.last is not best.last]
+    rest = [pair for pair in pairs[1:] if _is_another(pair, best)]
     if not rest:
         return _moved(pairs, best), None
     second = rest[0]
@@ -458,8 +464,33 @@ def _ends(
                 continue
             cores.append(mask)
             masks.append(mask_of_mover(footage, watched, i, largest(_grown_to(mask, moved))))
+    pieces = _of_named_colour(footage.rgb[i], phrase, cores)
     blobs = _rated(footage, watched, phrase, i, masks, cores)
+    cut = [mask_of_mover(footage, watched, i, piece) for piece in pieces]
+    blobs += [
+        replace(blob, parts={**blob.parts, "cut by colour": _PIECE})
+        for blob in _rated(footage, watched, phrase, i, cut, pieces)
+    ]
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
+
+
+def _of_named_colour(
+    image: UInt8[np.ndarray, "h w 3"], phrase: str, wholes: Sequence[Bool[np.ndarray, "h w"]]
+) -> list[Bool[np.ndarray, "h w"]]:
+    """Return what of each whole has the colour that the phrase names, where an arm may have been taken along.
+
+    An arm reaches the picture's edge, and most of such a whole has another colour.
+    """
+    if not named_colours(phrase):
+        return []
+    match = colour_match(balance(image), colour_words(phrase)) > _LIKELY
+    out = []
+    for whole in wholes:
+        if is_cut(whole) and (whole & match).any():
+            piece = largest(tidy(whole & match, _GAP_PX))
+            if LEAST_SHARE * piece.size <= piece.sum() < _MOSTLY_OTHER * whole.sum():
+                out.append(piece)
+    return out
 
 
 def _rated(
@@ -576,7 +607,7 @@ def _pair_parts(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[s
 
 def _moved(pairs: list[_Pair], chosen: _Pair) -> Moved:
     a, b = chosen.first, chosen.last
-    rival = max((p.rating for p in pairs if p.first is not a and p.last is not b), default=0.0)
+    rival = max((pair.rating for pair in pairs if _is_another(pair, chosen)), default=0.0)
     cues = {
         **{f"first {k}": v for k, v in a.parts.items()},
         **{f"last {k}": v for k, v in b.parts.items()},
@@ -585,6 +616,12 @@ def _moved(pairs: list[_Pair], chosen: _Pair) -> Moved:
     }
     score = float(np.prod(list(cues.values())))
     return Moved(first=a.mask, last=b.mask, score=score, look=a.hist, cues=cues)
+
+
+def _is_another(pair: _Pair, chosen: _Pair) -> bool:
+    """Return whether a pair is another thing than the chosen one, and no part of it, at both ends."""
+    ends = ((pair.first, chosen.first), (pair.last, chosen.last))
+    return all((a.mask & b.mask).sum() < _SAME_THING * min(a.area, b.area) for a, b in ends)
 
 
 def _held(footage: Footage, watched: Watched, hist: np.ndarray) -> float:

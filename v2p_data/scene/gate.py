@@ -70,7 +70,7 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
         add("pose", f"{which} seen at the end", max(0.1, least + seen))
     thing = sights.objects[0]
     add("camera", "camera height", height_plausibility(placement.height_m))
-    if not stands_on(sights.table, thing.first):
+    if not stands_on(sights.table, thing.first, sights.watched):
         add("grounding", "standing on the table at first", 0.6)
     if not (thing.noun.known or thing.known_m):
         add("size", f"knowing what '{thing.phrase}' is", 0.9)
@@ -90,7 +90,7 @@ def held_at_first(sights: Sights, placement: Placement) -> bool:
     thing = sights.objects[0]
     if placement.objects[0].grown < _GROWN:
         return False
-    if not stands_on(sights.table, thing.first):
+    if not stands_on(sights.table, thing.first, sights.watched):
         return True
     hand = None if sights.watched is None else hand_at(sights.watched, thing.at)
     return hand is not None and bool((hand & grow(thing.first, TOUCH_PX)).any())

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.classes import HAND, MOVED, OTHER
+from v2p_data.scene.classes import HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
     LEAST_SHARE,
@@ -60,6 +60,8 @@ _LEAST_HAND = 0.002
 _LITTLE = 0.2
 """Of a thing's first outline: when no more than this is seen of it, it is hidden."""
 _TOUCH_PX = 6
+_BELOW_PX, _SEEN_BELOW = 5, 0.5
+"""How far below a thing the network must see table, and how surely in the mean."""
 _ELSEWHERE_LAB = 12.0
 """Where a thing is, and where it is not, a picture differs by so much and more."""
 _FILLED = 0.85
@@ -627,7 +629,11 @@ def _agreed(
     for own, other in ((moved.first, by_change.first), (moved.last, by_change.last)):
         common = float((own & other).sum())
         overlap = common / max(1.0, float((own | other).sum()))
-        overlaps.append(max(overlap, 0.5) if common > _LIES_WITHIN * own.sum() else overlap)
+        if common > _LIES_WITHIN * own.sum():
+            overlap = max(overlap, 0.5)
+        elif common > _LIES_WITHIN * other.sum():  # its most colourful piece
+            overlap = max(overlap, 0.35)
+        overlaps.append(overlap)
     opinion = float(np.clip(0.55 + 0.75 * max(0.0, overlaps[0]), 0, 1)) * float(
         np.clip(0.75 + 0.5 * overlaps[1], 0, 1)
     )
@@ -658,13 +664,21 @@ def _less_what_passes(
     return out
 
 
-def stands_on(table: Table, mask: Bool[np.ndarray, "h w"]) -> bool:
-    """Return whether the mask's foot lies on the table's part of the picture."""
+def stands_on(table: Table, mask: Bool[np.ndarray, "h w"], watched: Watched | None = None) -> bool:
+    """Return whether the mask's foot lies on the table's part of the picture, or the network sees table beneath it."""
     x, y, w, h = bounding_box(mask)
     foot = np.zeros_like(mask)
     foot[y + int(0.75 * h) : y + h, x : x + w] = True
     foot &= mask
-    return float((foot & grow(table.hull, 6)).sum()) > 0.3 * float(foot.sum())
+    if float((foot & grow(table.hull, 6)).sum()) > 0.3 * float(foot.sum()):
+        return True
+    below = grow(foot, _BELOW_PX) & ~grow(mask, 1)
+    below[: y + int(0.75 * h)] = False
+    return (
+        watched is not None
+        and below.any()
+        and float(watched.early[TABLE][below].mean()) > _SEEN_BELOW
+    )
 
 
 def _rise(x: float, middle: float, width: float) -> float:
