@@ -674,11 +674,9 @@ def stands_on(table: Table, mask: Bool[np.ndarray, "h w"], watched: Watched | No
         return True
     below = grow(foot, _BELOW_PX) & ~grow(mask, 1)
     below[: y + int(0.75 * h)] = False
-    return (
-        watched is not None
-        and below.any()
-        and float(watched.early[TABLE][below].mean()) > _SEEN_BELOW
-    )
+    if watched is None or not below.any():
+        return False
+    return float(watched.early[TABLE][below].mean()) > _SEEN_BELOW
 
 
 def _rise(x: float, middle: float, width: float) -> float:
