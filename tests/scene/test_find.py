@@ -256,6 +256,15 @@ def test_a_marked_outline_loses_what_surely_is_table_but_no_part_of_the_thing():
     assert found[handle].mean() > 0.9
 
 
+def test_a_thin_thing_that_is_marked_stays_what_it_was():
+    pen, shadow = np.zeros((2, H, W), bool)
+    pen[40:42, 20:80] = True
+    shadow[42:44, 20:80] = True
+
+    assert np.array_equal(less_table(pen, seen_as(moved=pen)), pen)
+    assert np.array_equal(less_table(pen | shadow, seen_as(moved=pen)), pen)
+
+
 def test_where_the_network_does_not_know_the_thing_its_outline_stays():
     thing = square(40, 30, 20)
 

@@ -353,10 +353,15 @@ def less_table(
 
     It may leave several parts: the root of a handle is easily taken for table.
     """
-    kept = tidy(_less_table(mask, shares))
-    _, parts, stats, _ = cv2.connectedComponentsWithStats(kept.astype(np.uint8))
-    large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] > _LEAST_CHANGE * kept.sum())
-    return _if_worth(kept & np.isin(parts, large), mask)
+    kept = _less_table(mask, shares)
+    if _if_worth(kept, mask) is mask:
+        return mask
+    rest = tidy(kept)
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(rest.astype(np.uint8))
+    large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] > _LEAST_CHANGE * rest.sum())
+    rest &= np.isin(parts, large)
+    # What is thin is gone when it is tidied.
+    return rest if rest.sum() >= (1 - _MOST_CUT) * kept.sum() else kept
 
 
 def _less_table(
