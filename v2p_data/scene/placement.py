@@ -6,7 +6,6 @@ are held; how far away something in mid-air is cannot be seen from one side and 
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
@@ -40,7 +39,7 @@ from v2p_data.scene.pose import (
 )
 from v2p_data.scene.scale import SizeVote, camera_height_m, table_width_m
 from v2p_data.scene.scene import Observed
-from v2p_data.scene.segment import bounding_box, grow, tidy
+from v2p_data.scene.segment import bounding_box, grow, handle_of, tidy
 from v2p_data.scene.sight import Sighting
 
 _INSIDE_KINDS = (*SWALLOWING_KINDS, "place_onto")
@@ -59,10 +58,6 @@ _GRIP_HEIGHT_M = 0.08
 """Over the table, of a hand that pushes with something: the fist must clear the table."""
 _OTHER_FORM_COST = 0.02
 """By so much a noun's second form must cover an outline better: a box has a side and a turn more to choose than a cylinder."""
-_HANDLE_WIDTH = 0.45
-"""A handle is narrower than this share of its vessel's outline."""
-_LEAST_HANDLE = 0.02
-"""Of an outline: what sticks out less is a corner."""
 _LYING_TELLS = 0.1
 """A lid that is taken off lies on the table at first if that fits so much better, in units of IoU."""
 _SIZE_TELLS, _MOST_OFF = 0.01, 3.0
@@ -454,19 +449,10 @@ def _options(see: _Shown, camera: Camera, *, thorough: bool = True) -> list[Fit]
 def _body(
     mask: Bool[np.ndarray, "h w"], hidden: Bool[np.ndarray, "h w"], noun: Noun
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return the outline that a noun's round shape is fitted to, and what says nothing: a handle is neither.
-
-    A handle is narrower than its vessel: a disc that fits into the one does not fit into the other.
-    """
-    if not (noun.handled and mask.any()):
+    """Return the outline that a noun's round shape is fitted to, and what says nothing: a handle is neither."""
+    if not noun.handled:
         return mask, hidden
-    inner = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    radius = _HANDLE_WIDTH * float(inner.max())
-    core = (inner <= radius).astype(np.uint8)
-    body = mask & (cv2.distanceTransform(core, cv2.DIST_L2, 5) <= radius)
-    count, parts, stats, _ = cv2.connectedComponentsWithStats((mask & ~body).astype(np.uint8))
-    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] > _LEAST_HANDLE * mask.sum()]
-    handle = np.isin(parts, large)
+    handle = handle_of(mask)
     return mask & ~handle, hidden | handle
 
 

@@ -7,6 +7,10 @@ from jaxtyping import Bool, Float, UInt8
 from v2p_data.scene.colour import lab_of
 
 _ITERATIONS = 4
+_HANDLE_WIDTH = 0.45
+"""A handle is narrower than this share of its vessel's outline."""
+_LEAST_HANDLE = 0.02
+"""Of an outline: what sticks out less is a corner."""
 
 
 def refine(
@@ -71,6 +75,19 @@ def spans(mask: Bool[np.ndarray, "h w"], box: tuple[int, int, int, int]) -> floa
     x0, y0, x1, y1 = box
     common = max(0, min(x + w, x1) - max(x, x0)) * max(0, min(y + h, y1) - max(y, y0))
     return common / (w * h + (x1 - x0) * (y1 - y0) - common)
+
+
+def handle_of(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return what sticks out of a vessel's outline: a disc that fits into the vessel does not fit into its handle."""
+    if not mask.any():
+        return mask
+    inner = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    radius = _HANDLE_WIDTH * float(inner.max())
+    core = (inner <= radius).astype(np.uint8)
+    body = mask & (cv2.distanceTransform(core, cv2.DIST_L2, 5) <= radius)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats((mask & ~body).astype(np.uint8))
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] > _LEAST_HANDLE * mask.sum()]
+    return np.isin(parts, large)
 
 
 def attainable_iou(mask: Bool[np.ndarray, "h w"]) -> float:

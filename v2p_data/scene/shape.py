@@ -6,7 +6,7 @@ handle deforms outlines too. One view does not show the back: it is taken to be 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -27,7 +27,7 @@ from v2p_data.geometry.pillow import inflated, pillow
 from v2p_data.geometry.pose import inverse, transform
 from v2p_data.scene.crop import Crop, View, middle_of
 from v2p_data.scene.nouns import Form, Noun
-from v2p_data.scene.segment import bounding_box, largest
+from v2p_data.scene.segment import bounding_box, handle_of, largest
 
 Kind = Literal["primitive", "revolution", "inflated"]
 Size = tuple[float, float, float]
@@ -203,7 +203,12 @@ def _others(
     found: list[tuple[_Candidate | None, float]] = []
     if noun.form != "box":
         margin = cfg.revolution_margin if noun.form == "cylinder" else cfg.ball_margin
-        found.append((_revolution(view, crop, size_m, noun), margin))
+        body = crop
+        if noun.handled:
+            handle = handle_of(view.mask)
+            unknown = handle if view.hidden is None else view.hidden | handle
+            body = Crop(replace(view, mask=view.mask & ~handle, hidden=unknown), crop.camera)
+        found.append((_revolution(view, body, size_m, noun), margin))
     if not noun.hollow and noun.symmetry != "sphere" and not crop.at_border:
         irregular = noun.form == "box" and noun.symmetry == "none"
         margin = cfg.irregular_margin if irregular else cfg.regular_margin
@@ -354,7 +359,9 @@ def _revolution(view: View, crop: Crop, size_m: Size, noun: Noun) -> _Candidate 
     if len(rows) < 4 or radius.max() <= 0:
         return None
     centre = T[:3, 3] + T[:3, :3] @ (shift * diameter * side)
-    first, last = _needed(crop, T, centre, z, radius, rows, bottom=up <= 0.9, top=up >= -0.9)
+    first, last = _needed(
+        crop, T, centre, z, radius, rows, fitted=height / 2, bottom=up <= 0.9, top=up >= -0.9
+    )
     if last - first < 3:
         return None
     z, radius = z[first : last + 1], radius[first : last + 1]
@@ -404,10 +411,14 @@ def _needed(
     radius: Float[np.ndarray, "k"],
     rows: np.ndarray,
     *,
+    fitted: float,
     bottom: bool,
     top: bool,
 ) -> tuple[int, int]:
-    """Return the first and last disc without which the silhouette would lack something."""
+    """Return the first and last disc without which the silhouette would lack something, or the body its fitted height.
+
+    `fitted` is half that height: the base of a bowl that lies on its mouth is seen within the outline, which does not need it.
+    """
     angles = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(_AROUND)], axis=1)
     discs = []
@@ -426,7 +437,7 @@ def _needed(
         if not (top if step < 0 else bottom):
             continue
         k, lost, left = end, 0.0, covers.copy()
-        while 0 <= k < len(rows):
+        while 0 <= k < len(rows) and abs(z[rows[k]]) > fitted:
             left = left - stack[k]
             lost = float(((left == 0) & (covers > 0) & crop.mask).sum())
             if lost > allowed:
