@@ -148,6 +148,27 @@ def test_a_bowl_bulges_and_can_be_filled():
     np.testing.assert_allclose(winding(choice.mesh, floor), 1, atol=1e-6)
 
 
+def test_a_bowl_that_lies_on_its_mouth_keeps_its_height():
+    """From steeply above, its base is seen within the outline of its rim."""
+    steep, size = camera_above((240, 320), 1.0, 1.01, 0.5), (0.158, 0.158, 0.06)
+    at = np.array([0.32, 0.05, 0.0])
+    over = np.diag([1.0, -1.0, -1.0])
+    bowl = lathe(BOWL, 0.004)
+    lying = trimesh.Trimesh(bowl.vertices @ over + at + [0, 0, size[2]], bowl.faces, process=False)
+    T = transform(over, at + np.array([0.0, 0.0, size[2] / 2]))
+
+    choice = best_shape(
+        [View(mask=seen([lying], steep), T_world_obj=T)],
+        steep,
+        size,
+        noun("cylinder", hollow=True, taper=0.35, symmetry="round"),
+    )
+
+    check_solid(choice)
+    assert choice.kind == "revolution"
+    assert choice.size_m[2] > 0.9 * size[2]
+
+
 def test_a_mug_stays_a_hollow_cylinder_in_spite_of_its_handle():
     size = (0.082, 0.082, 0.095)
     handle = trimesh.creation.torus(0.026, 0.005)
