@@ -162,6 +162,24 @@ def test_a_box_around_the_object_leads_to_the_same_place(draw, pushed):
     assert both.sum() / (hinted.masks[0] | pushed.objects[0].masks[0]).sum() > 0.8
 
 
+def test_a_box_around_the_object_on_its_way_leads_to_the_same_place(draw, pushed):
+    own = pushed.objects[0]
+    frame = min(own.masks, key=lambda i: abs(i - 18))
+    assert not (own.masks[frame] & own.masks[0]).sum() > 0.8 * own.masks[0].sum()
+    x, y = np.nonzero(own.masks[frame])[::-1]
+    box = [float(x.min()) - 2, float(y.min()) - 2, float(x.max()) + 3, float(y.max()) + 3]
+    clip = draw(hints={"blue box": {"frame": frame, "box": box, "size_m": list(SIZE_M)}})
+
+    hinted = rebuild(clip).objects[0]
+
+    for end in (min(own.masks), max(own.masks)):
+        both = hinted.masks[end] & own.masks[end]
+        assert both.sum() / (hinted.masks[end] | own.masks[end]).sum() > 0.8
+    np.testing.assert_allclose(
+        hinted.T_world_objs[-1][:2, 3], own.T_world_objs[-1][:2, 3], atol=0.02
+    )
+
+
 def test_the_written_scene_is_read_back(folder, pushed):
     scene = Scene.load(folder)
 
