@@ -258,8 +258,8 @@ def _fit_both_ends(
     The last pose is `support` above the table [camera heights], over the disc `within`.
     """
     options = _options(see, camera)
-    body, unknown = _body(see.last_mask, see.last_hidden, see.s.noun)
-    silhouette = Silhouette(body, unknown, camera, see.last_image)
+    body = _body(see.last_mask, see.last_hidden, see.s.noun)
+    silhouette = Silhouette(*body, camera, see.last_image)
     found = [_fit_last(silhouette, see.s, kind, first, support, within) for first in options]
     costs = [a.cost + b.cost for a, (b, _) in zip(options, found, strict=True)]
     best = int(np.argmin(costs))
@@ -435,8 +435,7 @@ def _rests(s: Sighting, kind: str) -> _Rests:
 def _options(see: _Shown, camera: Camera, *, thorough: bool = True) -> list[Fit]:
     """Return the best fit for every way in which the object may rest."""
     noun = see.s.noun
-    body, unknown = _body(see.s.first, see.hidden, noun)
-    silhouette = Silhouette(body, unknown, camera, see.image)
+    silhouette = Silhouette(*_body(see.s.first, see.hidden, noun), camera, see.image)
     fits = []
     for rest, extra in see.rests:
         fit = fit_shape(silhouette, noun, rest, thorough=thorough)

@@ -233,31 +233,33 @@ def _handled(body: _Candidate, kind: _Handle, view: View, crop: Crop) -> _Candid
         return None
     made = []
     for z in (share * height for share in kind.heights):
-        spots = _spots(spare, crop.matrix @ T, z)
-        way = spots.mean(0) / np.linalg.norm(spots.mean(0))
         inner = _radius_at(body.mesh, z)
-        if kind is _STICK:
-            along, across = spots @ way, spots @ np.array([-way[1], way[0]])
-            length = float(np.percentile(along, 97)) - inner
-            seen = 2 * np.sqrt(3) * across.std()
-            widths = np.clip([0.7 * seen, seen], 0.06 * diameter, 0.25 * diameter).tolist()
-            tries = [(way, (length, wide, min(wide, 0.4 * height))) for wide in widths]
-        else:
-            facing = np.arctan2(way[1], way[0]) + np.radians(np.arange(-75, 76, 15))
-            tries = [
-                (
-                    np.array([np.cos(a), np.sin(a)]),
-                    (share * diameter, 0.15 * diameter, 0.6 * height),
-                )
-                for a in facing
-                for share in (0.2, 0.3, 0.4, 0.5)
-            ]
         made += [
             _with_handle(body, way, inner, extents, z)
-            for way, extents in tries
+            for way, extents in _tries(_spots(spare, crop.matrix @ T, z), kind, body, inner)
             if kind.shortest * diameter < extents[0] < kind.longest * diameter
         ]
     return max(made, key=lambda one: _iou(one, [view], [crop]), default=None)
+
+
+def _tries(
+    spots: Float[np.ndarray, "n 2"], kind: _Handle, body: _Candidate, inner: float
+) -> list[tuple[Float[np.ndarray, "2"], Size]]:
+    """Return directions and extents of handles that may be what is seen at these spots beside the axis."""
+    diameter, height = float(body.mesh.extents[:2].mean()), float(body.mesh.extents[2])
+    way = spots.mean(0) / np.linalg.norm(spots.mean(0))
+    if kind is _STICK:
+        along, across = spots @ way, spots @ np.array([-way[1], way[0]])
+        length = float(np.percentile(along, 97)) - inner
+        seen = 2 * np.sqrt(3) * across.std()
+        widths = np.clip([0.7 * seen, seen], 0.06 * diameter, 0.25 * diameter).tolist()
+        return [(way, (length, wide, min(wide, 0.4 * height))) for wide in widths]
+    facing = np.arctan2(way[1], way[0]) + np.radians(np.arange(-75, 76, 15))
+    return [
+        (np.array([np.cos(a), np.sin(a)]), (share * diameter, 0.15 * diameter, 0.6 * height))
+        for a in facing
+        for share in (0.2, 0.3, 0.4, 0.5)
+    ]
 
 
 def _spots(

@@ -53,6 +53,8 @@ _CLEARLY_BETTER = 1.6
 """What those cues found is preferred where the network's own measures rate it so many times as high."""
 _LIES_WITHIN = 0.8
 """Share of the one outline in the other from which both see the same thing, one of them with something beside it."""
+_AS_A_PART, _AS_A_PIECE = 0.5, 0.35
+"""What overlap such a finding counts as at least: the network's within that of those cues, and theirs within the network's."""
 _NO_OPINION = 0.75
 """What the finding of the network alone counts where those cues have none."""
 _LEAST_HAND = 0.002
@@ -185,7 +187,7 @@ def sight(
         _sighting(clip, meaning.manipulated, "manipulated"), footage, watched, moved, own
     )
     moved = replace(moved, last=thing.masks[-1])
-    scene = _Scene(clip, footage, table, watched, meaning, moved, thing.masks, min_found)
+    scene = _Scene(clip, footage, table, watched, meaning, moved, thing, min_found)
     objects, warnings = [thing], list[str]()
     taken = np.zeros(footage.shape, bool)
     for phrase, role in meaning.others:
@@ -244,8 +246,8 @@ class _Scene:
     watched: Watched | None
     meaning: Meaning
     moved: Moved
-    mover: Bool[np.ndarray, "time h w"]
-    """The manipulated object's masks."""
+    mover: Sighting
+    """The manipulated object."""
     min_found: float
 
 
@@ -264,7 +266,7 @@ def _mover(
         every=_every(footage),
         moving=None if watched is None else lambda i: watched.at(i)[MOVED],
     )
-    if mark is not None and mark.mask.any() and _is_on_its_way(mark, footage):
+    if mark is not None and _is_on_its_way(mark, footage):
         course.masks[mark.frame], course.quality[mark.frame] = mark.mask, 1.0
     return replace(
         thing,
@@ -319,7 +321,7 @@ def _tool(
     found, sure = None, 0.0
     if scene.watched is not None:
         box = None if mark is None else (mark.frame, mark.box)
-        found = find_tool(scene.footage, scene.watched, scene.mover, thing.noun, box)
+        found = find_tool(scene.footage, scene.watched, scene.mover.masks, thing.noun, box)
     if found is not None:
         sure = found.sure if mark is None else mark.sure
     if found is not None and sure >= scene.min_found:
@@ -389,7 +391,7 @@ def _stander(
                 table=scene.table,
                 watched=watched,
                 phrase=phrase,
-                moved=_sighting(scene.clip, scene.meaning.manipulated, "manipulated").noun,
+                moved=scene.mover.noun,
                 kind=kind,
                 ends=(scene.moved.first, scene.moved.last),
                 taken=taken,
@@ -630,9 +632,9 @@ def _agreed(
         common = float((own & other).sum())
         overlap = common / max(1.0, float((own | other).sum()))
         if common > _LIES_WITHIN * own.sum():
-            overlap = max(overlap, 0.5)
+            overlap = max(overlap, _AS_A_PART)
         elif common > _LIES_WITHIN * other.sum():  # its most colourful piece
-            overlap = max(overlap, 0.35)
+            overlap = max(overlap, _AS_A_PIECE)
         overlaps.append(overlap)
     opinion = float(np.clip(0.55 + 0.75 * max(0.0, overlaps[0]), 0, 1)) * float(
         np.clip(0.75 + 0.5 * overlaps[1], 0, 1)
@@ -655,8 +657,8 @@ def _less_what_passes(
     scene: _Scene, mask: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "time h w"]:
     """Return a standing thing's mask over time, less what passes in front of it."""
-    out = np.repeat(mask[None], len(scene.mover), axis=0)
-    for i, hidden in enumerate(scene.mover):
+    out = np.repeat(mask[None], len(scene.mover.masks), axis=0)
+    for i, hidden in enumerate(scene.mover.masks):
         if scene.watched is not None:
             shares = scene.watched.at(i)
             hidden = hidden | (shares[HAND] + shares[MOVED] > 0.5)
@@ -672,11 +674,11 @@ def stands_on(table: Table, mask: Bool[np.ndarray, "h w"], watched: Watched | No
     foot &= mask
     if float((foot & grow(table.hull, 6)).sum()) > 0.3 * float(foot.sum()):
         return True
+    if watched is None:
+        return False
     below = grow(foot, _BELOW_PX) & ~grow(mask, 1)
     below[: y + int(0.75 * h)] = False
-    if watched is None or not below.any():
-        return False
-    return float(watched.early[TABLE][below].mean()) > _SEEN_BELOW
+    return bool(below.any()) and float(watched.early[TABLE][below].mean()) > _SEEN_BELOW
 
 
 def _rise(x: float, middle: float, width: float) -> float:
