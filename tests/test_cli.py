@@ -80,6 +80,15 @@ def test_where_no_video_was_understood_the_review_page_comes_next(capsys, tmp_pa
     assert f"Next: v2p scene review {tmp_path / 'run'}" in capsys.readouterr().out
 
 
+def test_videos_that_nobody_describes_are_named(capsys, videos, tmp_path):
+    (videos / "IMG_1234.mp4").write_bytes(b"no video")
+    (videos / "tip_over__green_carton.mp4").write_bytes(b"no video either")
+
+    run(["scene", str(videos), "--out", str(tmp_path / "run")])
+
+    assert "1 of 2 videos without a caption (IMG_1234.mp4)" in capsys.readouterr().err
+
+
 def test_an_unknown_option_gets_a_suggestion(capsys, videos, tmp_path):
     message = said(capsys, *generate(videos, tmp_path / "out", "--expert.num-evs", "3"))
 
@@ -88,10 +97,21 @@ def test_an_unknown_option_gets_a_suggestion(capsys, videos, tmp_path):
     assert len(message.strip().splitlines()) == 1
 
 
-def test_a_value_out_of_range_is_named(capsys, videos, tmp_path):
-    assert "min_success" in said(
-        capsys, *generate(videos, tmp_path / "out", "--expert.min-success", "3")
-    )
+@pytest.mark.parametrize(
+    ("flags", "option"),
+    [
+        (("--expert.min-success", "3"), "--expert.min-success"),
+        (("--scene.pitch-rad=9",), "--scene.pitch-rad"),
+        (("--scene.ground.batch-size", "0"), "--scene.ground.batch-size"),
+    ],
+)
+def test_a_value_out_of_range_is_named_as_it_was_typed(
+    capsys, videos, tmp_path, flags: tuple[str, ...], option: str
+):
+    message = said(capsys, *generate(videos, tmp_path / "out", *flags))
+
+    assert message.startswith(f"v2p generate: {option} must ")
+    assert message.count("--help") == 1
 
 
 def test_a_missing_folder_is_named(capsys, tmp_path):

@@ -106,7 +106,7 @@ def parse[T](kind: type[T], argv: list[str], command: str, default: T | None = N
     except SystemExit as error:
         if wants_help or not error.code:
             raise
-        wrong = _one_sentence(words.getvalue())
+        wrong = _by_option(_one_sentence(words.getvalue()), argv)
         raise V2PError(f"{wrong}.{_meant(argv, command)} See 'v2p {command} --help'") from error
 
 
@@ -119,11 +119,25 @@ def _meant(argv: list[str], command: str) -> str:
 
 
 def _one_sentence(box: str) -> str:
-    text = re.sub(r"[╭╮╰╯│─]+", " ", box)
+    text = re.sub(r"[╭╮╰╯│─]+|[+|]?-{3,}[+|]?|^\||\|$", " ", box, flags=re.M)
     text = re.sub(r"\s+", " ", text).strip()
     text = re.sub(r"^(Unrecognized options|Parsing error|Required options)\s+", "", text)
-    text = re.sub(r"For full helptext, run:? .*$", "", text)
+    text = re.sub(r"For full helptext, (run|see):? .*$", "", text)
     return text.strip().removesuffix(".")
+
+
+def _by_option(wrong: str, argv: list[str]) -> str:
+    """Return a setting's own words about its value with the option as it was typed, not by its inner name."""
+    found = re.fullmatch(r"(?:Value error )?Error parsing ([\w.]+): (\w+)( must .*)", wrong)
+    if found is None:
+        return wrong
+    inner, field, must = found.groups()
+    for word in argv:
+        option = word.split("=")[0]
+        name = option.removeprefix("--").replace("-", "_")
+        if option.startswith("--") and f".{inner}.{field}".endswith(f".{name}"):
+            return option + must
+    return f"{field}{must}"
 
 
 def _command(name: str) -> Callable[[list[str]], int]:

@@ -43,7 +43,7 @@ class Made:
 
     def __init__(self, home) -> None:
         self.videos, self.root = home / "my videos", home / "run"
-        self.videos.mkdir()
+        self.videos.mkdir(parents=True)
         (self.root / "scene").mkdir(parents=True)
 
     def video(self, item, entry=None):
@@ -311,6 +311,25 @@ def test_marks_that_cannot_be_are_refused_and_nothing_is_written(
     assert said in capsys.readouterr().err
     assert (made.videos / "captions.json").read_bytes() == before
     assert not list(made.videos.glob("*.bak"))
+
+
+def test_the_videos_own_captions_are_no_download(made, capsys):
+    made.rejected("lift", CUP)
+    own = made.videos / "captions.json"
+
+    assert run(["scene", "review", str(made.root), "--apply", str(own)]) == 2
+
+    assert "the very file that the hints go into" in capsys.readouterr().err
+
+
+def test_runs_of_one_name_do_not_share_what_the_browser_keeps(tmp_path):
+    here, there = Made(tmp_path / "here"), Made(tmp_path / "there")
+    for made in (here, there):
+        made.rejected("lift", CUP)
+
+    assert here.root.name == there.root.name
+    assert here.data()["store"] == here.data()["store"]
+    assert here.data()["store"] != there.data()["store"]
 
 
 def test_a_folder_without_scenes_and_flags_that_exclude_each_other_are_named(tmp_path, capsys):

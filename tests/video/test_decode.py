@@ -311,13 +311,20 @@ def test_a_mark_that_the_video_does_not_have_is_a_bad_hint(film, hint, said):
 def test_text_named_mp4_is_unreadable(tmp_path, capfd):
     path = tmp_path / "letter.mp4"
     path.write_text("Dear video,\n" * 100)
-    empty = tmp_path / "empty.mp4"
-    empty.touch()
 
     assert reason_for(path) == "unreadable"
-    assert reason_for(empty) == "unreadable"
     assert reason_for(tmp_path / "missing.mp4") == "unreadable"
     assert capfd.readouterr().err == ""
+
+
+def test_an_empty_file_has_its_own_reason(tmp_path):
+    path = tmp_path / "empty.mp4"
+    path.touch()
+
+    with pytest.raises(ItemRejectedError, match="empty.mp4 holds not one byte") as error:
+        read_clip(item(path))
+
+    assert error.value.reason == "empty_file"
 
 
 @pytest.mark.parametrize(

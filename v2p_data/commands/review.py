@@ -1,6 +1,8 @@
 """`v2p scene review`: a page to judge a run's scenes on, and what comes back from it."""
 
+import hashlib
 import json
+import os
 import shlex
 from collections import Counter
 from collections.abc import Sequence
@@ -62,6 +64,7 @@ def review_command(argv: list[str]) -> int:
         clips,
         page,
         title=args.run.resolve().name,
+        store=_store(args.run),
         captions=_captions(folder),
         commands=_commands(args),
     )
@@ -187,6 +190,12 @@ def _captions(folder: Path | None) -> dict[str, Any]:
     """Return the caption file's content; `find_videos` has checked it."""
     path = folder / CAPTIONS_FILE if folder else None
     return json.loads(path.read_text("utf-8-sig")) if path and path.is_file() else {}
+
+
+def _store(run: Path) -> str:
+    """Return a name that no other run's page has, even where two run folders are named alike."""
+    where = run.resolve()
+    return f"{where.name}:{hashlib.sha256(os.fsencode(where)).hexdigest()[:12]}"
 
 
 def _commands(args: Review) -> dict[str, str]:

@@ -32,7 +32,7 @@ from v2p_data.stages import (
     task_stage,
 )
 from v2p_data.task.task import TASK_FILE
-from v2p_data.video.captions import VideoItem, find_videos
+from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, find_videos
 
 RUN_FILE = "run.json"
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
@@ -219,7 +219,7 @@ def generate(
     videos: Path, root: Path, repo_id: str, cfg: EngineConfig, runtime: Runtime
 ) -> Path | None:
     """Run the chain on every video and pack what came through; return the dataset, if there is one."""
-    chains = [chain(video, cfg) for video in find_videos(videos)]
+    chains = [chain(video, cfg) for video in _videos(videos)]
     outcomes = _run(chains, runtime)
     good = [c for c in chains if outcomes[(c.name, c.folder_name)].is_usable]
     good = [c for c in good if _record(c.folder(root)).counts.get("episodes", 0)]
@@ -299,7 +299,7 @@ def _item_name(folder: Path) -> str:
 def _unseen_tasks(
     videos: Path, root: Path, cfg: EngineConfig, runtime: Runtime
 ) -> dict[str, Path]:
-    stages = [task_stage(scene_stage(video, cfg), cfg) for video in find_videos(videos)]
+    stages = [task_stage(scene_stage(video, cfg), cfg) for video in _videos(videos)]
     outcomes = _run(stages, runtime)
     return {s.item: s.folder(root) for s in stages if outcomes[(s.name, s.folder_name)].is_usable}
 
@@ -310,7 +310,7 @@ def _up_to(
     args = _with_config(FromVideos, argv, name)
     root = _run_folder(args.out)
     with only_run_in(root):
-        stages = [stage_of(video, args.engine) for video in find_videos(args.videos)]
+        stages = [stage_of(video, args.engine) for video in _videos(args.videos)]
         outcomes = _run(stages, args.how.runtime(root))
         page = write_page(root)
     print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
@@ -328,6 +328,19 @@ def _up_to(
         goes_on,
     )
     return 0 if counts["usable"] else 2
+
+
+def _videos(folder: Path) -> list[VideoItem]:
+    """Return a folder's videos, and say which of them nobody describes: the caption names what is looked for."""
+    videos = find_videos(folder)
+    mute = [video.path.name for video in videos if video.caption == NO_CAPTION]
+    if mute:
+        print(  # noqa: T201
+            f"{len(mute)} of {len(videos)} videos without a caption ({', '.join(mute)}): what moves there is called "
+            f"'{NO_CAPTION}'; captions go into {CAPTIONS_FILE} beside the videos",
+            file=sys.stderr,
+        )
+    return videos
 
 
 def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:

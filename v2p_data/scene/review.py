@@ -116,6 +116,7 @@ def write_review(
     out: Path,
     *,
     title: str,
+    store: str,
     captions: Mapping[str, Any],
     commands: Mapping[str, str],
 ) -> Path:
@@ -125,6 +126,7 @@ def write_review(
         clips: in the order in which they are shown.
         out: the page; overlay videos are linked relative to it.
         title: name of the run.
+        store: under what the browser keeps what is judged; another run's page must not read it.
         captions: content of the caption file beside the videos, `{}` if there is none.
         commands: what to type with the downloaded `review.json` and `captions.json`, by these names.
 
@@ -134,6 +136,7 @@ def write_review(
     data = {
         "schema": SCHEMA,
         "run": title,
+        "store": store,
         "captions": dict(captions),
         "commands": dict(commands),
         "clips": [_clip_json(clip, out.parent) for clip in clips],

@@ -28,6 +28,8 @@ from v2p_data.video.meaning import parse_caption as parse_caption
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".webm", ".mkv", ".gif")
 CAPTIONS_FILE = "captions.json"
+NO_CAPTION = "moving object"
+"""What stands for a caption where nobody gave one and the file's name tells nothing."""
 MIN_SIZE_M = 0.002
 """Thinner than a coin is a slip of the unit, and nothing a simulator can hold."""
 MAX_SIZE_M = 1.5
@@ -143,10 +145,15 @@ def merge_captions(folder: Path, addition: Path) -> Merged:
         addition: a `captions.json`, or a `review.json` (`{"clips": [{"video", "hints"}]}`).
 
     Raises:
-        V2PError: no such file, a clip or an object that is not known, or a hint that cannot be used.
+        V2PError: no such file, the folder's own captions, a clip or an object that is not known, or a hint that
+            cannot be used.
     """
     items = {video.path.name: video for video in find_videos(folder)}
     path = folder / CAPTIONS_FILE
+    if addition.resolve() == path.resolve():
+        raise V2PError(
+            f"{addition} is the very file that the hints go into; give the one that was downloaded from the review page"
+        )
     captions: dict[str, Any] = _read_json(path) if path.is_file() else {}
     changed: dict[str, dict[str, Hint]] = {}
     added: list[str] = []
@@ -410,7 +417,7 @@ def _filled(template: str, objects: list[str]) -> str:
 def _from_name(path: Path) -> str:
     words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", path.stem).split()
     kept = [w for w in words if not re.fullmatch(_NO_WORDS, w.lower())]
-    return " ".join(kept) or "moving object"
+    return " ".join(kept) or NO_CAPTION
 
 
 def _read_json(path: Path) -> Any:

@@ -80,7 +80,7 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
     """Decode one video.
 
     Raises:
-        ItemRejectedError: `unreadable`, `truncated`, `no_video_stream`, `too_few_frames`, `too_small`,
+        ItemRejectedError: `empty_file`, `unreadable`, `truncated`, `no_video_stream`, `too_few_frames`, `too_small`,
             `too_large`, `too_long` or `too_slow`; `bad_hint` where a hint marks what the video does not have.
     """
     film = _decode(item.path, cfg)
@@ -200,6 +200,8 @@ def _decode(path: Path, cfg: VideoConfig) -> _Film:
 
 
 def _opened(path: Path, cfg: VideoConfig) -> "av.container.InputContainer":
+    if path.is_file() and path.stat().st_size == 0:
+        raise ItemRejectedError("empty_file", f"{path.name} holds not one byte; copy it again", 0.0)
     try:
         return av.open(
             f"file:{path.resolve()}",
