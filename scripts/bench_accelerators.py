@@ -33,9 +33,10 @@ from typing import Literal, get_args
 import tyro
 
 from policies.evaluation.rate import wilson
-from policies.ppo.imitate import ImitationConfig, imitate
+from policies.ppo.config import ImitationConfig, PPOConfig
+from policies.ppo.imitate import imitate
 from policies.ppo.policy import Expert
-from policies.ppo.train import PPOConfig, train_expert
+from policies.ppo.train import train_expert
 from v2p_data.episodes.collect import judge_expert
 from v2p_data.errors import V2PError
 from v2p_data.learning import success_of

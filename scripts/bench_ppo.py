@@ -45,10 +45,11 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from policies.ppo.config import ImitationConfig, PPOConfig
 from policies.ppo.evaluate import evaluate
-from policies.ppo.imitate import ImitationConfig, imitate
+from policies.ppo.imitate import imitate
 from policies.ppo.policy import EXPERT_FILE, Expert
-from policies.ppo.train import LAST_FOLDER, PPOConfig, train_expert
+from policies.ppo.train import LAST_FOLDER, train_expert
 from v2p_data.seeds import seed_for, torch_rng_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.teacher import Teacher

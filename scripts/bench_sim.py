@@ -36,8 +36,9 @@ from jaxtyping import Float
 from mujoco.batch import Batch
 from tensordict import TensorDict, TensorDictBase
 
+from policies.ppo.config import PPOConfig
 from policies.ppo.policy import Expert
-from policies.ppo.train import LAST_FOLDER, PPOConfig, train_expert
+from policies.ppo.train import LAST_FOLDER, train_expert
 from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for, torch_rng_for

@@ -21,7 +21,8 @@ import numpy as np
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
 from v2p_data.episodes.collect import judge_expert
-from v2p_data.learning import ExpertConfig, learn
+from v2p_data.expert_config import ExpertConfig
+from v2p_data.learning import learn
 from v2p_data.report.sheet import write_contact_sheet
 from v2p_data.seeds import seed_for
 from v2p_data.task.benchmark import benchmark_names, load_benchmark

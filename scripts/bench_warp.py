@@ -21,9 +21,10 @@ from pathlib import Path
 import torch
 import tyro
 
+from policies.ppo.config import PPOConfig
 from policies.ppo.evaluate import evaluate
 from policies.ppo.policy import Expert
-from policies.ppo.train import PPOConfig, train_expert
+from policies.ppo.train import train_expert
 from v2p_data.errors import V2PError
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.torchrl_env import TorchRLEnv

@@ -37,6 +37,14 @@ def test_help_imports_no_heavy_library():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
+def test_reading_a_command_s_options_does_not_wait_for_what_trains():
+    code = (
+        "import sys, v2p_data.commands.run;"
+        "assert not {'torchrl', 'tensordict', 'lerobot', 'transformers'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
 @pytest.fixture
 def videos(tmp_path) -> Path:
     folder = tmp_path / "videos"

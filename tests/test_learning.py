@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from policies.ppo.imitate import ImitationConfig
+from policies.ppo.config import ImitationConfig, PPOConfig
 from policies.ppo.policy import Expert, weights_of
-from policies.ppo.train import PPOConfig
-from v2p_data.learning import TAUGHT_FOLDER, ExpertConfig, Learned, learn, success_of
+from v2p_data.expert_config import ExpertConfig
+from v2p_data.learning import TAUGHT_FOLDER, Learned, learn, success_of
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle

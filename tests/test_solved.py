@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from policies.ppo.policy import ActorConfig, ActorCritic, Expert
+from policies.ppo.config import ActorConfig
+from policies.ppo.policy import ActorCritic, Expert
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import Record, write_record
 from v2p_data.solved import find_solved, solved_digests

@@ -28,9 +28,10 @@ import torch
 from jaxtyping import Float
 from tensordict import TensorDict
 
-from policies.ppo.imitate import ImitationConfig, imitate
+from policies.ppo.config import ImitationConfig, PPOConfig
+from policies.ppo.imitate import imitate
 from policies.ppo.policy import Expert
-from policies.ppo.train import NotFiniteError, PPOConfig, train_expert
+from policies.ppo.train import NotFiniteError, train_expert
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.reward.candidate import (

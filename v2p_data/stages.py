@@ -20,7 +20,7 @@ from typing import Any
 from policies.evaluation.rate import wilson
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
-from v2p_data.learning import ExpertConfig, learn
+from v2p_data.expert_config import ExpertConfig
 from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
@@ -317,6 +317,7 @@ def make_expert(
     """Find a teacher, imitate it, go on with PPO, all at the coarse time step; judge at the fine one with the independent referee."""
     from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import judge_expert
+    from v2p_data.learning import learn
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.task_check import check_task
     from v2p_data.task.pool import add_solved

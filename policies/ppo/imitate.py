@@ -8,7 +8,7 @@ out is an expert's folder, from which PPO goes on.
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,42 +18,14 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import EnvBase
 
-from policies.ppo.policy import ActorConfig, ActorCritic, Expert, load_weights, weights_of
+from policies.ppo.config import ImitationConfig
+from policies.ppo.policy import ActorCritic, Expert, load_weights, weights_of
 from policies.ppo.train import torch_threads
 
 log = logging.getLogger(__name__)
 
 Teacher = Callable[[], Float[np.ndarray, "env act"]]
 """What to do in the worlds as they are now."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImitationConfig:
-    """How long, and how much is left to the learner."""
-
-    rounds: int = 14
-    """At most; the teacher moves all worlds in the first and ever fewer in the later ones."""
-    least_rounds: int = 5
-    """From then on the learner is tried after each round."""
-    target_success: float = 0.98
-    """A learner that succeeds this often has learned enough; else the round with the highest success counts."""
-    round_steps: int = 32
-    """Control steps per world and round."""
-    teacher_rounds: int = 8
-    """Until this round the teacher's share falls to its least."""
-    epochs: int = 6
-    """Passes over everything seen so far, after each round."""
-    minibatch: int = 1024
-    learning_rate: float = 1e-3
-    noise: float = 0.2
-    """Standard deviation added to actions, so that the teacher is seen recovering."""
-    least_teacher: float = 0.1
-    """Share of the worlds that the teacher always keeps: who fails early never sees how a task ends."""
-    num_threads: int = 1
-    actor: ActorConfig = field(
-        default_factory=lambda: ActorConfig(min_std=0.05, gripper_min_std=0.3)
-    )
-    """With less noise than from scratch: what releases and what grasps is known already."""
 
 
 @dataclass(frozen=True, kw_only=True)

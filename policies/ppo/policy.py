@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,35 +13,11 @@ from jaxtyping import Float
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from policies.ppo.config import ActorConfig
+
 WEIGHTS_FILE = "weights.safetensors"
 EXPERT_FILE = "expert.json"
 SCHEMA = 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class ActorConfig:
-    """Shape of the policy and limits of its Gaussian."""
-
-    hidden: tuple[int, ...] = (128, 128)
-    """Width of the tanh layers, for the actor and for the critic."""
-    init_std: float = 0.6
-    """Standard deviation of the exploration at the start, in units of the action range."""
-    min_std: float = 0.1
-    """Exploration never shrinks below this; the deterministic policy is unaffected."""
-    mean_bound: float = 1.5
-    """Means stay within +-this, so that every part of [-1, 1] keeps being sampled."""
-    gripper_mean_bound: float = 0.8
-    """Same for the last action: an unbounded gripper mean drifts to 2 and a release is never sampled again."""
-    gripper_min_std: float = 0.6
-    """Least standard deviation of the last action, for the same reason."""
-    obs_clip: float = 5.0
-    """Normalised observations are clipped to +-this."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.min_std <= self.init_std:
-            raise ValueError(
-                f"need 0 < min_std <= init_std, got {self.min_std} and {self.init_std}"
-            )
 
 
 class Normaliser(nn.Module):

@@ -32,6 +32,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from policies.evaluation.rate import Rate
+from policies.ppo.config import PPOConfig
 from policies.ppo.curve import (
     CURVE_FILE,
     PICTURE_FILE,
@@ -42,7 +43,7 @@ from policies.ppo.curve import (
     plot_curve,
 )
 from policies.ppo.evaluate import evaluate, outcome
-from policies.ppo.policy import ActorConfig, ActorCritic, Expert, load_weights, weights_of
+from policies.ppo.policy import ActorCritic, Expert, load_weights, weights_of
 
 log = logging.getLogger(__name__)
 
@@ -51,70 +52,6 @@ LAST_FOLDER = "last"
 DUMP_FILE = "not_finite.pt"
 FINITE_KEYS = (("next", "observation"), ("next", "reward"), "observation", "action")
 COMPONENTS_KEY = ("next", "components")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PPOConfig:
-    """The recipe. With the defaults, lifting a box was learned in 0.43 million steps: 66 s of one core."""
-
-    total_steps: int = 1_000_000
-    """Control steps over all worlds; the recipe's budget: about 150 s on one core to itself."""
-    max_seconds: float = 600.0
-    """Wall-clock safety net, added up over resumptions; a run it stops depends on the machine."""
-    target_success: float = 0.95
-    """Training stops once the deterministic worlds reach this."""
-    window_episodes: int = 128
-    """The success rates are taken over this many last episodes (two rounds of the deterministic worlds)."""
-    min_window_episodes: int = 64
-    """With fewer episodes there is no rate yet."""
-    num_deterministic: int = 64
-    """Worlds that act without exploration and never enter the loss."""
-    batch_time: int = 16
-    """Control steps per world between two updates."""
-    epochs: int = 4
-    minibatch: int = 1024
-    learning_rate: float = 1e-3
-    """At the start; from then on it follows the KL divergence."""
-    min_learning_rate: float = 1e-4
-    max_learning_rate: float = 3e-3
-    kl_low: float = 0.015
-    """Below, the learning rate grows by a half."""
-    kl_high: float = 0.03
-    """Above, it shrinks by a third."""
-    decline: float = 0.25
-    """A policy that started warm and has fallen this far below its best success is not trained any further."""
-    kl_stop: float = 0.06
-    """Above, the remaining epochs of this batch are skipped."""
-    gamma: float = 0.97
-    """A horizon of about 1.7 s at 20 Hz."""
-    gae_lambda: float = 0.9
-    clip: float = 0.2
-    max_grad_norm: float = 1.0
-    warm_start_std: float = 0.15
-    """Exploration of a policy that starts from another expert's weights."""
-    warm_start_learning_rate: float = 2e-4
-    """At the start of such a training."""
-    warm_start_critic_batches: int = 6
-    """So many batches teach only the value after a warm start: a value that knows nothing spoils a good policy."""
-    checkpoint_seconds: float = 10.0
-    """A kill loses at most about this much work."""
-    num_threads: int = 1
-    """Threads of torch. Two cost a factor three when another process shares the cores."""
-    eval_episodes: int = 128
-    """Fresh episodes in `eval_env` at the end."""
-    actor: ActorConfig = field(default_factory=ActorConfig)
-
-    def __post_init__(self) -> None:
-        if not 0 < self.min_window_episodes <= self.window_episodes:
-            raise ValueError(
-                "need 0 < min_window_episodes <= window_episodes, "
-                f"got {self.min_window_episodes} and {self.window_episodes}"
-            )
-        if not self.min_learning_rate <= self.learning_rate <= self.max_learning_rate:
-            raise ValueError(
-                "need min_learning_rate <= learning_rate <= max_learning_rate, "
-                f"got {self.min_learning_rate}, {self.learning_rate}, {self.max_learning_rate}"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)

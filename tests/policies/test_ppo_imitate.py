@@ -9,10 +9,11 @@ import pytest
 import torch
 from point_mass import PointMass
 
+from policies.ppo.config import ActorConfig, ImitationConfig, PPOConfig
 from policies.ppo.evaluate import evaluate
-from policies.ppo.imitate import ImitationConfig, imitate
-from policies.ppo.policy import ActorConfig, Expert, weights_of
-from policies.ppo.train import PPOConfig, train_expert
+from policies.ppo.imitate import imitate
+from policies.ppo.policy import Expert, weights_of
+from policies.ppo.train import train_expert
 
 NUM_ENVS = 64
 # The last action of the point mass is no gripper.

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from policies.ppo.policy import ActorConfig, ActorCritic, Expert, Normaliser
+from policies.ppo.config import ActorConfig
+from policies.ppo.policy import ActorCritic, Expert, Normaliser
 
 
 def expert(seed: int = 0) -> Expert:

@@ -12,9 +12,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
+from policies.ppo.config import ActorConfig, PPOConfig
 from policies.ppo.evaluate import evaluate, outcome
-from policies.ppo.policy import ActorConfig, Expert, weights_of
-from policies.ppo.train import NotFiniteError, PPOConfig, advantage_estimator, train_expert
+from policies.ppo.policy import Expert, weights_of
+from policies.ppo.train import NotFiniteError, advantage_estimator, train_expert
 
 SMALL = PPOConfig(
     batch_time=8,

@@ -321,7 +321,7 @@ def test_an_empty_file_has_its_own_reason(tmp_path):
     path = tmp_path / "empty.mp4"
     path.touch()
 
-    with pytest.raises(ItemRejectedError, match="empty.mp4 holds not one byte") as error:
+    with pytest.raises(ItemRejectedError, match=r"empty\.mp4 holds not one byte") as error:
         read_clip(item(path))
 
     assert error.value.reason == "empty_file"

@@ -201,7 +201,9 @@ def _decode(path: Path, cfg: VideoConfig) -> _Film:
 
 def _opened(path: Path, cfg: VideoConfig) -> "av.container.InputContainer":
     if path.is_file() and path.stat().st_size == 0:
-        raise ItemRejectedError("empty_file", f"{path.name} holds not one byte; copy it again", 0.0)
+        raise ItemRejectedError(
+            "empty_file", f"{path.name} holds not one byte; copy it again", 0.0
+        )
     try:
         return av.open(
             f"file:{path.resolve()}",

@@ -1,0 +1,46 @@
+"""Settings of the expert stage, without the libraries that train."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from policies.ppo.config import ImitationConfig, PPOConfig
+from v2p_data.sim.backends import Backend
+from v2p_data.sim.bank import BankConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpertConfig:
+    """How an expert is trained and judged."""
+
+    teacher: Literal["programs", "none"] = "programs"
+    """`none`: PPO from nothing, as in the paper; ten times slower where it works at all."""
+    least_teacher_success: float = 0.1
+    """A program that succeeds less often teaches nothing."""
+    trial_worlds: int = 64
+    """Worlds in which programs and taught policies are tried."""
+    imitation: ImitationConfig = field(default_factory=ImitationConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    bank: BankConfig = field(default_factory=lambda: BankConfig(share=0.0))
+    """With a share above 0, PPO begins some episodes where the best program was; on the CPU only."""
+    warm_start: Path | None = None
+    """A folder of finished runs: if no program succeeds, PPO starts from the expert of the most similar task there.
+    All its experts are part of the recipe, so name another folder than the one that is written to."""
+    num_envs: int = 512
+    """Worlds that learn at the same time; the flat optimum on two cores is 256 to 1024."""
+    backend: Backend = "cpu"
+    """Where PPO's worlds are simulated: `warp` is for the GPU of `--device` and 8192 worlds; all else stays on
+    the CPU."""
+    eval_episodes: int = 64
+    """Episodes at the fine time step that judge the finished expert, on seeds of their own."""
+    min_success: float = 0.3
+    """Experts below this make too few demonstrations to be worth the wait."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_success <= 1:
+            raise ValueError(f"min_success must be between 0 and 1, got {self.min_success}")
+        if self.bank.share and (self.backend != "cpu" or self.teacher == "none"):
+            raise ValueError(
+                "bank.share needs a teacher whose moments are kept, and worlds on the CPU; "
+                f"got teacher '{self.teacher}' and backend '{self.backend}'"
+            )
