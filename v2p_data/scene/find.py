@@ -106,6 +106,10 @@ class _Blob:
     def rating(self) -> float:
         return float(np.prod(list(self.parts.values())))
 
+    def weighed(self, what: str, part: float) -> "_Blob":
+        """Return the blob with one factor more in its rating."""
+        return replace(self, parts={**self.parts, what: part})
+
 
 @dataclass(frozen=True)
 class _Pair:
@@ -343,7 +347,7 @@ def settled(
         mask: the outline.
         shares: what the network sees in the picture that it was drawn in.
     """
-    return _if_worth(completed(_less_table(mask, shares), shares[MOVED]), mask)
+    return _if_worth(completed(_off_sure_table(mask, shares), shares[MOVED]), mask)
 
 
 def less_table(
@@ -353,7 +357,7 @@ def less_table(
 
     It may leave several parts: the root of a handle is easily taken for table.
     """
-    kept = _less_table(mask, shares)
+    kept = _off_sure_table(mask, shares)
     if _if_worth(kept, mask) is mask:
         return mask
     rest = tidy(kept)
@@ -364,7 +368,7 @@ def less_table(
     return rest if rest.sum() >= (1 - _MOST_CUT) * kept.sum() else kept
 
 
-def _less_table(
+def _off_sure_table(
     mask: Bool[np.ndarray, "h w"], shares: Float32[np.ndarray, "5 h w"]
 ) -> Bool[np.ndarray, "h w"]:
     kept = mask & ~(shares[TABLE] > _SURELY_TABLE)
@@ -473,7 +477,7 @@ def _ends(
     blobs = _rated(footage, watched, phrase, i, masks, cores)
     cut = [mask_of_mover(footage, watched, i, piece) for piece in pieces]
     blobs += [
-        replace(blob, parts={**blob.parts, "cut by colour": _PIECE})
+        blob.weighed("cut by colour", _PIECE)
         for blob in _rated(footage, watched, phrase, i, cut, pieces)
     ]
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
@@ -559,14 +563,13 @@ def _hidden_end(blob: _Blob, weight: float) -> _Blob:
 
 def _alike(blob: _Blob, look: Float[np.ndarray, "l a b"]) -> _Blob:
     """Return a blob that counts little where it has other colours than what the user marked."""
-    likeness = 0.2 + 0.8 * similarity(blob.hist, look)
-    return replace(blob, parts={**blob.parts, "alike what is marked": likeness})
+    return blob.weighed("alike what is marked", 0.2 + 0.8 * similarity(blob.hist, look))
 
 
 def _at_goal(blob: _Blob, goal: Bool[np.ndarray, "h w"]) -> _Blob:
     """Return a blob of the last frame that counts little where it is not at the goal: hands uncover other things."""
     share = float((blob.mask & goal).sum()) / blob.area
-    return replace(blob, parts={**blob.parts, "at the goal": min(1.0, 0.2 + 2 * share)})
+    return blob.weighed("at the goal", min(1.0, 0.2 + 2 * share))
 
 
 def _grown_to(

@@ -145,6 +145,15 @@ class _Marked:
     box: Bool[np.ndarray, "h w"]
     """What was drawn, or the box around the mask."""
 
+    def at_end(self, footage: Footage) -> bool:
+        return self.frame > 0.5 * (len(footage.rgb) - 1)
+
+    def on_its_way(self, footage: Footage) -> bool:
+        """Return whether what is marked is elsewhere at the nearer end of the clip: then the mark shows how it looks, not where it ends."""
+        end = -1 if self.at_end(footage) else 0
+        off = np.linalg.norm(footage.lab[self.frame] - footage.lab[end], axis=-1)[self.mask]
+        return bool(off.size and np.median(off) > _ELSEWHERE_LAB)
+
 
 def sight(
     clip: Clip,
@@ -169,7 +178,7 @@ def sight(
     marked = _marked(clip, footage, watched, boxes or {})
     tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
     own = marked.get(meaning.manipulated)
-    if own is not None and _at_end(own, footage):
+    if own is not None and own.at_end(footage):
         _check_there_at_first(clip, meaning.manipulated, watched)
     moved, held = _find_movers(clip, footage, table, watched, meaning, tool, marked)
     sure, why = _sureness(moved, watched, own)
@@ -202,7 +211,7 @@ def sight(
         if not seen.moves:
             taken |= grow(seen.first, 2)
         objects.append(seen)
-    may_be_hidden = own is None or not _at_end(own, footage)
+    may_be_hidden = own is None or not own.at_end(footage)
     if watched is not None and meaning.kind in SWALLOWING_KINDS and may_be_hidden and objects[1:]:
         objects[0] = swallowed(watched, objects[0], objects[1])
     return Sights(
@@ -266,7 +275,7 @@ def _mover(
         every=_every(footage),
         moving=None if watched is None else lambda i: watched.at(i)[MOVED],
     )
-    if mark is not None and _is_on_its_way(mark, footage):
+    if mark is not None and mark.on_its_way(footage):
         course.masks[mark.frame], course.quality[mark.frame] = mark.mask, 1.0
     return replace(
         thing,
@@ -544,11 +553,11 @@ def _find_movers(
     marked: dict[str, _Marked],
 ) -> tuple[Moved, Moved | None]:
     mark = marked.get(meaning.manipulated)
-    at_end = mark is not None and _at_end(mark, footage)
+    at_end = mark is not None and mark.at_end(footage)
     first = mark.mask if mark and not at_end else None
     last = mark.mask if mark and at_end else None
     look = None
-    if mark is not None and watched is not None and _is_on_its_way(mark, footage):
+    if mark is not None and watched is not None and mark.on_its_way(footage):
         first, last, look = None, None, histogram(footage.rgb[mark.frame][mark.mask])
     moved, held = None, None
     if watched is not None:
@@ -594,17 +603,6 @@ def _settled(footage: Footage, watched: Watched, moved: Moved, keep: Sequence[in
         for end, (mask, i) in enumerate(((moved.first, 0), (moved.last, int(watched.idx[-1]))))
     )
     return replace(moved, first=first, last=last, look=histogram(footage.rgb[0][first]))
-
-
-def _is_on_its_way(mark: _Marked, footage: Footage) -> bool:
-    """Return whether what is marked is elsewhere at the nearer end of the clip: then the mark shows how it looks, not where it ends."""
-    end = -1 if _at_end(mark, footage) else 0
-    off = np.linalg.norm(footage.lab[mark.frame] - footage.lab[end], axis=-1)[mark.mask]
-    return bool(off.size and np.median(off) > _ELSEWHERE_LAB)
-
-
-def _at_end(mark: _Marked, footage: Footage) -> bool:
-    return mark.frame > 0.5 * (len(footage.rgb) - 1)
 
 
 def _agreed(

@@ -26,7 +26,8 @@ from v2p_data.scene.segment import bounding_box, edge_contrast, grow, iou, refin
 from v2p_data.scene.table import Table
 
 WEIGHTS = Path(__file__).with_name("standing.json")
-TELLING_KINDS = (*TOUCHING_KINDS, *NEARING_KINDS, "uncover")
+_UNDER_KINDS = ("uncover",)
+TELLING_KINDS = (*TOUCHING_KINDS, *NEARING_KINDS, *_UNDER_KINDS)
 """Tasks that tell where the other stands. What the captions of others mention may stand anywhere: how sure it is follows from its
 rivals alone."""
 _LEVELS = (0.75, 0.5, 0.25)
@@ -82,6 +83,11 @@ class Search:
     """The manipulated object's first and last outline."""
     taken: Bool[np.ndarray, "h w"]
     """What other phrases mean."""
+
+    @property
+    def late(self) -> bool:
+        """Whether what is meant is seen at the end only."""
+        return self.kind in _UNDER_KINDS
 
     @cached_property
     def stands(self) -> Float32[np.ndarray, "h w"]:
@@ -170,63 +176,120 @@ def larger_than_usual(noun: Noun, camera: SeenCamera, mask: Bool[np.ndarray, "h 
 
 def candidates(search: Search) -> list[Candidate]:
     """Return all that may be meant by the phrase, with its cues."""
-    footage, table, watched, kind = search.footage, search.table, search.watched, search.kind
-    late = kind == "uncover"
-    first, last = search.ends
+    footage, table, watched, late = search.footage, search.table, search.watched, search.late
     still, here = (footage.late, watched.late) if late else (footage.early, watched.early)
-    h, w = first.shape
-    words, noun = colour_words(search.phrase), noun_for(search.phrase)
-    stands = search.stands
-    colour = colour_match(balance(still), words) if words else np.zeros((h, w), np.float32)
-    usual = float(colour[table.seen].mean()) if table.seen.any() else 0.0
-    goal, own = (first, last) if late else (last, first)
-    reach_px = float(np.sqrt(max(1, goal.sum())))
-    goal_zone = grow(goal, 6)
-    foot = goal_zone.copy()
-    top, tall = bounding_box(goal)[1::2]
-    foot[: top + tall // 2] = False
-    from_goal, from_first = (
-        cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) for mask in (goal, first)
-    )
-    spots = [np.argwhere(mask).mean(0) for mask in search.ends if mask.any()]
-    way_px = max(8.0, float(np.linalg.norm(spots[-1] - spots[0])) if spots else 0.0)
-    lab = lab_of(still)
+    words = colour_words(search.phrase)
+    colour = colour_match(balance(still), words) if words else None
     apart = table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5)
-    free = ~search.taken & ~grow(last, 2) if late else ~search.taken
-    out = []
-    for mask, is_part in _masks(stands, apart, free, colour if words else None):
-        x, y, bw, bh = bounding_box(mask)
+    free = ~search.taken & ~grow(search.ends[1], 2) if late else ~search.taken
+    lab, way = lab_of(still), _Way.of(search)
+    return [
+        Candidate(
+            mask=mask,
+            cues={
+                "part": float(is_part),
+                **_own_cues(search, mask, lab, colour),
+                **way.cues(mask, search.kind),
+            },
+        )
+        for mask, is_part in _masks(search.stands, apart, free, colour)
+    ]
+
+
+def _own_cues(
+    search: Search,
+    mask: Bool[np.ndarray, "h w"],
+    lab: Float32[np.ndarray, "h w 3"],
+    colour: Float32[np.ndarray, "h w"] | None,
+) -> dict[str, float]:
+    """Return what a candidate looks like; `colour` is how well each pixel has the colour that the phrase names."""
+    stands, seen = search.stands, search.table.seen
+    h, w = mask.shape
+    x, y, bw, bh = bounding_box(mask)
+    area = float(mask.sum())
+    ring = grow(mask, 4) & ~grow(mask, 1)
+    noun = noun_for(search.phrase)
+    off = larger_than_usual(noun, search.watched.camera, mask) - search.log_scale
+    named = 0.0
+    if colour is not None:
+        named = float(colour[mask].mean()) - (float(colour[seen].mean()) if seen.any() else 0.0)
+    return {
+        "seen": float(stands[mask].mean()),
+        "seen around": float(stands[ring].mean()) if ring.any() else 0.0,
+        "sides cut": float(sum((x <= 1, x + bw >= w - 1, y <= 1, y + bh >= h - 1))),
+        "larger than usual": max(0.0, off),
+        "smaller than usual": max(0.0, -off),
+        "area": float(np.log(area / (h * w))),
+        "solidity": solidity(mask),
+        "fill": area / (bw * bh),
+        "edge": min(40.0, edge_contrast(lab, mask)) / 40,
+        "table around": float(seen[ring].mean()) if ring.any() else 0.0,
+        "colour": named,
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Way:
+    """From where to where something moved, as far as that tells which thing is meant."""
+
+    own: Bool[np.ndarray, "h w"]
+    """Where what moved is itself in the picture that is searched."""
+    goal_zone: Bool[np.ndarray, "h w"]
+    """Around where it went; what is uncovered is where it came from."""
+    foot: Bool[np.ndarray, "h w"]
+    """The lower half of that."""
+    from_goal: Float32[np.ndarray, "h w"]
+    """Distances [px]."""
+    from_first: Float32[np.ndarray, "h w"]
+    reach_px: float
+    """The moved thing's extent."""
+    length_px: float
+
+    @classmethod
+    def of(cls, search: Search) -> "_Way":
+        first, last = search.ends
+        goal, own = (first, last) if search.late else (last, first)
+        zone = grow(goal, 6)
+        foot = zone.copy()
+        top, tall = bounding_box(goal)[1::2]
+        foot[: top + tall // 2] = False
+        from_goal, from_first = (
+            cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+            for mask in (goal, first)
+        )
+        spots = [np.argwhere(mask).mean(0) for mask in search.ends if mask.any()]
+        return cls(
+            own=own,
+            goal_zone=zone,
+            foot=foot,
+            from_goal=from_goal,
+            from_first=from_first,
+            reach_px=float(np.sqrt(max(1, goal.sum()))),
+            length_px=max(8.0, float(np.linalg.norm(spots[-1] - spots[0])) if spots else 0.0),
+        )
+
+    def cues(self, mask: Bool[np.ndarray, "h w"], kind: str) -> dict[str, float]:
+        """Return how a candidate lies to it, under the names for the kind of task."""
         area = float(mask.sum())
-        ring = grow(mask, 4) & ~grow(mask, 1)
-        off = larger_than_usual(noun, watched.camera, mask) - search.log_scale
-        gap = min(_MOST_GAP, float(from_goal[mask].min()) / reach_px)
-        nearer = (float(from_first[mask].min()) - float(from_goal[mask].min())) / way_px
-        at_goal = float((mask & goal_zone).sum() / max(1.0, min(float(goal_zone.sum()), area)))
-        cues = {
-            "seen": float(stands[mask].mean()),
-            "seen around": float(stands[ring].mean()) if ring.any() else 0.0,
-            "part": float(is_part),
-            "sides cut": float(sum((x <= 1, x + bw >= w - 1, y <= 1, y + bh >= h - 1))),
-            "larger than usual": max(0.0, off),
-            "smaller than usual": max(0.0, -off),
-            "area": float(np.log(area / (h * w))),
-            "solidity": solidity(mask),
-            "fill": area / (bw * bh),
-            "edge": min(40.0, edge_contrast(lab, mask)) / 40,
-            "table around": float(table.seen[ring].mean()) if ring.any() else 0.0,
-            "colour": float(colour[mask].mean()) - usual if words else 0.0,
-            "moved": float((mask & own).sum() / area),
+        to_goal, to_first = (
+            float(distance[mask].min()) for distance in (self.from_goal, self.from_first)
+        )
+        gap = min(_MOST_GAP, to_goal / self.reach_px)
+        reached = min(float(self.goal_zone.sum()), area)
+        there = {
             "gap": gap,
+            "at the end": float((mask & self.goal_zone).sum() / max(1.0, reached)),
+            "nearer": float(np.clip((to_first - to_goal) / self.length_px, -1, 1)),
         }
-        for name, kinds in (("into", TOUCHING_KINDS), ("towards", NEARING_KINDS)):
-            there = kind in kinds
-            cues[f"{name}: gap"] = gap if there else 0.0
-            cues[f"{name}: at the end"] = at_goal if there else 0.0
-            cues[f"{name}: nearer"] = float(np.clip(nearer, -1, 1)) if there else 0.0
-        cues["under: gap"] = gap if late else 0.0
-        cues["under: foot"] = float((mask & foot).sum() / area) if late else 0.0
-        out.append(Candidate(mask=mask, cues=cues))
-    return out
+        under = {"gap": gap, "foot": float((mask & self.foot).sum() / area)}
+        out = {"moved": float((mask & self.own).sum() / area), "gap": gap}
+        for name, kinds, cues in (
+            ("into", TOUCHING_KINDS, there),
+            ("towards", NEARING_KINDS, there),
+            ("under", _UNDER_KINDS, under),
+        ):
+            out |= {f"{name}: {what}": cue * (kind in kinds) for what, cue in cues.items()}
+        return out
 
 
 def _is_with_handle(mask: Bool[np.ndarray, "h w"], body: Bool[np.ndarray, "h w"]) -> bool:
@@ -278,8 +341,7 @@ def _masks(
 def _outlined(search: Search, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Return the outline that follows the edges around a thing, as far as the network lets it."""
     footage, watched, stands = search.footage, search.watched, search.stands
-    late = search.kind == "uncover"
-    never = search.ends[1]
+    late, never = search.late, search.ends[1]
     if not late:
         passes = [shares[HAND] + shares[MOVED] for shares in (watched.early, watched.late)]
         hidden = [float(plane[mask].mean()) for plane in passes]
