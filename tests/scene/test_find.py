@@ -187,6 +187,29 @@ def test_an_outline_at_the_end_that_shows_something_else_is_not_believed(watched
     assert course.quality[-1] < 0.4
 
 
+@pytest.mark.parametrize(("lies_there_from", "believed"), [(0, 0.0), (8, 1.0)])
+def test_a_look_alike_that_lay_there_all_along_is_not_the_thing_at_the_end(
+    watched_of, lies_there_from, believed
+):
+    """A thing disappears behind an arm; what is taken for it at the end was there from a frame on."""
+    gone, there = square(10, 40), square(80, 20)
+    frames = []
+    for i in range(12):
+        parts = [(gone, RED, MOVED)] if i < 4 else []
+        parts += [(square(6, 36, 40), SKIN, HAND)] if 4 <= i < 8 else []
+        frames.append([*parts, (there, RED, OTHER)] if i >= lies_there_from else parts)
+    footage, _ = watched_of(frames)
+    first, last = large(gone, footage), large(there, footage)
+    moved = Moved(
+        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+    )
+
+    course = track(footage, moved)
+
+    assert course.quality[0] == 1
+    assert course.quality[-1] == believed
+
+
 def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours(watched_of):
     frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
     arm = square(76, 54, 30)

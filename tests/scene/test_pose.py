@@ -262,6 +262,18 @@ def test_what_a_fist_hides_goes_up_with_it():
     assert course.poses[-1][0, 3] == pytest.approx(start[0, 3])
 
 
+def test_a_hand_that_is_not_recognised_for_a_moment_takes_nothing_elsewhere():
+    """A striped sleeve: what the network takes for a hand there ends far from the hand's own end."""
+    thing, watched = lifted_in_a_fist(50)
+    shares = watched.shares.copy()
+    shares[6, HAND] = cv2.line(np.zeros((120, 160), np.uint8), (159, 10), (120, 10), 1, 16)
+
+    carried = dict(carried_by_hand(thing, replace(watched, shares=shares)))
+
+    assert 6 not in carried
+    np.testing.assert_allclose(carried[9], (0, -50), atol=2)
+
+
 @pytest.mark.parametrize(
     ("rises_px", "seen_rising"), [(0, False), (3, False), (50, True)],
     ids=["it stays", "it trembles", "the thing itself is seen"],

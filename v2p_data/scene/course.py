@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
@@ -23,6 +24,9 @@ _SEEN_RISING = 0.5
 """Of its height in the picture: a thing that is seen to rise less than this is hidden by the hand that lifts it."""
 _LEFT_IN_SIGHT = 0.3
 """Of its area: where so much that moved is in sight, no hand hides it."""
+_TIPS_BESIDE, _JUMP = 7, 0.1
+"""In so many frames beside each other a hand's end is compared; it jumps where it is farther from their median than this share of
+the picture's width."""
 _GOES_WITH_HAND = 0.5
 """How sure a pose is of what a hand hides."""
 
@@ -129,13 +133,8 @@ def carried_by_hand(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.n
     if _centre(s.first)[1] - _centre(s.masks[i])[1] > _SEEN_RISING * tall:
         return []
     home = grow(s.first, TOUCH_PX)
-    tips, holding = {}, []
-    for at in watched.idx.tolist():
-        hand = hand_at(watched, at)
-        end = hand_end(hand)
-        if end is not None:
-            tips[at] = np.array(end.tip_px)
-            holding += [at] if (hand & home).any() else []
+    tips = _tips(watched)
+    holding = [at for at in tips if (hand_at(watched, at) & home).any()]
     if not holding:
         return []
     middle = np.mean([max(tips[at][1] for at in holding), min(tip[1] for tip in tips.values())])
@@ -143,8 +142,9 @@ def carried_by_hand(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.n
 
     def haste(at: int) -> float:
         k = order.index(at)
-        beside = [tips[other] for other in order[max(0, k - 1) : k + 2]]
-        return float(np.linalg.norm(np.ptp(beside, axis=0)))
+        beside = order[max(0, k - 1) : k + 2]
+        way = np.ptp([tips[other] for other in beside], axis=0)
+        return float(np.linalg.norm(way)) / max(1, beside[-1] - beside[0])
 
     grip = min((at for at in holding if tips[at][1] >= middle), key=haste)
     since = [(at, tip - tips[grip]) for at, tip in tips.items() if at > grip]
@@ -155,6 +155,21 @@ def carried_by_hand(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.n
     ending = since[-max(1, len(since) // 3) :]
     in_sight = np.median([(watched.at(at)[MOVED] > 0.5).sum() for at, _ in ending])
     return [] if in_sight > _LEFT_IN_SIGHT * s.first.sum() else since
+
+
+def _tips(watched: Watched) -> dict[int, Float[np.ndarray, "2"]]:
+    """Return where the hand ends, by footage frame, but where that jumps: there something else was taken for the hand."""
+    ends = {at: hand_end(hand_at(watched, at)) for at in watched.idx.tolist()}
+    tips = {at: np.array(end.tip_px) for at, end in ends.items() if end is not None}
+    if not tips:
+        return {}
+    usual = median_filter(np.array(list(tips.values())), (_TIPS_BESIDE, 1), mode="nearest")
+    far = _JUMP * watched.early.shape[2]
+    return {
+        at: tip
+        for (at, tip), there in zip(tips.items(), usual, strict=True)
+        if np.linalg.norm(tip - there) < far
+    }
 
 
 def course_in_hand(

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
-from v2p_data.scene.colour import histogram, likelihood, similarity
+from v2p_data.scene.colour import histogram, lab_of, likelihood, similarity
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Moved
 from v2p_data.scene.segment import bounding_box, convex_hull, grow, iou, largest, tidy
@@ -21,6 +21,9 @@ _LOST = 0.4
 """Likeness below which what is followed from one frame alone is taken to be gone."""
 _HAND_RATIO = 3.0
 """Logarithm of how much better the hand's colours explain a pixel of the last outline: more, and it is hand."""
+_BARE, _UNLIKE = 0.4, 0.2
+"""Of a mask: where so much of it shows what stands there for good, it is not the object; and of the object, how much at most may look
+like the table under it for that to tell anything."""
 _MOSTLY, _LITTLE = 0.4, 0.05
 """Of an outline: what must be left of it without the hand, and what is not worth cutting off."""
 
@@ -80,6 +83,13 @@ def track(
     # An outline at the end that does not look like the object is not it: it is hidden there.
     alike = _likeness(footage, n - 1, end, moved.look, area_first)
     quality[0], quality[-1] = 1.0, 1.0 if alike > _LOST else alike
+    # Nor is what stands there at both ends, where the object looks otherwise than the table under it.
+    early, late = (lab_of(still) for still in (footage.early, footage.late))
+    if _alike_share(footage.lab[0], late, moved.first) < _UNLIKE:
+        for i in steps[1:]:
+            still, place = (early, moved.first) if i >= n / 2 else (late, end)
+            if _alike_share(footage.lab[i], still, masks[i], grow(place, 2)) > _BARE:
+                quality[i] = 0.0
     for i in range(1, n):
         if not masks[i].any():
             masks[i] = masks[i - 1]
@@ -220,6 +230,20 @@ def _less_hand(
     if hand.sum() < _LITTLE * area or rest.sum() < _MOSTLY * area:
         return mask
     return largest(rest)
+
+
+def _alike_share(
+    lab: Float32[np.ndarray, "h w 3"],
+    still: Float32[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    but_for: Bool[np.ndarray, "h w"] | None = None,
+) -> float:
+    """Return how much of a mask looks in a frame as it does in a still; `but_for` are pixels that do not count as alike."""
+    here, there = (cv2.GaussianBlur(image, (0, 0), 1) for image in (lab, still))
+    alike = np.linalg.norm(here - there, axis=-1) < _SAME_LAB
+    if but_for is not None:
+        alike &= ~but_for
+    return float(alike[mask].mean()) if mask.any() else 0.0
 
 
 def _likeness(
