@@ -18,8 +18,9 @@ from v2p_data.scene.find import (
 )
 from v2p_data.scene.ground import Moved
 from v2p_data.scene.nouns import noun_for
-from v2p_data.scene.sight import Sighting, swallowed
+from v2p_data.scene.sight import Sighting, sight, swallowed
 from v2p_data.scene.track import carried, track
+from v2p_data.video.captions import parse_caption
 
 H, W = 90, 120
 TABLE_RGB, RED, BLUE, SKIN = (150, 140, 120), (190, 40, 40), (40, 60, 190), (224, 172, 140)
@@ -365,6 +366,30 @@ def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(watched
 
     assert iou(moved.first, square(15, 60)) > 0.8
     assert iou(moved.last, square(15 + 33, 60)) > 0.8
+
+
+def test_a_box_says_more_than_an_outline_that_fills_half_of_it(watched_of, draw):
+    """A cube whose top has the table's colour: neither edges nor the network show more than its front."""
+    fronts = [square(20 + 3 * i, 40, 20) & (np.arange(H) >= 50)[:, None] for i in range(12)]
+    footage, watched = watched_of([[(front, RED, MOVED)] for front in fronts])
+    clip = replace(
+        draw(num_frames=12),
+        caption="Pushing cube from left to right",
+        hints={"cube": {"frame": 0, "box": [20.0, 40.0, 40.0, 60.0]}},
+    )
+    hand = watched.shares.copy()
+    hand[6, HAND, :20] = 1.0
+
+    seen = sight(
+        clip,
+        footage,
+        parse_caption(clip.caption, ()),
+        replace(watched, shares=hand),
+        min_found=0.5,
+    )
+
+    assert iou(seen.objects[0].first, square(20, 40, 20)) > 0.7
+    assert iou(seen.objects[0].last, fronts[-1]) > 0.7
 
 
 def test_a_thing_is_cut_by_its_colour_from_the_arm_that_was_taken_along(watched_of):

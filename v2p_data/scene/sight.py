@@ -33,6 +33,7 @@ from v2p_data.scene.nouns import Noun, noun_for
 from v2p_data.scene.scene import Role
 from v2p_data.scene.segment import (
     bounding_box,
+    ellipse_in,
     from_box,
     from_points,
     grow,
@@ -68,6 +69,8 @@ _ELSEWHERE_LAB = 12.0
 """Where a thing is, and where it is not, a picture differs by so much and more."""
 _FILLED = 0.85
 """People draw boxes tightly: of an outline that spans less of its box a part is missing."""
+_LEAST_SPAN = 0.55
+"""Of a person's box: what has a face in the table's colours is outlined without it; then the box itself says more."""
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
 """What the caption says of other objects is an aside here: such a scene makes sense without them."""
 
@@ -524,6 +527,8 @@ def _boxed(
         if spans(mask, drawn) < _FILLED:
             mask = filled(mask, watched.at(i), inside)
         mask = less_table(mask, watched.at(i))
+        if spans(mask, drawn) < _LEAST_SPAN:
+            mask = ellipse_in(drawn, footage.shape)
     return _Marked(mask=mask, frame=i, sure=sure, box=inside)
 
 
