@@ -12,7 +12,8 @@ written down beside its result with the commit that ran it.
 
 The caption is all that a clip comes with. With `--boxes` each named object has one box more, as a person would draw it:
 around what is visible at the first frame, or at the last for what is hidden at first, a few pixels off at each side. With
-`--size` the manipulated object's length, width and height are given as well, as somebody measured them.
+`--size` the manipulated object's length, width and height are given as well, as somebody measured them; with `--camera` how
+high the camera stands, how far it looks down and how wide it sees, as somebody with one stand for all videos can measure once.
 """
 
 import argparse
@@ -96,6 +97,13 @@ GOALS = {
 PAPER = {"grounding": 0.60, "segmentation": 0.15, "mesh": 0.35, "pose": 0.55}
 """Failure rates of Video2Policy, table 4: 20 videos, each stage on successes of the one before."""
 
+WAYS = {
+    "boxes": "one box per named object as a hint",
+    "size": "the manipulated object's size as a hint",
+    "camera": "the camera's height, pitch and field of view as settings",
+}
+"""What may be given beside the caption."""
+
 Row = dict[str, Any]
 
 
@@ -130,16 +138,16 @@ def main() -> None:
     missing = [(job, folders[job.name]) for job in jobs if not folders[job.name].is_dir()]
     for _ in _each(args.jobs, _draw_clip, missing, "drawn"):
         pass
-    name = args.split + "".join(f"_{way}" for way in ("quick", "boxes", "size") if vars(args)[way])
+    given = frozenset(way for way in WAYS if vars(args)[way])
+    name = "_".join([args.split, *["quick"] * args.quick, *(way for way in WAYS if way in given)])
     pictures = args.out / f"pictures_{name}"
-    tasks = [(job, folders[job.name], args.boxes, args.size, pictures) for job in jobs]
+    tasks = [(job, folders[job.name], given, pictures) for job in jobs]
     rows = list(_each(args.jobs, _reconstructed, tasks, "reconstructed"))
     rows.sort(key=lambda row: (KINDS.index(row["kind"]), row["seed"]))
     summary = summarised(rows)
     result = {
         "split": args.split,
-        "boxes": args.boxes,
-        "size": args.size,
+        **{way: way in given for way in WAYS},
         "commit": _commit(),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "load": round(os.getloadavg()[0], 2),
@@ -379,10 +387,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--clips", type=int, default=120)
     parser.add_argument("--split", choices=["tune", "final"], default="tune")
     parser.add_argument("--quick", action="store_true", help="one clip per kind, few frames")
-    parser.add_argument("--boxes", action="store_true", help="one box per named object as a hint")
-    parser.add_argument(
-        "--size", action="store_true", help="the manipulated object's size as a hint"
-    )
+    for way, words in WAYS.items():
+        parser.add_argument(f"--{way}", action="store_true", help=words)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
     parser.add_argument(
@@ -406,8 +412,7 @@ def _note_final_run(args: argparse.Namespace) -> list[dict[str, Any]]:
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _commit(),
         "clips": args.clips,
-        "boxes": args.boxes,
-        "size": args.size,
+        **{way: vars(args)[way] for way in WAYS},
     }
     with path.open("a") as file:
         file.write(json.dumps(run) + "\n")
@@ -474,12 +479,22 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:8]
 
 
-def _reconstructed(job: Job, folder: Path, boxes: bool, size: bool, pictures: Path) -> Row:
+def settings_for(camera: Camera) -> SceneConfig:
+    """Return the default settings with a camera as somebody measured it."""
+    T = camera.T_world_cam
+    return SceneConfig(
+        camera_height_m=float(T[2, 3]),
+        pitch_rad=float(np.arcsin(-T[2, 2])),
+        fov_rad=float(2 * np.arctan(0.5 * camera.width_px / camera.K[0, 0])),
+    )
+
+
+def _reconstructed(job: Job, folder: Path, given: frozenset[str], pictures: Path) -> Row:
     truth = load_truth(folder, job.name)
     true = true_of(truth)
     said: Row = {"caption": truth.caption}
-    hints = boxes_of(true, truth.camera, rng_for(job.seed, "boxes")) if boxes else {}
-    if size:
+    hints = boxes_of(true, truth.camera, rng_for(job.seed, "boxes")) if "boxes" in given else {}
+    if "size" in given:
         thing = true.things[0]
         hints.setdefault(thing.phrase, {})["size_m"] = [round(side, 3) for side in thing.size_m]
     if hints:
@@ -505,7 +520,7 @@ def _reconstructed(job: Job, folder: Path, boxes: bool, size: bool, pictures: Pa
             video.symlink_to((folder / video.name).resolve())
             (Path(home) / "captions.json").write_text(json.dumps({video.name: said}))
             clip = read_clip(find_videos(Path(home))[0])
-            cfg = SceneConfig()
+            cfg = settings_for(truth.camera) if "camera" in given else SceneConfig()
             rng = rng_for(job.seed, "scene")
             made = reconstruct(clip, cfg.without_gate(), rng)
             row["frames_per_s"] = round(len(clip.frames) / (time.perf_counter() - started), 2)

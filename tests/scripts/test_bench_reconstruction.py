@@ -6,6 +6,7 @@ import trimesh
 
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.scene.score import TrueClip, TrueThing
+from v2p_data.video.synthetic_camera import View
 
 
 @pytest.fixture(scope="module")
@@ -132,3 +133,13 @@ def test_a_hint_is_a_box_in_the_files_pixels_where_the_object_shows(bench):
     assert [hints[phrase]["frame"] for phrase in ("box", "ball", "stick")] == [0, 59, 30]
     for hint in hints.values():
         assert np.abs(np.array(hint["box"]) - [100, 200, 180, 280]).max() < 4 * bench.JITTER_PX
+
+
+def test_a_measured_camera_is_given_as_a_person_would_measure_it(bench):
+    view = View(height_m=0.5, pitch_rad=0.6, fovy_rad=0.7, width_px=640, height_px=480)
+
+    cfg = bench.settings_for(view.camera())
+
+    assert cfg.camera_height_m == pytest.approx(0.5)
+    assert cfg.pitch_rad == pytest.approx(0.6)
+    assert np.tan(cfg.fov_rad / 2) == pytest.approx(640 / 480 * np.tan(0.7 / 2))
