@@ -21,9 +21,10 @@ from v2p_data.scene.backends.config import (
     SegmentConfig,
 )
 from v2p_data.scene.footage import Footage
+from v2p_data.scene.marks import Box
 from v2p_data.scene.placement import CameraGuess
 from v2p_data.scene.segment import grow
-from v2p_data.scene.sight import Box, Sighting
+from v2p_data.scene.sight import Sighting
 from v2p_data.video.clip import Clip
 
 DETECTORS = ("grounding_dino", "mm_grounding_dino", "owlv2", "worker")

@@ -11,17 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.classes import HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.classes import HAND, MOVED, TABLE
 from v2p_data.scene.colour import histogram
 from v2p_data.scene.find import (
     LEAST_SHARE,
     SWALLOWING_KINDS,
     Watched,
     apart,
-    filled,
     find_movers,
     hand_at,
-    less_table,
     rated,
     seen_at_first,
     settled,
@@ -29,16 +27,13 @@ from v2p_data.scene.find import (
 )
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.ground import Moved, find_moved, find_other
+from v2p_data.scene.marks import Box, Mark, marks_of
 from v2p_data.scene.nouns import Noun, noun_for
 from v2p_data.scene.scene import Role
 from v2p_data.scene.segment import (
     bounding_box,
-    ellipse_in,
-    from_box,
-    from_points,
     grow,
     largest,
-    spans,
 )
 from v2p_data.scene.stand import Search, find_standing
 from v2p_data.scene.table import Table, find_table
@@ -47,7 +42,6 @@ from v2p_data.scene.track import carried, track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
 
-_HINTED_SURE = 0.97
 _CHANGE_TELLS = 4.0
 """Score of the hand-written cues from which their finding is an opinion."""
 _CLEARLY_BETTER = 1.6
@@ -65,12 +59,6 @@ _LITTLE = 0.2
 _TOUCH_PX = 6
 _BELOW_PX, _SEEN_BELOW = 5, 0.5
 """How far below a thing the network must see table, and how surely in the mean."""
-_ELSEWHERE_LAB = 12.0
-"""Where a thing is, and where it is not, a picture differs by so much and more."""
-_FILLED = 0.85
-"""People draw boxes tightly: of an outline that spans less of its box a part is missing."""
-_LEAST_SPAN = 0.55
-"""Of a person's box: what has a face in the table's colours is outlined without it; then the box itself says more."""
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
 """What the caption says of other objects is an aside here: such a scene makes sense without them."""
 
@@ -126,38 +114,6 @@ class Sights:
     warnings: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Box:
-    """Where a detector sees a phrase."""
-
-    frame: int
-    """Of the clip."""
-    box_xyxy: tuple[float, float, float, float]
-    """[px] of the clip's frames."""
-    score: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Marked:
-    """A mask that a user or a detector stands for."""
-
-    mask: Bool[np.ndarray, "h w"]
-    frame: int
-    """Footage frame."""
-    sure: float
-    box: Bool[np.ndarray, "h w"]
-    """What was drawn, or the box around the mask."""
-
-    def at_end(self, footage: Footage) -> bool:
-        return self.frame > 0.5 * (len(footage.rgb) - 1)
-
-    def on_its_way(self, footage: Footage) -> bool:
-        """Return whether what is marked is elsewhere at the nearer end of the clip: then the mark shows how it looks, not where it ends."""
-        end = -1 if self.at_end(footage) else 0
-        off = np.linalg.norm(footage.lab[self.frame] - footage.lab[end], axis=-1)[self.mask]
-        return bool(off.size and np.median(off) > _ELSEWHERE_LAB)
-
-
 def sight(
     clip: Clip,
     footage: Footage,
@@ -178,7 +134,7 @@ def sight(
         _check_hand(clip, watched)
         footage = _knowing_hand(footage, watched)
     table = find_table(footage.always, table_seen(watched) if watched else None)
-    marked = _marked(clip, footage, watched, boxes or {})
+    marked = marks_of(clip, footage, watched, boxes or {})
     tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
     own = marked.get(meaning.manipulated)
     if own is not None and own.at_end(footage):
@@ -268,7 +224,7 @@ def _mover(
     footage: Footage,
     watched: Watched | None,
     moved: Moved,
-    mark: _Marked | None,
+    mark: Mark | None,
 ) -> Sighting:
     """Return a thing that moves, followed from its first outline to its last."""
     sure, why = _sureness(moved, watched, mark)
@@ -321,7 +277,7 @@ def swallowed(watched: Watched, thing: Sighting, other: Sighting) -> Sighting:
 
 
 def _tool(
-    scene: _Scene, thing: Sighting, mark: _Marked | None, held: Moved | None
+    scene: _Scene, thing: Sighting, mark: Mark | None, held: Moved | None
 ) -> Sighting | None:
     """Return a tool: in a hand that brings it, else what moves as well, or what is marked, followed.
 
@@ -358,7 +314,7 @@ def _tool(
     return seen
 
 
-def _held(scene: _Scene, thing: Sighting, mark: _Marked) -> Sighting | None:
+def _held(scene: _Scene, thing: Sighting, mark: Mark) -> Sighting | None:
     """Return a marked tool, followed from that frame on; None where the mark is empty."""
     if not mark.mask.any():
         return None
@@ -385,7 +341,7 @@ def _held(scene: _Scene, thing: Sighting, mark: _Marked) -> Sighting | None:
 
 
 def _stander(
-    scene: _Scene, thing: Sighting, mark: _Marked | None, taken: Bool[np.ndarray, "h w"]
+    scene: _Scene, thing: Sighting, mark: Mark | None, taken: Bool[np.ndarray, "h w"]
 ) -> Sighting | None:
     """Return a thing that stands still; None where it is not found and the caption can do without.
 
@@ -493,61 +449,6 @@ def _knowing_hand(footage: Footage, watched: Watched) -> Footage:
     )
 
 
-def _marked(
-    clip: Clip, footage: Footage, watched: Watched | None, boxes: Mapping[str, Box]
-) -> dict[str, _Marked]:
-    """Return the masks that users' boxes and points mean, and detectors' boxes, by phrase."""
-    out = {}
-    for phrase, box in boxes.items():
-        i = int(np.abs(footage.frame_idx - box.frame).argmin())
-        out[phrase] = _boxed(footage, watched, i, box.box_xyxy, box.score)
-    for phrase, hint in clip.hints.items():
-        i = int(np.abs(footage.frame_idx - hint.get("frame", 0)).argmin())
-        if "box" in hint:
-            out[phrase] = _boxed(footage, watched, i, hint["box"], _HINTED_SURE)
-        elif "points" in hint:
-            spots = [(x * footage.px_scale, y * footage.px_scale) for x, y in hint["points"]]
-            mask = from_points(footage.rgb[i], spots)
-            x, y, w, h = bounding_box(mask)
-            inside = _inside_of((x, y, x + w, y + h), footage.shape)
-            out[phrase] = _Marked(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
-    return out
-
-
-def _boxed(
-    footage: Footage, watched: Watched | None, i: int, box_xyxy: Sequence[float], sure: float
-) -> _Marked:
-    """Return what a box in the clip's pixels means at footage frame `i`."""
-    x0, y0, x1, y1 = (v * footage.px_scale for v in box_xyxy)
-    box = (x0, y0, x1, y1)
-    mask = from_box(footage.rgb[i], box, _thing_at(watched, i))
-    inside = _inside_of(box, footage.shape)
-    drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
-    if watched is not None:
-        if spans(mask, drawn) < _FILLED:
-            mask = filled(mask, watched.at(i), inside)
-        mask = less_table(mask, watched.at(i))
-        if spans(mask, drawn) < _LEAST_SPAN:
-            mask = ellipse_in(drawn, footage.shape)
-    return _Marked(mask=mask, frame=i, sure=sure, box=inside)
-
-
-def _inside_of(
-    box_xyxy: tuple[float, float, float, float], shape: tuple[int, int]
-) -> Bool[np.ndarray, "h w"]:
-    x0, y0, x1, y1 = (max(0, round(v)) for v in box_xyxy)
-    inside = np.zeros(shape, bool)
-    inside[y0:y1, x0:x1] = True
-    return inside
-
-
-def _thing_at(watched: Watched | None, i: int) -> Float[np.ndarray, "h w"] | None:
-    if watched is None:
-        return None
-    shares = watched.at(i)
-    return shares[MOVED] + shares[OTHER]
-
-
 def _find_movers(
     clip: Clip,
     footage: Footage,
@@ -555,7 +456,7 @@ def _find_movers(
     watched: Watched | None,
     meaning: Meaning,
     tool: str,
-    marked: dict[str, _Marked],
+    marked: dict[str, Mark],
 ) -> tuple[Moved, Moved | None]:
     mark = marked.get(meaning.manipulated)
     at_end = mark is not None and mark.at_end(footage)
@@ -646,7 +547,7 @@ def _agreed(
     return replace(moved, score=moved.score * opinion, cues=cues)
 
 
-def _sureness(moved: Moved, watched: Watched | None, mark: _Marked | None) -> tuple[float, str]:
+def _sureness(moved: Moved, watched: Watched | None, mark: Mark | None) -> tuple[float, str]:
     if mark is not None:
         return mark.sure, ""
     if watched is None or "no rival" not in moved.cues:
