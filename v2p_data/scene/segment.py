@@ -67,9 +67,14 @@ def from_box(
     return max(masks, key=lambda mask: _plausibility(image, mask, (x0, y0, x1, y1)))
 
 
-def ellipse_in(box: tuple[int, int, int, int], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Return the ellipse that fills a box, in a picture of this shape: what a box says by itself."""
-    return _ellipse(box, shape, 2)
+def ellipse_in(
+    box: tuple[int, int, int, int], shape: tuple[int, int], share: float = 1.0
+) -> Bool[np.ndarray, "h w"]:
+    """Return the ellipse in a box's middle that spans this share of its sides, in a picture of this shape."""
+    x0, y0, x1, y1 = box
+    centre = ((x0 + x1) // 2, (y0 + y1) // 2)
+    axes = (max(1, int(share * (x1 - x0) / 2)), max(1, int(share * (y1 - y0) / 2)))
+    return cv2.ellipse(np.zeros(shape, np.uint8), centre, axes, 0, 0, 360, 1, -1) > 0
 
 
 def spans(mask: Bool[np.ndarray, "h w"], box: tuple[int, int, int, int]) -> float:
@@ -242,21 +247,11 @@ def _grab_cut(image: np.ndarray, labels: np.ndarray) -> np.ndarray | None:
 def _ellipse_cut(
     image: np.ndarray, inside: np.ndarray, box: tuple[int, int, int, int]
 ) -> np.ndarray | None:
-    core = _ellipse(box, inside.shape, 4)
+    core = ellipse_in(box, inside.shape, share=0.5)
     labels = np.full(inside.shape, cv2.GC_BGD, np.uint8)
     labels[inside] = cv2.GC_PR_FGD
     labels[core] = cv2.GC_FGD
     return _grab_cut(image, labels)
-
-
-def _ellipse(
-    box: tuple[int, int, int, int], shape: tuple[int, ...], part: int
-) -> Bool[np.ndarray, "h w"]:
-    """Return an ellipse in a box's middle, whose half axes are the box's sides over `part`."""
-    x0, y0, x1, y1 = box
-    centre = ((x0 + x1) // 2, (y0 + y1) // 2)
-    axes = (max(1, (x1 - x0) // part), max(1, (y1 - y0) // part))
-    return cv2.ellipse(np.zeros(shape, np.uint8), centre, axes, 0, 0, 360, 1, -1) > 0
 
 
 def _unlike_ring(image: np.ndarray, inside: np.ndarray) -> np.ndarray | None:
