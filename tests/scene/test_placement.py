@@ -12,6 +12,7 @@ from v2p_data.scene.gate import held_at_first
 from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.placement import CameraGuess, _body, _hidden, place, with_forms
 from v2p_data.scene.pose import camera_above
+from v2p_data.scene.reconstruct import SceneConfig, told
 from v2p_data.scene.scale import SeenCamera
 from v2p_data.scene.sight import Sighting, Sights
 from v2p_data.scene.table import find_table
@@ -192,3 +193,19 @@ def test_a_lid_that_is_taken_off_lay_on_what_it_covered():
     assert start[:2] == pytest.approx(there, abs=0.06)
     assert stop[:2] == pytest.approx((1.1, -0.3), abs=0.06)
     assert placed.first.size == pytest.approx(size, rel=0.25)
+
+
+def test_a_measured_height_says_as_much_of_lengths_as_is_known_of_pitch_and_focal_length():
+    """A low camera with a long lens sees what a high one with a short lens does."""
+    guess = CameraGuess(pitch_rad=np.pi / 4, pitch_sd_rad=0.1, fov_rad=1.0)
+
+    height = told(guess, SceneConfig(camera_height_m=0.5))
+    seen_too = told(guess, SceneConfig(camera_height_m=0.5, fov_rad=0.9))
+    whole = told(guess, SceneConfig(camera_height_m=0.5, fov_rad=0.9, pitch_rad=0.7))
+
+    assert height.height_m == seen_too.height_m == whole.height_m == 0.5
+    assert whole.height_sd == pytest.approx(0.02)
+    assert seen_too.height_sd == pytest.approx(np.hypot(0.02, 0.1)), "at 45 degrees"
+    assert height.height_sd > 1.5 * seen_too.height_sd
+    assert (whole.fov_rad, whole.pitch_rad) == (0.9, 0.7)
+    assert told(guess, SceneConfig()) == guess

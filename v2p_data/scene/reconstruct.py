@@ -66,6 +66,8 @@ _USUAL_FOV_RAD = 1.01
 """58 degrees, for web cameras and phones filming wide."""
 _MEASURED_SD = 0.02
 """Of a pitch [rad], or of the logarithm of a height, that the user gives."""
+_FOCAL_SD = 0.15
+"""Of the logarithm of a guessed focal length, on drawn clips."""
 _HELD_SURE = 0.3
 """How far to believe a first pose on the table of what a hand seems to hold in the air."""
 _WIDTH_DOUBT = 1.4
@@ -87,7 +89,7 @@ class SceneConfig:
     check_motion: bool = True
     """Reject what does not move as its caption says."""
     camera_height_m: float | None = None
-    """Of the camera above the table, where you measured it: it gives all sizes, which are guesses otherwise."""
+    """Of the camera above the table, where you measured it: with pitch and field of view it gives all sizes, which are guesses otherwise."""
     pitch_rad: float | None = None
     """How far the camera looks below the horizon, where you know it."""
     pitch_spread_rad: float = 0.14
@@ -289,12 +291,26 @@ def _camera_guess(sights: Sights, cfg: SceneConfig) -> CameraGuess:
             table_width_m=seen.table_width_m,
             table_width_sd=_WIDTH_DOUBT * seen.table_width_sd,
         )
+    return told(guess, cfg)
+
+
+def told(guess: CameraGuess, cfg: SceneConfig) -> CameraGuess:
+    """Return a guess of the camera with what the user measured in place of what was guessed.
+
+    How large things are that one sees follows from the height together with pitch and focal length: where these are guessed,
+    a measured height says no more than they do.
+    """
+    spread = _MEASURED_SD
     if cfg.pitch_rad is not None:
         guess = replace(guess, pitch_rad=cfg.pitch_rad, pitch_sd_rad=_MEASURED_SD)
+    else:
+        spread = float(np.hypot(spread, guess.pitch_sd_rad / np.tan(guess.pitch_rad)))
     if cfg.fov_rad is not None:
         guess = replace(guess, fov_rad=cfg.fov_rad)
+    else:
+        spread = float(np.hypot(spread, _FOCAL_SD))
     if cfg.camera_height_m is not None:
-        guess = replace(guess, height_m=cfg.camera_height_m, height_sd=_MEASURED_SD)
+        guess = replace(guess, height_m=cfg.camera_height_m, height_sd=spread)
     return guess
 
 
