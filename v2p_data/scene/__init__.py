@@ -13,11 +13,11 @@ Reading order:
     reconstruct     the steps, in order; `SceneConfig`
     footage, colour, table      frames at working size, stills without passers-by, the bare table
     classes, network            the five classes, and the network that tells them apart
-    sight           which pixels are which object in every frame: `find` (network) or `ground` (heuristics), then `segment`
-                    and `track`
+    sight           which pixels are which object in every frame: `find` and `stand` (network), `tool`, `ground` (heuristics) or
+                    `marks` (a person's), then `segment` and `track`
     placement, pose             masks become camera, sizes and poses, in camera heights
     nouns, scale                usual sizes turn camera heights into metres
-    shape           primitive, solid of revolution or inflated silhouette
+    shape           primitive, solid of revolution (`revolved`) or inflated silhouette (`inflation`), with `handles`
     learned, backends           where learned models and workers take part
     gate            how sure each stage is; does the motion fit the caption?
     scene, export, overlay      what is written

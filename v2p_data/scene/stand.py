@@ -183,12 +183,13 @@ def candidates(search: Search) -> list[Candidate]:
     apart = table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5)
     free = ~search.taken & ~grow(search.ends[1], 2) if late else ~search.taken
     lab, way = lab_of(still), _Way.of(search)
+    usual = float(colour[table.seen].mean()) if colour is not None and table.seen.any() else 0.0
     return [
         Candidate(
             mask=mask,
             cues={
                 "part": float(is_part),
-                **_own_cues(search, mask, lab, colour),
+                **_own_cues(search, mask, lab, colour, usual),
                 **way.cues(mask, search.kind),
             },
         )
@@ -201,8 +202,9 @@ def _own_cues(
     mask: Bool[np.ndarray, "h w"],
     lab: Float32[np.ndarray, "h w 3"],
     colour: Float32[np.ndarray, "h w"] | None,
+    usual: float,
 ) -> dict[str, float]:
-    """Return what a candidate looks like; `colour` is how well each pixel has the colour that the phrase names."""
+    """Return what a candidate looks like; `colour` is how well each pixel has the colour that the phrase names, `usual` the table's mean."""
     stands, seen = search.stands, search.table.seen
     h, w = mask.shape
     x, y, bw, bh = bounding_box(mask)
@@ -210,9 +212,6 @@ def _own_cues(
     ring = grow(mask, 4) & ~grow(mask, 1)
     noun = noun_for(search.phrase)
     off = larger_than_usual(noun, search.watched.camera, mask) - search.log_scale
-    named = 0.0
-    if colour is not None:
-        named = float(colour[mask].mean()) - (float(colour[seen].mean()) if seen.any() else 0.0)
     return {
         "seen": float(stands[mask].mean()),
         "seen around": float(stands[ring].mean()) if ring.any() else 0.0,
@@ -224,7 +223,7 @@ def _own_cues(
         "fill": area / (bw * bh),
         "edge": min(40.0, edge_contrast(lab, mask)) / 40,
         "table around": float(seen[ring].mean()) if ring.any() else 0.0,
-        "colour": named,
+        "colour": 0.0 if colour is None else float(colour[mask].mean()) - usual,
     }
 
 

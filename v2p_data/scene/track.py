@@ -84,7 +84,7 @@ def track(
     alike = _likeness(footage, n - 1, end, moved.look, area_first)
     quality[0], quality[-1] = 1.0, 1.0 if alike > _LOST else alike
     # Nor is what stands there at both ends, where the object looks otherwise than the table under it.
-    early, late = (lab_of(still) for still in (footage.early, footage.late))
+    early, late = (_smooth(lab_of(still)) for still in (footage.early, footage.late))
     if _alike_share(footage.lab[0], late, moved.first) < _UNLIKE:
         for i in steps[1:]:
             still, place = (early, moved.first) if i >= n / 2 else (late, end)
@@ -133,7 +133,7 @@ def _follow(
     h, w = footage.shape
     flow_of = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     grid_y, grid_x = np.mgrid[:h, :w].astype(np.float32)
-    before = cv2.GaussianBlur(footage.lab[anchor], (0, 0), 1)
+    before = _smooth(footage.lab[anchor])
     home, area = grow(start, 2), int(start.sum())
     mask, out = start, [start]
     grey = cv2.cvtColor(footage.rgb[anchor], cv2.COLOR_RGB2GRAY)
@@ -167,7 +167,7 @@ def _follow(
         if moving is not None:
             votes = 0.35 * ratio + 2 * (prior - 0.35) + 5 * (moving(i)[rows, cols] - 0.5)
         vote = cv2.GaussianBlur(votes.astype(np.float32), (0, 0), 1)
-        smooth = cv2.GaussianBlur(footage.lab[i][rows, cols], (0, 0), 1)
+        smooth = _smooth(footage.lab[i][rows, cols])
         still = np.linalg.norm(smooth - before[rows, cols], axis=-1) < _SAME_LAB
         floor = 0.03 if mask.sum() < 1.3 * area else 0.3
         allowed = (prior > floor) & ~(still & ~home[rows, cols])
@@ -205,7 +205,7 @@ def _find_again(
         likelihood(footage.hand_hist, image), 0.7 * likelihood(footage.rest_hist, image)
     )
     ratio = np.log(likelihood(look, image) + 1e-6) - np.log(others + 1e-6)
-    changed = np.linalg.norm(cv2.GaussianBlur(footage.lab[i], (0, 0), 1) - before, axis=-1) > 7
+    changed = np.linalg.norm(_smooth(footage.lab[i]) - before, axis=-1) > 7
     pixels = (cv2.GaussianBlur(ratio.astype(np.float32), (0, 0), 1.5) > 0.3) & (changed | home)
     count, parts = cv2.connectedComponents(tidy(pixels, 7).astype(np.uint8))
     best, value = mask, _likeness(footage, i, mask, look, float(area)) + 0.05
@@ -232,15 +232,19 @@ def _less_hand(
     return largest(rest)
 
 
+def _smooth(lab: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Return a picture without the noise of single pixels."""
+    return np.asarray(cv2.GaussianBlur(lab, (0, 0), 1))
+
+
 def _alike_share(
     lab: Float32[np.ndarray, "h w 3"],
     still: Float32[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
     but_for: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Return how much of a mask looks in a frame as it does in a still; `but_for` are pixels that do not count as alike."""
-    here, there = (cv2.GaussianBlur(image, (0, 0), 1) for image in (lab, still))
-    alike = np.linalg.norm(here - there, axis=-1) < _SAME_LAB
+    """Return how much of a mask looks in a frame as in a smoothed still; `but_for` are pixels that do not count as alike."""
+    alike = np.linalg.norm(_smooth(lab) - still, axis=-1) < _SAME_LAB
     if but_for is not None:
         alike &= ~but_for
     return float(alike[mask].mean()) if mask.any() else 0.0
