@@ -121,7 +121,7 @@ def scene_stage(video: VideoItem, cfg: EngineConfig) -> Stage:
         item=video.item,
         config=recipe,
         sources={"video": file_digest(video.path)},
-        version=2,
+        version=3,
         make=partial(make_scene, video=video),
     )
 

@@ -54,6 +54,7 @@ def write_scene(reconstruction: Reconstruction, folder: Path) -> Scene:
             stage: StageConfidence(value=round(value, 4), reason=reason)
             for stage, (value, reason) in reconstruction.stages.items()
         },
+        scale_spread=round(reconstruction.scale_spread, 4),
         warnings=(*clip.warnings, *reconstruction.warnings),
         folder=folder,
     )

@@ -64,8 +64,6 @@ _USUAL_PITCH_RAD = 0.61
 """35 degrees, for a camera on a stand at a table."""
 _USUAL_FOV_RAD = 1.01
 """58 degrees, for web cameras and phones filming wide."""
-_MEASURED_SD = 0.02
-"""Of a pitch [rad], or of the logarithm of a height, that the user gives."""
 _FOCAL_SD = 0.15
 """Of the logarithm of a guessed focal length, on drawn clips."""
 _HELD_SURE = 0.3
@@ -96,6 +94,9 @@ class SceneConfig:
     """How far silhouettes may pull the pitch from the expected one."""
     fov_rad: float | None = None
     """Horizontal field of view of the camera, where you know it."""
+    camera_spread: float = 0.02
+    """How far off what you give of the camera may be: standard deviation of the pitch in radians, and of the height's logarithm. 0.02
+    with a tape and a level; 'v2p scene camera' says how sure it is."""
     max_poses: int = 150
     """Poses kept per object, the first and last among them."""
     ground: GroundConfig = field(default_factory=GroundConfig)
@@ -111,6 +112,7 @@ class SceneConfig:
             raise ValueError(f"min_found must lie in 0..1, got {self.min_found}")
         for name, low, high in (
             ("camera_height_m", 0.05, 5.0), ("pitch_rad", 0.1, 1.5), ("fov_rad", 0.3, 2.2),
+            ("camera_spread", 0.0, 1.0),
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not low < value < high:
@@ -300,9 +302,9 @@ def told(guess: CameraGuess, cfg: SceneConfig) -> CameraGuess:
     How large things are that one sees follows from the height together with pitch and focal length: where these are guessed,
     a measured height says no more than they do.
     """
-    spread = _MEASURED_SD
+    spread = cfg.camera_spread
     if cfg.pitch_rad is not None:
-        guess = replace(guess, pitch_rad=cfg.pitch_rad, pitch_sd_rad=_MEASURED_SD)
+        guess = replace(guess, pitch_rad=cfg.pitch_rad, pitch_sd_rad=cfg.camera_spread)
     else:
         spread = float(np.hypot(spread, guess.pitch_sd_rad / np.tan(guess.pitch_rad)))
     if cfg.fov_rad is not None:

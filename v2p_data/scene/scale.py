@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from v2p_data.scene.nouns import Noun
 
@@ -78,19 +79,33 @@ def camera_height_m(
     """Return the camera's height [m] and the standard deviation of its logarithm.
 
     `measured` are such pairs from elsewhere, as from predicted depth. What a noun says counts the less the farther it is from
-    what all say together: a box may be of any size, and what was taken for a pen may be none. (Weights of Student's t
-    with four degrees of freedom; Lange, Little and Taylor 1989.)
+    what all say together: a box may be of any size, and what was taken for a pen may be none.
     """
     rows = [(float(np.log(_USUAL_HEIGHT_M)), _HEIGHT_SPREAD, 1.0, False)]
     rows += [(float(np.log(height_m)), spread, 1.0, False) for height_m, spread in measured]
     rows += [(*_implied(vote), vote.trust, vote.known_m is None) for vote in votes]
-    mean, spread, trust, doubtful = (np.array(column) for column in zip(*rows, strict=True))
+    says, spread, trust, doubtful = (np.array(column) for column in zip(*rows, strict=True))
+    middle, sd = robust_mean(says, spread, trust, doubtful)
+    return float(np.exp(middle)), sd
+
+
+def robust_mean(
+    says: Float[np.ndarray, "n"],
+    spread: Float[np.ndarray, "n"],
+    trust: Float[np.ndarray, "n"],
+    doubtful: Bool[np.ndarray, "n"],
+) -> tuple[float, float]:
+    """Return the mean of what several say, each with its standard deviation and its trust of 0 to 1, and the mean's standard deviation.
+
+    What is doubtful counts the less the farther it is from the mean: weights of Student's t with four degrees of freedom.
+
+    Source: Lange, Little and Taylor 1989.
+    """
     weight = trust / spread**2
     for _ in range(_ROUNDS):
-        middle = float(mean @ weight / weight.sum())
-        off = (mean - middle) / spread
+        off = (says - says @ weight / weight.sum()) / spread
         weight = trust / spread**2 * np.where(doubtful, 1 / (1 + off**2 / _FREEDOM), 1.0)
-    return float(np.exp(mean @ weight / weight.sum())), float(weight.sum() ** -0.5)
+    return float(says @ weight / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def disagreement(vote: SizeVote, height_m: float) -> float:

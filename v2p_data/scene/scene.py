@@ -204,6 +204,8 @@ class Scene:
     """0 to 1; below the gate a scene is rejected."""
     confidences: dict[str, StageConfidence] = field(default_factory=dict[str, StageConfidence])
     """Per stage of the reconstruction."""
+    scale_spread: float = 0.0
+    """Standard deviation of the logarithm of all lengths together: one view does not show scale."""
     table: Plane = Plane()
     """The table's top."""
     gravity_m_s2: tuple[float, float, float] = GRAVITY_M_S2

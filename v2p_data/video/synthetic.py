@@ -161,7 +161,11 @@ def render_views(
 
 
 def random_spec(
-    name: str, kind: MotionKind, rng: np.random.Generator, others: int | None = None
+    name: str,
+    kind: MotionKind,
+    rng: np.random.Generator,
+    others: int | None = None,
+    beside: VideoSpec | None = None,
 ) -> VideoSpec:
     """Return a clip of this kind with everything else drawn at random.
 
@@ -170,6 +174,11 @@ def random_spec(
         kind: what happens.
         rng: where the draws come from.
         others: things that stand around, at most; 0 to 4 by chance where None.
+        beside: a clip of the same folder: the same person filmed this one too, in the same room with the same camera on the same stand,
+            and things lie anywhere on the table that it sees.
+
+    Raises:
+        ValueError: no camera sees all of what was drawn, or that one does not.
     """
     for _ in range(60):
         hand, across = _random_hand(rng, kind)
@@ -188,7 +197,17 @@ def random_spec(
             room=random_room(rng, across or bool(rng.random() < 0.15)), sensor=random_sensor(rng),
             seconds=float(rng.uniform(2.5, 5.0)), fps=fps, hide_m=0.0, seed=int(rng.integers(2**31)),
         )  # fmt: skip
-        framed = _framed(spec, rng)
+        if beside is not None:
+            same = beside.hand
+            hand = replace(
+                hand,
+                scale=same.scale,
+                skin=same.skin,
+                sleeve=same.sleeve,
+                sleeve_print=same.sleeve_print,
+            )
+            spec = replace(spec, hand=hand, room=beside.room, sensor=beside.sensor)
+        framed = _framed(spec, rng, None if beside is None else beside.view)
         if framed is not None:
             return framed
     raise ValueError(f"no camera sees all of a '{kind}' clip; draw again with another stream")
@@ -243,8 +262,15 @@ _SIZES = ((640, 480), (854, 480), (480, 640), (426, 240), (640, 360), (320, 240)
 _SHARES = (0.36, 0.18, 0.14, 0.14, 0.08, 0.05, 0.05)
 
 
-def _framed(spec: VideoSpec, rng: np.random.Generator) -> VideoSpec | None:
-    """Return the clip with a camera that sees every thing of the caption at first and at last; None where none does."""
+_ANYWHERE_M = 0.12
+"""Standard deviation of where on the table things lie under a camera that nobody moves for them."""
+
+
+def _framed(spec: VideoSpec, rng: np.random.Generator, stand: View | None) -> VideoSpec | None:
+    """Return the clip with a camera that sees every thing of the caption at first and at last; None where none does.
+
+    With a `stand`, the camera is as high as that one, looks the same way, and is moved beside the things alone.
+    """
     story = spec.story
     motion = motion_of(spec)
     named = [k for k, a in enumerate(story.actors) if a.role not in ("bystander", "tool")]
@@ -259,17 +285,16 @@ def _framed(spec: VideoSpec, rng: np.random.Generator) -> VideoSpec | None:
     )
     middle = (points.min(0) + points.max(0)) / 2
     for _ in range(60):
-        width, height = _SIZES[int(rng.choice(len(_SIZES), p=_SHARES))]
-        camera_height, pitch = (
-            float(rng.uniform(0.25, 0.8)),
-            float(np.radians(rng.uniform(20, 60))),
+        view, aside = (
+            _random_view(rng) if stand is None else (stand, rng.normal(0, _ANYWHERE_M, 2))
         )
-        aim = middle[:2] + rng.normal(0, 0.04, 2)
-        view = View(
-            height_m=camera_height, pitch_rad=pitch, roll_rad=float(np.radians(rng.normal(0, 0.9))),
-            back_m=float((camera_height - middle[2]) / np.tan(pitch) - aim[0]), side_m=float(aim[1]),
-            fovy_rad=float(np.radians(rng.uniform(35, 60))), width_px=width, height_px=height,
-        )  # fmt: skip
+        aim = middle[:2] + aside
+        view = replace(
+            view,
+            back_m=float((view.height_m - middle[2]) / np.tan(view.pitch_rad) - aim[0]),
+            side_m=float(aim[1]),
+        )
+        width, height = view.width_px, view.height_px
         camera = view.camera()
         uv = camera.project(points)
         margin = 0.015 * width
@@ -297,6 +322,20 @@ def _framed(spec: VideoSpec, rng: np.random.Generator) -> VideoSpec | None:
         )
         return replace(spec, view=view, hide_m=hide, room=room)
     return None
+
+
+def _random_view(rng: np.random.Generator) -> tuple[View, Float[np.ndarray, "2"]]:
+    """Return a camera, and how far beside the things' middle it looks [m]."""
+    width, height = _SIZES[int(rng.choice(len(_SIZES), p=_SHARES))]
+    camera_height, pitch = float(rng.uniform(0.25, 0.8)), float(np.radians(rng.uniform(20, 60)))
+    aside = rng.normal(0, 0.04, 2)
+    roll = float(np.radians(rng.normal(0, 0.9)))
+    fovy = float(np.radians(rng.uniform(35, 60)))
+    view = View(
+        height_m=camera_height, pitch_rad=pitch, roll_rad=roll,
+        fovy_rad=fovy, width_px=width, height_px=height,
+    )  # fmt: skip
+    return view, aside
 
 
 def _hides(story: Story, uv: Float[np.ndarray, "n 2"], num: int) -> bool:
