@@ -37,7 +37,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, Protocol, cast, get_args
 
 import cv2
 import numpy as np
@@ -49,6 +49,7 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import apply, transform_from_pose
 from v2p_data.scene.footage import WIDTH_PX
+from v2p_data.scene.one_camera import filmed
 from v2p_data.scene.reconstruct import Reconstruction, SceneConfig, reconstruct
 from v2p_data.scene.score import (
     STAGES,
@@ -107,9 +108,23 @@ WAYS = {
 Row = dict[str, Any]
 
 
+class Drawn(Protocol):
+    """A clip to draw."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def kind(self) -> MotionKind: ...
+    @property
+    def seed(self) -> int: ...
+    def spec(self) -> synthetic.VideoSpec:
+        """Return all that is drawn."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One clip to draw."""
+    """One clip to draw, like no other."""
 
     kind: MotionKind
     seed: int
@@ -134,21 +149,21 @@ def main() -> None:
     os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
     args.out.mkdir(parents=True, exist_ok=True)
     runs = _note_final_run(args) if args.split == "final" else []
-    folders = {job.name: _folder(job, args.out / "clips", args.old_clips) for job in jobs}
+    folders = {job.name: folder_of(job, args.out / "clips", args.old_clips) for job in jobs}
     missing = [(job, folders[job.name]) for job in jobs if not folders[job.name].is_dir()]
-    for _ in _each(args.jobs, _draw_clip, missing, "drawn"):
+    for _ in each(args.jobs, draw_clip, missing, "drawn"):
         pass
     given = frozenset(way for way in WAYS if vars(args)[way])
     name = "_".join([args.split, *["quick"] * args.quick, *(way for way in WAYS if way in given)])
     pictures = args.out / f"pictures_{name}"
     tasks = [(job, folders[job.name], given, pictures) for job in jobs]
-    rows = list(_each(args.jobs, _reconstructed, tasks, "reconstructed"))
+    rows = list(each(args.jobs, reconstructed, tasks, "reconstructed"))
     rows.sort(key=lambda row: (KINDS.index(row["kind"]), row["seed"]))
     summary = summarised(rows)
     result = {
         "split": args.split,
         **{way: way in given for way in WAYS},
-        "commit": _commit(),
+        "commit": commit(),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "load": round(os.getloadavg()[0], 2),
         "jobs": args.jobs,
@@ -410,7 +425,7 @@ def _note_final_run(args: argparse.Namespace) -> list[dict[str, Any]]:
     path = args.out / FINAL_RUNS
     run = {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": _commit(),
+        "commit": commit(),
         "clips": args.clips,
         **{way: vars(args)[way] for way in WAYS},
     }
@@ -424,7 +439,7 @@ def _note_final_run(args: argparse.Namespace) -> list[dict[str, Any]]:
     return runs
 
 
-def _commit() -> str:
+def commit() -> str:
     """Return the commit, with a plus where the working tree differs from it."""
 
     def git(*words: str) -> str:
@@ -438,7 +453,7 @@ def _commit() -> str:
     )
 
 
-def _each(jobs: int, function: Any, tasks: list[tuple[Any, ...]], done: str) -> Iterator[Any]:
+def each(jobs: int, function: Any, tasks: list[tuple[Any, ...]], done: str) -> Iterator[Any]:
     """Run tasks in fresh processes, a few at a time, so that each has its own peak of memory."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(_IMPORTED_ONCE))
@@ -450,7 +465,7 @@ def _each(jobs: int, function: Any, tasks: list[tuple[Any, ...]], done: str) -> 
             yield future.result()
 
 
-def _folder(job: Job, clips: Path, old_code: bool) -> Path:
+def folder_of(job: Drawn, clips: Path, old_code: bool) -> Path:
     """Return where the clip is, or where it belongs if this very clip was not drawn before by the same code."""
     recipe = _digest(json.dumps(asdict(job.spec()), sort_keys=True, default=str).encode())
     code = _drawing_code()
@@ -465,7 +480,7 @@ def _drawing_code() -> str:
     return _digest(b"".join(source.read_bytes() for source in sources))
 
 
-def _draw_clip(job: Job, folder: Path) -> None:
+def draw_clip(job: Drawn, folder: Path) -> None:
     if folder.is_dir():  # a run beside this one drew it meanwhile
         return
     partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
@@ -489,7 +504,14 @@ def settings_for(camera: Camera) -> SceneConfig:
     )
 
 
-def _reconstructed(job: Job, folder: Path, given: frozenset[str], pictures: Path) -> Row:
+def reconstructed(
+    job: Drawn,
+    folder: Path,
+    given: frozenset[str],
+    pictures: Path,
+    camera: SceneConfig | None = None,
+) -> Row:
+    """Return what becomes of a clip with what is `given` beside its caption, and with the settings of a `camera` that was found out."""
     truth = load_truth(folder, job.name)
     true = true_of(truth)
     said: Row = {"caption": truth.caption}
@@ -520,7 +542,7 @@ def _reconstructed(job: Job, folder: Path, given: frozenset[str], pictures: Path
             video.symlink_to((folder / video.name).resolve())
             (Path(home) / "captions.json").write_text(json.dumps({video.name: said}))
             clip = read_clip(find_videos(Path(home))[0])
-            cfg = settings_for(truth.camera) if "camera" in given else SceneConfig()
+            cfg = settings_for(truth.camera) if "camera" in given else camera or SceneConfig()
             rng = rng_for(job.seed, "scene")
             made = reconstruct(clip, cfg.without_gate(), rng)
             row["frames_per_s"] = round(len(clip.frames) / (time.perf_counter() - started), 2)
@@ -529,6 +551,7 @@ def _reconstructed(job: Job, folder: Path, given: frozenset[str], pictures: Path
             row["stages"] = {stage: [sure, why] for stage, (sure, why) in made.stages.items()}
             row["cues"] = [[cue.stage, cue.what, round(cue.value, 4)] for cue in made.cues]
             row["scale_spread"] = round(made.scale_spread, 4)
+            row["camera"] = asdict(filmed(job.name, made.camera, made.scale_spread))
             row["height_m"] = round(float(made.camera.T_world_cam[2, 3]), 4)
             row["true_height_m"] = round(float(true.T_world_cam[2, 3]), 4)
             row["least_found"] = round(made.least_found, 4)

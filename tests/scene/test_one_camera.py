@@ -41,7 +41,7 @@ def scene_from(height_m, pitch_rad, spread=0.1):
 def test_clips_that_agree_give_the_camera_that_each_says():
     scene = scene_from(0.5, 0.7)
 
-    camera = shared_camera([filmed(scene, "a"), filmed(scene, "b")])
+    camera = shared_camera([filmed(item, scene.camera, 0.1) for item in "ab"])
 
     assert camera.height_m == pytest.approx(0.5)
     assert camera.pitch_rad == pytest.approx(0.7)

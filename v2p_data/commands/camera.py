@@ -35,7 +35,9 @@ def camera_command(argv: list[str]) -> int:
                 f"{args.run} holds no scene '{item}'.{did_you_mean(item, list(scenes))}"
             )
     clips = [
-        filmed(scene, item) for item, (scene, _) in scenes.items() if item not in args.without
+        filmed(item, scene.camera, scene.scale_spread)
+        for item, (scene, _) in scenes.items()
+        if item not in args.without
     ]
     if len(clips) < FEWEST:
         raise V2PError(

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scale import robust_mean, table_width_m
-from v2p_data.scene.scene import Scene
 
 FEWEST = 2
 """Clips, with fewer nothing is put together."""
@@ -61,16 +61,14 @@ class SharedCamera:
     """Items of clips that seem to be filmed by another camera, or from elsewhere."""
 
 
-def filmed(scene: Scene, item: str) -> Filmed:
-    """Return what a scene says of its camera."""
-    camera = scene.camera
+def filmed(item: str, camera: Camera, scale_spread: float) -> Filmed:
+    """Return what a clip's scene says of its camera; `scale_spread` is how sure that is of all lengths."""
     pitch = float(np.arcsin(np.clip(-camera.T_world_cam[2, 2], -1, 1)))
     focal = float(camera.K[0, 0]) / camera.width_px
-    height = float(camera.T_world_cam[2, 3])
     return Filmed(
         item=item,
-        table_width_m=table_width_m(pitch, focal, height),
-        width_sd=max(scene.scale_spread, _SUREST),
+        table_width_m=table_width_m(pitch, focal, float(camera.T_world_cam[2, 3])),
+        width_sd=max(scale_spread, _SUREST),
         pitch_rad=pitch,
         focal_widths=focal,
         aspect=camera.width_px / camera.height_px,
