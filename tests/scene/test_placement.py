@@ -160,9 +160,29 @@ def test_lids_of_jars_and_of_pots_are_told_by_their_size(across_m: float, word: 
         pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=height_m, height_sd=0.12
     )
 
-    (told,) = with_forms(
-        footage_of(filmed(frames)), (resting("lid", "manipulated", np.stack([mask] * 12)),), guess
+    lid = resting("lid", "manipulated", np.stack([mask] * 12))
+
+    (told,) = with_forms(footage_of(filmed(frames)), (lid,), guess, "lift_up")
+
+    assert told.noun.size_m == noun_for(word).size_m
+
+
+@pytest.mark.parametrize(("vessel", "word"), [("jar", "lid"), ("pot", "pot lid")])
+def test_a_lid_is_about_as_wide_as_what_it_covers(vessel: str, word: str):
+    """Halfway between a jar's and a pot's, its own size does not tell."""
+    size = (0.27, 0.27, 0.06)
+    masks = [
+        outline_of(noun_for("lid"), size, 1.1, 0.0),
+        outline_of(noun_for(vessel), size, 1.1, 0.5),
+    ]
+    frames = np.full((12, H, W, 3), 150, np.uint8)
+    objects = tuple(
+        resting(name, role, np.stack([mask] * 12))
+        for name, role, mask in zip(("lid", vessel), ("cover", "reference"), masks, strict=True)
     )
+    guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=0.5)
+
+    told, _ = with_forms(footage_of(filmed(frames)), objects, guess, "cover")
 
     assert told.noun.size_m == noun_for(word).size_m
 

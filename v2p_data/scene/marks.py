@@ -9,7 +9,15 @@ from jaxtyping import Bool, Float
 from v2p_data.scene.classes import MOVED, OTHER
 from v2p_data.scene.find import Watched, filled, less_table
 from v2p_data.scene.footage import Footage
-from v2p_data.scene.segment import bounding_box, ellipse_in, from_box, from_points, spans
+from v2p_data.scene.segment import (
+    bounding_box,
+    ellipse_in,
+    from_box,
+    from_points,
+    grow,
+    refine,
+    spans,
+)
 from v2p_data.video.clip import Clip
 
 _HINTED_SURE = 0.97
@@ -17,6 +25,8 @@ _ELSEWHERE_LAB = 12.0
 """Where a thing is, and where it is not, a picture differs by so much and more."""
 _FILLED = 0.85
 """People draw boxes tightly: of an outline that spans less of its box a part is missing."""
+_BESIDE_PX = 3
+"""At working size, 320 px wide: so far beside a box an edge may lie. People are off by a pixel or two."""
 _LEAST_SPAN = 0.55
 """Of a person's box: what has a face in the table's colours is outlined without it; then the box itself says more."""
 
@@ -87,8 +97,9 @@ def _boxed(
         if spans(mask, drawn) < _FILLED:
             mask = filled(mask, watched.at(i), inside)
         mask = less_table(mask, watched.at(i))
-        if spans(mask, drawn) < _LEAST_SPAN:
-            mask = ellipse_in(drawn, footage.shape)
+    mask = refine(footage.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
+    if watched is not None and spans(mask, drawn) < _LEAST_SPAN:
+        mask = ellipse_in(drawn, footage.shape)
     return Mark(mask=mask, frame=i, sure=sure, box=inside)
 
 

@@ -57,7 +57,7 @@ _NO_SPREAD = 0.01
 _GRIP_HEIGHT_M = 0.08
 """Over the table, of a hand that pushes with something: the fist must clear the table."""
 _OTHER_FORM_COST = 0.02
-"""By so much a noun's second form must cover an outline better: a box has a side and a turn more to choose than a cylinder."""
+"""By so much a noun's second form must cover an outline better where it is a box: that has a side and a turn more to choose than a cylinder."""
 _LYING_TELLS = 0.1
 """A lid that is taken off lies on the table at first if that fits so much better, in units of IoU."""
 _SIZE_TELLS, _MOST_OFF = 0.01, 3.0
@@ -364,31 +364,40 @@ def _placed(see: _Shown, fits: _Fits, course: Course) -> Placed:
 
 
 def with_forms(
-    footage: Footage, objects: tuple[Sighting, ...], guess: CameraGuess
+    footage: Footage, objects: tuple[Sighting, ...], guess: CameraGuess, kind: str
 ) -> tuple[Sighting, ...]:
-    """Return the sightings with their nouns in the form that their outlines fit, where a noun has two."""
+    """Return the sightings with their nouns in the form that their outlines fit, where a noun has two; a lid is about as wide as what it covers."""
+    beneath = objects[1].noun if kind in ("cover", "uncover") and len(objects) > 1 else None
     camera = camera_above(footage.shape, guess.pitch_rad, guess.fov_rad)
     out = []
     for s in objects:
         if s.noun.other is not None:
             unknown = _others(objects, s, s.at)
             silhouette = Silhouette(s.first, unknown, camera)
+            under = beneath if s is objects[0] and _is_lid(s.noun) else None
             usual, other = (
-                _cost_of(fit_shape(silhouette, noun, np.eye(3)), noun, guess)
+                _cost_of(fit_shape(silhouette, noun, np.eye(3)), noun, guess, under)
                 for noun in (s.noun, s.noun.other)
             )
-            s = replace(s, noun=s.noun.other if other + _OTHER_FORM_COST < usual else s.noun)
+            freer = _OTHER_FORM_COST if s.noun.other.form == "box" else 0.0
+            s = replace(s, noun=s.noun.other if other + freer < usual else s.noun)
         out.append(s)
     return tuple(out)
 
 
-def _cost_of(fit: Fit, noun: Noun, guess: CameraGuess) -> float:
-    """Return what a fit costs as one of a noun's two forms: jar lids and pot lids are alike but for their size."""
+def _cost_of(fit: Fit, noun: Noun, guess: CameraGuess, beneath: Noun | None) -> float:
+    """Return what a fit costs as one of a noun's two forms: jar lids and pot lids are alike but for their size.
+
+    `beneath` is the round thing that a lid covers.
+    """
     sizes = np.log(np.array(fit.size) / np.array(noun.size_m)).mean()
     offs = [
         (sizes + np.log(height_m)) / np.hypot(noun.spread, sd)
         for height_m, sd in guess.heights(guess.pitch_rad)
     ]
+    if beneath is not None and beneath.form == "cylinder":
+        wider = float(np.log(noun.size_m[0] / beneath.size_m[0]))
+        offs.append(wider / float(np.hypot(noun.spread, beneath.spread)))
     return fit.cost + _SIZE_TELLS * float(np.square(np.clip(offs, -_MOST_OFF, _MOST_OFF)).sum())
 
 

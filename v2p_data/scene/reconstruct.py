@@ -201,7 +201,9 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
             sights, objects=segmented(clip, sights.footage, sights.objects, cfg.segment)
         )
     guess = _camera_guess(sights, cfg)
-    sights = replace(sights, objects=with_forms(sights.footage, sights.objects, guess))
+    sights = replace(
+        sights, objects=with_forms(sights.footage, sights.objects, guess, meaning.kind)
+    )
     if cfg.depth.backend != "none":
         guess = camera_from_depth(clip, sights.footage, sights.objects, guess, cfg.depth, rng)
     placement = place(

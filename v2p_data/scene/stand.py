@@ -34,6 +34,8 @@ _LEVELS = (0.75, 0.5, 0.25)
 """Probabilities at which what the network sees is cut into things."""
 _LEAST_SHARE, _MOST_SHARE = 0.0005, 0.2
 """Of the picture."""
+_MOST_SEEN_SHARE = 0.45
+"""The same where the network says it is a thing: bowls and baskets are filmed from near. What only stands out may be half of a table."""
 _KINDS_VARY = 0.3
 """Logarithm: what moves may be so much larger or smaller than usual without anybody's doubting the camera."""
 _FOOT = 0.8
@@ -315,20 +317,20 @@ def _masks(
     colour: Float32[np.ndarray, "h w"] | None,
 ) -> Iterator[tuple[Bool[np.ndarray, "h w"], bool]]:
     """Yield candidates, each with whether it is cut out of a larger one: by a neck, or by its colour."""
-    sets = [(tidy((stands > level) & free), False) for level in _LEVELS]
-    sets.append((tidy(apart & free, 5), False))
+    sets = [(tidy((stands > level) & free), False, _MOST_SEEN_SHARE) for level in _LEVELS]
+    sets.append((tidy(apart & free, 5), False, _MOST_SHARE))
     if colour is not None:
         named = free & (colour > 0.5)
         sets += [
-            (tidy(pixels & named, 5), True)
+            (tidy(pixels & named, 5), True, _MOST_SHARE)
             for pixels in (apart, *(stands > level for level in _LEVELS[1:]))
         ]
     known: list[Bool[np.ndarray, "h w"]] = []
-    least, most = _LEAST_SHARE * free.size, _MOST_SHARE * free.size
-    for pixels, is_part in sets:
+    least = _LEAST_SHARE * free.size
+    for pixels, is_part, most_share in sets:
         count, parts, stats, _ = cv2.connectedComponentsWithStats(pixels.astype(np.uint8))
         for k in range(1, count):
-            if not least <= stats[k, cv2.CC_STAT_AREA] <= most:
+            if not least <= stats[k, cv2.CC_STAT_AREA] <= most_share * free.size:
                 continue
             whole = parts == k
             for mask in (whole, *pieces_of(whole, least)):
