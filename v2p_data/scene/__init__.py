@@ -16,7 +16,7 @@ Reading order:
     sight           which pixels are which object in every frame: `find` and `stand` (network), `tool`, `ground` (heuristics) or
                     `marks` (a person's), then `segment` and `track`
     placement, pose             masks become camera, sizes and poses, in camera heights
-    nouns, scale                usual sizes turn camera heights into metres
+    nouns, scale                usual sizes turn camera heights into metres; `one_camera` puts together what several clips say
     shape           primitive, solid of revolution (`revolved`) or inflated silhouette (`inflation`), with `handles`
     learned, backends           where learned models and workers take part
     gate            how sure each stage is; does the motion fit the caption?

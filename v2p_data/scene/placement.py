@@ -57,11 +57,13 @@ _NO_SPREAD = 0.01
 _GRIP_HEIGHT_M = 0.08
 """Over the table, of a hand that pushes with something: the fist must clear the table."""
 _OTHER_FORM_COST = 0.02
-"""By so much a noun's second form must cover an outline better where it is a box: that has a side and a turn more to choose than a cylinder."""
+"""By so much a noun's second form must cover an outline better where it alone is a box: that has a side and a turn more to choose than a cylinder."""
 _LYING_TELLS = 0.1
 """A lid that is taken off lies on the table at first if that fits so much better, in units of IoU."""
 _SIZE_TELLS, _MOST_OFF = 0.01, 3.0
 """Of a form whose size is one standard deviation off, in units of IoU, and from where on it counts no more."""
+_COVERED_TELLS = 0.02
+"""The same of a lid that is not as wide as what it covers: no jar's lid lies on a pot."""
 _PITCH_RANGE_RAD = (0.15, 1.4)
 """From nearly level to nearly straight down: beyond, outlines on the table say nothing of places on it."""
 _MOUTH_DOWN = np.diag([1.0, -1.0, -1.0])
@@ -379,7 +381,7 @@ def with_forms(
                 _cost_of(fit_shape(silhouette, noun, np.eye(3)), noun, guess, under)
                 for noun in (s.noun, s.noun.other)
             )
-            freer = _OTHER_FORM_COST if s.noun.other.form == "box" else 0.0
+            freer = _OTHER_FORM_COST if s.noun.other.form == "box" != s.noun.form else 0.0
             s = replace(s, noun=s.noun.other if other + freer < usual else s.noun)
         out.append(s)
     return tuple(out)
@@ -395,10 +397,11 @@ def _cost_of(fit: Fit, noun: Noun, guess: CameraGuess, beneath: Noun | None) -> 
         (sizes + np.log(height_m)) / np.hypot(noun.spread, sd)
         for height_m, sd in guess.heights(guess.pitch_rad)
     ]
+    told = _SIZE_TELLS * float(np.square(np.clip(offs, -_MOST_OFF, _MOST_OFF)).sum())
     if beneath is not None and beneath.form == "cylinder":
-        wider = float(np.log(noun.size_m[0] / beneath.size_m[0]))
-        offs.append(wider / float(np.hypot(noun.spread, beneath.spread)))
-    return fit.cost + _SIZE_TELLS * float(np.square(np.clip(offs, -_MOST_OFF, _MOST_OFF)).sum())
+        wider = np.log(noun.size_m[0] / beneath.size_m[0]) / np.hypot(noun.spread, beneath.spread)
+        told += _COVERED_TELLS * float(np.clip(wider, -_MOST_OFF, _MOST_OFF)) ** 2
+    return fit.cost + told
 
 
 def _best_pitch(shown: list[_Shown], guess: CameraGuess) -> tuple[float, list[Fit]]:
