@@ -16,6 +16,8 @@ _MAX_RADIUS = 0.8
 """Of the fitted diameter: rings are tried up to here."""
 _BEYOND = 0.35
 """Of the fitted height: a profile may go on that far beyond the primitive."""
+_RIM = 0.12
+"""Of its height, what is open at the top does not close again so near to its rim: corners of outlines come out round."""
 _RING_INSIDE = 0.94
 """Of a ring's points must lie in the mask: a disc half a percent too large has 6 % outside."""
 
@@ -53,6 +55,8 @@ def revolution(view: View, crop: Crop, size_m: Size, noun: Noun) -> Candidate | 
         return None
     z, radius = z[first : last + 1], radius[first : last + 1]
     radius = gaussian_filter1d(radius, 1.0, mode="nearest")
+    if noun.hollow:
+        radius = _with_rim(z, radius)
     middle = (z[0] + z[-1]) / 2
     profile = np.c_[np.maximum(radius, 1e-3 * diameter), z - middle]
     wide, tall = 2 * float(radius.max()), float(z[-1] - z[0])
@@ -88,6 +92,14 @@ def _carved(
     reach = np.cumprod(fits, axis=1).sum(axis=1)
     sure = (np.cumprod(fits, axis=1) * seen).any(axis=1)
     return np.where((reach > 1) & sure, radii[np.maximum(reach - 1, 0)], 0.0)
+
+
+def _with_rim(z: Float[np.ndarray, "k"], radius: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+    """Return the radii of a vessel, its rim at the last, as wide there as just below."""
+    below = np.flatnonzero(z < z[-1] - _RIM * (z[-1] - z[0]))
+    out = radius.copy()
+    out[below[-1] :] = np.maximum(out[below[-1] :], radius[below[-1]])
+    return out
 
 
 def _needed(
