@@ -148,6 +148,26 @@ def test_a_bowl_bulges_and_can_be_filled():
     np.testing.assert_allclose(winding(choice.mesh, floor), 1, atol=1e-6)
 
 
+def test_a_cup_is_open_as_wide_as_it_is_below_its_rim():
+    """Outlines come out with round corners."""
+    size = (0.08, 0.08, 0.1)
+    whole = seen([placed(lathe(np.array([(0.032, 0.0), (0.04, 0.1)]), 0.003))])
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (21, 21))
+    mask = cv2.morphologyEx(whole.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0
+
+    choice = best_shape(
+        [View(mask=mask, T_world_obj=fit(size))],
+        CAMERA,
+        size,
+        noun("cylinder", hollow=True, taper=1.0, symmetry="round"),
+        ShapeConfig(revolution_margin=-1.0),
+    )
+
+    assert choice.kind == "revolution"
+    r, z = np.hypot(*choice.mesh.vertices[:, :2].T), choice.mesh.vertices[:, 2] / choice.size_m[2]
+    assert r[z > 0.49].max() >= r[(z > 0.3) & (z < 0.38)].max() - 1e-6
+
+
 def test_a_bowl_that_lies_on_its_mouth_keeps_its_height():
     """From steeply above, its base is seen within the outline of its rim."""
     steep, size = camera_above((240, 320), 1.0, 1.01, 0.5), (0.158, 0.158, 0.06)

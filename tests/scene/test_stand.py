@@ -78,6 +78,17 @@ def test_of_two_things_the_one_that_was_pushed_to_is_meant(watched_of):
     assert iou(found.mask, large(near, footage)) > 0.8
 
 
+def test_a_bowl_that_fills_a_third_of_the_picture_is_still_a_thing(watched_of):
+    bowl, small = square(50, 20, 62), square(5, 5)
+    frames = pushed_to(60, [(bowl, BLUE), (small, BLUE)])
+
+    found, footage = meant(
+        watched_of, frames, "bowl", "throw_into", (square(5, 40), square(60, 40))
+    )
+
+    assert iou(found.mask, large(bowl, footage)) > 0.8
+
+
 def test_a_named_colour_outweighs_a_little_distance(watched_of):
     near, far = square(60, 62), square(70, 15)
     frames = pushed_to(60, [(near, BLUE), (far, GREEN)])

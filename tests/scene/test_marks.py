@@ -1,0 +1,58 @@
+"""What somebody draws on a frame becomes an outline there; people draw a few pixels off."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from v2p_data.scene.footage import Footage, footage_of
+from v2p_data.scene.marks import Box, marks_of
+from v2p_data.scene.segment import bounding_box
+from v2p_data.video.clip import Clip
+
+GREY, RED = (120, 118, 115), (190, 40, 40)
+H, W = 240, 320
+X, Y, WIDE, TALL = 140, 100, 40, 30
+
+
+@pytest.fixture
+def drawn() -> tuple[Clip, Footage]:
+    grain = np.random.default_rng(0).integers(-6, 7, (H, W, 3))
+    image = np.full((H, W, 3), GREY) + grain
+    image[Y : Y + TALL, X : X + WIDE] = RED + grain[Y : Y + TALL, X : X + WIDE]
+    frames = np.stack([image.astype(np.uint8)] * 10)
+    clip = Clip(
+        item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=frames, fps=12.0,
+        total_frames=10, source_fps=12.0, source_frame=np.arange(10), times_s=np.arange(10) / 12,
+        source_size_px=(W, H), warnings=(),
+    )  # fmt: skip
+    return clip, footage_of(clip)
+
+
+def outlined(drawn, *box):
+    clip, footage = drawn
+    x0, y0, x1, y1 = (float(v) for v in box)
+    said = Box(frame=0, box_xyxy=(x0, y0, x1, y1), score=0.9)
+    return marks_of(clip, footage, None, {"box": said})["box"]
+
+
+@pytest.mark.parametrize("off_px", [-3, 3])
+def test_sides_that_a_box_cuts_off_belong_to_the_outline(drawn, off_px):
+    box = (X + off_px, Y + 2, X + WIDE + off_px, Y + TALL - 2)
+
+    x, y, w, h = bounding_box(outlined(drawn, *box).mask)
+
+    assert (x, y, w, h) == pytest.approx((X, Y, WIDE, TALL), abs=1)
+
+
+def test_what_was_drawn_stays_what_was_drawn(drawn):
+    mark = outlined(drawn, X + 3, Y, X + WIDE + 3, Y + TALL)
+
+    assert bounding_box(mark.box) == (X + 3, Y, WIDE, TALL)
+
+
+def test_far_beside_a_box_nothing_belongs_to_it(drawn):
+    """Of a box around the left half the right half is something else, as far as colours tell."""
+    mask = outlined(drawn, X, Y, X + WIDE // 2, Y + TALL).mask
+
+    assert not mask[:, X + WIDE // 2 + 5 :].any()
