@@ -27,6 +27,8 @@ _FILLED = 0.85
 """People draw boxes tightly: of an outline that spans less of its box a part is missing."""
 _BESIDE_PX = 3
 """At working size, 320 px wide: so far beside a box an edge may lie. People are off by a pixel or two."""
+_RAN_AWAY = 0.2
+"""Of the box: an outline that agrees with it so much less than before went on into something alike beside it."""
 _LEAST_SPAN = 0.55
 """Of a person's box: what has a face in the table's colours is outlined without it; then the box itself says more."""
 
@@ -97,7 +99,9 @@ def _boxed(
         if spans(mask, drawn) < _FILLED:
             mask = filled(mask, watched.at(i), inside)
         mask = less_table(mask, watched.at(i))
-    mask = refine(footage.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
+    beside = refine(footage.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
+    if spans(beside, drawn) > spans(mask, drawn) - _RAN_AWAY:
+        mask = beside
     if watched is not None and spans(mask, drawn) < _LEAST_SPAN:
         mask = ellipse_in(drawn, footage.shape)
     return Mark(mask=mask, frame=i, sure=sure, box=inside)

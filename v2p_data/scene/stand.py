@@ -34,8 +34,9 @@ _LEVELS = (0.75, 0.5, 0.25)
 """Probabilities at which what the network sees is cut into things."""
 _LEAST_SHARE, _MOST_SHARE = 0.0005, 0.2
 """Of the picture."""
-_MOST_SEEN_SHARE = 0.45
-"""The same where the network says it is a thing: bowls and baskets are filmed from near. What only stands out may be half of a table."""
+_MOST_SEEN_SHARE, _TOO_LARGE = 0.45, 0.3
+"""The same where the network says it is a thing, and the logarithm of how much larger than usual that may be: bowls and baskets are
+filmed from near, but so are tables that seem to be things."""
 _KINDS_VARY = 0.3
 """Logarithm: what moves may be so much larger or smaller than usual without anybody's doubting the camera."""
 _FOOT = 0.8
@@ -186,17 +187,14 @@ def candidates(search: Search) -> list[Candidate]:
     free = ~search.taken & ~grow(search.ends[1], 2) if late else ~search.taken
     lab, way = lab_of(still), _Way.of(search)
     usual = float(colour[table.seen].mean()) if colour is not None and table.seen.any() else 0.0
-    return [
-        Candidate(
-            mask=mask,
-            cues={
-                "part": float(is_part),
-                **_own_cues(search, mask, lab, colour, usual),
-                **way.cues(mask, search.kind),
-            },
-        )
-        for mask, is_part in _masks(search.stands, apart, free, colour)
-    ]
+    found = []
+    for mask, is_part in _masks(search.stands, apart, free, colour):
+        own = _own_cues(search, mask, lab, colour, usual)
+        if mask.mean() > _MOST_SHARE and own["larger than usual"] > _TOO_LARGE:
+            continue
+        cues = {"part": float(is_part), **own, **way.cues(mask, search.kind)}
+        found.append(Candidate(mask=mask, cues=cues))
+    return found
 
 
 def _own_cues(
