@@ -188,6 +188,19 @@ def test_of_a_clip_that_was_made_twice_the_newer_scene_counts(filmings, capsys):
     assert height_in(filmings.said(capsys)[1].out) == pytest.approx(0.5, abs=0.001)
 
 
+def test_what_cannot_be_read_is_left_out(filmings, capsys):
+    for item in ("one", "two", "old", "torn"):
+        filmings.scene(item, 0.5)
+    (filmings.root / "scene" / "old-0a1b2c3d" / "scene.json").write_text('{"schema": 1}')
+    (filmings.root / "scene" / "torn-0a1b2c3d" / "record.json").write_text('{"stage": "sce')
+
+    code, said = filmings.said(capsys)
+
+    assert code == 0
+    assert "2 clips from one stand" in said.out
+    assert "'old' is left out" in said.err
+
+
 def test_a_clip_from_elsewhere_is_named_and_can_be_left_out(filmings, capsys):
     for item in ("one", "two", "three", "four"):
         filmings.scene(item, 0.5)

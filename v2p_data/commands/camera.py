@@ -1,6 +1,7 @@
 """`v2p scene camera`: what all scenes of a run together say of the one camera that filmed them."""
 
 import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import tyro
 from v2p_data.cli import COMMANDS, parse
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.pipeline.artifact import Record, read_record
+from v2p_data.report.reading import PARTIAL_SUFFIX
 from v2p_data.scene.one_camera import FEWEST, Filmed, SharedCamera, filmed, shared_camera
 from v2p_data.scene.scene import Scene
 
@@ -65,13 +67,19 @@ def guessed_scenes(run: Path) -> dict[str, tuple[Scene, Record]]:
         raise V2PError(f"{run} holds no scenes; make some with 'v2p scene VIDEOS --out RUN'")
     newest: dict[str, tuple[str, Path, Record]] = {}
     for folder in sorted((run / "scene").iterdir()):
-        record = read_record(folder) if folder.is_dir() and folder.suffix != ".partial" else None
+        record = _record_in(folder)
         if record is None or record.rejected or _given(record):
             continue
         when = str(record.provenance.get("time", ""))
         if record.item not in newest or when >= newest[record.item][0]:
             newest[record.item] = when, folder, record
-    return {item: (Scene.load(folder), record) for item, (_, folder, record) in newest.items()}
+    scenes = {}
+    for item, (_, folder, record) in newest.items():
+        try:
+            scenes[item] = Scene.load(folder), record
+        except V2PError as error:
+            print(f"'{item}' is left out: {error}", file=sys.stderr)  # noqa: T201
+    return scenes
 
 
 def table(clips: Sequence[Filmed], camera: SharedCamera) -> str:
@@ -99,6 +107,16 @@ def flags(camera: SharedCamera) -> list[str]:
         f"--scene.{name.replace('_', '-')}={value:.3f}"
         for name, value in zip(_SETTINGS, values, strict=True)
     ]
+
+
+def _record_in(folder: Path) -> Record | None:
+    """Return the record of a complete scene; None for what is half made or cannot be read."""
+    if folder.suffix == PARTIAL_SUFFIX:
+        return None
+    try:
+        return read_record(folder)
+    except (ValueError, TypeError, OSError):
+        return None
 
 
 def _given(record: Record) -> bool:
