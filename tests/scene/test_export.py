@@ -98,6 +98,7 @@ def reconstruction() -> Reconstruction:
         confidence=0.8,
         warnings=(),
         stages={"mesh": (0.61234, "the neck is hidden"), "pose": (0.9, "")},
+        scale_spread=0.123,
     )
 
 
@@ -122,6 +123,10 @@ def mujoco_warnings() -> Iterator[list[str]]:
         yield said
     finally:
         mujoco.set_mju_user_warning(before)
+
+
+def test_a_scene_says_how_sure_its_scale_is(scene):
+    assert scene.scale_spread == 0.123
 
 
 def test_the_file_says_what_a_task_needs_to_know(folder):
