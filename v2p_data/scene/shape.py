@@ -33,8 +33,8 @@ class ShapeConfig:
     revolution_margin: float = 0.025
     ball_margin: float = 0.06
     """For round fruit: a pear is no ball, but most outlines of balls are dented by noise."""
-    irregular_margin: float = 0.015
-    """For an inflated silhouette of what is known to have no simple shape."""
+    irregular_margin: float = -0.06
+    """For an inflated silhouette of what is known to have no simple shape: there the primitive must cover the outline better."""
     regular_margin: float = 0.15
     """For an inflated silhouette of anything else."""
     min_px: int = 80
