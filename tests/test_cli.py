@@ -1,6 +1,7 @@
 """What a user gets for bad input: one sentence, exit code 2, and nothing made before is harmed."""
 
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -86,6 +87,27 @@ def test_where_no_video_was_understood_the_review_page_comes_next(capsys, tmp_pa
     assert run(["scene", str(videos), "--out", str(tmp_path / "run")]) == 2
 
     assert f"Next: v2p scene review {tmp_path / 'run'}" in capsys.readouterr().out
+
+
+def test_the_next_command_keeps_the_settings(capsys, tmp_path):
+    """Without them it would make everything anew, otherwise."""
+    videos, out = tmp_path / "my videos", tmp_path / "run"
+    videos.mkdir()
+    (videos / "lift_up__mug.mp4").write_bytes(b"no video")
+
+    run(["task", "--seed", "3", f"{videos}/", "--out", str(out), "--scene.fov-rad=1.0"])
+
+    after = shlex.split(capsys.readouterr().out.split("Next: ")[1])
+    assert after == [
+        "v2p",
+        "expert",
+        str(videos),
+        "--out",
+        str(out),
+        "--seed",
+        "3",
+        "--scene.fov-rad=1.0",
+    ]
 
 
 def test_videos_that_nobody_describes_are_named(capsys, videos, tmp_path):

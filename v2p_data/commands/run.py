@@ -317,7 +317,9 @@ def _up_to(
     counts = tally(list(outcomes.values()), name)
     rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
     out = shlex.quote(str(args.out))
-    goes_on = f"{then} {shlex.quote(str(args.videos))} --out {out}"
+    goes_on = shlex.join(
+        [*then.split(), str(args.videos), "--out", str(args.out), *_settings_in(argv, args)]
+    )
     if name == "scene" and not counts["usable"]:
         goes_on = f"v2p scene review {out}   (to mark what was not found)"
     elif then == "v2p generate":
@@ -328,6 +330,17 @@ def _up_to(
         goes_on,
     )
     return 0 if counts["usable"] else 2
+
+
+def _settings_in(argv: Sequence[str], args: FromVideos) -> list[str]:
+    """Return what a command line says beside videos and run folder: without it the next command would make everything anew."""
+    words = list(argv)
+    words.remove(next(word for word in words if Path(word) == args.videos))
+    for k, word in enumerate(words):
+        if word == "--out" or word.startswith("--out="):
+            del words[k : k + (1 if "=" in word else 2)]
+            break
+    return words
 
 
 def _videos(folder: Path) -> list[VideoItem]:
