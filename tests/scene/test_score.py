@@ -1,6 +1,7 @@
 """Truth and reconstruction are compared by what can be seen and used; numbers by hand."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,11 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.mesh import mesh_for
 from v2p_data.geometry.pose import transform
+from v2p_data.scene.nouns import noun_for
+from v2p_data.scene.pose import camera_above
+from v2p_data.scene.reconstruct import Estimate, Reconstruction
 from v2p_data.scene.score import (
     FoundClip,
     FoundThing,
     TrueClip,
     TrueThing,
+    found_of,
     opening,
     rejected,
     score_clip,
@@ -22,6 +27,8 @@ from v2p_data.scene.score import (
     size_sides,
     turn_between,
 )
+from v2p_data.scene.spoon import spoons
+from v2p_data.video.clip import Clip
 
 BOX_M = (0.12, 0.08, 0.04)
 CAMERA = transform(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.5]))
@@ -434,3 +441,25 @@ def test_of_a_mug_with_its_handle_and_a_round_one_the_open_side_is_compared():
 
     assert turn_between(handled, plain, about("z", 75), np.eye(3)) == pytest.approx(0, abs=1e-6)
     assert np.degrees(turn_between(handled, plain, np.eye(3), about("x", 90))) == pytest.approx(90)
+
+
+@pytest.mark.parametrize(("name", "hollow"), [("spoon", False), ("bowl", True)])
+def test_what_arches_is_no_vessel_and_what_is_open_is_one(name, hollow):
+    """Room under a spoon's handle is not closed before spoons are compared."""
+    noun, T = noun_for(name), np.eye(4)
+    solids = {"spoon": spoons(noun.size_m, T)[0].mesh, "bowl": None}
+    thing = Estimate(
+        name=name, label=name, role="manipulated", noun=noun, size_m=noun.size_m, rgba=(1.0, 1.0, 1.0, 1.0), frames=(0, 1),
+        T_world_objs=np.stack([T, T]), confidences=(1.0, 1.0), masks={}, source={}, mass_kg=0.1, mesh=solids[name],
+    )  # fmt: skip
+    clip = Clip(
+        item="a", path=Path("a.mp4"), caption="", objects=(), hints={}, frames=np.zeros((2, 8, 8, 3), np.uint8), fps=12.0, total_frames=2,
+        source_fps=12.0, source_frame=np.arange(2), times_s=np.arange(2) / 12, source_size_px=(8, 8), warnings=(),
+    )  # fmt: skip
+    made = Reconstruction(
+        clip=clip, kind="lift_up", objects=(thing,), camera=camera_above((8, 8), 0.6, 1.0), confidence=1.0, warnings=(), stages={},
+    )  # fmt: skip
+
+    (found,) = found_of(made).things
+
+    assert found.hollow is hollow

@@ -17,7 +17,7 @@ Reading order:
                     `marks` (a person's), then `segment` and `track`
     placement, pose             masks become camera, sizes and poses, in camera heights
     nouns, scale                usual sizes turn camera heights into metres; `one_camera` puts together what several clips say
-    shape           primitive, solid of revolution (`revolved`) or inflated silhouette (`inflation`), with `handles`
+    shape           primitive, solid of revolution (`revolved`) or inflated silhouette (`inflation`), with `handles`; a `spoon`
     learned, backends           where learned models and workers take part
     gate            how sure each stage is; does the motion fit the caption?
     scene, export, overlay      what is written

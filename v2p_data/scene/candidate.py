@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from v2p_data.scene.crop import Crop, View
 
-Kind = Literal["primitive", "revolution", "inflated"]
+Kind = Literal["primitive", "revolution", "inflated", "spoon"]
 Size = tuple[float, float, float]
 
 

@@ -258,7 +258,8 @@ def found_of(reconstruction: Reconstruction) -> FoundClip:
         masks = {int(file_frame[f]): mask for f, mask in thing.masks.items()}
         noun = thing.noun
         mesh = thing.mesh
-        hollow = noun.hollow if mesh is None else opening(mesh) is not None
+        # What arches is no vessel: a spoon has room under its handle.
+        hollow = noun.hollow and (mesh is None or opening(mesh) is not None)
         if mesh is None:
             mesh = mesh_for(noun.form, thing.size_m, hollow=hollow, taper=noun.taper)
         things.append(

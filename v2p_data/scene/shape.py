@@ -21,7 +21,10 @@ from v2p_data.scene.inflation import inflation
 from v2p_data.scene.nouns import Form, Noun
 from v2p_data.scene.revolved import revolution
 from v2p_data.scene.segment import handle_of
+from v2p_data.scene.spoon import is_spoon, spoons
 
+_OTHER_END = 0.03
+"""By so much, in units of IoU, a spoon must cover its outline better with its bowl at the end at which hands hold spoons."""
 _OTHER_SIDES = 1.8
 """An inflated silhouette's sides are at most by this factor others than the fitted primitive's."""
 
@@ -91,6 +94,10 @@ def best_shape(
     cfg = cfg or ShapeConfig()
     crops = [Crop(view, camera) for view in views]
     primitive = _primitive(size_m, noun)
+    if is_spoon(noun):
+        held, other = spoons(size_m, views[0].T_world_obj)
+        gain = iou_of(other, views, crops) - iou_of(held, views, crops)
+        primitive = other if gain > _OTHER_END else held
     plain = iou_of(primitive, views, crops)
     hidden = crops[0].hidden_share(crops[0].drawn(primitive.mesh, views[0].T_world_obj))
     best, best_iou, best_gain = primitive, plain, 0.0
@@ -157,7 +164,7 @@ def _others(
             body = Crop(replace(view, mask=view.mask & ~handle, hidden=unknown), crop.camera)
         found.append((revolution(view, body, size_m, noun), margin))
     if not noun.hollow and noun.symmetry != "sphere" and not crop.at_border:
-        irregular = noun.form == "box" and noun.symmetry == "none"
+        irregular = noun.form == "box" and noun.symmetry == "none" and not is_spoon(noun)
         margin = cfg.irregular_margin if irregular else cfg.regular_margin
         found.append((inflation(view, crop, size_m), margin))
     return [(candidate, margin) for candidate, margin in found if candidate is not None]
@@ -170,6 +177,8 @@ def _as_large(shape: Candidate, size_m: Size) -> bool:
 
 
 def _word(noun: Noun) -> str:
+    if is_spoon(noun):
+        return "spoon"
     if noun.bore:
         return "ring"
     hollow = "hollow " if noun.hollow else ""
