@@ -372,11 +372,11 @@ def with_forms(
     beneath = objects[1].noun if kind in ("cover", "uncover") and len(objects) > 1 else None
     camera = camera_above(footage.shape, guess.pitch_rad, guess.fov_rad)
     out = []
-    for s in objects:
+    for k, s in enumerate(objects):
         if s.noun.other is not None:
             unknown = _others(objects, s, s.at)
             silhouette = Silhouette(s.first, unknown, camera)
-            under = beneath if s is objects[0] and _is_lid(s.noun) else None
+            under = beneath if k == 0 and _is_lid(s.noun) else None
             usual, other = (
                 _cost_of(fit_shape(silhouette, noun, np.eye(3)), noun, guess, under)
                 for noun in (s.noun, s.noun.other)
