@@ -10,7 +10,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +109,13 @@ def parse[T](kind: type[T], argv: list[str], command: str, default: T | None = N
             raise
         wrong = _by_option(_one_sentence(words.getvalue()), argv)
         raise V2PError(f"{wrong}.{_meant(argv, command)} See 'v2p {command} --help'") from error
+
+
+def command_of(provenances: Sequence[Mapping[str, Any]]) -> list[str] | None:
+    """Return the command line that the newest of these records was made by, with all its settings; None where it is not known."""
+    newest = max(provenances, key=lambda made: str(made.get("time", "")), default={})
+    argv = [str(word) for word in newest.get("argv", [])]
+    return argv if argv[1:2] and argv[1] in COMMANDS else None
 
 
 def _meant(argv: list[str], command: str) -> str:

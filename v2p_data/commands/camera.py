@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from v2p_data.cli import COMMANDS, parse
+from v2p_data.cli import command_of, parse
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.pipeline.artifact import Record, read_record
 from v2p_data.report.reading import PARTIAL_SUFFIX
@@ -52,8 +52,9 @@ def camera_command(argv: list[str]) -> int:
         print(  # noqa: T201
             f"'{item}' seems to be filmed from elsewhere, or to be misunderstood: look at it, and name it with --without"
         )
-    records = [record for _, record in scenes.values()]
-    print(f"Next: {shlex.join([*_made_by(args.run, records), *flags(camera)])}")  # noqa: T201
+    records = [record.provenance for _, record in scenes.values()]
+    again = command_of(records) or ["v2p", "scene", "VIDEOS", "--out", str(args.run)]
+    print(f"Next: {shlex.join([*again, *flags(camera)])}")  # noqa: T201
     return 0
 
 
@@ -124,14 +125,3 @@ def _given(record: Record) -> bool:
     recipe: dict[str, Any] = record.recipe.get("config") or {}
     scene: dict[str, Any] = recipe.get("scene") or {}
     return any(scene.get(name) is not None for name in _SETTINGS[:3])
-
-
-def _made_by(run: Path, records: Sequence[Record]) -> list[str]:
-    """Return the command that made the newest of these scenes: as nobody told it the camera, that can be added."""
-    newest = max(records, key=lambda record: str(record.provenance.get("time", "")))
-    argv = [str(word) for word in newest.provenance.get("argv", [])]
-    return (
-        argv
-        if argv[1:2] and argv[1] in COMMANDS
-        else ["v2p", "scene", "VIDEOS", "--out", str(run)]
-    )

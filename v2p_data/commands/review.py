@@ -13,7 +13,7 @@ from typing import Any
 import tyro
 
 from policies.evaluation.rate import wilson
-from v2p_data.cli import COMMANDS, parse
+from v2p_data.cli import command_of, parse
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.report.reading import Result, number, read_run
@@ -240,12 +240,9 @@ def _applied(args: Review, addition: Path, folder: Path | None, results: Sequenc
 
 def _made_by(args: Review, folder: Path, results: Sequence[Result]) -> list[str]:
     """Return the command that made the run, with all its settings, or the plain one where it is not known."""
-    records = [r.record for r in results if r.record is not None]
-    newest = max(records, key=lambda r: str(r.provenance.get("time", "")), default=None)
-    argv = [str(a) for a in newest.provenance.get("argv", [])] if newest else []
-    if args.videos is None and argv[1:2] and argv[1] in COMMANDS:
-        return argv
-    return ["v2p", "scene", str(folder), "--out", str(args.run)]
+    records = [r.record.provenance for r in results if r.record is not None]
+    argv = command_of(records) if args.videos is None else None
+    return argv or ["v2p", "scene", str(folder), "--out", str(args.run)]
 
 
 def _read_review(path: Path) -> list[dict[str, Any]]:

@@ -10,7 +10,6 @@ import trimesh
 from jaxtyping import Float
 
 from v2p_data.geometry.mesh import lathe
-from v2p_data.geometry.pose import transform
 from v2p_data.scene.candidate import Candidate, Size, turned
 from v2p_data.scene.nouns import Noun
 
@@ -42,16 +41,16 @@ def spoons(size_m: Size, T_world_obj: Float[np.ndarray, "4 4"]) -> tuple[Candida
     axes[up, 2] = 1.0 if R[2, up] >= 0 else -1.0
     axes[:, 1] = np.cross(axes[:, 2], axes[:, 0])
     mesh, parts = _spoon(size_m[long], size_m[across], size_m[up])
-    over = np.diag([-1.0, -1.0, 1.0])
-    return tuple(  # pyright: ignore[reportReturnType]  # of two
-        Candidate(
+
+    def lying(turn: Float[np.ndarray, "3 3"]) -> Candidate:
+        return Candidate(
             kind="spoon",
             mesh=turned(mesh, turn),
             parts=tuple(turned(part, turn) for part in parts),
-            T_obj_shape=transform(np.eye(3), np.zeros(3)),
+            T_obj_shape=np.eye(4),
         )
-        for turn in (axes, axes @ over)
-    )
+
+    return lying(axes), lying(axes @ np.diag([-1.0, -1.0, 1.0]))
 
 
 def _spoon(
