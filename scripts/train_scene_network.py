@@ -25,7 +25,7 @@ from jaxtyping import Float, Float32, UInt8
 from safetensors.torch import load_file, save_file
 from scipy.spatial.transform import Rotation
 from torch.nn import functional as F  # noqa: N812  (the usual name)
-from training import HELD_OUT, add_commands, compressed, descend, draw_all, write
+from training import HELD_OUT, add_commands, compressed, descend, draw_all, half_precision, write
 
 from v2p_data.geometry.camera import between_centres
 from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
@@ -412,7 +412,7 @@ def train(
     def loss() -> torch.Tensor:
         batch = examples.batch(rng, BATCH)
         x = inputs_of(batch["frame"], batch["early"], batch["late"])
-        with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
+        with half_precision():
             logits, camera = net(x.contiguous(memory_format=torch.channels_last))
         return loss_of(logits.float(), camera, batch)
 

@@ -122,6 +122,13 @@ def batch_of(
     return planes.contiguous(memory_format=torch.channels_last), known, truth
 
 
+def half_precision() -> torch.autocast:
+    """Return a context in which networks compute in half precision, where this CPU knows it: twice as fast there, eight times slower elsewhere."""
+    return torch.autocast(
+        "cpu", torch.bfloat16, enabled=bool(torch.cpu.get_capabilities().get("avx512_bf16"))
+    )
+
+
 def learn[N: torch.nn.Module](
     new: Callable[[], N],
     varied: Callable[[Scene, int, np.random.Generator], tuple[np.ndarray, ...]],
@@ -156,7 +163,7 @@ def learn[N: torch.nn.Module](
         chosen = [scenes.own[k] for k in rng.integers(len(scenes.own), size=batch)]
         views = [(scene, int(rng.integers(len(scene["known"])))) for scene in chosen]
         planes, known, truth = batch_of(varied, views, rng)
-        with torch.autocast("cpu", torch.bfloat16):  # twice as fast on CPUs that know it
+        with half_precision():
             said = net(planes, known)
         return loss_of(said.float(), truth)
 

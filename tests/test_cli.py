@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from v2p_data.cli import run
+from v2p_data.commands.run import _settings_in
 
 SAMPLES = Path(__file__).parents[1] / "datasets" / "sample_videos"
 
@@ -108,6 +109,18 @@ def test_the_next_command_keeps_the_settings(capsys, tmp_path):
         "3",
         "--scene.fov-rad=1.0",
     ]
+
+
+@pytest.mark.parametrize(
+    ("line", "kept"),
+    [
+        ("videos --out run --repo-id a/b --config my.yaml", "--config my.yaml"),
+        ("--repo_id=a/b --out=run --policy.steps 50 videos/", "--policy.steps 50"),
+        ("videos --out videos --repo-id a/b", ""),
+    ],
+)
+def test_what_generate_was_told_is_what_train_and_eval_are_told(line, kept):
+    assert _settings_in(line.split(), Path("videos")) == kept.split()
 
 
 def test_videos_that_nobody_describes_are_named(capsys, videos, tmp_path):

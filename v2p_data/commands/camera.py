@@ -55,6 +55,10 @@ def camera_command(argv: list[str]) -> int:
     records = [record.provenance for _, record in scenes.values()]
     again = command_of(records) or ["v2p", "scene", "VIDEOS", "--out", str(args.run)]
     print(f"Next: {shlex.join([*again, *flags(camera)])}")  # noqa: T201
+    if args.without:
+        print(  # noqa: T201
+            f"That gives this camera to all videos of the folder: take those of {', '.join(args.without)} out of it before"
+        )
     return 0
 
 

@@ -145,7 +145,7 @@ def generate_command(argv: list[str]) -> int:
     _say(
         f"Made {dataset}",
         f"{counts['episodes']} episodes, {counts['frames']} frames; page: {page}",
-        f"v2p train {shlex.quote(str(dataset))}",
+        shlex.join(["v2p", "train", str(dataset), *_settings_in(argv, args.videos)]),
     )
     return 0
 
@@ -160,7 +160,7 @@ def train_command(argv: list[str]) -> int:
     _say(
         f"Made {policy}",
         f"loss {loss:.3f} after {args.engine.policy.steps} steps; page: {page}",
-        f"v2p eval {shlex.quote(str(policy))}",
+        shlex.join(["v2p", "eval", str(policy), *_settings_in(argv, args.dataset)]),
     )
     return 0
 
@@ -318,7 +318,7 @@ def _up_to(
     rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
     out = shlex.quote(str(args.out))
     goes_on = shlex.join(
-        [*then.split(), str(args.videos), "--out", str(args.out), *_settings_in(argv, args)]
+        [*then.split(), str(args.videos), "--out", str(args.out), *_settings_in(argv, args.videos)]
     )
     if name == "scene" and not counts["usable"]:
         goes_on = f"v2p scene review {out}   (to mark what was not found)"
@@ -332,14 +332,15 @@ def _up_to(
     return 0 if counts["usable"] else 2
 
 
-def _settings_in(argv: Sequence[str], args: FromVideos) -> list[str]:
-    """Return what a command line says beside videos and run folder: without it the next command would make everything anew."""
+def _settings_in(argv: Sequence[str], source: Path) -> list[str]:
+    """Return what a command line says beside what it begins with and where it goes: without it the next command would do all anew."""
     words = list(argv)
-    words.remove(next(word for word in words if Path(word) == args.videos))
-    for k, word in enumerate(words):
-        if word == "--out" or word.startswith("--out="):
-            del words[k : k + (1 if "=" in word else 2)]
-            break
+    words.remove(next(word for word in words if Path(word) == source))
+    for flag in ("--out", "--repo-id", "--repo_id"):
+        for k, word in enumerate(words):
+            if word == flag or word.startswith(flag + "="):
+                del words[k : k + (1 if "=" in word else 2)]
+                break
     return words
 
 
