@@ -16,8 +16,15 @@ class HandEnd:
     """The end of a hand that is farthest from where its arm comes into the picture."""
 
     tip_px: tuple[float, float]
-    way: tuple[float, float]
-    """Unit vector from there to where the arm comes in."""
+    entry_px: tuple[float, float]
+    """Where the arm comes into the picture."""
+
+    @property
+    def way(self) -> tuple[float, float]:
+        """Unit vector from there to where the arm comes in."""
+        dx, dy = self.entry_px[0] - self.tip_px[0], self.entry_px[1] - self.tip_px[1]
+        far = max(1e-6, float(np.hypot(dx, dy)))
+        return dx / far, dy / far
 
 
 def hand_end(hand: Bool[np.ndarray, "h w"]) -> HandEnd | None:
@@ -36,8 +43,9 @@ def hand_end(hand: Bool[np.ndarray, "h w"]) -> HandEnd | None:
     if far.max() < _LEAST_REACH * w:
         return None
     tip = spots[far >= np.percentile(far, 98)].mean(0)
-    way = (entry - tip) / max(1e-6, float(np.linalg.norm(entry - tip)))
-    return HandEnd(tip_px=(float(tip[0]), float(tip[1])), way=(float(way[0]), float(way[1])))
+    return HandEnd(
+        tip_px=(float(tip[0]), float(tip[1])), entry_px=(float(entry[0]), float(entry[1]))
+    )
 
 
 def gap_px(hand: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> float:

@@ -14,7 +14,6 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.colour import lab_of
 from v2p_data.scene.course import (
-    TOUCH_PX,
     Course,
     carried_by_hand,
     course_between,
@@ -23,13 +22,13 @@ from v2p_data.scene.course import (
 )
 from v2p_data.scene.find import SWALLOWING_KINDS, Watched
 from v2p_data.scene.footage import Footage
+from v2p_data.scene.held import fit_held, push_of
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.pose import (
     Fit,
     Silhouette,
     Within,
     camera_above,
-    fit_held,
     fit_lifted,
     fit_pose,
     fit_shape,
@@ -54,8 +53,12 @@ _TURN_COST = 0.007
 """Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
 _NO_SPREAD = 0.01
 """Of the logarithm of a length that is known."""
-_GRIP_HEIGHT_M = 0.08
-"""Over the table, of a hand that pushes with something: the fist must clear the table."""
+_MOST_VIEWS = 5
+"""Frames in which the outline of a tool is compared."""
+_LATE = 0.6
+"""Share of the way of what a tool pushes, from which on an outline shows how the tool ends."""
+_LEAST_QUALITY, _UNSEEN_SURE = 0.4, 0.4
+"""Of a tool's masks that are compared; and how sure a pose is where there is none."""
 _OTHER_FORM_COST = 0.02
 """By so much a noun's second form must cover an outline better where it alone is a box: that has a side and a turn more to choose than a cylinder."""
 _LYING_TELLS = 0.1
@@ -120,7 +123,7 @@ class Placed:
     rival: float | None
     """By how much the next best way of lying covers the outlines worse; None where there is no other."""
     in_fist: bool = False
-    """Whether the hand that lifts it hides it from the camera: then its poses go with the hand."""
+    """Whether a hand hides it from the camera: then its poses go with the hand."""
     unseen: bool = False
     """Whether nothing shows where it ends: then it lies in the middle of what swallowed it."""
     grown: float = 0.0
@@ -128,6 +131,8 @@ class Placed:
     in the air is nearer to the camera, and seems larger."""
     taken_off: bool = False
     """Whether it lies on something at first: then its last outline, on the table, shows its shape."""
+    T_world_seen: Float[np.ndarray, "4 4"] | None = None
+    """Where the sighting's first outline shows it, if that is not its first pose."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,13 +218,14 @@ def place(
         by_hand = _height_by_hand(footage, watched, shown[0], fits[0], kind, camera, guessed)
         if by_hand is not None:
             height_m, spread = camera_height_m(votes, [*known, by_hand])
-    for k, s in enumerate(objects):
-        if s.in_hand:
-            fits[k] = _fit_in_hand(shown[k], thing, camera, height_m)
-    placed = []
+    placed: list[Placed] = []
     for k, see in enumerate(shown):
         if k == 0 and carried:
             placed.append(_in_fist(see, fits[k], carried, camera))
+        elif see.s.in_hand:
+            placed.append(
+                _pushing(see, thing, placed[0], camera, height_m, footage, watched, max_poses)
+            )
         else:
             course = _course(see, fits[k], kind, camera, max_poses)
             placed.append(_placed(see, fits[k], course))
@@ -472,12 +478,8 @@ def _end_of(s: Sighting, kind: str, thing: Sighting) -> tuple[int, Bool[np.ndarr
     if s.role == "manipulated" and kind == "lift_up":
         i = peak(s)
         return i, s.masks[i]
-    if s.in_hand or (s.at > 0 and s.moves):  # a tool may be gone again before the clip ends
-        seen = np.flatnonzero(s.masks.any((1, 2)))
-        touching = [
-            i for i in seen[seen > s.at] if (grow(s.masks[i], TOUCH_PX) & thing.masks[i]).any()
-        ]
-        i = int(touching[-1] if s.in_hand and touching else seen[-1])
+    if s.at > 0 and s.moves:  # a tool may be gone again before the clip ends
+        i = int(np.flatnonzero(s.masks.any((1, 2)))[-1])
         return i, s.masks[i]
     return len(s.masks) - 1, s.last
 
@@ -518,24 +520,64 @@ def _fit_last(
     return min(turned, key=lambda fit: fit.cost), same.cost
 
 
-def _fit_in_hand(see: _Shown, thing: Sighting, camera: Camera, height_m: float) -> _Fits:
-    """Return the poses of a tool in a hand, whose outline is seen beside that of what it pushes."""
-    s, grip = see.s, _GRIP_HEIGHT_M / height_m
-    seen = (
-        (Silhouette(s.first, see.hidden, camera), thing.masks[s.at]),
-        (Silhouette(see.last_mask, see.last_hidden, camera), thing.masks[see.last_i]),
+def _pushing(
+    see: _Shown,
+    thing: Sighting,
+    pushed: Placed,
+    camera: Camera,
+    height_m: float,
+    footage: Footage,
+    watched: Watched | None,
+    max_poses: int,
+) -> Placed:
+    """Return the poses of a tool in a hand, from when what it pushes sets out, or it is first seen well, until that has come to rest."""
+    s = see.s
+    ground = camera.on_plane(np.argwhere(s.first).mean(0)[None, ::-1])[0][:2]
+    push = push_of(
+        Course(list(pushed.frames), list(pushed.T_world_objs), [], []),
+        pushed.first,
+        thing.noun.form,
+        len(s.masks),
+        ground if np.isfinite(ground).all() else np.zeros(2),
+        camera,
+        height_m,
+        watched,
     )
+    begins, ends = push.frames
+    seen = [
+        i
+        for i in range(max(s.at, begins), ends + 1)
+        if s.masks[i].any() and s.quality[i] > _LEAST_QUALITY
+    ] or [s.at]
+    few = np.unique(np.linspace(0, len(seen) - 1, _MOST_VIEWS).round().astype(int))
+    views = []
+    for i in (seen[k] for k in few):
+        unknown = _hidden(footage, (thing, s), s.masks[i], i) | _others((thing, s), s, i)
+        views.append((i, Silhouette(s.masks[i], unknown, camera)))
+    size, spread = (s.known_m, _NO_SPREAD) if s.known_m else (s.noun.size_m, s.noun.spread)
+    held = fit_held(views, push, s.noun, three(np.array(size) / height_m), spread)
+    fit = held.fit
+    gone = np.linalg.norm(push.spots - push.spots[0], axis=1)
+    late = begins <= seen[-1] <= ends and gone[seen[-1]] >= _LATE * gone[-1]
+    last_i = seen[-1] if late else ends
 
-    def fits(size: tuple[float, float, float], spread: float) -> list[Fit]:
-        return [fit_held(mask, s.noun, size, spread, pushed, grip) for mask, pushed in seen]
+    def pose(i: int) -> Float[np.ndarray, "4 4"]:
+        T = fit.T_world_obj.copy()
+        T[:2, 3] += push.spots[i] - push.spots[0]
+        return T
 
-    if s.known_m:
-        first, last = fits(three(np.array(s.known_m) / height_m), _NO_SPREAD)
-    else:
-        free = fits(three(np.array(s.noun.size_m) / height_m), s.noun.spread)
-        # It has one length: as long as it is seen.
-        first, last = fits(max((fit.size for fit in free), key=max), _NO_SPREAD)
-    return _Fits(first=first, last=last)
+    def sure(i: int) -> float:
+        return float(np.clip(fit.iou, 0, 1)) if i in seen else _UNSEEN_SURE
+
+    course = Course([begins], [pose(begins)], [sure(begins)], ["no_depth"])
+    count = min(max_poses, last_i - begins + 1)
+    for i in np.unique(np.linspace(begins, last_i, count).round().astype(int)).tolist():
+        course.then(i, pose(i), sure(i), "no_depth")
+    mask = s.masks[last_i] if late else np.zeros_like(s.first)
+    see = replace(see, last_i=last_i, last_mask=mask)
+    first, last = (replace(fit, T_world_obj=course.poses[k]) for k in (0, -1))
+    placed = _placed(see, _Fits(first=first, last=last), course)
+    return replace(placed, in_fist=not late, T_world_seen=held.T_world_seen)
 
 
 def _goal(

@@ -31,11 +31,6 @@ _LOOK_WEIGHT, _MOST_BY_LOOK = 0.01, 0.15
 """Outlines hardly tell a cube's yaw. What a box costs per nat that the box network finds it less likely, and at most, in units of IoU."""
 _LEAST_FACE_PX = 10
 """Smaller boxes show nothing of how they are turned."""
-_GRIP_AT = 0.7
-"""From its tip, as a share of its length: where a hand holds what it pushes with."""
-_TILTS = (0.34, 0.81)
-"""Sines: steeper nobody holds a short pen, and nobody lays a long stick flat."""
-_TILT_SD_RAD = 0.25
 _PRIOR_WEIGHT = 0.03
 """Cost of proportions one sigma off the noun's, in units of IoU."""
 
@@ -176,13 +171,6 @@ class Silhouette:
         x, y, w, h = self.box
         return np.array([x + w / 2, y + h / 2])
 
-    def nearest_to(self, other: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
-        """Return the point of the mask that is nearest to another mask of the whole picture [px]."""
-        away = cv2.distanceTransform((~other).astype(np.uint8), cv2.DIST_L2, 5)
-        y, x = np.nonzero(self.mask)
-        k = int(away[y, x].argmin())
-        return np.array([x[k] + 0.5, y[k] + 0.5])
-
 
 def _filled(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Return the mask without holes: what is fitted is convex, a ring's hole says nothing against it."""
@@ -263,7 +251,7 @@ def fit_shape(
     ]
     steps = np.array([0.25, 0.25, 0.3, *[0.25] * len(free)])
     # Outlines of a box at two yaws are nearly as good as each other.
-    best = _search(cost, starts, steps, kept=4 if thorough and noun.form == "box" else 2)
+    best = search(cost, starts, steps, kept=4 if thorough and noun.form == "box" else 2)
     size = size_of(best)
     T = posed(best, size)
     points = outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
@@ -326,7 +314,7 @@ def fit_pose(
     if within is not None:
         there = (within.xy - ground) / extents.max()
         starts += [np.array([*there, yaw]) for yaw in turns[:1]]
-    best = _search(cost, starts, np.array([0.15, 0.15, 0.3]))
+    best = search(cost, starts, np.array([0.15, 0.15, 0.3]))
     T = place(best)
     points = points0 @ T[:3, :3].T + T[:3, 3]
     return Fit(
@@ -366,7 +354,7 @@ def fit_lifted(
         turned = 0.01 * (1 - np.cos(v[2]))
         return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + turned + look
 
-    best = _search(
+    best = search(
         cost,
         [np.zeros(3), np.array([0, 0, 0.5]), np.array([0, 0, -0.5])],
         np.array([0.2, 0.2, 0.2]),
@@ -375,77 +363,6 @@ def fit_lifted(
     points = points0 @ T[:3, :3].T + T[:3, 3]
     return Fit(
         size=size,
-        T_world_obj=T,
-        iou=silhouette.iou(points),
-        visible=silhouette.visible(points),
-        cost=cost(best),
-    )
-
-
-def fit_held(
-    silhouette: Silhouette,
-    noun: Noun,
-    size: tuple[float, float, float],
-    spread: float,
-    pushed: Bool[np.ndarray, "h w"],
-    grip_height: float,
-) -> Fit:
-    """Return where something long is that a hand pushes with: on the table at its tip, held up at the grip.
-
-    One outline does not show how steep it is: what brings the grip to `grip_height` over the table is the assumption,
-    from which the outline may pull it a little.
-
-    Args:
-        silhouette: its outline.
-        noun: its shape.
-        size: its usual one, along its own axes, in camera heights like all lengths here.
-        spread: standard deviation of the logarithm of its length. It may be longer than usual; where it seems shorter, the
-            hand or the picture's edge hides the rest.
-        pushed: outline of what it pushes: its tip is the end nearest to that.
-        grip_height: of the hand.
-    """
-    unit = outline_points(noun.form, (1.0, 1.0, 1.0), noun.taper)
-    order = np.argsort(size)[::-1]
-    middle = size[order[1]]
-
-    def size_of(v: np.ndarray) -> np.ndarray:
-        out = np.array(size)
-        out[order[0]] *= np.exp(abs(v[4]))
-        return out
-
-    tip_px = silhouette.nearest_to(pushed)
-    ground = silhouette.camera.on_plane(tip_px[None], middle / 2)[0][:2]
-
-    def place(v: np.ndarray) -> np.ndarray:
-        level = np.array([np.cos(v[2]), np.sin(v[2]), 0.0])
-        along = np.cos(v[3]) * level + np.array([0.0, 0.0, np.sin(v[3])])
-        rotation = np.empty((3, 3))
-        rotation[:, order[0]] = along
-        rotation[:, order[1]] = (-level[1], level[0], 0.0)
-        rotation[:, order[2]] = np.cross(along, rotation[:, order[1]])
-        rotation[:, order[2]] *= np.sign(np.linalg.det(rotation))
-        tip = np.array([*(ground + v[:2] * max(size)), middle / 2])
-        return transform(rotation, tip + along * size_of(v).max() / 2)
-
-    def outline(v: np.ndarray) -> np.ndarray:
-        T = place(v)
-        return (unit * size_of(v)) @ T[:3, :3].T + T[:3, 3]
-
-    def usual_tilt(v: np.ndarray) -> float:
-        high = grip_height / (_GRIP_AT * size_of(v).max())
-        return float(np.arcsin(np.clip(high, *_TILTS)))
-
-    def cost(v: np.ndarray) -> float:
-        off = np.array([(v[3] - usual_tilt(v)) / _TILT_SD_RAD, v[4] / spread])
-        prior = _PRIOR_WEIGHT * float((off**2).sum())
-        return 1 - silhouette.iou(outline(v), _HIDDEN_WEIGHT) + prior
-
-    turns = np.radians(range(0, 360, 20))
-    starts = [np.array([0.0, 0.0, turn, usual_tilt(np.zeros(5)), 0.0]) for turn in turns]
-    best = _search(cost, starts, np.array([0.1, 0.1, 0.3, 0.1, 0.1]))
-    T, points = place(best), outline(best)
-    return Fit(
-        size=three(size_of(best)),
         T_world_obj=T,
         iou=silhouette.iou(points),
         visible=silhouette.visible(points),
@@ -535,7 +452,7 @@ def _aligned(
     return v
 
 
-def _search(
+def search(
     cost: Callable[[np.ndarray], float],
     starts: list[np.ndarray],
     step: np.ndarray,

@@ -338,10 +338,13 @@ def _shaped(sights: Sights, placement: Placement) -> tuple[Placement, list[_Shap
     objects, out = list(placement.objects), []
     for k, (s, placed) in enumerate(zip(sights.objects, placement.objects, strict=True)):
         length, width, tall = (float(v) * height for v in placed.first.size)
-        poses = np.stack(
-            [transform(T[:3, :3], (T[:3, 3] - origin) * height) for T in placed.T_world_objs]
+        seen = placed.T_world_objs[0] if placed.T_world_seen is None else placed.T_world_seen
+        at_first, *rest = (
+            transform(T[:3, :3], (T[:3, 3] - origin) * height)
+            for T in (seen, *placed.T_world_objs)
         )
-        first = View(mask=s.first, T_world_obj=poses[0], hidden=placed.hidden)
+        poses = np.stack(rest)
+        first = View(mask=s.first, T_world_obj=at_first, hidden=placed.hidden)
         last = View(mask=placed.last_mask, T_world_obj=poses[-1], hidden=placed.last_hidden)
         shape = best_shape(
             [last if placed.taken_off else first],
@@ -351,7 +354,7 @@ def _shaped(sights: Sights, placement: Placement) -> tuple[Placement, list[_Shap
             ShapeConfig(handles=s.known_m is None),
         )
         poses = poses @ shape.T_obj_shape
-        shows_it = s.moves and not s.swallowed and placed.last.iou > UNSEEN_IOU
+        shows_it = s.moves and not s.swallowed and placed.last.iou > UNSEEN_IOU and not s.in_hand
         if shows_it and shape.kind != "primitive" and not placed.taken_off:
             in_air = placed.observed[-1] == "no_depth"
             view = replace(last, T_world_obj=poses[-1])

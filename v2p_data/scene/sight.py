@@ -37,7 +37,7 @@ from v2p_data.scene.segment import (
 )
 from v2p_data.scene.stand import Search, find_standing
 from v2p_data.scene.table import Table, find_table
-from v2p_data.scene.tool import find_tool
+from v2p_data.scene.tool import HeldTool, find_tool
 from v2p_data.scene.track import carried, track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
@@ -59,6 +59,8 @@ _LITTLE = 0.2
 _TOUCH_PX = 6
 _BELOW_PX, _SEEN_BELOW = 5, 0.5
 """How far below a thing the network must see table, and how surely in the mean."""
+_SETS_OUT, _WELL_SEEN = 0.05, 0.6
+"""Share of its way that a thing has gone when it moves; and the share of its largest area that shows a tool well."""
 _OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
 """What the caption says of other objects is an aside here: such a scene makes sense without them."""
 
@@ -298,7 +300,7 @@ def _tool(
             masks=found.masks,
             quality=found.quality,
             moves=True,
-            at=found.at,
+            at=_first_pushing(found, scene.mover),
             sure=sure,
             why=found.why,
             hinted=mark is not None,
@@ -312,6 +314,21 @@ def _tool(
     if seen is None:
         _check_needed(scene, thing.phrase, sure)
     return seen
+
+
+def _first_pushing(tool: HeldTool, pushed: Sighting) -> int:
+    """Return the footage frame that shows a tool first and well while what it pushes moves, or shortly before or after."""
+    spots = {i: np.argwhere(m).mean(0) for i, m in enumerate(pushed.masks) if m.any()}
+    start = np.argwhere(pushed.first).mean(0)
+    way = np.argwhere(pushed.last).mean(0) - start
+    gone = {i: float((spot - start) @ way) / max(1e-6, way @ way) for i, spot in spots.items()}
+    moves = [i for i, share in gone.items() if _SETS_OUT < share < 1 - _SETS_OUT]
+    if not moves:
+        return tool.at
+    area = tool.masks.sum((1, 2)) * (tool.quality > 0)
+    around = range(max(0, moves[0] - 1), min(len(area), moves[-1] + 2))
+    seen = [i for i in around if area[i]]
+    return next((i for i in seen if area[i] > _WELL_SEEN * area[seen].max()), tool.at)
 
 
 def _held(scene: _Scene, thing: Sighting, mark: Mark) -> Sighting | None:
