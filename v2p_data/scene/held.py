@@ -33,8 +33,8 @@ _ARM_SD_RAD, _BEHIND_SD_RAD = 0.9, 1.0
 """How far the tool's heading is from the arm's, and from straight back."""
 _GAP_SD_M, _ASIDE_SD_M = 0.01, 0.015
 """How far its tip is from what it pushes, and aside of the middle."""
-_AWAY_SD_M = 0.1
-"""The same before and after it pushes."""
+_AWAY_SD_M, _FARTHEST_AWAY = 0.1, 3.0
+"""The same before and after it pushes; and how many of its lengths away it is searched then."""
 _PRIOR_WEIGHT = 0.03
 """Cost of what is one standard deviation off, in units of IoU."""
 _TIP_AT, _HIGHEST_TIP_M = 0.35, 0.03
@@ -209,24 +209,35 @@ def fit_held(
 
     def cost(v: np.ndarray) -> float:
         metres = max(size) * push.height_m
-        off = [
+        turned = [
             (v[3] - usual_tilt(v)) / _TILT_SD_RAD,
-            v[4] / spread,
-            v[0] * metres / np.hypot(_GAP_SD_M, loose),
-            v[1] * metres / np.hypot(_ASIDE_SD_M, loose),
             _between(v[2], back) / _BEHIND_SD_RAD,
         ]
         if push.arm_rad is not None:
-            off.append(_between(v[2], push.arm_rad) / _ARM_SD_RAD)
+            turned.append(_between(v[2], push.arm_rad) / _ARM_SD_RAD)
+        off = [
+            v[4] / spread,
+            v[0] * metres / np.hypot(_GAP_SD_M, loose),
+            v[1] * metres / np.hypot(_ASIDE_SD_M, loose),
+        ]
+        prior = np.square(turned).sum() + np.log1p(np.square(off)).sum()
         points = outline(v)
         ious = [
             silhouette.iou(points + shift, _HIDDEN_WEIGHT)
             for shift, (_, silhouette) in zip(shifts, views, strict=True)
         ]
-        return 1 - float(np.mean(ious)) + _PRIOR_WEIGHT * float(np.square(off).sum())
+        return 1 - float(np.mean(ious)) + _PRIOR_WEIGHT * float(prior)
 
+    tip = np.zeros(2)
+    if away:  # the view's point nearest to where the tip would push
+        i, silhouette = views[0]
+        here = np.array([*(push.spots[i] + push.behind), push.tip_height])
+        pixel = silhouette.nearest_to(silhouette.camera.project(here[None])[0])
+        off_xy = (silhouette.camera.on_plane(pixel[None], push.tip_height)[0] - here)[:2]
+        if np.linalg.norm(off_xy) < _FARTHEST_AWAY * max(size):
+            tip = np.array([off_xy @ push.way, off_xy @ aside]) / max(size)
     turns = np.radians(range(0, 360, 20))
-    starts = [np.array([0.0, 0.0, turn, usual_tilt(np.zeros(5)), 0.0]) for turn in turns]
+    starts = [np.array([*tip, turn, usual_tilt(np.zeros(5)), 0.0]) for turn in turns]
     best = search(cost, starts, np.array([0.1, 0.1, 0.3, 0.1, 0.1]))
     points = outline(best)
     covers = [
