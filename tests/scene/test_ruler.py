@@ -42,12 +42,12 @@ def test_twice_as_many_pixels_per_metre_show_the_same():
         np.random.default_rng(1).integers(0, 255, (120, 160, 3), dtype=np.uint8), (0, 0), 3
     )
     hand = cv2.line(np.zeros((120, 160), np.float32), (0, 60), (100, 80), 1, 12)
-    end = HandEnd(tip_px=(104.0, 81.0), way=(-1.0, 0.0))
+    end = HandEnd(tip_px=(104.0, 81.0), entry_px=(0.0, 81.0))
     foot = np.array([120.0, 90.0])
 
     one = look_at(rgb, hand, end, foot, 200.0, 0.6, 0.1)
     big, big_hand = (cv2.resize(x, None, fx=2, fy=2) for x in (rgb, hand))
-    far = HandEnd(tip_px=(208.0, 162.0), way=(-1.0, 0.0))
+    far = HandEnd(tip_px=(208.0, 162.0), entry_px=(0.0, 162.0))
     two = look_at(big, big_hand, far, 2 * foot, 400.0, 0.6, 0.1)
 
     np.testing.assert_allclose(one.known, two.known, rtol=1e-6)

@@ -24,12 +24,12 @@ _HIDDEN_WEIGHT = 0.15
 """Of pixels that may be hidden, in the overlap."""
 _GRIP_AT = 0.7
 """From its tip, as a share of its length: where a hand holds it."""
-_GRIP_HEIGHT_M = 0.08
-"""Over the table, of a hand that pushes with something: the fist must clear the table."""
-_TILTS = (0.34, 0.81)
-"""Sines: steeper nobody holds a short pen, and nobody lays a long stick flat."""
+_GRIP_HEIGHT_M, _LOWEST_GRIP_M = 0.08, 0.04
+"""Over the table, of a hand that pushes with something, and at least: the fist must clear the table."""
+_STEEPEST, _LEAST_USUAL_TILT_RAD = 0.81, 0.35
+"""Sine: steeper nobody holds a short pen; and a long stick is seldom laid flatter."""
 _TILT_SD_RAD = 0.25
-_ARM_SD_RAD, _BEHIND_SD_RAD = 0.9, 1.0
+_ARM_SD_RAD, _BEHIND_SD_RAD = 0.5, 1.0
 """How far the tool's heading is from the arm's, and from straight back."""
 _GAP_SD_M, _ASIDE_SD_M = 0.01, 0.015
 """How far its tip is from what it pushes, and aside of the middle."""
@@ -188,9 +188,14 @@ def fit_held(
         out[order[0]] *= np.exp(abs(v[4]))
         return out
 
+    def tilt_for(grip_m: float, v: np.ndarray) -> float:
+        high = grip_m / push.height_m / (_GRIP_AT * size_of(v).max())
+        return float(np.arcsin(min(high, _STEEPEST)))
+
     def place(v: np.ndarray) -> np.ndarray:
+        tilt = max(v[3], tilt_for(_LOWEST_GRIP_M, v))
         level = np.array([np.cos(v[2]), np.sin(v[2]), 0.0])
-        along = np.cos(v[3]) * level + np.array([0.0, 0.0, np.sin(v[3])])
+        along = np.cos(tilt) * level + np.array([0.0, 0.0, np.sin(tilt)])
         rotation = np.empty((3, 3))
         rotation[:, order[0]] = along
         rotation[:, order[1]] = (-level[1], level[0], 0.0)
@@ -204,8 +209,7 @@ def fit_held(
         return (unit * size_of(v)) @ T[:3, :3].T + T[:3, 3]
 
     def usual_tilt(v: np.ndarray) -> float:
-        high = _GRIP_HEIGHT_M / push.height_m / (_GRIP_AT * size_of(v).max())
-        return float(np.arcsin(np.clip(high, *_TILTS)))
+        return max(tilt_for(_GRIP_HEIGHT_M, v), _LEAST_USUAL_TILT_RAD)
 
     def cost(v: np.ndarray) -> float:
         metres = max(size) * push.height_m
@@ -213,13 +217,13 @@ def fit_held(
             (v[3] - usual_tilt(v)) / _TILT_SD_RAD,
             _between(v[2], back) / _BEHIND_SD_RAD,
         ]
-        if push.arm_rad is not None:
-            turned.append(_between(v[2], push.arm_rad) / _ARM_SD_RAD)
         off = [
             v[4] / spread,
             v[0] * metres / np.hypot(_GAP_SD_M, loose),
             v[1] * metres / np.hypot(_ASIDE_SD_M, loose),
         ]
+        if push.arm_rad is not None:
+            off.append(_between(v[2], push.arm_rad) / _ARM_SD_RAD)
         prior = np.square(turned).sum() + np.log1p(np.square(off)).sum()
         points = outline(v)
         ious = [

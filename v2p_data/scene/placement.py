@@ -242,7 +242,7 @@ def place(
 def _shown(footage: Footage, objects: tuple[Sighting, ...], s: Sighting, kind: str) -> _Shown:
     thing = objects[0]
     hidden = _hidden(footage, objects, s.first, s.at) | _others(objects, s, s.at)
-    last_i, last_mask = _end_of(s, kind, thing)
+    last_i, last_mask = _end_of(s, kind)
     last_hidden = hidden
     if s.moves:
         last_hidden = _hidden(footage, objects, last_mask, last_i) | _others(objects, s, last_i)
@@ -473,8 +473,8 @@ def _body(
     return mask & ~handle, hidden | handle
 
 
-def _end_of(s: Sighting, kind: str, thing: Sighting) -> tuple[int, Bool[np.ndarray, "h w"]]:
-    """Return the footage frame of an object's last pose, and its mask there; `thing` is what is manipulated."""
+def _end_of(s: Sighting, kind: str) -> tuple[int, Bool[np.ndarray, "h w"]]:
+    """Return the footage frame of an object's last pose, and its mask there."""
     if s.role == "manipulated" and kind == "lift_up":
         i = peak(s)
         return i, s.masks[i]
@@ -552,8 +552,7 @@ def _pushing(
     few = np.unique(np.linspace(0, len(seen) - 1, _MOST_VIEWS).round().astype(int))
     views = []
     for i in (seen[k] for k in few):
-        unknown = _hidden(footage, (thing, s), s.masks[i], i) | _others((thing, s), s, i)
-        views.append((i, Silhouette(s.masks[i], unknown, camera)))
+        views.append((i, Silhouette(s.masks[i], _unknown(footage, thing, s, i), camera)))
     size, spread = (s.known_m, _NO_SPREAD) if s.known_m else (s.noun.size_m, s.noun.spread)
     held = fit_held(views, push, s.noun, three(np.array(size) / height_m), spread)
     fit = held.fit
@@ -574,10 +573,16 @@ def _pushing(
     for i in np.unique(np.linspace(begins, last_i, count).round().astype(int)).tolist():
         course.then(i, pose(i), sure(i), "no_depth")
     mask = s.masks[last_i] if late else np.zeros_like(s.first)
-    see = replace(see, last_i=last_i, last_mask=mask)
+    unknown = _unknown(footage, thing, s, last_i) if late else mask
+    see = replace(see, last_i=last_i, last_mask=mask, last_hidden=unknown)
     first, last = (replace(fit, T_world_obj=course.poses[k]) for k in (0, -1))
     placed = _placed(see, _Fits(first=first, last=last), course)
     return replace(placed, in_fist=not late, T_world_seen=held.T_world_seen)
+
+
+def _unknown(footage: Footage, thing: Sighting, s: Sighting, i: int) -> Bool[np.ndarray, "h w"]:
+    """Return what may hide a tool in a frame: the hand, and what it pushes."""
+    return _hidden(footage, (thing, s), s.masks[i], i) | _others((thing, s), s, i)
 
 
 def _goal(
