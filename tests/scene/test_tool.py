@@ -168,6 +168,7 @@ def test_a_scene_holds_the_tool_in_the_hand_and_makes_no_sense_without_it():
     assert (block.role, block.in_hand) == ("manipulated", False)
     assert (stick.role, stick.in_hand, stick.moves) == ("tool", True, True)
     assert iou(stick.masks[12], sticks[12]) > 0.6
+    assert 7 <= stick.at <= 9  # the block sets out in frame 9
     with pytest.raises(ItemRejectedError, match="the 'stick' was not found") as error:
         sight(bare, footage_of(bare), meaning, seen, 0.5)
     assert error.value.reason == "reference_not_found"
