@@ -530,7 +530,7 @@ def _pushing(
     watched: Watched | None,
     max_poses: int,
 ) -> Placed:
-    """Return the poses of a tool in a hand, from when what it pushes sets out, or it is first seen well, until that has come to rest."""
+    """Return the poses of a tool in a hand, from when what it pushes sets out until that has come to rest."""
     s = see.s
     ground = camera.on_plane(np.argwhere(s.first).mean(0)[None, ::-1])[0][:2]
     push = push_of(
