@@ -211,6 +211,28 @@ def test_a_look_alike_that_lay_there_all_along_is_not_the_thing_at_the_end(
     assert course.quality[-1] == believed
 
 
+def test_what_lies_there_still_keeps_its_whole_outline(watched_of):
+    """The network sees half of a thing that nobody has touched yet; the other half has nearly the table's colours."""
+    frames = []
+    for i in range(12):
+        x = 10 + 9 * max(0, i - 7)
+        upper, lower = square(x, 40), square(x, 40)
+        upper[47:], lower[:47] = False, False
+        frames.append([(upper, RED, MOVED), (lower, (165, 150, 110), MOVED)])
+    footage, _ = watched_of(frames)
+    first, last = large(square(10, 40), footage), large(square(46, 40), footage)
+    half = first.copy()
+    half[: round(47 / H * len(half))] = False
+    moved = Moved(
+        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+    )
+
+    course = track(footage, moved, moving=lambda i: np.where(half, 0.0, 0.7 * first))
+
+    for i in range(1, 7):
+        assert iou(course.masks[i], square(10, 40)) > 0.9, i
+
+
 def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours(watched_of):
     frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
     arm = square(76, 54, 30)

@@ -23,6 +23,7 @@ from v2p_data.scene.backends.config import (
     PoseConfig,
     SegmentConfig,
 )
+from v2p_data.scene.bore import seen_through
 from v2p_data.scene.crop import View
 from v2p_data.scene.find import Watched, passed, watch
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
@@ -376,6 +377,7 @@ def _estimates(
     cfg: SceneConfig,
 ) -> list[Estimate]:
     footage, height = sights.footage, placement.height_m
+    work = _metric(placement.camera, _origin(placement), height)
     taken: set[str] = set()
     out = []
     for s, placed, made in zip(sights.objects, placement.objects, shaped, strict=True):
@@ -407,6 +409,9 @@ def _estimates(
             frames, sure = tuple(range(len(poses))), tuple(float(c) for c in marks)
             observed = ("full",) * len(poses)
         image = footage.rgb[s.at] if s.moves else footage.late if s.at else footage.early
+        masks = _mask_track(footage, s, placed)
+        if s.noun.bore:
+            masks = _pierced(masks, s.noun.bore, size, frames, footage, poses, work)
         out.append(
             Estimate(
                 name=name,
@@ -418,7 +423,7 @@ def _estimates(
                 frames=tuple(int(footage.frame_idx[i]) for i in frames),
                 T_world_objs=poses,
                 confidences=tuple(round(c, 3) for c in sure),
-                masks=_mask_track(footage, s, placed),
+                masks=masks,
                 source={**_sources(s), "shape": how},
                 mass_kg=_mass(s.noun, size),
                 mesh=None if plain else mesh,
@@ -463,6 +468,24 @@ def _mask_track(
     if s.moves and not (s.swallowed or placed.in_fist):
         masks[int(footage.frame_idx[placed.last_i])] = placed.last_mask
     return dict(sorted(masks.items()))
+
+
+def _pierced(
+    masks: dict[int, Bool[np.ndarray, "h w"]],
+    bore: float,
+    size_m: tuple[float, float, float],
+    frames: tuple[int, ...],
+    footage: Footage,
+    T_world_objs: Float[np.ndarray, "pose 4 4"],
+    camera: Camera,
+) -> dict[int, Bool[np.ndarray, "h w"]]:
+    """Return a ring's masks without what is seen through it, in each as it lies in the frame with a pose that is nearest."""
+    posed = footage.frame_idx[list(frames)]
+    return {
+        i: mask
+        & ~seen_through(size_m, bore, T_world_objs[int(np.abs(posed - i).argmin())], camera)
+        for i, mask in masks.items()
+    }
 
 
 def _remarks(kind: str, sights: Sights, placement: Placement, num_frames: int) -> list[str]:

@@ -1,7 +1,7 @@
 """A spoon is a bowl at the end of a rod: as the block that encloses it, no gripper could hold it by its handle.
 
-Proportions are those of cutlery and of wooden cooking spoons: the bowl is a third of the length, two fifths of the height
-that a lying spoon has, and one to three millimetres thick; the rod is a fifth as wide as the bowl, leaves it at its rim and
+Proportions are those of cutlery and of wooden cooking spoons: the bowl is a third (cutlery) to a quarter (wood) of the length,
+two fifths of the height that a lying spoon has, and one to three millimetres thick; the rod is a fifth as wide as the bowl, leaves it at its rim and
 rises to the full height over two thirds of its way. One view seldom shows more of it than which end the bowl is.
 """
 
@@ -13,7 +13,7 @@ from v2p_data.geometry.mesh import lathe
 from v2p_data.scene.candidate import Candidate, Size, turned
 from v2p_data.scene.nouns import Noun
 
-_BOWL_LENGTH, _BOWL_DEPTH, _WALL = 0.33, 0.42, 0.12
+_BOWL_LENGTH, _BOWL_DEPTH, _WALL = 0.3, 0.42, 0.12
 """Of the spoon's length, and twice of its height."""
 _ROD, _RISEN = 0.22, 0.7
 """Diameter in widths of the bowl, and on which part of its way it has risen."""
@@ -64,10 +64,10 @@ def _spoon(
         0,
         (deep - height) / 2,
     ]
-    radius = min(_ROD * width / 2, deep / 2)
+    radius = min(_ROD * width / 2, height / 2)
     share = np.linspace(0, 1, _RINGS)
     x = length / 2 - long - (length - long) * share
-    low, high = deep - height / 2 - radius, height / 2 - radius
+    low, high = max(deep, 2 * radius) - height / 2 - radius, height / 2 - radius
     z = low + (high - low) * np.sin(np.pi / 2 * np.minimum(share / _RISEN, 1))
     angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     ring = radius * np.stack([np.zeros(_AROUND), np.cos(angle), np.sin(angle)], 1)

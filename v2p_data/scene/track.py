@@ -19,6 +19,8 @@ from v2p_data.scene.segment import bounding_box, convex_hull, grow, iou, largest
 _SAME_LAB = 6.0
 _LOST = 0.4
 """Likeness below which what is followed from one frame alone is taken to be gone."""
+_RESTS = 0.4
+"""Of the first outline: while so much of it looks as before, and the table under it does not, the object has not left."""
 _HAND_RATIO = 3.0
 """Logarithm of how much better the hand's colours explain a pixel of the last outline: more, and it is hand."""
 _BARE, _UNLIKE = 0.4, 0.2
@@ -52,7 +54,9 @@ def track(
     """
     n = len(footage.rgb)
     steps = sorted({*range(0, n, every), n - 1})
-    forward = _follow(footage, steps, moved.first, moved.look, 0, moving)
+    early, late = (_smooth(lab_of(still)) for still in (footage.early, footage.late))
+    unlike = _alike_share(footage.lab[0], late, moved.first) < _UNLIKE
+    forward = _follow(footage, steps, moved.first, moved.look, 0, moving, may_rest=unlike)
     area_first = float(moved.first.sum())
     found, carried = (
         _likeness(footage, n - 1, mask, moved.look, area_first)
@@ -65,7 +69,9 @@ def track(
         else moved.last
     )
     end = _less_hand(footage, n - 1, end, moved.look)
-    backward = _follow(footage, steps[::-1], end, moved.look, n - 1, moving)[::-1]
+    may_rest = _alike_share(footage.lab[-1], early, end) < _UNLIKE
+    backward = _follow(footage, steps[::-1], end, moved.look, n - 1, moving, may_rest=may_rest)
+    backward.reverse()
     area_last = float(end.sum())
     masks = np.zeros((n, *footage.shape), bool)
     quality = np.zeros(n)
@@ -84,8 +90,7 @@ def track(
     alike = _likeness(footage, n - 1, end, moved.look, area_first)
     quality[0], quality[-1] = 1.0, 1.0 if alike > _LOST else alike
     # Nor is what stands there at both ends, where the object looks otherwise than the table under it.
-    early, late = (_smooth(lab_of(still)) for still in (footage.early, footage.late))
-    if _alike_share(footage.lab[0], late, moved.first) < _UNLIKE:
+    if unlike:
         for i in steps[1:]:
             still, place = (early, moved.first) if i >= n / 2 else (late, end)
             if _alike_share(footage.lab[i], still, masks[i], grow(place, 2)) > _BARE:
@@ -129,7 +134,13 @@ def _follow(
     look: Float[np.ndarray, "l a b"],
     anchor: int,
     moving: Moving | None,
+    *,
+    may_rest: bool = False,
 ) -> list[Bool[np.ndarray, "h w"]]:
+    """Return the mask in these frames, the first of them the `anchor`.
+
+    With `may_rest`, what of the start looks as it did belongs to the mask while most of it does: the object lies there still.
+    """
     h, w = footage.shape
     flow_of = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     grid_y, grid_x = np.mgrid[:h, :w].astype(np.float32)
@@ -181,6 +192,10 @@ def _follow(
             mask[rows, cols] = np.isin(parts, 1 + np.flatnonzero(big))
         else:
             mask[rows, cols] = prior > 0.5
+        if may_rest:
+            as_before = np.linalg.norm(_smooth(footage.lab[i]) - before, axis=-1) < _SAME_LAB
+            rests = start & as_before
+            mask = mask | rests if rests.sum() > _RESTS * area else mask
         if mask.sum() < 0.45 * area:
             mask = _find_again(footage, i, look, before, home, area, mask)
         if mask.sum() < 15:
