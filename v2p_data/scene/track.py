@@ -21,6 +21,12 @@ _LOST = 0.4
 """Likeness below which what is followed from one frame alone is taken to be gone."""
 _RESTS = 0.4
 """Of the first outline: while so much of it looks as before, and the table under it does not, the object has not left."""
+_SHRUNK = 1.25
+"""Of what was followed: what lies there still is taken as it was where that is larger, as less is an outline's own correction."""
+_MOVES, _UNSEEN = 0.5, 0.05
+"""How surely the network sees something move where the object is at both ends, for it to be believed where it sees nothing."""
+_NEAR = 0.3
+"""Of an object's extent: what moves so near to a mask may be it, a frame before or after."""
 _HAND_RATIO = 3.0
 """Logarithm of how much better the hand's colours explain a pixel of the last outline: more, and it is hand."""
 _BARE, _UNLIKE = 0.4, 0.2
@@ -48,7 +54,7 @@ def track(
 ) -> Track:
     """Return the object's mask over time: forwards from the first and backwards from the last outline.
 
-    At each frame the direction is taken whose mask looks more like the object. `every` skips frames for speed; the
+    At each frame the direction is taken whose mask looks more like the object, and agrees better with `moving`. `every` skips frames for speed; the
     skipped ones repeat their neighbour with no quality. `moving` says how likely each pixel of a frame belongs to
     something that moves and is no hand, if anyone knows.
     """
@@ -73,16 +79,39 @@ def track(
     backward = _follow(footage, steps[::-1], end, moved.look, n - 1, moving, may_rest=may_rest)
     backward.reverse()
     area_last = float(end.sum())
+    knows_it = moving is not None and all(
+        float(moving(i)[mask].mean()) > _MOVES
+        for i, mask in ((0, moved.first), (n - 1, end))
+        if mask.any()
+    )
+
+    def agreement(i: int, mask: Bool[np.ndarray, "h w"]) -> float:
+        """Return how well a mask agrees with what the network sees move, where it knows the object."""
+        return 0.0 if moving is None or not knows_it else iou(mask, moving(i) > 0.5)
+
+    def astray(i: int, mask: Bool[np.ndarray, "h w"]) -> bool:
+        """Return whether the network, which knows the object, sees nothing move here where it does not lie."""
+        if moving is None or not knows_it or not mask.any():
+            return False
+        area = float(mask.sum())
+        lies = max(float((mask & place).sum()) for place in (moved.first, end))
+        around = grow(mask, round(_NEAR * np.sqrt(area)))  # not every frame was looked at
+        return lies < 0.5 * area and float(moving(i)[around].sum()) < _UNSEEN * area
+
     masks = np.zeros((n, *footage.shape), bool)
     quality = np.zeros(n)
     for k, i in enumerate(steps):
         share = i / max(1, n - 1)
         area = float(area_first ** (1 - share) * area_last**share)
         marks = [
-            _likeness(footage, i, mask, moved.look, area) - 0.15 * away
+            _likeness(footage, i, mask, moved.look, area) - 0.15 * away - astray(i, mask)
             for mask, away in ((forward[k], share), (backward[k], 1 - share))
         ]
-        best = int(marks[1] > marks[0])
+        votes = [
+            mark + agreement(i, mask)
+            for mark, mask in zip(marks, (forward[k], backward[k]), strict=True)
+        ]
+        best = int(votes[1] > votes[0])
         masks[i] = (forward[k], backward[k])[best]
         quality[i] = max(0.0, marks[best])
     masks[0], masks[-1] = moved.first, end
@@ -195,7 +224,8 @@ def _follow(
         if may_rest:
             as_before = np.linalg.norm(_smooth(footage.lab[i]) - before, axis=-1) < _SAME_LAB
             rests = start & as_before
-            mask = mask | rests if rests.sum() > _RESTS * area else mask
+            if rests.sum() > max(_RESTS * area, _SHRUNK * mask.sum()):
+                mask = mask | rests
         if mask.sum() < 0.45 * area:
             mask = _find_again(footage, i, look, before, home, area, mask)
         if mask.sum() < 15:
