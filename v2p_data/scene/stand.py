@@ -30,7 +30,7 @@ _UNDER_KINDS = ("uncover",)
 TELLING_KINDS = (*TOUCHING_KINDS, *NEARING_KINDS, *_UNDER_KINDS)
 """Tasks that tell where the other stands. What the captions of others mention may stand anywhere: how sure it is follows from its
 rivals alone."""
-_LEVELS = (0.75, 0.5, 0.25)
+_LEVELS = (0.75, 0.5, 0.25, 0.12)
 """Probabilities at which what the network sees is cut into things."""
 _LEAST_SHARE, _MOST_SHARE = 0.0005, 0.2
 """Of the picture."""
