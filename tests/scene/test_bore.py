@@ -6,7 +6,7 @@ import pytest
 
 from v2p_data.geometry.mesh import ring
 from v2p_data.geometry.pose import apply, transform
-from v2p_data.scene.bore import seen_through
+from v2p_data.scene.bore import pierced, seen_through
 from v2p_data.scene.pose import camera_above
 
 
@@ -43,3 +43,18 @@ def test_a_ring_behind_the_camera_hides_nothing():
     T = transform(np.eye(3), np.array([-2.0, 0.0, 0.4]))
 
     assert not seen_through((0.1, 0.1, 0.02), 0.6, T, camera).any()
+
+
+def test_a_mask_keeps_its_hole_filled_where_the_ring_is_not_as_posed():
+    camera = camera_above((960, 1280), 1.1, 1.01, 0.4)
+    size, bore = (0.15, 0.15, 0.03), 0.65
+    here, elsewhere = (
+        transform(np.eye(3), camera.on_plane(np.array([[x, 500.0]]), 0.015)[0])
+        for x in (680.0, 420.0)
+    )
+    faces, whole = drawn(ring(size[0], size[2], bore), here, camera)
+
+    assert (pierced(whole, size, bore, here, camera) & ~faces).sum() < 0.05 * (
+        whole & ~faces
+    ).sum()
+    np.testing.assert_array_equal(pierced(whole, size, bore, elsewhere, camera), whole)

@@ -23,7 +23,7 @@ from v2p_data.scene.backends.config import (
     PoseConfig,
     SegmentConfig,
 )
-from v2p_data.scene.bore import seen_through
+from v2p_data.scene.bore import pierced
 from v2p_data.scene.crop import View
 from v2p_data.scene.find import Watched, passed, watch
 from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
@@ -411,7 +411,7 @@ def _estimates(
         image = footage.rgb[s.at] if s.moves else footage.late if s.at else footage.early
         masks = _mask_track(footage, s, placed)
         if s.noun.bore:
-            masks = _pierced(masks, s.noun.bore, size, frames, footage, poses, work)
+            masks = _with_hole(masks, s.noun.bore, size, frames, footage, poses, work)
         out.append(
             Estimate(
                 name=name,
@@ -470,7 +470,7 @@ def _mask_track(
     return dict(sorted(masks.items()))
 
 
-def _pierced(
+def _with_hole(
     masks: dict[int, Bool[np.ndarray, "h w"]],
     bore: float,
     size_m: tuple[float, float, float],
@@ -479,11 +479,10 @@ def _pierced(
     T_world_objs: Float[np.ndarray, "pose 4 4"],
     camera: Camera,
 ) -> dict[int, Bool[np.ndarray, "h w"]]:
-    """Return a ring's masks without what is seen through it, in each as it lies in the frame with a pose that is nearest."""
+    """Return a ring's masks without what is seen through it, posed as in the nearest frame that has a pose."""
     posed = footage.frame_idx[list(frames)]
     return {
-        i: mask
-        & ~seen_through(size_m, bore, T_world_objs[int(np.abs(posed - i).argmin())], camera)
+        i: pierced(mask, size_m, bore, T_world_objs[int(np.abs(posed - i).argmin())], camera)
         for i, mask in masks.items()
     }
 
