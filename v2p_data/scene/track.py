@@ -175,6 +175,8 @@ def _follow(
     grid_y, grid_x = np.mgrid[:h, :w].astype(np.float32)
     before = _smooth(footage.lab[anchor])
     home, area = grow(start, 2), int(start.sum())
+    x, y, bw, bh = bounding_box(grow(start, 4))
+    there = slice(y, y + bh), slice(x, x + bw)
     mask, out = start, [start]
     grey = cv2.cvtColor(footage.rgb[anchor], cv2.COLOR_RGB2GRAY)
     for i in steps[1:]:
@@ -222,8 +224,9 @@ def _follow(
         else:
             mask[rows, cols] = prior > 0.5
         if may_rest:
-            as_before = np.linalg.norm(_smooth(footage.lab[i]) - before, axis=-1) < _SAME_LAB
-            rests = start & as_before
+            rests = np.zeros((h, w), bool)
+            off = np.linalg.norm(_smooth(footage.lab[i][there]) - before[there], axis=-1)
+            rests[there] = start[there] & (off < _SAME_LAB)
             if rests.sum() > max(_RESTS * area, _SHRUNK * mask.sum()):
                 mask = mask | rests
         if mask.sum() < 0.45 * area:
