@@ -1,6 +1,6 @@
 """Learn from drawn clips which of the things that stand there a caption means (`v2p_data/scene/stand.py`).
 
-    python scripts/train_standing.py data --out DATA --clips 295 --jobs 2
+    python scripts/train_standing.py data --out DATA --clips 120 --jobs 2
     python scripts/train_standing.py train DATA --out v2p_data/scene/standing.json
 
 `data` draws clips with a second object, lets the scene network watch them, and keeps the cues of all candidates with how
@@ -124,7 +124,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     data = commands.add_parser("data", help="draw and watch clips")
     data.add_argument("--out", type=Path, required=True)
-    data.add_argument("--clips", type=int, default=295)
+    data.add_argument("--clips", type=int, default=120)
     data.add_argument("--start", type=int, default=0, help="number of the first clip")
     data.add_argument("--jobs", type=int, default=2)
     train = commands.add_parser("train", help="fit the weights")
