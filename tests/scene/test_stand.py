@@ -13,6 +13,7 @@ from v2p_data.scene.segment import iou
 from v2p_data.scene.sight import stands_on
 from v2p_data.scene.stand import (
     WEIGHTS,
+    Candidate,
     Search,
     candidates,
     find_standing,
@@ -109,6 +110,29 @@ def test_a_named_colour_outweighs_a_little_distance(watched_of):
 
     assert iou(blue.mask, large(near, footage)) > 0.8
     assert iou(green.mask, large(far, footage)) > 0.8
+
+
+def test_a_whole_that_was_cut_out_twice_is_meant_rather_than_something_likelier_by_itself(
+    watched_of, monkeypatch
+):
+    """What two candidates nearly agree on is likelier than the one candidate that agrees with none."""
+    ends = square(5, 40), square(50, 40)
+    search = searched(watched_of, pushed_to(50, [(square(72, 28, 20), BLUE)]), "box", "push_next_to", ends)  # fmt: skip
+    usual = candidates(search)[0]
+    shapes = [(square(72, 28, 20), 0.70), (square(73, 29, 19), 0.69), (square(5, 5), 0.75)]
+    found = [
+        Candidate(
+            mask=large(mask, search.footage),
+            cues={**dict.fromkeys(usual.cues, 0.0), "seen": seen},
+        )
+        for mask, seen in shapes
+    ]
+    monkeypatch.setattr("v2p_data.scene.stand.candidates", lambda _: found)
+
+    assert iou(find_standing(search).mask, found[0].mask) > 0.7
+
+    monkeypatch.setattr("v2p_data.scene.stand.candidates", lambda _: found[1:])
+    assert iou(find_standing(search).mask, found[2].mask) > 0.7
 
 
 def test_one_alone_is_surer_than_one_of_two_that_are_alike(watched_of):

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.special import softmax
 
 from v2p_data.scene.classes import HAND, MOVED, OTHER
 from v2p_data.scene.colour import balance, colour_match, colour_words, lab_of
@@ -47,6 +48,8 @@ _SAME = 0.9
 """IoU from which two candidates are one."""
 _ALIKE = 0.5
 """IoU from which two candidates are the same thing, cut out differently."""
+_SOFTER = 0.7
+"""For what can be expected of a candidate, ratings count so much: the odds that they were learned for are too sure."""
 _LEAST_CHANCE = 0.01
 """No candidate is likelier or less likely than by this."""
 _MOST_WITH_HANDLE = 1.5
@@ -108,18 +111,21 @@ class Search:
 
 
 def find_standing(search: Search) -> Found | None:
-    """Return the thing that the phrase means, its score being how likely it is the right one; None where nothing stands."""
+    """Return the thing that the phrase means, its score being how likely it is the right one; None where nothing stands.
+
+    It is the candidate from which most overlap with what is meant can be expected: a whole rather than its likelier half.
+    """
     found = candidates(search)
     if not found:
         return None
     learned = _learned()
     rating = np.array([_sum(learned["choice"], one.cues) for one in found])
-    likely = np.exp(rating - rating.max())
-    likely /= likely.sum()
-    best = found[int(likely.argmax())]
+    likely = softmax(rating)
+    overlaps = overlaps_of(found)
+    k = int((overlaps @ softmax(_SOFTER * rating)).argmax())
+    best = found[k]
     mask = best.mask
-    alike = np.array([iou(one.mask, mask) for one in found])
-    said = {"offset": 1.0, "odds": odds_of(likely, alike)}
+    said = {"offset": 1.0, "odds": odds_of(likely, overlaps[k])}
     if search.kind in TELLING_KINDS:
         odds = _sum(learned["sure"], {**said, **best.cues})
     else:
@@ -128,6 +134,13 @@ def find_standing(search: Search) -> Found | None:
         mask = max((c.mask for c in found if _is_with_handle(c.mask, mask)), key=np.sum)
     mask = _outlined(search, mask)
     return Found(mask=mask, score=float(1 / (1 + np.exp(-odds))))
+
+
+def overlaps_of(found: list[Candidate]) -> Float[np.ndarray, "n n"]:
+    """Return how far each candidate overlaps each (IoU)."""
+    masks = np.stack([one.mask.ravel() for one in found]).astype(np.float32)
+    common, area = masks @ masks.T, masks.sum(1)
+    return common / np.maximum(1, area[:, None] + area - common)
 
 
 def odds_of(likely: Float[np.ndarray, "n"], alike: Float[np.ndarray, "n"]) -> float:
