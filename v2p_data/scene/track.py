@@ -49,6 +49,38 @@ class Track:
 Moving = Callable[[int], Float[np.ndarray, "h w"]]
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Witness:
+    """The network, where it sees the object move at both ends."""
+
+    moving: Moving
+    ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]
+
+    def agrees(self, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
+        """Return how well a mask overlaps what it sees move."""
+        return iou(mask, self.moving(i) > 0.5)
+
+    def misses(self, i: int, mask: Bool[np.ndarray, "h w"]) -> bool:
+        """Return whether it sees nothing move there, and the object does not lie there at either end."""
+        area = float(mask.sum())
+        lies = max(float((mask & place).sum()) for place in self.ends)
+        around = grow(mask, round(_NEAR * np.sqrt(area)))  # not every frame was looked at
+        return lies < 0.5 * area and float(self.moving(i)[around].sum()) < _UNSEEN * area
+
+
+def _witness(
+    moving: Moving | None,
+    first: Bool[np.ndarray, "h w"],
+    last: Bool[np.ndarray, "h w"],
+    last_i: int,
+) -> _Witness | None:
+    """Return the network as a witness; None where it was not asked, or does not see the object at one end."""
+    if moving is None:
+        return None
+    seen = [float(moving(i)[m].mean()) for i, m in ((0, first), (last_i, last)) if m.any()]
+    return _Witness(moving=moving, ends=(first, last)) if min(seen, default=1.0) > _MOVES else None
+
+
 def track(
     footage: Footage, moved: Moved, *, every: int = 1, moving: Moving | None = None
 ) -> Track:
@@ -79,41 +111,28 @@ def track(
     backward = _follow(footage, steps[::-1], end, moved.look, n - 1, moving, may_rest=may_rest)
     backward.reverse()
     area_last = float(end.sum())
-    knows_it = moving is not None and all(
-        float(moving(i)[mask].mean()) > _MOVES
-        for i, mask in ((0, moved.first), (n - 1, end))
-        if mask.any()
-    )
-
-    def agreement(i: int, mask: Bool[np.ndarray, "h w"]) -> float:
-        """Return how well a mask agrees with what the network sees move, where it knows the object."""
-        return 0.0 if moving is None or not knows_it else iou(mask, moving(i) > 0.5)
-
-    def astray(i: int, mask: Bool[np.ndarray, "h w"]) -> bool:
-        """Return whether the network, which knows the object, sees nothing move here where it does not lie."""
-        if moving is None or not knows_it or not mask.any():
-            return False
-        area = float(mask.sum())
-        lies = max(float((mask & place).sum()) for place in (moved.first, end))
-        around = grow(mask, round(_NEAR * np.sqrt(area)))  # not every frame was looked at
-        return lies < 0.5 * area and float(moving(i)[around].sum()) < _UNSEEN * area
-
+    witness = _witness(moving, moved.first, end, n - 1)
     masks = np.zeros((n, *footage.shape), bool)
     quality = np.zeros(n)
     for k, i in enumerate(steps):
         share = i / max(1, n - 1)
         area = float(area_first ** (1 - share) * area_last**share)
+        both = (forward[k], backward[k])
         marks = [
-            _likeness(footage, i, mask, moved.look, area) - 0.15 * away - astray(i, mask)
-            for mask, away in ((forward[k], share), (backward[k], 1 - share))
+            _likeness(footage, i, mask, moved.look, area) - 0.15 * away
+            for mask, away in zip(both, (share, 1 - share), strict=True)
         ]
-        votes = [
-            mark + agreement(i, mask)
-            for mark, mask in zip(marks, (forward[k], backward[k]), strict=True)
-        ]
+        if witness is not None:
+            marks = [
+                mark - witness.misses(i, mask) for mark, mask in zip(marks, both, strict=True)
+            ]
+            votes = [
+                mark + witness.agrees(i, mask) for mark, mask in zip(marks, both, strict=True)
+            ]
+        else:
+            votes = marks
         best = int(votes[1] > votes[0])
-        masks[i] = (forward[k], backward[k])[best]
-        quality[i] = max(0.0, marks[best])
+        masks[i], quality[i] = both[best], max(0.0, marks[best])
     masks[0], masks[-1] = moved.first, end
     # An outline at the end that does not look like the object is not it: it is hidden there.
     alike = _likeness(footage, n - 1, end, moved.look, area_first)
