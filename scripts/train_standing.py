@@ -30,7 +30,14 @@ from v2p_data.scene.find import watch
 from v2p_data.scene.footage import footage_of
 from v2p_data.scene.segment import iou
 from v2p_data.scene.sight import sight
-from v2p_data.scene.stand import TELLING_KINDS, Candidate, Search, candidates, odds_of
+from v2p_data.scene.stand import (
+    TELLING_KINDS,
+    Candidate,
+    Search,
+    candidates,
+    odds_of,
+    overlaps_of,
+)
 from v2p_data.scene.steady import steadied
 from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos, parse_caption
@@ -91,7 +98,7 @@ def make_clip(job: tuple[int, Path]) -> str:
         names=list(found[0].cues),
         cues=cues,
         right=[iou(one.mask, shown) for one in found],
-        alike=[[iou(a.mask, b.mask) for b in found] for a in found],
+        alike=overlaps_of(found),
     )
     return ""
 
