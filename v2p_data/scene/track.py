@@ -118,19 +118,15 @@ def track(
         share = i / max(1, n - 1)
         area = float(area_first ** (1 - share) * area_last**share)
         both = (forward[k], backward[k])
-        marks = [
-            _likeness(footage, i, mask, moved.look, area) - 0.15 * away
-            for mask, away in zip(both, (share, 1 - share), strict=True)
-        ]
-        if witness is not None:
-            marks = [
-                mark - witness.misses(i, mask) for mark, mask in zip(marks, both, strict=True)
-            ]
-            votes = [
-                mark + witness.agrees(i, mask) for mark, mask in zip(marks, both, strict=True)
-            ]
-        else:
-            votes = marks
+        marks, votes = [], []
+        for mask, away in zip(both, (share, 1 - share), strict=True):
+            mark = _likeness(footage, i, mask, moved.look, area) - 0.15 * away
+            agreement = 0.0
+            if witness is not None:
+                mark -= witness.misses(i, mask)
+                agreement = witness.agrees(i, mask)
+            marks.append(mark)
+            votes.append(mark + agreement)
         best = int(votes[1] > votes[0])
         masks[i], quality[i] = both[best], max(0.0, marks[best])
     masks[0], masks[-1] = moved.first, end
@@ -242,7 +238,7 @@ def _follow(
             mask[rows, cols] = np.isin(parts, 1 + np.flatnonzero(big))
         else:
             mask[rows, cols] = prior > 0.5
-        if may_rest:
+        if may_rest and _SHRUNK * mask.sum() < area:
             rests = np.zeros((h, w), bool)
             off = np.linalg.norm(_smooth(footage.lab[i][there]) - before[there], axis=-1)
             rests[there] = start[there] & (off < _SAME_LAB)
