@@ -11,6 +11,7 @@ seeds of their own (`box network`), so that no clip of `bench_reconstruction.py`
 
 import argparse
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -52,12 +53,14 @@ from v2p_data.video.synthetic import (
     render_views,
 )
 from v2p_data.video.synthetic_camera import View
+from v2p_data.video.synthetic_props import Prop
 
 BOXES = ("box", "book", "bin")
-"""Kinds of things."""
+ALONG = ("duck", "bottle")
+"""Kinds of things: boxes, and those that have a front and sides as a box has, bottles where they are oval."""
 CAMERAS = 14
-SPECS = 4
-"""Drawn for each scene; the one with most boxes is kept."""
+SPECS, SPECS_ALONG = 4, 16
+"""Drawn for each scene; the one with most boxes is kept, or with most ducks and oval bottles."""
 KEPT_PX, KEPT_SHARE = 112, 2.0
 """What is kept of a picture: so many pixels, for so many longer sides of the outline."""
 SIZES = ((480, 360), (480, 360), (480, 270), (360, 480))
@@ -67,8 +70,8 @@ MOST_HEADING_RAD = float(np.radians(50))
 """Cameras of clips look along +x, and many things there stand along it too."""
 LEAST_SIDES_PX = (5, 10)
 """Shorter and longer side of what is seen of a box, at working size."""
-LEAST_SHOWN = 0.6
-"""Of its whole outline."""
+LEAST_SHOWN, SHARE_OF_BOX = 0.6, 0.7
+"""Of its whole outline, and what share of its box's outline that of a duck or a bottle is."""
 UPRIGHT = 0.9995
 BATCH = 64
 MOST_KAPPA = 60.0
@@ -93,8 +96,11 @@ class Turned(View):
         return replace(camera, T_world_cam=T)
 
 
-def make_scene(job: tuple[int, Path]) -> str:
-    """Draw one scene through some cameras and write what training needs; return an error's words, or nothing."""
+def make_scene(along: bool, job: tuple[int, Path]) -> str:
+    """Draw one scene through some cameras and write what training needs; return an error's words, or nothing.
+
+    With `along`, one with ducks or oval bottles.
+    """
     number, out = job
     path = out / f"{number:05d}.npz"
     if path.is_file():
@@ -103,9 +109,10 @@ def make_scene(job: tuple[int, Path]) -> str:
     try:
         kind = MOTION_KINDS[number % len(MOTION_KINDS)]
         specs = [
-            random_spec(f"clip{number}", kind, rng, int(rng.integers(2, 6))) for _ in range(SPECS)
+            random_spec(f"clip{number}", kind, rng, int(rng.integers(2, 6)))
+            for _ in range(SPECS_ALONG if along else SPECS)
         ]
-        spec = max(specs, key=lambda spec: len(_boxes(spec)))
+        spec = max(specs, key=lambda spec: (along * _count_along(spec), len(_boxes(spec))))
         w, h = SIZES[int(rng.integers(len(SIZES)))]
         fovy_rad = float(np.radians(rng.uniform(35, 60)))
         spec = replace(spec, view=replace(spec.view, width_px=w, height_px=h, fovy_rad=fovy_rad))
@@ -119,7 +126,19 @@ def make_scene(job: tuple[int, Path]) -> str:
 
 
 def _boxes(spec: VideoSpec) -> list[int]:
-    return [k for k, actor in enumerate(spec.story.actors) if actor.prop.kind in BOXES]
+    return [
+        k
+        for k, actor in enumerate(spec.story.actors)
+        if actor.prop.kind in BOXES or _is_along(actor.prop)
+    ]
+
+
+def _is_along(prop: Prop) -> bool:
+    return prop.kind in ALONG and prop.symmetry == "none"
+
+
+def _count_along(spec: VideoSpec) -> int:
+    return sum(_is_along(actor.prop) for actor in spec.story.actors)
 
 
 def views_of(spec: VideoSpec, rng: np.random.Generator) -> list[dict[str, np.ndarray]]:
@@ -146,8 +165,9 @@ def views_of(spec: VideoSpec, rng: np.random.Generator) -> list[dict[str, np.nda
     for i, view, rgb, own in zip(frames, views, pictures, labels, strict=True):
         rgb = compressed(rgb, rng)
         for k in boxes:
-            T, extents = motion.T_world_things[k, i], spec.story.actors[k].extents_m
-            row = _row(view.camera(), T, extents, rgb, own == LABEL_THING + k)
+            T, actor = motion.T_world_things[k, i], spec.story.actors[k]
+            share = SHARE_OF_BOX if _is_along(actor.prop) else 1.0
+            row = _row(view.camera(), T, actor.extents_m, rgb, own == LABEL_THING + k, share)
             if row is not None:
                 rows.append(row)
     return rows
@@ -163,6 +183,7 @@ def _row(
     extents: Float[np.ndarray, "3"],
     rgb: UInt8[np.ndarray, "h w 3"],
     outline: Bool[np.ndarray, "h w"],
+    share: float = 1.0,
 ) -> dict[str, np.ndarray] | None:
     """Return what a camera that looks straight at a box sees, and how that is turned; None where little of it is seen."""
     up = int(np.abs(T[2, :3]).argmax())
@@ -179,7 +200,7 @@ def _row(
     whole = cv2.contourArea(cv2.convexHull(small.project(corners).astype(np.float32)))
     sides_px = bounding_box(mask)[2:]
     too_small = min(sides_px) < LEAST_SIDES_PX[0] or max(sides_px) < LEAST_SIDES_PX[1]
-    if too_small or mask.sum() < LEAST_SHOWN * whole:
+    if too_small or mask.sum() < LEAST_SHOWN * share * whole:
         return None
     rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     aim = aim_at(mask, small, KEPT_PX, KEPT_SHARE)
@@ -313,11 +334,12 @@ def _degrees(angle: torch.Tensor) -> torch.Tensor:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    add_commands(parser, "scene", 500)
+    _, data = add_commands(parser, "scene", 500)
+    data.add_argument("--along", action="store_true", help="scenes with ducks and oval bottles")
     args = parser.parse_args()
     if args.command == "data":
         numbers = range(args.start, args.start + args.scenes)
-        draw_all(make_scene, numbers, args.out, args.jobs)
+        draw_all(partial(make_scene, args.along), numbers, args.out, args.jobs)
     else:
         learn(BoxNetwork, varied, loss_of, measure, BATCH, "box network", args)
 

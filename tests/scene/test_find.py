@@ -211,6 +211,22 @@ def test_a_look_alike_that_lay_there_all_along_is_not_the_thing_at_the_end(
     assert course.quality[-1] == believed
 
 
+def test_where_the_network_surely_sees_bare_table_nothing_is_followed(watched_of):
+    """It knows the thing at first; what looks like it later is table to the network, while a fist hides the thing."""
+    frames = [[(square(10 + 6 * i, 40), RED, MOVED if i < 6 else TABLE)] for i in range(12)]
+    footage, watched = watched_of(frames)
+    first, last = large(square(10, 40), footage), large(square(76, 40), footage)
+    moved = Moved(
+        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+    )
+
+    def told(**also):
+        return track(footage, moved, moving=lambda i: watched.at(i)[MOVED], **also).quality
+
+    assert (told(bare=lambda i: watched.at(i)[TABLE]) > 0.5).tolist() == [True] * 6 + [False] * 6
+    assert (told()[:10] > 0.5).all()
+
+
 def test_what_lies_there_still_keeps_its_whole_outline(watched_of):
     """The network sees half of a thing that nobody has touched yet; the other half has nearly the table's colours."""
     frames = []

@@ -1,13 +1,17 @@
 """What somebody draws on a frame becomes an outline there; people draw a few pixels off."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from v2p_data.scene.classes import CLASSES, OTHER, TABLE
+from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import Footage, footage_of
 from v2p_data.scene.marks import Box, marks_of
-from v2p_data.scene.segment import bounding_box
+from v2p_data.scene.scale import SeenCamera
+from v2p_data.scene.segment import bounding_box, iou
 from v2p_data.video.clip import Clip
 
 GREY, RED = (120, 118, 115), (190, 40, 40)
@@ -56,3 +60,30 @@ def test_far_beside_a_box_nothing_belongs_to_it(drawn):
     mask = outlined(drawn, X, Y, X + WIDE // 2, Y + TALL).mask
 
     assert not mask[:, X + WIDE // 2 + 5 :].any()
+
+
+def test_a_face_in_the_colours_of_the_table_is_completed_by_what_the_network_sees(drawn):
+    clip, footage = drawn
+    image = footage.rgb[0].copy()
+    face = np.zeros((H, W), bool)
+    face[Y + TALL // 2 : Y + TALL, X + 5 : X + WIDE] = True
+    image[face] = image[: TALL // 2, : WIDE - 5].reshape(-1, 3)
+    frames = np.stack([image] * 10)
+    clip, whole = replace(clip, frames=frames), np.zeros((H, W), bool)
+    whole[Y : Y + TALL, X : X + WIDE] = True
+    footage = footage_of(clip)
+    said = Box(frame=0, box_xyxy=(140.0, 100.0, 180.0, 130.0), score=0.9)
+    label = np.where(whole, OTHER, TABLE)
+    shares = 0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None])
+    shares = shares.astype(np.float32)
+    camera = SeenCamera(
+        pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.6, table_width_sd=0.2
+    )
+    watched = Watched(
+        idx=np.array([0, 9]), shares=np.stack([shares] * 2), early=shares, late=shares, camera=camera
+    )  # fmt: skip
+
+    alone, told = (marks_of(clip, footage, w, {"box": said})["box"].mask for w in (None, watched))
+
+    assert iou(told, whole) > 0.85
+    assert iou(alone, whole) < 0.75

@@ -13,6 +13,7 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import lathe, ring
 from v2p_data.geometry.pillow import pillow
 from v2p_data.geometry.pose import transform
+from v2p_data.scene.inflation import _standing
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.pose import camera_above
 from v2p_data.scene.shape import ShapeChoice, ShapeConfig, View, best_shape
@@ -239,6 +240,36 @@ def test_a_duck_is_inflated_from_its_outline():
     T = fit(size, 90) @ choice.T_obj_shape
     lowest = (choice.mesh.vertices @ T[:3, :3].T + T[:3, 3])[:, 2].min()
     assert lowest == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("yaw_deg", [20, 60, 110])
+def test_what_is_inflated_keeps_the_axes_of_the_fit(yaw_deg):
+    """The plane that it is inflated in is the camera's: its axes say nothing of how the object is turned."""
+    size, irregular = (0.07, 0.055, 0.07), noun("box", symmetry="none")
+    mask = seen(
+        [
+            ball([0.03, 0.042, 0.03], AT + np.array([0, 0, 0.03])),
+            ball(0.02, AT + np.array([0, 0.02, 0.065])),
+        ]
+    )
+    T = fit(size, yaw_deg)
+
+    choice = best_shape([View(mask=mask, T_world_obj=T)], CAMERA, size, irregular)
+
+    check_solid(choice)
+    assert choice.kind == "inflated"
+    np.testing.assert_allclose(choice.T_obj_shape[:3, :3], np.eye(3), atol=1e-6)
+    low, high = AT - [0.06, 0.06, 0.01], AT + np.array([0.06, 0.06, 0.1])
+    assert overlap(choice, T, duck_like, low, high) > 0.5
+
+
+def test_an_outline_that_is_all_below_the_table_keeps_a_base():
+    outline = np.zeros((200, 200), bool)
+    outline[190:200, 90:110] = True
+
+    standing = _standing(outline, 100)
+
+    assert standing[190:, 90:110].all()
 
 
 def test_a_flat_spoon_comes_out_flat_and_long():

@@ -12,6 +12,7 @@ from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import footage_of
 from v2p_data.scene.nouns import noun_for
 from v2p_data.scene.scale import SeenCamera
+from v2p_data.scene.segment import bounding_box
 from v2p_data.scene.sight import sight
 from v2p_data.scene.tool import find_tool
 from v2p_data.video.captions import parse_caption
@@ -130,6 +131,23 @@ def test_a_box_around_the_tool_decides_which_piece_it_is(frame):
     assert (
         find_tool(footage_of(clip), watched, blocks, noun_for("stick"), (frame, elsewhere)) is None
     )
+
+
+@pytest.mark.parametrize("frame", [9, 12, 15])
+def test_a_tool_of_the_colours_of_the_hand_lies_across_its_box(frame):
+    clip, watched, blocks, sticks = drawn(colour=(208, 158, 132))
+    y, x = np.nonzero(sticks[frame])
+    box = np.zeros((H, W), bool)
+    box[y.min() : y.max() + 1, x.min() : x.max() + 1] = True
+
+    tool = find_tool(footage_of(clip), watched, blocks, noun_for("stick"), (frame, box))
+
+    found = tool.masks[frame]
+    assert found[sticks[frame]].mean() > 0.7
+    x0, y0, w, h = bounding_box(found)
+    filled = np.zeros((H, W), bool)
+    filled[y0 : y0 + h, x0 : x0 + w] = True
+    assert iou(filled, box) > 0.8
 
 
 def test_the_picture_edge_may_cut_the_tool():

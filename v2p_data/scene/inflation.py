@@ -16,6 +16,8 @@ _FLAT = 0.45
 _PLANE_PX = 200
 """Side of the square picture in which an outline is inflated."""
 _CORRECTIONS = 4
+_STANDS = 0.99
+"""Cosine of the angle between a standing fit's z axis and upright."""
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turns (right, towards the back, up) to an upright plane's (right, up, towards the camera)."""
 
@@ -81,12 +83,28 @@ def inflation(view: View, crop: Crop, size_m: Size) -> Candidate | None:
     grown, T_world_mesh = _settled(crop, solids[0], T_world_mesh)
     for solid in solids:
         solid.vertices *= grown
+    if not lies and abs(T[2, 2]) > _STANDS:
+        solids, T_world_mesh = _along_fit(solids, T_world_mesh, T)
     return Candidate(
         kind="inflated",
         mesh=solids[0],
         parts=tuple(solids[1:]),
         T_obj_shape=inverse(T) @ T_world_mesh,
     )
+
+
+def _along_fit(
+    solids: list[trimesh.Trimesh],
+    T_world_mesh: Float[np.ndarray, "4 4"],
+    T_world_fit: Float[np.ndarray, "4 4"],
+) -> tuple[list[trimesh.Trimesh], Float[np.ndarray, "4 4"]]:
+    """Return the same solids and pose with the fit's axes for their own: those of the picture's plane are the camera's, not the object's."""
+    turn = T_world_mesh[:3, :3].T @ T_world_fit[:3, :3]
+    solids = [turned(solid, turn.T) for solid in solids]
+    middle = solids[0].bounds.mean(axis=0)
+    for solid in solids:
+        solid.vertices -= middle
+    return solids, T_world_mesh @ transform(turn, turn @ middle)
 
 
 def _settled(
@@ -194,7 +212,7 @@ def _standing(outline: Bool[np.ndarray, "h w"], table: int) -> Bool[np.ndarray, 
     tall = int(rows[-1]) - table
     if tall < 4:
         return outline
-    base = max(table, int(rows[0])) + max(1, int(0.08 * tall))
+    base = min(max(table, int(rows[0])) + max(1, int(0.08 * tall)), int(rows[-1]))
     out = outline.copy()
     out[max(0, table - int(0.3 * tall)) : base] = outline[base]
     return out

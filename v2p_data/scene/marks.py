@@ -23,8 +23,8 @@ from v2p_data.video.clip import Clip
 _HINTED_SURE = 0.97
 _ELSEWHERE_LAB = 12.0
 """Where a thing is, and where it is not, a picture differs by so much and more."""
-_FILLED = 0.85
-"""People draw boxes tightly: of an outline that spans less of its box a part is missing."""
+_DRAWN_OFF_PX = 2
+"""At working size, 320 px wide: as far beside a box what is marked may go on, as the network sees it."""
 _BESIDE_PX = 3
 """At working size, 320 px wide: so far beside a box an edge may lie. People are off by a pixel or two."""
 _RAN_AWAY = 0.2
@@ -96,9 +96,7 @@ def _boxed(
     inside = _inside_of(box, footage.shape)
     drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
     if watched is not None:
-        if spans(mask, drawn) < _FILLED:
-            mask = filled(mask, watched.at(i), inside)
-        mask = less_table(mask, watched.at(i))
+        mask = less_table(filled(mask, watched.at(i), grow(inside, _DRAWN_OFF_PX)), watched.at(i))
     beside = refine(footage.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
     if spans(beside, drawn) > spans(mask, drawn) - _RAN_AWAY:
         mask = beside

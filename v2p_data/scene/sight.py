@@ -235,6 +235,7 @@ def _mover(
         moved,
         every=_every(footage),
         moving=None if watched is None else lambda i: watched.at(i)[MOVED],
+        bare=None if watched is None else lambda i: watched.at(i)[TABLE],
     )
     if mark is not None and mark.on_its_way(footage):
         course.masks[mark.frame], course.quality[mark.frame] = mark.mask, 1.0

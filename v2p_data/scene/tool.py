@@ -39,11 +39,18 @@ _KEPT, _EXTENDED = 8, 5
 """Pieces of a frame that are kept, and that are prolonged along their line."""
 _LEAST_ALIKE = 0.4
 """Pieces of a chain that look less like its best one are something else."""
-_LEAST_IN_BOX = 0.3
+_LEAST_IN_BOX, _AS_GOOD_AS_FILLED = 0.3, 0.85
+"""Overlap with a drawn box that a piece must have, and from which on more says nothing: people draw a little off."""
 _BESIDE_BOX = 0.3
 """Where a user drew a box, all else counts by this exponent."""
+_BESIDE_BOX_PX = 2
+"""People draw boxes tightly."""
+_MOSTLY_PASSES = 0.7
+"""Of a strip across the box, for it to be what passes there."""
 _MARKED_WORTH = 10.0
 """What a piece of the frame that a user marked adds to a chain beside its rating: the chain goes through there."""
+_FILLS_WORTH = 3.0
+"""What it adds where it fills the box: more than what goes over into the pieces of other frames."""
 _LEAST_WORTH = 0.25
 """Root of a rating below which it is better to see nothing."""
 
@@ -208,6 +215,13 @@ def _best_pieces(
         for piece in best:
             longer = _along(frame, passing, piece.mask, usual_px)
             _add(pieces, frame, passing, longer, usual_px, box)
+    if box is not None:
+        for mask in _across(frame, box, usual_px):
+            _add(pieces, frame, frame.passing, mask, usual_px, box)
+        inside = grow(box, _BESIDE_BOX_PX)
+        for piece in sorted(pieces, key=lambda piece: -piece.rating)[:_EXTENDED]:
+            for part in _connected(piece.mask & inside):
+                _add(pieces, frame, frame.passing, part, usual_px, box)
     return sorted(pieces, key=lambda piece: -piece.rating)[:_KEPT]
 
 
@@ -227,7 +241,7 @@ def _add(
     parts = _parts(frame, passing, mask, usual_px)
     if box is not None:
         parts |= {name: part**_BESIDE_BOX for name, part in parts.items()}
-        parts["in the box"] = _fills(mask, box)
+        parts["in the box"] = min(1.0, _fills(mask, box) / _AS_GOOD_AS_FILLED)
     pieces.append(_Piece(mask=mask, parts=parts, hist=histogram(frame.rgb[mask])))
 
 
@@ -256,6 +270,22 @@ def _along(
     return mask | tidy(line & alike, 1)
 
 
+def _across(
+    frame: _Frame, box: Bool[np.ndarray, "h w"], usual_px: tuple[float, ...]
+) -> Iterator[Bool[np.ndarray, "h w"]]:
+    """Yield what passes along the two diagonals of the box: something straight and thin that fills it lies along one of them."""
+    x, y, w, h = bounding_box(box)
+    wide = max(2, round(usual_px[1]))
+    half = wide / 2
+    left, right, top, low = (round(v) for v in (x + half, x + w - half, y + half, y + h - half))
+    for ends in (((left, top), (right, low)), ((left, low), (right, top))):
+        strip = np.zeros(box.shape, np.uint8)
+        cv2.line(strip, *ends, 1, wide)
+        passes = (strip > 0) & grow(frame.passing, 1)
+        if passes.sum() >= max(_LEAST_PX / 2, _MOSTLY_PASSES * strip.sum()):
+            yield passes
+
+
 def _best_chain(
     footage: Footage, frames: list[int], pieces: list[list[_Piece]]
 ) -> dict[int, _Piece]:
@@ -282,7 +312,9 @@ def _best_chain(
 
 def _worth(piece: _Piece) -> float:
     """Return what a piece adds to a chain: less than nothing where it is rated low."""
-    return piece.rating**0.5 - _LEAST_WORTH + _MARKED_WORTH * ("in the box" in piece.parts)
+    marked = piece.parts.get("in the box")
+    said = 0.0 if marked is None else _MARKED_WORTH + _FILLS_WORTH * marked
+    return piece.rating**0.5 - _LEAST_WORTH + said
 
 
 def _cut(passing: Bool[np.ndarray, "h w"], frame: _Frame) -> Iterator[Bool[np.ndarray, "h w"]]:

@@ -23,6 +23,8 @@ _RESTS = 0.4
 """Of the first outline: while so much of it looks as before, and the table under it does not, the object has not left."""
 _SHRUNK = 1.25
 """Of what was followed: what lies there still is taken as it was where that is larger, as less is an outline's own correction."""
+_SURELY_BARE = 0.8
+"""How surely the network sees bare table where a mask is: then the mask is none of an object that it knows."""
 _MOVES, _UNSEEN = 0.5, 0.05
 """How surely the network sees something move where the object is at both ends, for it to be believed where it sees nothing."""
 _NEAR = 0.3
@@ -82,13 +84,18 @@ def _witness(
 
 
 def track(
-    footage: Footage, moved: Moved, *, every: int = 1, moving: Moving | None = None
+    footage: Footage,
+    moved: Moved,
+    *,
+    every: int = 1,
+    moving: Moving | None = None,
+    bare: Moving | None = None,
 ) -> Track:
     """Return the object's mask over time: forwards from the first and backwards from the last outline.
 
     At each frame the direction is taken whose mask looks more like the object, and agrees better with `moving`. `every` skips frames for speed; the
     skipped ones repeat their neighbour with no quality. `moving` says how likely each pixel of a frame belongs to
-    something that moves and is no hand, if anyone knows.
+    something that moves and is no hand, `bare` how likely it is bare table, if anyone knows.
     """
     n = len(footage.rgb)
     steps = sorted({*range(0, n, every), n - 1})
@@ -139,6 +146,12 @@ def track(
             still, place = (early, moved.first) if i >= n / 2 else (late, end)
             if _alike_share(footage.lab[i], still, masks[i], grow(place, 2)) > _BARE:
                 quality[i] = 0.0
+    # Nor is bare table, where the network knows the object at first and it is hidden at the end, as in a fist.
+    if witness is None and moving is not None and bare is not None:
+        if float(moving(0)[moved.first].mean()) > _MOVES:
+            for i in steps[1:]:
+                if masks[i].any() and float(bare(i)[masks[i]].mean()) > _SURELY_BARE:
+                    quality[i] = 0.0
     for i in range(1, n):
         if not masks[i].any():
             masks[i] = masks[i - 1]
