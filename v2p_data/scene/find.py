@@ -60,8 +60,6 @@ _BARE_RATIO = 1.0
 """Logarithm of how much better what lies around explains a pixel than the thing does."""
 _SURELY, _SURELY_TABLE = 0.9, 0.8
 """From this on the network's word goes before the edges that an outline follows: they may be those of a shadow or of print."""
-_SURELY_IN_BOX = 0.8
-"""The same within a box that somebody drew."""
 _SAME_THING = 0.5
 """Share of the smaller outline in the larger, from which both are the same thing."""
 _PIECE = 0.85
@@ -378,10 +376,10 @@ def _off_sure_table(
 
 
 def completed(
-    mask: Bool[np.ndarray, "h w"], thing: Float32[np.ndarray, "h w"], surely: float = _SURELY
+    mask: Bool[np.ndarray, "h w"], thing: Float32[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Return an outline with what adjoins it and surely belongs to a thing; `thing` is how likely each pixel does."""
-    whole = tidy(mask | ((thing > surely) & grow(mask, _BESIDE_PX)))
+    whole = tidy(mask | ((thing > _SURELY) & grow(mask, _BESIDE_PX)))
     return _if_worth(largest(whole), mask) if whole.any() else mask
 
 
@@ -395,7 +393,7 @@ def filled(
     Only by what is seen as the same kind, moved or not: what moves may stand before something that does not.
     """
     own = max((MOVED, OTHER), key=lambda what: float(shares[what][mask].mean()))
-    return completed(mask, np.where(inside, shares[own], 0), _SURELY_IN_BOX)
+    return completed(mask, np.where(inside, shares[own], 0))
 
 
 def _if_worth(
