@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import apply, transform
 from v2p_data.scene.pose import camera_above
+from v2p_data.seeds import rng_for
+from v2p_data.video.synthetic import random_spec
 
 EXTENTS = np.array([0.3, 0.15, 0.1])
 
@@ -58,6 +60,34 @@ def test_a_tilted_or_hidden_box_is_left_out(trainer):
     level = transform(np.eye(3), np.array([1.5, 0, 0.05]))
     outline[155:] = False
     assert trainer._row(camera, level, EXTENTS, rgb, outline) is None
+
+
+def test_ducks_and_oval_bottles_are_learned_beside_boxes_and_round_bottles_are_not(trainer):
+    kinds = set()
+    for number in range(60):
+        rng = rng_for(number, "box network")
+        spec = random_spec(f"clip{number}", "push_left", rng, 4)
+        for k, actor in enumerate(spec.story.actors):
+            prop, learned = actor.prop, k in trainer._boxes(spec)
+            assert learned == (prop.kind in trainer.BOXES or trainer._is_along(prop))
+            if prop.kind in trainer.ALONG:
+                assert learned == (len({round(s, 6) for s in prop.size_m[:2]}) == 2)
+                kinds.add((prop.kind, learned))
+    assert {("duck", True), ("bottle", True), ("bottle", False)} <= kinds
+
+
+def test_a_duck_fills_less_of_its_box(trainer):
+    camera = camera_above((360, 480), 0.6, 0.9)
+    T = transform(np.eye(3), np.array([1.5, 0.4, EXTENTS[2] / 2]))
+    corners = camera.project(apply(T, outline_points("box", (0.3, 0.15, 0.1))))
+    middle = corners.mean(0)
+    half = np.zeros((360, 480), np.uint8)
+    inner = cv2.convexHull((middle + 0.7 * (corners - middle)).round().astype(np.int32))
+    cv2.fillConvexPoly(half, inner, 1)
+    rgb = np.full((360, 480, 3), 90, np.uint8)
+
+    assert trainer._row(camera, T, EXTENTS, rgb, half > 0) is None
+    assert trainer._row(camera, T, EXTENTS, rgb, half > 0, trainer.SHARE_OF_BOX) is not None
 
 
 def test_nothing_is_likelier_than_the_truth(trainer):

@@ -147,11 +147,11 @@ def track(
             if _alike_share(footage.lab[i], still, masks[i], grow(place, 2)) > _BARE:
                 quality[i] = 0.0
     # Nor is bare table, where the network knows the object at first and it is hidden at the end, as in a fist.
-    if witness is None and moving is not None and bare is not None:
-        if float(moving(0)[moved.first].mean()) > _MOVES:
-            for i in steps[1:]:
-                if masks[i].any() and float(bare(i)[masks[i]].mean()) > _SURELY_BARE:
-                    quality[i] = 0.0
+    known = moving is not None and moving(0)[moved.first].sum() > _MOVES * moved.first.sum()
+    if bare is not None and known and witness is None:
+        for i in steps[1:]:
+            if masks[i].any() and float(bare(i)[masks[i]].mean()) > _SURELY_BARE:
+                quality[i] = 0.0
     for i in range(1, n):
         if not masks[i].any():
             masks[i] = masks[i - 1]
