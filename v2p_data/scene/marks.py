@@ -23,6 +23,9 @@ from v2p_data.video.clip import Clip
 _HINTED_SURE = 0.97
 _ELSEWHERE_LAB = 12.0
 """Where a thing is, and where it is not, a picture differs by so much and more."""
+_SMALL_PX, _FILLED = 1500, 0.85
+"""At working size, 320 px wide: of smaller things the network, which sees them enlarged, knows more than their colours tell. People draw
+boxes tightly: of a larger outline that spans less of its box a part is missing."""
 _DRAWN_OFF_PX = 2
 """At working size, 320 px wide: as far beside a box what is marked may go on, as the network sees it."""
 _BESIDE_PX = 3
@@ -96,7 +99,9 @@ def _boxed(
     inside = _inside_of(box, footage.shape)
     drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
     if watched is not None:
-        mask = less_table(filled(mask, watched.at(i), grow(inside, _DRAWN_OFF_PX)), watched.at(i))
+        if mask.sum() < _SMALL_PX or spans(mask, drawn) < _FILLED:
+            mask = filled(mask, watched.at(i), grow(inside, _DRAWN_OFF_PX))
+        mask = less_table(mask, watched.at(i))
     beside = refine(footage.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
     if spans(beside, drawn) > spans(mask, drawn) - _RAN_AWAY:
         mask = beside
