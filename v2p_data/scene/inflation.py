@@ -76,9 +76,7 @@ def inflation(view: View, crop: Crop, size_m: Size) -> Candidate | None:
     turn = _along(mesh) if lies else _UPRIGHT
     T_world_mesh = T_world_plane @ transform(turn, np.zeros(3))
     solids = [turned(solid, turn.T) for solid in (mesh, *parts)]
-    middle = solids[0].bounds.mean(axis=0)
-    for solid in solids:
-        solid.vertices -= middle
+    middle = _centred(solids)
     T_world_mesh = T_world_mesh @ transform(np.eye(3), middle)
     grown, T_world_mesh = _settled(crop, solids[0], T_world_mesh)
     for solid in solids:
@@ -101,10 +99,16 @@ def _along_fit(
     """Return the same solids and pose with the fit's axes for their own: those of the picture's plane are the camera's, not the object's."""
     turn = T_world_mesh[:3, :3].T @ T_world_fit[:3, :3]
     solids = [turned(solid, turn.T) for solid in solids]
+    middle = _centred(solids)
+    return solids, T_world_mesh @ transform(turn, turn @ middle)
+
+
+def _centred(solids: list[trimesh.Trimesh]) -> Float[np.ndarray, "3"]:
+    """Move the solids together so that the first one's bounding box is centred, and return where its middle was."""
     middle = solids[0].bounds.mean(axis=0)
     for solid in solids:
         solid.vertices -= middle
-    return solids, T_world_mesh @ transform(turn, turn @ middle)
+    return middle
 
 
 def _settled(

@@ -277,11 +277,12 @@ def _across(
     x, y, w, h = bounding_box(box)
     wide = max(2, round(usual_px[1]))
     half = wide / 2
+    passing = grow(frame.passing, 1)
     left, right, top, low = (round(v) for v in (x + half, x + w - half, y + half, y + h - half))
     for ends in (((left, top), (right, low)), ((left, low), (right, top))):
         strip = np.zeros(box.shape, np.uint8)
         cv2.line(strip, *ends, 1, wide)
-        passes = (strip > 0) & grow(frame.passing, 1)
+        passes = (strip > 0) & passing
         if passes.sum() >= max(_LEAST_PX / 2, _MOSTLY_PASSES * strip.sum()):
             yield passes
 
