@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import apply
+from v2p_data.geometry.raster import fill, in_parts
 from v2p_data.scene.segment import iou
 
 _AROUND = 32
@@ -64,6 +65,5 @@ def _hull(points_world: Float[np.ndarray, "n 3"], camera: Camera) -> Bool[np.nda
     drawn = np.zeros((camera.height_px, camera.width_px), np.uint8)
     pixels = camera.project(points_world)
     if np.isfinite(pixels).all() and np.abs(pixels).max() < 4 * max(drawn.shape):
-        hull = cv2.convexHull(((pixels - 0.5) * 16).astype(np.int32))
-        cv2.fillConvexPoly(drawn, hull, 1, cv2.LINE_8, 4)
+        fill(drawn, cv2.convexHull(in_parts(pixels)))
     return drawn > 0

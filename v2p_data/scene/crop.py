@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from v2p_data.geometry.camera import Camera, between_centres
 from v2p_data.geometry.pose import inverse
+from v2p_data.geometry.raster import fill, in_parts
 from v2p_data.scene.segment import bounding_box
 
 _CROP_PX = 160
@@ -78,8 +79,8 @@ class Crop:
         a, b, c = (pixels[mesh.faces[:, k]] for k in range(3))
         turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
         # Of a closed surface the faces that look this way cover all.
-        for triangle in ((np.stack([a, b, c], axis=1)[turn < 0] - 0.5) * 16).astype(np.int32):
-            cv2.fillConvexPoly(picture, triangle, 1, cv2.LINE_8, 4)
+        for triangle in in_parts(np.stack([a, b, c], axis=1)[turn < 0]):
+            fill(picture, triangle)
         return picture > 0
 
     def iou(self, drawn: Bool[np.ndarray, "i j"]) -> float:

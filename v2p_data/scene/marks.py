@@ -10,6 +10,7 @@ from v2p_data.scene.classes import MOVED, OTHER
 from v2p_data.scene.find import Watched, filled, less_table
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.segment import (
+    DRAWN_OFF_PX,
     bounding_box,
     ellipse_in,
     from_box,
@@ -26,8 +27,6 @@ _ELSEWHERE_LAB = 12.0
 _SMALL_PX, _FILLED = 1500, 0.85
 """At working size, 320 px wide: of smaller things the network, which sees them enlarged, knows more than their colours tell. People draw
 boxes tightly: of a larger outline that spans less of its box a part is missing."""
-_DRAWN_OFF_PX = 2
-"""At working size, 320 px wide: as far beside a box what is marked may go on, as the network sees it."""
 _BESIDE_PX = 3
 """At working size, 320 px wide: so far beside a box an edge may lie. People are off by a pixel or two."""
 _RAN_AWAY = 0.2
@@ -100,7 +99,7 @@ def _boxed(
     drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
     if watched is not None:
         if mask.sum() < _SMALL_PX or spans(mask, drawn) < _FILLED:
-            mask = filled(mask, watched.at(i), grow(inside, _DRAWN_OFF_PX))
+            mask = filled(mask, watched.at(i), grow(inside, DRAWN_OFF_PX))
         mask = less_table(mask, watched.at(i))
     beside = refine(footage.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
     if spans(beside, drawn) > spans(mask, drawn) - _RAN_AWAY:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import inverse, transform
+from v2p_data.geometry.raster import PARTS, fill, in_parts
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.segment import bounding_box, is_cut
 
@@ -155,14 +156,13 @@ class Silhouette:
         if not np.isfinite(pixels).all() or np.abs(pixels).max() > 4000:
             return None
         drawn = np.zeros(self._mask.shape, np.uint8)
-        # Pixel centres lie at one half, OpenCV counts them as whole numbers.
-        hull = cv2.convexHull(((pixels - 0.5) * 16).astype(np.int32))
-        cv2.fillConvexPoly(drawn, hull, 1, cv2.LINE_8, 4)
+        hull = cv2.convexHull(in_parts(pixels))
+        fill(drawn, hull)
         covered = drawn > 0
         total = float(covered.sum())
         seen = covered & self._known
         common, hidden = float((seen & self._mask).sum()), total - float(seen.sum())
-        beyond = 0.0 if self._at_border else max(0.0, cv2.contourArea(hull) / 256 - total)
+        beyond = 0.0 if self._at_border else max(0.0, cv2.contourArea(hull) / PARTS**2 - total)
         return common, float(seen.sum()) - common + beyond, hidden, total + beyond
 
     @property

@@ -1,12 +1,12 @@
 """The largest body of revolution that an outline leaves room for: the neck of a bottle, the bulge of a bowl."""
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from v2p_data.geometry.mesh import lathe, lathe_parts, wall_m
 from v2p_data.geometry.pose import transform
+from v2p_data.geometry.raster import fill, in_parts
 from v2p_data.scene.candidate import Candidate, Size
 from v2p_data.scene.crop import Crop, View
 from v2p_data.scene.nouns import Noun
@@ -126,7 +126,7 @@ def _needed(
         pixels = crop.pixels(points @ T_world_obj[:3, :3].T + centre)
         picture = np.zeros(crop.mask.shape, np.uint8)
         if np.isfinite(pixels).all():
-            cv2.fillConvexPoly(picture, ((pixels - 0.5) * 16).astype(np.int32), 1, cv2.LINE_8, 4)
+            fill(picture, in_parts(pixels))
         discs.append(picture > 0)
     stack = np.array(discs)
     covers = stack.sum(axis=0)

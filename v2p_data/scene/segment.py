@@ -7,6 +7,8 @@ from jaxtyping import Bool, Float, UInt8
 from v2p_data.scene.colour import lab_of
 
 _ITERATIONS = 4
+DRAWN_OFF_PX = 2
+"""At working size, 320 px wide: people draw boxes so tightly that what they mean may go on so far beside them."""
 _HANDLE_WIDTH = 0.45
 """A handle is narrower than this share of its vessel's outline."""
 _LEAST_HANDLE = 0.02

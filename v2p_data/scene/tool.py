@@ -18,7 +18,7 @@ from v2p_data.scene.find import Watched
 from v2p_data.scene.footage import Footage
 from v2p_data.scene.nouns import Noun
 from v2p_data.scene.scale import px_per_m
-from v2p_data.scene.segment import bounding_box, grow, iou, is_cut, tidy
+from v2p_data.scene.segment import DRAWN_OFF_PX, bounding_box, grow, iou, is_cut, tidy
 
 _PASSING_LAB = 10.0
 """A pixel that differs so much from what is there for good shows something that passes."""
@@ -43,8 +43,6 @@ _LEAST_IN_BOX, _AS_GOOD_AS_FILLED = 0.3, 0.85
 """Overlap with a drawn box that a piece must have, and from which on more says nothing: people draw a little off."""
 _BESIDE_BOX = 0.3
 """Where a user drew a box, all else counts by this exponent."""
-_BESIDE_BOX_PX = 2
-"""People draw boxes tightly."""
 _MOSTLY_PASSES = 0.7
 """Of a strip across the box, for it to be what passes there."""
 _MARKED_WORTH = 10.0
@@ -218,7 +216,7 @@ def _best_pieces(
     if box is not None:
         for mask in _across(frame, box, usual_px):
             _add(pieces, frame, frame.passing, mask, usual_px, box)
-        inside = grow(box, _BESIDE_BOX_PX)
+        inside = grow(box, DRAWN_OFF_PX)
         for piece in sorted(pieces, key=lambda piece: -piece.rating)[:_EXTENDED]:
             for part in _connected(piece.mask & inside):
                 _add(pieces, frame, frame.passing, part, usual_px, box)
