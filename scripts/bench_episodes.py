@@ -343,7 +343,7 @@ def stage_synthetic(out: Path, episodes: int, tasks: int) -> None:
         Episode(
             id=f"synthetic_{number:05d}", item=f"item_{number % tasks}", task=f"do task {number % tasks}",
             seed=number, labels=labels,
-            state=rng.normal(size=(SYNTHETIC_FRAMES, 7)).astype(np.float32),
+            state=rng.normal(size=(SYNTHETIC_FRAMES, 11)).astype(np.float32),
             action=rng.uniform(-1, 1, (SYNTHETIC_FRAMES, 7)).astype(np.float32),
             success=np.arange(SYNTHETIC_FRAMES) > SYNTHETIC_FRAMES - 8, referee=True, objects=("a", "b"),
         ).save(out / "episodes")  # fmt: skip

@@ -15,7 +15,12 @@ from v2p_data.task.task import TaskBundle
 
 pytestmark = pytest.mark.slow
 
-STATE_NAMES = [f"eef_{k}.pos" for k in ("x", "y", "z", "rx", "ry", "rz")] + ["gripper.pos"]
+STATE_NAMES = [
+    *(f"eef_{k}.pos" for k in ("x", "y", "z", "rx", "ry", "rz")),
+    "gripper.pos",
+    *(f"lead_{k}.pos" for k in ("x", "y", "z")),
+    "target_gripper.pos",
+]
 ACTION_NAMES = [f"delta_{k}.pos" for k in ("x", "y", "z", "rx", "ry", "rz")] + [
     "gripper_close.pos"
 ]
@@ -91,7 +96,6 @@ def dataset(tmp_path_factory) -> Path:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     root = tmp_path_factory.mktemp("data") / "dummy"
-    shape = {"dtype": "float32", "shape": (7,)}
     writer = LeRobotDataset.create(
         "v2p/dummy",
         fps=20,
@@ -103,8 +107,8 @@ def dataset(tmp_path_factory) -> Path:
                 "shape": (64, 64, 3),
                 "names": ["height", "width", "channels"],
             },
-            "observation.state": {**shape, "names": STATE_NAMES},
-            "action": {**shape, "names": ACTION_NAMES},
+            "observation.state": {"dtype": "float32", "shape": (11,), "names": STATE_NAMES},
+            "action": {"dtype": "float32", "shape": (7,), "names": ACTION_NAMES},
         },
         rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=0, pix_fmt="yuv420p"),
     )
@@ -115,7 +119,7 @@ def dataset(tmp_path_factory) -> Path:
             writer.add_frame(
                 {
                     "observation.images.mask": greys[rng.integers(0, 3, (64, 64, 1))].repeat(3, 2),
-                    "observation.state": rng.normal(size=7).astype(np.float32),
+                    "observation.state": rng.normal(size=11).astype(np.float32),
                     "action": rng.uniform(-1, 1, 7).astype(np.float32),
                     "task": "leaving the cube alone",
                 }
@@ -341,4 +345,4 @@ def test_targets_move_by_the_action_scale_and_stay_on_their_leashes():
     turned = ToolPose(
         pos=measured.pos, rotation=Rotation.from_rotvec([0, 0, 0.3]) * DOWN, opening=0
     )
-    np.testing.assert_allclose(turned.state()[3:], [0, 0, -0.3, 0], atol=1e-12)
+    np.testing.assert_allclose(turned.state(turned)[3:7], [0, 0, -0.3, 0], atol=1e-12)

@@ -25,9 +25,21 @@ class ToolPose:
     opening: float
     """0 closed, 1 open."""
 
-    def state(self) -> Float[np.ndarray, "7"]:
-        """Return `observation.state`: position [m], rotation from straight down [rad], opening."""
-        return np.concatenate([self.pos, (DOWN.inv() * self.rotation).as_rotvec(), [self.opening]])
+    def state(self, target: "ToolPose") -> Float[np.ndarray, "11"]:
+        """Return `observation.state` of a tool that is commanded to `target`.
+
+        Position [m], rotation vector from straight down [rad], opening; then the command: target position minus
+        position [m], target opening.
+        """
+        return np.concatenate(
+            [
+                self.pos,
+                (DOWN.inv() * self.rotation).as_rotvec(),
+                [self.opening],
+                target.pos - self.pos,
+                [target.opening],
+            ]
+        )
 
 
 def next_target(

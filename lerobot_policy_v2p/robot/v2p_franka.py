@@ -92,7 +92,9 @@ class FrankyArm:
         self.pending: Any = None
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._measure().state(), labels_to_rgb(np.asarray(self.labels(), np.uint8))
+        return self._measure().state(self.target), labels_to_rgb(
+            np.asarray(self.labels(), np.uint8)
+        )
 
     def act(self, action: np.ndarray) -> None:
         self.target = next_target(

@@ -33,7 +33,7 @@ def an_episode(number: int, *, size_px: int = SIZE_PX, num_frames: int = NUM_FRA
         task="lift the toy up" if number % 2 == 0 else "push the toy to the left",
         seed=number,
         labels=labels,
-        state=rng.normal(size=(num_frames, 7)).astype(np.float32),
+        state=rng.normal(size=(num_frames, 11)).astype(np.float32),
         action=rng.uniform(-1, 1, (num_frames, 7)).astype(np.float32),
         success=np.arange(num_frames) >= num_frames - 4,
         referee=True,

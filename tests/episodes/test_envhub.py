@@ -132,7 +132,7 @@ def test_lerobot_loads_a_pushed_environment_by_its_name(
     assert [line for line in done.stdout.splitlines() if ": " in line] == [
         "untrusted: True",
         "tasks: {'v2p': [0, 1]}",
-        "seen: (2, 256, 256, 3) (2, 7)",
+        "seen: (2, 256, 256, 3) (2, 11)",
         "repeats: True",
         "told: ('push the cube to the left', 'push the cube to the left') [False, False]",
         "from the cache: True",

@@ -195,7 +195,7 @@ def episode(name: str, item: str, num_frames=40) -> Episode:
     action = np.sin(np.linspace(0, 6, num_frames)[:, None] + np.arange(7)).astype(np.float32)
     return Episode(
         id=name, item=item, task="Lifting a mug", seed=1, labels=labels, action=action, objects=("mug",),
-        state=np.zeros((num_frames, 7), np.float32), success=np.arange(num_frames) > 30, referee=True,
+        state=np.zeros((num_frames, 11), np.float32), success=np.arange(num_frames) > 30, referee=True,
     )  # fmt: skip
 
 

@@ -386,9 +386,11 @@ def test_the_gripper_leans_no_further_than_its_limit(make_env: Callable[..., Bat
     assert tilt == pytest.approx(env.cfg.tilt_limit_rad, abs=0.02)
 
 
-def test_robot_state_is_pose_from_straight_down_and_opening(make_env: Callable[..., BatchEnv]):
+def test_robot_state_is_pose_from_straight_down_opening_and_command(
+    make_env: Callable[..., BatchEnv],
+):
     env = make_env(cfg=CALM)
-    assert env.robot_state()[0, 3:] == pytest.approx([0, 0, 0, 1], abs=1e-6)
+    assert env.robot_state()[0, 3:] == pytest.approx([0, 0, 0, 1, 0, 0, 0, 1], abs=1e-6)
     action = np.zeros((8, 7))
     action[:, [0, 3, 5, 6]] = 0.3, 0.4, 0.8, 0.5
 
@@ -403,6 +405,11 @@ def test_robot_state_is_pose_from_straight_down_and_opening(make_env: Callable[.
         state[3:6], Rotation.from_matrix(down.T @ tool).as_rotvec(), atol=1e-5
     )
     assert state[6] == pytest.approx(float(env.states()["gripper_width"][0]) / 0.085, abs=1e-5)
+    base = env.states()["base_observation"][0].numpy()  # its own way to the same numbers
+    np.testing.assert_allclose(state[7:10], base[11:14] / 20, atol=1e-6)
+    assert state[10] == pytest.approx(base[14], abs=1e-6)
+    assert state[7] > 0.002
+    assert state[10] < 1
 
 
 def test_a_delta_action_moves_the_tool_by_its_metres_and_radians(

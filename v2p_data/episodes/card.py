@@ -14,7 +14,10 @@ TAGS = ("LeRobot", "robotics", "segmentation", "simulation", "mujoco", "video2po
 LICENSE = "apache-2.0"
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 """The Hub's words for how many episodes there are."""
-STATE_UNITS = ("m", "m", "m", "rad", "rad", "rad", "0 closed to 1 open")
+STATE_UNITS = (
+    *("m", "m", "m", "rad", "rad", "rad", "0 closed to 1 open"),
+    *("m, target minus tool", "m", "m", "0 closed to 1 open"),
+)
 ACTION_UNITS = (
     *("x 0.03 m",) * 3,
     *("x 0.2 rad",) * 3,

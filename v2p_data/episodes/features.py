@@ -24,8 +24,13 @@ STATE_NAMES = (
     "eef_ry.pos",
     "eef_rz.pos",
     "gripper.pos",
+    "lead_x.pos",
+    "lead_y.pos",
+    "lead_z.pos",
+    "target_gripper.pos",
 )
-"""Tool position [m], rotation vector from straight down [rad], gripper opening 0 to 1; robot base frame."""
+"""Tool position [m], rotation vector from straight down [rad], gripper opening 0 to 1; then the controller's command:
+target position minus tool position [m], target opening 0 to 1. Robot base frame."""
 ACTION_NAMES = (
     "delta_x.pos",
     "delta_y.pos",
@@ -49,7 +54,11 @@ def features(size_px: int, cameras: tuple[str, ...] = ("mask",)) -> dict[str, di
             }
             for camera in cameras
         },
-        STATE_KEY: {"dtype": "float32", "shape": (7,), "names": list(STATE_NAMES)},
+        STATE_KEY: {
+            "dtype": "float32",
+            "shape": (len(STATE_NAMES),),
+            "names": list(STATE_NAMES),
+        },
         ACTION_KEY: {"dtype": "float32", "shape": (7,), "names": list(ACTION_NAMES)},
         SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},
     }

@@ -38,7 +38,7 @@ class Rollouts:
     """One batch of episodes, drawn later or never. Row `t` precedes action `t`."""
 
     seed: int
-    state: Float32[np.ndarray, "time env 7"]
+    state: Float32[np.ndarray, "time env 11"]
     action: Float32[np.ndarray, "time env 7"]
     success: Bool[np.ndarray, "time env"]
     """The task's judgement after action `t`."""

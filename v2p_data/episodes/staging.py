@@ -47,7 +47,7 @@ class Episode:
     seed: int
     labels: UInt8[np.ndarray, "time h w"]
     """0 background, 1 robot, 2 manipulated object, 3.. the others."""
-    state: Float32[np.ndarray, "time 7"]
+    state: Float32[np.ndarray, "time 11"]
     action: Float32[np.ndarray, "time 7"]
     success: Bool[np.ndarray, "time"]
     """Whether success has held (0.25 s on end) by the end of the row's action; never falls back."""

@@ -347,14 +347,21 @@ class BatchEnv:
         """Return the tensors task code sees; they share memory that the next step or reset overwrites."""
         return self._block.tensors()
 
-    def robot_state(self) -> Float32[np.ndarray, "env 7"]:
-        """Return `observation.state`: tool position [m], its rotation from straight down [rad], opening 0 to 1."""
+    def robot_state(self) -> Float32[np.ndarray, "env 11"]:
+        """Return `observation.state`.
+
+        Tool position [m], its rotation vector from straight down [rad], gripper opening (0 to 1), then what the
+        controller knows of its command: target position minus tool position [m], target opening (0 to 1).
+        """
+        travel = self._robot.finger_travel_m
         fingers = self._qpos[:, self._robot.fingers].sum(1, keepdims=True)
         return np.concatenate(
             [
                 self._tool.pos,
                 _rotvec_from_down(self._tool.quat_wxyz),
-                np.clip(fingers / (2 * self._robot.finger_travel_m), 0.0, 1.0),
+                np.clip(fingers / (2 * travel), 0.0, 1.0),
+                self._target_pos - self._tool.pos,
+                self._target_finger[:, None] / travel,
             ],
             axis=1,
             dtype=np.float32,

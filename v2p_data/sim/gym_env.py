@@ -2,7 +2,7 @@
 
 | | |
 |---|---|
-| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `agent_pos`: 7 float32, see `BatchEnv.robot_state` |
+| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `agent_pos`: 11 float32, see `BatchEnv.robot_state` |
 | Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz |
 | Reward | the task's training reward |
 | Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
@@ -30,8 +30,9 @@ from v2p_data.task.task import TaskBundle
 
 ENV_ID = "v2p/Task-v0"
 CONTROL_HZ = 20
-STATE_LOW = (-1.5, -1.5, -0.5, -np.pi, -np.pi, -np.pi, 0.0)
-STATE_HIGH = (1.5, 1.5, 1.5, np.pi, np.pi, np.pi, 1.0)
+STATE_LOW = (-1.5, -1.5, -0.5, -np.pi, -np.pi, -np.pi, 0.0, -1.0, -1.0, -1.0, 0.0)
+STATE_HIGH = (1.5, 1.5, 1.5, np.pi, np.pi, np.pi, 1.0, 1.0, 1.0, 1.0, 1.0)
+"""Bounds of `BatchEnv.robot_state`."""
 
 
 class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):

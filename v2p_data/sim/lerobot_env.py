@@ -17,7 +17,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.gym_env import CONTROL_HZ, V2PEnv
+from v2p_data.sim.gym_env import CONTROL_HZ, STATE_LOW, V2PEnv
 from v2p_data.task.task import TASK_FILE
 
 TASKS_IN_DATASET = Path("v2p/tasks")
@@ -71,7 +71,7 @@ class V2PEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (7,)),
-            "agent_pos": PolicyFeature(FeatureType.STATE, (7,)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (len(STATE_LOW),)),
             "pixels/mask": PolicyFeature(FeatureType.VISUAL, (self.size_px, self.size_px, 3)),
         }
 
