@@ -1,11 +1,11 @@
-"""Settings of the `v2p_bc` policy: the paper's behaviour cloning, with sizes a laptop can train.
+"""Settings of the `v2p_bc` policy: the paper's behaviour cloning, what mends it, and sizes a laptop can train.
 
 LeRobot fills `input_features` and `output_features` from the dataset. This is a LeRobot config, hence neither
 frozen nor keyword-only: draccus parses it and LeRobot writes into it.
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
@@ -16,13 +16,41 @@ BACKBONE_WEIGHTS = "ResNet18_Weights.IMAGENET1K_V1"
 LONGEST_TRAINING = 1_000_000_000
 """Steps, more than anyone trains for: LeRobot shortens a schedule to fit, but never stretches one."""
 CameraInput = Literal["auto", "mask", "rgb"]
+Encoder = Literal["resnet18", "conv", "none"]
+PRESETS: dict[str, dict[str, Any]] = {
+    "custom": {},
+    "paper": {
+        "n_obs_steps": 2,
+        "chunk_size": 1,
+        "n_action_steps": 1,
+        "input_size_px": 256,
+        "encoder": "resnet18",
+        "mask_moments": False,
+        "head": "regression",
+        "pretrained_backbone_weights": BACKBONE_WEIGHTS,
+        "optimizer_lr": 3e-4,
+        "optimizer_lr_backbone": 3e-5,
+        "lr_schedule": "constant",
+    },
+    "small": {
+        "encoder": "none",
+        "mask_moments": True,
+        "head": "bins",
+        "pretrained_backbone_weights": None,
+        "optimizer_lr": 1e-3,
+    },
+}
+"""Per preset the settings that it fixes."""
 
 
 @PreTrainedConfig.register_subclass("v2p_bc")
 @dataclass
 class V2PBCConfig(PreTrainedConfig):
-    """ResNet18 on stacked frames, a state MLP, an optional task embedding, and a three-layer head."""
+    """An encoder of stacked frames, a state MLP, an optional task embedding, and a three-layer head."""
 
+    preset: Literal["custom", "paper", "small"] = "custom"
+    """Fixes several settings at once, over what is said of them elsewhere. `paper`: ResNet18, 256 px, regression, the
+    paper's learning rates. `small`: no convolutions, moments of the masks only; trains in minutes on a CPU."""
     n_obs_steps: int = 2
     """Frames the policy sees: the current one and the ones before it; at an episode's start the first is repeated."""
     chunk_size: int = 1
@@ -37,12 +65,29 @@ class V2PBCConfig(PreTrainedConfig):
     cameras with 'mask' in their name, `rgb` for the others."""
     mask_greys: tuple[int, ...] = (0, 64, 128, 192, 255, 31, 95, 159, 223)
     """Grey (0 to 255) of each label of a label image; a pixel belongs to the nearest."""
+    num_labels: int | None = None
+    """Labels that the network tells apart, the background included; higher ones count as none. Null: all greys. Fewer
+    cost less: our trainer sets it to the labels that occur."""
+
+    encoder: Encoder = "resnet18"
+    """`resnet18`: the paper's, pooled by averaging. `conv`: four strided convolutions and a flatten, which keep
+    positions. `none`: masks are seen by their moments only (other cameras still get `conv`)."""
+    mask_moments: bool = True
+    """Give the head area, centroid, extent and bounding box of each label, measured at full resolution."""
+    head: Literal["bins", "regression"] = "bins"
+    """`bins`: a distribution over levels for each entry of the action, which can choose between opposites.
+    `regression`: the paper's."""
+    num_bins: int = 21
+    """Levels of an action's entry from its smallest to its largest value."""
 
     random_shift: float = 0.0
     """Training only: images are shifted at random by up to this share of their size, all frames of a sample alike.
     Meant for long trainings on few demonstrations; in 300 steps it only slows the fit."""
     pretrained_backbone_weights: str | None = BACKBONE_WEIGHTS
-    """Used when the file lies in torch's cache (nothing is ever downloaded); null starts from random weights."""
+    """Of `resnet18`. Used when the file lies in torch's cache (nothing is ever downloaded); null starts from random
+    weights."""
+    state_entries: int | None = None
+    """Entries of the robot's state that are used, from the first on. Null: all."""
     state_dim: int = 256
     """Width of the robot state's embedding."""
     head_dim: int = 512
@@ -72,9 +117,19 @@ class V2PBCConfig(PreTrainedConfig):
             "ACTION": NormalizationMode.MEAN_STD,
         }
     )
+    """`ACTION` follows from `head`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name, value in PRESETS[self.preset].items():
+            setattr(self, name, value)
+        # Bins need a bounded range.
+        self.normalization_mapping = {
+            **self.normalization_mapping,
+            "ACTION": NormalizationMode.MIN_MAX
+            if self.head == "bins"
+            else NormalizationMode.MEAN_STD,
+        }
         if self.n_obs_steps < 1:
             raise ValueError(f"n_obs_steps is {self.n_obs_steps}; it must be 1 or more")
         if not 1 <= self.n_action_steps <= self.chunk_size:
@@ -83,6 +138,13 @@ class V2PBCConfig(PreTrainedConfig):
             )
         if self.input_size_px < 32:
             raise ValueError(f"input_size_px is {self.input_size_px}; ResNet18 needs 32 or more")
+        if self.num_bins < 2:
+            raise ValueError(f"num_bins is {self.num_bins}; it must be 2 or more")
+        if self.num_labels is not None and not 2 <= self.num_labels <= len(self.mask_greys):
+            raise ValueError(
+                f"num_labels is {self.num_labels}; it lies between 2 and the number of mask_greys"
+                f" ({len(self.mask_greys)})"
+            )
         if not 0 <= self.random_shift < 0.5:
             raise ValueError(f"random_shift is {self.random_shift}; it lies between 0 and 0.5")
         if len(set(self.mask_greys)) < 2 or not all(0 <= grey <= 255 for grey in self.mask_greys):

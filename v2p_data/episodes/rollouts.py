@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 
 from v2p_data.episodes.features import FPS
-from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot
-from v2p_data.sim.verdict import referee_verdict
+from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot, StepResult
+from v2p_data.sim.verdict import as_cut, referee_verdict
 from v2p_data.task.task import Task, TaskBundle
 
 Act = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
@@ -78,6 +78,49 @@ class Rollouts:
                 "detail": "the task's success held, the independent one did not"}  # fmt: skip
 
 
+class EpisodeEnds:
+    """Where the episodes of a batch of worlds end: soon after success has held, at a breakdown, or when time is up.
+
+    Args:
+        num_worlds: number of worlds.
+        horizon: longest episode, in control steps.
+        cut: how soon after success.
+
+    Attributes:
+        num_frames: rows that belong to each episode, as far as is known.
+        held_at: row at whose end success had held for the first time; the horizon where it has not.
+        broke: where the simulation broke down during the episode.
+    """
+
+    def __init__(self, num_worlds: int, horizon: int, cut: CutConfig) -> None:
+        self.cut, self.horizon = cut, horizon
+        self.num_frames = np.full(num_worlds, horizon)
+        self.held_at = np.full(num_worlds, horizon)
+        self.broke = np.zeros(num_worlds, bool)
+        self._held = np.zeros(num_worlds, bool)
+
+    def note(self, t: int, result: StepResult) -> None:
+        """Take into account what action `t` led to."""
+        now = result.held & ~self._held & ~self.broke
+        self.num_frames[now] = np.clip(
+            t + 1 + self.cut.tail_steps, self.cut.min_frames, self.horizon
+        )
+        self.held_at[now] = t
+        self._held |= now
+        gone = result.terminated & ~self.broke & (t < self.num_frames)
+        self.num_frames[gone] = t + 1
+        self.broke |= gone
+
+    def all_over(self, t: int) -> bool:
+        """Tell whether action `t` was the last one that belongs to an episode."""
+        return bool((t + 1 >= self.num_frames).all())
+
+    @property
+    def successes(self) -> Bool[np.ndarray, "env"]:
+        """Where success has held and the simulation is sound."""
+        return self._held & ~self.broke
+
+
 def roll_out(
     bundle: TaskBundle,
     act: Act,
@@ -97,10 +140,7 @@ def roll_out(
     obs = env.observe()
     states, actions, successes, snapshots = [], [], [], []
     trajectory = [_copied(env)]
-    held = np.zeros(num_worlds, bool)
-    broke = np.zeros(num_worlds, bool)
-    end = np.full(num_worlds, env.horizon)
-    held_at = end.copy()
+    ends = EpisodeEnds(num_worlds, env.horizon, cut)
     for t in range(env.horizon):
         states.append(env.robot_state())
         snapshots.append(env.snapshot(everyone))
@@ -110,29 +150,23 @@ def roll_out(
         actions.append(action)
         successes.append(result.success)
         trajectory.append(_copied(env))
-        now = result.held & ~held & ~broke
-        end[now] = np.clip(t + 1 + cut.tail_steps, cut.min_frames, env.horizon)
-        held_at[now] = t
-        held |= now
-        gone = result.terminated & ~broke & (t < end)
-        end[gone] = t + 1
-        broke |= gone
-        if (t + 1 >= end).all():
+        ends.note(t, result)
+        if ends.all_over(t):
             break
-    held &= ~broke
+    held = ends.successes
     judge = referee or referee_verdict
-    verdict = judge(bundle, _as_cut(trajectory, end)) & held if held.any() else held
+    verdict = judge(bundle, as_cut(trajectory, ends.num_frames)) & held if held.any() else held
     return Rollouts(
         seed=seed,
         state=np.stack(states),
         action=np.stack(actions),
         success=np.stack(successes),
         snapshots=tuple(snapshots),
-        num_frames=end,
-        held_at=held_at,
+        num_frames=ends.num_frames,
+        held_at=ends.held_at,
         task_successes=held,
         referee=verdict,
-        broke=broke,
+        broke=ends.broke,
         params=params,
     )
 
@@ -143,10 +177,3 @@ def _copied(env: BatchEnv) -> dict[str, np.ndarray]:
         for key, value in env.states().items()
         if key != "base_observation"
     }
-
-
-def _as_cut(moments: list[dict[str, np.ndarray]], end: Int[np.ndarray, "env"]) -> Course:
-    """Return the moments stacked, each world standing still from its episode's end on."""
-    time = np.minimum(np.arange(len(moments))[:, None], end[None])
-    worlds = np.arange(len(end))
-    return {key: np.stack([m[key] for m in moments])[time, worlds] for key in moments[0]}

@@ -21,6 +21,9 @@ OBSERVATION_LIMIT = 5.0
 OBJECT_SLOTS = 2
 """Objects that the base observation describes: the manipulated one, then the first other."""
 
+PROGRESS_COLUMN = 72
+"""Of the base observation: the share of the horizon that has passed. Experts know values up to 1."""
+
 NUM_ROBOT_COLUMNS = 16
 NUM_OBJECT_COLUMNS = 26
 _ROBOT_COLUMNS = {
@@ -199,7 +202,7 @@ def _fill_base(
     np.subtract(pos, _OBJECT_CENTRE, out=slot[:, 15:18])
     slot[:, 18:21] = objects[:, 7:10]
     base[64:70].reshape(OBJECT_SLOTS, 3, n)[:slots] = objects[:, 13:16]
-    base[72] = seen.progress
+    base[PROGRESS_COLUMN] = seen.progress
     np.subtract(pos, objects[:, 16:19], out=base[73:79].reshape(OBJECT_SLOTS, 3, n)[:slots])
     base[79] = float(slots > 1)
 

@@ -19,6 +19,7 @@ from v2p_data.sim.states import (
     NEARLY_OPEN_M,
     OBJECT_SLOTS,
     OBSERVATION_LIMIT,
+    PROGRESS_COLUMN,
 )
 from v2p_data.task.task import BASE_OBSERVATION_DIM
 
@@ -139,7 +140,7 @@ def base_observation(
     out[:, 70:72] = seen.touches[:, 0]
     if slots > 1:
         out[:, 88:90] = seen.touches[:, 1]
-    out[:, 72] = seen.progress
+    out[:, PROGRESS_COLUMN] = seen.progress
     out[:, 79] = float(slots > 1)
     return out.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 

@@ -1,9 +1,9 @@
 """The independent referee on episodes that a `BatchEnv` is running: what happened so far, and is it success?"""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.task.referee import ObjectTrack, Trajectory, referee_success
@@ -30,6 +30,15 @@ def referee_verdict(
     return referee_success(bundle.kind, bundle.scene, trajectory)
 
 
+def as_cut(
+    moments: Sequence[Mapping[str, np.ndarray]], end: Int[np.ndarray, "env"]
+) -> dict[str, np.ndarray]:
+    """Return the moments stacked, each world standing still from its episode's end on."""
+    time = np.minimum(np.arange(len(moments))[:, None], end[None])
+    worlds = np.arange(len(end))
+    return {key: np.stack([m[key] for m in moments])[time, worlds] for key in moments[0]}
+
+
 class Witness:
     """Remembers the courses of all worlds of an environment, which start and end together."""
 
@@ -51,6 +60,10 @@ class Witness:
             for key in ("pos", "quat", "size", "touched", "grasped")
         ]
         self.moments.append({key: states[key].numpy().astype(float) for key in keys})
+
+    def verdict_as_cut(self, end: Int[np.ndarray, "env"]) -> Bool[np.ndarray, "env"]:
+        """Return what the referee says of episodes of `end` steps each; see `as_cut`."""
+        return referee_verdict(self.env.bundle, as_cut(self.moments, end))
 
     def verdict(self) -> Bool[np.ndarray, "env"]:
         """Return what the referee says of the episodes so far."""

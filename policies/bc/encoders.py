@@ -1,0 +1,318 @@
+"""From pictures to vectors: what is computed once a frame (`prepare`), and what is learned (`forward`).
+
+A label image becomes one channel per label before it is made smaller: a grey level means nothing, and averaging
+labels 0 and 2 must not look like label 1, whereas averaging channels gives the share of each label in a pixel.
+`prepare` has no parameters and treats each frame by itself, so its uint8 and float32 results can be kept: a trainer
+computes them once a frame, a roll-out once a step.
+"""
+
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everybody knows
+from jaxtyping import Float, Shaped, UInt8
+from torch import Tensor, nn
+from torchvision.models import ResNet18_Weights, resnet18
+
+from policies.bc.configuration_v2p_bc import V2PBCConfig
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+BACKBONE_DIM = 512
+CONV_WIDTHS = (32, 64, 96, 128)
+NUM_MOMENTS = 10
+"""Numbers that `mask_moments` gives per label."""
+LEAST_PIXELS = 4
+"""A label with fewer pixels counts as absent."""
+
+Prepared = dict[str, Tensor]
+"""`picture`: uint8 `(batch, time, channel, h, w)`; `moments`: float32 `(batch, time, label x 10)`; either may be absent."""
+
+
+def shrink(
+    frames: Float[Tensor, "batch c h w"], longer_side_px: int
+) -> Float[Tensor, "batch c h2 w2"]:
+    """Average the frames down until their longer side has this many pixels; never enlarge."""
+    height, width = frames.shape[-2:]
+    scale = longer_side_px / max(height, width)
+    if scale >= 1:
+        return frames
+    return F.interpolate(frames, size=(round(height * scale), round(width * scale)), mode="area")
+
+
+def as_uint8(frames: Shaped[Tensor, "*batch h w"]) -> UInt8[Tensor, "*batch h w"]:
+    """Return pictures as 0 to 255, from that or from floats in [0, 1]."""
+    if frames.dtype == torch.uint8:
+        return frames
+    return (frames * 255).round().clamp(0, 255).to(torch.uint8)
+
+
+def labels_of(
+    frames: Shaped[Tensor, "batch time c h w"], greys: tuple[int, ...]
+) -> UInt8[Tensor, "batch time h w"]:
+    """Return the label of each pixel: the one whose grey is nearest to the first channel."""
+    distances = torch.tensor([[abs(grey - value) for grey in greys] for value in range(256)])
+    nearest = distances.argmin(1).to(torch.uint8).to(frames.device)
+    return nearest[as_uint8(frames[:, :, 0]).int()]
+
+
+def label_shares(
+    labels: UInt8[Tensor, "batch h w"], num_labels: int, longer_side_px: int
+) -> UInt8[Tensor, "batch label h2 w2"]:
+    """Return one channel per label: its share of each pixel of the smaller image, 0 to 255."""
+    highest = min(int(labels.max()), num_labels - 1)
+    seen = [  # labels beyond the largest in the batch need no work
+        as_uint8(shrink((labels == k).to(torch.float32)[:, None], longer_side_px)[:, 0])
+        for k in range(highest + 1)
+    ]
+    return F.pad(torch.stack(seen, 1), (0, 0, 0, 0, 0, num_labels - len(seen)))
+
+
+def mask_moments(
+    labels: UInt8[Tensor, "batch h w"], num_labels: int
+) -> Float[Tensor, "batch label 10"]:
+    """Return size, place and extent of each label but the background; zeros where it is absent.
+
+    Per label: root of its area; centroid x, y; standard deviation along x, y; correlation of x and y; edges of its
+    bounding box: left, right, top, bottom. Coordinates are from the image centre, in eighths of its longer side.
+    Areas and deviations are in units of a quarter of that, so that all are of order one. Sums of pixels are exact, so
+    the numbers do not depend on which frames are computed together.
+    """
+    batch, height, width = labels.shape
+    unit = max(height, width) / 8
+    x = torch.arange(width, device=labels.device, dtype=torch.float64) + 0.5 - width / 2
+    y = torch.arange(height, device=labels.device, dtype=torch.float64) + 0.5 - height / 2
+    sums = torch.stack([torch.ones_like(x), x], 1).float()
+    out = torch.zeros(batch, num_labels - 1, NUM_MOMENTS, device=labels.device)
+    for k in range(1, min(int(labels.max()), num_labels - 1) + 1):
+        mask = (labels == k).to(torch.float32)
+        by_row, x_by_row = (mask @ sums).double().unbind(-1)
+        by_column = mask.sum(1).double()
+        area = by_row.sum(1)
+        n = area.clamp(min=1)
+        cx, cy = (by_column @ x) / n, (by_row @ y) / n
+        sx = ((by_column @ x**2) / n - cx**2).clamp(min=0).sqrt()
+        sy = ((by_row @ y**2) / n - cy**2).clamp(min=0).sqrt()
+        sxy = (x_by_row @ y) / n - cx * cy
+        column_seen, row_seen = by_column > 0, by_row > 0
+        left, right = _first(column_seen) - width / 2, width / 2 - _first(column_seen.flip(1))
+        top, bottom = _first(row_seen) - height / 2, height / 2 - _first(row_seen.flip(1))
+        values = torch.stack(
+            [
+                area.sqrt() / (unit / 2),
+                *(cx / unit, cy / unit, sx / (unit / 4), sy / (unit / 4)),
+                2 * sxy / (sx * sy + 1),
+                *(left / unit, right / unit, top / unit, bottom / unit),
+            ],
+            1,
+        )
+        out[:, k - 1] = torch.where((area >= LEAST_PIXELS)[:, None], values, 0.0).float()
+    return out
+
+
+def shifted(images: Float[Tensor, "batch c h w"], reach_px: int) -> Float[Tensor, "batch c h w"]:
+    """Return each image moved by up to `reach_px` along both axes; its border fills the gap."""
+    batch, _, height, width = images.shape
+    padded = F.pad(images, [reach_px] * 4, mode="replicate")
+    by = torch.randint(0, 2 * reach_px + 1, (2, batch, 1), device=images.device)
+    rows = (by[0] + torch.arange(height, device=images.device))[:, :, None]
+    columns = (by[1] + torch.arange(width, device=images.device))[:, None, :]
+    sample = torch.arange(batch, device=images.device)[:, None, None]
+    return padded[sample, :, rows, columns].permute(0, 3, 1, 2)
+
+
+def pretrained_backbone_file() -> Path:
+    """Return where torchvision keeps the pretrained ResNet18 on this machine."""
+    return (
+        Path(torch.hub.get_dir()) / "checkpoints" / Path(ResNet18_Weights.IMAGENET1K_V1.url).name
+    )
+
+
+def mask_stem(
+    rgb_weight: Float[Tensor, "out 3 k k"], greys: tuple[int, ...]
+) -> Float[Tensor, "out label k k"]:
+    """Return first-layer filters that answer label channels as `rgb_weight` answers the normalised grey image.
+
+    Copying a filter to every label would be blind: the channels of a pixel sum to one.
+    """
+    mean, std = torch.tensor(IMAGENET_MEAN), torch.tensor(IMAGENET_STD)
+    as_seen = (torch.tensor(greys)[:, None] / 255 - mean) / std
+    return torch.einsum("ockl,nc->onkl", rgb_weight, as_seen)
+
+
+class Standardiser(nn.Module):
+    """Zero mean and unit deviation by running statistics, which are fixed after the first training samples.
+
+    The same numbers serve training and inference, unlike those of a batch normalisation in training.
+    """
+
+    mean: Tensor
+    var: Tensor
+    count: Tensor
+
+    NUM_SAMPLES = 20_000
+    """Training samples that the statistics are taken from."""
+    MIN_STD = 0.02
+    """A number that hardly varied must not blow up once it does."""
+    LIMIT = 10.0
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(dim))
+        self.register_buffer("var", torch.ones(dim))
+        self.register_buffer("count", torch.zeros((), dtype=torch.int64))
+
+    def forward(self, x: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch dim"]:
+        if self.training and int(self.count) < self.NUM_SAMPLES:
+            self._take(x.detach())
+        std = self.var.sqrt().clamp_min(self.MIN_STD)
+        return ((x - self.mean) / std).clamp(-self.LIMIT, self.LIMIT)
+
+    def _take(self, x: Float[Tensor, "batch dim"]) -> None:
+        """Take a batch into account.
+
+        Source: Chan, Golub, LeVeque 1979, eq. 2.1.
+        """
+        share = len(x) / (int(self.count) + len(x))
+        delta = x.mean(0) - self.mean
+        var = x.var(0, correction=0)
+        self.var.copy_((1 - share) * self.var + share * var + share * (1 - share) * delta**2)
+        self.mean.add_(share * delta)
+        self.count.add_(len(x))
+
+
+class CameraEncoder(nn.Module):
+    """One camera's frames become a vector.
+
+    All frames go through the backbone at once, stacked as channels: that costs half as much as one by one, and the
+    first layer sees motion. The moments of a mask join the backbone's features as they are.
+
+    Args:
+        cfg: the policy's settings.
+        is_mask: whether the camera shows labels.
+        shape: height and width of its pictures.
+        weights: torchvision's pretrained ResNet18, if there is one.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        cfg: V2PBCConfig,
+        *,
+        is_mask: bool,
+        shape: tuple[int, int],
+        weights: dict[str, Tensor] | None,
+    ) -> None:
+        super().__init__()
+        self.is_mask = is_mask
+        self.greys = tuple(cfg.mask_greys)
+        self.num_labels = cfg.num_labels or len(self.greys)
+        self.input_size_px = cfg.input_size_px
+        self.random_shift = cfg.random_shift
+        self.has_moments = is_mask and cfg.mask_moments
+        channels = (self.num_labels if is_mask else 3) * cfg.n_obs_steps
+        self.backbone: nn.Module | None = None
+        self.dim = 0
+        self.standardise: Standardiser | None = None
+        if self.has_moments:
+            self.dim += cfg.n_obs_steps * (self.num_labels - 1) * NUM_MOMENTS
+            self.standardise = Standardiser(self.dim)
+        if cfg.encoder == "resnet18":
+            self.backbone = _resnet18(
+                cfg.n_obs_steps, self.greys[: self.num_labels] if is_mask else None, weights
+            )
+            self.dim += BACKBONE_DIM
+        elif cfg.encoder == "conv" or not self.has_moments:
+            self.backbone, width = _strided_convolutions(channels, shape, cfg.input_size_px)
+            self.dim += width
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
+
+    @torch.no_grad()
+    def prepare(self, frames: Shaped[Tensor, "batch time c h w"]) -> Prepared:
+        """Return all that is computed from the frames without parameters; each frame by itself.
+
+        Args:
+            frames: uint8 0 to 255, or floats in [0, 1]. Of label images the first channel is enough.
+        """
+        batch, time = frames.shape[:2]
+        out: Prepared = {}
+        if self.is_mask:
+            labels = labels_of(frames, self.greys).flatten(0, 1)
+            if self.backbone is not None:
+                out["picture"] = label_shares(labels, self.num_labels, self.input_size_px)
+            if self.has_moments:
+                out["moments"] = mask_moments(labels, self.num_labels).flatten(1)
+        else:
+            frames = frames.flatten(0, 1)
+            if frames.dtype == torch.uint8:
+                frames = frames.to(torch.float32) / 255
+            out["picture"] = as_uint8(shrink(frames, self.input_size_px))
+        return {name: value.unflatten(0, (batch, time)) for name, value in out.items()}
+
+    def forward(self, prepared: Prepared) -> Float[Tensor, "batch feature"]:
+        """Return the features of frames that `prepare` prepared."""
+        parts: list[Tensor] = []
+        if self.standardise is not None:
+            parts.append(self.standardise(prepared["moments"].flatten(1)))
+        if self.backbone is not None:
+            frames = prepared["picture"].to(self.mean.dtype) / 255
+            if not self.is_mask:
+                frames = (frames - self.mean) / self.std
+            stacked = frames.flatten(1, 2)
+            reach_px = round(self.random_shift * max(stacked.shape[-2:]))
+            if self.training and reach_px:
+                stacked = shifted(stacked, reach_px)
+            stacked = stacked.contiguous(memory_format=torch.channels_last)
+            parts.append(self.backbone(stacked))
+        return torch.cat(parts, 1)
+
+
+def _resnet18(
+    num_frames: int, greys: tuple[int, ...] | None, weights: dict[str, Tensor] | None
+) -> nn.Sequential:
+    """Return ResNet18 up to its pooled features, for stacked frames of labels or of colours."""
+    net = resnet18(weights=None)
+    if weights is not None:
+        net.load_state_dict(weights)
+    stem = net.conv1.weight.detach()
+    if greys is not None:
+        stem = mask_stem(stem, greys)
+    net.conv1 = nn.Conv2d(stem.shape[1] * num_frames, 64, 7, stride=2, padding=3, bias=False)
+    if weights is not None:
+        with torch.no_grad():  # a still scene excites the layer as one frame does
+            net.conv1.weight.copy_(stem.repeat(1, num_frames, 1, 1) / num_frames)
+    return nn.Sequential(
+        net.conv1,
+        net.bn1,
+        net.relu,
+        net.maxpool,
+        net.layer1,
+        net.layer2,
+        net.layer3,
+        net.layer4,
+        nn.AdaptiveAvgPool2d(1),
+        nn.Flatten(),
+    )
+
+
+def _strided_convolutions(
+    channels: int, shape: tuple[int, int], longer_side_px: int
+) -> tuple[nn.Sequential, int]:
+    """Return four convolutions of stride two and a flatten, which keeps positions, and its width."""
+    layers: list[nn.Module] = []
+    before = channels
+    for width in CONV_WIDTHS:
+        layers += [nn.Conv2d(before, width, 3, 2, 1), nn.GroupNorm(8, width), nn.ReLU()]
+        before = width
+    net = nn.Sequential(*layers, nn.Flatten())
+    with torch.no_grad():
+        picture = shrink(torch.zeros(1, channels, *shape), longer_side_px)
+        return net, net(picture).shape[1]
+
+
+def _first(seen: Shaped[Tensor, "batch n"]) -> Float[Tensor, "batch"]:
+    """Return the position of the first true entry."""
+    return seen.to(torch.uint8).argmax(1).to(torch.float32)

@@ -1,0 +1,299 @@
+"""Training and collecting in turn: each round's student begins the episodes that the next one learns from.
+
+A batch of episodes follows from the seed, the round, the batch's number and the student. It is written down in a
+ledger once it is staged, and students are kept until the next one exists, so a killed distillation that is started
+again makes the same files as an undisturbed one.
+"""
+
+import json
+import logging
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from v2p_data.distillation.config import DistillationConfig
+from v2p_data.distillation.handover import ActingStudent, ExpertAct, Handovers, hand_over
+from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
+from v2p_data.episodes.staging import Episode, refusals_told, staged_episodes
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.seeds import rng_for, seed_for
+from v2p_data.task.task import TaskBundle
+
+logger = logging.getLogger(__name__)
+
+ROUNDS_FOLDER = "rounds"
+STUDENT_FOLDER = "student"
+TRAINING_FOLDER = "training"
+BATCHES_FOLDER = "batches"
+Progress = Callable[[float, str], None]
+
+
+class LearningStudent(ActingStudent, Protocol):
+    """A student that takes episodes in, and is kept in folders."""
+
+    def add(
+        self,
+        labels: UInt8[np.ndarray, "frame h w"],
+        state: Float32[np.ndarray, "frame 11"],
+        action: Float32[np.ndarray, "frame 7"],
+        task: str,
+        lengths: Sequence[int],
+    ) -> None:
+        """Take in episodes, one after the other, of these lengths."""
+        ...
+
+    def save(self, folder: Path) -> None:
+        """Write the policy so that it is whole or absent."""
+        ...
+
+    def load(self, folder: Path) -> None:
+        """Go on from what `save` wrote."""
+        ...
+
+
+Train = Callable[[int, Path, int, Progress], None]
+"""Trains the student: gradient steps, folder for the training's state, seed, progress."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lesson:
+    """One task and who can do it."""
+
+    bundle: TaskBundle
+    expert: ExpertAct
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distilled:
+    """What lies in a distillation's folder."""
+
+    paths: tuple[Path, ...]
+    """Staged handover episodes, in the order they were collected."""
+    num_frames: int
+    num_rollouts: int
+    recovered: tuple[float, ...]
+    """Per round the share of episodes that the expert ended in success after taking over."""
+
+    def counts(self) -> dict[str, Any]:
+        """Return it for the record."""
+        return {
+            "episodes": len(self.paths),
+            "frames": self.num_frames,
+            "rollouts": self.num_rollouts,
+            "recovered": [round(share, 4) for share in self.recovered],
+        }
+
+
+def distill(
+    lessons: Mapping[str, Lesson],
+    student: LearningStudent,
+    train: Train,
+    cfg: DistillationConfig,
+    episodes: EpisodesConfig,
+    out: Path,
+    seed: int,
+    *,
+    num_threads: int = 1,
+    on_progress: Progress = lambda share, words: None,
+) -> Distilled:
+    """Train and collect `cfg.rounds` times; go on where an earlier call was stopped.
+
+    Args:
+        lessons: the tasks by item.
+        student: knows the demonstrations already; learns further in place.
+        train: trains it.
+        cfg: the recipe.
+        episodes: what the demonstrations were recorded under.
+        out: `rounds/`, `student/` and `training/` are written here.
+        seed: decides everything that is drawn.
+        num_threads: for physics and masks; changes no result.
+        on_progress: told the share that is done and a few words.
+
+    Raises:
+        V2PError: the pictures are not masks, the disk is full, or `out` cannot be written to.
+    """
+    if episodes.render != "masks":
+        raise V2PError(
+            f"the demonstrations show '{episodes.render}', and distillation draws masks only; collect them with"
+            " --episodes.render=masks, or train without it: --distillation.rounds=0"
+        )
+    with refusals_told("distillation", out):
+        return _distill(
+            lessons, student, train, cfg, episodes, out, seed, num_threads, on_progress
+        )
+
+
+def handover_episodes(folder: Path) -> list[Path]:
+    """Return the staged episodes under a distillation's folder, in the order they were collected."""
+    return [
+        path
+        for number in sorted((folder / ROUNDS_FOLDER).glob("*"))
+        for item in sorted(number.glob("*"))
+        for path in staged_episodes(item)
+    ]
+
+
+def take_in(student: LearningStudent, paths: Sequence[Path]) -> None:
+    """Let a student learn from staged episodes of one task."""
+    if not paths:
+        return
+    loaded = [Episode.load(path) for path in paths]
+    student.add(
+        np.concatenate([e.labels for e in loaded]),
+        np.concatenate([e.state for e in loaded]),
+        np.concatenate([e.action for e in loaded]),
+        loaded[0].task,
+        [e.num_frames for e in loaded],
+    )
+
+
+def _distill(
+    lessons: Mapping[str, Lesson],
+    student: LearningStudent,
+    train: Train,
+    cfg: DistillationConfig,
+    episodes: EpisodesConfig,
+    out: Path,
+    seed: int,
+    num_threads: int,
+    on_progress: Progress,
+) -> Distilled:
+    final = out / STUDENT_FOLDER
+    ledgers: list[list[dict[str, Any]]] = []
+    for number in range(cfg.rounds):
+        here = out / f"{STUDENT_FOLDER}-{number}"
+        done = number / cfg.rounds
+
+        def tell(
+            share: float, words: str, done: float = done, what: str = f"round {number + 1}"
+        ) -> None:
+            on_progress(done + share / cfg.rounds, f"{what}: {words}")
+
+        if final.is_dir():
+            pass  # all is collected; only the ledgers are read
+        elif here.is_dir():
+            student.load(here)
+        else:
+            steps = cfg.round_steps if number else cfg.first_steps
+            train(
+                steps,
+                out / TRAINING_FOLDER / str(number),
+                seed_for(seed, "training", number),
+                lambda share, words: tell(0.5 * share, words),
+            )
+            student.save(here)
+        collected: list[dict[str, Any]] = []
+        for k, (item, lesson) in enumerate(lessons.items()):
+            folder = out / ROUNDS_FOLDER / str(number) / item
+            tell(0.5 + 0.5 * k / len(lessons), f"handing over {item}")
+            collected += _collect(lesson, student, cfg, episodes, folder, number, seed_for(seed, item, number), num_threads)  # fmt: skip
+            if not final.is_dir():
+                take_in(student, staged_episodes(folder))
+        ledgers.append(collected)
+        if number:
+            shutil.rmtree(out / f"{STUDENT_FOLDER}-{number - 1}", ignore_errors=True)
+    last = out / f"{STUDENT_FOLDER}-{cfg.rounds - 1}"
+    if last.is_dir():
+        last.rename(final)
+    batches = [batch for ledger in ledgers for batch in ledger]
+    return Distilled(
+        paths=tuple(handover_episodes(out)),
+        num_frames=sum(b["frames"] for b in batches),
+        num_rollouts=sum(b["rollouts"] for b in batches),
+        recovered=tuple(
+            sum(b["successes"] for b in ledger) / max(1, sum(b["rollouts"] for b in ledger))
+            for ledger in ledgers
+        ),
+    )
+
+
+def _collect(
+    lesson: Lesson,
+    student: ActingStudent,
+    cfg: DistillationConfig,
+    episodes: EpisodesConfig,
+    folder: Path,
+    number: int,
+    seed: int,
+    num_threads: int,
+) -> list[dict[str, Any]]:
+    """Stage one task's handover episodes of one round; return the ledgers of its batches."""
+    ledger_folder = folder / BATCHES_FOLDER
+    ledger_folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob("*/*.tmp"):
+        leftover.unlink()
+    batches: list[dict[str, Any]] = []
+    for batch in range(-(-cfg.episodes // cfg.worlds)):
+        path = ledger_folder / f"{batch:03d}.json"
+        if not path.is_file():
+            handovers = hand_over(
+                lesson.bundle,
+                lesson.expert,
+                student,
+                cfg,
+                seed=seed_for(seed, "batch", batch),
+                size_px=episodes.size_px,
+                randomization=episodes.randomization,
+                cut=episodes.cut,
+                num_threads=num_threads,
+            )
+            first = batch * cfg.worlds
+            write_json_atomically(
+                path, _stage(lesson.bundle, handovers, episodes, folder, number, first)
+            )
+        batches.append(json.loads(path.read_text()))
+    return batches
+
+
+def _stage(
+    bundle: TaskBundle,
+    handovers: Handovers,
+    episodes: EpisodesConfig,
+    folder: Path,
+    number: int,
+    first: int,
+) -> dict[str, Any]:
+    """Write the successful episodes of a batch; return its ledger."""
+    winners = [int(w) for w in np.flatnonzero(handovers.successes)]
+    names: list[str] = []
+    frames = 0
+    for world in winners:
+        length = int(handovers.num_frames[world])
+        rows = np.arange(length)
+        episode_id = f"{bundle.title}_handover{number}_{first + world:05d}"
+        labels = handovers.labels[:length, world].copy()
+        params = handovers.params[world]
+        if not episodes.mask_noise.is_off:
+            rng = rng_for(handovers.seed, "mask-noise", episode_id)
+            faults = draw_faults(labels, episodes.mask_noise, rng)
+            labels = apply_faults(labels, faults)
+            params = params | {"mask_faults": as_json(faults)}
+        Episode(
+            id=episode_id,
+            item=bundle.title,
+            task=bundle.description,
+            seed=handovers.seed,
+            labels=labels,
+            state=handovers.state[:length, world].copy(),
+            action=handovers.action[:length, world].copy(),
+            success=rows >= handovers.held_at[world],
+            intervention=rows >= handovers.taken_over_at[world],
+            referee=True,
+            objects=tuple(o.name for o in bundle.scene.objects),
+            params=params,
+        ).save(folder / "episodes")
+        names.append(episode_id)
+        frames += length
+    return {
+        "episodes": names,
+        "frames": frames,
+        "rollouts": len(handovers.successes),
+        "successes": len(winners),
+    }
