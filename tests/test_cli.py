@@ -173,11 +173,14 @@ def test_a_caption_for_a_missing_file_is_named(capsys, videos, tmp_path):
     assert "tip_ovr__green_carton.mp4" in said(capsys, *generate(videos, tmp_path / "out"))
 
 
-def test_a_bad_repo_id_is_refused_before_any_work(capsys, videos, tmp_path):
-    assert "USER/NAME" in said(
-        capsys, "generate", videos, "--out", tmp_path / "out", "--repo-id", "toys"
-    )
-    assert not (tmp_path / "out").exists()
+@pytest.mark.parametrize("repo_id", ["toys", "me/a--b", "me/a..b", "me/my toys", "-me/toys"])
+def test_a_bad_repo_id_is_refused_before_any_work(capsys, videos, tmp_path, repo_id):
+    out = tmp_path / "out"
+
+    words = said(capsys, "generate", videos, "--out", out, f"--repo-id={repo_id}")
+
+    assert f"'{repo_id}' is no repository id; it reads USER/NAME" in words
+    assert not out.exists()
 
 
 def test_a_folder_that_cannot_be_written_is_named(capsys, videos, tmp_path):

@@ -13,6 +13,7 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.commands.display import Display, describe, outcome_table, outcomes_json, tally
+from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
@@ -35,7 +36,6 @@ from v2p_data.task.task import TASK_FILE
 from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, find_videos
 
 RUN_FILE = "run.json"
-REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ def episodes_command(argv: list[str]) -> int:
 def generate_command(argv: list[str]) -> int:
     args = _with_config(Generate, argv, "generate")
     root = _run_folder(args.out)
-    _check_repo_id(args.repo_id)
+    check_repo_id(args.repo_id)
     with only_run_in(root):
         dataset = generate(args.videos, root, args.repo_id, args.engine, args.how.runtime(root))
         page = write_page(root)
@@ -408,11 +408,6 @@ def _run_folder(out: Path) -> Path:
     if out.exists() and not out.is_dir():
         raise V2PError(f"{out} is a file; --out must be a folder")
     return out
-
-
-def _check_repo_id(repo_id: str) -> None:
-    if not REPO_ID.fullmatch(repo_id):
-        raise V2PError(f"--repo-id must look like USER/NAME, got '{repo_id}'")
 
 
 def _say(made: str, number: str, then: str) -> None:

@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 from v2p_data.episodes.card import write_card
 from v2p_data.episodes.cut import write_episodes, write_stats, write_without
 from v2p_data.episodes.features import METADATA_FILE
+from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.episodes.tables import (
     BOOKKEEPING,
     DATA_GLOB,
@@ -35,7 +36,6 @@ from v2p_data.episodes.tables import (
     row_spans,
 )
 from v2p_data.episodes.verify import frames_differ
-from v2p_data.episodes.writer import check_repo_id
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.pipeline.artifact import write_json_atomically
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from v2p_data.episodes.card import LICENSE
 from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
-from v2p_data.episodes.writer import check_repo_id
+from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.errors import V2PError
 from v2p_data.sim.arms import robot_from_json
 from v2p_data.sim.robot import FINE

@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from v2p_data.episodes.card import CARD_FILE, LICENSE, write_card, write_text
 from v2p_data.episodes.features import METADATA_FILE
-from v2p_data.episodes.writer import check_repo_id
+from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.errors import V2PError
 
 logger = logging.getLogger(__name__)

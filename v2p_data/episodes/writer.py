@@ -8,7 +8,6 @@ finished. The same episodes give the same bytes, after any number of kills, with
 import contextlib
 import logging
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from v2p_data.episodes.features import (
     SUCCESS_KEY,
     features,
 )
+from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.episodes.shards import Shard, make_shards, plan_shards, stats_of
 from v2p_data.episodes.staging import MASK_CAMERA, Episode, Heading, refusals_told
 from v2p_data.episodes.stream import MASK_CRF, RGB_CRF, encoder_config
@@ -47,7 +47,6 @@ DATA_FILE_FRAMES = 400_000
 """Rows per file, 40 MB; each episode is a row group of its own, as LeRobot writes it."""
 EPISODES_PER_WRITE = 100
 METADATA_SCHEMA = 1
-_REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,18 +122,6 @@ def pack(
     num_frames = sum(h.num_frames for h in headings)
     logger.info("packed %d episodes, %d frames, at %s", len(headings), num_frames, root)
     return Packed(root=root, repo_id=repo_id, num_episodes=len(headings), num_frames=num_frames)
-
-
-def check_repo_id(repo_id: str) -> None:
-    """Raise unless `repo_id` reads `user/name`.
-
-    Raises:
-        V2PError: it does not.
-    """
-    if not _REPO_ID.fullmatch(repo_id) or "--" in repo_id or ".." in repo_id:
-        raise V2PError(
-            f"'{repo_id}' is no repository id; it reads USER/NAME, of letters, digits, '-', '_' and '.'"
-        )
 
 
 def _headings(staged: Sequence[Path]) -> list[Heading]:
