@@ -14,7 +14,7 @@ import pytest
 from hub_server import TOKEN, Hub
 
 from v2p_data.episodes import shards
-from v2p_data.episodes.card import write_card
+from v2p_data.episodes.card import dataset_card, write_card
 from v2p_data.episodes.episode_stats import rgb_stats
 from v2p_data.episodes.features import features
 from v2p_data.episodes.staging import Episode, Heading
@@ -332,6 +332,18 @@ def test_the_card_tells_tasks_palette_and_ranges(packed: Path, tmp_path: Path):
     assert "| objects toy mass_kg | 0.1 | 0.12 |" in card
     assert "license: apache-2.0" in card.split("---")[1]
     assert "- LeRobot" in card.split("---")[1]
+
+
+def test_the_card_of_an_older_dataset_names_its_seven_numbers(packed: Path):
+    about, info = (read_json(packed / "meta" / name) for name in ("v2p.json", "info.json"))
+    state = info["features"]["observation.state"]
+    assert (state["shape"], len(state["names"])) == ([11], 11)
+
+    info["features"]["observation.state"] = state | {"shape": [7], "names": state["names"][:7]}
+    card = dataset_card(about, info, "user/toys")
+
+    assert "gripper.pos (0 closed to 1 open) |" in card
+    assert "target_gripper.pos" not in card
 
 
 PUSH_AND_LOAD = """

@@ -5,7 +5,14 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from v2p_data.episodes.features import ACTION_NAMES, MASK_KEY, METADATA_FILE, STATE_NAMES
+from v2p_data.episodes.features import (
+    ACTION_NAMES,
+    INTERVENTION_KEY,
+    MASK_KEY,
+    METADATA_FILE,
+    STATE_NAMES,
+)
+from v2p_data.episodes.handovers import who_acted
 from v2p_data.episodes.sheet import SHEET_FILE, write_sheet
 from v2p_data.errors import V2PError
 
@@ -91,6 +98,7 @@ def dataset_card(
         _tasks(episodes),
         "## What a frame holds",
         _frame(info),
+        *(["## Who acted", _who_acted(episodes)] if INTERVENTION_KEY in info["features"] else []),
         "## Masks",
         _palette(about, episodes),
         "## Randomisation",
@@ -136,15 +144,36 @@ def _frame(info: dict[str, Any]) -> str:
         elif key.startswith("observation.images"):
             meaning = "picture of the same camera at the same moment"
         elif key == "observation.state":
-            meaning = _named(STATE_NAMES, STATE_UNITS)
+            # Datasets of earlier versions have the first seven.
+            shown = len(feature["names"])
+            meaning = _named(STATE_NAMES[:shown], STATE_UNITS[:shown])
         elif key == "action":
             meaning = "each in [-1, 1]: " + _named(ACTION_NAMES, ACTION_UNITS)
         elif key == "next.success":
             meaning = "the task's success has held for 0.25 s by the end of this action"
+        elif key == INTERVENTION_KEY:
+            meaning = "true where the expert acted, false where a student did"
         else:
             continue
         lines.append(f"| `{key}` | {list(feature['shape'])} | {meaning} |")
     return "\n".join(lines)
+
+
+def _who_acted(episodes: list[dict[str, Any]]) -> str:
+    acted = who_acted(episodes)
+    return "\n".join(
+        [
+            "| episodes | number | frames in which the expert acted | frames in which a student acted |",
+            "|---|---|---|---|",
+            f"| demonstrations | {acted.num_demonstrations} | {acted.demonstration_frames} | 0 |",
+            f"| handovers | {acted.num_handovers} | {acted.taken_over_frames} | {acted.student_frames} |",
+            "",
+            "In a handover a student policy acts and the expert takes over. `action` is the expert's in every frame: "
+            "where a student acted, it is what the expert would have done there, not what was done. LeRobot's own "
+            f"recordings hold the policy's action there. `{INTERVENTION_KEY}` is true throughout in demonstrations; "
+            "`source` in `meta/v2p.json` tells the two kinds of episode apart.",
+        ]
+    )
 
 
 def _palette(about: dict[str, Any], episodes: list[dict[str, Any]]) -> str:

@@ -11,7 +11,7 @@ import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ import pyarrow.parquet as pq
 
 from v2p_data.episodes.card import write_card
 from v2p_data.episodes.cut import write_episodes, write_stats, write_without
-from v2p_data.episodes.features import METADATA_FILE
+from v2p_data.episodes.features import INTERVENTION_KEY, METADATA_FILE
+from v2p_data.episodes.handovers import about_with_sources, info_with_column, write_with_column
 from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.episodes.tables import (
     BOOKKEEPING,
@@ -67,6 +68,8 @@ class _Source:
     lengths: list[int]
     tasks_of_episodes: list[list[str]]
     digests: list[str] = field(repr=False)
+    lacks_column: bool = False
+    """`info` and `about` tell of a column that is to be written yet: who acted."""
 
     @property
     def repo_id(self) -> str:
@@ -82,19 +85,22 @@ def merge(
 ) -> Edited:
     """Write the episodes of several LeRobot v3 datasets, in this order, as one at `out`.
 
+    Where one of them has handovers, demonstrations of ours get the column `intervention` too, true throughout.
+
     Raises:
         V2PError: there is something at `out`, one is no sound dataset, or they do not go together.
     """
     check_repo_id(repo_id)
     if len(roots) < 2:
         raise V2PError("merging needs two datasets at least")
-    sources = [_read(root) for root in roots]
+    sources = _all_with_column([_read(root) for root in roots])
     for other in sources[1:]:
         _check_alike(sources[0], other)
     _check_doubles(sources)
     with _in_place(out) as partial:
         on_progress(0.0, "starting LeRobot")
-        _aggregate(sources, repo_id, partial)
+        with _tables(sources, partial) as folders:
+            _aggregate(sources, folders, repo_id, partial)
         on_progress(0.4, "gathering tasks and provenance")
         about = _merged_about(sources, repo_id, partial)
         return _finish(
@@ -215,7 +221,49 @@ def _check_doubles(sources: list[_Source]) -> None:
             seen[digest] = here
 
 
-def _aggregate(sources: list[_Source], repo_id: str, partial: Path) -> None:
+def _all_with_column(sources: list[_Source]) -> list[_Source]:
+    """Return the sources, all with the column that says who acted, or none."""
+    having = [s for s in sources if INTERVENTION_KEY in s.info["features"]]
+    if not having:
+        return sources
+    told: list[_Source] = []
+    for source in sources:
+        if INTERVENTION_KEY in source.info["features"]:
+            told.append(source)
+        elif source.about is None or having[0].about is None:
+            raise V2PError(
+                f"{having[0].root} has the column {INTERVENTION_KEY} and {source.root} has not: nothing tells who acted "
+                "there, so they do not go together"
+            )
+        else:
+            told.append(
+                replace(
+                    source,
+                    info=info_with_column(source.info),
+                    about=about_with_sources(source.about),
+                    lacks_column=True,
+                )
+            )
+    return told
+
+
+@contextmanager
+def _tables(sources: list[_Source], partial: Path) -> Iterator[list[Path]]:
+    """Give the folders that LeRobot is to merge: the sources, or copies of their tables with the column."""
+    folder = partial.with_name(f"{partial.name}.tables")
+    shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
+    try:
+        folders: list[Path] = []
+        for k, source in enumerate(sources):
+            if source.lacks_column:
+                write_with_column(source.root, source.info, folder / str(k))
+            folders.append(folder / str(k) if source.lacks_column else source.root)
+        yield folders
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _aggregate(sources: list[_Source], folders: list[Path], repo_id: str, partial: Path) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
 
     def smallest(name: str) -> int | None:
@@ -225,7 +273,7 @@ def _aggregate(sources: list[_Source], repo_id: str, partial: Path) -> None:
         aggregate_datasets(
             repo_ids=[s.repo_id for s in sources],
             aggr_repo_id=repo_id,
-            roots=[s.root for s in sources],
+            roots=folders,
             aggr_root=partial,
             data_files_size_in_mb=smallest("data_files_size_in_mb"),
             video_files_size_in_mb=smallest("video_files_size_in_mb"),

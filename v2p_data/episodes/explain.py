@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.episodes.features import METADATA_FILE
+from v2p_data.episodes.handovers import who_acted
 from v2p_data.episodes.tables import INFO_FILE, episodes_of, read_info, read_json
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import RECORD_FILE, read_record
@@ -125,6 +126,12 @@ def _task(
     seeds = sorted({e["seed"] for e in episodes})
     yield f"  seeds     {', '.join(map(str, seeds[:6]))}{' ...' if len(seeds) > 6 else ''}"
     yield f"  labels    {', '.join(f'{k} {name}' for k, name in episodes[0]['labels'].items())}"
+    acted = who_acted(episodes)
+    if acted.num_handovers:
+        yield (
+            f"  acted     {acted.num_handovers} handovers: a student in {acted.student_frames} frames and the expert in "
+            f"{acted.taken_over_frames}; the expert alone in {acted.num_demonstrations} demonstrations"
+        )
     carried = root / TASKS_FOLDER / item
     scene = read_json(carried / "scene/scene.json") or {}
     if scene:

@@ -12,7 +12,12 @@ RGB_KEY = "observation.images.rgb"
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 SUCCESS_KEY = "next.success"
+INTERVENTION_KEY = "intervention"
+"""Whether the expert acted, as LeRobot's DAgger recordings name it; True throughout in demonstrations."""
+INTERVENTION_FEATURE: dict[str, Any] = {"dtype": "bool", "shape": (1,), "names": None}
 KEY_OF_CAMERA = {"mask": MASK_KEY, "rgb": RGB_KEY}
+DEMONSTRATION, HANDOVER = "demonstration", "handover"
+"""Where an episode is from, in `METADATA_FILE` of datasets with handovers."""
 METADATA_FILE = "meta/v2p.json"
 """Palette, provenance and drawn parameters; LeRobot ignores it and uploads it."""
 
@@ -43,8 +48,16 @@ ACTION_NAMES = (
 """Each in [-1, 1]: x 0.03 m, x 0.2 rad about the world's axes, and x 0.012 m of finger travel (+ closes)."""
 
 
-def features(size_px: int, cameras: tuple[str, ...] = ("mask",)) -> dict[str, dict[str, Any]]:
-    """Return LeRobot's feature table for pictures of `size_px` x `size_px` from these cameras."""
+def features(
+    size_px: int, cameras: tuple[str, ...] = ("mask",), *, has_handovers: bool = False
+) -> dict[str, dict[str, Any]]:
+    """Return LeRobot's feature table for pictures of `size_px` x `size_px` from these cameras.
+
+    Args:
+        size_px: width and height.
+        cameras: which pictures there are.
+        has_handovers: some episodes were acted by a student at first, so there is a column that says who acted.
+    """
     return {
         **{
             KEY_OF_CAMERA[camera]: {
@@ -61,4 +74,5 @@ def features(size_px: int, cameras: tuple[str, ...] = ("mask",)) -> dict[str, di
         },
         ACTION_KEY: {"dtype": "float32", "shape": (7,), "names": list(ACTION_NAMES)},
         SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},
+        **({INTERVENTION_KEY: INTERVENTION_FEATURE} if has_handovers else {}),
     }

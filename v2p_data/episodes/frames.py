@@ -13,6 +13,8 @@ import numpy as np
 from v2p_data.episodes.features import (
     ACTION_KEY,
     ACTION_NAMES,
+    DEMONSTRATION,
+    INTERVENTION_KEY,
     MASK_KEY,
     METADATA_FILE,
     RGB_KEY,
@@ -80,7 +82,11 @@ class Checks:
         )  # fmt: skip
         self.has_masks = self.is_ours and MASK_KEY in self.features
         self.seen: dict[str, int] = {}
-        self.columns: dict[str, list[np.ndarray]] = {k: [] for k in (*self.floats, *BOOKKEEPING)}
+        self.sources: list[dict[str, Any]] | None = None
+        if about is not None and INTERVENTION_KEY in self.features:
+            self.sources = about["episodes"]
+        summed = (*self.floats, *BOOKKEEPING, *((INTERVENTION_KEY,) if self.sources else ()))
+        self.columns: dict[str, list[np.ndarray]] = {k: [] for k in summed}
         self.brightness: dict[str, list[tuple[float, int]]] = {k: [] for k in self.cameras}
 
     def skipped(self) -> Iterator[str]:
@@ -208,6 +214,7 @@ class EpisodeCheck:
         ):
             add("action_bounds", where, f"an action is {largest:.3f}, beyond 1")
         self._success(columns)
+        self._who_acted(columns)
         self._duplicate(columns)
         self._cameras(columns.get(STATE_KEY))
         if self.recorded is not None:
@@ -217,6 +224,18 @@ class EpisodeCheck:
         if SUCCESS_KEY in columns and not columns[SUCCESS_KEY][-1].all():
             tell = self.checks.said.add if self.checks.is_ours else self.checks.said.note
             tell("success", self.where, "ends before its task is done")
+
+    def _who_acted(self, columns: dict[str, np.ndarray]) -> None:
+        if self.checks.sources is None or self.k >= len(self.checks.sources):
+            return
+        told = self.checks.sources[self.k]
+        source, said = told.get("source", DEMONSTRATION), int(told.get("student_frames", 0))
+        true = int((~columns[INTERVENTION_KEY].astype(bool)).sum())
+        if true != said or (true and source == DEMONSTRATION):
+            self.checks.said.add(
+                "who_acted", self.where,
+                f"a student acted in {true} frames, {METADATA_FILE} tells of {said} in a {source}",
+            )  # fmt: skip
 
     def _duplicate(self, columns: dict[str, np.ndarray]) -> None:
         digest = hashlib.sha256()
@@ -261,6 +280,10 @@ class EpisodeCheck:
             ACTION_KEY: episode.action,
             SUCCESS_KEY: episode.success[:, None],
         }
+        if INTERVENTION_KEY in columns:
+            recorded[INTERVENTION_KEY] = episode.expert_acted[:, None]
+        elif episode.is_handover:
+            add("differs", where, f"{INTERVENTION_KEY} was recorded and is no column")
         for key, values in recorded.items():
             if key in columns and not np.array_equal(columns[key].reshape(values.shape), values):
                 add("differs", where, f"{key} differs from what was recorded")

@@ -24,6 +24,8 @@ from v2p_data.errors import V2PError
 EPISODES_FOLDER = "episodes"
 SCHEMA = 1
 ARRAYS = ("labels", "state", "action", "success")
+INTERVENTION = "intervention"
+"""The array that only handovers have."""
 MASK_CAMERA, RGB_CAMERA = "mask", "rgb"
 _REFUSALS = {
     errno.ENOSPC: "the disk is full; free some space",
@@ -37,7 +39,10 @@ _REFUSALS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """One demonstration. Row `t` is what was seen before the action of row `t` was taken."""
+    """One demonstration, or a handover: a student acts and the expert takes over.
+
+    Row `t` is what was seen before the action of row `t` was taken.
+    """
 
     id: str
     """`<item>_<number of the world it ran in>`."""
@@ -61,9 +66,14 @@ class Episode:
     """Which pictures go into a dataset: `mask`, `rgb` or both. Label images are staged in any case."""
     rgb_mp4: bytes = b""
     """The pictures of `rgb`, a video already."""
+    intervention: Bool[np.ndarray, "time"] | None = None
+    """Who acted: True the expert, which took over from a student; False the student. None for a demonstration.
+    Where the student acted, `action` holds the expert's label: what it would have done, for that is to be learned."""
 
     def __post_init__(self) -> None:
         lengths = {len(self.labels), len(self.state), len(self.action), len(self.success)}
+        if self.intervention is not None:
+            lengths.add(len(self.intervention))
         if len(lengths) != 1:
             raise ValueError(f"episode {self.id}: columns differ in length: {sorted(lengths)}")
         if (RGB_CAMERA in self.cameras) != bool(self.rgb_mp4):
@@ -74,6 +84,17 @@ class Episode:
     @property
     def num_frames(self) -> int:
         return len(self.state)
+
+    @property
+    def is_handover(self) -> bool:
+        return self.intervention is not None
+
+    @property
+    def expert_acted(self) -> Bool[np.ndarray, "time"]:
+        """Whether the expert acted, per row; in a demonstration it did throughout."""
+        if self.intervention is None:
+            return np.ones(self.num_frames, bool)
+        return self.intervention
 
     def save(self, folder: Path) -> Path:
         """Write `folder/<id>.npz` atomically and return it."""
@@ -92,6 +113,8 @@ class Episode:
         arrays: dict[str, np.ndarray] = {name: getattr(self, name) for name in ARRAYS}
         if self.cameras != (MASK_CAMERA,):
             about["cameras"] = list(self.cameras)
+        if self.intervention is not None:
+            arrays[INTERVENTION] = self.intervention
         if self.rgb_mp4:
             arrays["rgb_mp4"] = np.frombuffer(self.rgb_mp4, np.uint8)
         arrays["about"] = np.array(json.dumps(about, sort_keys=True))
@@ -110,6 +133,8 @@ class Episode:
                 about = _about(data, path)
                 names = ARRAYS if pictures else ARRAYS[1:]
                 arrays: dict[str, Any] = {k: data[k] for k in names}
+                if INTERVENTION in data:
+                    arrays[INTERVENTION] = data[INTERVENTION]
                 if not pictures:
                     arrays["labels"] = np.zeros((len(arrays["state"]), 0, 0), np.uint8)
                     about["cameras"] = ()
@@ -136,6 +161,8 @@ class Heading:
     size_px: tuple[int, int]
     """Height and width of the label images."""
     cameras: tuple[str, ...]
+    is_handover: bool
+    """It holds who acted."""
     digest: str
     """SHA-256 of the file."""
 
@@ -150,6 +177,7 @@ class Heading:
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             with np.load(path) as data:
                 about = _about(data, path)
+                is_handover = INTERVENTION in data
             with zipfile.ZipFile(path) as archive, archive.open("labels.npy") as member:
                 np.lib.format.read_magic(member)
                 shape, _, _ = np.lib.format.read_array_header_1_0(member)
@@ -168,6 +196,7 @@ class Heading:
             num_frames=count,
             size_px=(height, width),
             cameras=about.get("cameras", (MASK_CAMERA,)),
+            is_handover=is_handover,
             digest=digest,
         )
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from v2p_data.episodes.features import METADATA_FILE
+from v2p_data.episodes.features import INTERVENTION_KEY, METADATA_FILE
 from v2p_data.episodes.frames import Checks, Said
 from v2p_data.episodes.reading import Rows, same
 from v2p_data.episodes.staging import Episode
@@ -161,6 +161,8 @@ def frames_differ(
 ) -> str:
     """Return how the dataset at `root` differs from episodes of other datasets, frame by frame.
 
+    Of a source without the column that says who acted the expert did throughout.
+
     Args:
         root: the dataset; its episodes are those of `sources`, in order.
         sources: folders of datasets, each with the numbers of its episodes.
@@ -170,6 +172,7 @@ def frames_differ(
         A sentence, empty where all pixels and numbers are equal.
     """
     made = Rows(root)
+    absent = {INTERVENTION_KEY: True}
     columns = [*(keys or (k for k in made.dataset.meta.features if k not in RENUMBERED)), "task"]
     at = 0
     for folder, numbers in sources:
@@ -181,7 +184,9 @@ def frames_differ(
                 return f"{root} ends before episode {number} of {folder}"
             pairs = zip(source.episode(start, length), made.episode(at, length), strict=True)
             for t, (old, new) in enumerate(pairs):
-                wrong = [key for key in columns if not same(old[key], new[key])]
+                wrong = [
+                    key for key in columns if not same(old.get(key, absent.get(key)), new[key])
+                ]
                 if wrong:
                     return f"row {at + t} differs from frame {t} of episode {number} of {folder} in {', '.join(wrong)}"  # fmt: skip
             at += length

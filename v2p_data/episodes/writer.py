@@ -22,7 +22,10 @@ from v2p_data.episodes.episode_stats import number_stats
 from v2p_data.episodes.features import (
     ACTION_KEY,
     ACTION_NAMES,
+    DEMONSTRATION,
     FPS,
+    HANDOVER,
+    INTERVENTION_KEY,
     KEY_OF_CAMERA,
     METADATA_FILE,
     ROBOT_TYPE,
@@ -70,7 +73,8 @@ def pack(
 ) -> Packed:
     """Write staged episodes, in this order, as a LeRobot v3 dataset at `root`.
 
-    A packing that was stopped goes on where it was when it is called again.
+    A packing that was stopped goes on where it was when it is called again. Where handovers are among the episodes,
+    all frames have the column `intervention`: whether the expert acted.
 
     Args:
         staged: files that `Episode.save` wrote.
@@ -163,10 +167,11 @@ def _write(
     from lerobot.datasets.io_utils import write_info, write_stats
 
     first = shards[0].episodes[0]
+    has_handovers = any(e.is_handover for shard in shards for e in shard.episodes)
     meta: Any = LeRobotDatasetMetadata.create(
         repo_id,
         fps=FPS,
-        features=features(first.size_px[0], first.cameras),
+        features=features(first.size_px[0], first.cameras, has_handovers=has_handovers),
         robot_type=ROBOT_TYPE,
         root=root,
         video_files_size_in_mb=VIDEO_FILE_MB,
@@ -198,7 +203,7 @@ def _write(
                     }.items()
                 }
                 data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
-                described.append(_describe(episode))
+                described.append(_describe(episode, has_handovers=has_handovers))
                 frame += episode.num_frames
     finally:
         data.close()
@@ -241,6 +246,8 @@ class _DataFiles:
             "index": np.arange(first, first + count),
             "task_index": np.full(count, meta.get_task_index(episode.task)),
         }
+        if INTERVENTION_KEY in self.numbers:
+            columns[INTERVENTION_KEY] = episode.expert_acted
         if self.writer is None or first - self.first_row + count > DATA_FILE_FRAMES:
             self._next_file(first)
         assert self.writer is not None
@@ -303,7 +310,11 @@ def _place(source: Path, target: Path) -> None:
     shutil.copyfile(source, target)
 
 
-def _describe(episode: Episode) -> dict[str, Any]:
+def _describe(episode: Episode, *, has_handovers: bool) -> dict[str, Any]:
+    source = {
+        "source": HANDOVER if episode.is_handover else DEMONSTRATION,
+        "student_frames": int((~episode.expert_acted).sum()),
+    }
     return {
         "id": episode.id,
         "item": episode.item,
@@ -314,6 +325,7 @@ def _describe(episode: Episode) -> dict[str, Any]:
         "success": bool(np.any(episode.success)),
         "referee": episode.referee,
         "params": episode.params,
+        **(source if has_handovers else {}),
     }
 
 
