@@ -8,12 +8,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hub_server import TOKEN, Hub
 
-from v2p_data.episodes import shards
+from v2p_data.episodes import shards, writer
 from v2p_data.episodes.card import dataset_card, write_card
 from v2p_data.episodes.episode_stats import rgb_stats
 from v2p_data.episodes.features import features
@@ -109,7 +110,6 @@ def test_tables_and_metadata_are_what_lerobots_writer_makes(
     dataset = LeRobotDataset.create(
         "user/toys", fps=20, features=features(64), root=root, robot_type="v2p_franka",
         rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=0, pix_fmt="yuv420p", g=2),
-        video_files_size_in_mb=10,
     )  # fmt: skip
     for episode in map(Episode.load, staged):
         for t, picture in enumerate(labels_to_rgb(episode.labels)):
@@ -184,6 +184,7 @@ def test_a_packing_goes_on_from_its_finished_shards(
     shards.make_shards(planned, folder, num_threads=1)
     kept = (folder / "00000.mask.mp4").stat().st_ino
     (folder / "00001.json").write_text("half")
+    monkeypatch.setattr(writer, "VIDEO_FILE_MB", 0)  # a file per shard
 
     pack(staged, "user/toys", root, num_threads=3)
 
@@ -191,6 +192,52 @@ def test_a_packing_goes_on_from_its_finished_shards(
     assert first.stat().st_ino == kept
     assert verify(root, staged).is_good
     assert first.stat().st_size > second.stat().st_size
+
+
+def test_shards_of_a_camera_share_a_file_that_lerobot_can_stream(
+    staged: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """LeRobot takes a frame's number over the rate for its time in the file, which holds for the first one."""
+    from lerobot.datasets import streaming_dataset
+    from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
+    from lerobot.datasets.video_utils import decode_video_frames
+
+    def decode(path: str, times: list[float], tolerance_s: float, **options: Any) -> Any:
+        return decode_video_frames(path, times, tolerance_s, backend="pyav")
+
+    # LeRobot's choice needs the system's FFmpeg; which times it asks for is what is tested.
+    monkeypatch.setattr(streaming_dataset, "decode_video_frames_torchcodec", decode)
+    monkeypatch.setattr(shards, "SHARD_FRAMES", 12)  # an episode each
+    root = tmp_path / "toys"
+
+    pack(staged, "user/toys", root)
+
+    assert len(list(root.glob("videos/*/*/*.mp4"))) == 1
+    assert verify(root, staged).is_good
+    labels = np.concatenate([Episode.load(path).labels for path in staged])
+    rows = list(StreamingLeRobotDataset("user/toys", root=root, shuffle=False))
+    assert sorted(int(row["index"]) for row in rows) == list(range(36))
+    for row in rows:
+        grey = np.asarray(row["observation.images.mask"])[0] * 255
+        assert np.abs(grey - np.asarray(PALETTE)[labels[int(row["index"])]]).max() < 1e-3
+
+
+def test_a_video_file_ends_below_the_limit(
+    staged: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(shards, "SHARD_FRAMES", 12)
+    planned = shards.plan_shards([Heading.read(path) for path in staged])
+    shards.make_shards(planned, tmp_path, num_threads=1)
+    sizes = [s.file(tmp_path, "mask").stat().st_size for s in planned]
+
+    def numbers(max_bytes: int) -> list[list[int]]:
+        return [
+            [s.number for s in g] for g in shards.plan_files(planned, tmp_path, "mask", max_bytes)
+        ]
+
+    assert numbers(sum(sizes) + 1) == [[0, 1, 2]]
+    assert numbers(sum(sizes)) == [[0, 1], [2]]
+    assert numbers(1) == [[0], [1], [2]]
 
 
 def test_a_shard_of_other_episodes_is_not_taken(staged: list[Path], tmp_path: Path, make_episode):

@@ -266,8 +266,8 @@ def _tables(sources: list[_Source], partial: Path) -> Iterator[list[Path]]:
 def _aggregate(sources: list[_Source], folders: list[Path], repo_id: str, partial: Path) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    def smallest(name: str) -> int | None:
-        return min((int(s.info[name]) for s in sources if s.info.get(name)), default=None)
+    def told(name: str) -> list[int]:
+        return [int(s.info[name]) for s in sources if s.info.get(name)]
 
     try:
         aggregate_datasets(
@@ -275,9 +275,10 @@ def _aggregate(sources: list[_Source], folders: list[Path], repo_id: str, partia
             aggr_repo_id=repo_id,
             roots=folders,
             aggr_root=partial,
-            data_files_size_in_mb=smallest("data_files_size_in_mb"),
-            video_files_size_in_mb=smallest("video_files_size_in_mb"),
-            chunk_size=smallest("chunks_size"),
+            data_files_size_in_mb=min(told("data_files_size_in_mb"), default=None),
+            # The largest: LeRobot can stream the pictures of a camera's first file only.
+            video_files_size_in_mb=max(told("video_files_size_in_mb"), default=None),
+            chunk_size=min(told("chunks_size"), default=None),
             concatenate_videos=_one_encoder(sources),
         )
     except ValueError as error:

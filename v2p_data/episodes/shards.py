@@ -1,14 +1,17 @@
-"""Staged episodes become finished video files, each with many episodes: what takes the time, in parallel and kept.
+"""Staged episodes become video files, each with many episodes: what takes the time, in parallel and kept.
 
-A shard is some episodes on end and, per camera, the file that holds them. It is encoded, decoded again,
+A shard is some episodes on end and, per camera, a file that holds them. It is encoded, decoded again,
 compared and renamed into place, then noted down with the digests of what it was made from. A packing that was
 killed makes only the shards that are missing. Which episode lies in which shard follows from their lengths alone,
-and each is encoded by itself, so neither the number of threads nor a kill changes a byte.
+and each is encoded by itself, so neither the number of threads nor a kill changes a byte. Shards on end then make a
+video file of the dataset: LeRobot's `StreamingLeRobotDataset` finds frames in the first file of a camera only.
 """
 
+import contextlib
 import hashlib
 import json
 import os
+import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,7 +27,7 @@ from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
 
 SHARD_FRAMES = 4096
-"""A file is full once it has so many: 2 MB of masks, lost at most when a packing is killed, and far from LeRobot's limit."""
+"""A shard is full once it has so many: 2 MB of masks, lost at most when a packing is killed."""
 ENCODING = 1
 """Raised by hand when the same episode gives other bytes than before."""
 Progress = Callable[[float, str], None]
@@ -32,7 +35,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Shard:
-    """Episodes that share a video file."""
+    """Episodes that are encoded and kept together."""
 
     number: int
     episodes: tuple[Heading, ...]
@@ -117,6 +120,41 @@ def stats_of(shard: Shard, folder: Path) -> list[dict[str, Stats]] | None:
         {c: {k: np.asarray(v) for k, v in s.items()} for c, s in episode.items()}
         for episode in note["stats"]
     ]
+
+
+def plan_files(
+    shards: Sequence[Shard], folder: Path, camera: str, max_bytes: int
+) -> list[list[Shard]]:
+    """Return the finished shards in order, in groups whose files of a camera are smaller than `max_bytes` together."""
+    groups: list[list[Shard]] = []
+    room = 0
+    for shard in shards:
+        size = shard.file(folder, camera).stat().st_size
+        if size >= room:
+            groups.append([])
+            room = max_bytes
+        groups[-1].append(shard)
+        room -= size
+    return groups
+
+
+def write_file(shards: Sequence[Shard], folder: Path, camera: str, path: Path) -> None:
+    """Write what finished shards hold of a camera, one after the other, as the file `path`; the shards stay."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if len(shards) > 1:
+        stream.join(
+            (
+                stream.Encoded(mp4=s.file(folder, camera).read_bytes(), num_frames=s.num_frames)
+                for s in shards
+            ),
+            path,
+        )
+        return
+    source = shards[0].file(folder, camera)
+    with contextlib.suppress(OSError):
+        os.link(source, path)
+        return
+    shutil.copyfile(source, path)
 
 
 @dataclass(frozen=True, kw_only=True)

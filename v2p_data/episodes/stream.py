@@ -77,8 +77,10 @@ def decode_rgb(mp4: bytes) -> UInt8[np.ndarray, "time h w 3"]:
         return np.stack([f.to_ndarray(format="rgb24") for f in video.decode(video=0)])
 
 
-def join(parts: Sequence[Encoded], path: Path) -> None:
+def join(parts: Iterable[Encoded], path: Path) -> None:
     """Write streams one after the other, packet by packet, as one file that is whole or absent.
+
+    The parts are looked at once, in order, so that they need not be in memory together.
 
     Raises:
         RuntimeError: the streams need different decoders, or the file does not hold what was put in.
@@ -86,7 +88,7 @@ def join(parts: Sequence[Encoded], path: Path) -> None:
     av = _av()
     temporary = path.with_name(path.name + ".tmp")
     put = hashlib.sha256()
-    done = 0
+    lengths: list[int] = []
     with av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as made:
         into: Any = None
         extradata = b""
@@ -99,7 +101,7 @@ def join(parts: Sequence[Encoded], path: Path) -> None:
                     extradata = bytes(stream.codec_context.extradata or b"")
                 elif bytes(stream.codec_context.extradata or b"") != extradata:
                     raise RuntimeError(f"a stream for {path} needs another decoder than the first")
-                shift = round(done / (FPS * stream.time_base))
+                shift = round(sum(lengths) / (FPS * stream.time_base))
                 for packet in video.demux(stream):
                     if packet.dts is None:
                         continue
@@ -108,8 +110,8 @@ def join(parts: Sequence[Encoded], path: Path) -> None:
                     packet.dts += shift
                     packet.stream = into
                     made.mux(packet)
-            done += part.num_frames
-    _check_joined(temporary, [p.num_frames for p in parts], put.hexdigest())
+            lengths.append(part.num_frames)
+    _check_joined(temporary, lengths, put.hexdigest())
     with temporary.open("rb") as written:
         os.fsync(written.fileno())
     temporary.replace(path)

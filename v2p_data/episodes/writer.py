@@ -1,11 +1,10 @@
 """Staged episodes become one LeRobot dataset.
 
-The video files are made first (`shards`); then the tables, by LeRobot's own functions for metadata and statistics. The
+The video is encoded first (`shards`) and put into files; then the tables, by LeRobot's own functions for metadata and statistics. The
 dataset grows in `<root>.partial`, is checked, and is renamed into place at the end, so that what lies at `root` is
 finished. The same episodes give the same bytes, after any number of kills, with any number of threads.
 """
 
-import contextlib
 import logging
 import os
 import shutil
@@ -35,7 +34,14 @@ from v2p_data.episodes.features import (
     features,
 )
 from v2p_data.episodes.repo_id import check_repo_id
-from v2p_data.episodes.shards import Shard, make_shards, plan_shards, stats_of
+from v2p_data.episodes.shards import (
+    Shard,
+    make_shards,
+    plan_files,
+    plan_shards,
+    stats_of,
+    write_file,
+)
 from v2p_data.episodes.staging import MASK_CAMERA, Episode, Heading, refusals_told
 from v2p_data.episodes.stream import MASK_CRF, RGB_CRF, encoder_config
 from v2p_data.errors import V2PError
@@ -44,8 +50,8 @@ from v2p_data.sim.masks import PALETTE, label_names
 
 logger = logging.getLogger(__name__)
 
-VIDEO_FILE_MB = 10
-"""What LeRobot's tools go by when they add to the dataset; our own files end earlier."""
+VIDEO_FILE_MB = 200
+"""LeRobot's own limit, for us and for its tools when they add to the dataset; 400,000 frames of masks."""
 DATA_FILE_FRAMES = 400_000
 """Rows per file, 40 MB; each episode is a row group of its own, as LeRobot writes it."""
 EPISODES_PER_WRITE = 100
@@ -177,9 +183,15 @@ def _write(
         video_files_size_in_mb=VIDEO_FILE_MB,
         metadata_buffer_size=EPISODES_PER_WRITE,
     )
-    for shard in shards:
-        for camera in first.cameras:
-            _place(shard.file(finished, camera), _video_path(meta, shard, camera))
+    lies_in: dict[tuple[str, int], tuple[int, int]] = {}  # file, and frame in it, of a shard
+    for camera in first.cameras:
+        planned = plan_files(shards, finished, camera, VIDEO_FILE_MB * 2**20)
+        for number, group in enumerate(planned):
+            write_file(group, finished, camera, _video_path(meta, number, camera))
+            frame = 0
+            for shard in group:
+                lies_in[camera, shard.number] = number, frame
+                frame += shard.num_frames
     for camera in first.cameras:
         crf = MASK_CRF if camera == MASK_CAMERA else RGB_CRF
         meta.update_video_info(KEY_OF_CAMERA[camera], video_encoder=encoder_config(crf))
@@ -192,16 +204,16 @@ def _write(
                 shard.episodes, stats_of(shard, finished) or [], strict=True
             ):
                 episode = Episode.load(heading.path, pictures=False)
-                where = {
-                    f"videos/{KEY_OF_CAMERA[camera]}/{name}": value
-                    for camera in first.cameras
-                    for name, value in {
-                        "chunk_index": shard.number // meta.chunks_size,
-                        "file_index": shard.number % meta.chunks_size,
-                        "from_timestamp": frame / FPS,
-                        "to_timestamp": (frame + episode.num_frames) / FPS,
-                    }.items()
-                }
+                where: dict[str, Any] = {}
+                for camera in first.cameras:
+                    number, start = lies_in[camera, shard.number]
+                    key, begin = f"videos/{KEY_OF_CAMERA[camera]}", start + frame
+                    where |= {
+                        f"{key}/chunk_index": number // meta.chunks_size,
+                        f"{key}/file_index": number % meta.chunks_size,
+                        f"{key}/from_timestamp": begin / FPS,
+                        f"{key}/to_timestamp": (begin + episode.num_frames) / FPS,
+                    }
                 data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
                 described.append(_describe(episode, has_handovers=has_handovers))
                 frame += episode.num_frames
@@ -293,21 +305,12 @@ def _column(values: np.ndarray, field: pa.Field) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
-def _video_path(meta: Any, shard: Shard, camera: str) -> Path:
-    chunk, file = divmod(shard.number, meta.chunks_size)
+def _video_path(meta: Any, number: int, camera: str) -> Path:
+    chunk, file = divmod(number, meta.chunks_size)
     name = meta.video_path.format(
         video_key=KEY_OF_CAMERA[camera], chunk_index=chunk, file_index=file
     )
     return Path(meta.root) / name
-
-
-def _place(source: Path, target: Path) -> None:
-    """Put a finished file into the dataset and keep it, for a kill may come before the end."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with contextlib.suppress(OSError):
-        os.link(source, target)
-        return
-    shutil.copyfile(source, target)
 
 
 def _describe(episode: Episode, *, has_handovers: bool) -> dict[str, Any]:
