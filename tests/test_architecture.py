@@ -17,10 +17,14 @@ BELOW: dict[str, set[str]] = {
     # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
     "sim": {"task", "scene", "geometry", "errors", "seeds"},
     "episodes": {"sim", "task", "scene", "geometry", "pipeline", "errors", "seeds"},
+    "distillation": {"episodes", "sim", "task", "pipeline", "errors", "seeds"},
     "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds"},
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }
-TOP = {"stages", "learning", "expert_config", "solved", "candidate_worker", "cli", "commands"}
+TOP = {
+    *("stages", "learning", "expert_config", "policy_training", "policy_config"),
+    *("solved", "candidate_worker", "cli", "commands"),
+}
 
 
 def imported_modules(path: Path) -> set[str]:

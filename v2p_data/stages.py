@@ -1,6 +1,6 @@
 """START HERE: the engine's stages in the order they happen.
 
-    video --> scene --> task --> (reward -->) expert --> episodes --+--> dataset --> policy --> evaluation
+    video --> scene --> task --> (reward -->) expert --> episodes --+--> dataset --> (distillation -->) policy --> evaluation
     video --> scene --> task --> (reward -->) expert --> episodes --+
 
 Each stage is a recipe and inputs (what it is) and a `make_*` function (how it comes about). A `make_*` loads
@@ -18,12 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from policies.evaluation.rate import wilson
+from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.expert_config import ExpertConfig
 from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.policy_config import PolicyConfig
+from v2p_data.policy_training import POLICY_FOLDER, Source, make_distillation, make_policy
 from v2p_data.reward.config import RewardConfig
 from v2p_data.scene.reconstruct import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
@@ -43,22 +46,7 @@ MODEL_CALLS_FOLDER = "vlm"
 SOLVED_POOL_FOLDER = "pool"
 """Of a run: solved tasks that a language model is shown as examples."""
 EVALUATION_FILE = "evaluation.json"
-POLICY_FOLDER = "policy"
 REWARD_SEARCH_FOLDER = "search"
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolicyConfig:
-    """How the behaviour-cloning policy is trained; anything else goes through `lerobot-train` itself."""
-
-    steps: int = 20_000
-    """Gradient steps."""
-    batch_size: int = 64
-    """Frames a step."""
-    input_size_px: int = 256
-    """Masks are scaled to this before the network; less is faster."""
-    num_workers: int = 1
-    """Processes that decode video while the network trains."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +77,7 @@ class EngineConfig:
     reward: RewardConfig = field(default_factory=RewardConfig)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     episodes: EpisodesConfig = field(default_factory=EpisodesConfig)
+    distillation: DistillationConfig = field(default_factory=DistillationConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     seed: int = 0
@@ -378,7 +367,7 @@ def episodes_stage(task: Stage, expert: Stage, cfg: EngineConfig) -> Stage:
         item=task.item,
         config=Seeded(config=cfg.episodes, seed=cfg.seed),
         inputs={"task": task, "expert": expert},
-        version=1,
+        version=2,
         make=make_episodes,
         resumes=True,
     )
@@ -415,7 +404,7 @@ def dataset_stage(episodes: Sequence[Stage], repo_id: str) -> Stage:
         item=repo_id.split("/")[-1],
         config={"repo_id": repo_id},
         inputs={stage.item: stage for stage in episodes},
-        version=1,
+        version=2,
         make=partial(make_dataset, tasks={s.item: s.inputs["task"] for s in episodes}),
     )
 
@@ -449,14 +438,7 @@ def make_dataset(
         num_threads=runtime.num_threads,
         on_progress=lambda share, words: runtime.progress(0.7 * share, words),
     )
-    for item, stage in tasks.items():
-        shutil.copytree(
-            stage.folder(runtime.root),
-            root / ROOT_OF_TASKS / item,
-            ignore=shutil.ignore_patterns(
-                "record.json", "samples", "overlay*", REWARD_SEARCH_FOLDER
-            ),
-        )
+    copy_tasks({item: stage.folder(runtime.root) for item, stage in tasks.items()}, root)
     runtime.progress(0.75, "comparing every frame")
     report = verify(root, staged=staged)
     if not report.is_good:
@@ -470,6 +452,18 @@ def make_dataset(
         "frames": report.num_frames,
         "repo_id": cfg["repo_id"],
     }
+
+
+def copy_tasks(tasks: Mapping[str, Path], dataset: Path) -> None:
+    """Put tasks, by item, into the dataset that was made in them."""
+    for item, folder in tasks.items():
+        shutil.copytree(
+            folder,
+            dataset / ROOT_OF_TASKS / item,
+            ignore=shutil.ignore_patterns(
+                "record.json", "samples", "overlay*", REWARD_SEARCH_FOLDER
+            ),
+        )
 
 
 def _history(folder: Path, root: Path) -> dict[str, Any]:
@@ -491,50 +485,60 @@ def _history(folder: Path, root: Path) -> dict[str, Any]:
     }
 
 
-# --- dataset -> policy ---------------------------------------------------------------------------------------
+# --- dataset -> distillation -> policy -------------------------------------------------------------------------
 
 
-def policy_stage(dataset: Path, record: Record, cfg: EngineConfig) -> Stage:
-    """Return the stage that clones the experts' behaviour from a finished dataset."""
+def distillation_stage(
+    dataset: Path, record: Record, cfg: EngineConfig, sources: Sequence[Source]
+) -> Stage:
+    """Return the stage in which a student acts, and the experts of a dataset's tasks label and take over.
+
+    Args:
+        dataset: folder of the demonstrations.
+        record: its record.
+        cfg: settings.
+        sources: tasks and experts of the dataset; its record names them, so they are part of its identity.
+    """
     return Stage(
-        name="policy",
+        name="distillation",
         item=record.item,
-        config=Seeded(config=cfg.policy, seed=cfg.seed),
+        config=Seeded(
+            config={"distillation": cfg.distillation, "policy": cfg.policy}, seed=cfg.seed
+        ),
         sources={"dataset": f"{record.item}-{record.fingerprint}"},
         version=1,
-        make=partial(make_policy, dataset=dataset, repo_id=str(record.counts["repo_id"])),
+        make=partial(
+            make_distillation,
+            dataset=dataset,
+            repo_id=str(record.counts["repo_id"]),
+            sources=tuple(sources),
+        ),
         resumes=True,
     )
 
 
-def make_policy(
-    cfg: Seeded,
-    inputs: Mapping[str, Path],
-    out: Path,
-    runtime: Runtime,
-    *,
-    dataset: Path,
-    repo_id: str,
-) -> dict[str, Any]:
-    """Run `lerobot-train` on the dataset, going on from its last checkpoint if there is one."""
-    from policies.bc.train import train
-
-    del inputs
-    policy_cfg: PolicyConfig = cfg.config
-    trained = train(
-        dataset=dataset,
-        repo_id=repo_id,
-        out=out,
-        steps=policy_cfg.steps,
-        batch_size=policy_cfg.batch_size,
-        input_size_px=policy_cfg.input_size_px,
-        num_workers=policy_cfg.num_workers,
-        seed=seed_for(cfg.seed, "policy") % 2**31,
-        num_threads=runtime.num_threads,
-        device=runtime.device,
-        on_progress=runtime.progress,
+def policy_stage(
+    dataset: Path, record: Record, cfg: EngineConfig, sources: Sequence[Source] = ()
+) -> Stage:
+    """Return the stage that trains a policy on a finished dataset, after a distillation where there are experts."""
+    inputs: dict[str, Stage] = {}
+    if sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
+        inputs["distillation"] = distillation_stage(dataset, record, cfg, sources)
+    return Stage(
+        name="policy",
+        item=record.item,
+        config=Seeded(config=cfg.policy, seed=cfg.seed),
+        inputs=inputs,
+        sources={"dataset": f"{record.item}-{record.fingerprint}"},
+        version=2,
+        make=partial(
+            make_policy,
+            dataset=dataset,
+            repo_id=str(record.counts["repo_id"]),
+            sources=tuple(sources),
+        ),
+        resumes=True,
     )
-    return {"steps": policy_cfg.steps, "final_loss": trained.final_loss, "policy": POLICY_FOLDER}
 
 
 # --- policy -> evaluation ------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ and takes the mean about the likeliest. Where experts do one of two opposite thi
 regression answers with their mean, which is neither; a distribution chooses one.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everybody knows
@@ -15,6 +15,7 @@ from torch import Tensor
 from policies.bc.configuration_v2p_bc import V2PBCConfig
 
 
+@runtime_checkable
 class Head(Protocol):
     """What a last layer's outputs mean."""
 

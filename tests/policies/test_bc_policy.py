@@ -4,27 +4,23 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
-from torch import nn
+from torchvision.models import resnet18
 
-from policies.bc import modeling_v2p_bc as modeling
 from policies.bc.configuration_v2p_bc import BACKBONE_WEIGHTS, V2PBCConfig
-from policies.bc.modeling_v2p_bc import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    V2PBCPolicy,
-    label_channels,
-    mask_stem,
-    shifted,
-    shrink,
-    task_words,
-)
+from policies.bc.encoders import pretrained_backbone_file
+from policies.bc.modeling_v2p_bc import V2PBCPolicy, task_words
 
 MASK = "observation.images.mask"
 GREYS = (0, 64, 128, 192, 255)
 
 
 def config(image=(3, 48, 64), cameras=(MASK,), **settings) -> V2PBCConfig:
-    settings = {"pretrained_backbone_weights": None, "input_size_px": 32, **settings}
+    settings = {
+        "pretrained_backbone_weights": None,
+        "input_size_px": 32,
+        "encoder": "conv",
+        **settings,
+    }
     cfg = V2PBCConfig(device="cpu", **settings)
     cfg.input_features = {
         **{key: PolicyFeature(FeatureType.VISUAL, image) for key in cameras},
@@ -65,62 +61,6 @@ def training_batch(chunk=1, batch=2):
     }
 
 
-def test_each_label_becomes_a_channel_that_holds_its_share_of_the_pixel():
-    image = torch.tensor([[0, 64, 128, 128], [0, 0, 128, 255]]) / 255
-    frames = image.expand(1, 1, 3, 2, 4)
-
-    channels = label_channels(frames, GREYS, 2)
-
-    assert channels.shape == (1, 1, 5, 1, 2)
-    by_hand = torch.tensor([[0.75, 0.25, 0, 0, 0], [0, 0, 0.75, 0, 0.25]])
-    torch.testing.assert_close(channels[0, 0, :, 0].T, by_hand)
-
-
-def test_a_grey_slightly_off_after_compression_keeps_its_label():
-    exact = label_channels(torch.full((1, 1, 3, 4, 4), 128 / 255), GREYS, 4)
-
-    off = label_channels(torch.full((1, 1, 3, 4, 4), 131 / 255), GREYS, 4)
-
-    torch.testing.assert_close(off, exact)
-
-
-def test_small_images_are_never_enlarged_and_large_ones_keep_their_aspect():
-    assert shrink(torch.zeros(1, 3, 20, 30), 64).shape == (1, 3, 20, 30)
-    assert shrink(torch.zeros(1, 3, 480, 640), 64).shape == (1, 3, 48, 64)
-
-
-def test_shifting_moves_each_image_as_a_whole_and_fills_the_gap_with_its_border():
-    image = torch.arange(12.0).view(1, 1, 3, 4)
-    channels = torch.cat([image, image + 100], 1).expand(50, -1, -1, -1)
-
-    moved = shifted(channels, 1)
-
-    rows, columns = torch.arange(3), torch.arange(4)
-    possible = [
-        image[0, 0][(rows + dy).clamp(0, 2)][:, (columns + dx).clamp(0, 3)]
-        for dy in (-1, 0, 1)
-        for dx in (-1, 0, 1)
-    ]
-    seen = {next(i for i, p in enumerate(possible) if torch.equal(p, m[0])) for m in moved}
-    assert len(seen) > 4
-    assert torch.equal(moved[:, 0] + 100, moved[:, 1])
-
-
-def test_the_mask_stem_sees_labels_as_the_pretrained_one_sees_the_grey_picture():
-    rng = torch.Generator().manual_seed(0)
-    weight = torch.randn(8, 3, 7, 7, generator=rng)
-    picture = observation(1)[MASK]
-    mean, std = torch.tensor(IMAGENET_MEAN), torch.tensor(IMAGENET_STD)
-    normalised = (picture - mean.view(3, 1, 1)) / std.view(3, 1, 1)
-
-    from_labels = nn.functional.conv2d(
-        label_channels(picture[:, None], GREYS, 64)[:, 0], mask_stem(weight, GREYS), padding=3
-    )
-
-    expected = nn.functional.conv2d(normalised, weight, padding=3)
-    torch.testing.assert_close(from_labels, expected, rtol=1e-4, atol=1e-4)
-
-
 def test_the_same_words_give_the_same_vector_and_other_words_another():
     lift = task_words("Lift the mug!", 64)
 
@@ -131,11 +71,11 @@ def test_the_same_words_give_the_same_vector_and_other_words_another():
 
 
 def test_the_loss_is_the_huber_loss_of_the_actions_inside_the_episode():
-    net = policy(chunk_size=3).eval()
+    net = policy(chunk_size=3, head="regression").eval()
     batch = training_batch(chunk=3)
     batch["action_is_pad"][0, 1:] = True
     with torch.no_grad():
-        error = (net.net(batch) - batch["action"]).abs().numpy()
+        error = (net.net(batch)[..., 0] - batch["action"]).abs().numpy()
 
     loss, logged = net(batch)
 
@@ -143,6 +83,8 @@ def test_the_loss_is_the_huber_loss_of_the_actions_inside_the_episode():
     by_hand = (huber[0, :1].sum() + huber[1].sum()) / (4 * 7)
     assert loss.item() == pytest.approx(by_hand, rel=1e-5)
     assert logged["huber"] == pytest.approx(by_hand, rel=1e-5)
+    each, _ = net(batch, reduction="none")
+    assert each.tolist() == pytest.approx([huber[0, :1].mean(), huber[1].mean()], rel=1e-5)
 
 
 def test_stepping_through_an_episode_acts_as_the_stacked_frames_would():
@@ -202,6 +144,46 @@ def test_any_mix_of_cameras_works_and_only_masks_are_split_into_labels():
     assert action.shape == (2, 7)
     assert [camera.backbone[0].in_channels for camera in net.net.cameras] == [2 * 9, 2 * 3]
     assert policy(camera_input="rgb").net.cameras[0].backbone[0].in_channels == 6
+    assert policy(num_labels=3).net.cameras[0].backbone[0].in_channels == 2 * 3
+    small = policy(cameras=cameras, preset="small")  # colours need a backbone in any case
+    assert [camera.backbone is None for camera in small.net.cameras] == [True, False]
+    assert small.select_action(observation(cameras=cameras)).shape == (2, 7)
+
+
+def test_a_picture_of_bytes_acts_as_the_same_one_of_floats():
+    for settings in ({"encoder": "resnet18"}, {"encoder": "conv"}, {"preset": "small"}):
+        net = policy(**settings)
+        floats = observation()
+        one_channel = (floats[MASK][:, :1] * 255).round().to(torch.uint8)
+        net.reset()
+        expected = net.select_action(floats)
+        net.reset()
+
+        assert torch.equal(net.select_action({**floats, MASK: one_channel}), expected)
+
+
+def test_the_papers_preset_is_the_papers_network():
+    cfg = V2PBCConfig(device="cpu", preset="paper", encoder="conv", head="bins")
+
+    assert (cfg.encoder, cfg.head, cfg.input_size_px, cfg.n_obs_steps) == (
+        "resnet18",
+        "regression",
+        256,
+        2,
+    )
+    assert (cfg.optimizer_lr, cfg.optimizer_lr_backbone) == (3e-4, 3e-5)
+    assert not cfg.mask_moments
+
+
+def test_states_beyond_those_used_change_nothing():
+    net = policy(state_entries=3)
+    obs = observation()
+    net.reset()
+    before = net.select_action(obs)
+    obs["observation.state"][:, 3:] += 5.0
+    net.reset()
+
+    assert torch.equal(net.select_action(obs), before)
 
 
 def test_one_gradient_step_on_a_batch_lowers_its_loss():
@@ -239,7 +221,7 @@ def test_without_pretrained_weights_at_hand_the_policy_starts_anyway_and_says_so
 ):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
 
-    net = policy(pretrained_backbone_weights=BACKBONE_WEIGHTS)
+    net = policy(encoder="resnet18", pretrained_backbone_weights=BACKBONE_WEIGHTS)
 
     assert "random weights" in caplog.text
     assert {group.get("lr") for group in net.get_optim_params()} == {None, net.config.optimizer_lr}
@@ -247,13 +229,15 @@ def test_without_pretrained_weights_at_hand_the_policy_starts_anyway_and_says_so
 
 def test_pretrained_weights_at_hand_are_used_and_trained_ten_times_slower(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    path = modeling.pretrained_backbone_file()
+    path = pretrained_backbone_file()
     path.parent.mkdir(parents=True)
-    given = modeling.resnet18(weights=None).state_dict()
+    given = resnet18(weights=None).state_dict()
     torch.save(given, path)
 
     net = policy(
-        pretrained_backbone_weights=BACKBONE_WEIGHTS, cameras=("observation.images.front",)
+        encoder="resnet18",
+        pretrained_backbone_weights=BACKBONE_WEIGHTS,
+        cameras=("observation.images.front",),
     )
 
     stem = net.net.cameras[0].backbone[0].weight
@@ -264,14 +248,16 @@ def test_pretrained_weights_at_hand_are_used_and_trained_ten_times_slower(tmp_pa
     heads, backbones = net.get_optim_params()
     assert "lr" not in heads
     assert backbones["lr"] == 3e-5
-    assert policy(optimizer_lr_backbone=1e-6).get_optim_params()[1]["lr"] == 1e-6
+    assert (
+        policy(encoder="resnet18", optimizer_lr_backbone=1e-6).get_optim_params()[1]["lr"] == 1e-6
+    )
 
 
 def test_a_saved_policy_loads_without_looking_for_pretrained_weights(
     tmp_path, monkeypatch, caplog
 ):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "empty"))
-    net = policy(pretrained_backbone_weights=BACKBONE_WEIGHTS)
+    net = policy(encoder="resnet18", pretrained_backbone_weights=BACKBONE_WEIGHTS)
     net.save_pretrained(tmp_path / "saved")
     caplog.clear()
 
@@ -292,6 +278,8 @@ def test_a_saved_policy_loads_without_looking_for_pretrained_weights(
         ({"pretrained_backbone_weights": "resnet50"}, "IMAGENET1K_V1"),
         ({"n_obs_steps": 0}, "n_obs_steps"),
         ({"random_shift": 0.7}, "random_shift"),
+        ({"num_bins": 1}, "num_bins"),
+        ({"num_labels": 10}, "num_labels"),
     ],
 )
 def test_impossible_settings_are_refused_by_name(settings, word):

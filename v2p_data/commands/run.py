@@ -19,6 +19,7 @@ from v2p_data.pipeline.artifact import Record, read_record, write_json_atomicall
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Key, only_run_in, run_stages
+from v2p_data.policy_training import sources_of
 from v2p_data.report.page import write_page
 from v2p_data.stages import (
     EVALUATION_FILE,
@@ -240,7 +241,13 @@ def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Pat
             f"{dataset} is no dataset of v2p generate; for others use"
             " 'lerobot-train --policy.type=v2p_bc --dataset.root=...'"
         )
-    stage = policy_stage(dataset.resolve(), record, cfg)
+    sources = sources_of(dataset.resolve(), root)
+    if not sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
+        print(  # noqa: T201
+            f"the experts of {dataset} are not in {root}, so the policy clones its demonstrations only",
+            file=sys.stderr,
+        )
+    stage = policy_stage(dataset.resolve(), record, cfg, sources)
     outcome = _run(
         [stage], replace(runtime, num_threads=max(runtime.workers, runtime.num_threads))
     )[(stage.name, stage.folder_name)]

@@ -7,7 +7,7 @@ episodes that end in success are kept: the expert's labels in hopeless states te
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
@@ -25,6 +25,7 @@ from v2p_data.task.task import TaskBundle
 ExpertAct = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
 
 
+@runtime_checkable
 class ActingStudent(Protocol):
     """A policy that sees masks and the robot's state."""
 

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -35,6 +35,7 @@ BATCHES_FOLDER = "batches"
 Progress = Callable[[float, str], None]
 
 
+@runtime_checkable
 class LearningStudent(ActingStudent, Protocol):
     """A student that takes episodes in, and is kept in folders."""
 

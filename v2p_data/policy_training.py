@@ -1,0 +1,246 @@
+"""A dataset becomes a policy: distillation in rounds, where there are experts, and a last training on all frames.
+
+The student of the distillation is the LeRobot policy itself, so the last training goes on from its weights.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from v2p_data.distillation.config import DistillationConfig
+from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import provenance, read_record
+from v2p_data.pipeline.runner import Runtime
+from v2p_data.pipeline.settings import from_values
+from v2p_data.policy_config import PolicyConfig
+from v2p_data.seeds import seed_for
+
+if TYPE_CHECKING:
+    from policies.bc.student import Student
+
+CACHE_FOLDER = "cache"
+"""Of a run: decoded pictures of its datasets, as networks take them. Safe to delete."""
+DATASET_FOLDER = "dataset"
+"""Of a distillation: demonstrations and handover episodes as one LeRobot dataset."""
+POLICY_FOLDER = "policy"
+ACTION_LIMIT = 1.0
+"""The simulator clips every entry of an action to this."""
+EPISODES_OF_JUDGING = "checkpoints"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where one task of a dataset came from, in its run folder."""
+
+    item: str
+    task: Path
+    expert: Path
+    episodes: Path
+
+
+def sources_of(dataset: Path, root: Path) -> list[Source]:
+    """Return the tasks and experts behind a dataset of `v2p generate`; empty where they are not in the run folder."""
+    record = read_record(dataset)
+    found: list[Source] = []
+    for item, folder in (record.inputs if record else {}).items():
+        episodes = root / "episodes" / folder
+        of_episodes = read_record(episodes)
+        if of_episodes is None:
+            return []
+        task = next(root.glob(f"*/{of_episodes.inputs['task']}"), None)
+        expert = root / "expert" / of_episodes.inputs["expert"]
+        if task is None or not (expert / "weights.safetensors").is_file():
+            return []
+        found.append(Source(item=item, task=task, expert=expert, episodes=episodes))
+    return found
+
+
+def recorded_under(source: Source) -> EpisodesConfig:
+    """Return the settings that a task's demonstrations were recorded with."""
+    record = read_record(source.episodes)
+    assert record is not None
+    return from_values(EpisodesConfig, record.recipe["config"]["config"], str(source.episodes))
+
+
+def make_distillation(
+    cfg: Any,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    dataset: Path,
+    repo_id: str,
+    sources: Sequence[Source],
+) -> dict[str, Any]:
+    """Let a student act, the expert label and take over, and train on, in rounds."""
+    from policies.bc.trainer import TrainerConfig
+    from policies.ppo.policy import Expert
+    from v2p_data.distillation.rounds import Lesson, distill
+    from v2p_data.task.task import TaskBundle
+
+    del inputs
+    recipe: DistillationConfig = cfg.config["distillation"]
+    policy: PolicyConfig = cfg.config["policy"]
+    seed = seed_for(cfg.seed, "distillation")
+    runtime.progress(0.0, "reading the demonstrations")
+    with bad_data_told():
+        student = new_student(dataset, repo_id, policy, seed, runtime)
+        last: dict[str, Any] = {}
+
+        def train(steps: int, folder: Path, seed: int, progress: Any) -> None:
+            trained = student.train(
+                TrainerConfig(steps=steps, batch_size=policy.batch_size),
+                folder,
+                seed=seed,
+                on_progress=progress,
+            )
+            last.update(asdict(trained))
+
+        distilled = distill(
+            {
+                s.item: Lesson(bundle=TaskBundle.load(s.task), expert=Expert.load(s.expert).act)
+                for s in sources
+            },
+            student,
+            train,
+            recipe,
+            recorded_under(sources[0]),
+            out,
+            seed,
+            num_threads=runtime.num_threads,
+            on_progress=lambda share, words: runtime.progress(0.9 * share, words),
+        )
+    counts = distilled.counts() | {"samples_per_s": round(last.get("samples_per_s", 0.0), 1)}
+    if recipe.pack:
+        runtime.progress(0.9, "packing")
+        counts["packed"] = _pack(repo_id, sources, distilled.paths, out, runtime)
+    return counts
+
+
+def _pack(
+    repo_id: str, sources: Sequence[Source], handovers: Sequence[Path], out: Path, runtime: Runtime
+) -> str:
+    """Write demonstrations and handovers as one LeRobot dataset; return its name."""
+    from v2p_data.episodes.card import write_card
+    from v2p_data.episodes.collect import staged_episodes
+    from v2p_data.episodes.verify import verify
+    from v2p_data.episodes.writer import pack
+    from v2p_data.stages import copy_tasks
+
+    name = f"{repo_id}-distilled"
+    root = out / DATASET_FOLDER
+    staged = [*(p for s in sources for p in staged_episodes(s.episodes)), *handovers]
+    if not root.exists():
+        pack(
+            staged, name, root, provenance=provenance(), num_threads=runtime.num_threads,
+            on_progress=lambda share, words: runtime.progress(0.9 + 0.07 * share, words),
+        )  # fmt: skip
+        copy_tasks({s.item: s.task for s in sources}, root)
+    runtime.progress(0.97, "comparing every frame")
+    report = verify(root, staged=staged)
+    if not report.is_good:
+        raise V2PError(f"the packed dataset differs from the episodes: {report.summary()}")
+    write_card(root, name)
+    return name
+
+
+def make_policy(
+    cfg: Any,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    dataset: Path,
+    repo_id: str,
+    sources: Sequence[Source],
+) -> dict[str, Any]:
+    """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
+    from policies.bc.trainer import TrainerConfig
+    from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
+
+    policy: PolicyConfig = cfg.config.resolved
+    seed = seed_for(cfg.seed, "policy")
+    distilled = inputs.get("distillation")
+    runtime.progress(0.0, "reading the frames")
+    with bad_data_told():
+        student = new_student(
+            dataset, repo_id, policy, seed, runtime,
+            start_from=distilled / STUDENT_FOLDER if distilled else None,
+        )  # fmt: skip
+        for path in handover_episodes(distilled) if distilled else ():
+            take_in(student, [path])
+        steps = policy.num_steps(len(student.table))
+        trained = student.train(
+            TrainerConfig(
+                steps=steps, batch_size=policy.batch_size, checkpoints=policy.checkpoints
+            ),
+            out,
+            seed=seed % 2**63,
+            on_progress=runtime.progress,
+        )
+    student.save(out / POLICY_FOLDER)
+    return {
+        "steps": steps,
+        "samples": steps * policy.batch_size,
+        "frames": len(student.table),
+        "final_loss": trained.final_loss,
+        "samples_per_s": round(trained.samples_per_s, 1),
+        "loader_share": round(trained.loader_share, 4),
+        "judged": [list(pair) for pair in trained.judged],
+        "policy": POLICY_FOLDER,
+    }
+
+
+def new_student(
+    dataset: Path,
+    repo_id: str,
+    policy: PolicyConfig,
+    seed: int,
+    runtime: Runtime,
+    *,
+    start_from: Path | None = None,
+) -> "Student":
+    """Return a student that knows the demonstrations; `start_from` is a policy to go on from."""
+    from policies.bc.configuration_v2p_bc import V2PBCConfig
+    from policies.bc.student import Student
+
+    return Student.of_dataset(
+        dataset,
+        repo_id,
+        V2PBCConfig(**policy.network(), num_labels=_num_labels(dataset)),
+        runtime.root / CACHE_FOLDER / dataset.name,
+        seed=seed % 2**63,
+        device=runtime.device,
+        start_from=start_from,
+        num_threads=runtime.num_threads,
+        action_limit=ACTION_LIMIT,
+    )
+
+
+def _num_labels(dataset: Path) -> int | None:
+    """Return how many labels occur in a dataset of ours, the background included; None where it is not known."""
+    from v2p_data.episodes.features import METADATA_FILE
+
+    path = dataset / METADATA_FILE
+    if not path.is_file():
+        return None
+    return max(
+        (1 + max(int(label) for label in e["labels"])
+         for e in json.loads(path.read_text())["episodes"]),
+        default=None,
+    )  # fmt: skip
+
+
+class bad_data_told:  # noqa: N801 - used as a context manager
+    """Turns complaints about a dataset or a training into errors of ours, one sentence each."""
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        from policies.bc.frames import DatasetError
+
+        if isinstance(error, DatasetError):
+            raise V2PError(str(error)) from error
