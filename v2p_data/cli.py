@@ -50,6 +50,9 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
 
 def main() -> None:
     """Run the command line; bad input ends with one sentence and exit code 2."""
+    # Read when torch is loaded, here and in worker processes. Threads that wait by spinning made training on two cores
+    # ten times slower beside another job.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Ninety lines on FFmpeg versions that say what setup says in one.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     # The Ctrl-C of a pipe's reader (`v2p status | head`) is no error of ours.
