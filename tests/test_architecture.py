@@ -17,6 +17,8 @@ BELOW: dict[str, set[str]] = {
     # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
     "sim": {"task", "scene", "geometry", "errors", "seeds"},
     "episodes": {"sim", "task", "scene", "geometry", "pipeline", "errors", "seeds"},
+    # Loading a LeRobot policy is for `policies.evaluation`; here a policy is whatever has `reset` and `act`.
+    "evaluation": {"sim", "task", "scene", "episodes", "pipeline", "errors", "seeds"},
     "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds"},
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }

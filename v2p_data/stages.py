@@ -20,6 +20,7 @@ from typing import Any
 from policies.evaluation.rate import wilson
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.expert_config import ExpertConfig
 from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
@@ -59,16 +60,6 @@ class PolicyConfig:
     """Masks are scaled to this before the network; less is faster."""
     num_workers: int = 1
     """Processes that decode video while the network trains."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationConfig:
-    """How a policy is judged."""
-
-    episodes: int = 20
-    """Episodes per task."""
-    batch_size: int = 10
-    """Episodes at the same time."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -402,6 +402,10 @@ class BatchEnv:
         fields = {name: drawn[name][ids].copy() for name in looks + view}
         return Snapshot(qpos=self._qpos[ids].copy(), qvel=self._qvel[ids].copy(), **fields)
 
+    def motion(self) -> tuple[Float[np.ndarray, "env q"], Float[np.ndarray, "env v"]]:
+        """Return copies of all worlds' positions and velocities: what changes in a `Snapshot` during an episode."""
+        return self._qpos.copy(), self._qvel.copy()
+
     def episode_params(self, env: int) -> dict[str, Any]:
         """Return what was drawn for the episode in world `env`, for JSON."""
         return {

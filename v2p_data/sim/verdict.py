@@ -30,6 +30,15 @@ def referee_verdict(
     return referee_success(bundle.kind, bundle.scene, trajectory)
 
 
+def course_keys(env: BatchEnv) -> list[str]:
+    """Return the states that `referee_verdict` looks at."""
+    return ["eef_pos"] + [
+        f"{name}_{key}"
+        for name in env.object_names
+        for key in ("pos", "quat", "size", "touched", "grasped")
+    ]
+
+
 class Witness:
     """Remembers the courses of all worlds of an environment, which start and end together."""
 
@@ -45,12 +54,9 @@ class Witness:
     def note(self) -> None:
         """Note the present moment; call after each step."""
         states = self.env.states()
-        keys = ["eef_pos"] + [
-            f"{name}_{key}"
-            for name in self.env.object_names
-            for key in ("pos", "quat", "size", "touched", "grasped")
-        ]
-        self.moments.append({key: states[key].numpy().astype(float) for key in keys})
+        self.moments.append(
+            {key: states[key].numpy().astype(float) for key in course_keys(self.env)}
+        )
 
     def verdict(self) -> Bool[np.ndarray, "env"]:
         """Return what the referee says of the episodes so far."""
