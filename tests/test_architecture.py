@@ -22,7 +22,16 @@ BELOW: dict[str, set[str]] = {
     "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds"},
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }
-TOP = {"stages", "learning", "expert_config", "solved", "candidate_worker", "cli", "commands"}
+TOP = {
+    "stages",
+    "learning",
+    "expert_config",
+    "solved",
+    "candidate_worker",
+    "judging",
+    "cli",
+    "commands",
+}
 
 
 def imported_modules(path: Path) -> set[str]:

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from v2p_data.errors import V2PError
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.teacher import Teacher
@@ -50,16 +51,29 @@ class ExpertActor:
 
     Args:
         act: from the task's observation to actions.
+        obs_dim: length of the observation that it knows.
     """
 
     def __init__(
-        self, act: Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env 7"]]
+        self,
+        act: Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env 7"]],
+        obs_dim: int,
     ) -> None:
         self._act = act
+        self._obs_dim = obs_dim
         self._progress: list[int] = []
 
     def begin(self, env: BatchEnv) -> None:
-        """Find where the observation tells how much of the episode has passed."""
+        """Find where the observation tells how much of the episode has passed.
+
+        Raises:
+            V2PError: the task's observation is not the expert's.
+        """
+        if env.obs_dim != self._obs_dim:
+            raise V2PError(
+                f"the expert knows observations of length {self._obs_dim}, and task '{env.bundle.title}' makes ones of"
+                f" length {env.obs_dim}: it is another task's expert"
+            )
         self._progress = _progress_columns(env)
 
     def act_in(self, env: BatchEnv) -> Float32[np.ndarray, "env 7"]:

@@ -358,7 +358,7 @@ class BatchEnv:
             clipped = np.nan_to_num(clipped)
         np.minimum(np.maximum(clipped, -1.0, out=clipped), 1.0, out=clipped)
         noise = self.cfg.randomization.action_noise
-        moved = clipped + self._action_noise(noise, clipped.shape) if noise else clipped
+        moved = clipped + self._action_noise(noise) if noise else clipped
         self._move_targets(moved)
         self._write_controls(slice(None))
         self._batch.step(moving, nstep=self.physics.substeps)
@@ -485,13 +485,13 @@ class BatchEnv:
         self._bank_row = np.full(n, -1)
         self._tool = self._tool_of(slice(None))
 
-    def _action_noise(self, noise: float, shape: tuple[int, int]) -> Float[np.ndarray, "7 env"]:
+    def _action_noise(self, noise: float) -> Float[np.ndarray, "7 env"]:
         """Draw for all worlds from the shared stream, unless each has one of its own."""
-        own = self._own_rngs
+        own, shape = self._own_rngs, (ACT_DIM, self.num_envs)
         all_own = len(own) == self.num_envs
         drawn = np.empty(shape) if all_own else self._rng.normal(0.0, noise, shape)
         for k, rng in own.items():
-            drawn[:, k] = rng.normal(0.0, noise, shape[0])
+            drawn[:, k] = rng.normal(0.0, noise, ACT_DIM)
         return drawn
 
     def _move_targets(self, action: Float[np.ndarray, "7 env"]) -> None:
