@@ -18,12 +18,14 @@ BELOW: dict[str, set[str]] = {
     "sim": {"task", "scene", "geometry", "errors", "seeds"},
     "episodes": {"sim", "task", "scene", "geometry", "pipeline", "errors", "seeds"},
     "distillation": {"episodes", "sim", "task", "pipeline", "errors", "seeds"},
+    # Loading a LeRobot policy is for `policies.evaluation`; here a policy is whatever has `reset` and `act`.
+    "evaluation": {"sim", "task", "scene", "episodes", "pipeline", "errors", "seeds"},
     "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds"},
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }
 TOP = {
     *("stages", "learning", "expert_config", "policy_training", "policy_config"),
-    *("solved", "candidate_worker", "cli", "commands"),
+    *("solved", "candidate_worker", "judging", "cli", "commands"),
 }
 
 

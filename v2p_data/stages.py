@@ -21,7 +21,9 @@ from policies.evaluation.rate import wilson
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.expert_config import ExpertConfig
+from v2p_data.judging import PROGRAMS, Contestant, judge_task, play_of, row_of
 from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
@@ -46,17 +48,9 @@ MODEL_CALLS_FOLDER = "vlm"
 SOLVED_POOL_FOLDER = "pool"
 """Of a run: solved tasks that a language model is shown as examples."""
 EVALUATION_FILE = "evaluation.json"
+VIDEOS_FOLDER, SHEET_FILE = "videos", "sheet.png"
+"""Of an evaluation: a folder per task with a few films and a contact sheet."""
 REWARD_SEARCH_FOLDER = "search"
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationConfig:
-    """How a policy is judged."""
-
-    episodes: int = 20
-    """Episodes per task."""
-    batch_size: int = 10
-    """Episodes at the same time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -545,27 +539,36 @@ def policy_stage(
 
 
 def evaluation_stage(
-    policy: Path, tasks: Mapping[str, Path], cfg: EngineConfig, seen: Sequence[str]
+    who: Contestant, tasks: Mapping[str, Path], cfg: EngineConfig, seen: Sequence[str]
 ) -> Stage:
-    """Return the stage that rolls the policy out on each task.
+    """Return the stage that judges someone in each task.
 
     Args:
-        policy: folder of a LeRobot policy.
+        who: a LeRobot policy, an expert, or the scripted programs.
         tasks: folders of the tasks to try, by name.
         cfg: settings.
-        seen: names of the tasks that the policy's dataset had.
+        seen: names of the tasks that the policy's dataset had, or that the expert learned.
     """
     return Stage(
         name="evaluation",
-        item=policy.parent.name.rsplit("-", 1)[0] if policy.name == POLICY_FOLDER else policy.name,
+        item=_item_of(who),
         config=Seeded(config=cfg.evaluation, seed=cfg.seed),
         sources={
-            "policy": file_digest(policy / "model.safetensors"),
+            **who.sources,
             **{f"task {name}": file_digest(path / "task.py") for name, path in tasks.items()},
         },
-        version=1,
-        make=partial(make_evaluation, policy=policy, tasks=dict(tasks), seen=tuple(seen)),
+        version=2,
+        make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=tuple(seen)),
     )
+
+
+def _item_of(who: Contestant) -> str:
+    if who.kind == "programs":
+        return PROGRAMS
+    if who.kind == "expert":
+        return f"{who.folder.name.rsplit('-', 1)[0]}-expert"
+    folder = who.folder
+    return folder.parent.name.rsplit("-", 1)[0] if folder.name == POLICY_FOLDER else folder.name
 
 
 def make_evaluation(
@@ -574,34 +577,34 @@ def make_evaluation(
     out: Path,
     runtime: Runtime,
     *,
-    policy: Path,
+    who: Contestant,
     tasks: Mapping[str, Path],
     seen: Sequence[str],
 ) -> dict[str, Any]:
-    """Roll the policy out and write success rates with their intervals."""
-    from policies.evaluation.rollout import evaluate_policy
+    """Judge many episodes of each task; write rates with their intervals, kinds of failure, films and contact sheets."""
+    from v2p_data.report.films import write_films
+    from v2p_data.report.sheet import SheetConfig, write_contact_sheet
+    from v2p_data.task.task import TaskBundle
 
     del inputs
+    play = play_of(who, cfg.seed, runtime.device)
     rows: list[dict[str, Any]] = []
     for index, (name, folder) in enumerate(tasks.items()):
-        runtime.progress(index / len(tasks), name)
-        first_seed = seed_for(cfg.seed, "evaluation", name) % 2**31
-        successes = evaluate_policy(
-            policy,
-            folder,
-            episodes=cfg.config.episodes,
-            batch_size=cfg.config.batch_size,
-            first_seed=first_seed,
-            videos=out / "videos" / name,
+        bundle = TaskBundle.load(folder)
+        judged = judge_task(
+            play,
+            bundle,
+            cfg.config,
+            seed_for(cfg.seed, "evaluation", name) % 2**31,
+            runtime,
+            lambda share, k=index, words=name: runtime.progress((k + share) / len(tasks), words),
         )
-        rows.append(
-            {
-                "task": name,
-                "seen": name in seen,
-                "first_seed": first_seed,
-                **wilson(sum(successes), len(successes)).as_dict(),
-            }
+        videos = out / VIDEOS_FOLDER / name
+        write_films(bundle, judged.shown, videos)
+        write_contact_sheet(
+            bundle, judged.shown, videos / SHEET_FILE, SheetConfig(successes=3, failures=3)
         )
+        rows.append({"task": name, "seen": name in seen, "judged": who.kind, **row_of(judged)})
     (out / EVALUATION_FILE).write_text(json.dumps(rows, indent=1))
     return {"tasks": len(rows), "rows": rows}
 

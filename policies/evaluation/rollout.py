@@ -1,7 +1,8 @@
 """Roll a LeRobot policy out in simulated tasks and say which episodes succeeded.
 
-LeRobot's own evaluation does the work, so that these numbers are those of `lerobot-eval`. The tasks come
-through LeRobot's environment type `v2p`, which the plugin `lerobot_policy_v2p` registers.
+LeRobot's own evaluation does the work, with one environment per episode at a time. `v2p eval` has a faster way to
+the same successes (`actor`); this one is what it is compared with. The tasks come through LeRobot's environment type
+`v2p`, which the plugin `lerobot_policy_v2p` registers.
 """
 
 from dataclasses import dataclass
@@ -24,14 +25,19 @@ class LoadedPolicy:
     postprocessor: Any
 
 
-def load_policy(folder: Path, env_config: Any) -> LoadedPolicy:
-    """Read a checkpoint of any policy type LeRobot knows, checked against the environment's features."""
+def load_policy(folder: Path, env_config: Any, device: str | None = None) -> LoadedPolicy:
+    """Read a checkpoint of any policy type LeRobot knows, checked against the environment's features.
+
+    It runs on `device`, by default where its settings say.
+    """
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import make_policy, make_pre_post_processors
 
     _register_plugins()
     config = PreTrainedConfig.from_pretrained(folder)
     config.pretrained_path = folder
+    if device is not None:
+        config.device = device
     policy = make_policy(config, env_cfg=env_config)
     preprocessor, postprocessor = make_pre_post_processors(
         policy_cfg=config,
@@ -41,12 +47,12 @@ def load_policy(folder: Path, env_config: Any) -> LoadedPolicy:
     return LoadedPolicy(policy=policy, preprocessor=preprocessor, postprocessor=postprocessor)
 
 
-def env_config(tasks: Path) -> Any:
-    """Return LeRobot's settings for the tasks in a folder."""
+def env_config(tasks: Path | None = None, **settings: Any) -> Any:
+    """Return LeRobot's settings for the tasks in a folder; without one, of the simulator in general."""
     from lerobot.envs.factory import make_env_config
 
     _register_plugins()
-    return make_env_config(ENV_TYPE, tasks=str(tasks))
+    return make_env_config(ENV_TYPE, tasks="" if tasks is None else str(tasks), **settings)
 
 
 def roll_out(
@@ -93,6 +99,7 @@ def evaluate_policy(
     batch_size: int = 10,
     first_seed: int = 0,
     videos: Path | None = None,
+    **settings: Any,
 ) -> list[bool]:
     """Return which episodes of the task (or of all tasks, one after the other) in a folder succeeded.
 
@@ -103,8 +110,9 @@ def evaluate_policy(
         batch_size: episodes at the same time.
         first_seed: seed of a task's first episode; the others follow.
         videos: where to put a few videos; none are made without it.
+        settings: of the environment, such as `size_px`.
     """
-    config = env_config(tasks)
+    config = env_config(tasks, **settings)
     loaded = load_policy(policy, config)
     envs = config.create_envs(n_envs=min(batch_size, episodes), use_async_envs=False)
     results = roll_out(

@@ -197,6 +197,34 @@ def test_task_names_of_an_evaluation_cannot_reach_outside_its_folder(run):
     assert not outline(run).of("video")
 
 
+def test_an_evaluation_shows_both_rates_what_went_wrong_and_a_film_of_each_kind(run):
+    row = {
+        "task": "t",
+        "seen": True,
+        "judged": "policy",
+        "successes": 3,
+        "trials": 4,
+        "low": 0.3,
+        "high": 0.95,
+    }
+    at_end = {"successes": 2, "trials": 4, "low": 0.15, "high": 0.85}
+    told = {"at_end": at_end, "failures": {"never_reached": 1}, "median_success_s": 2.5}
+    folder = run.evaluation([row | told])
+    videos = folder / "videos" / "t"
+    film = (videos / "episode_0.mp4").read_bytes()
+    for name in ("failure_0001", "failure_0002", "success_0000"):
+        (videos / f"{name}.mp4").write_bytes(film)
+    run.evaluation([row | {"judged": "expert", "seen": False, "successes": 4}], item="t-expert")
+
+    page = outline(run)
+
+    assert "after 2.5 s" in page.text
+    assert "never reached 1" in page.text
+    assert "The policy succeeds in 3 of 4 episodes (75 %)" in page.text
+    alts = [str(v.get("aria-label")) for v in page.of("video")]
+    assert [a.split(": ")[-1] for a in alts[:2]] == ["success_0000", "failure_0001"]
+
+
 def test_a_run_with_nothing_in_it_has_a_page(run):
     page = outline(run)
 

@@ -121,11 +121,16 @@ def test_moving_up_raises_the_tool_in_the_state(env):
     assert 0.02 < after["agent_pos"][2] - before["agent_pos"][2] < 0.095
 
 
-def test_an_episode_without_success_ends_at_the_horizon(env):
+@pytest.mark.parametrize(("scale", "steps"), [(2.0, 12), (1.0, 6)])
+def test_an_episode_without_success_ends_at_a_multiple_of_the_horizon(
+    write_task, tmp_path, scale, steps
+):
+    env = V2PEnv(str(write_task(tmp_path / "lift")), size_px=16, horizon_scale=scale)
     env.reset(seed=0)
-    ends = [env.step(np.zeros(7, np.float32))[2:4] for _ in range(6)]
+    ends = [env.step(np.zeros(7, np.float32))[2:4] for _ in range(steps)]
 
-    assert ends == [(False, False)] * 5 + [(False, True)]
+    assert ends == [(False, False)] * (steps - 1) + [(False, True)]
+    env.close()
 
 
 def test_success_counts_when_held_and_ends_the_episode(write_task, tmp_path):
@@ -184,7 +189,7 @@ def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(wri
     assert {i: e.call("task")[0] for i, e in envs["v2p"].items()} == {0: "a-lift", 1: "b-push"}
     env = envs["v2p"][0]
     assert env.call("task_description") == ("lifting a cube",) * 2
-    assert env.call("_max_episode_steps") == (6, 6)
+    assert env.call("_max_episode_steps") == (12, 12)
     env.reset(seed=[1, 2])
     infos = [env.step(np.zeros((2, 7), np.float32))[4] for _ in range(7)]
     assert "final_info" not in infos[3]

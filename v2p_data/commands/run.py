@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -15,6 +15,7 @@ from v2p_data.cli import parse
 from v2p_data.commands.display import Display, describe, outcome_table, outcomes_json, tally
 from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.errors import V2PError
+from v2p_data.judging import PROGRAMS, Contestant, contestant
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 from v2p_data.pipeline.settings import load_settings
@@ -96,7 +97,7 @@ class Train:
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
     policy: tyro.conf.Positional[Path]
-    """Folder of a policy."""
+    """Folder of a policy or of an expert; `programs` for the scripted programs."""
     tasks: tuple[Path, ...] = ()
     """More task folders (or folders of tasks) to try: these count as unseen."""
     out: Path | None = None
@@ -168,15 +169,21 @@ def train_command(argv: list[str]) -> int:
 
 def eval_command(argv: list[str]) -> int:
     args = _with_config(Evaluate, argv, "eval")
-    root = _run_folder(args.out or args.policy.resolve().parent.parent.parent)
+    who = contestant(args.policy)
+    root = _run_folder(args.out or _home_of(who, args.tasks))
     unseen = {name: path for folder in args.tasks for name, path in task_folders(folder).items()}
     with only_run_in(root):
-        outcome, rows = evaluate(args.policy, unseen, root, args.engine, args.how.runtime(root))
+        outcome, rows = evaluate(who, unseen, root, args.engine, args.how.runtime(root))
         page = write_page(root)
+    goes_on = {
+        "policy": f"v2p push {shlex.quote(str(args.policy))} --repo-id USER/NAME",
+        "expert": f"v2p eval {PROGRAMS} --tasks TASKS   (the same judge on scripted programs)",
+        "programs": "v2p eval POLICY   (the same judge on a policy)",
+    }
     _say(
         f"Made {outcome.folder / EVALUATION_FILE}",
         "\n".join(rate_lines(rows)) + f"\npage: {page}",
-        f"v2p push {shlex.quote(str(args.policy))} --repo-id USER/NAME",
+        goes_on[who.kind],
     )
     return 0
 
@@ -203,7 +210,7 @@ def demo_command(argv: list[str]) -> int:
             raise V2PError(f"no sample clip came as far as episodes; see {write_page(root)}")
         policy = train(dataset, root, cfg, runtime)
         unseen = _unseen_tasks(samples / "unseen", root, cfg, runtime)
-        _, rows = evaluate(policy, unseen, root, cfg, runtime)
+        _, rows = evaluate(contestant(policy), unseen, root, cfg, runtime)
         page = write_page(root)
     _say(
         f"Made {page}",
@@ -248,31 +255,44 @@ def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Pat
             file=sys.stderr,
         )
     stage = policy_stage(dataset.resolve(), record, cfg, sources)
-    outcome = _run(
-        [stage], replace(runtime, num_threads=max(runtime.workers, runtime.num_threads))
-    )[(stage.name, stage.folder_name)]
+    outcome = _run([stage], _all_threads(runtime))[(stage.name, stage.folder_name)]
     _demand(outcome)
     return outcome.folder / POLICY_FOLDER
 
 
 def evaluate(
-    policy: Path, unseen: dict[str, Path], root: Path, cfg: EngineConfig, runtime: Runtime
-) -> tuple[Outcome, list[dict[str, object]]]:
-    """Roll a policy out on its dataset's tasks and on unseen ones."""
-    if not (policy / "model.safetensors").is_file():
-        raise V2PError(f"{policy} holds no model.safetensors: it is no LeRobot policy")
-    record = read_record(policy.parent)
-    seen: dict[str, Path] = {}
-    if record is not None and record.stage == "policy":
-        for dataset in sorted((root / "dataset").glob(record.recipe["sources"]["dataset"])):
-            seen = task_folders(dataset / ROOT_OF_TASKS)
+    who: Contestant, unseen: dict[str, Path], root: Path, cfg: EngineConfig, runtime: Runtime
+) -> tuple[Outcome, list[dict[str, Any]]]:
+    """Judge a policy, an expert or the programs in the tasks that it learned from and in unseen ones."""
+    seen = _seen_tasks(who)
     tasks = {**seen, **unseen}
     if not tasks:
-        raise V2PError(f"no task is known for {policy}; name task folders with --tasks")
-    stage = evaluation_stage(policy.resolve(), tasks, cfg, seen=list(seen))
-    outcome = _run([stage], runtime)[(stage.name, stage.folder_name)]
+        raise V2PError(f"no task is known for {who.folder}; name task folders with --tasks")
+    stage = evaluation_stage(who, tasks, cfg, seen=list(seen))
+    outcome = _run([stage], _all_threads(runtime))[(stage.name, stage.folder_name)]
     _demand(outcome)
     return outcome, _record(outcome.folder).counts["rows"]
+
+
+def _seen_tasks(who: Contestant) -> dict[str, Path]:
+    """Return the tasks of a policy's dataset, or the one that an expert learned, as far as its run has them."""
+    if who.kind == "programs":
+        return {}
+    root = _home_of(who, ())
+    record = read_record(who.folder.parent if who.kind == "policy" else who.folder)
+    if record is not None and (who.kind, record.stage) == ("policy", "policy"):
+        for dataset in sorted((root / "dataset").glob(record.recipe["sources"]["dataset"])):
+            return task_folders(dataset / ROOT_OF_TASKS)
+    if record is not None and (who.kind, record.stage) == ("expert", "expert"):
+        for stage, folder in record.inputs.items():
+            if (root / stage / folder / TASK_FILE).is_file():
+                return {record.item: root / stage / folder}
+    return {}
+
+
+def _all_threads(runtime: Runtime) -> Runtime:
+    """Let the only job have all threads."""
+    return replace(runtime, num_threads=max(runtime.workers, runtime.num_threads))
 
 
 def task_folders(folder: Path) -> dict[str, Path]:
@@ -289,14 +309,37 @@ def task_folders(folder: Path) -> dict[str, Path]:
     return found
 
 
-def rate_lines(rows: Sequence[dict[str, object]]) -> list[str]:
+def _home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
+    """Return the run folder that a policy or an expert lies in; of the programs, the one that the tasks lie in.
+
+    Raises:
+        V2PError: the programs' tasks are not named.
+    """
+    if who.kind == "programs":
+        if not tasks:
+            raise V2PError(f"the scripted programs need tasks: v2p eval {PROGRAMS} --tasks FOLDER")
+        task = next(iter(task_folders(tasks[0]).values()))
+        return task.resolve().parent.parent
+    return who.folder.parent.parent.parent if who.kind == "policy" else who.folder.parent.parent
+
+
+def rate_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return one line per task: seen or unseen, the rate and its interval."""
     width = max(len(str(r["task"])) for r in rows)
     return [
         f"  {r['task']!s:<{width}}  {'seen  ' if r['seen'] else 'unseen'}  {r['successes']}/{r['trials']}"
-        f" = {r['rate']:.0%}, 95 % interval {r['low']:.0%} to {r['high']:.0%}"
+        f" = {r['rate']:.0%}, 95 % interval {r['low']:.0%} to {r['high']:.0%}{_more(r)}"
         for r in rows
     ]
+
+
+def _more(row: dict[str, Any]) -> str:
+    """Return how often success was still there at the end, and what went wrong most often."""
+    words = ""
+    if row.get("at_end"):
+        words += f"; at the end {row['at_end']['rate']:.0%}"
+    failures = [f"{kind.replace('_', ' ')} {n}" for kind, n in row.get("failures", {}).items()]
+    return words + (f"; failures: {', '.join(failures)}" if failures else "")
 
 
 def _item_name(folder: Path) -> str:

@@ -71,7 +71,7 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
         world = build_world(bundle.scene, FINE, robot=robot_from_json(bundle.robot))
         (partial / "mjcf").mkdir(exist_ok=True)
         (partial / "mjcf" / f"{name}.xml").write_text(world.xml)
-        rows.append(f"| {len(rows)} | {bundle.description} | `{name}` | {bundle.horizon_steps} |")
+        rows.append(f"| {len(rows)} | {bundle.description} | `{name}` | {bundle.policy_steps()} |")
     modules = engine_modules()
     for module in modules:
         path = _path_of(module)
@@ -233,7 +233,7 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
         sys.path.insert(0, str(folder))
     from v2p_data.sim.lerobot_env import V2PEnvConfig
 
-    named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg")
+    named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg", "horizon_scale")
     given = {name: getattr(cfg, name) for name in named if hasattr(cfg, name)}
     return V2PEnvConfig(tasks=str(folder / TASKS), **given).create_envs(n_envs, use_async_envs)
 

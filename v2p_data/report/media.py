@@ -114,7 +114,17 @@ def film_uri(path: Path, max_width_px: int, max_frames: int) -> str | None:
 
 
 def frames_uri(frames: UInt8[np.ndarray, "time h w 3"], fps: float) -> str:
-    """Return RGB frames as an H.264 film. Odd sizes lose one row or column: H.264 halves its colours."""
+    """Return RGB frames as an H.264 film."""
+    return _uri("video/mp4", _film(frames, fps))
+
+
+def write_film(path: Path, frames: UInt8[np.ndarray, "time h w 3"], fps: float) -> None:
+    """Write RGB frames as an H.264 film."""
+    path.write_bytes(_film(frames, fps))
+
+
+def _film(frames: UInt8[np.ndarray, "time h w 3"], fps: float) -> bytes:
+    """Return RGB frames as an mp4 file. Odd sizes lose one row or column: H.264 halves its colours."""
     _, h, w, _ = frames.shape
     frames = frames[:, : h - h % 2, : w - w % 2]
     buffer = io.BytesIO()
@@ -130,7 +140,7 @@ def frames_uri(frames: UInt8[np.ndarray, "time h w 3"], fps: float) -> str:
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    return _uri("video/mp4", buffer.getvalue())
+    return buffer.getvalue()
 
 
 def draw_mesh(

@@ -14,21 +14,19 @@ import jinja2
 from markupsafe import Markup
 
 from v2p_data.report.chart import Line, line_chart
+from v2p_data.report.evaluations import EvaluationRow, evaluation_rows
 from v2p_data.report.items import ItemView, item_view
-from v2p_data.report.media import MediaBudget, Medium, PageConfig, film_uri
+from v2p_data.report.media import MediaBudget, PageConfig
 from v2p_data.report.reading import (
     ITEM_STAGES,
     JOINT_STAGES,
     STAGES,
     Dropped,
-    Rate,
     Run,
     dropped,
     model_use,
     number,
-    rate_of,
     read_curve,
-    read_json,
     read_run,
 )
 from v2p_data.report.words import NO_BREAK as NO_BREAK
@@ -36,15 +34,6 @@ from v2p_data.report.words import duration, percent
 
 PAGE_FILE = "report.html"
 TEMPLATE_FILE = "page.html"
-FILM_SUFFIXES = (".mp4", ".webm", ".mkv", ".avi", ".mov", ".gif")
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationRow:
-    task: str
-    is_seen: bool
-    rate: Rate
-    films: list[Medium]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +63,8 @@ def render_page(root: Path, cfg: PageConfig) -> str:
     """Return the page as HTML."""
     run = read_run(root)
     budget = MediaBudget(max_bytes=cfg.max_media_bytes)
-    evaluation = _evaluation_rows(run, cfg, budget)
-    held_out = {row.task for row in evaluation if not row.is_seen}
+    evaluation = evaluation_rows(run, cfg, budget)
+    held_out = {row.task for row in evaluation if row.is_policy and not row.is_seen}
     items = [
         item_view(run, item, f"video-{k}", item in held_out, k <= cfg.max_shown_items, cfg, budget)
         for k, item in enumerate(run.items, 1)
@@ -147,7 +136,7 @@ def _summary(run: Run, items: Sequence[ItemView], evaluation: Sequence[Evaluatio
             f"{_plural(int(episodes), 'successful episode')}, {_plural(int(frames), 'frame')}."
         )
     for is_seen, words in ((True, "it was trained on"), (False, "it has never seen")):
-        rates = [row.rate for row in evaluation if row.is_seen == is_seen]
+        rates = [r.rate for r in evaluation if r.is_policy and r.is_seen == is_seen]
         if rates:
             k, n = sum(r.successes for r in rates), sum(r.trials for r in rates)
             sentences.append(
@@ -167,7 +156,7 @@ def _key_figures(
         return _grouped(sum(int(number(r.counts.get(name)) or 0) for r in datasets))
 
     def success(is_seen: bool) -> str:
-        rates = [row.rate for row in evaluation if row.is_seen == is_seen]
+        rates = [r.rate for r in evaluation if r.is_policy and r.is_seen == is_seen]
         if not rates:
             return "-"
         return percent(sum(r.successes for r in rates) / sum(r.trials for r in rates))
@@ -189,32 +178,6 @@ def _is_made(view: ItemView, stage: str) -> bool:
 
 
 # --- the policy ----------------------------------------------------------------------------------------------
-
-
-def _evaluation_rows(run: Run, cfg: PageConfig, budget: MediaBudget) -> list[EvaluationRow]:
-    rows: list[EvaluationRow] = []
-    for result in run.made("evaluation"):
-        data = result.counts.get("rows") or read_json(result.folder / "evaluation.json")
-        for row in data if isinstance(data, list) else []:
-            rate = rate_of(row)
-            if rate is None:
-                continue
-            task = str(row.get("task", ""))
-            films = [
-                Medium(uri=uri, alt=f"The policy tries {task}: {path.stem}", is_film=True)
-                for path in _films(result.folder / "videos" / task, result.folder)[: cfg.max_rollouts_per_task]
-                if (uri := budget.admit(film_uri(path, 320, cfg.max_film_frames), f"{task}: {path.name}"))
-            ]  # fmt: skip
-            rows.append(
-                EvaluationRow(task=task, is_seen=bool(row.get("seen")), rate=rate, films=films)
-            )
-    return sorted(rows, key=lambda row: (not row.is_seen, row.task))
-
-
-def _films(folder: Path, inside: Path) -> list[Path]:
-    if not folder.resolve().is_relative_to(inside.resolve()) or not folder.is_dir():
-        return []
-    return sorted(p for p in folder.rglob("*") if p.suffix.lower() in FILM_SUFFIXES)
 
 
 def _policy_charts(run: Run) -> list[Markup]:

@@ -11,6 +11,7 @@ ended go on until `reset` is called for them. Results depend on the seed only, n
 
 import json
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -198,6 +199,8 @@ class BatchEnv:
             self.world, self._batch, self.cfg.randomization, rng_for(seed, "start-poses")
         )
         self._rng = rng_for(seed, "worlds")
+        self._own_rngs: dict[int, np.random.Generator] = {}
+        """Of worlds whose episode was seeded by itself."""
         self._allocate()
         self.task = task_code.load(bundle, self, task)
         self.reset(np.arange(num_envs))
@@ -223,6 +226,20 @@ class BatchEnv:
         self._rng = rng_for(seed, "worlds")
         self.randomizer.forget_prepared()
 
+    def reset_seeded(self, ids: Int[np.ndarray, "n"], seeds: Sequence[int]) -> None:
+        """Start an episode in each of the worlds `ids`, each from a seed and with a stream of its own.
+
+        Such a world draws its start and its action noise as the only world of an environment does after `seed` and
+        `reset`, whatever the other worlds do. It keeps its stream until it is reset without a seed.
+        """
+        shared = self._rng
+        for k, seed in zip(ids.tolist(), seeds, strict=True):
+            self.seed(seed)
+            self.reset(np.array([k]))
+            self._own_rngs[k] = self._rng
+        self._rng = shared
+        self.randomizer.forget_prepared()  # by the last world's stream
+
     def stagger(self, first: int = 0) -> None:
         """Put the worlds from `first` on at random moments of their episodes, so that they do not all end at once.
 
@@ -234,7 +251,11 @@ class BatchEnv:
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Start new episodes in the worlds `ids`."""
-        ids = self._start_from_bank(np.asarray(ids, np.int64))
+        ids = np.asarray(ids, np.int64)
+        if self._own_rngs:
+            for k in ids.tolist():
+                self._own_rngs.pop(k, None)
+        ids = self._start_from_bank(ids)
         n = len(ids)
         if n == 0:
             return
@@ -323,18 +344,24 @@ class BatchEnv:
             np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         return array.astype(np.float32, copy=False)
 
-    def step(self, action: Float[np.ndarray, "env 7"]) -> StepResult:
-        """Carry out one action of 50 ms in every world; actions are clipped to [-1, 1]."""
+    def step(
+        self, action: Float[np.ndarray, "env 7"], moving: Int[np.ndarray, "n"] | None = None
+    ) -> StepResult:
+        """Carry out one action of 50 ms in every world; actions are clipped to [-1, 1].
+
+        With `moving`, time passes in the worlds of these numbers only. What is said of the others means nothing until
+        their next reset.
+        """
         # Worlds come last in all that follows: numpy is fastest along the last axis.
         clipped = np.array(action.T, float, order="C")
         if not np.isfinite(clipped).all():
             clipped = np.nan_to_num(clipped)
         np.minimum(np.maximum(clipped, -1.0, out=clipped), 1.0, out=clipped)
         noise = self.cfg.randomization.action_noise
-        moved = clipped + self._rng.normal(0.0, noise, clipped.shape) if noise else clipped
+        moved = clipped + self._action_noise(noise) if noise else clipped
         self._move_targets(moved)
         self._write_controls(slice(None))
-        self._batch.step(nstep=self.physics.substeps)
+        self._batch.step(moving, nstep=self.physics.substeps)
         self._last_action[:] = clipped.T
         self._steps += 1
         self._touches[:] = self._sensordata.reshape(self.num_envs, -1, 2) > 0
@@ -374,6 +401,10 @@ class BatchEnv:
         view = ("camera_pos", "camera_quat", "camera_fovy_deg")
         fields = {name: drawn[name][ids].copy() for name in looks + view}
         return Snapshot(qpos=self._qpos[ids].copy(), qvel=self._qvel[ids].copy(), **fields)
+
+    def motion(self) -> tuple[Float[np.ndarray, "env q"], Float[np.ndarray, "env v"]]:
+        """Return copies of all worlds' positions and velocities: what changes in a `Snapshot` during an episode."""
+        return self._qpos.copy(), self._qvel.copy()
 
     def episode_params(self, env: int) -> dict[str, Any]:
         """Return what was drawn for the episode in world `env`, for JSON."""
@@ -453,6 +484,15 @@ class BatchEnv:
         self._broken = np.zeros(n, bool)
         self._bank_row = np.full(n, -1)
         self._tool = self._tool_of(slice(None))
+
+    def _action_noise(self, noise: float) -> Float[np.ndarray, "7 env"]:
+        """Draw for all worlds from the shared stream, unless each has one of its own."""
+        own, shape = self._own_rngs, (ACT_DIM, self.num_envs)
+        all_own = len(own) == self.num_envs
+        drawn = np.empty(shape) if all_own else self._rng.normal(0.0, noise, shape)
+        for k, rng in own.items():
+            drawn[:, k] = rng.normal(0.0, noise, ACT_DIM)
+        return drawn
 
     def _move_targets(self, action: Float[np.ndarray, "7 env"]) -> None:
         cfg, tool = self.cfg, self._tool
@@ -629,6 +669,10 @@ def _exp(rotvec: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "4 n"]:
 
 
 def _dot(a: Float[np.ndarray, "k n"], b: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "n"]:
+    if (
+        a.shape[1] == 1
+    ):  # einsum rounds a single column otherwise, and a world must not know how many others there are
+        return _dot(np.repeat(a, 2, axis=1), np.repeat(b, 2, axis=1))[:1]
     return np.einsum("kn,kn->n", a, b)
 
 

@@ -6,7 +6,7 @@
 | Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz |
 | Reward | the task's training reward |
 | Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
-| End | terminated: success, or the simulation broke down; truncated: the task's horizon |
+| End | terminated: success, or the simulation broke down; truncated: twice the task's horizon (`horizon_scale`) |
 | Info | `is_success`: the task's own success has held for 0.25 s and the independent referee agrees |
 
 The simulation runs at the fine time step: what the coarse one calls a success can be an object pressed
@@ -20,19 +20,25 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
 
 from v2p_data.errors import V2PError
 from v2p_data.sim import randomize
 from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig
 from v2p_data.sim.masks import MaskRenderer, labels_to_rgb
 from v2p_data.sim.verdict import Witness
-from v2p_data.task.task import TaskBundle
+from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle
 
 ENV_ID = "v2p/Task-v0"
 CONTROL_HZ = 20
 STATE_LOW = (-1.5, -1.5, -0.5, -np.pi, -np.pi, -np.pi, 0.0, -1.0, -1.0, -1.0, 0.0)
 STATE_HIGH = (1.5, 1.5, 1.5, np.pi, np.pi, np.pi, 1.0, 1.0, 1.0, 1.0, 1.0)
 """Bounds of `BatchEnv.robot_state`."""
+
+
+def stream_seed(seed: int) -> int:
+    """Return what `V2PEnv.reset(seed=seed)` seeds its world with, for `BatchEnv.reset_seeded`."""
+    return _next_seed(np_random(seed)[0])
 
 
 class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
@@ -44,6 +50,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         render_mode: `rgb_array`, or None.
         camera_pos_m, camera_angle_rad, camera_fovy_deg: how far the camera is moved at each reset, as in
             `RandomizationConfig`; a policy is evaluated under what its dataset was recorded under.
+        horizon_scale: an episode lasts at most this multiple of the task's own horizon.
 
     Raises:
         V2PError: the folder holds no task.
@@ -61,12 +68,14 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         camera_pos_m: float = 0.0,
         camera_angle_rad: float = 0.0,
         camera_fovy_deg: float = 0.0,
+        horizon_scale: float = POLICY_HORIZON_SCALE,
     ) -> None:
         bundle = TaskBundle.load(Path(task_folder))
         self.render_mode = render_mode
         self.task = bundle.title
         self.task_description = bundle.description
-        self._max_episode_steps = bundle.horizon_steps
+        self._max_episode_steps = bundle.policy_steps(horizon_scale)
+        self._num_steps = 0
         randomization = replace(
             randomize.recording(),
             camera_pos_m=camera_pos_m,
@@ -94,8 +103,9 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode; with a seed, always the same one."""
         super().reset(seed=seed)
-        self._world.seed(int(self.np_random.integers(2**62)))
+        self._world.seed(_next_seed(self.np_random))
         self._world.reset(np.array([0]))
+        self._num_steps = 0
         self._witness.restart()
         return self._observe(), {"is_success": False}
 
@@ -103,6 +113,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         """Carry out one action; it is clipped to [-1, 1]."""
         result = self._world.step(np.asarray(action, float)[None])
         self._witness.note()
+        self._num_steps += 1
         broke = bool(result.terminated[0])
         success = not broke and bool(result.held[0]) and bool(self._witness.verdict()[0])
         terminated = success or broke
@@ -110,7 +121,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             self._observe(),
             float(result.reward[0]),
             terminated,
-            bool(result.truncated[0]) and not terminated,
+            self._num_steps >= self._max_episode_steps and not terminated,
             {"is_success": success},
         )
 
@@ -132,6 +143,10 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         labels = self._masks.draw(self._world.snapshot(np.array([0])), 0)
         state = np.clip(self._world.robot_state()[0], STATE_LOW, STATE_HIGH).astype(np.float32)
         return {"pixels": {"mask": labels_to_rgb(labels)}, "agent_pos": state}
+
+
+def _next_seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**62))
 
 
 gym.register(id=ENV_ID, entry_point=V2PEnv)  # pyright: ignore[reportArgumentType]

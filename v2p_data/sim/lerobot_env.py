@@ -18,7 +18,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.gym_env import CONTROL_HZ, STATE_LOW, V2PEnv
-from v2p_data.task.task import TASK_FILE
+from v2p_data.task.task import POLICY_HORIZON_SCALE, TASK_FILE
 
 TASKS_IN_DATASET = Path("v2p/tasks")
 
@@ -59,6 +59,8 @@ class V2PEnvConfig(EnvConfig):
     """How far the camera is moved at each reset; see `RandomizationConfig`, as the next two."""
     camera_angle_rad: float = 0.0
     camera_fovy_deg: float = 0.0
+    horizon_scale: float = POLICY_HORIZON_SCALE
+    """An episode lasts at most this multiple of the task's own horizon."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {
@@ -82,6 +84,7 @@ class V2PEnvConfig(EnvConfig):
             "camera_pos_m": self.camera_pos_m,
             "camera_angle_rad": self.camera_angle_rad,
             "camera_fovy_deg": self.camera_fovy_deg,
+            "horizon_scale": self.horizon_scale,
         }
 
     def create_envs(

@@ -39,6 +39,15 @@ def as_cut(
     return {key: np.stack([m[key] for m in moments])[time, worlds] for key in moments[0]}
 
 
+def course_keys(env: BatchEnv) -> list[str]:
+    """Return the states that `referee_verdict` looks at."""
+    return ["eef_pos"] + [
+        f"{name}_{key}"
+        for name in env.object_names
+        for key in ("pos", "quat", "size", "touched", "grasped")
+    ]
+
+
 class Witness:
     """Remembers the courses of all worlds of an environment, which start and end together."""
 
@@ -54,12 +63,9 @@ class Witness:
     def note(self) -> None:
         """Note the present moment; call after each step."""
         states = self.env.states()
-        keys = ["eef_pos"] + [
-            f"{name}_{key}"
-            for name in self.env.object_names
-            for key in ("pos", "quat", "size", "touched", "grasped")
-        ]
-        self.moments.append({key: states[key].numpy().astype(float) for key in keys})
+        self.moments.append(
+            {key: states[key].numpy().astype(float) for key in course_keys(self.env)}
+        )
 
     def verdict_as_cut(self, end: Int[np.ndarray, "env"]) -> Bool[np.ndarray, "env"]:
         """Return what the referee says of episodes of `end` steps each; see `as_cut`."""

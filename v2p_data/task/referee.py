@@ -6,6 +6,7 @@ table is not inserted, a thing toppled is not pushed, a thing still held is not 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -64,14 +65,15 @@ class ObjectTrack:
         """Both pads touch it at the end."""
         return np.asarray(self.touched[-LAST:].all(axis=(0, 2)))
 
+    @cached_property
     def axes(self) -> Float[np.ndarray, "time env 3 3"]:
-        """Return rotation matrices; column k is the object's own axis k in the world."""
+        """Rotation matrices; column k is the object's own axis k in the world."""
         flat = Rotation.from_quat(self.quat_wxyz.reshape(-1, 4), scalar_first=True).as_matrix()
         return flat.reshape(*self.quat_wxyz.shape[:2], 3, 3)
 
     def leaned(self) -> Float[np.ndarray, "env"]:
         """Return the angle between its own z axis at the start and at the end [rad]."""
-        z = self.axes()[..., 2]
+        z = self.axes[..., 2]
         return np.arccos(np.clip((z[0] * z[-1]).sum(-1), -1.0, 1.0))
 
 
@@ -120,7 +122,7 @@ class Case:
         half = track.size_m / 2
         if shape == "sphere":
             return half.max(axis=-1)
-        along = np.einsum("ej,ejk->ek", direction, track.axes()[time])
+        along = np.einsum("ej,ejk->ek", direction, track.axes[time])
         if shape == "cylinder":
             c = np.abs(along[:, 2])
             return c * half[:, 2] + np.sqrt(np.clip(1 - c**2, 0, 1)) * half[:, :2].max(axis=-1)
@@ -147,7 +149,7 @@ class Case:
     def within(self) -> Bool[np.ndarray, "env"]:
         """Tell whether the manipulated object's centre lies over the other's footprint at the end."""
         local = np.einsum(
-            "ejk,ej->ek", self.other.axes()[-1], self.thing.pos[-1] - self.other.pos[-1]
+            "ejk,ej->ek", self.other.axes[-1], self.thing.pos[-1] - self.other.pos[-1]
         )
         return (np.abs(local[:, :2]) < self.other.size_m[:, :2] / 2).all(axis=-1)
 

@@ -23,6 +23,9 @@ SCENE_FOLDER = "scene"
 BASE_OBSERVATION_DIM = 90
 """Length of `states['base_observation']`, the same for every task so that experts can warm-start each other."""
 
+POLICY_HORIZON_SCALE = 2.0
+"""A policy gets this multiple of the task's horizon: experts need about half of theirs, the paper gives 300 steps."""
+
 ROBOT_STATES = {
     "eef_pos": ("(env, 3)", "m", "gripper's tool centre point, world frame"),
     "eef_quat": ("(env, 4)", "wxyz", "orientation of the gripper, world frame"),
@@ -133,6 +136,10 @@ class TaskBundle:
     """Another arm than the built-in one: the fields of `sim.arms.RobotConfig`."""
     audit: dict[str, Any] = field(default_factory=dict[str, Any])
     folder: Path = Path()
+
+    def policy_steps(self, scale: float = POLICY_HORIZON_SCALE) -> int:
+        """Return how many control steps a policy gets: this multiple of the task's own horizon."""
+        return max(1, round(scale * self.horizon_steps))
 
     def save(self, folder: Path) -> None:
         """Write the task and copy its scene's files."""

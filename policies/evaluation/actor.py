@@ -1,0 +1,142 @@
+"""A LeRobot policy as something that acts on batches of label pictures and robot states.
+
+Each step is `lerobot-eval`'s: observation, environment's processor, policy's processor, policy, and back; in inference
+mode, at the policy's own precision. Whoever makes the pictures says which grey stands for a label.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+
+from policies.evaluation.rollout import LoadedPolicy, env_config, load_policy
+
+MASK_KEY = "observation.images.mask"
+STATE_KEY = "observation.state"
+ACTION_KEY = "action"
+GREY_TYPE = "v2p_bc"
+"""The policy type that takes masks as one channel of greys, 0 to 255."""
+
+
+class UnsuitablePolicyError(ValueError):
+    """The policy wants to see or do something that the simulator does not have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyActor:
+    """A loaded policy that acts in a task; see `load_actor`."""
+
+    loaded: LoadedPolicy
+    before: Any
+    """The environment's processors, around those of the policy."""
+    after: Any
+    values: torch.Tensor
+    """What the policy sees for each label."""
+    channels: int
+    task: str
+    """The task in words."""
+    size_px: tuple[int, int]
+    """Height and width of the pictures that the policy was trained on."""
+
+    def for_task(self, words: str) -> "PolicyActor":
+        """Return the same policy, told another task."""
+        return replace(self, task=words)
+
+    def reset(self, n: int) -> None:
+        """Forget the last episodes; `n` new ones begin."""
+        del n
+        self.loaded.policy.eval()
+        self.loaded.policy.reset()
+
+    def act(
+        self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n state"]
+    ) -> Float32[np.ndarray, "n act"]:
+        """Return the next action of every world."""
+        picture = self.values[torch.from_numpy(labels).int()][:, None]
+        if self.channels > 1:
+            picture = picture.expand(-1, self.channels, -1, -1).contiguous()
+        observation = {
+            MASK_KEY: picture,
+            STATE_KEY: torch.from_numpy(state.copy()),
+            "task": [self.task] * len(state),
+        }
+        with torch.inference_mode():
+            action = self.loaded.policy.select_action(
+                self.loaded.preprocessor(self.before(observation))
+            )
+            action = self.after({ACTION_KEY: self.loaded.postprocessor(action)})[ACTION_KEY]
+        return action.to("cpu").numpy()
+
+
+def load_actor(
+    folder: Path, *, greys: Sequence[int], task: str = "", device: str | None = None
+) -> PolicyActor:
+    """Read a checkpoint of any policy type LeRobot knows.
+
+    Args:
+        folder: the checkpoint.
+        greys: grey (0 to 255) of each label of a picture.
+        task: the task in words; see `PolicyActor.for_task`.
+        device: where the policy runs; by default, where its settings say.
+
+    Raises:
+        UnsuitablePolicyError: it wants to see or do what the simulator does not have.
+    """
+    from lerobot.envs.factory import make_env_pre_post_processors
+
+    config = env_config()
+    height, width = check_features(folder, config)
+    loaded = load_policy(folder, config, device)
+    before, after = make_env_pre_post_processors(config, loaded.policy.config)
+    is_grey = loaded.policy.config.type == GREY_TYPE
+    values = torch.tensor(greys, dtype=torch.uint8)
+    if not is_grey:
+        values = values.to(torch.float32) / 255
+    return PolicyActor(
+        loaded=loaded,
+        before=before,
+        after=after,
+        values=values,
+        channels=1 if is_grey else 3,
+        task=task,
+        size_px=(height, width),
+    )
+
+
+def check_features(folder: Path, config: Any) -> tuple[int, int]:
+    """Demand that a checkpoint sees and does what the simulator has; return height and width of its pictures.
+
+    Raises:
+        UnsuitablePolicyError: it does not.
+    """
+    from lerobot.configs import FeatureType, PreTrainedConfig
+    from lerobot.envs.utils import env_to_policy_features
+
+    given = env_to_policy_features(config)
+    policy = PreTrainedConfig.from_pretrained(folder)
+    wanted = {**(policy.input_features or {}), **(policy.output_features or {})}
+    for key, feature in wanted.items():
+        shape = tuple(feature.shape)
+        if key not in given:
+            if "empty_camera" in key:  # LeRobot's placeholder for a camera that need not be there
+                continue
+            names = ", ".join(f"'{name}' {tuple(f.shape)}" for name, f in given.items())
+            raise UnsuitablePolicyError(
+                f"the policy in {folder} wants '{key}' {shape}, which the simulator does not give; it gives {names}"
+            )
+        if feature.type is not FeatureType.VISUAL and shape != tuple(given[key].shape):
+            raise UnsuitablePolicyError(
+                f"the policy in {folder} wants '{key}' of shape {shape}, and the simulator gives"
+                f" {tuple(given[key].shape)}: it was trained on a dataset of another version"
+            )
+    if MASK_KEY not in wanted:
+        raise UnsuitablePolicyError(
+            f"the policy in {folder} has no camera '{MASK_KEY}', and masks are the only pictures that the simulator"
+            f" gives; it wants {', '.join(wanted) or 'nothing'}"
+        )
+    _, height, width = wanted[MASK_KEY].shape
+    return int(height), int(width)
