@@ -2,9 +2,11 @@
 
 Video is decoded once, from the first frame of each file to the last, and what the encoders prepare of it is kept in a
 cache of memory-mapped arrays beside the training. The cache knows which dataset and which encoder it was made for and
-is made anew when either has changed.
+is made anew when either has changed. It is whole or absent, and one process at a time reads or writes it.
 """
 
+import contextlib
+import fcntl
 import hashlib
 import json
 import logging
@@ -141,6 +143,11 @@ def read_frames(dataset: Path, repo_id: str, net: BCNet, cache: Path) -> FrameTa
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     meta: Any = LeRobotDatasetMetadata(repo_id, root=dataset)
+    for key in net.camera_keys:
+        if key not in meta.camera_keys:
+            raise DatasetError(
+                f"{dataset} has no camera '{key}'; it has {', '.join(meta.camera_keys) or 'none'}"
+            )
     rows = _read_rows(dataset, [*net.vector_keys, ACTION])
     lengths = np.asarray(meta.episodes["length"])
     if int(lengths.sum()) != len(rows[ACTION]):
@@ -193,10 +200,10 @@ def _read_rows(dataset: Path, keys: list[str]) -> dict[str, np.ndarray]:
         raise DatasetError(f"{dataset} holds no data/*/*.parquet: it is no LeRobot v3 dataset")
     columns = {key: np.concatenate(values) for key, values in parts.items()}
     order = np.argsort(columns.pop("index"), kind="stable")
-    return {
-        key: values[order].astype(np.int64 if key == "task_index" else np.float32)
-        for key, values in columns.items()
-    }
+    tasks = columns.pop("task_index")[order].astype(np.int64)
+    # LeRobot stores features with one entry as plain numbers.
+    vectors = {k: v[order].reshape(len(v), -1).astype(np.float32) for k, v in columns.items()}
+    return {"task_index": tasks, **vectors}
 
 
 def _as_array(column: Any) -> np.ndarray:
@@ -207,41 +214,54 @@ def _as_array(column: Any) -> np.ndarray:
 
 
 def _cached_pictures(dataset: Path, meta: Any, net: BCNet, key: str, cache: Path) -> Prepared:
-    if key not in meta.features:
-        raise DatasetError(
-            f"{dataset} has no camera '{key}'; it has {', '.join(meta.camera_keys) or 'none'}"
-        )
-    identity = _identity(dataset, net, key)
-    stored = _open_cache(cache, identity, meta.total_frames)
-    if stored is not None:
-        return stored
-    shutil.rmtree(cache, ignore_errors=True)
-    cache.mkdir(parents=True)
-    arrays: dict[str, np.ndarray] = {}
-    done = 0
-    for frames in _pictures(dataset, meta, key):
-        prepared = _prepared(net, key, torch.from_numpy(frames))
-        for name, value in prepared.items():
-            if name not in arrays:
-                shape = (meta.total_frames, *value.shape[1:])
-                arrays[name] = np.lib.format.open_memmap(
-                    cache / f"{name}.npy", "w+", value.numpy().dtype, shape
-                )
-            arrays[name][done : done + len(value)] = value.numpy()
-        done += len(frames)
-    for array in arrays.values():
-        array.flush()  # pyright: ignore[reportAttributeAccessIssue] - a memmap
-    described = {"identity": identity, "arrays": sorted(arrays)}
-    (cache / CACHE_FILE).write_text(json.dumps(described))
-    stored = _open_cache(cache, identity, meta.total_frames)
+    num_frames = int(np.sum(meta.episodes["length"]))
+    identity = _identity(dataset, meta, net, key)
+    with _locked(cache):
+        stored = _open_cache(cache, identity, num_frames)
+        if stored is not None:
+            return stored
+        partial = cache.with_name(f"{cache.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
+        partial.mkdir()
+        arrays: dict[str, np.ndarray] = {}
+        done = 0
+        for frames in _pictures(dataset, meta, key):
+            prepared = _prepared(net, key, torch.from_numpy(frames))
+            for name, value in prepared.items():
+                if name not in arrays:
+                    shape = (num_frames, *value.shape[1:])
+                    arrays[name] = np.lib.format.open_memmap(
+                        partial / f"{name}.npy", "w+", value.numpy().dtype, shape
+                    )
+                arrays[name][done : done + len(value)] = value.numpy()
+            done += len(frames)
+        for array in arrays.values():
+            array.flush()  # pyright: ignore[reportAttributeAccessIssue] - a memmap
+        sizes = {name: (partial / f"{name}.npy").stat().st_size for name in sorted(arrays)}
+        (partial / CACHE_FILE).write_text(json.dumps({"identity": identity, "bytes": sizes}))
+        shutil.rmtree(cache, ignore_errors=True)
+        partial.rename(cache)
+        stored = _open_cache(cache, identity, num_frames)
     assert stored is not None
     return stored
 
 
-def _identity(dataset: Path, net: BCNet, key: str) -> str:
+@contextlib.contextmanager
+def _locked(cache: Path) -> Iterator[None]:
+    """Let no other process read or write the cache meanwhile."""
+    cache.parent.mkdir(parents=True, exist_ok=True)
+    with cache.with_name(f"{cache.name}.lock").open("a") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
+
+
+def _identity(dataset: Path, meta: Any, net: BCNet, key: str) -> str:
     """Return a digest of what the cached arrays depend on: the dataset's files and the encoder's settings."""
     digest = hashlib.sha256()
-    for path in sorted([*dataset.glob("videos/**/*.mp4"), *dataset.glob("images/**/*")]):
+    # Pictures that are no video are columns of the table.
+    is_image = meta.features[key]["dtype"] == "image"
+    files = "data/**/*.parquet" if is_image else f"videos/{key}/**/*.mp4"
+    for path in sorted(dataset.glob(files)):
         stat = path.stat()
         digest.update(f"{path.relative_to(dataset)} {stat.st_size} {stat.st_mtime_ns}\n".encode())
     for path in sorted([*dataset.glob("meta/episodes/*/*.parquet"), dataset / "meta/info.json"]):
@@ -261,17 +281,19 @@ def _open_cache(cache: Path, identity: str, num_frames: int) -> Prepared | None:
         described = json.loads((cache / CACHE_FILE).read_text())
         if described["identity"] != identity:
             return None
-        arrays = {
-            # Copy on write: torch wants writable memory, and nothing writes.
-            name: np.load(cache / f"{name}.npy", mmap_mode="c")
-            for name in described["arrays"]
-        }
+        sizes = {name: (cache / f"{name}.npy").stat().st_size for name in described["bytes"]}
+        # Copy on write: torch wants writable memory, and nothing writes.
+        arrays = {name: np.load(cache / f"{name}.npy", mmap_mode="c") for name in sizes}
+        is_whole = sizes == described["bytes"] and all(
+            len(array) == num_frames for array in arrays.values()
+        )
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         logger.warning("the cache %s is damaged (%s) and is made anew", cache, error)
         return None
-    if any(len(array) != num_frames for array in arrays.values()):
+    if not is_whole:
+        logger.warning("the cache %s is damaged (an array is cut) and is made anew", cache)
         return None
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
@@ -329,9 +351,15 @@ def _pictures(dataset: Path, meta: Any, key: str) -> Iterator[UInt8[np.ndarray, 
 def _decoded(path: Path) -> Iterator[UInt8[np.ndarray, "3 h w"]]:
     import av
 
-    with av.open(str(path)) as video:
-        for frame in video.decode(video=0):
-            yield frame.to_ndarray(format="rgb24").transpose(2, 0, 1)
+    try:
+        with av.open(str(path)) as video:
+            if not video.streams.video:
+                raise DatasetError(f"{path} cannot be decoded (it holds no video)")
+            for frame in video.decode(video=0):
+                yield frame.to_ndarray(format="rgb24").transpose(2, 0, 1)
+    except av.error.FFmpegError as error:
+        words = "is missing" if isinstance(error, FileNotFoundError) else "cannot be decoded"
+        raise DatasetError(f"{path} {words} ({error.strerror})") from error
 
 
 def _stored_images(meta: Any, key: str) -> Iterator[UInt8[np.ndarray, "frame c h w"]]:
