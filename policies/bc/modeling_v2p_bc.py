@@ -140,7 +140,12 @@ class V2PBCPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         weights = self._pretrained_weights() if start_from_pretrained else None
-        self.backbone_is_pretrained = weights is not None or not start_from_pretrained
+        if start_from_pretrained and config.optimizer_lr_backbone is None:
+            # Written down, because a checkpoint does not tell what its backbone started from.
+            is_pretrained = weights is not None
+            config.optimizer_lr_backbone = (
+                PRETRAINED_BACKBONE_LR if is_pretrained else config.optimizer_lr
+            )
         self.net = BCNet(config, weights)
         self.reset()
 
@@ -174,10 +179,8 @@ class V2PBCPolicy(PreTrainedPolicy):
         for name, parameter in self.named_parameters():
             (backbone if ".backbone." in name else rest).append(parameter)
         lr = self.config.optimizer_lr_backbone
-        if lr is None:
-            lr = (
-                PRETRAINED_BACKBONE_LR if self.backbone_is_pretrained else self.config.optimizer_lr
-            )
+        if lr is None:  # a checkpoint of an older version
+            lr = PRETRAINED_BACKBONE_LR
         return [{"params": rest}, {"params": backbone, "lr": lr}]
 
     def reset(self) -> None:

@@ -22,6 +22,7 @@ from policies.bc.trainer import (
     Progress,
     Trained,
     TrainerConfig,
+    check_features,
     load_policy,
     make_policy,
     save_policy,
@@ -73,6 +74,7 @@ class Student:
             policy, processors = load_policy(start_from, device=device)
         else:
             stats = fill_in_features(cfg, dataset, repo_id)
+            check_features(cfg, stats)
             policy, processors = make_policy(
                 cfg, widened(stats, cfg, action_limit), seed=seed, device=device
             )
@@ -181,7 +183,7 @@ def fill_in_features(cfg: V2PBCConfig, dataset: Path, repo_id: str) -> dict[str,
         for k, f in features.items()
         if f.type in (FeatureType.VISUAL, FeatureType.STATE, FeatureType.ENV)
     }
-    return meta.stats
+    return meta.stats or {}
 
 
 def widened(

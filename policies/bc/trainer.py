@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Int64
+from lerobot.configs.types import NormalizationMode
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -29,6 +30,11 @@ STATE_FILE = "training_state.pt"
 BEST_FILE = "best.safetensors"
 CURVE_FILE = "curve.csv"
 TENSORBOARD_FOLDER = "tensorboard"
+STATISTICS = {
+    NormalizationMode.MEAN_STD: ("mean", "std"),
+    NormalizationMode.MIN_MAX: ("min", "max"),
+}
+"""Per way to normalise what it needs to know of a feature."""
 CURVE_FIELDS = ("step", "loss", "lr", "samples_per_s", "loader_share")
 Precision = Literal["auto", "float32", "bfloat16"]
 Judge = Callable[[V2PBCPolicy], float]
@@ -97,22 +103,36 @@ def make_policy(
         device: cpu, cuda or mps.
 
     Raises:
-        DatasetError: the statistics lack a feature that is normalised.
+        DatasetError: there are no cameras or no actions, or the statistics lack what is normalised by.
     """
     from policies.bc.processor_v2p_bc import make_v2p_bc_pre_post_processors
 
     cfg.device = device
-    normalised = {**(cfg.input_features or {}), **(cfg.output_features or {})}
-    for key in normalised:
-        if key not in cfg.image_features and key not in stats:
-            raise DatasetError(
-                f"meta/stats.json has no statistics of '{key}'; it has {', '.join(stats)}"
-            )
+    check_features(cfg, stats)
     with torch.random.fork_rng():
         torch.random.default_generator.manual_seed(seed)
         policy = V2PBCPolicy(cfg).to(device)
     before, after = make_v2p_bc_pre_post_processors(cfg, stats)
     return policy, Processors(before=before, after=after)
+
+
+def check_features(cfg: V2PBCConfig, stats: dict[str, dict[str, Any]]) -> None:
+    """Refuse features that no policy can be made for, and statistics that cannot normalise them.
+
+    Raises:
+        DatasetError: says what is missing.
+    """
+    try:
+        cfg.validate_features()
+    except ValueError as error:
+        raise DatasetError(str(error)) from error
+    for key, feature in {**(cfg.input_features or {}), **(cfg.output_features or {})}.items():
+        known = stats.get(key, {})
+        for name in STATISTICS.get(cfg.normalization_mapping[feature.type.value], ()):
+            if name not in known:
+                raise DatasetError(
+                    f"meta/stats.json has no '{name}' of '{key}'; it has {', '.join(known) or 'nothing of it'}"
+                )
 
 
 def save_policy(folder: Path, policy: V2PBCPolicy, processors: Processors) -> None:
@@ -361,14 +381,14 @@ class _Run:
             self.optimizer.load_state_dict(state["optimizer"])
             if self.schedule is not None:
                 self.schedule.load_state_dict(state["schedule"])
+            self.step = int(state["step"])
+            self.rows = [tuple(row) for row in state["rows"]]
+            self.judged = [(int(step), float(rate)) for step, rate in state["judged"]]
         except Exception as error:
             raise DatasetError(
                 f"the training state {path} cannot be read ({type(error).__name__}); delete it to train from the"
                 " beginning"
             ) from error
-        self.step = int(state["step"])
-        self.rows = [tuple(row) for row in state["rows"]]
-        self.judged = [(int(step), float(rate)) for step, rate in state["judged"]]
 
     def _write_curve(self) -> None:
         with (self.out / CURVE_FILE).open("w", newline="") as stream:
