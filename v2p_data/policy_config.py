@@ -51,6 +51,12 @@ class PolicyConfig:
             raise ValueError(
                 "steps, batch_size and checkpoints must be at least 1, epochs 0 or more"
             )
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"n_action_steps must lie between 1 and chunk_size ({self.chunk_size}), got {self.n_action_steps}"
+            )
+        if self.n_obs_steps < 1:
+            raise ValueError(f"n_obs_steps must be at least 1, got {self.n_obs_steps}")
 
     @property
     def resolved(self) -> "PolicyConfig":
@@ -58,6 +64,18 @@ class PolicyConfig:
         if self.preset != "paper":
             return self
         return replace(self, epochs=PAPER_EPOCHS, batch_size=PAPER_BATCH_SIZE)
+
+    @property
+    def student(self) -> "PolicyConfig":
+        """The settings that a distillation depends on: the rest is of the last training, and here as by default."""
+        usual = PolicyConfig()
+        return replace(
+            self,
+            steps=usual.steps,
+            epochs=usual.epochs,
+            checkpoints=usual.checkpoints,
+            judge_episodes=usual.judge_episodes,
+        )
 
     def num_steps(self, num_frames: int) -> int:
         """Return the gradient steps on a table of so many frames."""

@@ -3,7 +3,9 @@
 The student of the distillation is the LeRobot policy itself, so the last training goes on from its weights.
 """
 
+import itertools
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -78,12 +80,14 @@ def make_distillation(
     """Let a student act, the expert label and take over, and train on, in rounds."""
     from policies.bc.trainer import TrainerConfig
     from policies.ppo.policy import Expert
-    from v2p_data.distillation.rounds import Lesson, distill
+    from v2p_data.distillation.rounds import Lesson, demand_masks, distill
     from v2p_data.task.task import TaskBundle
 
     del inputs
     recipe: DistillationConfig = cfg.config["distillation"]
     policy: PolicyConfig = cfg.config["policy"]
+    episodes = recorded_under(sources[0])
+    demand_masks(episodes)
     seed = seed_for(cfg.seed, "distillation")
     runtime.progress(0.0, "reading the demonstrations")
     with bad_data_told():
@@ -107,7 +111,7 @@ def make_distillation(
             student,
             train,
             recipe,
-            recorded_under(sources[0]),
+            episodes,
             out,
             seed,
             num_threads=runtime.num_threads,
@@ -128,7 +132,7 @@ def _pack(
     from v2p_data.episodes.collect import staged_episodes
     from v2p_data.episodes.verify import verify
     from v2p_data.episodes.writer import pack
-    from v2p_data.stages import copy_tasks
+    from v2p_data.stages import ROOT_OF_TASKS, copy_tasks
 
     name = f"{repo_id}-distilled"
     root = out / DATASET_FOLDER
@@ -138,7 +142,8 @@ def _pack(
             staged, name, root, provenance=provenance(), num_threads=runtime.num_threads,
             on_progress=lambda share, words: runtime.progress(0.9 + 0.07 * share, words),
         )  # fmt: skip
-        copy_tasks({s.item: s.task for s in sources}, root)
+    shutil.rmtree(root / ROOT_OF_TASKS, ignore_errors=True)  # of a run that was killed just here
+    copy_tasks({s.item: s.task for s in sources}, root)
     runtime.progress(0.97, "comparing every frame")
     report = verify(root, staged=staged)
     if not report.is_good:
@@ -170,8 +175,10 @@ def make_policy(
             dataset, repo_id, policy, seed, runtime,
             start_from=distilled / STUDENT_FOLDER if distilled else None,
         )  # fmt: skip
-        for path in handover_episodes(distilled) if distilled else ():
-            take_in(student, [path])
+        handovers = handover_episodes(distilled) if distilled else []
+        # A task's at once: each call copies the whole table.
+        for _, paths in itertools.groupby(handovers, key=lambda path: path.parent):
+            take_in(student, list(paths))
         steps = policy.num_steps(len(student.table))
         trained = student.train(
             TrainerConfig(
@@ -207,10 +214,14 @@ def new_student(
     from policies.bc.configuration_v2p_bc import V2PBCConfig
     from policies.bc.student import Student
 
+    try:
+        network = V2PBCConfig(**policy.network(), num_labels=_num_labels(dataset), device="cpu")
+    except ValueError as error:
+        raise V2PError(f"no such network can be made: {error}") from error
     return Student.of_dataset(
         dataset,
         repo_id,
-        V2PBCConfig(**policy.network(), num_labels=_num_labels(dataset)),
+        network,
         runtime.root / CACHE_FOLDER / dataset.name,
         seed=seed % 2**63,
         device=runtime.device,

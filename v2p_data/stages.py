@@ -497,7 +497,7 @@ def distillation_stage(
         name="distillation",
         item=record.item,
         config=Seeded(
-            config={"distillation": cfg.distillation, "policy": cfg.policy}, seed=cfg.seed
+            config={"distillation": cfg.distillation, "policy": cfg.policy.student}, seed=cfg.seed
         ),
         sources={"dataset": f"{record.item}-{record.fingerprint}"},
         version=1,

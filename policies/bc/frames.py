@@ -350,6 +350,7 @@ def _pictures(dataset: Path, meta: Any, key: str) -> Iterator[UInt8[np.ndarray, 
 
 def _decoded(path: Path) -> Iterator[UInt8[np.ndarray, "3 h w"]]:
     import av
+    from av import FFmpegError
 
     try:
         with av.open(str(path)) as video:
@@ -357,7 +358,7 @@ def _decoded(path: Path) -> Iterator[UInt8[np.ndarray, "3 h w"]]:
                 raise DatasetError(f"{path} cannot be decoded (it holds no video)")
             for frame in video.decode(video=0):
                 yield frame.to_ndarray(format="rgb24").transpose(2, 0, 1)
-    except av.error.FFmpegError as error:
+    except FFmpegError as error:
         words = "is missing" if isinstance(error, FileNotFoundError) else "cannot be decoded"
         raise DatasetError(f"{path} {words} ({error.strerror})") from error
 

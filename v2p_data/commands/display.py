@@ -13,7 +13,10 @@ from v2p_data.pipeline.runner import Outcome, Stage
 from v2p_data.pipeline.workers import Event
 
 PLAIN_EVERY_S = 15.0
-STAGE_ORDER = ("scene", "task", "reward", "expert", "episodes", "dataset", "policy", "evaluation")
+STAGE_ORDER = (
+    *("scene", "task", "reward", "expert", "episodes"),
+    *("dataset", "distillation", "policy", "evaluation"),
+)
 
 
 class Display:

@@ -56,6 +56,7 @@ class How:
             raise V2PError(
                 f"--workers is at least 0 and --threads at least 1, got {self.workers} and {self.threads}"
             )
+        _check_device(self.device)
         workers = self.workers or os.cpu_count() or 1
         return Runtime(root=root, workers=workers, num_threads=self.threads, device=self.device)
 
@@ -158,10 +159,10 @@ def train_command(argv: list[str]) -> int:
     with only_run_in(root):
         policy = train(args.dataset, root, args.engine, args.how.runtime(root))
         page = write_page(root)
-    loss = _record(policy.parent).counts["final_loss"]
+    counts = _record(policy.parent).counts
     _say(
         f"Made {policy}",
-        f"loss {loss:.3f} after {args.engine.policy.steps} steps; page: {page}",
+        f"loss {counts['final_loss']:.3f} after {counts['steps']} steps; page: {page}",
         shlex.join(["v2p", "eval", str(policy), *_settings_in(argv, args.dataset)]),
     )
     return 0
@@ -255,9 +256,10 @@ def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Pat
             file=sys.stderr,
         )
     stage = policy_stage(dataset.resolve(), record, cfg, sources)
-    outcome = _run([stage], _all_threads(runtime))[(stage.name, stage.folder_name)]
-    _demand(outcome)
-    return outcome.folder / POLICY_FOLDER
+    outcomes = _run([stage], _all_threads(runtime))
+    for made in (*stage.inputs.values(), stage):  # what a policy waits for says why it failed
+        _demand(outcomes[(made.name, made.folder_name)])
+    return stage.folder(root) / POLICY_FOLDER
 
 
 def evaluate(
@@ -448,6 +450,23 @@ def _flag(argv: Sequence[str], flag: str) -> str | None:
         if word.startswith(flag + "="):
             return word.split("=", 1)[1]
     return None
+
+
+def _check_device(name: str) -> None:
+    """Refuse a device that this machine lacks.
+
+    Raises:
+        V2PError: names those there are.
+    """
+    if name == "cpu":
+        return
+    import torch
+
+    found = ["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
+    found += ["cuda"] if torch.cuda.is_available() else []
+    found += ["mps"] if torch.backends.mps.is_available() else []
+    if name not in found:
+        raise V2PError(f"--device {name} is not on this machine; it has {', '.join(found)}")
 
 
 def _run_folder(out: Path) -> Path:

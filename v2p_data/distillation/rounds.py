@@ -120,14 +120,23 @@ def distill(
     Raises:
         V2PError: the pictures are not masks, the disk is full, or `out` cannot be written to.
     """
+    demand_masks(episodes)
+    with refusals_told("distillation", out):
+        return _distill(
+            lessons, student, train, cfg, episodes, out, seed, num_threads, on_progress
+        )
+
+
+def demand_masks(episodes: EpisodesConfig) -> None:
+    """Refuse demonstrations with other pictures than masks.
+
+    Raises:
+        V2PError: says what they show.
+    """
     if episodes.render != "masks":
         raise V2PError(
             f"the demonstrations show '{episodes.render}', and distillation draws masks only; collect them with"
             " --episodes.render=masks, or train without it: --distillation.rounds=0"
-        )
-    with refusals_told("distillation", out):
-        return _distill(
-            lessons, student, train, cfg, episodes, out, seed, num_threads, on_progress
         )
 
 

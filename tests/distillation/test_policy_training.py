@@ -1,0 +1,259 @@
+"""From a dataset to a policy: sources, the distillation and policy stages with a real student, and their kills."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import toy_run
+from toy_run import ENGINE, REPO_ID, contents, dataset_of, made, record_of
+
+from policies.bc.student import Student
+from policies.bc.trainer import TrainerConfig
+from v2p_data import stages
+from v2p_data.distillation import rounds
+from v2p_data.distillation.config import DistillationConfig
+from v2p_data.distillation.rounds import handover_episodes
+from v2p_data.episodes import writer
+from v2p_data.episodes.collect import staged_episodes
+from v2p_data.episodes.verify import verify
+from v2p_data.pipeline.runner import Outcome, Runtime
+from v2p_data.policy_config import PolicyConfig
+from v2p_data.policy_training import DATASET_FOLDER, POLICY_FOLDER, recorded_under, sources_of
+from v2p_data.stages import ROOT_OF_TASKS, distillation_stage, policy_stage
+
+
+class Killed(Exception):  # noqa: N818 - it stands for a kill
+    pass
+
+
+@pytest.fixture
+def root(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def stage_of(root: Path, engine=ENGINE):
+    dataset = dataset_of(root)
+    return policy_stage(dataset, record_of(dataset), engine, sources_of(dataset, root))
+
+
+def make(root: Path, engine=ENGINE) -> dict[str, Outcome]:
+    outcomes = made([stage_of(root, engine)], Runtime(root=root))
+    return {stage: outcome for (stage, _), outcome in outcomes.items()}
+
+
+def change_record(folder: Path, change) -> None:
+    path = folder / "record.json"
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+
+
+def test_the_task_and_expert_behind_a_dataset_are_found(finished: Path):
+    (source,) = sources_of(dataset_of(finished), finished)
+
+    assert source.item == toy_run.ITEM
+    assert (source.task / "task.json").is_file()
+    assert (source.expert / "weights.safetensors").is_file()
+    assert staged_episodes(source.episodes)
+    assert recorded_under(source) == toy_run.EPISODES
+
+
+@pytest.mark.parametrize("gone", ["expert", "task", "episodes"])
+def test_where_one_of_them_is_gone_there_are_no_sources(root: Path, gone: str):
+    shutil.rmtree(root / gone)
+
+    assert sources_of(dataset_of(root), root) == []
+    assert not stage_of(root).inputs
+
+
+def test_a_dataset_in_another_run_folder_has_no_sources(finished: Path, tmp_path: Path):
+    assert sources_of(dataset_of(finished), tmp_path) == []
+
+
+def test_the_chain_has_a_distillation_unless_it_is_turned_off(finished: Path):
+    def inputs(**changes: Any) -> list[str]:
+        return list(stage_of(finished, replace(ENGINE, **changes)).inputs)
+
+    assert inputs() == ["distillation"]
+    assert inputs(distillation=DistillationConfig(rounds=0)) == []
+    assert inputs(policy=PolicyConfig(preset="paper")) == []
+
+
+def test_a_longer_last_training_does_not_remake_the_distillation(finished: Path):
+    def of(policy: PolicyConfig) -> str:
+        stage = stage_of(finished, replace(ENGINE, policy=policy))
+        return stage.inputs["distillation"].folder_name
+
+    short = PolicyConfig(preset="small", steps=4, batch_size=8)
+    assert of(short) == of(replace(short, steps=5))
+    assert of(short) == of(replace(short, epochs=3, checkpoints=2, judge_episodes=1))
+    assert of(short) != of(replace(short, batch_size=16))
+    assert of(short) != of(replace(short, n_obs_steps=1))
+
+
+def test_the_papers_training_lasts_thirty_epochs():
+    assert PolicyConfig(preset="paper").resolved.num_steps(10_000) == 30 * 10_000 // 1024
+    assert PolicyConfig(steps=7).num_steps(10_000) == 7
+    assert PolicyConfig(epochs=2, batch_size=64).num_steps(10) == 1
+
+
+@pytest.fixture(scope="module")
+def distilled(finished: Path, tmp_path_factory) -> Path:
+    """A run folder up to its policy; do not write into it."""
+    root = Path(shutil.copytree(finished, tmp_path_factory.mktemp("distilled") / "run"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("v2p_data.sim.verdict.referee_verdict", toy_run.agree)
+        outcomes = make(root)
+    assert all(o.status == "made" for o in outcomes.values()), [
+        o.detail for o in outcomes.values()
+    ]
+    assert list(outcomes) == ["distillation", "policy"]
+    return root
+
+
+def only(root: Path, stage: str) -> Path:
+    (folder,) = (root / stage).glob("*")
+    return folder
+
+
+def test_demonstrations_and_handovers_become_one_good_dataset(distilled: Path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    folder = only(distilled, "distillation")
+    staged = [*staged_episodes(only(distilled, "episodes")), *handover_episodes(folder)]
+
+    dataset: Any = LeRobotDataset(f"{REPO_ID}-distilled", root=folder / DATASET_FOLDER)
+    acted = [bool(dataset[k]["intervention"]) for k in range(len(dataset))]
+
+    assert dataset.num_episodes == len(staged) > 3
+    assert all(acted[: sum(dataset.meta.episodes["length"][:3])])
+    assert not all(acted)
+    assert verify(folder / DATASET_FOLDER, staged=staged).is_good
+    assert (folder / DATASET_FOLDER / ROOT_OF_TASKS / toy_run.ITEM / "task.json").is_file()
+    counts = record_of(folder).counts
+    assert counts["packed"] == f"{REPO_ID}-distilled"
+    assert counts["episodes"] == len(handover_episodes(folder))
+
+
+def test_the_last_training_sees_all_frames(distilled: Path):
+    counts = record_of(only(distilled, "policy")).counts
+    demonstrations = record_of(dataset_of(distilled)).counts["frames"]
+    handovers = record_of(only(distilled, "distillation")).counts["frames"]
+
+    assert counts["frames"] == demonstrations + handovers
+    assert (counts["steps"], counts["samples"]) == (4, 32)
+    assert counts["policy"] == POLICY_FOLDER
+
+
+def weights_of(root: Path) -> Mapping[str, bytes]:
+    return {
+        name: (only(root, name) / folder / "model.safetensors").read_bytes()
+        for name, folder in (("distillation", "student"), ("policy", POLICY_FOLDER))
+    }
+
+
+def staged_of(root: Path) -> dict[str, bytes]:
+    return contents(only(root, "distillation") / "rounds")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "call"), [("train", 0), ("hand_over", 1), ("train", 1), ("train", 2), ("pack", 0)]
+)
+def test_a_run_that_was_killed_ends_in_the_same_episodes_and_weights(
+    agreeing_referee, distilled: Path, root: Path, name: str, call: int
+):
+    """Killed in one of the three trainings, between batches, or before the dataset is packed."""
+    with pytest.MonkeyPatch.context() as patch:
+        calls: list[int] = []
+
+        def counted(work):
+            def wrapped(*args: Any, **keywords: Any) -> Any:
+                calls.append(1)
+                if len(calls) != call + 1:
+                    return work(*args, **keywords)
+                if name != "train":
+                    raise Killed
+                pupil, cfg, out = args
+                # Saved after each step, and killed in the third.
+                cfg = TrainerConfig(
+                    steps=cfg.steps, batch_size=cfg.batch_size, save_every_s=0.0, log_points=9
+                )
+                return work(pupil, cfg, out, **keywords | {"on_progress": stop})
+
+            return wrapped
+
+        def stop(share: float, words: str) -> None:
+            if share > 0.6:
+                raise Killed
+
+        owner: Any = {"train": Student, "hand_over": rounds, "pack": writer}[name]
+        patch.setattr(owner, name, counted(getattr(owner, name)))
+        outcomes = make(root)
+    assert any(o.reason == "Killed" for o in outcomes.values()), [
+        o.detail for o in outcomes.values()
+    ]
+
+    outcomes = make(root)
+
+    assert all(o.is_usable for o in outcomes.values()), [o.detail for o in outcomes.values()]
+    assert staged_of(root) == staged_of(distilled)
+    assert weights_of(root) == weights_of(distilled)
+
+
+@pytest.mark.slow
+def test_a_kill_just_after_packing_loses_no_task(agreeing_referee, distilled: Path, root: Path):
+    def kill(tasks: Mapping[str, Path], dataset: Path) -> None:
+        (dataset / ROOT_OF_TASKS / "half").mkdir(parents=True)
+        raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stages, "copy_tasks", kill)
+        assert make(root)["distillation"].reason == "Killed"
+
+    assert make(root)["policy"].is_usable
+    copied, expected = (
+        {str(p.relative_to(only(r, "distillation"))) for p in only(r, "distillation").rglob("*")}
+        for r in (root, distilled)
+    )
+    assert {p for p in copied if ROOT_OF_TASKS in p} == {p for p in expected if ROOT_OF_TASKS in p}
+
+
+def test_colours_are_refused_before_anything_is_read(root: Path):
+    def paint(record: dict[str, Any]) -> None:
+        record["recipe"]["config"]["config"]["render"] = "rgb"
+
+    change_record(only(root, "episodes"), paint)
+
+    outcome = make(root)["distillation"]
+
+    assert (outcome.status, outcome.reason) == ("failed", "error")
+    assert "the demonstrations show 'rgb'" in outcome.detail
+    assert "\n" not in outcome.detail
+    assert not (root / "cache").exists()
+
+
+def test_without_rounds_the_policy_clones_the_demonstrations(root: Path):
+    engine = replace(ENGINE, distillation=DistillationConfig(rounds=0))
+
+    outcomes = make(root, engine)
+
+    assert list(outcomes) == ["policy"]
+    frames = record_of(outcomes["policy"].folder).counts["frames"]
+    assert frames == record_of(dataset_of(root)).counts["frames"]
+
+
+def test_a_distillation_belongs_to_its_dataset(finished: Path):
+    dataset = dataset_of(finished)
+    record = record_of(dataset)
+
+    one, other = (
+        distillation_stage(dataset, r, ENGINE, ()).folder_name
+        for r in (record, replace(record, fingerprint="00000000"))
+    )
+
+    assert one != other

@@ -1,0 +1,157 @@
+"""A run of the toy task, and a student that learns nothing and remembers everything."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import toy_task
+
+from policies.ppo.config import ActorConfig
+from policies.ppo.policy import ActorCritic, Expert
+from v2p_data.distillation.config import DistillationConfig
+from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.pipeline.artifact import Record, read_record
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, make_stage
+from v2p_data.policy_config import PolicyConfig
+from v2p_data.stages import EngineConfig, dataset_stage, episodes_stage
+from v2p_data.task.task import TaskBundle
+
+SIZE_PX = 48
+ITEM, REPO_ID = "toy", "me/toys"
+EPISODES = EpisodesConfig(num_episodes=3, batch_worlds=6, max_batches=3, size_px=SIZE_PX)
+DISTILLATION = DistillationConfig(
+    rounds=2, episodes=4, worlds=3, takeover=(0.1, 0.5), first_steps=3, round_steps=3
+)
+ENGINE = EngineConfig(
+    episodes=EPISODES,
+    distillation=DISTILLATION,
+    policy=PolicyConfig(preset="small", steps=4, batch_size=8),
+)
+CODE = """
+from factory.tasks.task import Task
+
+class Push(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, {})
+
+    def compute_success(self, states):
+        return (states["eef_pos"][:, 1] > 0.08) & (states["cube_pos"][:, 0] < 0.55)
+
+    def compute_reward(self, actions, states):
+        left = states["eef_pos"][:, 1]
+        return left, {"left": left}
+"""
+
+
+def bundle() -> TaskBundle:
+    """Return the toy task, as text."""
+    return replace(toy_task.bundle(), code=CODE, class_name="Push")
+
+
+def agree(_: object, course: Mapping[str, np.ndarray]) -> np.ndarray:
+    return np.ones(course["eef_pos"].shape[1], bool)
+
+
+def expert() -> Expert:
+    """Return a network that goes left at about the same speed, whatever it sees."""
+    model = ActorCritic(90, 7, ActorConfig(hidden=(4,)), torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        for parameter in model.actor.net.parameters():
+            parameter.mul_(0.3)
+        list(model.actor.net.parameters())[-1][1] = 0.7
+    return Expert(model)
+
+
+def make_run(root: Path) -> Path:
+    """Make task, expert, episodes and dataset; return the dataset."""
+
+    def make_task(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
+        scene = replace(bundle().scene, folder=out / "made")
+        scene.folder.mkdir()
+        scene.save(scene.folder)
+        replace(bundle(), scene=scene).save(out)
+
+    def make_expert(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
+        expert().save(out)
+
+    task = Stage(name="task", item=ITEM, config={}, make=make_task)
+    learned = Stage(name="expert", item=ITEM, config={}, inputs={"task": task}, make=make_expert)
+    stage = dataset_stage([episodes_stage(task, learned, ENGINE)], REPO_ID)
+    outcomes = made([stage], Runtime(root=root))
+    assert all(o.is_usable for o in outcomes.values()), [o.detail for o in outcomes.values()]
+    return stage.folder(root)
+
+
+def made(
+    stages: Sequence[Stage], runtime: Runtime, on_event: object = None
+) -> dict[tuple[str, str], Outcome]:
+    """Make stages in this process: in workers each would import LeRobot anew."""
+    outcomes: dict[tuple[str, str], Outcome] = {}
+    for stage in in_order(stages):
+        needs = [outcomes[(s.name, s.folder_name)] for s in stage.inputs.values()]
+        bad = next((o for o in needs if not o.is_usable), None)
+        if bad is not None:
+            outcome = Outcome(
+                stage=stage.name, item=stage.item, status="blocked",
+                folder=stage.folder(runtime.root), detail=f"needs {bad.stage} of {bad.item}",
+            )  # fmt: skip
+        else:
+            outcome = make_stage(stage, runtime)
+        outcomes[(stage.name, stage.folder_name)] = outcome
+    return outcomes
+
+
+def dataset_of(root: Path) -> Path:
+    (folder,) = (root / "dataset").glob("*")
+    return folder
+
+
+def record_of(folder: Path) -> Record:
+    record = read_record(folder)
+    assert record is not None
+    return record
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@dataclass
+class Pupil:
+    """Goes right at a speed that depends on what it sees and on all that it was ever told."""
+
+    told: list[str] = field(default_factory=list)
+    """What `skill` follows from; frames that were taken in are told again after a kill."""
+    skill: float = 0.0
+    tasks: list[str] = field(default_factory=list)
+    num_acts: int = 0
+
+    def reset(self, task: str) -> None:
+        self.tasks.append(task)
+
+    def act(self, labels: np.ndarray, state: np.ndarray) -> np.ndarray:
+        self.num_acts += 1
+        action = np.zeros((len(state), 7), np.float32)
+        seen = labels.reshape(len(labels), -1).mean(1)
+        action[:, 1] = -0.2 - 0.1 * np.tanh(seen) - 0.2 * self.skill
+        return action
+
+    def add(self, labels, state, action, task, lengths) -> None:
+        assert len(labels) == len(state) == len(action) == sum(lengths)
+        self.told.append(f"{labels.sum()} {state.sum()} {action.sum()} {task} {list(lengths)}")
+
+    def train(self, steps: int, folder: Path, seed: int, progress: Any) -> None:
+        progress(0.5, "learning")
+        text = json.dumps([steps, seed, self.skill, self.told])
+        self.skill = sum(text.encode()) % 997 / 997
+
+    def save(self, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        (folder / "skill.json").write_text(json.dumps(self.skill))
+
+    def load(self, folder: Path) -> None:
+        self.skill = json.loads((folder / "skill.json").read_text())
