@@ -221,3 +221,23 @@ def test_an_older_format_is_named(foreign: Path, tmp_path: Path):
 
     with pytest.raises(V2PError, match=r"version 'v2.1'; only v3"):
         read_info(root)
+
+
+def test_a_column_that_hardly_varies_is_not_taken_for_wrong_statistics(
+    make_episode: Callable[..., Episode], tmp_path: Path
+):
+    """LeRobot's deviation of 0.7 throughout is 2e-4, by rounding."""
+    still = make_episode(0)
+    still.action[:, 1] = 0.7
+    staged = [still.save(tmp_path / "staged")]
+    root = tmp_path / "still"
+    pack(staged, "user/still", root)
+    assert verify(root, staged).is_good
+
+    path = root / "meta/stats.json"
+    stats = json.loads(path.read_text())
+    stats["action"]["std"][1] = 0.01
+    path.write_text(json.dumps(stats))
+
+    (problem,) = verify(root, staged).problems
+    assert problem.detail == "std of action is not that of the data"
