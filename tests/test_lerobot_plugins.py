@@ -180,6 +180,24 @@ def test_lerobot_discovers_policy_environment_and_robot():
     assert "v2p_franka" in RobotConfig.get_known_choices()
 
 
+def test_lerobots_own_trainer_makes_the_small_preset(run_tool, dataset, tmp_path):
+    from lerobot.configs import PreTrainedConfig
+
+    checkpoint = trained(
+        run_tool,
+        dataset,
+        tmp_path / "run",
+        "--policy.type=v2p_bc",
+        "--policy.preset=small",
+        "--steps=2",
+        "--save_freq=2",
+    )
+
+    cfg = PreTrainedConfig.from_pretrained(checkpoint)
+    assert (cfg.preset, cfg.encoder, cfg.head) == ("small", "none", "bins")
+    assert (checkpoint / "model.safetensors").is_file()
+
+
 def test_training_resuming_and_evaluating_with_lerobots_own_tools(
     run_tool, dataset, task_folder, tmp_path
 ):
