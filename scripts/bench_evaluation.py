@@ -42,7 +42,7 @@ class BenchConfig:
     """Of what its network sees."""
     episodes: int = 128
     """For the judge, all at the same time."""
-    lerobot_episodes: int = 16
+    lerobot_episodes: int = 8
     """For LeRobot's evaluation, all at the same time."""
     first_seed: int = 0
     threads: int = 2
