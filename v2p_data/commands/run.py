@@ -20,6 +20,7 @@ from v2p_data.pipeline.artifact import Record, read_record, write_json_atomicall
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Key, only_run_in, run_stages
+from v2p_data.policy_training import DATASET_FOLDER as DISTILLED_DATASET
 from v2p_data.policy_training import sources_of
 from v2p_data.report.page import write_page
 from v2p_data.stages import (
@@ -29,6 +30,7 @@ from v2p_data.stages import (
     EngineConfig,
     chain,
     dataset_stage,
+    distillation_stage,
     evaluation_stage,
     policy_stage,
     scene_stage,
@@ -92,6 +94,11 @@ class Train:
     """YAML file with settings; flags go over it."""
     engine: Engine = field(default_factory=EngineConfig)
     how: Running = field(default_factory=How)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distill(Train):
+    """The same words as of `v2p train`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +170,36 @@ def train_command(argv: list[str]) -> int:
         f"Made {policy}",
         f"loss {loss:.3f} after {args.engine.policy.steps} steps; page: {page}",
         shlex.join(["v2p", "eval", str(policy), *_settings_in(argv, args.dataset)]),
+    )
+    return 0
+
+
+def distill_command(argv: list[str]) -> int:
+    args = _with_config(Distill, argv, "distill")
+    root = _run_folder(args.out or args.dataset.resolve().parent.parent)
+    if not args.engine.distillation.rounds:
+        raise V2PError("--distillation.rounds=0 leaves nothing to do; it is 1 or more")
+    record = _dataset_record(args.dataset)
+    sources = sources_of(args.dataset.resolve(), root)
+    if not sources:
+        raise V2PError(
+            f"the tasks and experts of {args.dataset} are not in {root}: distillation needs the run that made it;"
+            " 'v2p train' clones the demonstrations without"
+        )
+    stage = distillation_stage(args.dataset.resolve(), record, args.engine, sources)
+    runtime = _all_threads(args.how.runtime(root))
+    with only_run_in(root):
+        outcome = _run([stage], runtime)[(stage.name, stage.folder_name)]
+        _demand(outcome)
+        page = write_page(root)
+    counts = _record(outcome.folder).counts
+    recovered = ", ".join(f"{share:.0%}" for share in counts["recovered"])
+    made = outcome.folder / DISTILLED_DATASET if counts.get("packed") else outcome.folder
+    _say(
+        f"Made {made}",
+        f"{counts['episodes']} handover episodes, {counts['frames']} frames; the expert recovered {recovered} of each"
+        f" round's; page: {page}",
+        shlex.join(["v2p", "train", str(args.dataset), *_settings_in(argv, args.dataset)]),
     )
     return 0
 
@@ -242,12 +279,7 @@ def generate(
 
 def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Path:
     """Train a policy on a finished dataset and return its folder."""
-    record = read_record(dataset)
-    if record is None or record.stage != "dataset":
-        raise V2PError(
-            f"{dataset} is no dataset of v2p generate; for others use"
-            " 'lerobot-train --policy.type=v2p_bc --dataset.root=...'"
-        )
+    record = _dataset_record(dataset)
     sources = sources_of(dataset.resolve(), root)
     if not sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
         print(  # noqa: T201
@@ -293,6 +325,21 @@ def _seen_tasks(who: Contestant) -> dict[str, Path]:
 def _all_threads(runtime: Runtime) -> Runtime:
     """Let the only job have all threads."""
     return replace(runtime, num_threads=max(runtime.workers, runtime.num_threads))
+
+
+def _dataset_record(dataset: Path) -> Record:
+    """Return the record of a dataset of this engine.
+
+    Raises:
+        V2PError: it is none.
+    """
+    record = read_record(dataset)
+    if record is None or record.stage != "dataset":
+        raise V2PError(
+            f"{dataset} is no dataset of v2p generate; for others use"
+            " 'lerobot-train --policy.type=v2p_bc --dataset.root=...'"
+        )
+    return record
 
 
 def task_folders(folder: Path) -> dict[str, Path]:

@@ -17,7 +17,7 @@ from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record, read_re
 
 ITEM_STAGES = ("scene", "task", "reward", "expert", "episodes")
 """Stages that each video goes through by itself."""
-JOINT_STAGES = ("dataset", "policy", "evaluation")
+JOINT_STAGES = ("dataset", "distillation", "policy", "evaluation")
 STAGES = ITEM_STAGES + JOINT_STAGES
 RUN_FILE = "run.json"
 PARTIAL_SUFFIX = ".partial"
