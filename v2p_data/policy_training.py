@@ -23,12 +23,9 @@ if TYPE_CHECKING:
 
 CACHE_FOLDER = "cache"
 """Of a run: decoded pictures of its datasets, as networks take them. Safe to delete."""
-DATASET_FOLDER = "dataset"
-"""Of a distillation: demonstrations and handover episodes as one LeRobot dataset."""
 POLICY_FOLDER = "policy"
 ACTION_LIMIT = 1.0
 """The simulator clips every entry of an action to this."""
-EPISODES_OF_JUDGING = "checkpoints"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,40 +108,34 @@ def make_distillation(
             out,
             seed,
             num_threads=runtime.num_threads,
-            on_progress=lambda share, words: runtime.progress(0.9 * share, words),
+            on_progress=runtime.progress,
         )
     counts = distilled.counts() | {"samples_per_s": round(last.get("samples_per_s", 0.0), 1)}
-    if recipe.pack:
-        runtime.progress(0.9, "packing")
-        counts["packed"] = _pack(repo_id, sources, distilled.paths, out, runtime)
     return counts
 
 
-def _pack(
-    repo_id: str, sources: Sequence[Source], handovers: Sequence[Path], out: Path, runtime: Runtime
-) -> str:
-    """Write demonstrations and handovers as one LeRobot dataset; return its name."""
-    from v2p_data.episodes.card import write_card
+def make_distilled_dataset(
+    cfg: dict[str, Any],
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    sources: Sequence[Source],
+) -> dict[str, Any]:
+    """Write demonstrations and handover episodes as one LeRobot dataset and compare every frame with what was drawn."""
+    from v2p_data.distillation.rounds import handover_episodes
     from v2p_data.episodes.collect import staged_episodes
-    from v2p_data.episodes.verify import verify
-    from v2p_data.episodes.writer import pack
-    from v2p_data.stages import copy_tasks
+    from v2p_data.stages import pack_and_verify
 
-    name = f"{repo_id}-distilled"
-    root = out / DATASET_FOLDER
-    staged = [*(p for s in sources for p in staged_episodes(s.episodes)), *handovers]
-    if not root.exists():
-        pack(
-            staged, name, root, provenance=provenance(), num_threads=runtime.num_threads,
-            on_progress=lambda share, words: runtime.progress(0.9 + 0.07 * share, words),
-        )  # fmt: skip
-        copy_tasks({s.item: s.task for s in sources}, root)
-    runtime.progress(0.97, "comparing every frame")
-    report = verify(root, staged=staged)
-    if not report.is_good:
-        raise V2PError(f"the packed dataset differs from the episodes: {report.summary()}")
-    write_card(root, name)
-    return name
+    demonstrations = [path for source in sources for path in staged_episodes(source.episodes)]
+    return pack_and_verify(
+        [*demonstrations, *handover_episodes(inputs["distillation"])],
+        cfg["repo_id"],
+        out,
+        runtime,
+        provenance=provenance(),
+        tasks={source.item: source.task for source in sources},
+    )
 
 
 def make_policy(

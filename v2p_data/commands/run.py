@@ -20,7 +20,6 @@ from v2p_data.pipeline.artifact import Record, read_record, write_json_atomicall
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Key, only_run_in, run_stages
-from v2p_data.policy_training import DATASET_FOLDER as DISTILLED_DATASET
 from v2p_data.policy_training import sources_of
 from v2p_data.report.page import write_page
 from v2p_data.stages import (
@@ -31,6 +30,7 @@ from v2p_data.stages import (
     chain,
     dataset_stage,
     distillation_stage,
+    distilled_dataset_stage,
     evaluation_stage,
     policy_stage,
     scene_stage,
@@ -187,16 +187,16 @@ def distill_command(argv: list[str]) -> int:
             " 'v2p train' clones the demonstrations without"
         )
     stage = distillation_stage(args.dataset.resolve(), record, args.engine, sources)
-    runtime = _all_threads(args.how.runtime(root))
+    packed = distilled_dataset_stage(stage, record, sources)
     with only_run_in(root):
-        outcome = _run([stage], runtime)[(stage.name, stage.folder_name)]
-        _demand(outcome)
+        outcomes = _run([packed], _all_threads(args.how.runtime(root)))
+        for part in (stage, packed):
+            _demand(outcomes[(part.name, part.folder_name)])
         page = write_page(root)
-    counts = _record(outcome.folder).counts
+    counts = _record(stage.folder(root)).counts
     recovered = ", ".join(f"{share:.0%}" for share in counts["recovered"])
-    made = outcome.folder / DISTILLED_DATASET if counts.get("packed") else outcome.folder
     _say(
-        f"Made {made}",
+        f"Made {packed.folder(root)}",
         f"{counts['episodes']} handover episodes, {counts['frames']} frames; the expert recovered {recovered} of each"
         f" round's; page: {page}",
         shlex.join(["v2p", "train", str(args.dataset), *_settings_in(argv, args.dataset)]),
