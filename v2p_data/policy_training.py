@@ -4,8 +4,8 @@ The student of the distillation is the LeRobot policy itself, so the last traini
 """
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,8 +110,7 @@ def make_distillation(
             num_threads=runtime.num_threads,
             on_progress=runtime.progress,
         )
-    counts = distilled.counts() | {"samples_per_s": round(last.get("samples_per_s", 0.0), 1)}
-    return counts
+    return distilled.counts() | {"samples_per_s": round(last.get("samples_per_s", 0.0), 1)}
 
 
 def make_distilled_dataset(
@@ -170,6 +169,9 @@ def make_policy(
             ),
             out,
             seed=seed % 2**63,
+            judge=checkpoint_judge(student, sources, policy.judge_episodes, seed, runtime)
+            if policy.checkpoints > 1 and sources
+            else None,
             on_progress=runtime.progress,
         )
     student.save(out / POLICY_FOLDER)
@@ -209,6 +211,54 @@ def new_student(
         num_threads=runtime.num_threads,
         action_limit=ACTION_LIMIT,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudentActor:
+    """A student as `evaluation.batch.judge` wants it: told its task once."""
+
+    student: "Student"
+    task: str
+    """In words."""
+
+    def reset(self, n: int) -> None:
+        """Start episodes in `n` worlds."""
+        del n
+        self.student.reset(self.task)
+
+    def act(self, labels: Any, state: Any) -> Any:
+        """Return the worlds' next actions."""
+        return self.student.act(labels, state)
+
+
+def checkpoint_judge(
+    student: "Student", sources: Sequence[Source], episodes: int, seed: int, runtime: Runtime
+) -> Callable[[Any], float]:
+    """Return what gives a policy's mean success rate over tasks, on seeds that no evaluation uses."""
+    from v2p_data.evaluation.batch import judge
+    from v2p_data.evaluation.config import EvaluationConfig
+    from v2p_data.task.task import TaskBundle
+
+    bundles = {source.item: TaskBundle.load(source.task) for source in sources}
+    cfg = EvaluationConfig(episodes=episodes, worlds=episodes, at_end=False)
+
+    def rate(policy: Any) -> float:
+        judged = [
+            judge(
+                bundle,
+                StudentActor(
+                    student=replace(student, policy=policy.eval()), task=bundle.description
+                ),
+                episodes=episodes,
+                first_seed=seed_for(seed, "checkpoints", item) % 2**31,
+                cfg=cfg,
+                num_threads=runtime.num_threads,
+            )
+            for item, bundle in bundles.items()
+        ]
+        return sum(float(j.successes.mean()) for j in judged) / len(judged)
+
+    return rate
 
 
 def _num_labels(dataset: Path) -> int | None:
