@@ -1,5 +1,7 @@
 """The judge on tasks whose success can be told in advance; no policy is loaded."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,8 +48,6 @@ class Drive:
 
 @pytest.fixture
 def bundle() -> TaskBundle:
-    from dataclasses import replace
-
     found = load_benchmark("lift_up")
     thing = found.scene.manipulated
     still = replace(thing, poses_world=thing.poses_world[:1] * 2, frames=(0, 1), confidences=(1.0, 1.0))  # fmt: skip
@@ -56,7 +56,7 @@ def bundle() -> TaskBundle:
 
 
 def judged(bundle, actor, episodes=5, **settings) -> Judged:
-    cfg = EvaluationConfig(**{"worlds": 8} | settings)
+    cfg = replace(EvaluationConfig(worlds=8), **settings)
     return judge(
         bundle, actor, episodes=episodes, first_seed=3, cfg=cfg, size_px=SIZE_PX, task=HighTool
     )
@@ -68,7 +68,9 @@ def test_success_is_lost_again_at_the_end_and_counts_once(bundle):
 
     assert result.horizon_steps == 24
     assert result.successes.all()
+    assert result.at_end is not None
     assert not result.at_end.any()
+    assert stays.at_end is not None
     assert stays.at_end.all()
     assert (result.success_step >= HELD_STEPS - 1).all()
     assert result.median_success_s == np.median(result.success_step + 1) / 20
