@@ -65,6 +65,7 @@ VARIANTS = {
     "four_frames": Variant(network=SMALL | {"n_obs_steps": 4}),
     "chunk_4_do_1": Variant(network=SMALL | {"chunk_size": 4}),
     "chunk_4_do_2": Variant(network=SMALL | {"chunk_size": 4, "n_action_steps": 2}),
+    "head_256": Variant(network=SMALL | {"head_dim": 256}),
     "batch_64": Variant(network=SMALL, batch_size=64),
     "conv": Variant(network=CONV | {"mask_moments": False}, batch_size=128),
     "conv_and_moments": Variant(network=CONV, batch_size=128),
