@@ -148,7 +148,7 @@ def make_policy(
     sources: Sequence[Source],
 ) -> dict[str, Any]:
     """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
-    from policies.bc.trainer import TrainerConfig
+    from policies.bc.trainer import TrainerConfig, write_train_config
     from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
 
     policy: PolicyConfig = cfg.config.resolved
@@ -163,10 +163,11 @@ def make_policy(
         for path in handover_episodes(distilled) if distilled else ():
             take_in(student, [path])
         steps = policy.num_steps(len(student.table))
+        recipe = TrainerConfig(
+            steps=steps, batch_size=policy.batch_size, checkpoints=policy.checkpoints
+        )
         trained = student.train(
-            TrainerConfig(
-                steps=steps, batch_size=policy.batch_size, checkpoints=policy.checkpoints
-            ),
+            recipe,
             out,
             seed=seed % 2**63,
             judge=checkpoint_judge(student, sources, policy.judge_episodes, seed, runtime)
@@ -175,6 +176,7 @@ def make_policy(
             on_progress=runtime.progress,
         )
     student.save(out / POLICY_FOLDER)
+    write_train_config(out / POLICY_FOLDER, student.policy, dataset, repo_id, recipe, seed)
     return {
         "steps": steps,
         "samples": steps * policy.batch_size,

@@ -122,6 +122,23 @@ def save_policy(folder: Path, policy: V2PBCPolicy, processors: Processors) -> No
     processors.after.save_pretrained(folder)
 
 
+def write_train_config(
+    folder: Path, policy: V2PBCPolicy, dataset: Path, repo_id: str, cfg: TrainerConfig, seed: int
+) -> None:
+    """Write `train_config.json` beside a saved policy, from which `lerobot-train --config_path` trains the same one."""
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.configs.train import TrainPipelineConfig
+
+    TrainPipelineConfig(
+        dataset=DatasetConfig(repo_id=repo_id, root=str(dataset), use_imagenet_stats=False),
+        policy=policy.config,
+        steps=cfg.steps,
+        batch_size=cfg.batch_size,
+        seed=seed % 2**31,
+        env_eval_freq=0,
+    ).save_pretrained(folder)
+
+
 def load_policy(folder: Path, *, device: str = "cpu") -> tuple[V2PBCPolicy, Processors]:
     """Read what `save_policy` wrote."""
     from lerobot.policies.factory import make_pre_post_processors
