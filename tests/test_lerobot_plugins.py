@@ -198,6 +198,32 @@ def test_lerobots_own_trainer_makes_the_small_preset(run_tool, dataset, tmp_path
     assert (checkpoint / "model.safetensors").is_file()
 
 
+def test_lerobots_own_trainer_trains_a_policy_of_ours_anew(run_tool, dataset, tmp_path):
+    from lerobot.scripts.lerobot_train import main
+
+    from policies.bc.configuration_v2p_bc import V2PBCConfig
+    from policies.bc.student import Student
+    from policies.bc.trainer import TrainerConfig, write_train_config
+
+    cfg = V2PBCConfig(preset="small", device="cpu", push_to_hub=False)
+    student = Student.of_dataset(dataset, "v2p/dummy", cfg, tmp_path / "cache", seed=0)
+    recipe = TrainerConfig(steps=2, batch_size=2)
+    student.train(recipe, tmp_path / "training", seed=0)
+    student.save(tmp_path / "policy")
+    write_train_config(tmp_path / "policy", student.policy, dataset, "v2p/dummy", recipe, 0)
+
+    run_tool(
+        main,
+        f"--config_path={tmp_path / 'policy' / 'train_config.json'}",
+        f"--output_dir={tmp_path / 'run'}",
+        "--num_workers=0",
+    )
+
+    checkpoint = tmp_path / "run" / "checkpoints" / "last"
+    assert checkpoint.resolve().name == "000002"
+    assert (checkpoint / "pretrained_model" / "model.safetensors").is_file()
+
+
 def test_training_resuming_and_evaluating_with_lerobots_own_tools(
     run_tool, dataset, task_folder, tmp_path
 ):

@@ -5,9 +5,8 @@ The student of the distillation is the LeRobot policy itself, so the last traini
 
 import itertools
 import json
-import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,12 +24,9 @@ if TYPE_CHECKING:
 
 CACHE_FOLDER = "cache"
 """Of a run: decoded pictures of its datasets, as networks take them. Safe to delete."""
-DATASET_FOLDER = "dataset"
-"""Of a distillation: demonstrations and handover episodes as one LeRobot dataset."""
 POLICY_FOLDER = "policy"
 ACTION_LIMIT = 1.0
 """The simulator clips every entry of an action to this."""
-EPISODES_OF_JUDGING = "checkpoints"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,41 +111,33 @@ def make_distillation(
             out,
             seed,
             num_threads=runtime.num_threads,
-            on_progress=lambda share, words: runtime.progress(0.9 * share, words),
+            on_progress=runtime.progress,
         )
-    counts = distilled.counts() | {"samples_per_s": round(last.get("samples_per_s", 0.0), 1)}
-    if recipe.pack:
-        runtime.progress(0.9, "packing")
-        counts["packed"] = _pack(repo_id, sources, distilled.paths, out, runtime)
-    return counts
+    return distilled.counts() | {"samples_per_s": round(last.get("samples_per_s", 0.0), 1)}
 
 
-def _pack(
-    repo_id: str, sources: Sequence[Source], handovers: Sequence[Path], out: Path, runtime: Runtime
-) -> str:
-    """Write demonstrations and handovers as one LeRobot dataset; return its name."""
-    from v2p_data.episodes.card import write_card
+def make_distilled_dataset(
+    cfg: dict[str, Any],
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    sources: Sequence[Source],
+) -> dict[str, Any]:
+    """Write demonstrations and handover episodes as one LeRobot dataset and compare every frame with what was drawn."""
+    from v2p_data.distillation.rounds import handover_episodes
     from v2p_data.episodes.collect import staged_episodes
-    from v2p_data.episodes.verify import verify
-    from v2p_data.episodes.writer import pack
-    from v2p_data.stages import ROOT_OF_TASKS, copy_tasks
+    from v2p_data.stages import pack_and_verify
 
-    name = f"{repo_id}-distilled"
-    root = out / DATASET_FOLDER
-    staged = [*(p for s in sources for p in staged_episodes(s.episodes)), *handovers]
-    if not root.exists():
-        pack(
-            staged, name, root, provenance=provenance(), num_threads=runtime.num_threads,
-            on_progress=lambda share, words: runtime.progress(0.9 + 0.07 * share, words),
-        )  # fmt: skip
-    shutil.rmtree(root / ROOT_OF_TASKS, ignore_errors=True)  # of a run that was killed just here
-    copy_tasks({s.item: s.task for s in sources}, root)
-    runtime.progress(0.97, "comparing every frame")
-    report = verify(root, staged=staged)
-    if not report.is_good:
-        raise V2PError(f"the packed dataset differs from the episodes: {report.summary()}")
-    write_card(root, name)
-    return name
+    demonstrations = [path for source in sources for path in staged_episodes(source.episodes)]
+    return pack_and_verify(
+        [*demonstrations, *handover_episodes(inputs["distillation"])],
+        cfg["repo_id"],
+        out,
+        runtime,
+        provenance=provenance(),
+        tasks={source.item: source.task for source in sources},
+    )
 
 
 def make_policy(
@@ -163,7 +151,7 @@ def make_policy(
     sources: Sequence[Source],
 ) -> dict[str, Any]:
     """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
-    from policies.bc.trainer import TrainerConfig
+    from policies.bc.trainer import TrainerConfig, write_train_config
     from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
 
     policy: PolicyConfig = cfg.config.resolved
@@ -180,15 +168,20 @@ def make_policy(
         for _, paths in itertools.groupby(handovers, key=lambda path: path.parent):
             take_in(student, list(paths))
         steps = policy.num_steps(len(student.table))
+        recipe = TrainerConfig(
+            steps=steps, batch_size=policy.batch_size, checkpoints=policy.checkpoints
+        )
         trained = student.train(
-            TrainerConfig(
-                steps=steps, batch_size=policy.batch_size, checkpoints=policy.checkpoints
-            ),
+            recipe,
             out,
             seed=seed % 2**63,
+            judge=checkpoint_judge(student, sources, policy.judge_episodes, seed, runtime)
+            if policy.checkpoints > 1 and sources
+            else None,
             on_progress=runtime.progress,
         )
     student.save(out / POLICY_FOLDER)
+    write_train_config(out / POLICY_FOLDER, student.policy, dataset, repo_id, recipe, seed)
     return {
         "steps": steps,
         "samples": steps * policy.batch_size,
@@ -229,6 +222,54 @@ def new_student(
         num_threads=runtime.num_threads,
         action_limit=ACTION_LIMIT,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudentActor:
+    """A student as `evaluation.batch.judge` wants it: told its task once."""
+
+    student: "Student"
+    task: str
+    """In words."""
+
+    def reset(self, n: int) -> None:
+        """Start episodes in `n` worlds."""
+        del n
+        self.student.reset(self.task)
+
+    def act(self, labels: Any, state: Any) -> Any:
+        """Return the worlds' next actions."""
+        return self.student.act(labels, state)
+
+
+def checkpoint_judge(
+    student: "Student", sources: Sequence[Source], episodes: int, seed: int, runtime: Runtime
+) -> Callable[[Any], float]:
+    """Return what gives a policy's mean success rate over tasks, on seeds that no evaluation uses."""
+    from v2p_data.evaluation.batch import judge
+    from v2p_data.evaluation.config import EvaluationConfig
+    from v2p_data.task.task import TaskBundle
+
+    bundles = {source.item: TaskBundle.load(source.task) for source in sources}
+    cfg = EvaluationConfig(episodes=episodes, worlds=episodes, at_end=False)
+
+    def rate(policy: Any) -> float:
+        judged = [
+            judge(
+                bundle,
+                StudentActor(
+                    student=replace(student, policy=policy.eval()), task=bundle.description
+                ),
+                episodes=episodes,
+                first_seed=seed_for(seed, "checkpoints", item) % 2**31,
+                cfg=cfg,
+                num_threads=runtime.num_threads,
+            )
+            for item, bundle in bundles.items()
+        ]
+        return sum(float(j.successes.mean()) for j in judged) / len(judged)
+
+    return rate
 
 
 def _num_labels(dataset: Path) -> int | None:

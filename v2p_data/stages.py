@@ -28,7 +28,13 @@ from v2p_data.pipeline.artifact import Record, provenance, read_record, write_js
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.policy_config import PolicyConfig
-from v2p_data.policy_training import POLICY_FOLDER, Source, make_distillation, make_policy
+from v2p_data.policy_training import (
+    POLICY_FOLDER,
+    Source,
+    make_distillation,
+    make_distilled_dataset,
+    make_policy,
+)
 from v2p_data.reward.config import RewardConfig
 from v2p_data.scene.reconstruct import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
@@ -412,39 +418,63 @@ def make_dataset(
     tasks: Mapping[str, Stage],
 ) -> dict[str, Any]:
     """Write the dataset, reopen it with LeRobot and compare every frame with what was drawn."""
-    from v2p_data.episodes.card import write_card
     from v2p_data.episodes.collect import staged_episodes
+
+    return pack_and_verify(
+        [path for folder in inputs.values() for path in staged_episodes(folder)],
+        cfg["repo_id"],
+        out,
+        runtime,
+        provenance={
+            "items": {item: _history(folder, runtime.root) for item, folder in inputs.items()},
+            **provenance(),
+        },
+        tasks={item: stage.folder(runtime.root) for item, stage in tasks.items()},
+    )
+
+
+def pack_and_verify(
+    staged: Sequence[Path],
+    repo_id: str,
+    out: Path,
+    runtime: Runtime,
+    *,
+    provenance: Mapping[str, Any],
+    tasks: Mapping[str, Path],
+) -> dict[str, Any]:
+    """Write staged episodes as a LeRobot dataset into `out`, with their tasks and a card.
+
+    Raises:
+        V2PError: there is nothing to pack, or the dataset differs from the episodes when it is read again.
+    """
+    from v2p_data.episodes.card import write_card
     from v2p_data.episodes.verify import verify
     from v2p_data.episodes.writer import pack
 
-    staged = [path for folder in inputs.values() for path in staged_episodes(folder)]
     if not staged:
         raise V2PError("no task gave a successful episode, so there is nothing to pack")
     root = out / "packed"
     pack(
         staged,
-        cfg["repo_id"],
+        repo_id,
         root,
-        provenance={
-            "items": {item: _history(folder, runtime.root) for item, folder in inputs.items()},
-            **provenance(),
-        },
+        provenance=provenance,
         num_threads=runtime.num_threads,
         on_progress=lambda share, words: runtime.progress(0.7 * share, words),
     )
-    copy_tasks({item: stage.folder(runtime.root) for item, stage in tasks.items()}, root)
+    copy_tasks(tasks, root)
     runtime.progress(0.75, "comparing every frame")
     report = verify(root, staged=staged)
     if not report.is_good:
         raise V2PError(f"the packed dataset differs from the episodes: {report.summary()}")
-    write_card(root, cfg["repo_id"])
+    write_card(root, repo_id)
     for path in list(root.iterdir()):
         path.rename(out / path.name)
     root.rmdir()
     return {
         "episodes": report.num_episodes,
         "frames": report.num_frames,
-        "repo_id": cfg["repo_id"],
+        "repo_id": repo_id,
     }
 
 
@@ -508,6 +538,21 @@ def distillation_stage(
             sources=tuple(sources),
         ),
         resumes=True,
+    )
+
+
+def distilled_dataset_stage(
+    distillation: Stage, record: Record, sources: Sequence[Source]
+) -> Stage:
+    """Return the stage that packs demonstrations and handover episodes into one LeRobot dataset."""
+    name = f"{record.item}-distilled"
+    return Stage(
+        name="dataset",
+        item=name,
+        config={"repo_id": f"{str(record.counts['repo_id']).split('/')[0]}/{name}"},
+        inputs={"distillation": distillation},
+        version=1,
+        make=partial(make_distilled_dataset, sources=tuple(sources)),
     )
 
 

@@ -142,6 +142,23 @@ def save_policy(folder: Path, policy: V2PBCPolicy, processors: Processors) -> No
     processors.after.save_pretrained(folder)
 
 
+def write_train_config(
+    folder: Path, policy: V2PBCPolicy, dataset: Path, repo_id: str, cfg: TrainerConfig, seed: int
+) -> None:
+    """Write `train_config.json` beside a saved policy, from which `lerobot-train --config_path` trains the same one."""
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.configs.train import TrainPipelineConfig
+
+    TrainPipelineConfig(
+        dataset=DatasetConfig(repo_id=repo_id, root=str(dataset), use_imagenet_stats=False),
+        policy=policy.config,
+        steps=cfg.steps,
+        batch_size=cfg.batch_size,
+        seed=seed % 2**31,
+        env_eval_freq=0,
+    ).save_pretrained(folder)
+
+
 def load_policy(folder: Path, *, device: str = "cpu") -> tuple[V2PBCPolicy, Processors]:
     """Read what `save_policy` wrote."""
     from lerobot.policies.factory import make_pre_post_processors
@@ -216,7 +233,7 @@ class _Run:
         self.policy, self.table, self.cfg, self.out = policy, table, cfg, out
         self.seed, self.judge, self.on_progress = seed, judge, on_progress
         self.mean = copy.deepcopy(policy)
-        self.optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+        self.optimizer = _optimizer(policy)
         preset = policy.config.get_scheduler_preset()
         self.schedule = preset.build(self.optimizer, cfg.steps) if preset else None
         self.device = next(policy.parameters()).device
@@ -425,6 +442,19 @@ def _threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def _optimizer(policy: V2PBCPolicy) -> torch.optim.Optimizer:
+    """Return LeRobot's optimiser with the fused step, which takes a fifth less time on a CPU."""
+    preset = policy.config.get_optimizer_preset()
+    return torch.optim.AdamW(
+        policy.get_optim_params(),
+        lr=preset.lr,
+        betas=preset.betas,
+        eps=preset.eps,
+        weight_decay=preset.weight_decay,
+        fused=True,
+    )
 
 
 def _moved(value: Any, device: torch.device) -> Any:

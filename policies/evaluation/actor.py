@@ -34,7 +34,7 @@ class PolicyActor:
     before: Any
     """The environment's processors, around those of the policy."""
     after: Any
-    values: torch.Tensor
+    values: UInt8[np.ndarray, "label"] | Float32[np.ndarray, "label"]
     """What the policy sees for each label."""
     channels: int
     task: str
@@ -56,7 +56,7 @@ class PolicyActor:
         self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n state"]
     ) -> Float32[np.ndarray, "n act"]:
         """Return the next action of every world."""
-        picture = self.values[torch.from_numpy(labels).int()][:, None]
+        picture = torch.from_numpy(self.values[labels])[:, None]  # numpy's indexing is the faster
         if self.channels > 1:
             picture = picture.expand(-1, self.channels, -1, -1).contiguous()
         observation = {
@@ -93,9 +93,9 @@ def load_actor(
     loaded = load_policy(folder, config, device)
     before, after = make_env_pre_post_processors(config, loaded.policy.config)
     is_grey = loaded.policy.config.type == GREY_TYPE
-    values = torch.tensor(greys, dtype=torch.uint8)
+    values = np.asarray(greys, np.uint8)
     if not is_grey:
-        values = values.to(torch.float32) / 255
+        values = values.astype(np.float32) / np.float32(255)
     return PolicyActor(
         loaded=loaded,
         before=before,

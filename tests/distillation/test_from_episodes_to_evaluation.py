@@ -17,7 +17,7 @@ from v2p_data.stages import EVALUATION_FILE, ROOT_OF_TASKS, evaluation_stage, po
 
 LEARNING = replace(
     ENGINE,
-    distillation=replace(DISTILLATION, rounds=1, first_steps=40, pack=False),
+    distillation=replace(DISTILLATION, rounds=1, first_steps=40),
     policy=PolicyConfig(preset="small", steps=80, batch_size=32),
     evaluation=EvaluationConfig(episodes=12, worlds=6),
 )

@@ -11,19 +11,24 @@ import pytest
 import toy_run
 from toy_run import ENGINE, REPO_ID, contents, dataset_of, made, record_of
 
+from policies.bc import trainer
 from policies.bc.student import Student
 from policies.bc.trainer import TrainerConfig
 from v2p_data import stages
 from v2p_data.distillation import rounds
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.rounds import handover_episodes
-from v2p_data.episodes import writer
 from v2p_data.episodes.collect import staged_episodes
 from v2p_data.episodes.verify import verify
 from v2p_data.pipeline.runner import Outcome, Runtime
 from v2p_data.policy_config import PolicyConfig
-from v2p_data.policy_training import DATASET_FOLDER, POLICY_FOLDER, recorded_under, sources_of
-from v2p_data.stages import ROOT_OF_TASKS, distillation_stage, policy_stage
+from v2p_data.policy_training import POLICY_FOLDER, recorded_under, sources_of
+from v2p_data.stages import (
+    ROOT_OF_TASKS,
+    distillation_stage,
+    distilled_dataset_stage,
+    policy_stage,
+)
 
 
 class Killed(Exception):  # noqa: N818 - it stands for a kill
@@ -120,23 +125,37 @@ def only(root: Path, stage: str) -> Path:
     return folder
 
 
-def test_demonstrations_and_handovers_become_one_good_dataset(distilled: Path):
+def packed(root: Path) -> Outcome:
+    """Pack demonstrations and handovers of a run."""
+    dataset = dataset_of(root)
+    sources = sources_of(dataset, root)
+    stage = distillation_stage(dataset, record_of(dataset), ENGINE, sources)
+    outcomes = made(
+        [distilled_dataset_stage(stage, record_of(dataset), sources)], Runtime(root=root)
+    )
+    return list(outcomes.values())[-1]
+
+
+def test_demonstrations_and_handovers_become_one_good_dataset(distilled: Path, tmp_path: Path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    folder = only(distilled, "distillation")
-    staged = [*staged_episodes(only(distilled, "episodes")), *handover_episodes(folder)]
+    root = Path(shutil.copytree(distilled, tmp_path / "run"))
+    episodes, distillation = only(root, "episodes"), only(root, "distillation")
+    staged = [*staged_episodes(episodes), *handover_episodes(distillation)]
 
-    dataset: Any = LeRobotDataset(f"{REPO_ID}-distilled", root=folder / DATASET_FOLDER)
+    outcome = packed(root)
+
+    assert outcome.is_usable, outcome.detail
+    counts = record_of(outcome.folder).counts
+    dataset: Any = LeRobotDataset(counts["repo_id"], root=outcome.folder)
     acted = [bool(dataset[k]["intervention"]) for k in range(len(dataset))]
-
-    assert dataset.num_episodes == len(staged) > 3
+    assert counts["repo_id"] == f"{REPO_ID}-distilled"
+    assert dataset.num_episodes == counts["episodes"] == len(staged) > 3
     assert all(acted[: sum(dataset.meta.episodes["length"][:3])])
     assert not all(acted)
-    assert verify(folder / DATASET_FOLDER, staged=staged).is_good
-    assert (folder / DATASET_FOLDER / ROOT_OF_TASKS / toy_run.ITEM / "task.json").is_file()
-    counts = record_of(folder).counts
-    assert counts["packed"] == f"{REPO_ID}-distilled"
-    assert counts["episodes"] == len(handover_episodes(folder))
+    assert verify(outcome.folder, staged=staged).is_good
+    assert (outcome.folder / ROOT_OF_TASKS / toy_run.ITEM / "task.json").is_file()
+    assert record_of(distillation).counts["episodes"] == len(handover_episodes(distillation))
 
 
 def test_the_last_training_sees_all_frames(distilled: Path):
@@ -162,12 +181,12 @@ def staged_of(root: Path) -> dict[str, bytes]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "call"), [("train", 0), ("hand_over", 1), ("train", 1), ("train", 2), ("pack", 0)]
+    ("name", "call"), [("train", 0), ("hand_over", 1), ("train", 1), ("train", 2)]
 )
 def test_a_run_that_was_killed_ends_in_the_same_episodes_and_weights(
     agreeing_referee, distilled: Path, root: Path, name: str, call: int
 ):
-    """Killed in one of the three trainings, between batches, or before the dataset is packed."""
+    """Killed in one of the three trainings, or between batches."""
     with pytest.MonkeyPatch.context() as patch:
         calls: list[int] = []
 
@@ -191,7 +210,7 @@ def test_a_run_that_was_killed_ends_in_the_same_episodes_and_weights(
             if share > 0.6:
                 raise Killed
 
-        owner: Any = {"train": Student, "hand_over": rounds, "pack": writer}[name]
+        owner: Any = {"train": Student, "hand_over": rounds}[name]
         patch.setattr(owner, name, counted(getattr(owner, name)))
         outcomes = make(root)
     assert any(o.reason == "Killed" for o in outcomes.values()), [
@@ -206,21 +225,55 @@ def test_a_run_that_was_killed_ends_in_the_same_episodes_and_weights(
 
 
 @pytest.mark.slow
-def test_a_kill_just_after_packing_loses_no_task(agreeing_referee, distilled: Path, root: Path):
+def test_a_packing_that_was_killed_ends_in_the_same_dataset(distilled: Path, root: Path):
     def kill(tasks: Mapping[str, Path], dataset: Path) -> None:
         (dataset / ROOT_OF_TASKS / "half").mkdir(parents=True)
         raise Killed
 
+    shutil.copytree(distilled / "distillation", root / "distillation")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stages, "copy_tasks", kill)
-        assert make(root)["distillation"].reason == "Killed"
+        assert packed(root).reason == "Killed"
 
-    assert make(root)["policy"].is_usable
-    copied, expected = (
-        {str(p.relative_to(only(r, "distillation"))) for p in only(r, "distillation").rglob("*")}
-        for r in (root, distilled)
-    )
-    assert {p for p in copied if ROOT_OF_TASKS in p} == {p for p in expected if ROOT_OF_TASKS in p}
+    again, expected = packed(root), packed(distilled)
+
+    files = [
+        {
+            name: data
+            for name, data in contents(outcome.folder).items()
+            if name.startswith(("data", "videos", "v2p"))
+        }
+        for outcome in (again, expected)
+    ]
+    assert files[0] == files[1]
+    assert len(files[0]) > 4
+
+
+@pytest.mark.slow
+def test_checkpoints_are_judged_in_simulation_and_a_kill_changes_nothing(
+    agreeing_referee, distilled: Path, tmp_path: Path
+):
+    engine = replace(ENGINE, policy=replace(ENGINE.policy, checkpoints=2, judge_episodes=4))
+    found: list[tuple[Any, bytes]] = []
+    for name in ("calm", "killed"):
+        root = Path(shutil.copytree(distilled, tmp_path / name))
+        shutil.rmtree(root / "policy")
+        if name == "killed":
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(trainer._Run, "_keep_best", kill_now)
+                assert make(root, engine)["policy"].reason == "Killed"
+        outcome = make(root, engine)["policy"]
+        weights = (outcome.folder / POLICY_FOLDER / "model.safetensors").read_bytes()
+        found.append((record_of(outcome.folder).counts["judged"], weights))
+
+    (judged, _), _ = found
+    assert [step for step, _ in judged] == [3, 4]
+    assert all(0 <= rate <= 1 for _, rate in judged)
+    assert found[0] == found[1]
+
+
+def kill_now(*_: object) -> None:
+    raise Killed
 
 
 def test_colours_are_refused_before_anything_is_read(root: Path):

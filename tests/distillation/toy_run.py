@@ -15,7 +15,7 @@ from policies.ppo.policy import ActorCritic, Expert
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.pipeline.artifact import Record, read_record
-from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, make_stage
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, make_stage, stored_outcome
 from v2p_data.policy_config import PolicyConfig
 from v2p_data.stages import EngineConfig, dataset_stage, episodes_stage
 from v2p_data.task.task import TaskBundle
@@ -89,7 +89,7 @@ def make_run(root: Path) -> Path:
 def made(
     stages: Sequence[Stage], runtime: Runtime, on_event: object = None
 ) -> dict[tuple[str, str], Outcome]:
-    """Make stages in this process: in workers each would import LeRobot anew."""
+    """Make what is missing in this process: workers would import LeRobot anew."""
     outcomes: dict[tuple[str, str], Outcome] = {}
     for stage in in_order(stages):
         needs = [outcomes[(s.name, s.folder_name)] for s in stage.inputs.values()]
@@ -100,13 +100,13 @@ def made(
                 folder=stage.folder(runtime.root), detail=f"needs {bad.stage} of {bad.item}",
             )  # fmt: skip
         else:
-            outcome = make_stage(stage, runtime)
+            outcome = stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
         outcomes[(stage.name, stage.folder_name)] = outcome
     return outcomes
 
 
 def dataset_of(root: Path) -> Path:
-    (folder,) = (root / "dataset").glob("*")
+    (folder,) = (root / "dataset").glob("toys-????????")
     return folder
 
 

@@ -13,6 +13,8 @@ from policies.bc.encoders import (
     labels_of,
     mask_moments,
     mask_stem,
+    pixel_sums,
+    pixel_sums_by_products,
     shifted,
     shrink,
 )
@@ -119,6 +121,26 @@ def test_moments_do_not_depend_on_which_frames_are_computed_together():
     together = mask_moments(labels, 4)
 
     assert torch.equal(torch.cat([mask_moments(one[None], 4) for one in labels]), together)
+
+
+def test_the_compiled_sums_and_the_matrix_products_agree():
+    labels = torch.randint(
+        0, 5, (3, 48, 64), generator=torch.Generator().manual_seed(0), dtype=torch.uint8
+    )
+    labels[2][labels[2] == 2] = 0
+    y, x = np.mgrid[0:48, 0:64]
+
+    sums = pixel_sums(labels, 4)
+
+    for n, k in ((0, 1), (1, 3)):
+        mask = labels[n].numpy() == k
+        px, py = x[mask], y[mask]
+        by_hand = [len(px), px.sum(), py.sum(), (px**2).sum(), (py**2).sum(), (px * py).sum(), px.min(), px.max(), py.min(), py.max()]  # fmt: skip
+        assert sums[n, k - 1].tolist() == by_hand
+    assert not sums[2, 1].any()
+    products = pixel_sums_by_products(labels, 4)
+    seen = sums[..., 0] > 0
+    assert torch.equal(products[seen], sums[seen])
 
 
 def test_labels_beyond_those_that_the_network_tells_apart_count_as_none():

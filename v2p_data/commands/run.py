@@ -29,6 +29,8 @@ from v2p_data.stages import (
     EngineConfig,
     chain,
     dataset_stage,
+    distillation_stage,
+    distilled_dataset_stage,
     evaluation_stage,
     policy_stage,
     scene_stage,
@@ -93,6 +95,11 @@ class Train:
     """YAML file with settings; flags go over it."""
     engine: Engine = field(default_factory=EngineConfig)
     how: Running = field(default_factory=How)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distill(Train):
+    """The same words as of `v2p train`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,6 +171,36 @@ def train_command(argv: list[str]) -> int:
         f"Made {policy}",
         f"loss {counts['final_loss']:.3f} after {counts['steps']} steps; page: {page}",
         shlex.join(["v2p", "eval", str(policy), *_settings_in(argv, args.dataset)]),
+    )
+    return 0
+
+
+def distill_command(argv: list[str]) -> int:
+    args = _with_config(Distill, argv, "distill")
+    root = _run_folder(args.out or args.dataset.resolve().parent.parent)
+    if not args.engine.distillation.rounds:
+        raise V2PError("--distillation.rounds=0 leaves nothing to do; it is 1 or more")
+    record = _dataset_record(args.dataset)
+    sources = sources_of(args.dataset.resolve(), root)
+    if not sources:
+        raise V2PError(
+            f"the tasks and experts of {args.dataset} are not in {root}: distillation needs the run that made it;"
+            " 'v2p train' clones the demonstrations without"
+        )
+    stage = distillation_stage(args.dataset.resolve(), record, args.engine, sources)
+    packed = distilled_dataset_stage(stage, record, sources)
+    with only_run_in(root):
+        outcomes = _run([packed], _all_threads(args.how.runtime(root)))
+        for part in (stage, packed):
+            _demand(outcomes[(part.name, part.folder_name)])
+        page = write_page(root)
+    counts = _record(stage.folder(root)).counts
+    recovered = ", ".join(f"{share:.0%}" for share in counts["recovered"])
+    _say(
+        f"Made {packed.folder(root)}",
+        f"{counts['episodes']} handover episodes, {counts['frames']} frames; the expert recovered {recovered} of each"
+        f" round's; page: {page}",
+        shlex.join(["v2p", "train", str(args.dataset), *_settings_in(argv, args.dataset)]),
     )
     return 0
 
@@ -243,12 +280,7 @@ def generate(
 
 def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Path:
     """Train a policy on a finished dataset and return its folder."""
-    record = read_record(dataset)
-    if record is None or record.stage != "dataset":
-        raise V2PError(
-            f"{dataset} is no dataset of v2p generate; for others use"
-            " 'lerobot-train --policy.type=v2p_bc --dataset.root=...'"
-        )
+    record = _dataset_record(dataset)
     sources = sources_of(dataset.resolve(), root)
     if not sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
         print(  # noqa: T201
@@ -295,6 +327,21 @@ def _seen_tasks(who: Contestant) -> dict[str, Path]:
 def _all_threads(runtime: Runtime) -> Runtime:
     """Let the only job have all threads."""
     return replace(runtime, num_threads=max(runtime.workers, runtime.num_threads))
+
+
+def _dataset_record(dataset: Path) -> Record:
+    """Return the record of a dataset of this engine.
+
+    Raises:
+        V2PError: it is none.
+    """
+    record = read_record(dataset)
+    if record is None or record.stage != "dataset":
+        raise V2PError(
+            f"{dataset} is no dataset of v2p generate; for others use"
+            " 'lerobot-train --policy.type=v2p_bc --dataset.root=...'"
+        )
+    return record
 
 
 def task_folders(folder: Path) -> dict[str, Path]:

@@ -21,8 +21,6 @@ class DistillationConfig:
     """Gradient steps on the demonstrations, before the first round."""
     round_steps: int = 2_000
     """Gradient steps before each further round, on all frames so far."""
-    pack: bool = True
-    """Write demonstrations and handover episodes as one LeRobot dataset."""
 
     def __post_init__(self) -> None:
         if self.rounds < 0:

@@ -1,0 +1,98 @@
+"""Policies that do not suit the simulator are turned away, and those that do see what LeRobot would show them."""
+
+import numpy as np
+import pytest
+import torch
+
+from v2p_data.sim.masks import PALETTE, labels_to_rgb
+
+pytestmark = pytest.mark.slow
+
+MASK, STATE = "observation.images.mask", "observation.state"
+
+
+def checkpoint(folder, cameras=(MASK,), state_dim=11, act_dim=7):
+    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    from policies.bc.configuration_v2p_bc import V2PBCConfig
+
+    seen = {key: PolicyFeature(FeatureType.VISUAL, (3, 48, 64)) for key in cameras}
+    config = V2PBCConfig(
+        input_features={**seen, STATE: PolicyFeature(FeatureType.STATE, (state_dim,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (act_dim,))},
+        device="cpu",
+        push_to_hub=False,
+    )
+    config.save_pretrained(folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("odd", "said"),
+    [
+        ({"state_dim": 7}, r"'observation\.state' of shape \(7,\), and the simulator gives \(11,\)"),
+        ({"act_dim": 8}, r"'action' of shape \(8,\), and the simulator gives \(7,\)"),
+        ({"cameras": ["observation.images.rgb"]}, r"'observation\.images\.rgb' \(3, 48, 64\)"),
+        ({"cameras": []}, r"has no camera 'observation\.images\.mask'"),
+    ],
+)  # fmt: skip
+def test_a_policy_that_wants_something_else_is_told_what_there_is(tmp_path, odd, said):
+    from policies.evaluation.actor import UnsuitablePolicyError, load_actor
+
+    with pytest.raises(UnsuitablePolicyError, match=said):
+        load_actor(checkpoint(tmp_path, **odd), greys=PALETTE)
+
+
+def test_a_policy_is_shown_pictures_of_the_size_that_it_knows(tmp_path):
+    from policies.evaluation.actor import check_features
+    from policies.evaluation.rollout import env_config
+
+    assert check_features(checkpoint(tmp_path), env_config()) == (48, 64)
+
+
+def test_another_policy_type_sees_what_lerobot_shows_it():
+    from lerobot.envs.utils import preprocess_observation
+
+    from policies.evaluation.actor import PolicyActor
+    from policies.evaluation.rollout import LoadedPolicy
+
+    class Records:
+        def eval(self):
+            pass
+
+        def reset(self):
+            pass
+
+        def select_action(self, observation):
+            self.seen = observation
+            return torch.zeros(2, 7)
+
+    def same(data):
+        return data
+
+    labels = np.random.default_rng(0).integers(0, len(PALETTE), (2, 12, 16)).astype(np.uint8)
+    state = np.arange(22, dtype=np.float32).reshape(2, 11)
+    policy = Records()
+    actor = PolicyActor(
+        loaded=LoadedPolicy(policy=policy, preprocessor=same, postprocessor=same),
+        before=same,
+        after=same,
+        values=torch.tensor(PALETTE, dtype=torch.float32) / 255,
+        channels=3,
+        task="lifting a cube",
+        size_px=(12, 16),
+    )
+    actor.reset(2)
+
+    action = actor.act(labels, state)
+
+    theirs = preprocess_observation(
+        {"pixels": {"mask": labels_to_rgb(labels)}, "agent_pos": state}
+    )
+    assert action.shape == (2, 7)
+    assert policy.seen.pop("task") == ["lifting a cube"] * 2
+    assert policy.seen.keys() == theirs.keys()
+    for key, value in theirs.items():
+        torch.testing.assert_close(policy.seen[key], value, rtol=0, atol=0)

@@ -1,0 +1,167 @@
+"""The judge on tasks whose success can be told in advance; no policy is loaded."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from v2p_data.errors import V2PError
+from v2p_data.evaluation.actors import BASE_PROGRESS, ExpertActor, ProgramActor
+from v2p_data.evaluation.batch import NEVER, Judged, judge
+from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.sim.batch_env import HELD_STEPS, BatchEnv
+from v2p_data.task.benchmark import load_benchmark
+from v2p_data.task.task import Task, TaskBundle
+
+SIZE_PX = 32
+
+
+class HighTool(Task):
+    """Success while the tool is above a height; the video's object rests, and so it does here."""
+
+    def compute_success(self, states):
+        return states["eef_pos"][:, 2] > 0.27
+
+    def compute_reward(self, actions, states):
+        height = states["eef_pos"][:, 2]
+        return height, {"height": height}
+
+
+class Drive:
+    """Goes up for some steps and then down; remembers what it saw."""
+
+    def __init__(self, up: int = 10**6) -> None:
+        self.up = up
+        self.labels: list[np.ndarray] = []
+        self.states: list[np.ndarray] = []
+
+    def reset(self, n: int) -> None:
+        self.labels, self.states = [], []
+
+    def act(self, labels, state):
+        action = np.zeros((len(state), 7), np.float32)
+        action[:, 2] = 0.5 if len(self.labels) < self.up else -1.0
+        self.labels.append(labels.copy())
+        self.states.append(state.copy())
+        return action
+
+
+@pytest.fixture
+def bundle() -> TaskBundle:
+    found = load_benchmark("lift_up")
+    thing = found.scene.manipulated
+    still = replace(thing, poses_world=thing.poses_world[:1] * 2, frames=(0, 1), confidences=(1.0, 1.0))  # fmt: skip
+    scene = replace(found.scene, kind="generic", objects=(still,))
+    return replace(found, kind="generic", scene=scene, horizon_steps=12)
+
+
+def judged(bundle, actor, episodes=5, **settings) -> Judged:
+    cfg = replace(EvaluationConfig(worlds=8), **settings)
+    return judge(
+        bundle, actor, episodes=episodes, first_seed=3, cfg=cfg, size_px=SIZE_PX, task=HighTool
+    )
+
+
+def test_success_is_lost_again_at_the_end_and_counts_once(bundle):
+    result = judged(bundle, Drive(up=14))
+    stays = judged(bundle, Drive())
+
+    assert result.horizon_steps == 24
+    assert result.successes.all()
+    assert result.at_end is not None
+    assert not result.at_end.any()
+    assert stays.at_end is not None
+    assert stays.at_end.all()
+    assert (result.success_step >= HELD_STEPS - 1).all()
+    assert result.median_success_s == np.median(result.success_step + 1) / 20
+    assert result.failures == ("",) * 5
+
+
+def test_worlds_at_a_time_change_no_episode(bundle):
+    together, in_turn = judged(bundle, Drive()), judged(bundle, Drive(), worlds=2)
+
+    np.testing.assert_array_equal(together.success_step, in_turn.success_step)
+    assert len(in_turn.shown.successes) == 2
+
+
+def test_without_at_end_an_episode_is_over_with_its_success_and_its_picture_stays(bundle):
+    drive = Drive()
+    result = judged(bundle, drive, at_end=False)
+
+    first, last = sorted(set(result.success_step))[:1][0], result.success_step.max()
+    assert result.at_end is None
+    assert len(drive.states) == last + 1  # nobody acts once all are over
+    early = int(np.argmin(result.success_step))
+    assert first < last
+    np.testing.assert_array_equal(drive.states[-1][early], drive.states[first][early])
+    np.testing.assert_array_equal(drive.labels[-1][early], drive.labels[first][early])
+    late = int(np.argmax(result.success_step))
+    assert (drive.states[-1][late] != drive.states[first][late]).any()
+
+
+def test_without_success_episodes_last_to_the_horizon_and_say_what_went_wrong(bundle):
+    result = judged(bundle, Drive(up=0), horizon_scale=1.0)
+
+    assert result.horizon_steps == 12
+    assert (result.success_step == NEVER).all()
+    assert result.failure_counts() == {"never_reached": 5}
+    assert result.as_dict()["median_success_s"] is None
+    assert (result.shown.num_frames == 13).all()
+
+
+def test_a_simulation_that_breaks_ends_its_episode_as_a_failure(bundle):
+    class Breaks:
+        def begin(self, env: BatchEnv) -> None:
+            self.steps = 0
+
+        def act_in(self, env: BatchEnv) -> np.ndarray:
+            self.steps += 1
+            if self.steps == 2:
+                env._qvel[1] = np.nan
+            action = np.zeros((env.num_envs, 7))
+            action[:, 2] = 0.5
+            return action
+
+    result = judged(bundle, Breaks())
+
+    assert result.broke.tolist() == [False, True, False, False, False]
+    assert result.failures == ("", "simulation_broke", "", "", "")
+
+
+def test_an_expert_is_never_told_that_more_than_its_time_has_passed(bundle):
+    seen = []
+
+    def act(obs):
+        seen.append(obs[:, BASE_PROGRESS].max())
+        return np.zeros((len(obs), 7), np.float32)
+
+    judged(bundle, ExpertActor(act, obs_dim=90))
+
+    assert len(seen) == 24
+    np.testing.assert_allclose(seen[:13], np.arange(13) / 12, rtol=1e-6)
+    assert seen[13:] == [1.0] * 11
+
+
+def test_another_tasks_expert_is_turned_away(bundle):
+    with pytest.raises(V2PError, match="length 93, and task 'lift_up' makes ones of length 90"):
+        judged(bundle, ExpertActor(lambda obs: obs[:, :7], obs_dim=93))
+
+
+def test_actions_that_are_no_numbers_are_turned_away(bundle):
+    class Odd(Drive):
+        def act(self, labels, state):
+            return np.full((len(state), 7), np.nan, np.float32)
+
+    with pytest.raises(V2PError, match="in world 0 of task 'lift_up' is not finite"):
+        judged(bundle, Odd())
+
+
+@pytest.mark.slow
+def test_scripted_programs_push_to_the_left():
+    actor = ProgramActor(seed=0)
+    cfg = EvaluationConfig()
+
+    result = judge(load_benchmark("push_left"), actor, episodes=8, first_seed=0, cfg=cfg)
+
+    assert actor.name == "push as in the video"
+    assert result.successes.mean() >= 0.9
