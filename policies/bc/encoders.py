@@ -21,13 +21,24 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 BACKBONE_DIM = 512
 CONV_WIDTHS = (32, 64, 96, 128)
-NUM_MOMENTS = 10
+NUM_SUMS = 6
+"""Area, first and second moments."""
+DIRECTION_LENGTH = 1024
+DIRECTIONS = np.round(
+    DIRECTION_LENGTH
+    * np.stack([np.cos(2 * np.pi * np.arange(16) / 16), np.sin(2 * np.pi * np.arange(16) / 16)], 1)
+).astype(np.int64)
+"""Sixteen directions in the image, of whole numbers, so that sums over pixels are exact."""
+NUM_MOMENTS = NUM_SUMS + len(DIRECTIONS)
 """Numbers that `mask_moments` gives per label."""
 LEAST_PIXELS = 4
 """A label with fewer pixels counts as absent."""
 
+PREPARE_VERSION = 2
+"""Raised when `prepare` gives other numbers for the same pictures: caches of them are made anew."""
+
 Prepared = dict[str, Tensor]
-"""`picture`: uint8 `(batch, time, channel, h, w)`; `moments`: float32 `(batch, time, label x 10)`; either may be absent."""
+"""`picture`: uint8 `(batch, time, channel, h, w)`; `moments`: float32 `(batch, time, label x 22)`; either may be absent."""
 
 
 def shrink(
@@ -74,74 +85,75 @@ def label_shares(
 
 def mask_moments(
     labels: UInt8[Tensor, "batch h w"], num_labels: int
-) -> Float[Tensor, "batch label 10"]:
-    """Return size, place and extent of each label but the background; zeros where it is absent.
+) -> Float[Tensor, "batch label 22"]:
+    """Return place, size and outline of each label but the background; zeros where it is absent.
 
-    Per label: root of its area; centroid x, y; standard deviation along x, y; correlation of x and y; edges of its
-    bounding box: left, right, top, bottom. Coordinates are from the image centre, in eighths of its longer side.
-    Areas and deviations are in units of a quarter of that, so that all are of order one. Sums of pixels are exact, so
-    the numbers do not depend on which frames are computed together.
+    Per label: centroid x, y from the image centre, in eighths of its longer side; then, in units of a quarter of that,
+    root of the area, standard deviation along x, y; their correlation, doubled; and how far the label reaches from its
+    centroid in 16 directions, which tells how a box is turned. All are of order one. Sums of pixels are exact, so the
+    numbers do not depend on which frames are computed together.
     """
     _, height, width = labels.shape
     unit = max(height, width) / 8
     sums = pixel_sums(labels, num_labels).double()
-    area, x, y, xx, yy, xy, left, right, top, bottom = sums.unbind(-1)
+    area, x, y, xx, yy, xy = sums[..., :NUM_SUMS].unbind(-1)
     n = area.clamp(min=1)
     cx, cy = x / n, y / n
     sx = (xx / n - cx**2).clamp(min=0).sqrt()
     sy = (yy / n - cy**2).clamp(min=0).sqrt()
-    correlation = 2 * (xy / n - cx * cy) / (sx * sy + 1)
-    middle_x, middle_y = width / 2, height / 2
     values = torch.stack(
         [
-            area.sqrt() / (unit / 2),
-            *((cx + 0.5 - middle_x) / unit, (cy + 0.5 - middle_y) / unit),
-            *(sx / (unit / 4), sy / (unit / 4), correlation),
-            *((left - middle_x) / unit, (right + 1 - middle_x) / unit),
-            *((top - middle_y) / unit, (bottom + 1 - middle_y) / unit),
+            *((cx + 0.5 - width / 2) / unit, (cy + 0.5 - height / 2) / unit),
+            *(area.sqrt() / (unit / 4), sx / (unit / 4), sy / (unit / 4)),
+            2 * (xy / n - cx * cy) / (sx * sy + 1),
         ],
         -1,
     )
-    return torch.where((area >= LEAST_PIXELS)[..., None], values, 0.0).float()
+    along = torch.from_numpy(DIRECTIONS).to(labels.device).double()
+    middle = cx[..., None] * along[:, 0] + cy[..., None] * along[:, 1]
+    reach = (sums[..., NUM_SUMS:] - middle) / DIRECTION_LENGTH / (unit / 4)
+    out = torch.cat([values, reach], -1)
+    return torch.where((area >= LEAST_PIXELS)[..., None], out, 0.0).float()
 
 
 def pixel_sums(
     labels: UInt8[Tensor, "batch h w"], num_labels: int
-) -> Int64[Tensor, "batch label 10"]:
+) -> Int64[Tensor, "batch label 22"]:
     """Return sums over the pixels of each label but the background.
 
-    Per label: their number, the sums of x, y, x^2, y^2 and x y, then lowest and highest x and y; pixels are counted
-    from 0. On the CPU in one pass over the pixels, elsewhere by matrix products; both are exact.
+    Per label: their number, the sums of x, y, x^2, y^2 and x y, then the largest of `d_x x + d_y y` for each direction d
+    of `DIRECTIONS`; pixels are counted from 0. On the CPU in one pass over the pixels, elsewhere by matrix products;
+    both are exact.
     """
     if labels.device.type == "cpu":
         from policies.bc.pixel_sums import sum_pixels  # numba takes half a second to load
 
         out = np.zeros((len(labels), num_labels - 1, NUM_MOMENTS), np.int64)
-        sum_pixels(labels.numpy(), out)
+        sum_pixels(labels.numpy(), DIRECTIONS, out)
         return torch.from_numpy(out)
     return pixel_sums_by_products(labels, num_labels)
 
 
 def pixel_sums_by_products(
     labels: UInt8[Tensor, "batch h w"], num_labels: int
-) -> Int64[Tensor, "batch label 10"]:
+) -> Int64[Tensor, "batch label 22"]:
     """Return what `pixel_sums` does for labels that occur, on any device."""
     _, height, width = labels.shape
     x = torch.arange(width, device=labels.device, dtype=torch.float64)
     y = torch.arange(height, device=labels.device, dtype=torch.float64)
+    along = torch.from_numpy(DIRECTIONS).to(labels.device).double()
     out: list[Tensor] = []
     for k in range(1, num_labels):
-        mask = (labels == k).double()
+        seen = labels == k
+        mask = seen.double()
         by_row, x_by_row = (mask @ torch.stack([torch.ones_like(x), x], 1)).unbind(-1)
         by_column = mask.sum(1)
-        columns, rows = by_column > 0, by_row > 0
-        numbers = [
-            by_row.sum(1),
-            *(by_column @ x, by_row @ y, by_column @ x**2, by_row @ y**2, x_by_row @ y),
-            *(_first(columns), width - 1 - _first(columns.flip(1))),
-            *(_first(rows), height - 1 - _first(rows.flip(1))),
-        ]
-        out.append(torch.stack(numbers, -1))
+        left = seen.to(torch.uint8).argmax(2).double()
+        right = width - 1 - seen.flip(2).to(torch.uint8).argmax(2).double()
+        ends = torch.maximum(left[..., None] * along[:, 0], right[..., None] * along[:, 0])
+        ends = (ends + y[:, None] * along[:, 1]).masked_fill((by_row == 0)[..., None], -torch.inf)
+        numbers = [by_row.sum(1), by_column @ x, by_row @ y, by_column @ x**2, by_row @ y**2, x_by_row @ y]  # fmt: skip
+        out.append(torch.cat([torch.stack(numbers, -1), ends.amax(1).clamp(min=-1e12)], -1))
     return torch.stack(out, 1).long()
 
 
@@ -346,8 +358,3 @@ def _strided_convolutions(
     with torch.no_grad():
         picture = shrink(torch.zeros(1, channels, *shape), longer_side_px)
         return net, net(picture).shape[1]
-
-
-def _first(seen: Shaped[Tensor, "batch n"]) -> Float[Tensor, "batch"]:
-    """Return the position of the first true entry."""
-    return seen.to(torch.uint8).argmax(1).to(torch.float32)

@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 
-from policies.bc.encoders import CameraEncoder, Prepared
+from policies.bc.encoders import PREPARE_VERSION, CameraEncoder, Prepared
 from policies.bc.modeling_v2p_bc import BCNet
 
 logger = logging.getLogger(__name__)
@@ -286,7 +286,7 @@ def _identity(dataset: Path, meta: Any, net: BCNet, key: str) -> str:
     cfg = net.cfg
     settings = (
         *(cfg.is_mask(key), cfg.mask_greys, cfg.num_labels, cfg.input_size_px),
-        *(cfg.encoder, cfg.mask_moments),
+        *(cfg.encoder, cfg.mask_moments, PREPARE_VERSION),
     )
     digest.update(repr(settings).encode())
     return digest.hexdigest()

@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from policies.bc.encoders import (
+    DIRECTIONS,
     IMAGENET_MEAN,
     IMAGENET_STD,
     Standardiser,
@@ -88,16 +89,17 @@ def test_moments_measure_a_rectangle():
     labels[0, 10:20, 32:48] = 2  # rows 10 to 19, columns 32 to 47
     unit = 64 / 8
 
-    area, cx, cy, sx, sy, correlation, left, right, top, bottom = mask_moments(labels, 3)[0, 1]
+    cx, cy, area, sx, sy, correlation, *reach = mask_moments(labels, 3)[0, 1].tolist()
 
-    assert float(area) == pytest.approx(np.sqrt(160) / (unit / 2))
-    assert (float(cx), float(cy)) == pytest.approx((8 / unit, -17 / unit))
+    assert (cx, cy) == pytest.approx((8 / unit, -17 / unit))
+    assert area == pytest.approx(np.sqrt(160) / (unit / 4))
     # The variance of n evenly spaced pixels is (n^2 - 1) / 12.
-    assert float(sx) == pytest.approx(np.sqrt(255 / 12) / (unit / 4))
-    assert float(sy) == pytest.approx(np.sqrt(99 / 12) / (unit / 4))
-    assert float(correlation) == pytest.approx(0, abs=1e-6)
-    edges = [float(v) * unit for v in (left, right, top, bottom)]
-    assert edges == pytest.approx([0, 16, -22, -12])
+    assert (sx, sy) == pytest.approx(
+        (np.sqrt(255 / 12) / (unit / 4), np.sqrt(99 / 12) / (unit / 4))
+    )
+    assert correlation == pytest.approx(0, abs=1e-6)
+    corner = [7.5 * abs(np.cos(a)) + 4.5 * abs(np.sin(a)) for a in np.arange(16) * np.pi / 8]
+    assert reach == pytest.approx([c / (unit / 4) for c in corner], rel=2e-3)
 
 
 def test_moments_tell_which_way_a_stick_leans_and_are_zero_without_it():
@@ -135,7 +137,8 @@ def test_the_compiled_sums_and_the_matrix_products_agree():
     for n, k in ((0, 1), (1, 3)):
         mask = labels[n].numpy() == k
         px, py = x[mask], y[mask]
-        by_hand = [len(px), px.sum(), py.sum(), (px**2).sum(), (py**2).sum(), (px * py).sum(), px.min(), px.max(), py.min(), py.max()]  # fmt: skip
+        by_hand = [len(px), px.sum(), py.sum(), (px**2).sum(), (py**2).sum(), (px * py).sum()]
+        by_hand += [(dx * px + dy * py).max() for dx, dy in DIRECTIONS]
         assert sums[n, k - 1].tolist() == by_hand
     assert not sums[2, 1].any()
     products = pixel_sums_by_products(labels, 4)
