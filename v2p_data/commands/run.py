@@ -287,6 +287,15 @@ def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Pat
             f"the experts of {dataset} are not in {root}, so the policy clones its demonstrations only",
             file=sys.stderr,
         )
+    if (
+        runtime.device == "cpu"
+        and cfg.policy.preset != "small"
+        and cfg.policy.encoder == "resnet18"
+    ):
+        print(  # noqa: T201
+            "ResNet18 trains for hours to days on a CPU; --config configs/small.yaml takes minutes",
+            file=sys.stderr,
+        )
     stage = policy_stage(dataset.resolve(), record, cfg, sources)
     outcomes = _run([stage], _all_threads(runtime))
     for made in (*stage.inputs.values(), stage):  # what a policy waits for says why it failed
