@@ -56,6 +56,7 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
 
     kinds = {
         "generate": run.Generate, "train": run.Train, "eval": run.Evaluate, "demo": run.Demo,
+        "distill": run.Distill,
         "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
         "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify,
         "status": show.Shown, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.Review,

@@ -297,7 +297,9 @@ class _Run:
             writer.close()
         self._write_curve()
         self._keep_best()
+        # In this order: a state without the best checkpoint would end in other weights.
         (self.out / STATE_FILE).unlink(missing_ok=True)
+        (self.out / BEST_FILE).unlink(missing_ok=True)
         return Trained(
             final_loss=self.rows[-1][1],
             seconds=seconds,
@@ -369,7 +371,6 @@ class _Run:
         weights = load_file(best) if best.is_file() else self.mean.state_dict()
         self.policy.load_state_dict(weights)
         self.policy.eval()
-        best.unlink(missing_ok=True)
 
     def _save(self) -> None:
         temporary = self.out / f"{STATE_FILE}.tmp"
