@@ -53,7 +53,7 @@ def test_successful_episodes_are_staged_with_who_acted(calm: Path):
     told = json.loads((calm / "told.json").read_text())
 
     assert {path.parts[-3:-1] for path in paths} == {("toy", "episodes")}
-    assert {path.parts[-4] for path in paths} == {"0", "1"}
+    assert {path.parts[-4] for path in paths} == {"00", "01"}
     assert len({path.name for path in paths}) == len(paths) == told["episodes"]
     assert told["rollouts"] == 2 * 2 * DISTILLATION.worlds
     frames = 0
@@ -174,7 +174,7 @@ def test_a_killed_distillation_ends_like_an_undisturbed_one(
 
 
 def test_half_an_episode_is_no_episode(agreeing_referee, calm: Path, tmp_path: Path):
-    left = tmp_path / "rounds/0/toy/episodes/toy_handover0_00000.npz.tmp"
+    left = tmp_path / "rounds/00/toy/episodes/toy_handover0_00000.npz.tmp"
     left.parent.mkdir(parents=True)
     left.write_bytes(b"half")
 

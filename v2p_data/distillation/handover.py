@@ -105,7 +105,8 @@ def hand_over(
     student.reset(bundle.description)
     obs = env.observe()
     labels = np.zeros((n, size_px, size_px), np.uint8)
-    pictures, states, actions = [], [], []
+    pictures = np.empty((horizon, *labels.shape), np.uint8)
+    states, actions = [], []
     ends = EpisodeEnds(n, horizon, cut)
     with MaskRenderer(env.world, size_px, num_threads=num_threads) as renderer:
         for t in range(horizon):
@@ -119,7 +120,7 @@ def hand_over(
             action = label
             if (is_students := (t < takeover) & is_going).any():
                 action = np.where(is_students[:, None], student.act(labels, state), label)
-            pictures.append(labels.copy())
+            pictures[t] = labels
             states.append(state)
             actions.append(label)
             result = env.step(action)
@@ -130,7 +131,7 @@ def hand_over(
                 break
     return Handovers(
         seed=seed,
-        labels=np.stack(pictures),
+        labels=pictures[: len(states)],
         state=np.stack(states),
         action=np.stack(actions),
         taken_over_at=takeover,

@@ -201,7 +201,7 @@ def _distill(
             student.save(here)
         collected: list[dict[str, Any]] = []
         for k, (item, lesson) in enumerate(lessons.items()):
-            folder = out / ROUNDS_FOLDER / str(number) / item
+            folder = out / ROUNDS_FOLDER / f"{number:02d}" / item
             tell(0.5 + 0.5 * k / len(lessons), f"handing over {item}")
             collected += _collect(lesson, student, cfg, episodes, folder, number, seed_for(seed, item, number), num_threads)  # fmt: skip
             if not final.is_dir():
