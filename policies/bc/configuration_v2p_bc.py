@@ -29,7 +29,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "head": "regression",
         "pretrained_backbone_weights": BACKBONE_WEIGHTS,
         "optimizer_lr": 3e-4,
-        "optimizer_lr_backbone": 3e-5,
         "lr_schedule": "constant",
     },
     "small": {

@@ -171,7 +171,7 @@ def test_the_papers_preset_is_the_papers_network():
         256,
         2,
     )
-    assert (cfg.optimizer_lr, cfg.optimizer_lr_backbone) == (3e-4, 3e-5)
+    assert (cfg.optimizer_lr, cfg.optimizer_lr_backbone) == (3e-4, None)
     assert not cfg.mask_moments
 
 
