@@ -28,6 +28,8 @@ def policy_folder(tmp_path_factory) -> Path:
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
         input_size_px=32,
+        mask_moments=False,
+        head="regression",
         pretrained_backbone_weights=None,
         device="cpu",
         push_to_hub=False,

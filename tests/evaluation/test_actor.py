@@ -79,7 +79,7 @@ def test_another_policy_type_sees_what_lerobot_shows_it():
         loaded=LoadedPolicy(policy=policy, preprocessor=same, postprocessor=same),
         before=same,
         after=same,
-        values=torch.tensor(PALETTE, dtype=torch.float32) / 255,
+        values=np.asarray(PALETTE, np.float32) / np.float32(255),
         channels=3,
         task="lifting a cube",
         size_px=(12, 16),

@@ -166,7 +166,8 @@ def test_hostile_text_is_shown_and_never_run(run):
 
     assert_safe(page)
     assert page.text.count("<script>alert(1)</script>") >= 12
-    assert "49" not in re.findall(r"\{\{ 7\*7 \}\}|49", page.text)
+    shown = re.sub(r"pytest-\d+", "", page.text)  # the run's own path may hold the number
+    assert "49" not in re.findall(r"\{\{ 7\*7 \}\}|49", shown)
     assert len(page.of("title")) == 1
 
 
