@@ -28,6 +28,7 @@ from policies.bc.trainer import (
     save_policy,
     train,
 )
+from policies.threads import torch_threads
 
 STATE = "observation.state"
 STATE_STD_FLOOR = 0.01
@@ -98,12 +99,8 @@ class Student:
         batch = self.processors.before({STATE: torch.from_numpy(state)})
         batch[camera] = torch.from_numpy(self._greys(labels))[:, None].to(device)
         batch["task"] = [self.task] * len(state)
-        before = torch.get_num_threads()
-        torch.set_num_threads(self.num_threads)
-        try:
+        with torch_threads(self.num_threads):
             action = self.policy.select_action(batch)
-        finally:
-            torch.set_num_threads(before)
         return self.processors.after(action).numpy()
 
     # -- learning

@@ -9,7 +9,7 @@ import copy
 import csv
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from policies.bc.configuration_v2p_bc import V2PBCConfig
 from policies.bc.frames import ACTION, DatasetError, FrameTable
 from policies.bc.modeling_v2p_bc import V2PBCPolicy
+from policies.threads import torch_threads
 
 logger = logging.getLogger(__name__)
 
@@ -212,7 +213,7 @@ def train(
         DatasetError: the loss is not finite, or the saved state cannot be read.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with _threads(num_threads), torch.random.fork_rng():
+    with torch_threads(num_threads), torch.random.fork_rng():
         run = _Run(policy, normalised(table, processors), cfg, out, seed, judge, on_progress)
         return run.to_the_end()
 
@@ -433,16 +434,6 @@ def computes_bfloat16(device: torch.device) -> bool:
         found = torch.backends.cpu.get_cpu_capability()
         return "AVX512" in found and torch.cpu._is_avx512_bf16_supported()
     return False
-
-
-@contextlib.contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _optimizer(policy: V2PBCPolicy) -> torch.optim.Optimizer:
