@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from policies.ppo.config import ImitationConfig
 from policies.ppo.policy import ActorCritic, Expert, load_weights, weights_of
-from policies.ppo.train import torch_threads
+from policies.threads import torch_threads
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,7 @@ import logging
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -44,6 +43,7 @@ from policies.ppo.curve import (
 )
 from policies.ppo.evaluate import evaluate, outcome
 from policies.ppo.policy import ActorCritic, Expert, load_weights, weights_of
+from policies.threads import torch_threads
 
 log = logging.getLogger(__name__)
 
@@ -536,14 +536,3 @@ def _check_recipe(saved: dict[str, Any], asked: dict[str, Any], path: Path) -> N
         raise ValueError(
             f"{path} was made with another recipe ({what}); train in an empty folder instead"
         )
-
-
-@contextmanager
-def torch_threads(num_threads: int) -> Iterator[None]:
-    """Let torch use so many threads within."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(num_threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
