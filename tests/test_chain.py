@@ -23,7 +23,7 @@ expert:
   ppo: {total_steps: 60000, window_episodes: 16, min_window_episodes: 8, num_deterministic: 16}
 episodes: {num_episodes: 3, batch_worlds: 32, size_px: 64}
 """
-PATIENCE_S = 300
+PATIENCE_S = 480
 
 
 @pytest.fixture(scope="module")

@@ -35,9 +35,8 @@ def paid(code, scene, **states):
     drawn = random_states(scene, 32, np.random.default_rng(0)) | states
     tensors = {k: torch.as_tensor(np.asarray(v), dtype=torch.float32) for k, v in drawn.items()}
     task = load_task(code, FakePlacer(tensors, [o.name for o in scene.objects]), scene)
-    task.compute_observation_key(tensors)
-    total, parts = task.compute_reward(torch.full((len(tensors["eef_pos"]), 7), 0.1), tensors)
-    return total.numpy(), {k: v.numpy() for k, v in parts.items()}
+    said = task.judge(lambda: tensors, torch.full((len(tensors["eef_pos"]), 7), 0.1))
+    return said.reward.numpy(), {k: v.numpy() for k, v in said.components.items()}
 
 
 def feedback(successes=0, *, came=(), scene=None, **components):

@@ -123,9 +123,9 @@ BASE_PROGRESS = 72
 
 
 def _progress_columns(env: BatchEnv) -> list[int]:
-    states = env.states()
+    states = env.task_states()
     found, start = [], 0
-    for key in env.task.compute_observation_key(states):
+    for key in env.task.observed_keys(states):
         if key == "base_observation":
             found.append(start + BASE_PROGRESS)
         elif key == "progress":

@@ -208,9 +208,8 @@ class BatchEnv:
         fields = {name: array[looked_at] for name, array in self.randomizer.fields().items()}
         check_start(self.world, fields, self._qpos[looked_at], bundle.title)
         self.obs_dim = task_code.checked_obs_dim(self.task, bundle.title, self.observe().shape[1])
-        self.component_names = task_code.component_names(
-            self.task, torch.zeros(num_envs, ACT_DIM), self.states()
-        )
+        idle = torch.zeros(num_envs, ACT_DIM)
+        self.component_names = tuple(self.task.judge(self.task_states, idle).components)
 
     # -- what task code may ask for
 
@@ -269,13 +268,8 @@ class BatchEnv:
         self._target_pos[ids] = tool_pos
         self._target_quat[ids] = _turned_down(yaw)
         self._target_finger[ids] = self._robot.finger_travel_m
-        poses = self.task.reset_objects_states(torch.from_numpy(ids))
+        poses = self.task.reset_poses(torch.from_numpy(ids), self.object_names)
         for k, name in enumerate(self.object_names):
-            if name not in poses or tuple(poses[name].shape) != (n, 7):
-                raise V2PError(
-                    f"reset_objects_states of task '{self.bundle.title}' must give '{name}' poses of shape "
-                    f"({n}, 7); it gave { {key: tuple(pose.shape) for key, pose in poses.items()} }"
-                )
             self._object_qpos[ids, k] = poses[name].numpy()
         self._start_pose[ids] = self._object_qpos[ids]
         self._steps[ids] = 0
@@ -335,14 +329,21 @@ class BatchEnv:
 
     def observe(self) -> Float32[np.ndarray, "env obs"]:
         """Return the observation of all worlds as they are."""
-        return self._observation(self.states())
+        return self._observation(self.task.observe(self.task_states))
 
-    def _observation(self, states: dict[str, torch.Tensor]) -> Float32[np.ndarray, "env obs"]:
-        obs = task_code.observation(self.task, states)
+    def _observation(self, obs: torch.Tensor) -> Float32[np.ndarray, "env obs"]:
+        """Return a copy of what the task observed, 0 where it is not finite because the world broke down."""
         array = obs.clone(memory_format=torch.contiguous_format).numpy()
-        if not np.isfinite(array).all():
-            np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        return array.astype(np.float32, copy=False)
+        finite = np.isfinite(array)
+        if not finite.all():
+            odd = np.flatnonzero(~finite.all(1) & ~self._broken)
+            if len(odd):
+                raise V2PError(
+                    f"the observation of task '{self.bundle.title}' is not finite in world {odd[0]} although its "
+                    f"state is; first in column {np.flatnonzero(~finite[odd[0]])[0]}"
+                )
+            array[~finite] = 0.0
+        return array
 
     def step(
         self, action: Float[np.ndarray, "env 7"], moving: Int[np.ndarray, "n"] | None = None
@@ -371,8 +372,15 @@ class BatchEnv:
         return self._judge(torch.from_numpy(clipped.astype(np.float32).T))
 
     def states(self) -> dict[str, torch.Tensor]:
-        """Return the tensors task code sees; they share memory that the next step or reset overwrites."""
+        """Return the states that success is judged by, never to be given to task code: see `task_states`.
+
+        They share memory that the next step or reset overwrites.
+        """
         return self._block.tensors()
+
+    def task_states(self) -> dict[str, torch.Tensor]:
+        """Return copies for task code. The next call overwrites them."""
+        return self._block.copies()
 
     def robot_state(self) -> Float32[np.ndarray, "env 11"]:
         """Return `observation.state`.
@@ -556,19 +564,20 @@ class BatchEnv:
         )
 
     def _judge(self, action: Float32[torch.Tensor, "env 7"]) -> StepResult:
-        states = self.states()
         ok = ~self._broken
-        with torch.inference_mode():
-            # First: a reward may use what the observation adds to the states.
-            obs = self._observation(states)
-            success = self.task.compute_success(states).numpy().astype(bool) & ok
-            total, parts = self.task.compute_reward(action, states)
-        task_reward = self._of_sound_worlds(total)
+        said = self.task.judge(self.task_states, action)
+        obs = self._observation(said.observation)
+        if obs.shape[1] != self.obs_dim:
+            raise V2PError(
+                f"task '{self.bundle.title}' observes {obs.shape[1]} numbers after it observed {self.obs_dim}"
+            )
+        success = said.success.numpy() & ok
+        task_reward = self._of_sound_worlds(said.reward)
         if not np.isfinite(task_reward).all():
             env = int(np.flatnonzero(~np.isfinite(task_reward))[0])
             raise V2PError(
                 f"the reward of task '{self.bundle.title}' is {task_reward[env]} in world {env} although its state "
-                f"is finite; parts: { {k: float(v[env]) for k, v in parts.items()} }"
+                f"is finite; parts: { {k: float(v[env]) for k, v in said.components.items()} }"
             )
         self._held = np.where(success, self._held + 1, 0)
         reward = (task_reward + self.cfg.success_bonus * success) / self.cfg.reward_scale
@@ -580,7 +589,7 @@ class BatchEnv:
             terminated=self._broken.copy(),
             truncated=(self._steps >= self.horizon) & ok,
             task_reward=task_reward,
-            components={k: self._of_sound_worlds(v) for k, v in parts.items()},
+            components={k: self._of_sound_worlds(v) for k, v in said.components.items()},
         )
 
     def _of_sound_worlds(self, value: torch.Tensor) -> Float32[np.ndarray, "env"]:

@@ -89,7 +89,11 @@ class StateBlock:
         self._columns = np.zeros((width, num_envs), np.float32)
         self._base = np.zeros((BASE_OBSERVATION_DIM, num_envs), np.float32)
         self._rows = torch.zeros(num_envs, width)
-        self._tensors = self._views()
+        self._base_tensor = torch.from_numpy(self._base)
+        self._copied_rows = torch.zeros_like(self._rows)
+        self._copied_base = torch.zeros_like(self._base_tensor)
+        self._tensors = self._views(self._rows, self._base_tensor)
+        self._copied = self._views(self._copied_rows, self._copied_base)
 
     def fill(self, rows: slice | np.ndarray, seen: Observed) -> None:
         """Overwrite `rows`, all or listed ones, with what was seen of them."""
@@ -111,12 +115,18 @@ class StateBlock:
         """Return the states as views; new dict, shared memory."""
         return dict(self._tensors)
 
-    def _views(self) -> dict[str, torch.Tensor]:
-        states = {key: self._rows[:, columns] for key, columns in _ROBOT_COLUMNS.items()}
-        states["base_observation"] = torch.from_numpy(self._base.T)
+    def copies(self) -> dict[str, torch.Tensor]:
+        """Return the states as views of other memory, which the next call writes anew: for task code to keep."""
+        self._copied_rows.copy_(self._rows)
+        self._copied_base.copy_(self._base_tensor)
+        return dict(self._copied)
+
+    def _views(self, rows: torch.Tensor, base: torch.Tensor) -> dict[str, torch.Tensor]:
+        states = {key: rows[:, columns] for key, columns in _ROBOT_COLUMNS.items()}
+        states["base_observation"] = base.T
         for k, name in enumerate(self._names):
             start = NUM_ROBOT_COLUMNS + NUM_OBJECT_COLUMNS * k
-            block = self._rows[:, start : start + NUM_OBJECT_COLUMNS]
+            block = rows[:, start : start + NUM_OBJECT_COLUMNS]
             for key, columns in _OBJECT_COLUMNS.items():
                 states[f"{name}_{key}"] = block[:, columns]
         return states

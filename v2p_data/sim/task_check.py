@@ -12,6 +12,7 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.seeds import rng_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.task.audit import build_probes
+from v2p_data.task.guarded import GuardedTask, Show
 from v2p_data.task.task import Task, TaskBundle
 
 NUM_WORLDS = 64
@@ -40,7 +41,7 @@ def check_task(
         bundle, SimConfig(), num_envs=NUM_WORLDS, seed=seed, num_threads=num_threads, task=task
     )
     where = f"success of task '{bundle.title}' ({bundle.kind})"
-    at_start = _share(env.task, env.states())
+    at_start = _share(env.task, env.task_states)
     searched, count = _searched(env, bundle, seed)
     if at_start == 1 and searched == 1:
         raise ItemRejectedError(
@@ -79,9 +80,8 @@ def _searched(env: BatchEnv, bundle: TaskBundle, seed: int) -> tuple[float, int]
     """Return the share of the audit's states in which success is true, and their number."""
     probes = build_probes(bundle.scene, rng_for(seed, "audit", bundle.title))
     states = {name: torch.from_numpy(values) for name, values in probes.states.items()}
-    return _share(env.task, states), len(probes.states["eef_pos"])
+    return _share(env.task, lambda: states), len(probes.states["eef_pos"])
 
 
-def _share(task: Task, states: dict[str, torch.Tensor]) -> float:
-    task.compute_observation_key(states)  # success may read what it adds
-    return float(task.compute_success(states).float().mean())
+def _share(task: GuardedTask, show: Show) -> float:
+    return float(task.succeeds(show).float().mean())

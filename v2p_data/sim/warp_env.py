@@ -111,9 +111,8 @@ class WarpBatchEnv:
         self.task = task_code.load(bundle, self, task)
         self.reset(torch.arange(num_envs, device=self.device))
         self.obs_dim = task_code.checked_obs_dim(self.task, bundle.title, self.observe().shape[1])
-        self.component_names = task_code.component_names(
-            self.task, self._zeros(num_envs, ACT_DIM), self.states()
-        )
+        idle = self._zeros(num_envs, ACT_DIM)
+        self.component_names = tuple(self.task.judge(self.task_states, idle).components)
 
     @property
     def broken_count(self) -> int:
@@ -161,13 +160,8 @@ class WarpBatchEnv:
         self._target_pos[ids] = self._to_device(tool_pos)
         self._target_quat[ids] = self._to_device(down)
         self._target_finger[ids] = FINGER_TRAVEL_M
-        poses = self.task.reset_objects_states(ids)
+        poses = self.task.reset_poses(ids, self.object_names)
         for k, name in enumerate(self.object_names):
-            if name not in poses or tuple(poses[name].shape) != (n, 7):
-                raise V2PError(
-                    f"reset_objects_states of task '{self.bundle.title}' must give '{name}' poses of shape "
-                    f"({n}, 7); it gave { {key: tuple(pose.shape) for key, pose in poses.items()} }"
-                )
             self._object_qpos[ids, k] = poses[name].to(self.device, torch.float32)
         self._start_pose[ids] = self._object_qpos[ids]
         self._steps[ids] = 0
@@ -182,7 +176,7 @@ class WarpBatchEnv:
 
     def observe(self) -> Float32[torch.Tensor, "env obs"]:
         """Return the observation of all worlds as they are."""
-        return self._observation(self.states())
+        return self._observation(self.task.observe(self.task_states))
 
     def step(self, action: Float[torch.Tensor, "env 7"]) -> TensorStepResult:
         """Carry out one action of 50 ms in every world; actions are clipped to [-1, 1]."""
@@ -207,8 +201,16 @@ class WarpBatchEnv:
         return self._judge(clipped)
 
     def states(self) -> dict[str, torch.Tensor]:
-        """Return the tensors task code sees; they share memory that the next step or reset overwrites."""
+        """Return the states that success is judged by, never to be given to task code: see `task_states`.
+
+        They share memory that the next step or reset overwrites.
+        """
         return named_states(self._robot, self._objects, self._base, self.object_names)
+
+    def task_states(self) -> dict[str, torch.Tensor]:
+        """Return copies for task code."""
+        blocks = (self._robot.clone(), self._objects.clone(), self._base.clone())
+        return named_states(*blocks, self.object_names)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything the next step depends on, on the host; see `load_state_dict`."""
@@ -275,8 +277,7 @@ class WarpBatchEnv:
             **{f"env.{name}": getattr(self, name) for name in names},
         }
 
-    def _observation(self, states: dict[str, torch.Tensor]) -> Float32[torch.Tensor, "env obs"]:
-        obs = task_code.observation(self.task, states)
+    def _observation(self, obs: torch.Tensor) -> Float32[torch.Tensor, "env obs"]:
         return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0)
 
     def _move_targets(self, action: torch.Tensor) -> None:
@@ -336,11 +337,10 @@ class WarpBatchEnv:
         self._base = base_observation(seen, self._is_round)
 
     def _judge(self, action: torch.Tensor) -> TensorStepResult:
-        states = self.states()
-        obs = self._observation(states)  # first: a reward may use what it adds to the states
+        said = self.task.judge(self.task_states, action)
+        obs, total, parts = self._observation(said.observation), said.reward, said.components
         ok = ~self._broken
-        success = self.task.compute_success(states).bool() & ok
-        total, parts = self.task.compute_reward(action, states)
+        success = said.success & ok
         zero = torch.zeros_like(total)
         task_reward = torch.where(ok, total.detach(), zero).float()
         self._check(task_reward, parts)

@@ -84,7 +84,7 @@ SCRIPT_DECORATOR = "torch.jit.script"
 STATIC_DECORATOR = "staticmethod"
 
 IN_PLACE = _words("add_ clamp_ clip_ div_ fill_ masked_fill_ mul_ sub_ zero_")
-"""Harmless on tensors of the task's own; `watched` sees to it that they are not used on others."""
+"""Harmless on tensors of the task's own; `guarded` sees to it that they are not used on others."""
 
 ATTRIBUTES = (
     _MATHS

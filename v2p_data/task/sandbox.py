@@ -10,7 +10,7 @@ What it covers. Three walls, one behind the other:
   long, deep or many-noded programs and huge constants. Every refusal names the line and the reason.
 - `load_task` runs what is left with a handful of builtins and stand-ins for `torch`, `math` and `torch.Tensor`
   that hold the listed functions and nothing else. Of the environment it sees `num_envs` and copies of what
-  `sample_object_poses` gives, and a call that writes into a state or into the actions is an error (`watched`).
+  `sample_object_poses` gives. States are copies too, and every answer is checked (`guarded`).
 - `smoke.smoke_run` runs unknown code in a child process first, which has given up its rights (`confine`): no
   file, no socket, no process, no program, an empty folder and environment, and limits on time and memory. What comes
   back is JSON, read as data; nothing is ever unpickled.
@@ -33,26 +33,32 @@ import torch
 
 from v2p_data.scene.scene import Scene
 from v2p_data.task import allowed
+from v2p_data.task.guarded import GuardedTask, PlacerView
 from v2p_data.task.reader.check import checked_tree
 from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.task import Placer, Task
-from v2p_data.task.watched import watch
 
 MAX_RANGE = 1_000
 CODE_NAME = "<task code>"
 
 
-def load_task(source: str, envs: Placer, scene: Scene) -> Task:
-    """Return an instance of the one task class in `source`.
+def load_task(source: str, envs: Placer, scene: Scene) -> GuardedTask:
+    """Return the one task class in `source`, made and guarded.
 
     Raises:
         TaskCodeError: the code is refused, or it does not load.
     """
-    return make_task(source, envs, str(scene.folder))
+    return make_task(source, envs, str(scene.folder), scene.title)
 
 
-def make_task(source: str, envs: Placer, urdf_assets_root: str) -> Task:
-    """Return an instance of the one task class in `source`, made as the paper makes it.
+def make_task(source: str, envs: Placer, urdf_assets_root: str, title: str = "") -> GuardedTask:
+    """Return the one task class in `source`, made as the paper makes it, and guarded.
+
+    Args:
+        source: task code.
+        envs: the environment.
+        urdf_assets_root: folder of the object files.
+        title: for messages.
 
     Raises:
         TaskCodeError: the code is refused, or it does not load.
@@ -67,12 +73,13 @@ def make_task(source: str, envs: Placer, urdf_assets_root: str) -> Task:
             for v in namespace.values()
             if isinstance(v, type) and issubclass(v, Task) and v is not Task
         ]
-        watch(made[0])
-        return made[0](_PlacerView(envs), urdf_assets_root)  # pyright: ignore[reportCallIssue]
+        view = PlacerView(envs)
+        task = made[0](view, urdf_assets_root)  # pyright: ignore[reportCallIssue]
     except Exception as error:
         raise TaskCodeError(
             f"it does not load: {type(error).__name__}: {error}", line_in_task_code(error)
         ) from error
+    return GuardedTask(task, view, title)
 
 
 def class_name(source: str) -> str:
@@ -113,23 +120,6 @@ class _Strip(ast.NodeTransformer):
         if node.value is None:
             return ast.copy_location(ast.Pass(), node)
         return ast.copy_location(ast.Assign(targets=[node.target], value=node.value), node)
-
-
-class _PlacerView:
-    """The two things of the environment that task code may use."""
-
-    __slots__ = ("_envs",)
-
-    def __init__(self, envs: Placer) -> None:
-        self._envs = envs
-
-    @property
-    def num_envs(self) -> int:
-        return self._envs.num_envs
-
-    def sample_object_poses(self, env_ids: torch.Tensor) -> dict[str, torch.Tensor]:
-        # Copies, so that what task code does to them stays its own.
-        return {n: p.clone() for n, p in self._envs.sample_object_poses(env_ids).items()}
 
 
 class _TensorKind(type):

@@ -4,6 +4,7 @@
 or a memory bomb in one sample is that sample's own result. See `sandbox` for what the child may not do.
 """
 
+import hashlib
 import json
 import math
 import os
@@ -28,6 +29,8 @@ from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.source_text import shown
 
 BATCH = 16
+PARTS = 3
+"""Batch sizes, drawn at random, at which every program is asked again."""
 MAX_ANSWER_CHARS = 20_000_000
 
 
@@ -117,12 +120,17 @@ def trial_request(
     sources: list[str], scene: Scene, probes: States | None, seconds_each: float
 ) -> dict[str, Any]:
     """Return what the child is asked, as data that JSON can hold."""
-    states = random_states(scene, BATCH, rng_for(0, "smoke", scene.title))
+    rng = rng_for(
+        0, "smoke", scene.title, *(hashlib.sha256(s.encode()).hexdigest() for s in sources)
+    )
+    count = int(rng.integers(BATCH // 2, 2 * BATCH))
+    states = random_states(scene, count, rng)
     return {
         "sources": sources,
         "object_names": [o.name for o in scene.objects],
         "states": _as_lists(states),
         "edge_states": _as_lists(_edge_states(scene)),
+        "batch_sizes": rng.integers(1, count, PARTS).tolist(),
         "probes": _as_lists(probes or {}),
         "seconds_each": seconds_each,
     }

@@ -17,13 +17,12 @@ from typing import Any
 import torch
 
 from v2p_data.task.confine import confine, leave_the_network
+from v2p_data.task.guarded import Answers, GuardedTask, TaskOutputError, demand_equal
 from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.sandbox import line_in_task_code, make_task
-from v2p_data.task.watched import StatesChangedError
 
 MEMORY_BYTES = 2 * 1024**3
 """On top of what importing torch has mapped."""
-MAX_COMPONENTS = 32
 MAX_REWARD = 1000.0
 """Ten times the bonus for success, which then hardly counts."""
 MAX_ANSWER_BYTES = 4_000_000
@@ -94,118 +93,67 @@ def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
     names: list[str] = request["object_names"]
     task = make_task(source, FakePlacer(states, names), "")
     n = len(states["eef_pos"])
-    _check_reset(task, names, n)
+    task.reset_poses(torch.arange(n), names)
 
-    first = _outputs(task, states)
-    if not all(torch.equal(a, b) for a, b in _pairs(first, _outputs(task, states))):
-        raise BadTaskError("two calls with the same states give different results")
+    first = _answers(task, states)
+    demand_equal(first, _answers(task, states))
     order = torch.arange(n - 1, -1, -1)
-    turned = _outputs(task, {k: v[order] for k, v in states.items()})
+    turned = _answers(task, {k: v[order] for k, v in states.items()})
     if not all(_close(a[order], b) for a, b in _pairs(first, turned)):
         raise BadTaskError("the result depends on the order of the environments")
     warnings: list[str] = []
-    half = _outputs(task, {k: v[: n // 2] for k, v in states.items()})
-    if not all(_close(a[: n // 2], b) for a, b in _pairs(first, half)):
-        warnings.append("the result for one environment depends on the others")
-    edge = _outputs(task, _tensors(request["edge_states"]))
-    biggest = max(float(first["reward"].max()), float(edge["reward"].max()))
+    for count in request["batch_sizes"]:
+        some = _answers(task, {k: v[:count] for k, v in states.items()})
+        if not all(_close(a[:count], b) for a, b in _pairs(first, some)):
+            warnings.append("the result for one environment depends on the others")
+            break
+    edge = _answers(task, _tensors(request["edge_states"]))
+    biggest = max(float(first.reward.max()), float(edge.reward.max()))
     if biggest > MAX_REWARD:
         warnings.append(
             f"the reward reaches {biggest:.3g}; the bonus for success, 100, hardly counts"
         )
     answer = {
         "runnable": True,
-        "observation_dim": first["observation"].shape[1],
-        "components": [k.removeprefix("part ") for k in first if k.startswith("part ")],
+        "observation_dim": first.observation.shape[1],
+        "components": list(first.components),
         "warnings": warnings,
         "seconds": time.monotonic() - begin,
     }
     if request["probes"]:
-        probes = _outputs(task, _tensors(request["probes"]))
+        probes = _answers(task, _tensors(request["probes"]))
         answer |= {
-            "probe_success": probes["success"].int().tolist(),
-            "probe_reward": probes["reward"].tolist(),
+            "probe_success": probes.success.int().tolist(),
+            "probe_reward": probes.reward.tolist(),
         }
     return answer
 
 
-def _check_reset(task: Any, names: list[str], n: int) -> None:
-    ids = torch.arange(n)
-    poses = task.reset_objects_states(ids)
-    if not isinstance(poses, dict) or set(poses) != set(names):
-        raise BadTaskError(
-            f"reset_objects_states must return a pose per object: {', '.join(names)}"
-        )
-    for name, pose in poses.items():
-        if not isinstance(pose, torch.Tensor) or pose.shape != (n, 7):
-            raise BadTaskError(f"the reset pose of {name} must be a tensor of shape ({n}, 7)")
-        if not pose.isfinite().all() or not _close(pose[:, 3:].norm(dim=1), torch.ones(n)):
-            raise BadTaskError(
-                f"the reset pose of {name} is not finite or its quaternion is not of length 1"
-            )
-
-
-def _outputs(task: Any, given: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return observation, success, reward and its parts, checked, in the order in which the simulator asks."""
+def _answers(task: GuardedTask, given: dict[str, torch.Tensor]) -> Answers:
+    """Return copies of all that the task says of these states, checked."""
     n = len(given["eef_pos"])
-    states = {k: v.clone() for k, v in given.items()}
     begin = time.monotonic()
-    keys = task.compute_observation_key(states)
-    if not isinstance(keys, list) or not all(isinstance(k, str) for k in keys):
-        raise BadTaskError("compute_observation_key must return a list of keys")
-    columns: list[torch.Tensor] = []
-    for key in keys:
-        if key not in states:
-            raise BadTaskError(f"observation key '{key}' is not in states")
-        _check_tensor(f"observation '{key}'", states[key], n, max_dim=2)
-        columns.append(states[key].reshape(n, -1).float())
-    observation = torch.cat(columns, dim=1)
-    said = task.get_observation_space()
-    if not isinstance(said, int) or said != observation.shape[1]:
+    answers = task.judge(
+        lambda: {k: v.clone() for k, v in given.items()}, torch.full((n, 7), 0.1)
+    ).cloned()
+    said = task.observation_size()
+    if said != answers.observation.shape[1]:
         raise BadTaskError(
-            f"get_observation_space says {said}, but the observation has length {observation.shape[1]}"
+            f"get_observation_space says {said}, but the observation has length {answers.observation.shape[1]}"
         )
-    success = task.compute_success(states)
-    _check_tensor("compute_success", success, n, kind=torch.bool)
-    result = task.compute_reward(torch.full((n, 7), 0.1), states)
-    if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
-        raise BadTaskError("compute_reward must return the reward and a dict of its components")
-    reward, parts = result
-    _check_tensor("the reward", reward, n, kind=torch.float32)
-    if not 0 < len(parts) <= MAX_COMPONENTS or not all(isinstance(k, str) for k in parts):
-        raise BadTaskError(f"the reward needs 1 to {MAX_COMPONENTS} named components")
-    for name, part in parts.items():
-        _check_tensor(f"reward component '{name}'", part, n)
+    answers.check_finite()
+    if not answers.components:
+        raise BadTaskError("the reward needs at least one named component")
     if time.monotonic() - begin > SLOW_S:
         raise BadTaskError(f"one step of {n} environments takes more than {SLOW_S:.0f} s")
-    for key, value in given.items():
-        if not torch.equal(states[key], value):
-            raise BadTaskError(f"it changes states['{key}'] in place; work on a copy")
-    named = {f"part {k}": v.float() for k, v in parts.items()}
-    return {"observation": observation, "success": success, "reward": reward, **named}
+    return answers
 
 
-def _check_tensor(
-    what: str, value: Any, n: int, *, kind: torch.dtype | None = None, max_dim: int = 1
-) -> None:
-    if not isinstance(value, torch.Tensor):
-        raise BadTaskError(f"{what} must be a tensor, not {type(value).__name__}")
-    if value.ndim < 1 or value.ndim > max_dim or value.shape[0] != n:
-        raise BadTaskError(
-            f"{what} must have one row per environment ({n}), not shape {tuple(value.shape)}"
-        )
-    if kind is not None and value.dtype != kind:
-        raise BadTaskError(f"{what} must be of type {kind}, not {value.dtype}")
-    if not value.float().isfinite().all():
-        raise BadTaskError(f"{what} is not finite")
-
-
-def _pairs(
-    a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]
-) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    if a.keys() != b.keys():
+def _pairs(a: Answers, b: Answers) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    one, other = a.named(), b.named()
+    if one.keys() != other.keys():
         raise BadTaskError("the names of the reward components change from call to call")
-    return [(a[k], b[k]) for k in a]
+    return [(one[k], other[k]) for k in one]
 
 
 def _close(a: torch.Tensor, b: torch.Tensor) -> bool:
@@ -263,7 +211,7 @@ def answer(source: str, request: dict[str, Any]) -> dict[str, Any]:
     """Return the verdict on task code as data, whatever the code does."""
     try:
         return judge(source, request)
-    except (BadTaskError, TaskCodeError, StatesChangedError) as error:
+    except (BadTaskError, TaskCodeError, TaskOutputError) as error:
         return _failed(str(error))
     except MemoryError:
         return _failed("it needs too much memory")

@@ -1,0 +1,290 @@
+"""Task code that cheats, or answers what it may not: in the simulator, past the trial run, which it may have deceived."""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from v2p_data.episodes.rollouts import CutConfig, roll_out
+from v2p_data.errors import V2PError
+from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.task import guarded
+from v2p_data.task.guarded import StatesChangedError, TaskOutputError
+from v2p_data.task.task import TaskBundle
+
+NUM_WORLDS = 6
+CODE = """
+import torch
+scene_info = {{}}
+
+class Lift(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, scene_info)
+        self.count = 0
+        self.kept = []
+
+    def reset_objects_states(self, env_ids):
+        {reset}
+        return self.envs.sample_object_poses(env_ids)
+
+    def compute_observation_key(self, states):
+        keys = super().compute_observation_key(states)
+        {observe}
+        return keys
+
+    def get_observation_space(self):
+        return {size}
+
+    def compute_success(self, states):
+        self.count = self.count + 1
+        success = states["cube_pos"][:, 2] > 0.2
+        {success}
+        return success
+
+    def compute_reward(self, actions, states):
+        reward = states["cube_pos"][:, 2] * 1.0
+        parts = {{"height": reward}}
+        {reward}
+        return reward, parts
+"""
+
+
+def code(size="90", **bodies: str) -> str:
+    parts = ("reset", "observe", "success", "reward")
+    indented = {k: bodies.get(k, "pass").replace("\n", "\n        ") for k in parts}
+    return CODE.format(size=size, **indented)
+
+
+@pytest.fixture
+def make_env(make_bundle: Callable[..., TaskBundle]) -> Callable[..., BatchEnv]:
+    def make(**bodies: str) -> BatchEnv:
+        bundle = replace(make_bundle(), code=code(**bodies), class_name="Lift")
+        return BatchEnv(bundle, num_envs=NUM_WORLDS, seed=0, num_threads=1)
+
+    return make
+
+
+def idle(env: BatchEnv, steps: int = 12) -> None:
+    for _ in range(steps):
+        env.step(np.zeros((NUM_WORLDS, 7)))
+
+
+FORGERIES = {
+    "the observation of a dict of its own, then a write": {
+        "success": "own = {}\nfor key in states:\n    own[key] = states[key] * 0\nself.compute_observation_key(own)\n"
+        "states['cube_pos'][:, 2] = 0.5\nsuccess = states['cube_pos'][:, 2] > 0.2"
+    },
+    "a state that was kept, written into in another call": {
+        "observe": "self.kept.append(states['cube_pos'])",
+        "success": "self.kept[0].add_(1.0)\nsuccess = states['cube_pos'][:, 2] > 0.2",
+    },
+    "a state replaced by another tensor": {
+        "success": "states['cube_pos'] = states['cube_pos'] + 1.0\nsuccess = states['cube_pos'][:, 2] > 0.2"
+    },
+    "a state taken away and put back larger": {
+        "success": "lost = states.pop('cube_pos')\nstates.setdefault('cube_pos', lost + 1.0)\n"
+        "success = states['cube_pos'][:, 2] > 0.2"
+    },
+    "many states by update": {
+        "observe": "states.update({'cube_pos': states['cube_pos'] + 1.0, 'cube_start_pos': states['cube_pos'] * 0})",
+    },
+    "a view of a state, through a helper": {
+        "reward": "row = states['cube_pos'][:, 2]\nrow.fill_(1.0)",
+    },
+    "the dict itself, kept and filled during a reset": {
+        "observe": "self.kept.append(states)",
+        "reset": "for old in self.kept:\n    for key in old:\n        old[key].fill_(1.0)",
+    },
+    "the poses of the last reset, kept and lifted": {
+        "reset": "for old in self.kept:\n    old.add_(1.0)\nself.kept.append(self.envs.sample_object_poses(env_ids)['cube'])",
+    },
+    "the actions": {"reward": "actions.fill_(1.0)"},
+    "success for everybody": {"success": "success = states['cube_pos'][:, 2] > -1.0"},
+}
+
+
+@pytest.mark.parametrize("bodies", FORGERIES.values(), ids=FORGERIES)
+def test_no_idle_robot_gets_an_episode_that_counts(
+    bodies: dict[str, str], make_bundle: Callable[..., TaskBundle]
+):
+    bundle = replace(make_bundle(horizon=14), code=code(**bodies), class_name="Lift")
+
+    counted = 0
+    with contextlib.suppress(StatesChangedError):
+        counted = roll_out(
+            bundle,
+            lambda obs: np.zeros((len(obs), 7), np.float32),
+            SimConfig(),
+            num_worlds=NUM_WORLDS,
+            seed=0,
+            cut=CutConfig(),
+        ).successes.sum()
+
+    assert counted == 0
+
+
+def test_the_states_that_are_judged_are_those_of_the_physics(make_env: Callable[..., BatchEnv]):
+    name = "the dict itself, kept and filled during a reset"
+    honest, hostile = make_env(), make_env(**FORGERIES[name])
+    for env in (honest, hostile):
+        idle(env, 3)
+        env.reset(np.array([1, 4]))
+
+    for key, value in honest.states().items():
+        assert torch.equal(hostile.states()[key], value), key
+
+
+def test_a_reset_reaches_only_the_worlds_that_it_is_of(make_env: Callable[..., BatchEnv]):
+    env = make_env(
+        reset="if len(env_ids) == 2:\n    ids = env_ids * 1\n    env_ids.fill_(0)\n    env_ids = ids"
+    )
+    before = env.states()["cube_pos"].clone()
+
+    env.reset(np.array([2, 3]))
+
+    after = env.states()["cube_pos"]
+    assert torch.equal(after[[0, 1, 4, 5]], before[[0, 1, 4, 5]])
+    assert not torch.equal(after[[2, 3]], before[[2, 3]])
+
+
+DRAWS = {
+    "in success": {"success": "self.envs.sample_object_poses(states['cube_pos'][:, 0].long())"},
+    "in the observation": {"observe": "self.envs.sample_object_poses(torch.arange(1))"},
+    "in the reward": {"reward": "self.envs.sample_object_poses(torch.arange(1))"},
+    "of other worlds in a reset": {"reset": "self.envs.sample_object_poses(env_ids * 0)"},
+    "of fewer worlds in a reset": {"reset": "self.envs.sample_object_poses(env_ids[:1])"},
+}
+
+
+@pytest.mark.parametrize("bodies", DRAWS.values(), ids=DRAWS)
+def test_poses_are_drawn_for_a_reset_only(
+    bodies: dict[str, str], make_env: Callable[..., BatchEnv]
+):
+    with pytest.raises(
+        TaskOutputError, match=r"task 'test': sample_object_poses (may be|must be)"
+    ):
+        make_env(**bodies)
+
+
+def test_the_worlds_numbers_are_the_same_whatever_a_task_does_in_between(
+    make_env: Callable[..., BatchEnv],
+):
+    one, other = make_env(), make_env(success="self.kept.append(torch.zeros(3))")
+    for env in (one, other):
+        idle(env, 2)
+        env.reset(np.arange(NUM_WORLDS))
+
+    assert torch.equal(one.states()["cube_pos"], other.states()["cube_pos"])
+
+
+LATER = "if self.count > 4:\n    "
+ANSWERS = {
+    "success of one row": ({"success": LATER + "success = success[:1]"}, "one row per environment"),
+    "success of a number": ({"success": LATER + "success = success[0]"}, "one row per environment"),
+    "success n x n": (
+        {"success": LATER + "success = success[:, None] == success[None]"},
+        "one row per environment",
+    ),
+    "success of floats": ({"success": LATER + "success = success.float() * float('nan')"}, "torch.bool"),
+    "success of integers": ({"success": LATER + "success = success.int() + 1"}, "torch.bool"),
+    "success is a list": ({"success": LATER + "success = [True]"}, "must be a tensor"),
+    "success is None": ({"success": LATER + "success = None"}, "must be a tensor"),
+    "a wider observation": (
+        {"observe": "states['more'] = states['cube_pos']\n" + LATER + "keys.append('more')"},
+        "observes 93 numbers after it observed 90",
+    ),
+    "an observation of other rows": (
+        {"observe": "states['more'] = torch.zeros(2, 3)\n" + LATER + "keys.append('more')"},
+        "one row per environment",
+    ),
+    "an observation that is no number": (
+        {
+            "observe": "states['more'] = states['cube_pos'][:, 0] * 0\nif self.count > 4:\n"
+            "    states['more'] = states['more'] / 0\nkeys.append('more')",
+            "size": "91",
+        },
+        "not finite in world 0 although",
+    ),
+    "an unknown key": ({"observe": LATER + "keys.append('<b>')"}, "'<b>' is not in states"),
+    "keys that are no list": ({"observe": LATER + "keys = ('base_observation',)"}, "a list of keys"),
+    "no key": ({"observe": LATER + "keys = []"}, "at least one key"),
+    "a reward of one row": ({"reward": LATER + "reward = reward[:1]"}, "one row per environment"),
+    "a reward n x n": ({"reward": LATER + "reward = reward[:, None] + reward"}, "one row per environment"),
+    "a reward of doubles": ({"reward": LATER + "reward = reward.double()"}, "torch.float32"),
+    "a reward that is infinite": ({"reward": LATER + "reward = reward / 0"}, "is inf in world 0"),
+    "a component of one row": ({"reward": LATER + "parts['height'] = reward[:1]"}, "one row per environment"),
+    "a component that is no tensor": ({"reward": LATER + "parts['height'] = 1.0"}, "must be a tensor"),
+    "a new component": ({"reward": LATER + "parts['more'] = reward"}, "change from call to call"),
+    "a component gone": ({"reward": LATER + "parts = {}"}, "change from call to call"),
+    "the reward alone": ({"reward": LATER + "return reward"}, "a dict of its components"),
+    "a component called like markup": ({"reward": "parts['<script>'] = reward"}, "no name for a reward"),
+    "a component with a line end": ({"reward": "parts['a\\nb'] = reward"}, "no name for a reward"),
+    "a component with a comma": ({"reward": "parts['a,b'] = reward"}, "no name for a reward"),
+    "a component of 41 letters": ({"reward": f"parts['{'a' * 41}'] = reward"}, "no name for a reward"),
+    "a component called by a number": ({"reward": "parts[7] = reward"}, "no name for a reward"),
+    "33 components": (
+        {"reward": "for i in range(33):\n    parts['a' + str(i)] = reward"},
+        "more than 32 components",
+    ),
+    "a size that is no number": ({"size": "'90'"}, "a whole number"),
+    "poses of no object": ({"reset": "return {}"}, "a pose per object: cube"),
+    "poses of other objects": ({"reset": "return {'can': torch.zeros(6, 7)}"}, "a pose per object: cube"),
+    "poses of one row": (
+        {"reset": "return {'cube': torch.ones(1, 7)}"},
+        r"the reset pose of cube must be a tensor of shape \(6, 7\), not \(1, 7\)",
+    ),
+    "a pose that is no number": ({"reset": "return {'cube': torch.ones(6, 7) / 0}"}, "is not finite"),
+    "a pose of integers": ({"reset": "return {'cube': torch.ones(6, 7).int()}"}, "is not finite"),
+    "a quaternion of length 2": ({"reset": "return {'cube': torch.ones(6, 7)}"}, "not of length 1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("bodies", "words"), ANSWERS.values(), ids=ANSWERS)
+def test_an_answer_that_may_not_be_ends_with_a_sentence_whenever_it_comes(
+    bodies: dict[str, str], words: str, make_env: Callable[..., BatchEnv]
+):
+    with pytest.raises(V2PError, match=words) as error:
+        idle(make_env(**bodies))
+
+    assert "task 'test'" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_the_same_question_is_asked_twice_now_and_then(
+    make_env: Callable[..., BatchEnv], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(guarded, "ASKED_TWICE_ONCE_IN", 3)
+    env = make_env(reward="if self.count > 9:\n    reward = reward + self.count")
+
+    with pytest.raises(TaskOutputError, match="two calls with the same states give different"):
+        idle(env, 30)
+
+
+def test_asking_twice_changes_no_result(
+    make_env: Callable[..., BatchEnv], monkeypatch: pytest.MonkeyPatch
+):
+    def results() -> list[np.ndarray]:
+        env = make_env(success="states['mean'] = states['cube_pos'].mean(dim=1)")
+        done = [env.step(np.full((NUM_WORLDS, 7), 0.3)) for _ in range(6)]
+        return [array for step in done for array in (step.obs, step.reward, step.success)]
+
+    once = results()
+    monkeypatch.setattr(guarded, "ASKED_TWICE_ONCE_IN", 1)
+
+    twice = results()
+
+    assert all(np.array_equal(a, b) for a, b in zip(once, twice, strict=True))
+
+
+def test_what_a_task_adds_to_the_states_it_may_write_again(make_env: Callable[..., BatchEnv]):
+    env = make_env(
+        observe="states['rise'] = states['cube_pos'][:, 2] * 1",
+        success="states['rise'].add_(1.0)\nstates['rise'] = states['rise'] * 2",
+    )
+
+    idle(env, 3)
+
+    assert "rise" not in env.states()
