@@ -488,9 +488,9 @@ CONTAINED: dict[str, tuple[str, str]] = {
     "states: written into by a helper": (
         program("states['box_pos'].fill_(0.0)", "FUNCTION"), "changes states['box_pos'] in place"),
     "states: an action written into": (
-        program("actions.fill_(0.0)", "REWARD"), "changes its argument in place"),
+        program("actions.fill_(0.0)", "REWARD"), "changes the actions in place"),
     "states: an action written into by a view": (
-        program("actions[:, 6] = 1.0", "FUNCTION"), "changes its argument in place"),
+        program("actions[:, 6] = 1.0", "FUNCTION"), "changes the actions in place"),
     "states: a key that is no text": (
         program("states[1] = x\nreturn states"), "compute_success must be a tensor, not dict"),
     "answer: a text": (program("return 'yes'"), "must be a tensor, not str"),
@@ -503,7 +503,7 @@ CONTAINED: dict[str, tuple[str, str]] = {
     "answer: a tensor without numbers": (program("return x.to('meta')[:, 0] > 0"), ""),
     "answer: not finite": (program("r = torch.log(-1 - states['progress'])", "FUNCTION"), "not finite"),
     "answer: names that are no text": (
-        program("return actions[:, 0], {1: actions[:, 0]}", "REWARD"), "named components"),
+        program("return actions[:, 0], {1: actions[:, 0]}", "REWARD"), "no name for a reward component"),
     "answer: a reward and no parts": (program("return actions[:, 0]", "REWARD"), "must return the reward and a dict"),
     "answer: memory as it was": (program("y = Tensor(5)"), "made of a list of numbers"),
     "answer: memory as it was, by another name": (program("y = torch.FloatTensor(5)"), "made of a list of numbers"),
@@ -520,8 +520,8 @@ CONTAINED: dict[str, tuple[str, str]] = {
     "answer: differs from call to call": (
         program("self.calls = self.calls + 1\nx = x * self.calls").replace("#INIT", "self.calls = 0"), "two calls"),
     "answer: depends on the order": (program("x = x * torch.arange(len(x)).reshape(-1, 1)"), "order"),
-    "environment: more of it than there is": (program("y = self.envs.sample_object_poses(torch.arange(9999))"), "IndexError"),
-    "environment: a text for numbers": (program("y = self.envs.sample_object_poses('all')"), "Error"),
+    "environment: more of it than there is": (program("y = self.envs.sample_object_poses(torch.arange(9999))"), "in reset_objects_states only"),
+    "environment: a text for numbers": (program("y = self.envs.sample_object_poses('all')"), "in reset_objects_states only"),
     "error: unknown state": (program("y = states['nothing']"), "line 15: KeyError"),
     "error: a division by zero": (program("y = 1 / 0"), "line 15: ZeroDivisionError"),
     "error: a device that is not there": (program("y = x.to('cuda:63')"), ""),

@@ -23,6 +23,7 @@ import v2p_data
 from v2p_data.errors import V2PError
 from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
+from v2p_data.task.guarded import COMPONENT_NAME
 from v2p_data.task.probes import States, at_rest, concatenated, random_states
 from v2p_data.task.reader.check import check_code
 from v2p_data.task.reader.refusal import TaskCodeError
@@ -65,11 +66,14 @@ class SmokeResult:
             raise ValueError(f"{len(success)} answers to {num_probes} probes")
         if not all(math.isfinite(r) for r in reward):
             raise ValueError("a reward that is no number")
+        components = tuple(str(c) for c in data.get("components", []))
+        if not all(COMPONENT_NAME.fullmatch(c) for c in components):
+            raise ValueError("a reward component without a proper name")
         return SmokeResult(
             runnable=data["runnable"],
             error=shown(data.get("error", ""), 1000),
             observation_dim=int(data.get("observation_dim", 0)),
-            components=tuple(shown(c, 100) for c in data.get("components", [])),
+            components=components,
             warnings=tuple(shown(w, 300) for w in data.get("warnings", [])),
             probe_success=tuple(success),
             probe_reward=tuple(reward),
