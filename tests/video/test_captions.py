@@ -6,12 +6,12 @@ import pytest
 
 from v2p_data.errors import V2PError
 from v2p_data.video.captions import (
-    check_hints,
     find_videos,
     merge_captions,
     unique_items,
     write_captions,
 )
+from v2p_data.video.hints import check_hints
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_text_that_is_not_utf8_is_named(folder):
 def test_no_folder_and_no_videos_are_said_plainly(tmp_path):
     with pytest.raises(V2PError, match="no folder or video"):
         find_videos(tmp_path / "nowhere")
-    with pytest.raises(V2PError, match=r"holds no videos; known endings are \.mp4 \.mov"):
+    with pytest.raises(V2PError, match=r"holds no videos; known endings are \.mp4 \.m4v"):
         find_videos(tmp_path)
     (tmp_path / "a.txt").write_text("x")
     with pytest.raises(V2PError, match="is no video"):
