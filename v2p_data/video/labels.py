@@ -73,7 +73,7 @@ def _is_label_file(data: Any) -> bool:
 
 
 def _read(label: dict[str, Any]) -> tuple[str, tuple[str, ...], list[str]]:
-    """Return caption, objects, and what of the label could not be used."""
+    """Return caption, objects (none where the caption knows more), and what of the label could not be used."""
     faults: list[str] = []
     try:
         objects = _objects(label.get("placeholders") or [])
@@ -96,7 +96,8 @@ def _read(label: dict[str, Any]) -> tuple[str, tuple[str, ...], list[str]]:
     is_object += [True] * (len(objects) - len(is_object))
     names = _told_apart(objects)
     text = _renamed(_filled(text, objects), objects, names)
-    return text, tuple(n for n, kept in zip(names, is_object, strict=True) if kept), faults
+    kept = tuple(n for n, kept in zip(names, is_object, strict=True) if kept)
+    return text, kept if missing <= 0 else (), faults
 
 
 def _objects(placeholders: Any) -> list[str]:

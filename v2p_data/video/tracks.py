@@ -91,7 +91,7 @@ def promise_of(
         seconds = (container.duration or 0) / av.time_base
     frames = round(seconds * rate)
     if film.frames:  # those that an edit list leaves out are counted too
-        frames = min(frames, film.frames) if frames else film.frames
+        frames = min(max(1, frames), film.frames) if seconds > 0 else film.frames
     # damaged files promise anything
     return Promise(frames=frames if 0 < frames < 1e6 else 0, seconds=max(0.0, seconds))
 
