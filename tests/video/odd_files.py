@@ -60,21 +60,21 @@ def write_film(
     """Write a video frame by frame, beside it a sound, a cover picture before it, or another film after it."""
     frames = squares(20) if frames is None else frames
     with av.open(str(path), "w", options=container_options or {}) as out:
-        picture = out.add_stream("mjpeg", rate=1) if cover else None
+        picture: Any = out.add_stream("mjpeg", rate=1) if cover else None
         if picture is not None:
             picture.width, picture.height, picture.pix_fmt = 96, 96, "yuvj420p"
-            picture.disposition = av.stream.Disposition.attached_pic.value  # pyright: ignore[reportAttributeAccessIssue]
-        stream = out.add_stream(codec, rate=fps, options=options or {})
+            picture.disposition = av.stream.Disposition.attached_pic.value
+        stream: Any = out.add_stream(codec, rate=fps, options=options or {})
         _shape(stream, frames[0], pix_fmt)
         if aspect:
             stream.codec_context.sample_aspect_ratio = Fraction(aspect)
         if pts_ms is not None:
             stream.codec_context.time_base = Fraction(1, 1000)
             stream.time_base = Fraction(1, 1000)
-        other = out.add_stream(codec, rate=fps) if second is not None else None
+        other: Any = out.add_stream(codec, rate=fps) if second is not None else None
         if other is not None and second is not None:
             _shape(other, second[0], pix_fmt)
-        sound = out.add_stream("aac", rate=8000, layout="mono") if sound_s else None
+        sound: Any = out.add_stream("aac", rate=8000, layout="mono") if sound_s else None
         if picture is not None:
             green = np.full((96, 96, 3), (0, 255, 0), np.uint8)
             out.mux(picture.encode(av.VideoFrame.from_ndarray(green).reformat(format="yuvj420p")))
