@@ -14,6 +14,7 @@ from typing import Any
 
 import av
 import numpy as np
+from av.stream import Disposition
 
 Fill = Callable[[Path], object]
 PLAIN = "lift_red_box.mp4"
@@ -63,7 +64,7 @@ def write_film(
         picture: Any = out.add_stream("mjpeg", rate=1) if cover else None
         if picture is not None:
             picture.width, picture.height, picture.pix_fmt = 96, 96, "yuvj420p"
-            picture.disposition = av.stream.Disposition.attached_pic.value
+            picture.disposition = Disposition.attached_pic.value
         stream: Any = out.add_stream(codec, rate=fps, options=options or {})
         _shape(stream, frames[0], pix_fmt)
         if aspect:
@@ -87,9 +88,9 @@ def write_film(
                 frame.pts, frame.time_base = pts_ms[i], Fraction(1, 1000)
             out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
-        for pixels in second or ():
-            out.mux(other.encode(av.VideoFrame.from_ndarray(pixels)))
         if other is not None:
+            for pixels in second or ():
+                out.mux(other.encode(av.VideoFrame.from_ndarray(pixels)))
             out.mux(other.encode(None))
         if sound is not None:
             for at in range(0, int(8000 * sound_s), 1024):

@@ -17,6 +17,7 @@ from odd_files import (
 from v2p_data.errors import ItemRejectedError
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig, read_clip
+from v2p_data.video.tracks import shown_axes, turned_axes
 
 
 def item(path, **extra):
@@ -172,6 +173,17 @@ def test_a_mirrored_hint_is_where_the_player_shows_it(film):
     where = [np.flatnonzero(red[i, 48]).mean() for i in (0, 19)]
     # 0 to 31 and 76 to 107 of 128 columns, counted from the right
     assert where == pytest.approx([127 - 15.5, 127 - 91.5], abs=1)
+
+
+@pytest.mark.parametrize("way", ["upright", "right", "upside_down", "left"])
+def test_the_angle_that_pyav_gives_is_the_matrix_of_a_turn(film, way):
+    """It stands in where PyAV has no name for other data of the frame."""
+    with av.open(str(set_matrix(film("turned.mp4"), *EIGHT_WAYS[way]))) as container:
+        frame = next(container.decode(video=0))
+
+    axes = shown_axes(frame)
+
+    assert turned_axes(float(frame.rotation)) == pytest.approx(np.eye(2) if axes is None else axes)
 
 
 @pytest.mark.parametrize("matrix", [(0.8, 0.6, -0.6, 0.8), (1, 0, 1, 1), (1, 0, 1, 0)])

@@ -108,7 +108,7 @@ def orientation_of(frame: VideoFrame, path: Path) -> Orientation:
     Raises:
         ItemRejectedError: `odd_angle`.
     """
-    axes = _shown_axes(frame)
+    axes = shown_axes(frame)
     if axes is None:
         return Orientation()
     nearest = np.round(axes)
@@ -128,18 +128,29 @@ def orientation_of(frame: VideoFrame, path: Path) -> Orientation:
     )
 
 
-def _shown_axes(frame: VideoFrame) -> Float[np.ndarray, "2 2"] | None:
+def shown_axes(frame: VideoFrame) -> Float[np.ndarray, "2 2"] | None:
     """Return where the stored picture's axes, right and down, point to when shown: unit columns; None without a matrix.
 
     Source: ISO 14496-12, 8.3.2; libavutil/display.h.
     """
     try:
         data = bytes(frame.side_data["DISPLAYMATRIX"])  # pyright: ignore[reportTypedDictNotRequiredAccess, reportGeneralTypeIssues]
-    except (KeyError, ValueError):  # none, or side data of a kind that PyAV has no name for
+    except KeyError:
         return None
+    except (
+        ValueError
+    ):  # beside side data that PyAV has no name for, such as the eye of a spatial video
+        return turned_axes(float(frame.rotation))
     matrix = np.frombuffer(data, np.int32)[:9].reshape(3, 3)[:2, :2].T.astype(float)
     lengths = np.linalg.norm(matrix, axis=0)
     return matrix / lengths if lengths.all() else None
+
+
+def turned_axes(rotation_deg: float) -> Float[np.ndarray, "2 2"]:
+    """Return where the axes right and down of a picture point to that is turned counter-clockwise."""
+    angle = math.radians(rotation_deg)
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[cos, sin], [-sin, cos]])
 
 
 def _tagged_s(metadata: dict[str, str]) -> float:
