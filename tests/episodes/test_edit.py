@@ -176,12 +176,71 @@ def test_datasets_of_other_meaning_do_not_go_together(
 def test_datasets_of_other_columns_or_rates_do_not_go_together(
     packed: Path, more: Path, tmp_path: Path, change, words: str
 ):
-    other = Path(shutil.copytree(more, tmp_path / "other"))
-    info = json.loads((other / "meta/info.json").read_text())
-    change(info)
-    (other / "meta/info.json").write_text(json.dumps(info))
+    other = rewritten(more, tmp_path / "other", change)
 
     with pytest.raises(V2PError, match=rf"{words}|is not sound"):
+        merge([packed, other], "user/both", tmp_path / "both")
+
+
+def rewritten(root: Path, copy: Path, change: Callable[[dict], object]) -> Path:
+    """Return a copy of the dataset whose `meta/info.json` was changed."""
+    shutil.copytree(root, copy)
+    info = json.loads((copy / "meta/info.json").read_text())
+    change(info)
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    return copy
+
+
+def as_older_versions_wrote(info: dict) -> None:
+    for key, feature in info["features"].items():
+        if feature["dtype"] == "video":
+            feature["video_info"] = {"video.fps": 20.0, "video.codec": "av1"}
+            del feature["info"]
+            feature["names"] = ["height", "width", "channel"]
+        else:
+            feature["fps"] = info["fps"]
+        if key in ("action", "observation.state"):
+            feature["names"] = {"motors": feature["names"]}
+
+
+def test_datasets_that_say_the_same_in_other_words_are_merged(
+    packed: Path, more: Path, staged: list[Path], more_staged: list[Path], tmp_path: Path
+):
+    other = rewritten(more, tmp_path / "other", as_older_versions_wrote)
+    before = (other / "meta/info.json").read_bytes()
+
+    out = merge([packed, other], "user/both", tmp_path / "both").root
+
+    assert_holds(out, [*staged, *more_staged])
+    assert verify(out).is_good
+    features = [
+        json.loads((root / "meta/info.json").read_text())["features"] for root in (out, packed)
+    ]
+    for key, feature in features[1].items():
+        assert {k: features[0][key][k] for k in ("dtype", "shape", "names")} == {
+            k: feature[k] for k in ("dtype", "shape", "names")
+        }
+    assert (other / "meta/info.json").read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["both", "other"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f["action"].update(fps=30), "fps of action is 20 in the first and 30 in the"),
+        (lambda f: f["action"].update(dtype="float64"), "dtype of action is float32 in the first"),
+        (lambda f: f["action"].update(names={"motors": list("abcdefg")}), r"names of action is \['delta_x.pos', .* in the first and \['a', 'b', 'c', 'd', 'e', 'f', 'g'\] in the second"),
+        (lambda f: f["action"].update(names=None), r"names of action is .* and None in the second"),
+        (lambda f: f["observation.images.mask"]["info"].update(is_depth_map=True), "depth of observation.images.mask is False in the first and True in the second"),
+        (lambda f: f["observation.images.mask"].update(shape=[3, 64, 64]), r"shape of .*mask is \[64, 64, 3\] in the first and \[3, 64, 64\] in"),
+    ],
+)  # fmt: skip
+def test_the_first_field_that_differs_is_named_with_both_values(
+    packed: Path, more: Path, tmp_path: Path, change, words: str
+):
+    other = rewritten(more, tmp_path / "other", lambda info: change(info["features"]))
+
+    with pytest.raises(V2PError, match=words):
         merge([packed, other], "user/both", tmp_path / "both")
 
 

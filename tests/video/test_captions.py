@@ -1,17 +1,19 @@
 """What a folder and its captions become, and what is said when they cannot be used."""
 
 import json
+import unicodedata
 
 import pytest
 
 from v2p_data.errors import V2PError
 from v2p_data.video.captions import (
-    check_hints,
     find_videos,
     merge_captions,
+    read_footage,
     unique_items,
     write_captions,
 )
+from v2p_data.video.hints import check_hints
 
 
 @pytest.fixture
@@ -170,7 +172,7 @@ def test_text_that_is_not_utf8_is_named(folder):
 def test_no_folder_and_no_videos_are_said_plainly(tmp_path):
     with pytest.raises(V2PError, match="no folder or video"):
         find_videos(tmp_path / "nowhere")
-    with pytest.raises(V2PError, match=r"holds no videos; known endings are \.mp4 \.mov"):
+    with pytest.raises(V2PError, match=r"holds no videos; known endings are \.mp4 \.m4v"):
         find_videos(tmp_path)
     (tmp_path / "a.txt").write_text("x")
     with pytest.raises(V2PError, match="is no video"):
@@ -302,3 +304,98 @@ def test_additions_that_cannot_be_used_are_named_and_change_nothing(folder, addi
 
     assert said in str(error.value)
     assert (folder / "captions.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(("on_disk", "in_file"), [("NFD", "NFC"), ("NFC", "NFD")])
+def test_names_are_the_same_however_accents_are_encoded(tmp_path, on_disk, in_file):
+    stem, caption = "café", "Lifting café sign up"
+    name = unicodedata.normalize(on_disk, f"{stem}.mp4")
+    (tmp_path / name).write_bytes(b"x")
+    entry = {"caption": unicodedata.normalize(in_file, caption), "objects": [f"{stem} sign"]}
+    entry["hints"] = {unicodedata.normalize(in_file, f"{stem} sign"): {"name": "card"}}
+    write(tmp_path, {unicodedata.normalize(in_file, f"{stem}.mp4"): entry})
+
+    (video,) = find_videos(tmp_path)
+
+    assert video.path.name == name
+    assert (video.caption, video.objects) == (caption, (f"{stem} sign",))
+    assert video.hints["café sign"]["name"] == "card"
+
+
+def test_hints_for_a_name_in_another_form_go_to_its_only_entry(tmp_path):
+    composed, apart = (unicodedata.normalize(form, "café.mp4") for form in ("NFC", "NFD"))
+    (tmp_path / apart).write_bytes(b"x")
+    write(tmp_path, {composed: CUP})
+
+    result = merged(tmp_path, {composed: {**CUP, "hints": {"cup": {"name": "mug"}}}})
+
+    assert list(result.hints) == [apart]
+    assert list(json.loads((tmp_path / "captions.json").read_text())) == [apart]
+    assert find_videos(tmp_path)[0].hints["cup"]["name"] == "mug"
+
+
+def test_files_and_folders_that_are_passed_over_are_named_in_one_line(folder):
+    (folder / "take.webp").write_bytes(b"x")
+    (folder / "more").mkdir()
+    (folder / "more/c.mp4").write_bytes(b"x")
+    (folder / "empty").mkdir()
+    write(folder, {"b.mp4": "Lifting cup up"})
+
+    notes = read_footage(folder).notes
+
+    assert notes == (
+        f"4 in {folder} passed over, no videos: folder.mp4/, more/, notes.txt, take.webp",
+    )
+    assert read_footage(folder / "b.mp4").notes == ()
+
+
+def test_many_files_that_are_passed_over_are_counted(folder):
+    for k in range(20):
+        (folder / f"{k:02d}.jpg").write_bytes(b"x")
+
+    (note,) = read_footage(folder).notes
+
+    assert "22 in" in note
+    assert note.endswith("00.jpg, 01.jpg, 02.jpg, 03.jpg, 04.jpg, 05.jpg and 16 more")
+
+
+def test_videos_one_folder_deeper_are_pointed_to(tmp_path):
+    (tmp_path / "takes").mkdir()
+    (tmp_path / "takes/a.mp4").write_bytes(b"x")
+
+    with pytest.raises(V2PError, match="holds no videos, its folders takes/ do"):
+        find_videos(tmp_path)
+
+
+def test_boxes_are_said_as_they_were_read(folder):
+    hint = {"box": [10, 20, 80, 95.5]}
+    write(folder, {"b.mp4": {**CUP, "hints": {"cup": hint}}})
+
+    (_, note) = read_footage(folder).notes
+
+    assert note == "boxes read as x0, y0, x1, y1 in pixels: b.mp4 'cup' 70 x 75.5 px at (10, 20)"
+
+
+@pytest.mark.parametrize(
+    ("box", "said"),
+    [
+        ([0.2, 0.3, 0.5, 0.6], "looks like fractions of the picture; a box is x0, y0, x1, y1 in"),
+        ([0, 0, 1, 1], "looks like fractions"),
+        ([80, 60, 30, 20], "is x, y, width, height, write [80.0, 60.0, 110.0, 80.0]"),
+        ([80, 20, 30, 60], "is x, y, width, height, write [80.0, 20.0, 110.0, 80.0]"),
+    ],
+)
+def test_a_box_in_another_form_is_told_from_one_in_pixels(folder, box, said):
+    write(folder, {"b.mp4": {**CUP, "hints": {"cup": {"box": box}}}})
+
+    with pytest.raises(V2PError) as error:
+        find_videos(folder)
+
+    assert said in str(error.value)
+
+
+def test_points_in_fractions_are_refused(folder):
+    write(folder, {"b.mp4": {**CUP, "hints": {"cup": {"points": [[0.4, 0.5], [1, 0.2]]}}}})
+
+    with pytest.raises(V2PError, match="look like fractions"):
+        find_videos(folder)

@@ -6,10 +6,18 @@ from fractions import Fraction
 import av
 import numpy as np
 import pytest
+from odd_files import (
+    EIGHT_WAYS,
+    put_cover_first,
+    set_edit,
+    set_matrix,
+    squares,
+)
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig, read_clip
+from v2p_data.video.tracks import shown_axes, turned_axes
 
 
 def item(path, **extra):
@@ -27,14 +35,6 @@ def flat(value, count=10, height=96, width=128):
     return [np.full((height, width, 3), value, np.uint8) for _ in range(count)]
 
 
-def squares(count, height=96, width=128):
-    frames = flat(120, count, height, width)
-    for i, pixels in enumerate(frames):
-        x = 4 * i % (width - 32)
-        pixels[32:64, x : x + 32] = (200, 30, 30)
-    return frames
-
-
 @pytest.mark.parametrize(
     ("name", "codec", "pix_fmt"),
     [
@@ -46,6 +46,14 @@ def squares(count, height=96, width=128):
         ("a.gif", "gif", "rgb8"),
         ("b.mp4", "libx265", "yuv420p10le"),
         ("b.mkv", "ffv1", "gray"),
+        ("a.m4v", "mpeg4", "yuv420p"),
+        ("a.mpg", "mpeg1video", "yuv420p"),
+        ("a.ts", "libx264", "yuv420p"),
+        ("A.MTS", "mpeg2video", "yuv420p"),
+        ("a.3gp", "mpeg4", "yuv420p"),
+        ("a.wmv", "wmv2", "yuv420p"),
+        ("a.flv", "flv", "yuv420p"),
+        ("a.ogv", "libvpx", "yuv420p"),
         ("really_matroska.mp4.mkv", "ffv1", "bgra"),
     ],
 )
@@ -119,26 +127,142 @@ def test_pixels_that_are_not_square_are_made_square(film):
     assert read_clip(item(path)).frames.shape[1:3] == (96, 256)
 
 
-@pytest.mark.parametrize("turns", [1, 2, 3])
-def test_a_video_marked_as_turned_is_shown_upright(film, turns):
-    upright = np.full((96, 128, 3), 60, np.uint8)
-    upright[:32, :32] = (220, 40, 40)
-    stored = np.ascontiguousarray(np.rot90(upright, turns))
-    path = film("turned.mp4", [stored] * 10)
-    # ISO 14496-12: the track header's matrix, 16.16 fixed point, turns the picture clockwise by the angle
-    cos, sin = {1: (0, 1), 2: (-1, 0), 3: (0, -1)}[turns]
-    matrix = [cos, sin, 0, -sin, cos, 0, 0, 0]
-    data = bytearray(path.read_bytes())
-    at = data.index(b"tkhd") + 4 + 40
-    data[at : at + 32] = struct.pack(">8i", *(v * 65536 for v in matrix))
-    path.write_bytes(data)
+def corners(pixels):
+    """Return which of red, green, blue and white is seen top left, top right, bottom left and bottom right."""
+    seen = ""
+    for y in (0.25, 0.75):
+        for x in (0.25, 0.75):
+            red, green, blue = pixels[int(y * len(pixels)), int(x * pixels.shape[1])] > 128
+            seen += "W" if red and green and blue else "R" if red else "G" if green else "B"
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("way", "seen"),
+    [
+        ("upright", "RGBW"),
+        ("mirrored", "GRWB"),
+        ("upside_down", "WBGR"),
+        ("mirrored_upside_down", "BWRG"),
+        ("right", "BRWG"),
+        ("left", "GWRB"),
+        ("transposed", "RBGW"),
+        ("transposed_upside_down", "WGBR"),
+    ],
+)
+def test_a_video_is_shown_as_its_matrix_says(film, way, seen):
+    stored = np.full((96, 128, 3), 250, np.uint8)
+    stored[:48, :64], stored[:48, 64:], stored[48:, :64] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
+    path = set_matrix(film("turned.mp4", [stored] * 10), *EIGHT_WAYS[way])
 
     clip = read_clip(item(path))
 
+    assert corners(clip.frames[0]) == seen
+    size = (96, 128) if way in ("right", "left") or way.startswith("transposed") else (128, 96)
+    assert clip.source_size_px == size
+    assert clip.frames.shape[1:3] == size[::-1]
+
+
+def test_a_mirrored_hint_is_where_the_player_shows_it(film):
+    """The square goes from left to right in the file, so from right to left as shown."""
+    path = set_matrix(film("mirrored.mp4"), *EIGHT_WAYS["mirrored"])
+
+    clip = read_clip(item(path))
+
+    red = clip.frames[..., 0].astype(int) - clip.frames[..., 2] > 80
+    where = [np.flatnonzero(red[i, 48]).mean() for i in (0, 19)]
+    # 0 to 31 and 76 to 107 of 128 columns, counted from the right
+    assert where == pytest.approx([127 - 15.5, 127 - 91.5], abs=1)
+
+
+@pytest.mark.parametrize("way", ["upright", "right", "upside_down", "left"])
+def test_the_angle_that_pyav_gives_is_the_matrix_of_a_turn(film, way):
+    """It stands in where PyAV has no name for other data of the frame."""
+    with av.open(str(set_matrix(film("turned.mp4"), *EIGHT_WAYS[way]))) as container:
+        frame = next(container.decode(video=0))
+
+    axes = shown_axes(frame)
+
+    assert turned_axes(float(frame.rotation)) == pytest.approx(np.eye(2) if axes is None else axes)
+
+
+@pytest.mark.parametrize("matrix", [(0.8, 0.6, -0.6, 0.8), (1, 0, 1, 1), (1, 0, 1, 0)])
+def test_a_video_that_is_to_lean_is_refused(film, matrix):
+    assert reason_for(set_matrix(film("leaning.mp4"), *matrix)) == "odd_angle"
+
+
+def test_a_matrix_of_rounded_numbers_or_of_nothing_is_no_angle(film):
+    half_degree = (1, 0.0087, -0.0087, 1)
+
+    assert len(read_clip(item(set_matrix(film("a.mp4"), *half_degree))).frames) == 20
+    assert len(read_clip(item(set_matrix(film("b.mp4"), 0, 0, 0, 0))).frames) == 20
+    # scaled, not turned
+    assert len(read_clip(item(set_matrix(film("c.mp4"), 0.5, 0, 0, 0.5))).frames) == 20
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "first.mp4"])
+def test_a_cover_picture_is_not_the_film(film, name):
+    path = film(name, cover=True)
+    if name == "first.mp4":
+        put_cover_first(path)
+        with av.open(str(path)) as container:
+            assert container.streams.video[0].width == 96
+
+    clip = read_clip(item(path))
+
+    assert clip.frames.shape == (20, 96, 128, 3)
+    assert np.abs(clip.frames[0, 5, 5].astype(int) - 120).max() <= 4
+
+
+def test_a_file_with_two_films_says_which_is_read(film):
+    clip = read_clip(item(film("two.mp4", second=squares(20, 192, 256))))
+
     assert clip.frames.shape[1:3] == (96, 128)
-    assert clip.source_size_px == (128, 96)
-    assert clip.frames[0, 10, 10, 0] > 180
-    assert clip.frames[0, 80, 110, 0] < 90
+    assert "two.mp4 holds 2 films; the one of 128 x 96 px" in clip.warnings[0]
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv", "a.avi"])
+def test_sound_that_outlasts_the_picture_is_no_missing_picture(film, name):
+    codec = "mpeg4" if name.endswith("avi") else "libx264"
+
+    clip = read_clip(item(film(name, codec=codec, sound_s=5)))
+
+    assert (clip.total_frames, clip.warnings) == (20, ())
+
+
+def test_a_long_sound_does_not_make_a_film_too_long(film):
+    clip = read_clip(item(film("song.mp4", sound_s=5)), VideoConfig(max_duration_s=2.0))
+
+    assert clip.total_frames == 20
+
+
+@pytest.mark.parametrize("gop", ["1", "12", "250"])
+def test_an_edit_list_cuts_the_film(film, gop):
+    """Trimmed without encoding: frames before the cut are decoded, where others need them, and never shown."""
+    path = set_edit(film("trimmed.mp4", squares(60), options={"g": gop}), 0.5, 1.0)
+
+    clip = read_clip(item(path))
+
+    assert (clip.total_frames, clip.warnings) == (30, ())
+    red = clip.frames[..., 0].astype(int) - clip.frames[..., 2] > 80
+    # frame 15 of the file has the square at column 60, frame 44 at 176 - 96 = 80
+    assert [np.flatnonzero(red[i, 48])[0] for i in (0, 29)] == pytest.approx([60, 80], abs=2)
+
+
+def test_an_edit_list_of_a_fragmented_file_hides_what_is_before_zero(film):
+    fragments = {"movflags": "frag_keyframe+empty_moov+delay_moov"}
+    path = set_edit(film("trimmed.mp4", squares(60), container_options=fragments), 0.5, 0)
+
+    clip = read_clip(item(path))
+
+    assert (clip.total_frames, clip.warnings) == (45, ())
+
+
+def test_a_last_picture_that_stays_for_long_is_no_missing_end(film):
+    pts = [*(33 * i for i in range(30)), 5000]
+    path = film("recording.mkv", squares(31), codec="ffv1", pix_fmt="yuv444p", pts_ms=pts)
+
+    assert read_clip(item(path)).warnings == ()
 
 
 def test_what_is_transparent_is_white(film):

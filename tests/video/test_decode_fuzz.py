@@ -4,10 +4,11 @@ import time
 
 import numpy as np
 import pytest
+from odd_files import odd_folders
 
-from v2p_data.errors import ItemRejectedError
+from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.seeds import rng_for
-from v2p_data.video.captions import VideoItem
+from v2p_data.video.captions import VideoItem, read_footage
 from v2p_data.video.clip import Clip
 from v2p_data.video.decode import VideoConfig, read_clip
 
@@ -84,3 +85,33 @@ def test_a_damaged_file_gives_a_clip_or_a_reason(film, tmp_path, name, codec, pi
         assert seconds < MAX_S, (i, outcome)
         assert sorted(tmp_path.iterdir()) == before
     assert capfd.readouterr().err == ""
+
+
+ODD = list(odd_folders())
+
+
+@pytest.mark.parametrize("fill", [fill for _, fill in ODD], ids=[name for name, _ in ODD])
+def test_an_odd_folder_gives_clips_or_one_sentence_that_names_it(tmp_path, fill, capfd):
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    fill(folder)
+    before = sorted(folder.iterdir())
+    names = [str(folder), *(path.name for path in before)]
+    capfd.readouterr()
+
+    start = time.monotonic()
+    try:
+        for video in read_footage(folder).videos:
+            clip = read_clip(video, CFG)
+            assert len(clip.frames) >= 2
+            assert 0 < clip.fps < np.inf
+            clip.caption.encode()
+    except V2PError as error:
+        said = str(error)
+        assert any(name in said for name in names)
+        assert "\n" not in said
+        assert len(said) < 1000
+
+    assert time.monotonic() - start < MAX_S
+    assert sorted(folder.iterdir()) == before
+    assert "Traceback" not in capfd.readouterr().err

@@ -19,13 +19,13 @@ from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.report.reading import Result, number, read_run
 from v2p_data.scene.review import ReviewClip, Stills, stills_of, write_review
 from v2p_data.video.captions import (
-    CAPTIONS_FILE,
     VideoItem,
-    check_hints,
     find_videos,
     merge_captions,
     write_captions,
+    written_captions,
 )
+from v2p_data.video.hints import check_hints
 
 PAGE_FILE = "review.html"
 
@@ -187,9 +187,11 @@ def _videos_in(home: Path) -> dict[str, VideoItem]:
 
 
 def _captions(folder: Path | None) -> dict[str, Any]:
-    """Return the caption file's content; `find_videos` has checked it."""
-    path = folder / CAPTIONS_FILE if folder else None
-    return json.loads(path.read_text("utf-8-sig")) if path and path.is_file() else {}
+    """Return the caption file's content under the names of the videos."""
+    if folder is None:
+        return {}
+    home = folder if folder.is_dir() else folder.parent
+    return written_captions(home, [video.path.name for video in find_videos(home)])
 
 
 def _store(run: Path) -> str:

@@ -37,7 +37,7 @@ from v2p_data.stages import (
     task_stage,
 )
 from v2p_data.task.task import TASK_FILE
-from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, find_videos
+from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, read_footage
 
 RUN_FILE = "run.json"
 
@@ -453,8 +453,11 @@ def _settings_in(argv: Sequence[str], source: Path) -> list[str]:
 
 
 def _videos(folder: Path) -> list[VideoItem]:
-    """Return a folder's videos, and say which of them nobody describes: the caption names what is looked for."""
-    videos = find_videos(folder)
+    """Return a folder's videos; say what was passed over, and which of them nobody describes: the caption names what is looked for."""
+    footage = read_footage(folder)
+    for note in footage.notes:
+        print(note, file=sys.stderr)  # noqa: T201
+    videos = list(footage.videos)
     mute = [video.path.name for video in videos if video.caption == NO_CAPTION]
     if mute:
         print(  # noqa: T201

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from v2p_data.episodes.alike import common_features, first_difference, write_retold
 from v2p_data.episodes.card import write_card
 from v2p_data.episodes.cut import write_episodes, write_stats, write_without
 from v2p_data.episodes.features import INTERVENTION_KEY, METADATA_FILE
@@ -70,6 +71,8 @@ class _Source:
     digests: list[str] = field(repr=False)
     lacks_column: bool = False
     """`info` and `about` tell of a column that is to be written yet: who acted."""
+    is_retold: bool = False
+    """`info` says in other words than its file what the columns are."""
 
     @property
     def repo_id(self) -> str:
@@ -97,6 +100,7 @@ def merge(
     for other in sources[1:]:
         _check_alike(sources[0], other)
     _check_doubles(sources)
+    sources = _in_one_wording(sources)
     with _in_place(out) as partial:
         on_progress(0.0, "starting LeRobot")
         with _tables(sources, partial) as folders:
@@ -191,12 +195,8 @@ def _check_alike(a: _Source, b: _Source) -> None:
                 f"{a.root} and {b.root} do not go together: {what} is {one} in the first and {two} in the second"
             )
 
-    for name in ("fps", "robot_type"):
-        differ(name, a.info.get(name), b.info.get(name))
-    differ("the list of columns", sorted(a.info["features"]), sorted(b.info["features"]))
-    for key, feature in a.info["features"].items():
-        for part in ("dtype", "shape", "names"):
-            differ(f"{part} of {key}", feature.get(part), b.info["features"][key].get(part))
+    if difference := first_difference(a.info, b.info):
+        differ(*difference)
     for source in (a, b):
         if (source.info.get("data_path"), source.info.get("video_path") or VIDEO_PATH) != (
             DATA_PATH,
@@ -247,17 +247,33 @@ def _all_with_column(sources: list[_Source]) -> list[_Source]:
     return told
 
 
+def _in_one_wording(sources: list[_Source]) -> list[_Source]:
+    """Return the sources with one feature table: LeRobot compares notes that mean nothing, too."""
+    features = common_features([source.info for source in sources])
+    return [
+        replace(
+            source,
+            info=source.info | {"features": told},
+            is_retold=told != source.info["features"],
+        )
+        for source, told in zip(sources, features, strict=True)
+    ]
+
+
 @contextmanager
 def _tables(sources: list[_Source], partial: Path) -> Iterator[list[Path]]:
-    """Give the folders that LeRobot is to merge: the sources, or copies of their tables with the column."""
+    """Give the folders that LeRobot is to merge: the sources, or copies of their tables with the column or other words."""
     folder = partial.with_name(f"{partial.name}.tables")
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
     try:
         folders: list[Path] = []
         for k, source in enumerate(sources):
+            is_copied = source.lacks_column or source.is_retold
             if source.lacks_column:
                 write_with_column(source.root, source.info, folder / str(k))
-            folders.append(folder / str(k) if source.lacks_column else source.root)
+            elif source.is_retold:
+                write_retold(source.root, source.info, folder / str(k))
+            folders.append(folder / str(k) if is_copied else source.root)
         yield folders
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -282,7 +298,7 @@ def _aggregate(sources: list[_Source], folders: list[Path], repo_id: str, partia
             concatenate_videos=_one_encoder(sources),
         )
     except ValueError as error:
-        raise V2PError(f"LeRobot cannot merge these: {str(error)[:300]}") from error
+        raise V2PError(f"LeRobot cannot merge these: {error}") from error
     # LeRobot's sum is of the statistics before renumbering, and its rows name files that they are not in.
     write_episodes(partial, episodes_of(partial, with_stats=True))
     write_stats(partial)

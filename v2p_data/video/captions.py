@@ -1,7 +1,7 @@
 """Which videos a folder holds, and what a person said about each.
 
 A caption comes from `captions.json` beside the videos, else from a label file of Something-Something-v2 in the
-same folder (a JSON list of `{id, label, template, placeholders}`), else from the file's own name:
+same folder (`labels.py`), else from the file's own name:
 
     {"lift.mp4": "Lifting red box up",
      "push.mp4": {"caption": "Pushing blue box next to can", "objects": ["blue box", "can"],
@@ -16,31 +16,30 @@ import os
 import re
 import shutil
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.video.checked import check_keys, listed, read_json, same_name, type_of, words
 from v2p_data.video.clip import Hint
+from v2p_data.video.hints import MARK_KEYS, boxes_as_read, read_hint
+from v2p_data.video.labels import Labels, read_labels
 from v2p_data.video.meaning import Meaning as Meaning
 from v2p_data.video.meaning import parse_caption as parse_caption
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".webm", ".mkv", ".gif")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".m4v", ".mov", ".qt", ".3gp", ".3g2"),
+    *(".mkv", ".webm", ".avi", ".gif", ".ogv", ".flv", ".wmv", ".asf"),
+    *(".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
+)
+"""In small letters or capitals."""
 CAPTIONS_FILE = "captions.json"
 NO_CAPTION = "moving object"
 """What stands for a caption where nobody gave one and the file's name tells nothing."""
-MIN_SIZE_M = 0.002
-"""Thinner than a coin is a slip of the unit, and nothing a simulator can hold."""
-MAX_SIZE_M = 1.5
-"""No object on a table is longer."""
-MAX_NAME = 60
-"""Letters; a longer name is a sentence."""
 
 _ENTRY_KEYS = ("caption", "hints", "objects")
-_HINT_KEYS = ("box", "frame", "name", "points", "size_m")
-_MARK_KEYS = ("box", "frame", "points")
-"""What belongs to one frame and is replaced together."""
 _NO_WORDS = r"\d+|img|vid|video|videos|clip|mov|pxl|dsc|gopr|rec|screen|untitled|new|final|copy"
 
 
@@ -58,8 +57,27 @@ class VideoItem:
     """By object phrase; frame numbers and pixels are those of the file as a player shows it."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Footage:
+    """The videos of a folder, and what a person should know about how it was read."""
+
+    videos: tuple[VideoItem, ...]
+    """Sorted by file name."""
+    notes: tuple[str, ...]
+    """Sentences: files that were passed over, labels that cannot be used, boxes as they were read."""
+
+
 def find_videos(folder: Path) -> list[VideoItem]:
     """Return the videos of a folder, or the one video given, sorted by file name.
+
+    Raises:
+        V2PError: as `read_footage`.
+    """
+    return list(read_footage(folder).videos)
+
+
+def read_footage(folder: Path) -> Footage:
+    """Return the videos of a folder, or the one video given.
 
     Raises:
         V2PError: no such folder, no videos in it, or captions that cannot be used.
@@ -67,56 +85,68 @@ def find_videos(folder: Path) -> list[VideoItem]:
     if not folder.exists():
         raise V2PError(f"there is no folder or video {folder}; check the path")
     home = folder if folder.is_dir() else folder.parent
-    here = [p for p in sorted(home.iterdir()) if _is_video(p)]
+    try:
+        entries = sorted(home.iterdir())
+    except OSError as error:
+        raise V2PError(f"{home} cannot be listed: {error.strerror}") from error
+    here = [p for p in entries if _is_video(p)]
     wanted = here if folder.is_dir() else [p for p in here if p.name == folder.name]
     if not wanted:
+        deeper = [f"{p.name}/" for p in entries if p.is_dir() and _holds_videos(p)]
+        inside = f", its folders {listed(deeper)} do" if deeper and folder.is_dir() else ""
         raise V2PError(
-            f"{folder} {'holds no videos' if folder.is_dir() else 'is no video'}; "
+            f"{folder} {'holds no videos' if folder.is_dir() else 'is no video'}{inside}; "
             f"known endings are {' '.join(VIDEO_SUFFIXES)}"
         )
     written = _read_captions(home, [p.name for p in here])
-    labelled = _read_labels(home)
-    items = dict(zip(here, unique_items([p.stem for p in here]), strict=True))
-    return [
-        _item(items[p], p, written.get(p.name) or labelled.get(p.stem) or (_from_name(p), (), {}))
+    files = [p for p in entries if p.suffix.lower() == ".json" and p.name != CAPTIONS_FILE]
+    labels = read_labels([p for p in files if p.is_file()], [p.stem for p in here])
+    labelled = {stem: (*said, {}) for stem, said in labels.said.items()}
+    ids = dict(zip(here, unique_items([p.stem for p in here]), strict=True))
+    videos = tuple(
+        _item(ids[p], p, written.get(p.name) or labelled.get(p.stem) or (_from_name(p), (), {}))
         for p in wanted
+    )
+    passed = _passed_over(entries, labels) if folder.is_dir() else []
+    boxes = [box for v in videos for box in boxes_as_read(v.hints, v.path.name)]
+    notes = [
+        *labels.notes,
+        *([f"{len(passed)} in {home} passed over, no videos: {listed(passed)}"] if passed else []),
+        *([f"boxes read as x0, y0, x1, y1 in pixels: {listed(boxes, 3)}"] if boxes else []),
     ]
+    return Footage(videos=videos, notes=tuple(notes))
 
 
-def check_hints(
-    hints: Mapping[str, Hint], size_px: tuple[int, int], num_frames: int, where: str
-) -> None:
-    """Check marks against the picture they were made in.
+def written_captions(folder: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Return the content of a folder's caption file, under the names as the folder has them; `{}` where there is none.
 
     Args:
-        hints: by object phrase, in the file's pixels and frame numbers.
-        size_px: width and height of the picture as a player shows it.
-        num_frames: frames that the file holds.
-        where: what a sentence begins with, such as the file's name.
+        folder: the folder of the videos.
+        names: the videos' file names.
 
     Raises:
-        V2PError: a mark lies outside of the picture, or in a frame that there is not.
+        V2PError: no JSON object, or it names a file that is not there or names one twice.
     """
-    width, height = size_px
-    for name, hint in hints.items():
-        frame = hint.get("frame", 0)
-        if frame >= num_frames:
+    path = folder / CAPTIONS_FILE
+    if not path.is_file():
+        return {}
+    data = read_json(path)
+    if not isinstance(data, dict):
+        raise V2PError(f"{path} must hold an object, file name -> caption, not a {type_of(data)}")
+    found: dict[str, Any] = {}
+    for said_name, entry in data.items():
+        name = same_name(said_name, names)
+        if name is None:
             raise V2PError(
-                f"{where}, hint '{name}': there is no frame {frame}; the video's frames are 0 to {num_frames - 1}"
+                f"{path} has a caption for '{said_name}', which is not in the folder; "
+                f"rename or remove the entry.{did_you_mean(said_name, names)}"
             )
-        x0, y0, x1, y1 = hint.get("box", [0, 0, width, height])
-        # a box drawn to the border may round to the pixel behind it
-        if x1 > width + 1 or y1 > height + 1:
+        if name in found:
             raise V2PError(
-                f"{where}, hint '{name}': the box {[x0, y0, x1, y1]} reaches outside of the picture, "
-                f"which is {width} x {height} px"
+                f"{path} has two entries for '{name}', with its accents encoded in two ways; remove one"
             )
-        for x, y in hint.get("points", []):
-            if not (0 <= x <= width and 0 <= y <= height):
-                raise V2PError(
-                    f"{where}, hint '{name}': the point {[x, y]} lies outside of the picture, "
-                    f"which is {width} x {height} px"
-                )
+        found[name] = entry
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,15 +184,16 @@ def merge_captions(folder: Path, addition: Path) -> Merged:
         raise V2PError(
             f"{addition} is the very file that the hints go into; give the one that was downloaded from the review page"
         )
-    captions: dict[str, Any] = _read_json(path) if path.is_file() else {}
+    captions = written_captions(folder, list(items))
     changed: dict[str, dict[str, Hint]] = {}
     added: list[str] = []
     kept: list[str] = []
-    for name, entry in _entries_of(addition).items():
-        where = f"{addition}, entry '{name}'"
-        if name not in items:
+    for said_name, entry in _entries_of(addition).items():
+        where = f"{addition}, entry '{said_name}'"
+        name = same_name(said_name, items)
+        if name is None:
             raise V2PError(
-                f"{where}: there is no such video in {folder}.{did_you_mean(name, items)}"
+                f"{where}: there is no such video in {folder}.{did_you_mean(said_name, items)}"
             )
         video = items[name]
         hints = entry.get("hints") or {}
@@ -176,6 +207,7 @@ def merge_captions(folder: Path, addition: Path) -> Merged:
             entry_here if isinstance(entry_here, dict) else {"caption": video.caption}
         )
         both: dict[str, Any] = dict(old.get("hints", {}))
+        hints = {same_name(phrase, both) or phrase: hint for phrase, hint in hints.items()}
         for phrase, hint in hints.items():
             both[phrase] = _merged_hint(both.get(phrase), hint)
         if both == old.get("hints", {}):
@@ -237,10 +269,10 @@ def unique_items(stems: list[str]) -> list[str]:
 
 def _entries_of(path: Path) -> dict[str, dict[str, Any]]:
     """Return caption, objects and hints by file name, from either kind of file."""
-    data = _read_json(path)
+    data = read_json(path)
     if not isinstance(data, dict):
         raise V2PError(
-            f"{path} is neither a caption file nor a review: both are objects, not a {_type_of(data)}"
+            f"{path} is neither a caption file nor a review: both are objects, not a {type_of(data)}"
         )
     if isinstance(data.get("clips"), list):
         clips = [c for c in data["clips"] if isinstance(c, dict) and c.get("hints")]
@@ -251,12 +283,12 @@ def _entries_of(path: Path) -> dict[str, dict[str, Any]]:
         entry = {"caption": entry} if isinstance(entry, str) else entry
         if not isinstance(entry, dict):
             raise V2PError(
-                f"{where}: give a caption, or an object with caption, objects and hints, not a {_type_of(entry)}"
+                f"{where}: give a caption, or an object with caption, objects and hints, not a {type_of(entry)}"
             )
-        _check_keys(entry, _ENTRY_KEYS, where)
+        check_keys(entry, _ENTRY_KEYS, where)
         if not isinstance(entry.get("hints", {}), dict):
             raise V2PError(
-                f"{where}: 'hints' must be an object, name -> hint, not a {_type_of(entry['hints'])}"
+                f"{where}: 'hints' must be an object, name -> hint, not a {type_of(entry['hints'])}"
             )
         entries[name] = entry
     return entries
@@ -266,7 +298,7 @@ def _merged_hint(old: Any, new: Any) -> Any:
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return new
     if "box" in new or "points" in new:
-        old = {k: v for k, v in old.items() if k not in _MARK_KEYS}
+        old = {k: v for k, v in old.items() if k not in MARK_KEYS}
         return {**old, **new}
     return {**old, **{k: v for k, v in new.items() if k != "frame"}}
 
@@ -296,19 +328,9 @@ def _item(item: str, path: Path, said: _Said) -> VideoItem:
 
 
 def _read_captions(folder: Path, names: list[str]) -> dict[str, _Said]:
-    path = folder / CAPTIONS_FILE
-    if not path.is_file():
-        return {}
-    data = _read_json(path)
-    if not isinstance(data, dict):
-        raise V2PError(f"{path} must hold an object, file name -> caption, not a {_type_of(data)}")
-    for name in data:
-        if name not in names:
-            raise V2PError(
-                f"{path} has a caption for '{name}', which is not in the folder; "
-                f"rename or remove the entry.{did_you_mean(name, names)}"
-            )
-    return {name: _entry(entry, f"{path}, entry '{name}'") for name, entry in data.items()}
+    where = folder / CAPTIONS_FILE
+    written = written_captions(folder, names)
+    return {name: _entry(entry, f"{where}, entry '{name}'") for name, entry in written.items()}
 
 
 def _entry(entry: Any, where: str) -> _Said:
@@ -317,162 +339,54 @@ def _entry(entry: Any, where: str) -> _Said:
     if not isinstance(entry, dict):
         raise V2PError(
             f"{where}: give a caption, or an object with caption, objects and hints, "
-            f"not a {_type_of(entry)}"
+            f"not a {type_of(entry)}"
         )
-    _check_keys(entry, _ENTRY_KEYS, where)
-    caption = _words(entry.get("caption"), f"{where}: 'caption'")
+    check_keys(entry, _ENTRY_KEYS, where)
+    caption = words(entry.get("caption"), f"{where}: 'caption'")
     objects = entry.get("objects", [])
     if not isinstance(objects, list):
-        raise V2PError(f"{where}: 'objects' must be a list of names, not a {_type_of(objects)}")
-    objects = tuple(_words(o, f"{where}: each of 'objects'") for o in objects)
+        raise V2PError(f"{where}: 'objects' must be a list of names, not a {type_of(objects)}")
+    objects = tuple(words(o, f"{where}: each of 'objects'") for o in objects)
     if len(set(objects)) < len(objects):
         raise V2PError(f"{where}: 'objects' names one object twice; give each its own name")
     hints = entry.get("hints", {})
     if not isinstance(hints, dict):
-        raise V2PError(
-            f"{where}: 'hints' must be an object, name -> hint, not a {_type_of(hints)}"
-        )
+        raise V2PError(f"{where}: 'hints' must be an object, name -> hint, not a {type_of(hints)}")
     known = objects or parse_caption(caption).phrases
-    for name in hints:
-        if name not in known:
+    checked: dict[str, Hint] = {}
+    for said_name, hint in hints.items():
+        name = same_name(said_name, known)
+        if name is None:
             raise V2PError(
-                f"{where}: there is a hint for '{name}', which is none of the objects."
-                f"{did_you_mean(name, known)}"
+                f"{where}: there is a hint for '{said_name}', which is none of the objects."
+                f"{did_you_mean(said_name, known)}"
             )
-    return caption, objects, {n: _hint(h, f"{where}, hint '{n}'") for n, h in hints.items()}
+        checked[name] = read_hint(hint, f"{where}, hint '{said_name}'")
+    return caption, objects, checked
 
 
-def _hint(hint: Any, where: str) -> Hint:
-    if not isinstance(hint, dict):
-        raise V2PError(f"{where}: must be an object, not a {_type_of(hint)}")
-    _check_keys(hint, _HINT_KEYS, where)
-    frame = hint.get("frame", 0)
-    if not isinstance(frame, int) or isinstance(frame, bool) or frame < 0:
-        raise V2PError(f"{where}: 'frame' must be a frame number from 0, not {frame!r}")
-    checked = Hint(frame=frame)
-    if "box" in hint:
-        box = _numbers(hint["box"], 4, f"{where}: 'box' must be [x0, y0, x1, y1]")
-        if not (0 <= box[0] < box[2] and 0 <= box[1] < box[3]):
-            raise V2PError(
-                f"{where}: 'box' needs 0 <= x0 < x1 and 0 <= y0 < y1 in pixels, got {box}"
-            )
-        checked["box"] = box
-    if "points" in hint:
-        points = hint["points"]
-        if not isinstance(points, list) or not points:
-            raise V2PError(f"{where}: 'points' must be a list of [x, y], not {json.dumps(points)}")
-        checked["points"] = [_numbers(p, 2, f"{where}: a point must be [x, y]") for p in points]
-    if "size_m" in hint:
-        size = _numbers(hint["size_m"], 3, f"{where}: 'size_m' must be [length, width, height]")
-        if not all(MIN_SIZE_M <= side <= MAX_SIZE_M for side in size):
-            raise V2PError(
-                f"{where}: 'size_m' is in metres, each from {MIN_SIZE_M} to {MAX_SIZE_M}, got {size}"
-            )
-        checked["size_m"] = size
-    if "name" in hint:
-        name = _words(hint["name"], f"{where}: 'name'")
-        if len(name) > MAX_NAME:
-            raise V2PError(
-                f"{where}: 'name' is the object's name in a word or two, at most {MAX_NAME} letters, "
-                f"not {len(name)}"
-            )
-        checked["name"] = name
-    if len(checked) == 1:
-        raise V2PError(f"{where}: says nothing; give a box, points, size_m or name")
-    return checked
-
-
-def _read_labels(folder: Path) -> dict[str, _Said]:
-    """Return what the label files of Something-Something-v2 in the folder say, by video id."""
-    said: dict[str, _Said] = {}
-    for path in sorted(folder.glob("*.json")):
-        if path.name == CAPTIONS_FILE:
+def _passed_over(entries: list[Path], labels: Labels) -> list[str]:
+    """Return the names of files that are neither videos nor about them, and of folders with videos in them."""
+    names: list[str] = []
+    for path in entries:
+        name = path.name
+        if name.startswith((".", CAPTIONS_FILE)) or name in labels.files or _is_video(path):
             continue
-        data = _read_json(path)
-        if not (isinstance(data, list) and data and all(isinstance(d, dict) for d in data)):
-            continue
-        if not all("id" in d and ("label" in d or "template" in d) for d in data):
-            continue
-        for label in data:
-            where = f"{path}, id '{label['id']}'"
-            objects = label.get("placeholders", [])
-            if not isinstance(objects, list):
-                raise V2PError(
-                    f"{where}: 'placeholders' must be a list, not a {_type_of(objects)}"
-                )
-            objects = [_words(o, f"{where}: each of 'placeholders'") for o in objects]
-            caption = label.get("label") or _filled(str(label.get("template") or ""), objects)
-            caption = _words(caption, f"{where}: 'label'")
-            said.setdefault(str(label["id"]), (caption, tuple(dict.fromkeys(objects)), {}))
-    return said
+        if not path.is_dir():
+            names.append(name)
+        elif path.suffix.lower() in VIDEO_SUFFIXES or _holds_videos(path):
+            names.append(f"{name}/")
+    return names
 
 
-def _filled(template: str, objects: list[str]) -> str:
-    """Return the template with its `[something]` replaced by the objects, in order."""
-    for name in objects:
-        template = re.sub(r"\[[^\]]*\]", lambda _, name=name: name, template, count=1)
-    return template
+def _holds_videos(folder: Path) -> bool:
+    try:
+        return any(_is_video(p) for p in folder.iterdir())
+    except OSError:
+        return False
 
 
 def _from_name(path: Path) -> str:
     words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", path.stem).split()
     kept = [w for w in words if not re.fullmatch(_NO_WORDS, w.lower())]
     return " ".join(kept) or NO_CAPTION
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text("utf-8-sig"), object_pairs_hook=_no_duplicates)
-    except json.JSONDecodeError as error:
-        raise V2PError(
-            f"{path}, line {error.lineno}, column {error.colno}: {error.msg}; this is not valid JSON"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise V2PError(f"{path} is not UTF-8 text; save it as UTF-8") from error
-    except RecursionError as error:
-        raise V2PError(f"{path} is nested too deeply; this is no caption file") from error
-    except _DuplicateKeyError as error:
-        raise V2PError(f"{path} has two entries for '{error}'; remove one") from error
-    except OSError as error:
-        raise V2PError(f"{path} cannot be read: {error.strerror}") from error
-
-
-class _DuplicateKeyError(Exception):
-    pass
-
-
-def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    seen: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in seen:
-            raise _DuplicateKeyError(key)
-        seen[key] = value
-    return seen
-
-
-def _check_keys(data: dict[str, Any], known: tuple[str, ...], where: str) -> None:
-    for key in data:
-        if key not in known:
-            raise V2PError(f"{where}: unknown key '{key}'.{did_you_mean(key, known)}")
-
-
-def _words(value: Any, what: str) -> str:
-    if not isinstance(value, str):
-        raise V2PError(f"{what} must be text, not a {_type_of(value)}")
-    if not any(c.isalnum() for c in value):
-        raise V2PError(f"{what} is empty; say in words what happens or what it is")
-    return " ".join(value.split())
-
-
-def _numbers(value: Any, count: int, what: str) -> list[float]:
-    def fits(v: Any) -> bool:
-        return isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e6
-
-    if not (isinstance(value, list) and len(value) == count and all(fits(v) for v in value)):
-        raise V2PError(f"{what}, {count} numbers, not {json.dumps(value)}")
-    return [float(v) for v in value]
-
-
-def _type_of(value: Any) -> str:
-    names = {dict: "object", list: "list", str: "text", bool: "true/false", type(None): "null"}
-    return names.get(type(value), "number")

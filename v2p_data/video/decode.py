@@ -1,7 +1,7 @@
 """A video file becomes a clip: the only place that decodes video.
 
 Reads whatever libav reads from a local file of a known container, one frame at a time. What comes out is RGB,
-turned the way a player shows it, scaled down, and evenly spaced in time. Bytes that are no usable video end in
+turned and mirrored the way a player shows it, scaled down, and evenly spaced in time. Bytes that are no usable video end in
 an `ItemRejectedError`, never in a crash or an endless loop.
 """
 
@@ -23,8 +23,17 @@ from av.video.stream import VideoStream
 from jaxtyping import Int, UInt8
 
 from v2p_data.errors import ItemRejectedError, V2PError
-from v2p_data.video.captions import VideoItem, check_hints
+from v2p_data.video.captions import VideoItem
 from v2p_data.video.clip import Clip, Hint
+from v2p_data.video.hints import check_hints
+from v2p_data.video.tracks import (
+    Orientation,
+    Promise,
+    film_stream,
+    is_before_start,
+    orientation_of,
+    promise_of,
+)
 
 log = logging.getLogger(__name__)
 
@@ -80,15 +89,15 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
     """Decode one video.
 
     Raises:
-        ItemRejectedError: `empty_file`, `unreadable`, `truncated`, `no_video_stream`, `too_few_frames`, `too_small`,
-            `too_large`, `too_long` or `too_slow`; `bad_hint` where a hint marks what the video does not have.
+        ItemRejectedError: `empty_file`, `unreadable`, `truncated`, `no_video_stream`, `odd_angle`, `too_few_frames`,
+            `too_small`, `too_large`, `too_long` or `too_slow`; `bad_hint` where a hint marks what the video does not have.
     """
     film = _decode(item.path, cfg)
     total = film.seen
-    warnings: list[str] = []
+    warnings = [*film.notes]
     name = item.path.name
-    if film.promised and total < _TRUNCATED * film.promised:
-        detail = f"{name} is cut off: {total} of about {film.promised} frames can be decoded"
+    if film.is_cut:
+        detail = f"{name} is cut off: {total} of about {film.promise.frames} frames can be decoded"
         if total < cfg.min_frames:
             raise ItemRejectedError("truncated", f"{detail}; copy it again", float(total))
         warnings.append(f"{detail}; the rest of the motion is missing")
@@ -143,8 +152,9 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
 class _Film:
     """What one pass over a file gathers: at most `2 * max_frames` pictures, all in one piece of memory."""
 
-    promised: int
-    """Frames the container speaks of; 0 when it does not."""
+    promise: Promise
+    notes: tuple[str, ...]
+    """Sentences for a person about the choice of the stream."""
     seen: int = 0
     broken: int = 0
     """Packets that could not be decoded."""
@@ -159,6 +169,16 @@ class _Film:
     duration_s: float = 0.0
     """From the first frame to the last."""
     shown_px: tuple[int, int] = (0, 0)
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the end is missing: too few frames for the film's rate, and too early a last one.
+
+        A last picture may be shown for long, and the rate may vary, so neither is enough by itself.
+        """
+        few = self.seen < _TRUNCATED * self.promise.frames
+        early = self.duration_s < _TRUNCATED * self.promise.seconds
+        return few and (early or not self.promise.seconds)
 
     def keep(self, pixels: UInt8[np.ndarray, "h w 3"], time_s: float, most: int) -> None:
         """Add the picture seen last; there is room for `most`."""
@@ -227,20 +247,15 @@ def _opened(path: Path, cfg: VideoConfig) -> "av.container.InputContainer":
 
 
 def _film_of(container: "av.container.InputContainer", path: Path, cfg: VideoConfig) -> _Film:
-    if not container.streams.video:
-        raise ItemRejectedError("no_video_stream", f"{path.name} holds no pictures")
-    stream = container.streams.video[0]
-    if stream.codec_context is None:  # not what the types say, but what a damaged file gives
-        raise ItemRejectedError("unreadable", f"{path.name} holds pictures of an unknown kind")
+    stream, notes = film_stream(container, path)
     _check_size(path, stream.codec_context.width, stream.codec_context.height, cfg, low=False)
-    seconds = (container.duration or 0) / av.time_base
-    _check_duration(path, seconds, cfg)
     # threads would reorder what a damaged file gives
     stream.codec_context.thread_count = 1
     stream.codec_context.options = {"max_pixels": str(round(cfg.max_file_mpx * 1e6))}
     rate = stream.average_rate or stream.guessed_rate or Fraction(30)
-    promised = stream.frames or round(seconds * rate)
-    film = _Film(promised=promised if 0 < promised < 1e6 else 0)
+    promise = promise_of(container, stream, rate)
+    _check_duration(path, promise.seconds, cfg)
+    film = _Film(promise=promise, notes=notes)
     step = 0.0
     picture: _Picture | None = None
     for seen_s, frame in _timed_frames(container, stream, float(rate) or 30.0, film, cfg, path):
@@ -292,7 +307,7 @@ def _timed_frames(
         # a picture of 8K takes 50 to 100 MB: none is held while the next one is decoded
         while frames:
             frame = frames.pop(0)
-            if not isinstance(frame, VideoFrame):
+            if not isinstance(frame, VideoFrame) or is_before_start(container, frame):
                 continue
             shown = frame.time
             if shown is None or (first is not None and shown - first <= last):
@@ -326,8 +341,8 @@ class _Picture:
 
     width_px: int
     height_px: int
-    turns: int
-    """Quarter turns, counter-clockwise, after scaling."""
+    orientation: Orientation
+    """Applied after scaling."""
     shown_px: tuple[int, int]
 
     @staticmethod
@@ -337,13 +352,13 @@ class _Picture:
         width, height = frame.width * aspect, float(frame.height)
         _check_size(path, round(width), round(height), cfg)
         scale = min(1.0, cfg.max_side_px / max(width, height))
-        turns = round(frame.rotation / 90) % 4
+        orientation = orientation_of(frame, path)
         shown = round(width), round(height)
         return _Picture(
             width_px=max(2, 2 * round(width * scale / 2)),
             height_px=max(2, 2 * round(height * scale / 2)),
-            turns=turns,
-            shown_px=(shown[1], shown[0]) if turns % 2 else shown,
+            orientation=orientation,
+            shown_px=(shown[1], shown[0]) if orientation.swaps_axes else shown,
         )
 
     def rgb(self, frame: VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
@@ -362,7 +377,7 @@ class _Picture:
             opacity = scaled[..., 3:].astype(np.uint16)
             white = 255 * (255 - opacity)
             scaled = ((scaled[..., :3] * opacity + white + 127) // 255).astype(np.uint8)
-        return np.ascontiguousarray(np.rot90(scaled, self.turns))
+        return self.orientation.shown(scaled)
 
 
 def _even(

@@ -1,0 +1,131 @@
+"""Hints: what a person marked about an object, checked alone and against the picture that it was marked in."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from v2p_data.errors import V2PError
+from v2p_data.video.checked import check_keys, numbers, type_of, words
+from v2p_data.video.clip import Hint
+
+MIN_SIZE_M = 0.002
+"""Thinner than a coin is a slip of the unit, and nothing a simulator can hold."""
+MAX_SIZE_M = 1.5
+"""No object on a table is longer."""
+MAX_NAME = 60
+"""Letters; a longer name is a sentence."""
+MARK_KEYS = ("box", "frame", "points")
+"""What belongs to one frame and is replaced together."""
+
+_KEYS = ("box", "frame", "name", "points", "size_m")
+_LARGEST_FRACTION = 1.5
+"""Pixels; marks that all lie this near to the corner are shares of the picture."""
+
+
+def read_hint(hint: Any, where: str) -> Hint:
+    """Return one hint, checked as far as it can be without the picture.
+
+    Raises:
+        V2PError: it cannot be used; the sentence begins with `where`.
+    """
+    if not isinstance(hint, dict):
+        raise V2PError(f"{where}: must be an object, not a {type_of(hint)}")
+    check_keys(hint, _KEYS, where)
+    frame = hint.get("frame", 0)
+    if not isinstance(frame, int) or isinstance(frame, bool) or frame < 0:
+        raise V2PError(f"{where}: 'frame' must be a frame number from 0, not {frame!r}")
+    checked = Hint(frame=frame)
+    if "box" in hint:
+        checked["box"] = _box(hint["box"], where)
+    if "points" in hint:
+        points = hint["points"]
+        if not isinstance(points, list) or not points:
+            raise V2PError(f"{where}: 'points' must be a list of [x, y], not {json.dumps(points)}")
+        checked["points"] = [numbers(p, 2, f"{where}: a point must be [x, y]") for p in points]
+        flat = [v for point in checked["points"] for v in point]
+        if max(flat) <= _LARGEST_FRACTION and any(v % 1 for v in flat):
+            raise V2PError(
+                f"{where}: 'points' look like fractions of the picture, got {points}; "
+                "a point is [x, y] in pixels"
+            )
+    if "size_m" in hint:
+        size = numbers(hint["size_m"], 3, f"{where}: 'size_m' must be [length, width, height]")
+        if not all(MIN_SIZE_M <= side <= MAX_SIZE_M for side in size):
+            raise V2PError(
+                f"{where}: 'size_m' is in metres, each from {MIN_SIZE_M} to {MAX_SIZE_M}, got {size}"
+            )
+        checked["size_m"] = size
+    if "name" in hint:
+        name = words(hint["name"], f"{where}: 'name'")
+        if len(name) > MAX_NAME:
+            raise V2PError(
+                f"{where}: 'name' is the object's name in a word or two, at most {MAX_NAME} letters, "
+                f"not {len(name)}"
+            )
+        checked["name"] = name
+    if len(checked) == 1:
+        raise V2PError(f"{where}: says nothing; give a box, points, size_m or name")
+    return checked
+
+
+def check_hints(
+    hints: Mapping[str, Hint], size_px: tuple[int, int], num_frames: int, where: str
+) -> None:
+    """Check marks against the picture they were made in.
+
+    Args:
+        hints: by object phrase, in the file's pixels and frame numbers.
+        size_px: width and height of the picture as a player shows it.
+        num_frames: frames that the file holds.
+        where: what a sentence begins with, such as the file's name.
+
+    Raises:
+        V2PError: a mark lies outside of the picture, or in a frame that there is not.
+    """
+    width, height = size_px
+    for name, hint in hints.items():
+        frame = hint.get("frame", 0)
+        if frame >= num_frames:
+            raise V2PError(
+                f"{where}, hint '{name}': there is no frame {frame}; the video's frames are 0 to {num_frames - 1}"
+            )
+        x0, y0, x1, y1 = hint.get("box", [0, 0, width, height])
+        # a box drawn to the border may round to the pixel behind it
+        if x1 > width + 1 or y1 > height + 1:
+            raise V2PError(
+                f"{where}, hint '{name}': the box {[x0, y0, x1, y1]} reaches outside of the picture, "
+                f"which is {width} x {height} px; a box is x0, y0, x1, y1 in pixels of the video as a player shows it: "
+                "neither x, y, width, height nor thousandths of the picture"
+            )
+        for x, y in hint.get("points", []):
+            if not (0 <= x <= width and 0 <= y <= height):
+                raise V2PError(
+                    f"{where}, hint '{name}': the point {[x, y]} lies outside of the picture, "
+                    f"which is {width} x {height} px"
+                )
+
+
+def boxes_as_read(hints: Mapping[str, Hint], where: str) -> list[str]:
+    """Return in words which box was read for each object: a wrong order of its numbers shows in the size."""
+    return [
+        f"{where} '{name}' {x1 - x0:g} x {y1 - y0:g} px at ({x0:g}, {y0:g})"
+        for name, hint in hints.items()
+        if "box" in hint
+        for x0, y0, x1, y1 in [hint["box"]]
+    ]
+
+
+def _box(value: Any, where: str) -> list[float]:
+    box = numbers(value, 4, f"{where}: 'box' must be [x0, y0, x1, y1]")
+    x0, y0, x1, y1 = box
+    if max(box) <= _LARGEST_FRACTION:
+        raise V2PError(
+            f"{where}: 'box' {box} looks like fractions of the picture; a box is x0, y0, x1, y1 in pixels"
+        )
+    if not (0 <= x0 < x1 and 0 <= y0 < y1):
+        meant = [x0, y0, x0 + x1, y0 + y1]
+        other = f"; if {box} is x, y, width, height, write {meant}" if min(box) >= 0 else ""
+        raise V2PError(
+            f"{where}: 'box' needs 0 <= x0 < x1 and 0 <= y0 < y1 in pixels, got {box}{other}"
+        )
+    return box
