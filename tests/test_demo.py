@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[1]
 SAMPLES = ROOT / "datasets" / "sample_videos"
 SEEN, UNSEEN = "push_blue_box_left", "unseen/lift_orange_can"
 SETTINGS = """
+video: {max_side_px: 320, max_frames: 40}
 task: {num_samples: 1}
 expert:
   num_envs: 32
@@ -30,7 +31,7 @@ expert:
   imitation: {rounds: 5, least_rounds: 4, target_success: 0.5}
   ppo: {total_steps: 1024, window_episodes: 8, min_window_episodes: 4, num_deterministic: 8, eval_episodes: 8}
 episodes: {num_episodes: 2, batch_worlds: 16, size_px: 48}
-distillation: {rounds: 1, episodes: 2, worlds: 8, first_steps: 2}
+distillation: {rounds: 1, episodes: 2, worlds: 4, first_steps: 2}
 policy: {preset: small, steps: 3, batch_size: 8}
 evaluation: {episodes: 2, worlds: 2}
 """

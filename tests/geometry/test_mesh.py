@@ -158,6 +158,10 @@ def heights_of_centres(*meshes) -> list[float]:
     return [float(mass_properties(mesh, 1.0)[0][2]) for mesh in meshes]
 
 
+def test_a_balls_bounding_box_has_exactly_its_diameter():
+    np.testing.assert_allclose(sphere(0.07).bounds, [[-0.035] * 3, [0.035] * 3], rtol=1e-12)
+
+
 def test_a_box_weighs_around_its_middle_as_the_school_book_says():
     a, b, c = size = (0.1, 0.06, 0.2)
 

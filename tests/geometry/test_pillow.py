@@ -57,6 +57,8 @@ def test_nothing_is_thicker_than_the_cap_and_what_is_flat_stays_the_same():
     assert flat.max() == pytest.approx(0.004)
     assert free.max() > 0.015
     assert (flat <= np.maximum(free, 0.004) + 1e-9).all()
+    y, x = np.nonzero(outline)
+    assert flat[y, x][np.hypot(x - 40, y - 30) < 15].min() > 0.95 * 0.004  # a plate, no cone
     assert not inflated(np.zeros((20, 20), bool), PX_M, NO_CAP).any()
 
 
@@ -108,6 +110,29 @@ def test_a_mesh_moves_with_its_outline():
     moved, _ = made(disc(at=(52, 33)))
 
     np.testing.assert_allclose(moved.bounds - mesh.bounds, [[0.012, 0.003, 0]] * 2, atol=1e-6)
+
+
+def test_the_rim_lies_on_the_outline_to_half_a_pixel():
+    outline = disc()
+
+    mesh, _ = made(outline)
+
+    upright = np.abs(mesh.face_normals[:, 2]) < 1e-6
+    rim = mesh.vertices[np.unique(mesh.faces[upright]), :2] / PX_M
+    radii = np.linalg.norm(rim - [40.5, 30.5], axis=1)  # the middle of the pixel (40, 30)
+    np.testing.assert_allclose(radii, np.sqrt(outline.sum() / np.pi), atol=0.5)
+
+
+def test_a_rim_is_at_most_half_as_thick_as_the_middle_and_never_sharp():
+    outline = disc()
+    plate, _ = pillow(outline, np.full(outline.shape, 0.01, np.float32), PX_M)
+    leaf, _ = pillow(outline, np.zeros(outline.shape, np.float32), PX_M)
+
+    upright = np.abs(plate.face_normals[:, 2]) < 1e-6
+    rim = np.abs(plate.vertices[np.unique(plate.faces[upright]), 2])
+    np.testing.assert_allclose(rim, 0.005, rtol=1e-5)
+    assert plate.bounds[1, 2] == pytest.approx(0.01)
+    np.testing.assert_allclose(np.abs(leaf.vertices[:, 2]), 0.0004)
 
 
 @pytest.mark.parametrize("outline", [disc(), boot()], ids=["disc", "boot"])
