@@ -1,6 +1,6 @@
 """Learn the benchmark tasks and judge the experts: the table of `docs/experts.md`.
 
-Each task of `configs/benchmark` is learned with the engine's defaults, once per seed, and judged by the
+Each task of `v2p_data/task/paper_tasks` is learned with the engine's defaults, once per seed, and judged by the
 independent referee on fresh episodes at the fine time step. Results are appended to a JSON-lines file, so that a
 stopped run goes on where it was; `--table` prints what is there.
 

@@ -15,7 +15,15 @@ from policies.ppo.policy import ActorCritic, Expert
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.pipeline.artifact import Record, read_record
-from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, make_stage, stored_outcome
+from v2p_data.pipeline.runner import (
+    Make,
+    Outcome,
+    Runtime,
+    Stage,
+    in_order,
+    make_stage,
+    stored_outcome,
+)
 from v2p_data.policy_config import PolicyConfig
 from v2p_data.stages import EngineConfig, dataset_stage, episodes_stage
 from v2p_data.task.task import TaskBundle
@@ -54,6 +62,17 @@ def bundle() -> TaskBundle:
 
 def agree(_: object, course: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.ones(course["eef_pos"].shape[1], bool)
+
+
+def make_agreeing(
+    make: Make, cfg: Any, inputs: Mapping[str, Path], out: Path, how: Runtime
+) -> Any:
+    """Make a stage in a worker process, where the referee must be told anew to agree."""
+    from v2p_data.episodes import rollouts
+    from v2p_data.sim import verdict
+
+    verdict.referee_verdict = rollouts.referee_verdict = agree
+    return make(cfg, inputs, out, how)
 
 
 def expert() -> Expert:

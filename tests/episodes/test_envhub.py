@@ -4,33 +4,17 @@ import ast
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import pytest
 from hub_server import TOKEN, Hub
-from toy_task import bundle
+from toy_task import write_task
 
 from v2p_data.episodes.envhub import engine_modules, write_envhub
 from v2p_data.episodes.hub import push_envhub
 from v2p_data.errors import V2PError
 
-CODE = """
-from factory.tasks.task import Task
-
-class PushTask(Task):
-    def __init__(self, envs, urdf_assets_root):
-        super().__init__(envs, urdf_assets_root, {})
-        self.task_description = "push the cube to the left"
-
-    def compute_success(self, states):
-        return states["eef_pos"][:, 1] > 0.08
-
-    def compute_reward(self, actions, states):
-        left = states["eef_pos"][:, 1]
-        return left, {"left": left}
-"""
 LOAD = """
 import sys
 from pathlib import Path
@@ -54,15 +38,6 @@ print("told:", env.call("task_description"), info["is_success"].tolist())
 source = Path(sys.modules["v2p_data"].__file__)
 print("from the cache:", source.is_relative_to(sys.argv[1]))
 """
-
-
-def write_task(folder: Path, title: str) -> Path:
-    scene = folder.parent / f"{title}_scene"
-    scene.mkdir(parents=True)
-    made = bundle()
-    made.scene.save(scene)
-    replace(made, code=CODE, title=title, scene=replace(made.scene, folder=scene)).save(folder)
-    return folder
 
 
 @pytest.fixture

@@ -41,7 +41,7 @@ class Camera:
         origin = self.T_world_cam[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (height_m - origin[2]) / rays[:, 2:]
-        return np.where(distance > 0, origin + distance * rays, np.nan)
+            return np.where(distance > 0, origin + distance * rays, np.nan)
 
 
 def intrinsics(width_px: int, height_px: int, fovy_rad: float) -> Float[np.ndarray, "3 3"]:

@@ -1,4 +1,4 @@
-"""The twelve tasks of the paper as scenes without a video, for measuring: `configs/benchmark/<task>.yaml`.
+"""The twelve tasks of the paper as scenes without a video, for measuring: `paper_tasks/<task>.yaml`.
 
 A file says what a video would: the caption, the objects with their sizes, and the way each took. The task code
 beside it (`<task>.py`) is the reference; without one, the templates' first sample is taken.
@@ -19,7 +19,7 @@ from v2p_data.task.sandbox import class_name
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
 
-FOLDER = Path(__file__).parents[2] / "configs" / "benchmark"
+FOLDER = Path(__file__).parent / "paper_tasks"
 FPS = 20.0
 
 

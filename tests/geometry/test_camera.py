@@ -1,0 +1,208 @@
+"""Laws of the pinhole camera; OpenCV projects and resizes, MuJoCo frames its cameras, as oracles."""
+
+import cv2
+import mujoco
+import numpy as np
+import pytest
+
+from v2p_data.geometry.camera import (
+    CV_FROM_GL,
+    Camera,
+    between_centres,
+    intrinsics,
+    look_at,
+    mujoco_xyaxes,
+)
+from v2p_data.geometry.pose import apply
+
+WIDTH_PX, HEIGHT_PX, FOVY_RAD = 64, 48, 0.9
+
+
+@pytest.fixture
+def camera(rng, draw_transform) -> Camera:
+    """Of no symmetry: the principal point off the middle, pixels that are not square."""
+    K = np.array([[70.0, 0, 20], [0, 90, 33], [0, 0, 1]])
+    return Camera(width_px=WIDTH_PX, height_px=HEIGHT_PX, K=K, T_world_cam=draw_transform(rng))
+
+
+@pytest.fixture
+def seen_points(rng, camera) -> np.ndarray:
+    """In the world, before the camera."""
+    in_camera = np.c_[rng.uniform(-1, 1, (7, 2)), rng.uniform(0.5, 4, 7)]
+    return apply(camera.T_world_cam, in_camera)
+
+
+def test_points_are_projected_as_opencv_does(camera, seen_points):
+    T_cam_world = np.linalg.inv(camera.T_world_cam)
+    rotation, _ = cv2.Rodrigues(T_cam_world[:3, :3])
+    expected, _ = cv2.projectPoints(
+        seen_points, rotation, T_cam_world[:3, 3], camera.K, np.zeros(4)
+    )
+
+    np.testing.assert_allclose(camera.project(seen_points), expected[:, 0], atol=1e-6)
+
+
+def test_a_point_behind_the_camera_has_no_pixel(camera):
+    behind = apply(camera.T_world_cam, np.array([[0.1, 0.2, -1.0], [0.1, 0.2, 1.0]]))
+
+    found = camera.project(behind)
+
+    assert np.isnan(found[0]).all()
+    assert np.isfinite(found[1]).all()
+
+
+def test_the_ray_through_a_points_pixel_leads_to_the_point(camera, seen_points):
+    rays = camera.rays_world(camera.project(seen_points))
+
+    ways = seen_points - camera.T_world_cam[:3, 3]
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1)
+    np.testing.assert_allclose(rays, ways / np.linalg.norm(ways, axis=1)[:, None], atol=1e-9)
+
+
+def test_what_lies_along_a_rays_is_seen_in_its_pixel(camera, rng):
+    pixels = rng.uniform(0, [WIDTH_PX, HEIGHT_PX], (9, 2))
+    reach = rng.uniform(0.2, 5, (9, 1))
+
+    points = camera.T_world_cam[:3, 3] + reach * camera.rays_world(pixels)
+
+    np.testing.assert_allclose(camera.project(points), pixels, atol=1e-6)
+
+
+@pytest.mark.parametrize("height_m", [-0.2, 0.0, 0.3])
+def test_points_of_a_plane_are_found_again_from_their_pixels(rng, height_m: float):
+    eye = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(0.5, 1.0)])
+    camera = Camera(
+        width_px=WIDTH_PX,
+        height_px=HEIGHT_PX,
+        K=intrinsics(WIDTH_PX, HEIGHT_PX, FOVY_RAD),
+        T_world_cam=look_at(eye, np.array([0.8, 0.1, height_m])),
+    )
+    points = np.c_[rng.uniform([0.6, -0.2], [1.0, 0.4], (6, 2)), np.full(6, height_m)]
+
+    found = camera.on_plane(camera.project(points), height_m)
+
+    np.testing.assert_allclose(found, points, atol=1e-9)
+
+
+def test_a_pixel_above_the_horizon_meets_no_table():
+    level = look_at(np.array([0.0, 0, 0.5]), np.array([1.0, 0, 0.5]))
+    camera = Camera(
+        width_px=WIDTH_PX,
+        height_px=HEIGHT_PX,
+        K=intrinsics(WIDTH_PX, HEIGHT_PX, FOVY_RAD),
+        T_world_cam=level,
+    )
+
+    above, on, below = camera.on_plane(np.array([[32.0, 10], [32, 24], [32, 40]]))
+
+    assert np.isnan(above).all()
+    assert np.isnan(on).all()
+    assert below[0] > 0
+    assert below[2] == pytest.approx(0)
+    assert np.isfinite(camera.on_plane(np.array([[32.0, 10]]), height_m=0.9)).all()
+
+
+def test_the_edge_of_the_picture_is_half_the_opening_away_and_pixels_are_square():
+    K = intrinsics(WIDTH_PX, HEIGHT_PX, FOVY_RAD)
+
+    top = np.linalg.inv(K) @ [WIDTH_PX / 2, 0, 1]
+    right = np.linalg.inv(K) @ [WIDTH_PX, HEIGHT_PX / 2, 1]
+
+    np.testing.assert_allclose(top, [0, -np.tan(FOVY_RAD / 2), 1])
+    np.testing.assert_allclose(right, [np.tan(FOVY_RAD / 2) * WIDTH_PX / HEIGHT_PX, 0, 1])
+
+
+def test_twice_the_pixels_is_twice_the_intrinsics():
+    once, twice = (intrinsics(k * WIDTH_PX, k * HEIGHT_PX, FOVY_RAD) for k in (1, 2))
+
+    np.testing.assert_allclose(twice, np.diag([2.0, 2, 1]) @ once)
+
+
+def test_a_camera_looks_at_its_target_with_the_horizon_level_and_the_world_upright(rng):
+    eye, target = rng.normal(size=(2, 3))
+
+    T = look_at(eye, target)
+
+    camera = Camera(
+        width_px=WIDTH_PX, height_px=HEIGHT_PX, K=intrinsics(WIDTH_PX, HEIGHT_PX, FOVY_RAD),
+        T_world_cam=T,
+    )  # fmt: skip
+    way = (target - eye) / np.linalg.norm(target - eye)
+    left_of_way = np.cross([0, 0, 1.0], way)
+    pixels = camera.project(target + 0.01 * np.array([[0, 0, 0], [0, 0, 1.0], left_of_way]))
+    np.testing.assert_allclose(pixels[0], [WIDTH_PX / 2, HEIGHT_PX / 2], atol=1e-9)
+    assert pixels[1, 1] < pixels[0, 1]
+    assert pixels[1, 0] == pytest.approx(pixels[0, 0])
+    assert pixels[2, 0] < pixels[0, 0]
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    np.testing.assert_allclose(T[:3, 3], eye)
+
+
+def test_mujoco_looks_where_the_camera_looks(rng, draw_transform):
+    T = draw_transform(rng)
+    xyaxes, position = (" ".join(map(str, v)) for v in (mujoco_xyaxes(T), T[:3, 3]))
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><camera pos="{position}" xyaxes="{xyaxes}"'
+        f' fovy="{np.degrees(FOVY_RAD)}"/></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene, view = mujoco.MjvScene(model, maxgeom=2), mujoco.MjvCamera()
+    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+    mujoco.mjv_updateScene(
+        model, data, mujoco.MjvOption(), None, view, mujoco.mjtCatBit.mjCAT_ALL, scene
+    )
+    head, forward, up, right = (np.zeros(3) for _ in range(4))
+
+    mujoco.mjv_cameraFrame(head, forward, up, right, data, view)
+
+    right_cv, down_cv, forward_cv = T[:3, :3].T
+    np.testing.assert_allclose(head, T[:3, 3], atol=1e-6)
+    np.testing.assert_allclose(forward, forward_cv, atol=1e-6)
+    np.testing.assert_allclose(up, -down_cv, atol=1e-6)
+    np.testing.assert_allclose(right, right_cv, atol=1e-6)
+    half = np.linalg.inv(intrinsics(WIDTH_PX, HEIGHT_PX, FOVY_RAD)) @ [WIDTH_PX / 2, HEIGHT_PX, 1]
+    eye = scene.camera[0]
+    assert eye.frustum_top / eye.frustum_near == pytest.approx(half[1], rel=1e-5)
+
+
+def test_the_flip_between_opencv_and_mujoco_is_a_half_turn_about_x():
+    np.testing.assert_allclose(CV_FROM_GL @ CV_FROM_GL, np.eye(3))
+    assert np.linalg.det(CV_FROM_GL) == pytest.approx(1)
+    np.testing.assert_allclose(CV_FROM_GL @ [0, 0, -1], [0, 0, 1])  # both look forward
+    np.testing.assert_allclose(CV_FROM_GL @ [0, 1, 0], [0, -1, 0])  # up is not down
+    np.testing.assert_allclose(CV_FROM_GL @ [1, 0, 0], [1, 0, 0])
+
+
+@pytest.mark.parametrize("scale", [(2.0, 2.0), (0.5, 0.25), (3.0, 1.0)])
+def test_a_homography_between_pixels_resizes_as_opencv_does(rng, scale):
+    slope = np.array([*rng.uniform(2, 4, 2)])
+    picture = (np.mgrid[:24, :32].T @ slope).T.astype(np.float32)
+    size = (int(32 * scale[0]), int(24 * scale[1]))
+
+    warped = cv2.warpPerspective(
+        picture,
+        between_centres(np.diag([*scale, 1.0])),
+        size,
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+
+    # OpenCV's warps round places to a thirty-second of a pixel; a quarter of one would be off by more.
+    expected = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR)
+    np.testing.assert_allclose(warped, expected, atol=slope.sum() / 32)
+
+
+def test_homographies_between_centres_chain_and_keep_whole_pixels(rng):
+    A, B = (np.eye(3) + 0.1 * rng.normal(size=(3, 3)) for _ in range(2))
+    shift = np.array([[1.0, 0, 5], [0, 1, -3], [0, 0, 1]])
+
+    np.testing.assert_allclose(
+        between_centres(A @ B), between_centres(A) @ between_centres(B), atol=1e-12
+    )
+    np.testing.assert_allclose(between_centres(shift), shift)
+    np.testing.assert_allclose(between_centres(np.eye(3)), np.eye(3))
+    corner = np.array([7.0, 9.0])
+    seen = between_centres(A) @ [*(corner - 0.5), 1]
+    expected = A @ [*corner, 1]
+    np.testing.assert_allclose(seen[:2] / seen[2] + 0.5, expected[:2] / expected[2])

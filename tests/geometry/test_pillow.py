@@ -1,0 +1,192 @@
+"""Laws of the pillow: what an outline's shape, place and scale say of the mesh made of it."""
+
+import cv2
+import numpy as np
+import pytest
+
+from v2p_data.geometry.pillow import MAX_PARTS, inflated, pillow
+
+PX_M = 0.001
+NO_CAP = 1.0
+
+
+def disc(radius_px: int = 20, at: tuple[int, int] = (40, 30)) -> np.ndarray:
+    picture = np.zeros((64, 96), np.uint8)
+    cv2.circle(picture, at, radius_px, 1, -1)
+    return picture > 0
+
+
+def boot() -> np.ndarray:
+    """Return an outline of no symmetry: a shaft at the left, a toe at the lower right."""
+    picture = np.zeros((64, 96), bool)
+    picture[8:56, 12:30] = True
+    picture[40:56, 12:70] = True
+    return picture
+
+
+def made(outline: np.ndarray, *, cap_m: float = NO_CAP, px_m: float = PX_M):
+    return pillow(outline, inflated(outline, px_m, cap_m).astype(np.float32), px_m)
+
+
+def outside(points: np.ndarray, parts) -> np.ndarray:
+    """Return how far each point lies outside the nearest convex part [m]."""
+    far = np.full(len(points), np.inf)
+    for part in parts:
+        offset = np.einsum("fk,fk->f", part.face_normals, part.triangles[:, 0])
+        far = np.minimum(far, (points @ part.face_normals.T - offset).max(axis=1))
+    return far
+
+
+def test_a_disc_is_inflated_to_a_ball():
+    outline = disc()
+
+    half = inflated(outline, PX_M, NO_CAP)
+
+    y, x = np.nonzero(outline)
+    inner = np.hypot(x - 40, y - 30) < 15
+    ball = np.sqrt(20.5**2 - (x - 40) ** 2 - (y - 30) ** 2) * PX_M
+    np.testing.assert_allclose(half[y, x][inner], ball[inner], rtol=0.1)
+    assert not half[~outline].any()
+
+
+def test_nothing_is_thicker_than_the_cap_and_what_is_flat_stays_the_same():
+    outline = disc()
+
+    free, flat = inflated(outline, PX_M, NO_CAP), inflated(outline, PX_M, 0.004)
+
+    assert flat.max() == pytest.approx(0.004)
+    assert free.max() > 0.015
+    assert (flat <= np.maximum(free, 0.004) + 1e-9).all()
+    y, x = np.nonzero(outline)
+    assert flat[y, x][np.hypot(x - 40, y - 30) < 15].min() > 0.95 * 0.004  # a plate, no cone
+    assert not inflated(np.zeros((20, 20), bool), PX_M, NO_CAP).any()
+
+
+@pytest.mark.parametrize("factor", [0.5, 3.0])
+def test_thickness_and_mesh_grow_with_the_pixels_size(factor: float):
+    outline = boot()
+    mesh, _ = made(outline, cap_m=0.006)
+
+    large, _ = made(outline, cap_m=0.006 * factor, px_m=PX_M * factor)
+
+    np.testing.assert_allclose(
+        inflated(outline, PX_M * factor, 0.006 * factor),
+        factor * inflated(outline, PX_M, 0.006),
+        rtol=1e-5,
+    )
+    assert large.volume == pytest.approx(factor**3 * mesh.volume, rel=0.1)
+    np.testing.assert_allclose(large.bounds[:, :2], factor * mesh.bounds[:, :2], rtol=1e-6)
+
+
+def test_inflating_turns_and_mirrors_with_the_outline():
+    outline = boot()
+    half = inflated(outline, PX_M, 0.006)
+
+    for change in (np.transpose, np.fliplr, np.flipud):
+        np.testing.assert_allclose(
+            inflated(np.ascontiguousarray(change(outline)), PX_M, 0.006), change(half), atol=4e-4
+        )
+
+
+def test_columns_run_along_x_and_rows_along_y():
+    outline = boot()
+    y, x = np.nonzero(outline)
+
+    mesh, _ = made(outline)
+
+    np.testing.assert_allclose(
+        mesh.bounds[:, :2] / PX_M, [[x.min(), y.min()], [x.max() + 1, y.max() + 1]], atol=1.0
+    )
+    # the toe lies at large x and large y only
+    toe = mesh.vertices[mesh.vertices[:, 0] > 0.04]
+    assert toe[:, 1].min() > 0.037
+    section = mesh.vertices[mesh.vertices[:, 1] < 0.03]
+    assert section[:, 0].max() < 0.033
+
+
+def test_a_mesh_moves_with_its_outline():
+    mesh, _ = made(disc())
+
+    moved, _ = made(disc(at=(52, 33)))
+
+    np.testing.assert_allclose(moved.bounds - mesh.bounds, [[0.012, 0.003, 0]] * 2, atol=1e-6)
+
+
+def test_the_rim_lies_on_the_outline_to_half_a_pixel():
+    outline = disc()
+
+    mesh, _ = made(outline)
+
+    upright = np.abs(mesh.face_normals[:, 2]) < 1e-6
+    rim = mesh.vertices[np.unique(mesh.faces[upright]), :2] / PX_M
+    radii = np.linalg.norm(rim - [40.5, 30.5], axis=1)  # the middle of the pixel (40, 30)
+    np.testing.assert_allclose(radii, np.sqrt(outline.sum() / np.pi), atol=0.5)
+
+
+def test_a_rim_is_at_most_half_as_thick_as_the_middle_and_never_sharp():
+    outline = disc()
+    plate, _ = pillow(outline, np.full(outline.shape, 0.01, np.float32), PX_M)
+    leaf, _ = pillow(outline, np.zeros(outline.shape, np.float32), PX_M)
+
+    upright = np.abs(plate.face_normals[:, 2]) < 1e-6
+    rim = np.abs(plate.vertices[np.unique(plate.faces[upright]), 2])
+    np.testing.assert_allclose(rim, 0.005, rtol=1e-5)
+    assert plate.bounds[1, 2] == pytest.approx(0.01)
+    np.testing.assert_allclose(np.abs(leaf.vertices[:, 2]), 0.0004)
+
+
+@pytest.mark.parametrize("outline", [disc(), boot()], ids=["disc", "boot"])
+def test_a_pillow_is_closed_turned_outwards_and_the_same_from_both_sides(outline):
+    mesh, _ = made(outline, cap_m=0.008)
+
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.volume > 0
+    np.testing.assert_allclose(mesh.bounds[0, 2], -mesh.bounds[1, 2])
+    np.testing.assert_allclose(mesh.center_mass[2], 0, atol=1e-9)
+    front = mesh.face_normals[mesh.triangles_center[:, 2] > 1e-3]
+    assert (front[:, 2] > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("outline", [disc(), boot()], ids=["disc", "boot"])
+def test_a_pillows_volume_is_twice_the_sum_of_its_half_thickness(outline):
+    half = inflated(outline, PX_M, 0.008)
+
+    mesh, _ = pillow(outline, half.astype(np.float32), PX_M)
+
+    assert mesh.volume == pytest.approx(2 * float(half.sum()) * PX_M**2, rel=0.05)
+
+
+@pytest.mark.parametrize("outline", [disc(), boot()], ids=["disc", "boot"])
+def test_convex_parts_cover_the_pillow_and_add_little(outline):
+    mesh, parts = made(outline, cap_m=0.008)
+
+    assert 1 <= len(parts) <= MAX_PARTS
+    assert all(part.is_convex and part.is_watertight for part in parts)
+    assert outside(mesh.vertices, parts).max() < 1e-6
+    assert sum(part.volume for part in parts) < 1.35 * mesh.volume
+
+
+def test_a_boot_is_cut_so_that_the_air_above_its_toe_is_free():
+    _, parts = made(boot(), cap_m=0.008)
+
+    assert len(parts) >= 2
+    assert outside(np.array([[0.060, 0.020, 0.0]]), parts)[0] > 0.01
+
+
+def test_of_an_outline_in_pieces_the_largest_is_taken():
+    both = disc(8, at=(14, 14)) | disc(20, at=(60, 36))
+
+    mesh, _ = made(both)
+
+    alone, _ = made(disc(20, at=(60, 36)))
+    np.testing.assert_allclose(mesh.bounds[:, :2], alone.bounds[:, :2], atol=1e-6)
+
+
+@pytest.mark.parametrize("pixels", [0, 1])
+def test_an_outline_smaller_than_a_cell_is_refused(pixels: int):
+    outline = np.zeros((20, 20), bool)
+    outline[10, 10 : 10 + pixels] = True
+
+    with pytest.raises(ValueError, match=r"empty|too small"):
+        pillow(outline, np.zeros((20, 20), np.float32), PX_M)
