@@ -140,4 +140,5 @@ def load_candidate(bundle: Path, code: Path) -> TaskBundle:
     """Return a saved task with a candidate's code."""
     loaded = TaskBundle.load(bundle)
     text = code.read_text()
-    return replace(loaded, code=text, class_name=class_name(text))
+    # Tried by whoever made the candidate; a confined worker can start no trial of its own.
+    return replace(loaded, code=text, class_name=class_name(text), folder=Path())

@@ -8,11 +8,17 @@ from v2p_data.task.task import Placer, Task, TaskBundle
 
 
 def load(bundle: TaskBundle, worlds: Placer, task: type[Task] | None) -> Task:
-    """Return the bundle's task over some worlds, or `task` instead of its code."""
+    """Return the bundle's task over some worlds, or `task` instead of its code.
+
+    Raises:
+        V2PError: the code comes from a folder and fails its trial, or does not load.
+    """
     if task is not None:
         return task(worlds, str(bundle.scene.folder), {})
     from v2p_data.task.sandbox import load_task
+    from v2p_data.task.trial import demand_trial
 
+    demand_trial(bundle)
     return load_task(bundle.code, envs=worlds, scene=bundle.scene)
 
 

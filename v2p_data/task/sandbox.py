@@ -36,19 +36,23 @@ from v2p_data.task import allowed
 from v2p_data.task.reader.check import checked_tree
 from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.task import Placer, Task
+from v2p_data.task.time_limit import CODE_NAME, guard_calls, limited, line_in_task_code
 from v2p_data.task.watched import watch
 
 MAX_RANGE = 1_000
-CODE_NAME = "<task code>"
 
 
 def load_task(source: str, envs: Placer, scene: Scene) -> Task:
-    """Return an instance of the one task class in `source`.
+    """Return an instance of the one task class in `source`, whose calls end in time (`time_limit`).
 
     Raises:
         TaskCodeError: the code is refused, or it does not load.
+        TaskCodeTooSlowError: loading it takes too long.
     """
-    return make_task(source, envs, str(scene.folder))
+    with limited("loading"):
+        task = make_task(source, envs, str(scene.folder))
+    guard_calls(type(task))
+    return task
 
 
 def make_task(source: str, envs: Placer, urdf_assets_root: str) -> Task:
@@ -78,16 +82,6 @@ def make_task(source: str, envs: Placer, urdf_assets_root: str) -> Task:
 def class_name(source: str) -> str:
     """Return the name of the one task class in checked code."""
     return next(n.name for n in checked_tree(source).body if isinstance(n, ast.ClassDef))
-
-
-def line_in_task_code(error: BaseException) -> int | None:
-    """Return the line of the loaded task code at which an exception was raised."""
-    line, at = None, error.__traceback__
-    while at is not None:
-        if at.tb_frame.f_code.co_filename == CODE_NAME:
-            line = at.tb_lineno
-        at = at.tb_next
-    return line
 
 
 class _Strip(ast.NodeTransformer):

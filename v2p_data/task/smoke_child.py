@@ -18,7 +18,8 @@ import torch
 
 from v2p_data.task.confine import confine, leave_the_network
 from v2p_data.task.reader.refusal import TaskCodeError
-from v2p_data.task.sandbox import line_in_task_code, make_task
+from v2p_data.task.sandbox import make_task
+from v2p_data.task.time_limit import line_in_task_code
 from v2p_data.task.watched import StatesChangedError
 
 MEMORY_BYTES = 2 * 1024**3
