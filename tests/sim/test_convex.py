@@ -16,9 +16,9 @@ from v2p_data.sim.convex import ConvexConfig
 from v2p_data.sim.masks import FIRST_OBJECT, MaskRenderer
 from v2p_data.sim.randomize import Randomizer
 from v2p_data.sim.robot import COARSE
-from v2p_data.task.cache import cache_folder
 from v2p_data.sim.solids import solids_of
 from v2p_data.sim.world import CAMERA, MESH_SCALES, build_world
+from v2p_data.task.cache import cache_folder
 
 SIZE = (0.08, 0.08, 0.04)
 NOTCH = np.array([0.02, 0.02, 0.0])
@@ -93,7 +93,9 @@ def test_a_scene_that_brings_parts_along_is_built_of_them_and_nothing_is_split(
 
     world = build_world(replace(angle_scene, objects=(angle,)), COARSE)
 
-    assert not cache_folder("convex").exists()  # where parts that were found by splitting would lie
+    assert not cache_folder(
+        "convex"
+    ).exists()  # where parts that were found by splitting would lie
     obj, model = world.objects[0], world.model
     np.testing.assert_allclose(np.ptp(obj.hull, axis=0), SIZE, rtol=1e-6)
     assert len(obj.geom_ids) == len(LEGS)

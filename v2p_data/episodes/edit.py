@@ -160,7 +160,11 @@ def _read(root: Path) -> _Source:
             f"{root / METADATA_FILE} tells of {len(about['episodes'])} episodes, there are {len(lengths)}"
         )
     for entry in about["episodes"] if about is not None else ():
-        if not isinstance(item := entry.get("item"), str) or not is_plain_path(item) or "/" in item:
+        if (
+            not isinstance(item := entry.get("item"), str)
+            or not is_plain_path(item)
+            or "/" in item
+        ):
             raise V2PError(
                 f"{root / METADATA_FILE} has an episode of the item {str(item)[:100]!r}; an item is the plain name of a "
                 f"folder in {TASKS_FOLDER}"

@@ -55,7 +55,9 @@ def _file_name(text: str) -> str:
 def _path_of_kind(*kinds: str) -> AfterValidator:
     def check(text: str) -> str:
         if text and not is_plain_path(text):
-            raise ValueError("does not lie inside the scene's folder: write a relative path without '..'")
+            raise ValueError(
+                "does not lie inside the scene's folder: write a relative path without '..'"
+            )
         if text and not text.lower().endswith(kinds):
             raise ValueError(f"is no {' or '.join(kinds)} file")
         return text
@@ -253,4 +255,4 @@ def _check_course(thing: ObjectEntry, path: Path) -> None:
         raise V2PError(f"{path}: object '{thing.name}' has {told}; there must be one per frame")
 
 
-assert SCHEMA == SceneFile.model_fields["version"].annotation.__args__[0]  # pyright: ignore[reportOptionalMemberAccess]
+assert SceneFile.model_fields["version"].annotation.__args__[0] == SCHEMA  # pyright: ignore[reportOptionalMemberAccess]

@@ -108,7 +108,8 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in MESH_KINDS:
         raise ItemRejectedError(
-            "mesh_unreadable", f"{where} is none of the kinds {', '.join(MESH_KINDS)}; export it again as OBJ"
+            "mesh_unreadable",
+            f"{where} is none of the kinds {', '.join(MESH_KINDS)}; export it again as OBJ",
         )
     megabytes = path.stat().st_size / 1e6
     if megabytes > MAX_MESH_MB:
@@ -118,7 +119,9 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
             megabytes,
         )
     try:
-        with path.open("rb") as stream:  # a stream has no folder: materials and pictures that it names are not read
+        with path.open(
+            "rb"
+        ) as stream:  # a stream has no folder: materials and pictures that it names are not read
             mesh = trimesh.load(
                 stream, file_type=kind, force="mesh", process=False, skip_materials=True
             )

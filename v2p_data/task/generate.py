@@ -18,9 +18,9 @@ from v2p_data.task.audit import Audit, audit, build_probes
 from v2p_data.task.calls import Call
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
-from v2p_data.task.trial import note_passed
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
+from v2p_data.task.trial import note_passed
 from v2p_data.task.vlm_config import VlmConfig
 
 AUDIT_FILE = "audit.json"

@@ -194,6 +194,10 @@ class TaskBundle:
             raise V2PError(
                 f"{folder} holds no {TASK_FILE}: it is no task; make one with 'v2p task'"
             )
+        if (folder / SCENE_FOLDER).is_symlink():
+            raise V2PError(
+                f"{folder / SCENE_FOLDER} is a link; a task folder holds its scene itself"
+            )
         read = read_task_file(folder, TASK_FILE)
         robot = read.robot.model_dump()
         if robot:

@@ -21,6 +21,8 @@ CODE_NAME = "<task code>"
 LIMIT_S = 20.0
 """A call takes milliseconds; a machine that is busy with other things makes it a hundred times as long."""
 TICK_S = 0.25
+HASTY_TICKS = 3
+"""Calls of fewer ticks are far from being sent anything, so they end without a lock; `LIMIT_S` is many more."""
 METHODS = (
     "reset_objects_states",
     "compute_observation_key",
@@ -51,23 +53,19 @@ class _Watchman:
         self.tick = 0
         self._ended: set[int] = set()
         self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
+        self.thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Start the watching thread; where none may be started (a confined child) others limit the time."""
         with self._lock:
-            if self._thread is None:
+            if self.thread is None:
                 thread = threading.Thread(target=self._watch, name="task-code-time", daemon=True)
                 with suppress(RuntimeError):
                     thread.start()
-                self._thread = thread
+                self.thread = thread
 
     def forget(self, thread: int) -> bool:
         """End the watch over a thread's call; return whether it was sent an exception."""
-        since = self.calls.get(thread, 0)
-        if (self.tick - since) * TICK_S < LIMIT_S / 2:  # far from being sent anything
-            self.calls.pop(thread, None)
-            return False
         with self._lock:
             self.calls.pop(thread, None)
             if thread not in self._ended:
@@ -99,7 +97,7 @@ _watchman = _Watchman()
 
 
 def _renew() -> None:
-    global _watchman  # noqa: PLW0603 - a fork has the memory of its parent, not its threads
+    global _watchman
     _watchman = _Watchman()
 
 
@@ -146,14 +144,21 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(method)
     def call(*given: Any) -> Any:
         watchman, me = _watchman, me_of()
-        if me in watchman.calls:
+        calls = watchman.calls
+        if me in calls:
             return method(*given)
-        watchman.calls[me] = watchman.tick
+        if watchman.thread is None:
+            watchman.start()
+        late = False
+        calls[me] = began = watchman.tick
         try:
             try:
                 result = method(*given)
             finally:
-                late = watchman.forget(me)
+                if watchman.tick - began < HASTY_TICKS:
+                    del calls[me]
+                else:
+                    late = watchman.forget(me)
         except _TimeIsUpError:
             watchman.forget(me)
             late, result = True, None
