@@ -596,19 +596,13 @@ def evaluation_stage(
         cfg: settings.
         seen: names of the tasks that the policy's dataset had, or that the expert learned.
     """
-    from v2p_data.scene.files import own_file
-    from v2p_data.task.schema import MAX_CODE_BYTES
-
     return Stage(
         name="evaluation",
         item=_item_of(who),
         config=Seeded(config=cfg.evaluation, seed=cfg.seed),
         sources={
             **who.sources,
-            **{
-                f"task {name}": file_digest(own_file(path, "task.py", MAX_CODE_BYTES))
-                for name, path in tasks.items()
-            },
+            **{f"task {name}": file_digest(path / "task.py") for name, path in tasks.items()},
         },
         version=2,
         make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=tuple(seen)),

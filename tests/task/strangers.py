@@ -386,7 +386,7 @@ def _doubles(folder: Path) -> None:
 def _crowd(folder: Path) -> None:
     def change(data: dict[str, Any]) -> None:
         plate = {**data["objects"][1], "size_m": [0.44, 0.44, 0.02]}
-        data["objects"] += [{**plate, "name": f"plate_{k}"} for k in range(18)]
+        data["objects"] += [{**plate, "name": f"plate_{k}"} for k in range(6)]
 
     changed(SCENE, change)(folder)
 
@@ -524,7 +524,8 @@ for _name, _value in {
     "that reserves a terabyte": _arm("", '<size memory="1T"/>'),
     "that reserves 10**12 numbers": _arm("", '<size nuserdata="1000000000000"/>'),
     "with a picture of 10**10 pixels": _arm(
-        "", '<asset><texture name="t" type="2d" builtin="flat" width="100000" height="100000"/></asset>'
+        "",
+        '<asset><texture name="t" type="2d" builtin="flat" width="100000" height="100000"/></asset>',
     ),
     "with a height field of 10**12 cells": _arm(
         "", '<asset><hfield name="h" nrow="1000000" ncol="1000000" size="1 1 1 1"/></asset>'

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
-from v2p_data.scene.files import own_file
 
 Role = Literal["manipulated", "reference", "tool", "container", "cover"]
 Shape = Literal["box", "cylinder", "sphere", "mesh"]
@@ -30,7 +29,7 @@ FLOOR_MIN_M = 0.006
 """Through thinner floors hard-pressed objects were pushed into the table."""
 FLOOR_MAX_M = 0.02
 MAX_MASKS_BYTES = 1_000_000_000
-"""Of a mask track, packed or not: an hour at 10 Hz, one bit per pixel."""
+"""Of an unpacked mask track: an hour at 10 Hz, one bit per pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,7 +254,7 @@ class Scene:
             raise V2PError(
                 f"object '{name}' of scene '{self.title}' has no mask track: it was not made from a video"
             )
-        return read_masks(own_file(self.folder, thing.mask_track, MAX_MASKS_BYTES))
+        return read_masks(self.folder / thing.mask_track)
 
     def save(self, folder: Path) -> None:
         """Write `scene.json`; meshes, masks and URDFs are written by their makers."""

@@ -19,11 +19,13 @@ from pydantic import (
 )
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.files import is_plain_path, read_own
+from v2p_data.scene.files import is_plain_path, own_file, read_own
 from v2p_data.scene.scene import SCHEMA, Observed, Role, Shape, Symmetry
 
 MAX_SCENE_BYTES = 32_000_000
 """An hour of two objects at 10 Hz."""
+MAX_FILE_BYTES = 200_000_000
+"""Of a mesh or a mask track."""
 MAX_OBJECTS = 20
 MAX_PARTS = 128
 """Of one object."""
@@ -135,6 +137,12 @@ class ObjectEntry(FileModel):
     first_to_last: MotionEntry | None = None
     """For readers of the file; it follows from the poses."""
 
+    @property
+    def files(self) -> list[str]:
+        """The files that it names."""
+        named = (self.mesh, self.mesh_ply, self.urdf, self.mjcf, self.mask_track, *self.parts)
+        return [file for file in named if file]
+
 
 class CameraEntry(FileModel):
     width_px: Annotated[int, Gt(0), Le(16_384)]
@@ -193,6 +201,9 @@ def read_scene_file(folder: Path, name: str) -> SceneFile:
         )
     for thing in found.objects:
         _check_course(thing, path)
+        for file in thing.files:
+            if (folder / file).exists():
+                own_file(folder, file, MAX_FILE_BYTES)
     return found
 
 

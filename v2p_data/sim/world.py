@@ -11,7 +11,6 @@ uniform density. The manipulated object comes first, as in the scene.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import mujoco
@@ -21,7 +20,6 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.files import own_file
 from v2p_data.scene.scene import Scene, SceneObject, hollow_floor_m
 from v2p_data.sim.arms import BUILT_IN, Robot, RobotConfig, read_arm, sensor_ends
 from v2p_data.sim.robot import (
@@ -35,7 +33,7 @@ from v2p_data.sim.robot import (
     robot_rest_xml,
     servo_xml,
 )
-from v2p_data.sim.solids import MAX_MESH_MB, solids_of
+from v2p_data.sim.solids import solids_of
 from v2p_data.sim.suitability import check_grasp, check_names, checked_size
 
 MESH_SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
@@ -320,8 +318,8 @@ def _draft(obj: SceneObject, scene: Scene, opening_m: float) -> _Draft:
         com, inertia = _mass_properties(parts, obj.mass_kg)
     elif obj.shape == "mesh":
         kind = "mesh"
-        mesh, *ready = (_mesh_file(scene, file) for file in (obj.mesh, *obj.parts))
-        solids = solids_of(mesh, obj.name, thick, ready=ready)
+        ready = [scene.folder / part for part in obj.parts]
+        solids = solids_of(scene.folder / obj.mesh, obj.name, thick, ready=ready)
         parts = [
             Part(kind="mesh", half_size=_half(np.ptp(p.vertices, axis=0))) for p in solids.parts
         ]
@@ -363,12 +361,6 @@ def _draft(obj: SceneObject, scene: Scene, opening_m: float) -> _Draft:
         inertia=inertia,
         asset_xml=asset,
     )
-
-
-def _mesh_file(scene: Scene, name: str) -> Path:
-    """Return a mesh file of the scene's own folder."""
-    path = scene.folder / name
-    return own_file(scene.folder, name, MAX_MESH_MB * 1_000_000) if path.exists() else path
 
 
 def _rest_quat(obj: SceneObject, kind: str) -> tuple[float, float, float, float]:
