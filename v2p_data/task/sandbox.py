@@ -17,7 +17,7 @@ What it covers. Three walls, one behind the other:
 
 What it does not cover. Nothing here is proof against a hole in CPython, torch or the kernel. Code that has passed the
 smoke run is loaded into the training process, where the second wall stands alone unless that process calls
-`confine` too: code that turns slow or large for large batches only slows it down or ends it. Where the kernel has
+`confine` too: each call has a time limit (`time_limit`), but code that turns large for large batches ends it. Where the kernel has
 neither Landlock nor seccomp the limits of the third wall remain. Task code may also be *wrong*; that is
 `audit`'s business. `docs/safety.md` says how all this is tested.
 """
