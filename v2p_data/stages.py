@@ -480,8 +480,10 @@ def pack_and_verify(
 
 def copy_tasks(tasks: Mapping[str, Path], dataset: Path) -> None:
     """Put tasks, by item, into the dataset that was made in them."""
+    from v2p_data.scene.files import copy_folder
+
     for item, folder in tasks.items():
-        shutil.copytree(
+        copy_folder(
             folder,
             dataset / ROOT_OF_TASKS / item,
             ignore=shutil.ignore_patterns(
@@ -629,21 +631,24 @@ def make_evaluation(
     """Judge many episodes of each task; write rates with their intervals, kinds of failure, films and contact sheets."""
     from v2p_data.report.films import write_films
     from v2p_data.report.sheet import SheetConfig, write_contact_sheet
-    from v2p_data.task.task import TaskBundle
+    from v2p_data.task.task import TaskBundle, told_of
 
     del inputs
     play = play_of(who, cfg.seed, runtime.device)
     rows: list[dict[str, Any]] = []
     for index, (name, folder) in enumerate(tasks.items()):
         bundle = TaskBundle.load(folder)
-        judged = judge_task(
-            play,
-            bundle,
-            cfg.config,
-            seed_for(cfg.seed, "evaluation", name) % 2**31,
-            runtime,
-            lambda share, k=index, words=name: runtime.progress((k + share) / len(tasks), words),
-        )
+        with told_of(folder):
+            judged = judge_task(
+                play,
+                bundle,
+                cfg.config,
+                seed_for(cfg.seed, "evaluation", name) % 2**31,
+                runtime,
+                lambda share, k=index, words=name: runtime.progress(
+                    (k + share) / len(tasks), words
+                ),
+            )
         videos = out / VIDEOS_FOLDER / name
         write_films(bundle, judged.shown, videos)
         write_contact_sheet(

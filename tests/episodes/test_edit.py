@@ -147,6 +147,27 @@ def carrying(root: Path, copy: Path, code: str) -> Path:
     return copy
 
 
+def test_a_task_that_holds_a_link_is_not_merged(packed: Path, more: Path, tmp_path: Path):
+    first = carrying(packed, tmp_path / "a", "first")
+    (first / "v2p/tasks/toy/notes.txt").symlink_to("/etc/passwd")
+
+    with pytest.raises(V2PError, match=r"notes\.txt is a link"):
+        merge([first, more], "user/both", tmp_path / "both")
+
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
+
+
+@pytest.mark.parametrize("item", ["../../../outside", "/etc", "", 7])
+def test_an_item_that_is_no_plain_name_is_refused(packed: Path, tmp_path: Path, item: object):
+    root = Path(shutil.copytree(packed, tmp_path / "copy"))
+    told = about(root)
+    told["episodes"][0]["item"] = item
+    (root / "meta/v2p.json").write_text(json.dumps(told))
+
+    with pytest.raises(V2PError, match=r"v2p\.json has an episode of the item"):
+        drop(root, [PUSH], tmp_path / "less")
+
+
 @pytest.mark.parametrize(
     ("field", "value", "words"),
     [

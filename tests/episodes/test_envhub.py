@@ -77,6 +77,26 @@ def test_the_engine_comes_without_what_running_a_task_does_not_take():
     assert not [m for m in modules if m.startswith(("v2p_data.episodes", "v2p_data.video"))]
 
 
+def test_what_does_not_belong_to_a_task_stays_and_a_link_to_outside_is_refused(
+    run_folder: Path, tmp_path: Path
+):
+    task = run_folder / "task/first"
+    (task / "notes.txt").symlink_to("/etc/passwd")
+    (task / "scene/secret.obj").write_text("secret")
+
+    made = write_envhub(run_folder, "user/tasks", tmp_path / "hub")
+
+    files = {
+        str(p.relative_to(made.folder / "tasks/first"))
+        for p in made.folder.glob("tasks/first/**/*")
+    }
+    assert files == {"task.json", "task.py", "scene", "scene/scene.json"}
+    (task / "task.py").unlink()
+    (task / "task.py").symlink_to("/etc/passwd")
+    with pytest.raises(V2PError, match=r"task\.py is a link"):
+        write_envhub(run_folder, "user/tasks", tmp_path / "other")
+
+
 def test_nothing_is_overwritten_and_a_folder_without_tasks_is_refused(
     run_folder: Path, tmp_path: Path
 ):

@@ -1,6 +1,7 @@
 """Another arm than the built-in one: a small one with six joints, written here, its angles in degrees."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
@@ -354,6 +356,58 @@ def test_a_task_remembers_its_robot_in_its_json(six: RobotConfig):
     assert robot_from_json(json.loads(text)) == six
     assert robot_to_json(RobotConfig()) == {}
     assert robot_from_json({}) == RobotConfig()
+
+
+def test_a_task_carries_its_robots_files_and_needs_no_others(
+    six: RobotConfig, make_bundle: Callable[..., TaskBundle], lift_task: type[Task], tmp_path: Path
+):
+    (tmp_path / "arms/meshes").mkdir(parents=True)
+    trimesh.creation.box((0.02, 0.02, 0.02)).export(tmp_path / "arms/meshes/palm.stl")
+    (tmp_path / "arms/LICENSE").write_text("free")
+    palm = '<geom name="palm" type="mesh" mesh="palm" mass="0.5"/><geom type="box"'
+    (tmp_path / "arms/xml").mkdir()
+    (tmp_path / "arms/xml/arm.xml").write_text(
+        ARM.replace('<geom name="palm" type="box"', palm).replace(
+            "<worldbody>",
+            '<asset><mesh name="palm" file="../meshes/palm.stl"/></asset><worldbody>',
+            1,
+        )
+    )
+    arm = replace(six, path=tmp_path / "arms/xml/arm.xml")
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    made = replace(make_bundle(folder=scene), robot=robot_to_json(arm))
+    made.scene.save(scene)
+    here = BatchEnv(made, CALM, num_envs=1, seed=0, num_threads=1, task=lift_task)
+
+    made.save(tmp_path / "task")
+
+    shutil.rmtree(tmp_path / "arms")
+    written = json.loads((tmp_path / "task/task.json").read_text())
+    assert written["robot"]["path"] == "robot/xml/arm.xml"
+    loaded = TaskBundle.load(tmp_path / "task")
+    loaded.save(tmp_path / "again")
+    assert TaskBundle.load(tmp_path / "again").arm == loaded.arm
+    there = BatchEnv(loaded, CALM, num_envs=1, seed=0, num_threads=1, task=lift_task)
+    for env in (here, there):
+        env.step(np.full((1, 7), 0.3))
+    np.testing.assert_array_equal(
+        here.snapshot(np.arange(1)).qpos, there.snapshot(np.arange(1)).qpos
+    )
+
+
+def test_a_task_of_an_earlier_version_says_what_to_do_about_its_robot(
+    six: RobotConfig, make_bundle: Callable[..., TaskBundle], tmp_path: Path
+):
+    (tmp_path / "scene").mkdir()
+    made = replace(make_bundle(folder=tmp_path / "scene"), robot=robot_to_json(six))
+    made.scene.save(tmp_path / "scene")
+    made.save(tmp_path / "task")
+    file = tmp_path / "task/task.json"
+    file.write_text(file.read_text().replace("robot/six.xml", str(six.path)))
+
+    with pytest.raises(V2PError, match=r"robot\.path: .* own folder 'robot'.*--sim\.robot\.path"):
+        TaskBundle.load(tmp_path / "task")
 
 
 def test_a_task_for_another_robot_is_simulated_and_drawn_with_it(

@@ -12,12 +12,13 @@ from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
 from v2p_data.sim import convex, randomize
 from v2p_data.sim.batch_env import Snapshot
-from v2p_data.sim.convex import ConvexConfig, cache_folder
+from v2p_data.sim.convex import ConvexConfig
 from v2p_data.sim.masks import FIRST_OBJECT, MaskRenderer
 from v2p_data.sim.randomize import Randomizer
 from v2p_data.sim.robot import COARSE
 from v2p_data.sim.solids import solids_of
 from v2p_data.sim.world import CAMERA, MESH_SCALES, build_world
+from v2p_data.task.cache import cache_folder
 
 SIZE = (0.08, 0.08, 0.04)
 NOTCH = np.array([0.02, 0.02, 0.0])
@@ -92,7 +93,9 @@ def test_a_scene_that_brings_parts_along_is_built_of_them_and_nothing_is_split(
 
     world = build_world(replace(angle_scene, objects=(angle,)), COARSE)
 
-    assert not cache_folder().exists()  # where parts that were found by splitting would lie
+    assert not cache_folder(
+        "convex"
+    ).exists()  # where parts that were found by splitting would lie
     obj, model = world.objects[0], world.model
     np.testing.assert_allclose(np.ptp(obj.hull, axis=0), SIZE, rtol=1e-6)
     assert len(obj.geom_ids) == len(LEGS)
@@ -140,7 +143,7 @@ def test_a_convex_mesh_stays_one_hull_and_is_not_cached(tmp_path: Path):
     trimesh.creation.icosphere(subdivisions=2, radius=0.03).export(path)
 
     assert len(solids_of(path, "ball", SIZE).parts) == 1
-    assert not cache_folder().exists()
+    assert not cache_folder("convex").exists()
 
 
 def test_parts_are_found_once_per_mesh_and_settings_whatever_the_size(
@@ -159,7 +162,7 @@ def test_parts_are_found_once_per_mesh_and_settings_whatever_the_size(
 
 def test_a_damaged_cache_entry_is_made_again(angle_file: Path):
     solids_of(angle_file, "angle", SIZE)
-    (entry,) = cache_folder().glob("*.npz")
+    (entry,) = cache_folder("convex").glob("*.npz")
     entry.write_bytes(b"half a file")
 
     assert len(solids_of(angle_file, "angle", SIZE).parts) >= 2

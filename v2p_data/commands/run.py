@@ -36,7 +36,7 @@ from v2p_data.stages import (
     scene_stage,
     task_stage,
 )
-from v2p_data.task.task import TASK_FILE
+from v2p_data.task.task import TASK_FILE, TaskBundle
 from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, read_footage
 
 RUN_FILE = "run.json"
@@ -311,6 +311,8 @@ def evaluate(
     tasks = {**seen, **unseen}
     if not tasks:
         raise V2PError(f"no task is known for {who.folder}; name task folders with --tasks")
+    for folder in tasks.values():
+        TaskBundle.load(folder)  # what is wrong with a file is said before anything starts
     stage = evaluation_stage(who, tasks, cfg, seen=list(seen))
     outcome = _run([stage], _all_threads(runtime))[(stage.name, stage.folder_name)]
     _demand(outcome)

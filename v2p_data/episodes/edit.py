@@ -40,6 +40,7 @@ from v2p_data.episodes.tables import (
 from v2p_data.episodes.verify import frames_differ
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.scene.files import copy_folder, is_plain_path
 
 logger = logging.getLogger(__name__)
 
@@ -162,6 +163,16 @@ def _read(root: Path) -> _Source:
         raise V2PError(
             f"{root / METADATA_FILE} tells of {len(about['episodes'])} episodes, there are {len(lengths)}"
         )
+    for entry in about["episodes"] if about is not None else ():
+        if (
+            not isinstance(item := entry.get("item"), str)
+            or not is_plain_path(item)
+            or "/" in item
+        ):
+            raise V2PError(
+                f"{root / METADATA_FILE} has an episode of the item {str(item)[:100]!r}; an item is the plain name of a "
+                f"folder in {TASKS_FOLDER}"
+            )
     return _Source(
         root=root,
         info=info,
@@ -370,7 +381,7 @@ def _copied_tasks(root: Path, partial: Path) -> dict[str, str]:
         name = _free(folder.name, is_free)
         names[folder.name] = name
         if not (into / name).exists():
-            shutil.copytree(folder, into / name)
+            copy_folder(folder, into / name)
     return names
 
 
@@ -413,7 +424,7 @@ def _about_without(
     episodes = [source.about["episodes"][k] for k in kept]
     for item in dict.fromkeys(e["item"] for e in episodes):
         if (source.root / TASKS_FOLDER / item).is_dir():
-            shutil.copytree(source.root / TASKS_FOLDER / item, partial / TASKS_FOLDER / item)
+            copy_folder(source.root / TASKS_FOLDER / item, partial / TASKS_FOLDER / item)
     provenance = source.about.get("provenance", {})
     left = {e.get("history", e["item"]) for e in episodes}
     edit = {

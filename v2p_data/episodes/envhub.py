@@ -16,10 +16,11 @@ from v2p_data.episodes.card import LICENSE
 from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.errors import V2PError
-from v2p_data.sim.arms import robot_from_json
+from v2p_data.scene.files import own_file
 from v2p_data.sim.robot import FINE
 from v2p_data.sim.world import build_world
-from v2p_data.task.task import TASK_FILE, TaskBundle
+from v2p_data.task.task import TASK_FILE, TaskBundle, told_of
+from v2p_data.task.trial import demand_trial
 
 PACKAGE = "v2p_data"
 SOURCE = Path(__file__).parents[1]
@@ -27,7 +28,7 @@ ENTRY = f"{PACKAGE}.sim.lerobot_env"
 """What `env.py` imports; everything that it needs comes along."""
 PLACES = (Path(), Path("v2p/tasks"), Path("task"))
 """Where a folder of tasks, a dataset and a run keep theirs."""
-LEFT_OUT = ("record.json", "samples", "overlay*", "masks", "*.mp4", "*.partial", "__pycache__")
+MAX_FILE_BYTES = 200_000_000
 EXACT = ("mujoco", "lerobot")
 """Other versions of these make other physics, or load otherwise."""
 
@@ -64,11 +65,13 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
         bundle = TaskBundle.load(folder)
         if bundle.robot.get("path"):
             raise V2PError(
-                f"task '{name}' is for the arm in {bundle.robot['path']}, a file that others have not; only tasks of "
-                "the built-in arm can be shared"
+                f"task '{name}' is for the arm in {bundle.robot['path']}, a file that may not be yours to give away; "
+                "only tasks of the built-in arm can be shared"
             )
-        shutil.copytree(folder, partial / "tasks" / name, ignore=shutil.ignore_patterns(*LEFT_OUT))
-        world = build_world(bundle.scene, FINE, robot=robot_from_json(bundle.robot))
+        with told_of(folder):
+            demand_trial(bundle)
+            world = build_world(bundle.scene, FINE)
+        _copy_task(bundle, partial / "tasks" / name)
         (partial / "mjcf").mkdir(exist_ok=True)
         (partial / "mjcf" / f"{name}.xml").write_text(world.xml)
         rows.append(f"| {len(rows)} | {bundle.description} | `{name}` | {bundle.policy_steps()} |")
@@ -83,6 +86,13 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
     (partial / "README.md").write_text(_card(repo_id, rows))
     partial.rename(out)
     return EnvHub(folder=out, repo_id=repo_id, tasks=tuple(folders))
+
+
+def _copy_task(bundle: TaskBundle, into: Path) -> None:
+    """Copy what belongs to a task and nothing else that lies in its folder; a link to outside is refused."""
+    for name in bundle.files():
+        (into / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(own_file(bundle.folder, name, MAX_FILE_BYTES), into / name)
 
 
 def engine_modules() -> list[str]:

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from v2p_data.reward.config import RewardConfig
+from v2p_data.scene.files import copy_folder
 from v2p_data.scene.scene import SCENE_FILE, Scene, SceneObject
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.splice import REWARD, reward_part, with_reward
@@ -122,17 +123,15 @@ def save_bundle(bundle: TaskBundle, folder: Path) -> None:
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    with tempfile.TemporaryDirectory(prefix="v2p-scene-") as made:
-        source = bundle.scene.folder
+    with tempfile.TemporaryDirectory(prefix="v2p-scene-") as place:
+        source, made = bundle.scene.folder, Path(place) / "scene"
         if (source / SCENE_FILE).is_file():
-            shutil.copytree(
-                source,
-                made,
-                ignore=shutil.ignore_patterns("record.json", "*.mp4", "*.partial"),
-                dirs_exist_ok=True,
+            copy_folder(
+                source, made, ignore=shutil.ignore_patterns("record.json", "*.mp4", "*.partial")
             )
-        bundle.scene.save(Path(made))
-        replace(bundle, scene=replace(bundle.scene, folder=Path(made))).save(partial)
+        made.mkdir(exist_ok=True)
+        bundle.scene.save(made)
+        replace(bundle, scene=replace(bundle.scene, folder=made)).save(partial)
     partial.rename(folder)
 
 
@@ -140,4 +139,5 @@ def load_candidate(bundle: Path, code: Path) -> TaskBundle:
     """Return a saved task with a candidate's code."""
     loaded = TaskBundle.load(bundle)
     text = code.read_text()
-    return replace(loaded, code=text, class_name=class_name(text))
+    # Tried by whoever made the candidate; a confined worker can start no trial of its own.
+    return replace(loaded, code=text, class_name=class_name(text), folder=Path())

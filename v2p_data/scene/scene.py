@@ -7,9 +7,9 @@ side, so the same words (left, right, in front of) mean the same in the video an
 
 import json
 import zipfile
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,6 +28,8 @@ GRAVITY_M_S2 = (0.0, 0.0, -9.81)
 FLOOR_MIN_M = 0.006
 """Through thinner floors hard-pressed objects were pushed into the table."""
 FLOOR_MAX_M = 0.02
+MAX_MASKS_BYTES = 1_000_000_000
+"""Of an unpacked mask track: an hour at 10 Hz, one bit per pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,6 +171,7 @@ def read_masks(path: Path) -> dict[int, Bool[np.ndarray, "h w"]]:
     """
     try:
         with np.load(path) as stored:
+            _check_unpacked(path)
             h, w = (int(v) for v in stored["shape"])
             pixels = np.unpackbits(stored["bits"], axis=1, count=h * w).astype(bool)
             return {int(f): m.reshape(h, w) for f, m in zip(stored["frames"], pixels, strict=True)}
@@ -176,6 +179,13 @@ def read_masks(path: Path) -> dict[int, Bool[np.ndarray, "h w"]]:
         raise V2PError(
             f"{path} holds no mask track ({type(error).__name__}); remake the scene with 'v2p scene'"
         ) from error
+
+
+def _check_unpacked(path: Path) -> None:
+    """Refuse an archive that says it becomes larger than any mask track; NumPy reads no further than it says."""
+    with zipfile.ZipFile(path) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > MAX_MASKS_BYTES:
+            raise ValueError(f"more than {MAX_MASKS_BYTES / 1e6:.0f} MB when unpacked")
 
 
 def hollow_floor_m(height_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -264,44 +274,44 @@ class Scene:
 
     @staticmethod
     def load(folder: Path) -> "Scene":
-        """Read `folder/scene.json`.
+        """Read `folder/scene.json`, whoever made it.
 
         Raises:
-            V2PError: there is none, or it was written by another version.
+            V2PError: there is none, it was written by another version, or it says what `schema` does not allow.
         """
-        path = folder / SCENE_FILE
-        if not path.is_file():
+        from v2p_data.scene.schema import read_scene_file
+
+        if not (folder / SCENE_FILE).exists():
             raise V2PError(
                 f"{folder} holds no {SCENE_FILE}: it is no scene; make one with 'v2p scene'"
             )
-        data: dict[str, Any] = json.loads(path.read_text())
-        if data.pop("schema", None) != SCHEMA:
-            raise V2PError(f"{path} was written by another version; remake it with 'v2p scene'")
-        camera, table = data.pop("camera"), data.pop("table")
-        stages, things = data.pop("confidences"), data.pop("objects")
+        read = read_scene_file(folder, SCENE_FILE)
+        same = {f.name: getattr(read, f.name) for f in fields(Scene) if f.name in _AS_WRITTEN}
         return Scene(
-            **_with_tuples(data),
-            objects=tuple(_object_of(thing) for thing in things),
-            confidences={stage: StageConfidence(**sure) for stage, sure in stages.items()},
-            table=Plane(normal=tuple(table["normal"]), offset_m=table["offset_m"]),
+            **same,
+            objects=tuple(
+                SceneObject(**{f.name: getattr(thing, f.name) for f in fields(SceneObject)})
+                for thing in read.objects
+            ),
+            confidences={
+                stage: StageConfidence(value=sure.value, reason=sure.reason)
+                for stage, sure in read.confidences.items()
+            },
+            table=Plane(normal=read.table.normal, offset_m=read.table.offset_m),
             camera=Camera(
-                width_px=camera["width_px"],
-                height_px=camera["height_px"],
-                K=np.array(camera["K"], float),
-                T_world_cam=np.array(camera["T_world_cam"], float),
+                width_px=read.camera.width_px,
+                height_px=read.camera.height_px,
+                K=np.array(read.camera.K, float),
+                T_world_cam=np.array(read.camera.T_world_cam, float),
             ),
             folder=folder,
         )
 
 
-def _object_of(data: dict[str, Any]) -> SceneObject:
-    data.pop("first_to_last", None)
-    poses = tuple(tuple(pose) for pose in data.pop("poses_world"))
-    return SceneObject(**_with_tuples(data), poses_world=poses)
-
-
-def _with_tuples(data: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+_AS_WRITTEN = {f.name for f in fields(Scene)} - {
+    *("objects", "confidences", "table", "camera", "folder")
+}
+"""Fields that stand in the file as they are."""
 
 
 def _rounded3(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:

@@ -28,6 +28,7 @@ from v2p_data.sim.robot import (
     arm_qpos_for,
     tool_state,
 )
+from v2p_data.task.robot_files import robot_files
 
 PREFIX = "robot/"
 TCP_SITE = "v2p_tcp"
@@ -173,6 +174,7 @@ def read_arm(cfg: RobotConfig, physics: PhysicsConfig, servo: ServoConfig) -> Ar
     path = cfg.path
     if path is None or not path.is_file():
         raise V2PError(f"there is no robot file {path}; --sim.robot.path names an MJCF file")
+    robot_files(path)  # nothing is compiled that is more than an arm
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         model = spec.compile()

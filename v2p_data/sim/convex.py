@@ -18,6 +18,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from v2p_data.task.cache import cache_folder
+
 VERSION = 1
 """Raise it when the same settings give other parts."""
 
@@ -40,14 +42,6 @@ class ConvexConfig:
     """Then the hull is used. A mug takes 15 s on one core."""
 
 
-def cache_folder() -> Path:
-    """Return where convex parts lie: `$V2P_CACHE_DIR`, else below `$XDG_CACHE_HOME` or `~/.cache`."""
-    if named := os.environ.get("V2P_CACHE_DIR"):
-        return Path(named) / "convex"
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "v2p" / "convex"
-
-
 def convex_parts(
     path: Path,
     vertices: Float[np.ndarray, "n 3"],
@@ -68,7 +62,7 @@ def convex_parts(
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     text = json.dumps({"mesh": digest, "version": VERSION, **settings}, sort_keys=True)
-    entry = cache_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.npz"
+    entry = cache_folder("convex") / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.npz"
     if (parts := _read(entry)) is None:
         logger.info("splitting the mesh of '%s' into convex parts", name)
         parts, why = _split(vertices, faces, cfg)

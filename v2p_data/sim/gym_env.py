@@ -27,7 +27,7 @@ from v2p_data.sim import randomize
 from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig
 from v2p_data.sim.masks import MaskRenderer, labels_to_rgb
 from v2p_data.sim.verdict import Witness
-from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle
+from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
 
 ENV_ID = "v2p/Task-v0"
 CONTROL_HZ = 20
@@ -83,7 +83,8 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             camera_fovy_deg=camera_fovy_deg,
         )
         sim = SimConfig(fine=True, randomization=randomization)
-        self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
+        with told_of(bundle.folder):
+            self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
         self._witness = Witness(self._world)
         self._masks = MaskRenderer(self._world.world, size_px)
         self.observation_space = spaces.Dict(

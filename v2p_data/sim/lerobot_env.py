@@ -18,7 +18,8 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.gym_env import CONTROL_HZ, STATE_LOW, V2PEnv
-from v2p_data.task.task import POLICY_HORIZON_SCALE, TASK_FILE
+from v2p_data.task.task import POLICY_HORIZON_SCALE, TASK_FILE, TaskBundle, told_of
+from v2p_data.task.trial import demand_trial
 
 TASKS_IN_DATASET = Path("v2p/tasks")
 
@@ -93,10 +94,14 @@ class V2PEnvConfig(EnvConfig):
         """Return `{"v2p": {index: environments of that task}}`; finished ones cost nothing more."""
         if not self.tasks:
             raise V2PError("say which tasks: --env.tasks=FOLDER")
+        folders = find_tasks(Path(self.tasks))
+        for folder in folders:  # once here, and not in every process of a vector
+            with told_of(folder):
+                demand_trial(TaskBundle.load(folder))
         return {
             "v2p": {
                 index: _vector_env(folder, n_envs, use_async_envs, self.gym_kwargs)
-                for index, folder in enumerate(find_tasks(Path(self.tasks)))
+                for index, folder in enumerate(folders)
             }
         }
 

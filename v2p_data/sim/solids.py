@@ -19,6 +19,8 @@ from v2p_data.sim.convex import ConvexConfig, convex_parts
 
 MAX_MESH_MB = 200
 """Larger files are refused: reading them takes several times their size in memory."""
+MAX_FACES = 2_000_000
+MESH_KINDS = ("obj", "stl", "ply")
 FINE_FACES = 50_000
 """Meshes with more faces are thinned before they are split, and not mended."""
 FINE_VERTICES = 20_000
@@ -103,6 +105,12 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     where = f"mesh of '{name}' in {path}"
     if not path.is_file():
         raise ItemRejectedError("mesh_missing", f"mesh of '{name}' is missing: {path}")
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in MESH_KINDS:
+        raise ItemRejectedError(
+            "mesh_unreadable",
+            f"{where} is none of the kinds {', '.join(MESH_KINDS)}; export it again as OBJ",
+        )
     megabytes = path.stat().st_size / 1e6
     if megabytes > MAX_MESH_MB:
         raise ItemRejectedError(
@@ -111,13 +119,24 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
             megabytes,
         )
     try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, IndexError, KeyError, TypeError, AttributeError, OSError) as error:
+        with path.open(
+            "rb"
+        ) as stream:  # a stream has no folder: materials and pictures that it names are not read
+            mesh = trimesh.load(
+                stream, file_type=kind, force="mesh", process=False, skip_materials=True
+            )
+    except Exception as error:
         raise ItemRejectedError(
             "mesh_unreadable",
             f"{where} cannot be read ({type(error).__name__}: {error}); export it again as OBJ with triangles",
         ) from error
     faces = np.asarray(getattr(mesh, "faces", ()))
+    if len(faces) > MAX_FACES:
+        raise ItemRejectedError(
+            "mesh_too_large",
+            f"{where} has {len(faces)} triangles; at most {MAX_FACES} are taken: decimate it to {FINE_FACES}",
+            float(len(faces)),
+        )
     if not isinstance(mesh, trimesh.Trimesh) or not len(faces):
         raise ItemRejectedError(
             "mesh_unreadable",

@@ -6,12 +6,18 @@ from v2p_data.task.task import Placer, Task, TaskBundle
 
 
 def load(bundle: TaskBundle, worlds: Placer, task: type[Task] | None) -> GuardedTask:
-    """Return the bundle's task over some worlds, or `task` instead of its code."""
+    """Return the bundle's task over some worlds, or `task` instead of its code.
+
+    Raises:
+        V2PError: the code comes from a folder and fails its trial, or does not load.
+    """
     if task is not None:
         return GuardedTask(task(worlds, str(bundle.scene.folder), {}), title=bundle.title)
-    from v2p_data.task.sandbox import make_task
+    from v2p_data.task.sandbox import load_task
+    from v2p_data.task.trial import demand_trial
 
-    return make_task(bundle.code, worlds, str(bundle.scene.folder), bundle.title)
+    demand_trial(bundle)
+    return load_task(bundle.code, worlds, bundle.scene, bundle.title)
 
 
 def checked_obs_dim(task: GuardedTask, title: str, made: int) -> int:

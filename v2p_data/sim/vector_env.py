@@ -23,7 +23,7 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float, Float32
 
 from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig
-from v2p_data.task.task import TaskBundle
+from v2p_data.task.task import TaskBundle, told_of
 
 ENV_ID = "v2p/States-v0"
 
@@ -48,9 +48,10 @@ class V2PVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, num_envs: int, task_folder: str, *, fine: bool = False, num_threads: int = 0
     ) -> None:
         bundle = TaskBundle.load(Path(task_folder))
-        self.worlds = BatchEnv(
-            bundle, SimConfig(fine=fine), num_envs=num_envs, seed=0, num_threads=num_threads
-        )
+        with told_of(bundle.folder):
+            self.worlds = BatchEnv(
+                bundle, SimConfig(fine=fine), num_envs=num_envs, seed=0, num_threads=num_threads
+            )
         self.num_envs = num_envs
         self.single_observation_space = spaces.Box(
             -np.inf, np.inf, (self.worlds.obs_dim,), np.float32

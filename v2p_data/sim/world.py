@@ -19,6 +19,7 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject, hollow_floor_m
 from v2p_data.sim.arms import BUILT_IN, Robot, RobotConfig, read_arm, sensor_ends
 from v2p_data.sim.robot import (
@@ -147,12 +148,19 @@ def build_world(
         f"{bodies}{''.join(d.body_xml(physics) for d in drafts)}</worldbody>"
         f"{driven}<sensor>{sensors}</sensor></mujoco>"
     )
-    if arm is None:
-        model = mujoco.MjModel.from_xml_string(xml)
-    else:
-        spec = mujoco.MjSpec.from_string(xml)
-        arm.put_into(spec)
-        model = spec.compile()
+    try:
+        if arm is None:
+            model = mujoco.MjModel.from_xml_string(xml)
+        else:
+            spec = mujoco.MjSpec.from_string(xml)
+            arm.put_into(spec)
+            model = spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ItemRejectedError(
+            "model_not_compiled",
+            f"MuJoCo makes no model of scene '{scene.title}': {' '.join(str(error).split())[:300]}; are its sizes, masses "
+            "and meshes those of real objects?",
+        ) from error
     return World(
         robot=arm.robot(model) if arm else BUILT_IN,
         xml=xml,

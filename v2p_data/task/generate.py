@@ -20,6 +20,7 @@ from v2p_data.task.sandbox import class_name
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
+from v2p_data.task.trial import note_passed
 from v2p_data.task.vlm_config import VlmConfig
 
 AUDIT_FILE = "audit.json"
@@ -243,6 +244,7 @@ def _by_model(
 
 
 def _bundle(scene: Scene, cfg: TaskConfig, chosen: Sample) -> TaskBundle:
+    note_passed(chosen.code, scene)
     return TaskBundle(
         title=scene.title,
         description=scene.description,

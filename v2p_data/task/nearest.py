@@ -49,11 +49,12 @@ def rank_solved(bundle: TaskBundle, obs_dim: int, solved: Iterable[Solved]) -> l
     Experts for another arm, with another observation or another size of motion do not fit: in them the same
     number means something else.
     """
+    arm = bundle.arm
     fitting = [
         s
         for s in solved
         if s.obs_dim == obs_dim
-        and s.bundle.robot == bundle.robot
+        and s.bundle.arm == arm
         and s.bundle.motion_scale == bundle.motion_scale
     ]
     return sorted(fitting, key=lambda s: (-likeness(bundle, s.bundle), s.folder.name))

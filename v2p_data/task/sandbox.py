@@ -17,7 +17,7 @@ What it covers. Three walls, one behind the other:
 
 What it does not cover. Nothing here is proof against a hole in CPython, torch or the kernel. Code that has passed the
 smoke run is loaded into the training process, where the second wall stands alone unless that process calls
-`confine` too: code that turns slow or large for large batches only slows it down or ends it. Where the kernel has
+`confine` too: each call has a time limit (`time_limit`), but code that turns large for large batches ends it. Where the kernel has
 neither Landlock nor seccomp the limits of the third wall remain. Task code may also be *wrong*; that is
 `audit`'s business. `docs/safety.md` says how all this is tested.
 """
@@ -37,35 +37,45 @@ from v2p_data.task.guarded import GuardedTask, PlacerView
 from v2p_data.task.reader.check import checked_tree
 from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.task import Placer, Task
+from v2p_data.task.time_limit import CODE_NAME, guard_calls, limited, line_in_task_code
 
 MAX_RANGE = 1_000
-CODE_NAME = "<task code>"
 
 
-def load_task(source: str, envs: Placer, scene: Scene) -> GuardedTask:
-    """Return the one task class in `source`, made and guarded.
-
-    Raises:
-        TaskCodeError: the code is refused, or it does not load.
-    """
-    return make_task(source, envs, str(scene.folder), scene.title)
-
-
-def make_task(source: str, envs: Placer, urdf_assets_root: str, title: str = "") -> GuardedTask:
-    """Return the one task class in `source`, made as the paper makes it, and guarded.
+def load_task(source: str, envs: Placer, scene: Scene, title: str = "") -> GuardedTask:
+    """Return the one task class in `source`, made and guarded; its calls end in time (`time_limit`).
 
     Args:
         source: task code.
         envs: the environment.
-        urdf_assets_root: folder of the object files.
-        title: for messages.
+        scene: whose objects the task is about.
+        title: for messages; by default the scene's.
+
+    Raises:
+        TaskCodeError: the code is refused, or it does not load.
+        TaskCodeTooSlowError: loading it takes too long.
+    """
+    with limited("loading"):
+        task, view = _made(source, envs, str(scene.folder))
+    guard_calls(type(task))
+    return GuardedTask(task, view, title or scene.title)
+
+
+def make_task(source: str, envs: Placer, urdf_assets_root: str) -> GuardedTask:
+    """Return the one task class in `source`, made and guarded; nothing ends a call that takes too long.
 
     Raises:
         TaskCodeError: the code is refused, or it does not load.
     """
+    return GuardedTask(*_made(source, envs, urdf_assets_root))
+
+
+def _made(source: str, envs: Placer, urdf_assets_root: str) -> tuple[Task, PlacerView]:
+    """Return the task, made as the paper makes it, and what it sees of the environment."""
     tree = _Strip().visit(checked_tree(source))
     ast.fix_missing_locations(tree)
     namespace = _namespace()
+    view = PlacerView(envs)
     try:
         exec(compile(tree, CODE_NAME, "exec", dont_inherit=True), namespace)
         made = [
@@ -73,28 +83,16 @@ def make_task(source: str, envs: Placer, urdf_assets_root: str, title: str = "")
             for v in namespace.values()
             if isinstance(v, type) and issubclass(v, Task) and v is not Task
         ]
-        view = PlacerView(envs)
-        task = made[0](view, urdf_assets_root)  # pyright: ignore[reportCallIssue]
+        return made[0](view, urdf_assets_root), view  # pyright: ignore[reportCallIssue]
     except Exception as error:
         raise TaskCodeError(
             f"it does not load: {type(error).__name__}: {error}", line_in_task_code(error)
         ) from error
-    return GuardedTask(task, view, title)
 
 
 def class_name(source: str) -> str:
     """Return the name of the one task class in checked code."""
     return next(n.name for n in checked_tree(source).body if isinstance(n, ast.ClassDef))
-
-
-def line_in_task_code(error: BaseException) -> int | None:
-    """Return the line of the loaded task code at which an exception was raised."""
-    line, at = None, error.__traceback__
-    while at is not None:
-        if at.tb_frame.f_code.co_filename == CODE_NAME:
-            line = at.tb_lineno
-        at = at.tb_next
-    return line
 
 
 class _Strip(ast.NodeTransformer):

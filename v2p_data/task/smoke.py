@@ -29,6 +29,7 @@ from v2p_data.task.reader.check import check_code
 from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.source_text import shown
 
+CHILD = "smoke_child.py"
 BATCH = 16
 PARTS = 3
 """Batch sizes, drawn at random, at which every program is asked again."""
@@ -150,7 +151,8 @@ def _ask_child(
     num_probes = len(next(iter(probes.values()))) if probes else 0
     request = trial_request(sources, scene, probes, seconds_each)
     root = str(Path(v2p_data.__file__).parents[1])
-    starter = f"import sys; sys.path.insert(0, {root!r}); from v2p_data.task.smoke_child import main; main()"
+    module = f"v2p_data.task.{CHILD.removesuffix('.py')}"
+    starter = f"import sys; sys.path.insert(0, {root!r}); from {module} import main; main()"
     with tempfile.TemporaryDirectory(prefix="v2p-task-") as folder:
         child = subprocess.Popen(
             [sys.executable, "-I", "-c", starter],

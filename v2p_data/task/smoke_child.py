@@ -19,7 +19,8 @@ import torch
 from v2p_data.task.confine import confine, leave_the_network
 from v2p_data.task.guarded import Answers, GuardedTask, TaskOutputError, demand_equal
 from v2p_data.task.reader.refusal import TaskCodeError
-from v2p_data.task.sandbox import line_in_task_code, make_task
+from v2p_data.task.sandbox import make_task
+from v2p_data.task.time_limit import line_in_task_code
 
 MEMORY_BYTES = 2 * 1024**3
 """On top of what importing torch has mapped."""

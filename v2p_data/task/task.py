@@ -6,20 +6,27 @@ Task code is a Python text with six parts: scene information, `reset_objects_sta
 device, whose keys `states_table` lists.
 """
 
+import hashlib
 import json
+import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from v2p_data.errors import V2PError
-from v2p_data.scene.scene import Scene
+from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.scene.files import copy_folder, own_file, read_own_text
+from v2p_data.scene.scene import SCENE_FILE, Scene, SceneObject
 
 TASK_FILE = "task.json"
 CODE_FILE = "task.py"
 SCENE_FOLDER = "scene"
+ROBOT_FOLDER = "robot"
+"""Copies of another arm's files."""
 BASE_OBSERVATION_DIM = 90
 """Length of `states['base_observation']`, the same for every task so that experts can warm-start each other."""
 
@@ -133,7 +140,7 @@ class TaskBundle:
     motion_scale: float = 1.0
     """How much further than usual an action moves the gripper's target: throwing needs speed."""
     robot: dict[str, Any] = field(default_factory=dict[str, Any])
-    """Another arm than the built-in one: the fields of `sim.arms.RobotConfig`."""
+    """Another arm than the built-in one: the fields of `sim.arms.RobotConfig`; on disk its path is in `robot/`."""
     audit: dict[str, Any] = field(default_factory=dict[str, Any])
     folder: Path = Path()
 
@@ -141,36 +148,111 @@ class TaskBundle:
         """Return how many control steps a policy gets: this multiple of the task's own horizon."""
         return max(1, round(scale * self.horizon_steps))
 
+    @property
+    def arm(self) -> dict[str, Any]:
+        """Which arm it is for, wherever its file lies: the same for every copy of the file."""
+        if not self.robot or not Path(self.robot["path"]).is_file():
+            return self.robot
+        with Path(self.robot["path"]).open("rb") as stream:
+            return {**self.robot, "path": hashlib.file_digest(stream, "sha256").hexdigest()}
+
     def save(self, folder: Path) -> None:
-        """Write the task and copy its scene's files."""
-        shutil.copytree(
+        """Write the task and copy its scene's files and its robot's.
+
+        Raises:
+            V2PError: the scene's folder holds links, or the robot is not described as it should be.
+        """
+        from v2p_data.task.robot_files import copy_robot
+
+        copy_folder(
             self.scene.folder,
             folder / SCENE_FOLDER,
             ignore=shutil.ignore_patterns("record.json", "*.mp4", "*.partial"),
         )
+        robot = self.robot
+        if robot:
+            main = copy_robot(Path(robot["path"]), folder / ROBOT_FOLDER)
+            robot = {**robot, "path": str(PurePosixPath(ROBOT_FOLDER) / main)}
         (folder / CODE_FILE).write_text(self.code)
         data = {
             k: v
             for k, v in asdict(replace(self, scene=replace(self.scene, folder=Path()))).items()
             if k not in {"scene", "folder", "code"}
         }
-        (folder / TASK_FILE).write_text(json.dumps(data, indent=1))
+        (folder / TASK_FILE).write_text(json.dumps({**data, "robot": robot}, indent=1))
 
     @staticmethod
     def load(folder: Path) -> "TaskBundle":
-        """Read a task folder.
+        """Read a task folder, whoever made it; nothing outside of it is read, and none of its code is run.
 
         Raises:
-            V2PError: it holds no task.
+            V2PError: it holds no task, or something that a task may not hold.
         """
-        path = folder / TASK_FILE
-        if not path.is_file():
+        from v2p_data.task.schema import MAX_CODE_BYTES, read_task_file
+
+        if not (folder / TASK_FILE).exists():
             raise V2PError(
                 f"{folder} holds no {TASK_FILE}: it is no task; make one with 'v2p task'"
             )
+        if (folder / SCENE_FOLDER).is_symlink():
+            raise V2PError(
+                f"{folder / SCENE_FOLDER} is a link; a task folder holds its scene itself"
+            )
+        read = read_task_file(folder, TASK_FILE)
+        robot = read.robot.model_dump()
+        if robot:
+            robot["path"] = str(_own_robot(folder, robot["path"]))
         return TaskBundle(
-            **json.loads(path.read_text()),
-            code=(folder / CODE_FILE).read_text(),
+            title=read.title,
+            description=read.description,
+            kind=read.kind,
+            class_name=read.class_name,
+            horizon_steps=read.horizon_steps,
+            motion_scale=read.motion_scale,
+            robot=robot,
+            audit=read.audit.model_dump(mode="json"),
+            code=read_own_text(folder, CODE_FILE, MAX_CODE_BYTES),
             scene=Scene.load(folder / SCENE_FOLDER),
-            folder=folder,
+            folder=folder if folder != Path() else Path.cwd(),
         )
+
+    def files(self) -> list[str]:
+        """Return the files that it consists of, relative to its folder: what others need to run it."""
+        scene = [o for thing in self.scene.objects for o in _files_of(thing)]
+        there = [name for name in dict.fromkeys(scene) if (self.scene.folder / name).exists()]
+        return [TASK_FILE, CODE_FILE, f"{SCENE_FOLDER}/{SCENE_FILE}"] + [
+            f"{SCENE_FOLDER}/{name}" for name in there
+        ]
+
+
+@contextmanager
+def told_of(folder: Path) -> Iterator[None]:
+    """Let every error of what is done with a task begin with its folder."""
+    try:
+        yield
+    except ItemRejectedError as error:
+        if str(folder) in error.detail:
+            raise
+        raise ItemRejectedError(
+            error.reason, f"task {folder}: {error.detail}", error.value
+        ) from error
+    except V2PError as error:
+        if str(folder) in str(error):
+            raise
+        raise V2PError(f"task {folder}: {error}") from error
+
+
+def _own_robot(folder: Path, path: str) -> Path:
+    """Return a task's own robot file; all that it names must be plain files in the task's folder."""
+    from v2p_data.task.robot_files import MAX_FILE_BYTES, robot_files
+
+    main = own_file(folder, path, MAX_FILE_BYTES)
+    root = Path(os.path.abspath(folder))  # noqa: PTH100 - links are looked for below
+    for file in robot_files(main, root / ROBOT_FOLDER):
+        own_file(root, str(PurePosixPath(file.relative_to(root))), MAX_FILE_BYTES)
+    return main
+
+
+def _files_of(thing: SceneObject) -> tuple[str, ...]:
+    named = (thing.mesh, thing.mesh_ply, thing.urdf, thing.mjcf, *thing.parts)
+    return tuple(name for name in named if name)
