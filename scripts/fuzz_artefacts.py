@@ -1,0 +1,192 @@
+"""Damage files and folders of every kind that the engine reads, and look at what its commands answer.
+
+Three corpora of the tests are tried whole or in a random part: task folders as strangers may make them
+(`tests/task/strangers.py`), odd videos, captions, labels and boxes (`tests/video/odd_files.py`), and harms to each kind
+of file of a finished run (`tests/pipeline/damage.py`). Every case runs in a process of its own with a time limit.
+
+    python scripts/fuzz_artefacts.py --run outputs/demo --harms 200 --seed 1
+
+A case is good if it ends in one sentence and exit code 2, is listed as damaged, or is rightly accepted. Ends with exit
+code 1 if any case ends in a traceback, hangs, or a listed file changes unnoticed.
+"""
+
+import argparse
+import contextlib
+import io
+import json
+import multiprocessing
+import os
+import shutil
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from v2p_data import cli
+from v2p_data.errors import V2PError
+from v2p_data.seeds import rng_for
+
+ROOT = Path(__file__).parents[1]
+LIMIT_S = 120.0
+"""Of a case, in which imports may be the longest part on a busy machine."""
+READERS = {
+    "dataset": ("verify", "{folder}"),
+    "policy": ("eval", "{folder}/policy", "--evaluation.episodes=1"),
+    "expert": ("eval", "{folder}", "--evaluation.episodes=1"),
+    "distillation": ("train", "{dataset}", "--config", str(ROOT / "configs" / "demo.yaml")),
+}
+"""Stage -> a command that reads its folder and refuses a damaged one before anything is made."""
+Case = Callable[[Path], str]
+"""Given an empty folder, tries and returns what became of it; raises on what may not be."""
+
+
+def main() -> None:
+    """Read the command line, try, print what happened as one line of JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument(
+        "--run", type=Path, default=ROOT / "outputs" / "demo", help="a finished run"
+    )
+    parser.add_argument("--harms", type=int, default=200, help="harms to the run's files, drawn")
+    parser.add_argument("--parts", nargs="*", default=["tasks", "videos", "run"])
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    for folder in ("task", "video", "pipeline"):
+        sys.path.insert(0, str(ROOT / "tests" / folder))
+    outcomes: dict[str, Counter[str]] = {}
+    violations: list[str] = []
+    parts = {"tasks": _tasks, "videos": _videos, "run": lambda: _harms(args)}
+    for part in args.parts:
+        outcomes[part] = Counter()
+        for name, case in parts[part]():
+            outcome = _in_a_process(case)
+            outcomes[part][outcome.split(":")[0]] += 1
+            if outcome.startswith("violation"):
+                violations.append(f"{part}, {name}: {outcome}")
+                print(violations[-1], file=sys.stderr, flush=True)
+    print(json.dumps({"outcomes": outcomes, "violations": violations}))
+    sys.exit(1 if violations else 0)
+
+
+def _in_a_process(case: Case) -> str:
+    """Return the case's outcome; an exception, a crash or a hang is a violation."""
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as folder:
+        process = context.Process(target=_try, args=(case, Path(folder), there))
+        process.start()
+        there.close()
+        outcome = "violation: it took too long"
+        if here.poll(LIMIT_S):
+            try:
+                outcome = here.recv()
+            except EOFError:
+                outcome = "violation: its process ended"
+        process.kill()
+        process.join()
+    return outcome
+
+
+def _try(case: Case, folder: Path, answer: Connection) -> None:
+    os.environ["V2P_CACHE_DIR"] = str(folder / "cache")
+    try:
+        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+            outcome = case(folder)
+    except V2PError as error:
+        words = str(error)
+        outcome = "refused" if len(words) > 20 and "\n" not in words else f"violation: {words!r}"
+    except BaseException as error:  # noqa: BLE001 - what is looked for
+        outcome = f"violation: {type(error).__name__}: {str(error)[:200]}"
+    answer.send(outcome)
+
+
+# --- the corpora ---------------------------------------------------------------------------------------------
+
+
+def _tasks() -> Iterator[tuple[str, Case]]:
+    import strangers  # pyright: ignore[reportMissingImports]
+
+    from v2p_data.sim.gym_env import V2PEnv
+
+    def case(spoil: Callable[[Path], None]) -> Case:
+        def opened(folder: Path) -> str:
+            task = strangers.good_task(folder / "task")
+            spoil(task)
+            V2PEnv(str(task))
+            return "violation: it was opened"
+
+        return opened
+
+    for name, spoil in strangers.CASES.items():
+        yield name, case(spoil)
+
+
+def _videos() -> Iterator[tuple[str, Case]]:
+    import odd_files  # pyright: ignore[reportMissingImports]
+
+    from v2p_data.video.captions import find_videos
+    from v2p_data.video.decode import VideoConfig, read_clip
+
+    def case(fill: Callable[[Path], object]) -> Case:
+        def read(folder: Path) -> str:
+            (folder / "videos").mkdir()
+            fill(folder / "videos")
+            for video in find_videos(folder / "videos"):
+                read_clip(video, VideoConfig())
+            return "accepted"
+
+        return read
+
+    for name, fill in odd_files.odd_folders():
+        yield name, case(fill)
+
+
+def _harms(args: argparse.Namespace) -> Iterator[tuple[str, Case]]:
+    import damage  # pyright: ignore[reportMissingImports]
+
+    every = [
+        (kind, path, name, harm)
+        for kind in damage.KINDS
+        for path in kind.files(args.run)[:1]
+        for name, harm in (damage.HARMS | (damage.JSON_HARMS if path.suffix == ".json" else {})).items()
+        if path.stat().st_size > 1
+    ]  # fmt: skip
+    drawn = rng_for(args.seed, "fuzz-artefacts").permutation(len(every))[: args.harms]
+
+    def case(kind: Any, path: Path, harm: Callable[[Path], None]) -> Case:
+        def looked_at(folder: Path) -> str:
+            run = folder / "run"
+            shutil.copytree(
+                args.run, run, copy_function=os.link, ignore=shutil.ignore_patterns("cache")
+            )
+            hurt = run / path.relative_to(args.run)
+            whole = hurt.read_bytes()
+            hurt.unlink()  # the original shares its bytes
+            hurt.write_bytes(whole)
+            harm(hurt)
+            noticed = cli.run(["status", str(run), "--check"]) == 1
+            if kind.is_listed and not noticed:
+                return "violation: nobody noticed"
+            if cli.run(["report", str(run)]) not in (0, 2):
+                return "violation: the report has another exit code"
+            place = hurt.relative_to(run).parts
+            if kind.is_listed and (reader := READERS.get(place[0])):
+                words = {
+                    "folder": run / place[0] / place[1],
+                    "dataset": next((run / "dataset").glob("*")),
+                }
+                if cli.run([word.format(**words) for word in reader]) not in (1, 2):
+                    return "violation: it was read all the same"
+            return "noticed" if noticed else "accepted"
+
+        return looked_at
+
+    for k in drawn.tolist():
+        kind, path, name, harm = every[k]
+        yield f"{kind.name}: {name}", case(kind, path, harm)
+
+
+if __name__ == "__main__":
+    main()
