@@ -97,14 +97,14 @@ def read_record(folder: Path) -> Record | None:
         raise damaged(folder, f"{path} holds no record ({str(error)[:200]})") from error
 
 
-def demand_whole(folder: Path, root: Path, below: str = "") -> None:
+def demand_whole(folder: Path, root: Path | None = None, below: str = "") -> None:
     """Raise if a finished folder is not as it was made.
 
     What has no record, and what was made before records listed files, passes.
 
     Args:
         folder: of a result; of the run at `root` or of another one.
-        root: the run that remembers what was compared.
+        root: the run that remembers what was compared; without one all is read again.
         below: compare only what lies below this path in the folder.
 
     Raises:
@@ -114,7 +114,8 @@ def demand_whole(folder: Path, root: Path, below: str = "") -> None:
     if record is None or record.files is None:
         return
     files = {name: mark for name, mark in record.files.items() if name.startswith(below)}
-    demand_no(damages(folder, files, memory=memory_of(folder, root)), folder)
+    memory = memory_of(folder, root) if root else None
+    demand_no(damages(folder, files, memory=memory), folder)
 
 
 def _checksum(record: dict[str, Any]) -> str:
