@@ -81,7 +81,7 @@ def read_record(folder: Path) -> Record | None:
     if not isinstance(data, dict):
         raise damaged(folder, f"{path} holds no record")
     values = cast(dict[str, Any], data)
-    schema = values.get("schema", 1)
+    schema = values.get("schema")
     if isinstance(schema, int) and schema > SCHEMA:
         raise UnusableError(
             "newer_version",
@@ -89,7 +89,7 @@ def read_record(folder: Path) -> Record | None:
             "version, or another --out",
         )
     checksum = values.pop(CHECKSUM_KEY, None)
-    if schema != 1 and checksum != _checksum(values):
+    if (schema != 1 or checksum is not None) and checksum != _checksum(values):
         raise damaged(folder, f"{path} has another content than was written")
     try:
         return from_values(Record, values, "the record")
