@@ -51,7 +51,7 @@ from v2p_data.sim.arms import RobotConfig, robot_to_json
 from v2p_data.solved import find_solved, solved_digests
 from v2p_data.task.generate import TaskConfig
 from v2p_data.task.nearest import Solved
-from v2p_data.task.task import TASK_FILE
+from v2p_data.task.task import CODE_FILE, TASK_FILE
 from v2p_data.task.vlm_config import VlmConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
@@ -624,11 +624,20 @@ def evaluation_stage(
         config=Seeded(config=cfg.evaluation, seed=cfg.seed),
         sources={
             **who.sources,
-            **{f"task {name}": file_digest(path / "task.py") for name, path in tasks.items()},
+            **{f"task {name}": _code_digest(path) for name, path in tasks.items()},
         },
         version=2,
         make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=tuple(seen)),
     )
+
+
+def _code_digest(task: Path) -> str:
+    code = task / CODE_FILE
+    if not code.is_file():
+        raise V2PError(
+            f"{task} holds no {CODE_FILE}, so it is no whole task; make it again or copy it anew"
+        )
+    return file_digest(code)
 
 
 def demand_whole_part(place: Path, root: Path | None = None) -> None:

@@ -29,6 +29,7 @@ from v2p_data.stages import (
     EngineConfig,
     chain,
     dataset_stage,
+    demand_whole_part,
     distillation_stage,
     distilled_dataset_stage,
     evaluation_stage,
@@ -310,6 +311,8 @@ def evaluate(
     """Judge a policy, an expert or the programs in the tasks that it learned from and in unseen ones."""
     seen = _seen_tasks(who)
     tasks = {**seen, **unseen}
+    for task in tasks.values():
+        demand_whole_part(task.resolve(), root)
     if not tasks:
         raise V2PError(
             f"no task is known for {who.repo_id or who.folder}; name task folders with --tasks"
@@ -328,6 +331,7 @@ def _contestant(policy: Path) -> Contestant:
     """
     repo_id = policy.as_posix()
     if policy.exists() or not is_repo_id(repo_id):
+        demand_whole_part(policy.resolve())
         return contestant(policy)
     from v2p_data.episodes.hub import fetch_policy
 
@@ -495,7 +499,12 @@ def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:
     with Display() as display:
         outcomes = run_stages(stages, runtime, display)
     path = runtime.root / RUN_FILE
-    write_json_atomically(path, outcomes_json(outcomes, stages))
+    try:
+        write_json_atomically(path, outcomes_json(outcomes, stages))
+    except OSError as error:
+        raise V2PError(
+            f"cannot write {path} ({error.strerror}); what was made is kept: remove what is there and run again"
+        ) from error
     return outcomes
 
 

@@ -82,7 +82,7 @@ def _row(stage: str, folder: Path, *, check: bool) -> Row | None:
 def _failures(run: Path) -> Iterator[Row]:
     """Yield what the last command could not make; damage is told of each folder already."""
     path = run / RUN_FILE
-    if not path.exists():
+    if not path.exists(follow_symlinks=False):
         return
     outcomes = read_json(path)
     if not isinstance(outcomes, list) or not all(isinstance(o, dict) for o in outcomes):

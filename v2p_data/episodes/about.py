@@ -26,7 +26,7 @@ def read_about(root: Path) -> dict[str, Any] | None:
         V2PError: it is damaged, or a newer version wrote it.
     """
     path = root / METADATA_FILE
-    if not path.exists():
+    if not path.exists(follow_symlinks=False):
         return None
     about = read_json(path)
     if not isinstance(about, dict):

@@ -109,6 +109,8 @@ def read_run(root: Path) -> Run:
                 unreadable.append(error.detail)
                 continue
             if record is None:
+                if any(folder.iterdir()):
+                    unreadable.append(f"{folder / RECORD_FILE} is missing")
                 continue
             unreadable += [
                 f"{d.path} {d.what}" for d in damages(folder, record.files or {}, sizes_only=True)
@@ -279,7 +281,7 @@ def _from_record(stage: str, folder: Path, record: Record) -> Result:
 
 def _outcomes(root: Path) -> list[dict[str, Any]] | None:
     """Return what became of each result that the last command asked for; None where that cannot be read."""
-    if not (root / RUN_FILE).exists():
+    if not (root / RUN_FILE).exists(follow_symlinks=False):
         return []
     outcomes = read_json(root / RUN_FILE)
     if not isinstance(outcomes, list):
