@@ -15,6 +15,7 @@ from v2p_data.pipeline.shareable import without_places
         ("--config=~/x.yaml", "--config=x.yaml"),
         ("/home/ann/venv/bin/python /home/ann/worker.py --fast", "python worker.py --fast"),
         ("made from '/home/ann/a b.mp4'", "made from 'a b.mp4'"),
+        ("'/home/ann/my env/bin/python' -m \"/home/ann/x.py\"", "'python' -m \"x.py\""),
         ("outputs/demo", "outputs/demo"),
         ("https://api.example.com/v1/chat", "https://api.example.com/v1/chat"),
         ("put it in / onto the box", "put it in / onto the box"),

@@ -172,8 +172,17 @@ def fetch_policy(repo_id: str, *, waits_s: Sequence[float] = WAITS_S) -> Path:
     token = next((t for name in TOKEN_VARIABLES if (t := os.environ.get(name, "").strip())), "")
 
     from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import LocalEntryNotFoundError
 
     def fetch() -> Path:
+        try:
+            return once()
+        except (
+            LocalEntryNotFoundError
+        ) as error:  # nothing is stored here, for the reason that it hides
+            raise error.__cause__ or error from None
+
+    def once() -> Path:
         return Path(
             snapshot_download(
                 repo_id,

@@ -4,15 +4,18 @@ import re
 from pathlib import PurePath
 from typing import Any, cast
 
-_PATH = re.compile(r"(?<![\w/:.~-])~?/(?:[^\s/'\",;:=()\[\]{}]+/)+[^\s/'\",;:=()\[\]{}]*")
-"""An absolute path of two or more parts within a text; no part of an address or of a relative path."""
+_PATH = re.compile(
+    r"(?P<quote>['\"])(?P<quoted>~?/[^'\"\n]*)(?P=quote)"
+    r"|(?<![\w/:.~-])~?/(?:[^\s/'\",;:=()\[\]{}]+/)+[^\s/'\",;:=()\[\]{}]*"
+)
+"""An absolute path within a text, in quotes or of two or more parts; no part of an address or of a relative path."""
 
 
 def without_places(value: Any) -> Any:
     """Return JSON in which every absolute path is cut down to its last part.
 
     A text that is a path, or an option with one (`--out=/home/a/my run`), may hold blanks; a path within a longer
-    text ends at the first one.
+    text ends at the first one, unless it is in quotes.
     """
     if isinstance(value, dict):
         entries = cast(dict[Any, Any], value)
@@ -23,12 +26,18 @@ def without_places(value: Any) -> Any:
         option, equals, rest = value.partition("=")
         if equals and option.startswith("-"):
             return f"{option}={without_places(rest)}"
-        return _name(value) if _is_place(value) else _PATH.sub(lambda m: _name(m[0]), value)
+        return _name(value) if _is_place(value) else _PATH.sub(_shown, value)
     return value
 
 
 def _is_place(text: str) -> bool:
     return text.startswith(("/", "~/")) and "\n" not in text and " /" not in text
+
+
+def _shown(match: re.Match[str]) -> str:
+    if match["quote"]:
+        return f"{match['quote']}{_name(match['quoted'])}{match['quote']}"
+    return _name(match[0])
 
 
 def _name(path: str) -> str:
