@@ -24,7 +24,7 @@ BELOW: dict[str, set[str]] = {
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }
 TOP = {
-    *("stages", "learning", "expert_config", "policy_training", "policy_config"),
+    *("stages", "learning", "expert_config", "policy_training", "policy_config", "craft_data"),
     *("solved", "candidate_worker", "judging", "cli", "commands"),
 }
 

@@ -33,6 +33,7 @@ from policies.ppo.imitate import imitate
 from policies.ppo.policy import Expert
 from policies.ppo.train import NotFiniteError, train_expert
 from v2p_data.errors import V2PError
+from v2p_data.learning import success_of
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.reward.candidate import (
     DONE_FILE,
@@ -54,7 +55,7 @@ from v2p_data.reward.trajectories import Trajectories
 from v2p_data.scene.scene import SceneObject
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.teacher import Teacher, play
+from v2p_data.sim.teacher import Teacher
 from v2p_data.sim.torchrl_env import TorchRLEnv
 from v2p_data.task.confine import confine, leave_the_network
 
@@ -292,9 +293,13 @@ def teach(request: dict[str, Any], folder: Path) -> None:
     bundle = load_candidate(Path(request["bundle"]), Path(request["code"]))
     seed, threads = int(request["seed"]), int(request["num_threads"])
 
-    def worlds(count: int, what: str) -> BatchEnv:
+    def worlds(count: int, what: str, *, fine: bool = False) -> BatchEnv:
         return BatchEnv(
-            bundle, SimConfig(), num_envs=count, seed=seed_for(seed, what), num_threads=threads
+            bundle,
+            SimConfig(fine=fine),
+            num_envs=count,
+            seed=seed_for(seed, what),
+            num_threads=threads,
         )
 
     began = time.monotonic()
@@ -318,8 +323,8 @@ def teach(request: dict[str, Any], folder: Path) -> None:
             on_progress=lambda _: _beat(folder),
         )
         steps += imitated.steps
-        exam = worlds(int(request["eval_worlds"]), "exam")
-        success = float(play(exam, Expert.load(imitated.folder).act)[0].mean())
+        exam = worlds(int(request["eval_worlds"]), "exam", fine=True)
+        success = success_of(exam, Expert.load(imitated.folder))
         steps += exam.num_envs * bundle.horizon_steps
     write_json_atomically(
         folder / DONE_FILE,

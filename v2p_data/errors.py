@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Literal
 
 
 class V2PError(Exception):
@@ -22,6 +23,20 @@ class ItemRejectedError(V2PError):
         self.reason = reason
         self.detail = detail
         self.value = value
+
+
+class UnusableError(V2PError):
+    """A result that the engine made earlier cannot be used as it lies there; others can.
+
+    Args:
+        reason: `damaged` or `newer_version`.
+        detail: one sentence for a person: which file, and what to do.
+    """
+
+    def __init__(self, reason: Literal["damaged", "newer_version"], detail: str) -> None:
+        super().__init__(detail)
+        self.reason = reason
+        self.detail = detail
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -38,6 +38,8 @@ class Contestant:
     kind: Kind
     folder: Path
     """Of a policy or an expert."""
+    repo_id: str = ""
+    """Of a policy that was fetched from the Hub."""
 
     @property
     def sources(self) -> dict[str, str]:

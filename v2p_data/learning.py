@@ -175,5 +175,8 @@ def learn(
 
 
 def success_of(env: BatchEnv, expert: Expert) -> float:
-    """Play one episode in every world and return the share that the task's success held at some time."""
+    """Play one episode in every world and return the share that the task's success held at some time.
+
+    That is what episodes are recorded for, and what `taught_success` and `ppo_success` mean wherever they are kept.
+    """
     return float(play(env, expert.act)[1].mean())

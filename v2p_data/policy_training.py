@@ -4,7 +4,6 @@ The student of the distillation is the LeRobot policy itself, so the last traini
 """
 
 import itertools
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.artifact import provenance, read_record
+from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import from_values
 from v2p_data.policy_config import PolicyConfig
@@ -46,11 +45,11 @@ def sources_of(dataset: Path, root: Path) -> list[Source]:
     for item, folder in (record.inputs if record else {}).items():
         episodes = root / "episodes" / folder
         of_episodes = read_record(episodes)
-        if of_episodes is None:
+        if of_episodes is None or not {"task", "expert"} <= of_episodes.inputs.keys():
             return []
         task = next(root.glob(f"*/{of_episodes.inputs['task']}"), None)
         expert = root / "expert" / of_episodes.inputs["expert"]
-        if task is None or not (expert / "weights.safetensors").is_file():
+        if task is None or read_record(expert) is None:
             return []
         found.append(Source(item=item, task=task, expert=expert, episodes=episodes))
     return found
@@ -61,6 +60,12 @@ def recorded_under(source: Source) -> EpisodesConfig:
     record = read_record(source.episodes)
     assert record is not None
     return from_values(EpisodesConfig, record.recipe["config"]["config"], str(source.episodes))
+
+
+def demand_whole_sources(dataset: Path, sources: Sequence[Source], root: Path) -> None:
+    """Raise if a dataset, or what is behind it, is not as it was made: see `demand_whole`."""
+    for folder in (dataset, *(f for s in sources for f in (s.task, s.expert, s.episodes))):
+        demand_whole(folder, root)
 
 
 def make_distillation(
@@ -80,6 +85,7 @@ def make_distillation(
     from v2p_data.task.task import TaskBundle
 
     del inputs
+    demand_whole_sources(dataset, sources, runtime.root)
     recipe: DistillationConfig = cfg.config["distillation"]
     policy: PolicyConfig = cfg.config["policy"]
     episodes = recorded_under(sources[0])
@@ -129,6 +135,9 @@ def make_distilled_dataset(
     from v2p_data.episodes.collect import staged_episodes
     from v2p_data.stages import pack_and_verify
 
+    for source in sources:
+        demand_whole(source.task, runtime.root)
+        demand_whole(source.episodes, runtime.root)
     demonstrations = [path for source in sources for path in staged_episodes(source.episodes)]
     return pack_and_verify(
         [*demonstrations, *handover_episodes(inputs["distillation"])],
@@ -154,6 +163,7 @@ def make_policy(
     from policies.bc.trainer import TrainerConfig, write_train_config
     from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
 
+    demand_whole_sources(dataset, sources, runtime.root)
     policy: PolicyConfig = cfg.config.resolved
     seed = seed_for(cfg.seed, "policy")
     distilled = inputs.get("distillation")
@@ -181,7 +191,10 @@ def make_policy(
             on_progress=runtime.progress,
         )
     student.save(out / POLICY_FOLDER)
-    write_train_config(out / POLICY_FOLDER, student.policy, dataset, repo_id, recipe, seed)
+    # As seen from the run folder: the file is pushed, and a place names its maker.
+    is_own = dataset.is_relative_to(runtime.root.resolve())
+    place = dataset.relative_to(runtime.root.resolve()) if is_own else Path(dataset.name)
+    write_train_config(out / POLICY_FOLDER, student.policy, place, repo_id, recipe, seed)
     return {
         "steps": steps,
         "samples": steps * policy.batch_size,
@@ -274,16 +287,10 @@ def checkpoint_judge(
 
 def _num_labels(dataset: Path) -> int | None:
     """Return how many labels occur in a dataset of ours, the background included; None where it is not known."""
-    from v2p_data.episodes.features import METADATA_FILE
+    from v2p_data.episodes.about import read_about
 
-    path = dataset / METADATA_FILE
-    if not path.is_file():
-        return None
-    return max(
-        (1 + max(int(label) for label in e["labels"])
-         for e in json.loads(path.read_text())["episodes"]),
-        default=None,
-    )  # fmt: skip
+    about = read_about(dataset)
+    return max((1 + int(label) for e in (about or {}).get("episodes", ()) for label in e["labels"]), default=None)  # fmt: skip
 
 
 class bad_data_told:  # noqa: N801 - used as a context manager

@@ -18,15 +18,24 @@ from pathlib import Path
 from typing import Any
 
 from policies.evaluation.rate import wilson
+from v2p_data.craft_data import scene_data, task_data
 from v2p_data.distillation.config import DistillationConfig
+from v2p_data.episodes.about import CARRIED_TASKS
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.expert_config import ExpertConfig
 from v2p_data.judging import PROGRAMS, Contestant, judge_task, play_of, row_of
-from v2p_data.pipeline.artifact import Record, provenance, read_record, write_json_atomically
+from v2p_data.pipeline.artifact import (
+    Record,
+    demand_whole,
+    provenance,
+    read_record,
+    write_json_atomically,
+)
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.pipeline.shareable import without_places
 from v2p_data.policy_config import PolicyConfig
 from v2p_data.policy_training import (
     POLICY_FOLDER,
@@ -41,14 +50,15 @@ from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
 from v2p_data.solved import find_solved, solved_digests
 from v2p_data.task.generate import TaskConfig
+from v2p_data.task.nearest import Solved
+from v2p_data.task.task import CODE_FILE, TASK_FILE
 from v2p_data.task.vlm_config import VlmConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
 
 logger = logging.getLogger(__name__)
 
-ROOT_OF_TASKS = "v2p/tasks"
-"""Where a dataset carries the tasks that its episodes were made in."""
+ROOT_OF_TASKS = CARRIED_TASKS.as_posix()
 MODEL_CALLS_FOLDER = "vlm"
 """Of a run: everything that a language model was asked and answered."""
 SOLVED_POOL_FOLDER = "pool"
@@ -109,7 +119,7 @@ def scene_stage(video: VideoItem, cfg: EngineConfig) -> Stage:
         name="scene",
         item=video.item,
         config=recipe,
-        sources={"video": file_digest(video.path)},
+        sources={"video": file_digest(video.path)} | scene_data(),
         version=3,
         make=partial(make_scene, video=video),
     )
@@ -153,7 +163,7 @@ def task_stage(scene: Stage, cfg: EngineConfig) -> Stage:
         item=scene.item,
         config=Seeded(config=cfg.task.recipe(), seed=cfg.seed),
         inputs={"scene": scene},
-        sources=_robot_digests(robot),
+        sources=_robot_digests(robot) | task_data(asks_model=cfg.task.writer == "vlm"),
         version=1,
         make=partial(make_task, robot=robot, how=cfg.task),
     )
@@ -224,7 +234,8 @@ def reward_stage(task: Stage, cfg: EngineConfig) -> Stage:
         item=task.item,
         config=Seeded(config=cfg.reward, seed=cfg.seed),
         inputs={"task": task},
-        sources={} if vlm is None else {"model": fingerprint(vlm.recipe())},
+        sources=task_data(asks_model=vlm is not None)
+        | ({} if vlm is None else {"model": fingerprint(vlm.recipe())}),
         version=1,
         make=partial(make_reward, vlm=vlm),
         resumes=True,
@@ -322,7 +333,7 @@ def make_expert(
         seed=seed_for(cfg.seed, "expert", bundle.title),
         num_threads=runtime.num_threads,
         device=runtime.device,
-        solved=find_solved(warm_start) if warm_start else (),
+        solved=_whole(find_solved(warm_start), runtime.root) if warm_start else (),
         success_bonus=success_bonus,
         on_progress=lambda share, words: runtime.progress(0.95 * share, words),
     )
@@ -355,6 +366,13 @@ def make_expert(
     if teaches_model:  # an example for the tasks that come after
         add_solved(runtime.root / SOLVED_POOL_FOLDER, bundle, rate.value)
     return counts
+
+
+def _whole(solved: Sequence[Solved], root: Path) -> Sequence[Solved]:
+    for other in solved:
+        demand_whole(other.folder, root)
+        demand_whole(other.bundle.folder, root)
+    return solved
 
 
 # --- expert -> episodes --------------------------------------------------------------------------------------
@@ -420,6 +438,8 @@ def make_dataset(
     """Write the dataset, reopen it with LeRobot and compare every frame with what was drawn."""
     from v2p_data.episodes.collect import staged_episodes
 
+    for task in tasks.values():
+        demand_whole(task.folder(runtime.root), runtime.root)
     return pack_and_verify(
         [path for folder in inputs.values() for path in staged_episodes(folder)],
         cfg["repo_id"],
@@ -442,7 +462,7 @@ def pack_and_verify(
     provenance: Mapping[str, Any],
     tasks: Mapping[str, Path],
 ) -> dict[str, Any]:
-    """Write staged episodes as a LeRobot dataset into `out`, with their tasks and a card.
+    """Write staged episodes as a LeRobot dataset into `out`, with their tasks and a card, and no place of this machine.
 
     Raises:
         V2PError: there is nothing to pack, or the dataset differs from the episodes when it is read again.
@@ -458,7 +478,7 @@ def pack_and_verify(
         staged,
         repo_id,
         root,
-        provenance=provenance,
+        provenance=without_places(dict(provenance)),
         num_threads=runtime.num_threads,
         on_progress=lambda share, words: runtime.progress(0.7 * share, words),
     )
@@ -479,7 +499,7 @@ def pack_and_verify(
 
 
 def copy_tasks(tasks: Mapping[str, Path], dataset: Path) -> None:
-    """Put tasks, by item, into the dataset that was made in them."""
+    """Put tasks, by item, into the dataset that was made in them, without a place of this machine."""
     from v2p_data.scene.files import copy_folder
 
     for item, folder in tasks.items():
@@ -490,6 +510,10 @@ def copy_tasks(tasks: Mapping[str, Path], dataset: Path) -> None:
                 "record.json", "samples", "overlay*", REWARD_SEARCH_FOLDER
             ),
         )
+        described = dataset / ROOT_OF_TASKS / item / TASK_FILE
+        task = json.loads(described.read_text())
+        if (shareable := without_places(task)) != task:
+            described.write_text(json.dumps(shareable, indent=1))
 
 
 def _history(folder: Path, root: Path) -> dict[str, Any]:
@@ -602,11 +626,30 @@ def evaluation_stage(
         config=Seeded(config=cfg.evaluation, seed=cfg.seed),
         sources={
             **who.sources,
-            **{f"task {name}": file_digest(path / "task.py") for name, path in tasks.items()},
+            **{f"task {name}": _code_digest(path) for name, path in tasks.items()},
         },
         version=2,
         make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=tuple(seen)),
     )
+
+
+def _code_digest(task: Path) -> str:
+    code = task / CODE_FILE
+    if not code.is_file():
+        raise V2PError(
+            f"{task} holds no {CODE_FILE}, so it is no whole task; make it again or copy it anew"
+        )
+    return file_digest(code)
+
+
+def demand_whole_part(place: Path, root: Path | None = None) -> None:
+    """Raise if a policy, an expert or a task is not as it was made, wherever it lies: see `demand_whole`."""
+    if place.name == POLICY_FOLDER:
+        demand_whole(place.parent, root, f"{POLICY_FOLDER}/")
+    elif place.parent.as_posix().endswith(ROOT_OF_TASKS):
+        demand_whole(place.parents[2], root, f"{ROOT_OF_TASKS}/{place.name}/")
+    else:
+        demand_whole(place, root)
 
 
 def _item_of(who: Contestant) -> str:
@@ -614,6 +657,8 @@ def _item_of(who: Contestant) -> str:
         return PROGRAMS
     if who.kind == "expert":
         return f"{who.folder.name.rsplit('-', 1)[0]}-expert"
+    if who.repo_id:
+        return who.repo_id.split("/")[-1]
     folder = who.folder
     return folder.parent.name.rsplit("-", 1)[0] if folder.name == POLICY_FOLDER else folder.name
 
@@ -634,6 +679,8 @@ def make_evaluation(
     from v2p_data.task.task import TaskBundle, told_of
 
     del inputs
+    for place in (who.folder, *tasks.values()):
+        demand_whole_part(place, runtime.root)
     play = play_of(who, cfg.seed, runtime.device)
     rows: list[dict[str, Any]] = []
     for index, (name, folder) in enumerate(tasks.items()):

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from toy_run import dataset_of, made, record_of
 
 from v2p_data.cli import run
 from v2p_data.commands import run as commands
+from v2p_data.pipeline.artifact import write_record
+from v2p_data.pipeline.contents import list_files
 
 QUICK = ("--policy.preset", "small", "--policy.steps", "3", "--policy.batch-size", "8")
 
@@ -44,6 +47,11 @@ def change_json(path: Path, change: Callable[[Any], None]) -> None:
     path.write_text(json.dumps(data))
 
 
+def made_like_this(folder: Path) -> None:
+    """Let the record list the files as they are now: what they hold is at issue, not that they were changed."""
+    write_record(folder, replace(record_of(folder), files=list_files(folder)))
+
+
 def test_without_experts_the_demonstrations_are_cloned_and_that_is_said(capsys, dataset: Path):
     assert run(["train", str(dataset), *QUICK]) == 0
 
@@ -69,6 +77,7 @@ def test_a_dataset_without_cameras_is_refused(capsys, dataset: Path):
         del info["features"]["observation.images.mask"]
 
     change_json(dataset / "meta/info.json", blind)
+    made_like_this(dataset)
 
     assert "v2p_bc looks at images, and this dataset has none" in said(
         capsys, "train", dataset, *QUICK
@@ -92,6 +101,7 @@ def test_a_missing_statistic_is_named(
         del (stats[key] if statistic else stats)[statistic or key]
 
     change_json(dataset / "meta/stats.json", forget)
+    made_like_this(dataset)
 
     message = said(capsys, "train", dataset, "--policy.preset", preset)
 
@@ -102,6 +112,7 @@ def test_a_missing_statistic_is_named(
 def test_a_missing_video_is_named(capsys, dataset: Path):
     (video,) = dataset.glob("videos/**/*.mp4")
     video.unlink()
+    made_like_this(dataset)
 
     assert f"{video.name} is missing" in said(capsys, "train", dataset, *QUICK)
 
@@ -143,10 +154,9 @@ def test_why_the_distillation_failed_is_said_and_not_only_that_the_policy_waits_
     root = Path(shutil.copytree(finished, tmp_path / "run"))
     (episodes,) = (root / "episodes").glob("*")
 
-    def paint(record: dict[str, Any]) -> None:
-        record["recipe"]["config"]["config"]["render"] = "both"
-
-    change_json(episodes / "record.json", paint)
+    record = record_of(episodes)
+    record.recipe["config"]["config"]["render"] = "both"
+    write_record(episodes, record)
 
     message = said(capsys, "train", dataset_of(root), *QUICK)
 

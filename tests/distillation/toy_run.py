@@ -85,21 +85,27 @@ def expert() -> Expert:
     return Expert(model)
 
 
-def make_run(root: Path) -> Path:
-    """Make task, expert, episodes and dataset; return the dataset."""
+def make_task(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
+    scene = replace(bundle().scene, folder=out / "made")
+    scene.folder.mkdir()
+    scene.save(scene.folder)
+    replace(bundle(), scene=scene).save(out)
 
-    def make_task(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
-        scene = replace(bundle().scene, folder=out / "made")
-        scene.folder.mkdir()
-        scene.save(scene.folder)
-        replace(bundle(), scene=scene).save(out)
 
-    def make_expert(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
-        expert().save(out)
+def make_expert(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
+    expert().save(out)
 
+
+def last_stage(repo_id: str = REPO_ID) -> Stage:
+    """Return the stage that packs the run's episodes."""
     task = Stage(name="task", item=ITEM, config={}, make=make_task)
     learned = Stage(name="expert", item=ITEM, config={}, inputs={"task": task}, make=make_expert)
-    stage = dataset_stage([episodes_stage(task, learned, ENGINE)], REPO_ID)
+    return dataset_stage([episodes_stage(task, learned, ENGINE)], repo_id)
+
+
+def make_run(root: Path) -> Path:
+    """Make task, expert, episodes and dataset; return the dataset."""
+    stage = last_stage()
     outcomes = made([stage], Runtime(root=root))
     assert all(o.is_usable for o in outcomes.values()), [o.detail for o in outcomes.values()]
     return stage.folder(root)

@@ -80,7 +80,7 @@ def test_another_users_name_is_refused(dataset: Path, online: Hub):
     said = refusal(dataset, "stranger/toys")
 
     assert "answered 403" in said
-    assert "may not write to 'stranger/toys'" in said
+    assert "may not push 'stranger/toys'" in said
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from v2p_data.cli import command_of, parse
-from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.errors import UnusableError, V2PError, did_you_mean
 from v2p_data.pipeline.artifact import Record, read_record
 from v2p_data.report.reading import PARTIAL_SUFFIX
 from v2p_data.scene.one_camera import FEWEST, Filmed, SharedCamera, filmed, shared_camera
@@ -120,7 +120,8 @@ def _record_in(folder: Path) -> Record | None:
         return None
     try:
         return read_record(folder)
-    except (ValueError, TypeError, OSError):
+    except UnusableError as error:
+        print(f"left out: {error}", file=sys.stderr)  # noqa: T201
         return None
 
 

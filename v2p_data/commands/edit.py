@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from v2p_data.cli import parse
+from v2p_data.episodes.repo_id import check_repo_id
 
 if TYPE_CHECKING:
     from v2p_data.episodes.edit import Edited
@@ -38,6 +39,9 @@ def merge_command(argv: list[str]) -> int:
     from v2p_data.episodes.edit import merge
 
     args = parse(Merge, argv, "merge")
+    check_repo_id(args.repo_id)
+    for dataset in args.datasets:
+        _demand_sound(dataset)
     return _tell(merge(args.datasets, args.repo_id, args.out))
 
 
@@ -45,7 +49,19 @@ def drop_command(argv: list[str]) -> int:
     from v2p_data.episodes.edit import drop
 
     args = parse(Drop, argv, "drop")
+    if args.repo_id is not None:
+        check_repo_id(args.repo_id)
+    _demand_sound(args.dataset)
     return _tell(drop(args.dataset, args.tasks, args.out, args.repo_id))
+
+
+def _demand_sound(dataset: Path) -> None:
+    """Raise if a dataset of ours is not as it was made."""
+    from v2p_data.episodes.about import read_about
+    from v2p_data.pipeline.artifact import demand_whole
+
+    demand_whole(dataset)
+    read_about(dataset)
 
 
 def _tell(made: "Edited") -> int:

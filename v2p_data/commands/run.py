@@ -13,7 +13,7 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.commands.display import Display, describe, outcome_table, outcomes_json, tally
-from v2p_data.episodes.repo_id import check_repo_id
+from v2p_data.episodes.repo_id import check_repo_id, is_repo_id
 from v2p_data.errors import V2PError
 from v2p_data.judging import PROGRAMS, Contestant, contestant
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
@@ -29,6 +29,7 @@ from v2p_data.stages import (
     EngineConfig,
     chain,
     dataset_stage,
+    demand_whole_part,
     distillation_stage,
     distilled_dataset_stage,
     evaluation_stage,
@@ -105,11 +106,11 @@ class Distill(Train):
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
     policy: tyro.conf.Positional[Path]
-    """Folder of a policy or of an expert; `programs` for the scripted programs."""
+    """Folder of a policy or of an expert, or a policy's USER/NAME on the Hub; `programs` for the scripted programs."""
     tasks: tuple[Path, ...] = ()
     """More task folders (or folders of tasks) to try: these count as unseen."""
     out: Path | None = None
-    """Run folder; by default the one the policy lies in."""
+    """Run folder; by default the one the policy lies in, and outputs/NAME of a policy on the Hub."""
     config: Path | None = None
     """YAML file with settings; flags go over it."""
     engine: Engine = field(default_factory=EngineConfig)
@@ -189,6 +190,7 @@ def distill_command(argv: list[str]) -> int:
         )
     stage = distillation_stage(args.dataset.resolve(), record, args.engine, sources)
     packed = distilled_dataset_stage(stage, record, sources)
+    check_repo_id(packed.config["repo_id"])
     with only_run_in(root):
         outcomes = _run([packed], _all_threads(args.how.runtime(root)))
         for part in (stage, packed):
@@ -207,7 +209,7 @@ def distill_command(argv: list[str]) -> int:
 
 def eval_command(argv: list[str]) -> int:
     args = _with_config(Evaluate, argv, "eval")
-    who = contestant(args.policy)
+    who = _contestant(args.policy)
     root = _run_folder(args.out or _home_of(who, args.tasks))
     unseen = {name: path for folder in args.tasks for name, path in task_folders(folder).items()}
     with only_run_in(root):
@@ -221,7 +223,7 @@ def eval_command(argv: list[str]) -> int:
     _say(
         f"Made {outcome.folder / EVALUATION_FILE}",
         "\n".join(rate_lines(rows)) + f"\npage: {page}",
-        goes_on[who.kind],
+        f"v2p report {shlex.quote(str(root))}" if who.repo_id else goes_on[who.kind],
     )
     return 0
 
@@ -309,8 +311,12 @@ def evaluate(
     """Judge a policy, an expert or the programs in the tasks that it learned from and in unseen ones."""
     seen = _seen_tasks(who)
     tasks = {**seen, **unseen}
+    for task in tasks.values():
+        demand_whole_part(task.resolve(), root)
     if not tasks:
-        raise V2PError(f"no task is known for {who.folder}; name task folders with --tasks")
+        raise V2PError(
+            f"no task is known for {who.repo_id or who.folder}; name task folders with --tasks"
+        )
     for folder in tasks.values():
         TaskBundle.load(folder)  # what is wrong with a file is said before anything starts
     stage = evaluation_stage(who, tasks, cfg, seen=list(seen))
@@ -319,15 +325,35 @@ def evaluate(
     return outcome, _record(outcome.folder).counts["rows"]
 
 
+def _contestant(policy: Path) -> Contestant:
+    """Return who lies at a path, or the policy that is on the Hub by this name.
+
+    Raises:
+        V2PError: there is neither.
+    """
+    repo_id = policy.as_posix()
+    if policy.exists() or not is_repo_id(repo_id):
+        demand_whole_part(policy.resolve())
+        return contestant(policy)
+    from v2p_data.episodes.hub import fetch_policy
+
+    try:
+        return replace(contestant(fetch_policy(repo_id)), repo_id=repo_id)
+    except V2PError as error:
+        raise V2PError(f"there is no folder {policy}, and {error}") from error
+
+
 def _seen_tasks(who: Contestant) -> dict[str, Path]:
     """Return the tasks of a policy's dataset, or the one that an expert learned, as far as its run has them."""
-    if who.kind == "programs":
+    if who.kind == "programs" or who.repo_id:
         return {}
     root = _home_of(who, ())
     record = read_record(who.folder.parent if who.kind == "policy" else who.folder)
     if record is not None and (who.kind, record.stage) == ("policy", "policy"):
         for dataset in sorted((root / "dataset").glob(record.recipe["sources"]["dataset"])):
-            return task_folders(dataset / ROOT_OF_TASKS)
+            # The run's own tasks first: those in the dataset do not say where the file of another arm lies.
+            own = {source.item: source.task for source in sources_of(dataset, root)}
+            return own or task_folders(dataset / ROOT_OF_TASKS)
     if record is not None and (who.kind, record.stage) == ("expert", "expert"):
         for stage, folder in record.inputs.items():
             if (root / stage / folder / TASK_FILE).is_file():
@@ -372,6 +398,8 @@ def task_folders(folder: Path) -> dict[str, Path]:
 def _home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
     """Return the run folder that a policy or an expert lies in; of the programs, the one that the tasks lie in.
 
+    What is judged by its name on the Hub gets a run folder of its own.
+
     Raises:
         V2PError: the programs' tasks are not named.
     """
@@ -380,6 +408,8 @@ def _home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
             raise V2PError(f"the scripted programs need tasks: v2p eval {PROGRAMS} --tasks FOLDER")
         task = next(iter(task_folders(tasks[0]).values()))
         return task.resolve().parent.parent
+    if who.repo_id:
+        return Path("outputs") / who.repo_id.split("/")[-1]
     return who.folder.parent.parent.parent if who.kind == "policy" else who.folder.parent.parent
 
 
@@ -474,7 +504,12 @@ def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:
     with Display() as display:
         outcomes = run_stages(stages, runtime, display)
     path = runtime.root / RUN_FILE
-    write_json_atomically(path, outcomes_json(outcomes, stages))
+    try:
+        write_json_atomically(path, outcomes_json(outcomes, stages))
+    except OSError as error:
+        raise V2PError(
+            f"cannot write {path} ({error.strerror}); what was made is kept: remove what is there and run again"
+        ) from error
     return outcomes
 
 

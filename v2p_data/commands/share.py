@@ -66,7 +66,10 @@ def push_command(argv: list[str]) -> int:
 
 def _pushed(args: Push) -> tuple[str, str]:
     from v2p_data.episodes.hub import push_dataset, push_envhub, push_policy
+    from v2p_data.episodes.repo_id import check_repo_id
+    from v2p_data.stages import demand_whole_part
 
+    check_repo_id(args.repo_id)
     if args.envhub:
         from v2p_data.episodes.envhub import write_envhub
 
@@ -75,9 +78,11 @@ def _pushed(args: Push) -> tuple[str, str]:
             pushed = push_envhub(made.folder, args.repo_id, private=args.private, tag=args.tag)
         return pushed.url, f"make_env('{args.repo_id}', trust_remote_code=True)"
     if (args.path / "meta" / "info.json").is_file():
+        demand_whole_part(args.path.resolve())
         pushed = push_dataset(args.path, args.repo_id, private=args.private, tag=args.tag)
         return pushed.url, f"LeRobotDataset('{args.repo_id}')"
     if (args.path / "model.safetensors").is_file():
+        demand_whole_part(args.path.resolve())
         pushed = push_policy(args.path, args.repo_id, private=args.private, tag=args.tag)
         return pushed.url, f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS"  # fmt: skip
     raise V2PError(
@@ -88,9 +93,12 @@ def _pushed(args: Push) -> tuple[str, str]:
 
 def explain_command(argv: list[str]) -> int:
     from v2p_data.episodes.explain import differences, explain, told_as_json
-    from v2p_data.pipeline.artifact import write_json_atomically
+    from v2p_data.pipeline.artifact import demand_whole, write_json_atomically
 
     args = parse(Explain, argv, "explain")
+    for path in (args.path, args.other):
+        if path is not None:
+            demand_whole(path, below="meta/")
     if args.other is None:
         lines = explain(args.path, args.episode)
         data: object = told_as_json(args.path, args.episode)

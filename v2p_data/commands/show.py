@@ -1,6 +1,6 @@
 """Commands that show what a run made."""
 
-import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,8 +8,13 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.commands.display import STAGE_ORDER
-from v2p_data.errors import V2PError
-from v2p_data.pipeline.artifact import read_record
+from v2p_data.errors import UnusableError, V2PError
+from v2p_data.pipeline.artifact import RECORD_FILE, read_record
+from v2p_data.pipeline.contents import damaged, damages, demand_no
+from v2p_data.report.reading import PARTIAL_SUFFIX, RUN_FILE, read_json
+
+Row = tuple[str, str, str, str]
+"""Stage, item, what became of it, more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,29 +23,30 @@ class Shown:
     """Run folder, the --out of an earlier command."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Status(Shown):
+    check: bool = False
+    """Read every file and compare it with its digest; otherwise only sizes are looked at."""
+
+
 def status_command(argv: list[str]) -> int:
-    run = _run(parse(Shown, argv, "status").run)
-    rows: list[tuple[str, str, str, str]] = []
-    for stage in STAGE_ORDER:
-        for folder in sorted((run / stage).glob("*")):
-            record = read_record(folder)
-            if record is not None and record.rejected:
-                rows.append((stage, record.item, "rejected", f"{record.rejected['reason']}: {record.rejected['detail']}"))  # fmt: skip
-            elif record is not None:
-                counts = ", ".join(f"{k} {v}" for k, v in record.counts.items() if isinstance(v, int | float | str))  # fmt: skip
-                rows.append((stage, record.item, f"{record.seconds:.0f} s", counts))
-            elif folder.suffix == ".partial":
-                rows.append((stage, folder.stem, "unfinished", "the same command goes on with it"))
-    for outcome in (
-        json.loads((run / "run.json").read_text()) if (run / "run.json").is_file() else []
-    ):
-        if outcome["status"] == "failed":
-            rows.append((outcome["stage"], outcome["item"], "failed", f"{outcome['reason']}: {outcome['detail']}"))  # fmt: skip
-    widths = [max(len(row[i]) for row in rows) if rows else 0 for i in range(3)]
+    """Return 0; with `--check` 1 where something is damaged."""
+    args = parse(Status, argv, "status")
+    run = _run(args.run)
+    rows = [
+        row
+        for stage in STAGE_ORDER
+        for folder in sorted((run / stage).glob("*"))
+        if folder.is_dir() and (row := _row(stage, folder, check=args.check)) is not None
+    ]
+    num_damaged = sum(state == "damaged" for _, _, state, _ in rows)
+    rows += _failures(run)
+    widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
     for row in rows:
         print("  ".join(word.ljust(w) for word, w in zip(row, [*widths, 0], strict=True)).rstrip())  # noqa: T201
-    print(f"\n{len(rows)} results in {run}\nNext: v2p report {run}")  # noqa: T201
-    return 0
+    note = f", {num_damaged} of them damaged" if num_damaged else ""
+    print(f"\n{len(rows)} results in {run}{note}\nNext: v2p report {run}")  # noqa: T201
+    return 1 if args.check and num_damaged else 0
 
 
 def report_command(argv: list[str]) -> int:
@@ -49,6 +55,47 @@ def report_command(argv: list[str]) -> int:
     page = write_page(_run(parse(Shown, argv, "report").run))
     print(f"Made {page}, {page.stat().st_size / 1e6:.1f} MB\nNext: open it in a browser")  # noqa: T201
     return 0
+
+
+def _row(stage: str, folder: Path, *, check: bool) -> Row | None:
+    """Return a folder's line; None for an empty one."""
+    if folder.suffix == PARTIAL_SUFFIX:
+        return stage, folder.stem, "unfinished", "the same command goes on with it"
+    item = folder.name.rpartition("-")[0] or folder.name
+    try:
+        record = read_record(folder)
+        if record is None:
+            if not any(folder.iterdir()):
+                return None
+            raise damaged(folder, f"{folder / RECORD_FILE} is missing")
+        demand_no(damages(folder, record.files or {}, sizes_only=not check), folder)
+    except UnusableError as error:
+        return stage, item, error.reason.replace("_", " "), error.detail
+    except OSError as error:
+        return stage, item, "damaged", f"{folder} cannot be read ({error.strerror})"
+    if record.rejected:
+        return stage, record.item, "rejected", f"{record.rejected.get('reason')}: {record.rejected.get('detail')}"  # fmt: skip
+    counts = ", ".join(f"{k} {v}" for k, v in record.counts.items() if isinstance(v, int | float | str))  # fmt: skip
+    return stage, record.item, f"{record.seconds:.0f} s", counts
+
+
+def _failures(run: Path) -> Iterator[Row]:
+    """Yield what the last command could not make; damage is told of each folder already."""
+    path = run / RUN_FILE
+    if not path.exists(follow_symlinks=False):
+        return
+    outcomes = read_json(path)
+    if not isinstance(outcomes, list) or not all(isinstance(o, dict) for o in outcomes):
+        yield "run", RUN_FILE, "damaged", f"{path} cannot be read; the next command writes it anew"
+        return
+    for outcome in outcomes:
+        if outcome.get("status") == "failed" and outcome.get("reason") not in (
+            "damaged",
+            "newer_version",
+        ):
+            words = (outcome.get(key) for key in ("stage", "item", "reason", "detail"))
+            stage, item, reason, detail = map(str, words)
+            yield stage, item, "failed", f"{reason}: {detail}"
 
 
 def _run(run: Path) -> Path:

@@ -1,10 +1,10 @@
 """The dataset card: what is in a dataset and how it was made, for people and for the Hub's search."""
 
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from v2p_data.episodes.about import read_about
 from v2p_data.episodes.features import (
     ACTION_NAMES,
     INTERVENTION_KEY,
@@ -14,6 +14,7 @@ from v2p_data.episodes.features import (
 )
 from v2p_data.episodes.handovers import who_acted
 from v2p_data.episodes.sheet import SHEET_FILE, write_sheet
+from v2p_data.episodes.tables import damage_told, read_info
 from v2p_data.errors import V2PError
 
 CARD_FILE = "README.md"
@@ -38,16 +39,16 @@ def write_card(root: Path, repo_id: str) -> Path:
     Raises:
         V2PError: the dataset was not made by this engine.
     """
-    try:
-        about: dict[str, Any] = json.loads((root / METADATA_FILE).read_text())
-        info: dict[str, Any] = json.loads((root / "meta/info.json").read_text())
-    except FileNotFoundError as error:
+    about, info = read_about(root), read_info(root)
+    if about is None:
         raise V2PError(
-            f"{root} was not written by v2p ({error.filename} is missing); its card must be written by hand"
-        ) from error
+            f"{root} was not written by v2p ({METADATA_FILE} is missing); its card must be written by hand"
+        )
     has_sheet = _drawn(root, info, about)
     path = root / CARD_FILE
-    write_text(path, dataset_card(about, info, repo_id, has_sheet=has_sheet))
+    with damage_told(root):
+        card = dataset_card(about, info, repo_id, has_sheet=has_sheet)
+    write_text(path, card)
     return path
 
 

@@ -12,10 +12,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from v2p_data.episodes.about import CARRIED_TASKS
 from v2p_data.episodes.card import LICENSE
 from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import demand_whole
 from v2p_data.scene.files import own_file
 from v2p_data.sim.robot import FINE
 from v2p_data.sim.world import build_world
@@ -26,7 +28,7 @@ PACKAGE = "v2p_data"
 SOURCE = Path(__file__).parents[1]
 ENTRY = f"{PACKAGE}.sim.lerobot_env"
 """What `env.py` imports; everything that it needs comes along."""
-PLACES = (Path(), Path("v2p/tasks"), Path("task"))
+PLACES = (Path(), CARRIED_TASKS, Path("task"))
 """Where a folder of tasks, a dataset and a run keep theirs."""
 MAX_FILE_BYTES = 200_000_000
 EXACT = ("mujoco", "lerobot")
@@ -57,6 +59,9 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
     if out.exists():
         raise V2PError(f"{out} exists already; choose another place")
     folders = _tasks_in(source)
+    demand_whole(source, below=f"{CARRIED_TASKS.as_posix()}/")
+    for folder in folders.values():
+        demand_whole(folder)
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

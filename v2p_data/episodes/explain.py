@@ -11,13 +11,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from v2p_data.episodes.about import CARRIED_TASKS, read_about
 from v2p_data.episodes.features import METADATA_FILE
 from v2p_data.episodes.handovers import who_acted
-from v2p_data.episodes.tables import INFO_FILE, episodes_of, read_info, read_json
+from v2p_data.episodes.tables import INFO_FILE, damage_told, episodes_of, read_info, read_json
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import RECORD_FILE, read_record
 
-TASKS_FOLDER = Path("v2p/tasks")
 STAGES = ("scene", "task", "reward", "expert", "episodes")
 ABSENT = "(absent)"
 LONGEST = 100
@@ -41,7 +41,8 @@ def explain(path: Path, episode: int | None = None) -> list[str]:
         V2PError: there is neither at `path`, or no such episode.
     """
     if (path / INFO_FILE).is_file():
-        return _episode(path, episode) if episode is not None else _dataset(path)
+        with damage_told(path):
+            return _episode(path, episode) if episode is not None else _dataset(path)
     if read_record(path) is None:
         raise V2PError(
             f"{path} is neither a LeRobot dataset ({INFO_FILE}) nor a result of a run ({RECORD_FILE})"
@@ -57,7 +58,10 @@ def differences(first: Path, second: Path) -> list[Difference]:
     Raises:
         V2PError: one of them is neither, or they are of different kinds.
     """
-    a, b = _told(first), _told(second)
+    with damage_told(first):
+        a = _told(first)
+    with damage_told(second):
+        b = _told(second)
     if ("recipe" in a) != ("recipe" in b):
         raise V2PError(
             f"{first} and {second} are of different kinds: one is a dataset, one a result of a run"
@@ -72,19 +76,18 @@ def differences(first: Path, second: Path) -> list[Difference]:
 
 def told_as_json(path: Path, episode: int | None = None) -> dict[str, Any]:
     """Return what `explain` tells as data."""
-    if episode is None:
-        return _told(path)
-    return _entry(path, episode)
+    with damage_told(path):
+        return _told(path) if episode is None else _entry(path, episode)
 
 
 def _dataset(root: Path) -> list[str]:
     info = read_info(root)
-    about = read_json(root / METADATA_FILE)
+    about = read_about(root)
     lines = [
         f"{root.name}: LeRobot dataset, {info['total_episodes']} episodes, {info['total_frames']} frames at "
         f"{info['fps']} frames a second, robot {info.get('robot_type')}",
     ]
-    if not isinstance(about, dict):
+    if not about is not None:
         return [*lines, f"It holds no {METADATA_FILE}, so nothing is known of how it was made."]
     provenance: dict[str, Any] = about.get("provenance", {})
     lines += [f"repository  {about['repo_id']}", *_made_with(provenance)]
@@ -132,7 +135,7 @@ def _task(
             f"  acted     {acted.num_handovers} handovers: a student in {acted.student_frames} frames and the expert in "
             f"{acted.taken_over_frames}; the expert alone in {acted.num_demonstrations} demonstrations"
         )
-    carried = root / TASKS_FOLDER / item
+    carried = root / CARRIED_TASKS / item
     scene = read_json(carried / "scene/scene.json") or {}
     if scene:
         objects = ", ".join(f"{o['label']} ({o['shape']})" for o in scene.get("objects", []))
@@ -140,7 +143,7 @@ def _task(
     if (carried / "task.py").is_file():
         code = (carried / "task.py").read_text()
         digest = hashlib.sha256(code.encode()).hexdigest()[:12]
-        yield f"  task code {TASKS_FOLDER / item / 'task.py'}: {len(code.splitlines())} lines, sha256 {digest}, its reward included"
+        yield f"  task code {CARRIED_TASKS / item / 'task.py'}: {len(code.splitlines())} lines, sha256 {digest}, its reward included"
     for stage, node in _stages(history).items():
         counts = ", ".join(f"{k} {_short(v)}" for k, v in (node.get("counts") or {}).items())
         yield f"  {stage:<9} {node.get('folder', '?')}" + (f": {counts}" if counts else "")
@@ -175,7 +178,7 @@ def _entry(root: Path, episode: int) -> dict[str, Any]:
             f"{root} has no episode {episode}; they are numbered 0 to {int(info['total_episodes']) - 1}"
         )
     row = episodes_of(root).slice(episode, 1).to_pylist()[0]
-    about = read_json(root / METADATA_FILE)
+    about = read_about(root)
     entry: dict[str, Any] = {
         "episode": episode,
         "task": "; ".join(row["tasks"]),
@@ -190,16 +193,16 @@ def _entry(root: Path, episode: int) -> dict[str, Any]:
                 f"chunk {row[f'{key}/chunk_index']}, file {row[f'{key}/file_index']}, "
                 f"{row[name]:.2f} s to {row[f'{key}/to_timestamp']:.2f} s"
             )
-    if isinstance(about, dict):
+    if about is not None:
         entry |= about["episodes"][episode]
     return entry
 
 
 def _episode(root: Path, episode: int) -> list[str]:
     entry = _entry(root, episode)
-    about = read_json(root / METADATA_FILE)
+    about = read_about(root)
     lines = [f"{key:<24} {_short(value)}" for key, value in _flat(entry)]
-    if isinstance(about, dict):
+    if about is not None:
         items = about.get("provenance", {}).get("items", {})
         for stage, node in _stages(items.get(entry.get("history", entry["item"]), {})).items():
             lines.append(f"{stage:<24} {node.get('folder', '?')}")
@@ -235,13 +238,13 @@ def _told(path: Path) -> dict[str, Any]:
                 k: v for k, v in info.items() if k not in ("splits", "data_path", "video_path")
             }
         }
-        about = read_json(path / METADATA_FILE)
-        if isinstance(about, dict):
+        about = read_about(path)
+        if about is not None:
             told |= {k: v for k, v in about.items() if k != "episodes"}
             told["episodes"] = {e["id"]: e for e in about["episodes"]}
             told["task code"] = {
                 p.parent.name: hashlib.sha256(p.read_bytes()).hexdigest()[:12]
-                for p in sorted((path / TASKS_FOLDER).glob("*/task.py"))
+                for p in sorted((path / CARRIED_TASKS).glob("*/task.py"))
             }
         return told
     record = read_record(path)

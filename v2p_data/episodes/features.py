@@ -19,6 +19,7 @@ KEY_OF_CAMERA = {"mask": MASK_KEY, "rgb": RGB_KEY}
 DEMONSTRATION, HANDOVER = "demonstration", "handover"
 """Where an episode is from, in `METADATA_FILE` of datasets with handovers."""
 METADATA_FILE = "meta/v2p.json"
+METADATA_SCHEMA = 1
 """Palette, provenance and drawn parameters; LeRobot ignores it and uploads it."""
 
 STATE_NAMES = (

@@ -9,7 +9,6 @@ arrived are not sent again (the Hub knows them by their digest). The tag that Le
 file has arrived, so nobody loads half a version.
 """
 
-import json
 import logging
 import os
 import re
@@ -17,12 +16,16 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from v2p_data.episodes.about import CARRIED_TASKS
 from v2p_data.episodes.card import CARD_FILE, LICENSE, write_card, write_text
 from v2p_data.episodes.features import METADATA_FILE
 from v2p_data.episodes.repo_id import check_repo_id
+from v2p_data.episodes.tables import read_json
 from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.pipeline.shareable import without_places
 
 logger = logging.getLogger(__name__)
 
@@ -102,8 +105,12 @@ def push_dataset(
     info_path = root / "meta/info.json"
     if not info_path.is_file():
         raise V2PError(f"{root} holds no LeRobot dataset (no meta/info.json); nothing was pushed")
-    version = str(json.loads(info_path.read_text()).get("codebase_version", ""))
+    info = read_json(info_path)
+    if not isinstance(info, dict):
+        raise V2PError(f"{info_path} is damaged: it is no JSON object; nothing was pushed")
+    version = str(info.get("codebase_version", ""))
     if (root / METADATA_FILE).is_file():
+        _remove_places(root)
         write_card(root, repo_id)
     return _push(
         _Upload(
@@ -154,6 +161,44 @@ def push_policy(
     )
 
 
+def fetch_policy(repo_id: str, *, waits_s: Sequence[float] = WAITS_S) -> Path:
+    """Return the folder of a policy on the Hub, fetched once and kept in the library's own cache.
+
+    Raises:
+        V2PError: there is no such policy, or the Hub cannot be reached.
+    """
+    check_repo_id(repo_id)
+    endpoint = _endpoint()
+    token = next((t for name in TOKEN_VARIABLES if (t := os.environ.get(name, "").strip())), "")
+
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
+    def fetch() -> Path:
+        try:
+            return once()
+        except (
+            LocalEntryNotFoundError
+        ) as error:  # nothing is stored here, for the reason that it hides
+            raise error.__cause__ or error from None
+
+    def once() -> Path:
+        return Path(
+            snapshot_download(
+                repo_id,
+                endpoint=endpoint,
+                token=token or False,
+                ignore_patterns=["*.ckpt", "*.bin"],
+            )
+        )
+
+    folder = _explained(lambda: _patiently(fetch, waits_s), f"fetch '{repo_id}'", endpoint, token)
+    missing = [name for name in POLICY_FILES if not (folder / name).is_file()]
+    if missing:
+        raise V2PError(f"'{repo_id}' is no LeRobot policy: it holds no {' and no '.join(missing)}")
+    return folder
+
+
 def push_envhub(
     folder: Path,
     repo_id: str,
@@ -187,8 +232,7 @@ def push_envhub(
 def _push(upload: _Upload) -> Pushed:
     token = _token()
     _check_no_secret(upload.folder, token)
-    # Not left to the library's default, which it read from the environment when it was imported.
-    endpoint = os.environ.get("HF_ENDPOINT", "").rstrip("/") or DEFAULT_ENDPOINT
+    endpoint = _endpoint()
 
     from huggingface_hub import HfApi
     from huggingface_hub.errors import RevisionNotFoundError
@@ -224,10 +268,17 @@ def _push(upload: _Upload) -> Pushed:
         kind = "datasets/" if repo_type == "dataset" else ""
         return Pushed(repo_id=repo_id, url=f"{endpoint}/{kind}{repo_id}", commit=commit.oid)
 
-    return _explained(lambda: _patiently(send, upload.waits_s), repo_id, endpoint, token)
+    return _explained(
+        lambda: _patiently(send, upload.waits_s), f"push '{repo_id}'", endpoint, token
+    )
 
 
-def _patiently(send: Callable[[], Pushed], waits_s: Sequence[float]) -> Pushed:
+def _endpoint() -> str:
+    """Return the Hub's address; the library's default is what the environment said when it was imported."""
+    return os.environ.get("HF_ENDPOINT", "").rstrip("/") or DEFAULT_ENDPOINT
+
+
+def _patiently[T](send: Callable[[], T], waits_s: Sequence[float]) -> T:
     """Return what `send` returns, trying again after what may pass."""
     import httpx
     from huggingface_hub.errors import HfHubHTTPError
@@ -276,24 +327,24 @@ def _check_no_secret(folder: Path, token: str) -> None:
             )
 
 
-def _explained(upload: Callable[[], Pushed], repo_id: str, endpoint: str, token: str) -> Pushed:
-    """Return what `upload` returns, or raise in one sentence what the Hub or the network had against it."""
+def _explained[T](transfer: Callable[[], T], doing: str, endpoint: str, token: str) -> T:
+    """Return what `transfer` returns, or raise in one sentence what the Hub or the network had against it."""
     import httpx
     from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 
     again = "run the same command again; what has arrived is not sent twice"
     try:
-        return upload()
+        return transfer()
     except HfHubHTTPError as error:
         status = error.response.status_code if error.response is not None else 0
         said = _first_line(error.server_message or str(error), token)
         reasons = {
             401: "the token in HF_TOKEN is not valid there; make a new one with write access",
-            403: f"the token in HF_TOKEN may not write to '{repo_id}'; check the user name before the "
-            "slash and that the token has write access",
-            404: f"'{repo_id}' is not there, or this token may not see it",
+            403: f"the token in HF_TOKEN may not {doing}; check the user name before the slash and what the token "
+            "gives access to",
+            404: f"cannot {doing}: it is not there, or this token may not see it",
             507: "its storage is full; delete something there or make room in the plan",
-            409: f"'{repo_id}' is in use for something else or is being changed; choose another "
+            409: f"cannot {doing}: it is in use for something else or is being changed; choose another "
             "--repo-id or try again in a minute",
             413: "a file is larger than the Hub takes",
             429: f"it asks to slow down; wait some minutes and {again}",
@@ -302,7 +353,7 @@ def _explained(upload: Callable[[], Pushed], repo_id: str, endpoint: str, token:
         raise V2PError(f"{endpoint} answered {status} ({said}): {reason}") from None
     except OfflineModeIsEnabled:
         raise V2PError(
-            f"cannot push '{repo_id}': HF_HUB_OFFLINE is set; unset it and run the command again"
+            f"cannot {doing}: HF_HUB_OFFLINE is set; unset it and run the command again"
         ) from None
     except (httpx.TransportError, ConnectionError, TimeoutError) as error:
         raise V2PError(
@@ -311,28 +362,46 @@ def _explained(upload: Callable[[], Pushed], repo_id: str, endpoint: str, token:
         ) from None
     except OSError as error:
         raise V2PError(
-            f"cannot read or write here while pushing '{repo_id}' ({error.strerror or type(error).__name__}): "
+            f"cannot {doing}: something here cannot be read or written ({error.strerror or type(error).__name__}): "
             f"{error.filename or 'no file named'}; {again}"
         ) from None
 
 
 def _first_line(text: str, token: str) -> str:
-    lines = [line.strip() for line in text.replace(token, "***").splitlines() if line.strip()]
+    text = text.replace(token, "***") if token else text
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     return lines[0][:200] if lines else "no message"
 
 
+def _remove_places(root: Path) -> None:
+    """Take places of this machine out of what earlier versions wrote; today's names none."""
+    for path in (root / METADATA_FILE, *root.glob(f"{CARRIED_TASKS}/*/task.json")):
+        data = read_json(path)
+        if data is not None and (shareable := without_places(data)) != data:
+            write_json_atomically(path, shareable)
+
+
 def _policy_card(folder: Path, repo_id: str) -> str:
-    config: dict[str, Any] = json.loads((folder / "config.json").read_text())
+    config = read_json(folder / "config.json")
+    if not isinstance(config, dict):
+        raise V2PError(
+            f"{folder / 'config.json'} is damaged: it is no JSON object; nothing was pushed"
+        )
     kind = str(config.get("type", "unknown"))
-    dataset = ""
-    train_config = folder / "train_config.json"
-    if train_config.is_file():
-        dataset = str(json.loads(train_config.read_text()).get("dataset", {}).get("repo_id", ""))
+    trained = read_json(folder / "train_config.json")
+    source = trained.get("dataset") if isinstance(trained, dict) else None
+    dataset = str(source.get("repo_id", "")) if isinstance(source, dict) else ""
+    fetched = (
+        f"hf download {dataset} --repo-type dataset --include 'v2p/tasks/*' --local-dir dataset\n"
+        if dataset
+        else ""
+    )
+    tasks = "dataset/v2p/tasks" if dataset else "TASKS"
     trained_on = f"datasets:\n- {dataset}\n" if dataset else ""
     words = f"Policy of type `{kind}`" + (f", trained on `{dataset}`." if dataset else ".")
     return (
         f"---\nlibrary_name: lerobot\npipeline_tag: robotics\nlicense: {LICENSE}\n{trained_on}"
         f"tags:\n- lerobot\n- robotics\n- {kind}\n- video2policy\n---\n\n# {repo_id}\n\n{words}\n\n"
-        "It acts on segmentation masks and the robot's state. Evaluate it with\n\n"
-        f"```\nv2p eval {repo_id}\n```\n"
+        "It acts on segmentation masks and the robot's state. Evaluate it, in the tasks of its dataset or in others, with\n\n"
+        f"```\n{fetched}v2p eval {repo_id} --tasks {tasks}\n```\n"
     )

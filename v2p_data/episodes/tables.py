@@ -6,7 +6,8 @@ read here first, and what does not fit together is named by file.
 
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def read_json(path: Path) -> Any:
     """Return what the file holds, or None where there is none or it is no JSON."""
     try:
         return json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 
@@ -90,8 +91,34 @@ def episodes_of(root: Path, *, with_stats: bool = False) -> pa.Table:
     return pa.concat_tables(tables, promote_options="default")
 
 
+READING_ERRORS = (pa.ArrowException, OSError, LookupError, TypeError, ValueError, AttributeError)
+"""What reading a damaged table or JSON of another shape ends in."""
+
+
+@contextmanager
+def damage_told(root: Path) -> Generator[None]:
+    """Turn what a damaged dataset does to its readers into one sentence.
+
+    Raises:
+        V2PError: something could not be read.
+    """
+    try:
+        yield
+    except READING_ERRORS as error:
+        raise V2PError(
+            f"{root} is damaged ({_words(error)}); 'v2p verify {root}' names the file"
+        ) from error
+
+
 def layout_problems(root: Path, info: dict[str, Any]) -> list[Found]:
     """Return what is missing, damaged or contradicts itself in the files, pictures aside."""
+    try:
+        return _layout_problems(root, info)
+    except READING_ERRORS as error:
+        return [Found(check="unreadable_file", where="meta and data", detail=f"cannot be read ({_words(error)})")]  # fmt: skip
+
+
+def _layout_problems(root: Path, info: dict[str, Any]) -> list[Found]:
     found = list(_missing(root, info))
     if found:
         return found
@@ -309,6 +336,10 @@ def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
                     check="video_times", where=f"episode {b}",
                     detail=f"{key}: begins in the video before episode {a} ends there",
                 )  # fmt: skip
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:150]}"
 
 
 def _name(root: Path, path: Path) -> str:

@@ -6,11 +6,12 @@ v3 dataset is welcome: what holds for all is checked, what holds for ours only i
 the report says what was left out and why.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from v2p_data.episodes.about import CARRIED_TASKS, about_problems, read_about
 from v2p_data.episodes.features import INTERVENTION_KEY, METADATA_FILE
 from v2p_data.episodes.frames import Checks, Said
 from v2p_data.episodes.reading import Rows, same
@@ -21,8 +22,10 @@ from v2p_data.episodes.tables import (
     episodes_of,
     layout_problems,
     read_info,
-    read_json,
 )
+from v2p_data.errors import UnusableError, V2PError
+from v2p_data.pipeline.artifact import RECORD_FILE, read_record
+from v2p_data.pipeline.contents import damages
 
 Problem = Found
 SHOWN_PROBLEMS = 5
@@ -92,18 +95,48 @@ def verify(
         V2PError: there is no LeRobot v3 dataset at `root`.
     """
     info = read_info(root)
-    about = read_json(root / METADATA_FILE)
     said = Said()
-    said.problems += layout_problems(root, info)
-    checks = Checks(info=info, about=about if isinstance(about, dict) else None, said=said)
+    said.problems += [*_changed_files(root), *layout_problems(root, info)]
+    about = _about(root, said)
+    checks = Checks(info=info, about=about, said=said)
     if any(p.check in STOPPING for p in said.problems):
         return _report(root, checks, 0, 0, is_compared=False)
+    if about is not None:
+        table = episodes_of(root)
+        tasks, lengths = (table.column(name).to_pylist() for name in ("tasks", "length"))
+        said.problems += about_problems(root, about, tasks, lengths)
     leftovers = sorted(p.name for p in [root / "images", *root.glob("tmp*")] if p.exists())
     if leftovers:
         said.note("leftovers", ", ".join(leftovers), "LeRobot's temporary files; a push of its own uploads tmp*")  # fmt: skip
     repo_id = str((about or {}).get("repo_id", "local/dataset"))
     on_progress(0.0, "starting LeRobot")
     return _read(root, checks, repo_id, staged, on_progress)
+
+
+def _changed_files(root: Path) -> Iterator[Found]:
+    """Yield what is not as the record of a dataset of ours lists it; others have no record."""
+    try:
+        record = read_record(root)
+    except UnusableError as error:
+        yield Found(check="record", where=RECORD_FILE, detail=error.detail)
+        return
+    for damage in damages(root, (record.files if record else None) or {}):
+        where = damage.path.relative_to(root).as_posix()
+        yield Found(check="changed_file", where=where, detail=f"{damage.what}, says {RECORD_FILE}")
+
+
+def _about(root: Path, said: Said) -> dict[str, Any] | None:
+    """Return what our own metadata says; what is wrong with it is a finding."""
+    try:
+        about = read_about(root)
+    except V2PError as error:
+        said.add("unreadable_about", METADATA_FILE, str(error))
+        return None
+    if about is None and (root / CARRIED_TASKS).is_dir():
+        said.add(
+            "missing_file", METADATA_FILE, "is missing, and the dataset carries tasks of ours"
+        )
+    return about
 
 
 def _read(

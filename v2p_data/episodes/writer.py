@@ -27,6 +27,7 @@ from v2p_data.episodes.features import (
     INTERVENTION_KEY,
     KEY_OF_CAMERA,
     METADATA_FILE,
+    METADATA_SCHEMA,
     ROBOT_TYPE,
     STATE_KEY,
     STATE_NAMES,
@@ -55,7 +56,6 @@ VIDEO_FILE_MB = 200
 DATA_FILE_FRAMES = 400_000
 """Rows per file, 40 MB; each episode is a row group of its own, as LeRobot writes it."""
 EPISODES_PER_WRITE = 100
-METADATA_SCHEMA = 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,24 +1,37 @@
 """The folder of one result: complete if it holds a record, and the record says what it is."""
 
 import functools
+import hashlib
 import importlib.metadata
 import json
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from v2p_data.errors import ItemRejectedError
+from v2p_data.errors import ItemRejectedError, UnusableError, V2PError
+from v2p_data.pipeline.contents import (
+    FileMark,
+    damaged,
+    damages,
+    demand_no,
+    memory_of,
+)
+from v2p_data.pipeline.settings import from_values
+from v2p_data.pipeline.shareable import without_places
 
 RECORD_FILE = "record.json"
 REJECTS_FILE = "rejected.jsonl"
-SCHEMA = 1
+TRACEBACK_FILE = "traceback.txt"
+"""In a half-finished folder: why it was not finished."""
+SCHEMA = 2
+"""1: without the list of files and the record's own checksum."""
+CHECKSUM_KEY = "checksum"
 PACKAGES = ("lerobot", "mujoco", "torch", "torchrl", "numpy", "opencv-python-headless")
 
 
@@ -39,20 +52,76 @@ class Record:
     """Reason slug, sentence and number, when the item was rejected here."""
     counts: dict[str, Any] = field(default_factory=dict[str, Any])
     provenance: dict[str, Any] = field(default_factory=dict[str, Any])
+    files: dict[str, FileMark] | None = None
+    """What lies in the folder, by path; None in records of schema 1."""
     schema: int = SCHEMA
 
 
 def write_record(folder: Path, record: Record) -> None:
-    """Write the record so that it is either whole or absent."""
-    write_json_atomically(folder / RECORD_FILE, asdict(record))
+    """Write the record so that it is either whole or absent, with a checksum of itself."""
+    data = asdict(record)
+    write_json_atomically(folder / RECORD_FILE, data | {CHECKSUM_KEY: _checksum(data)})
 
 
 def read_record(folder: Path) -> Record | None:
-    """Return the record of a complete folder, else None."""
+    """Return the record of a complete folder, None where there is none.
+
+    Raises:
+        UnusableError: it is not as it was written, or a newer version wrote it.
+    """
+    path = folder / RECORD_FILE
     try:
-        return Record(**json.loads((folder / RECORD_FILE).read_text()))
+        data = json.loads(path.read_text())
     except (FileNotFoundError, NotADirectoryError):
         return None
+    except OSError as error:
+        raise damaged(folder, f"{path} cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise damaged(folder, f"{path} is no JSON") from error
+    if not isinstance(data, dict):
+        raise damaged(folder, f"{path} holds no record")
+    values = cast(dict[str, Any], data)
+    schema = values.get("schema")
+    if isinstance(schema, int) and schema > SCHEMA:
+        raise UnusableError(
+            "newer_version",
+            f"{path} was written by a newer version of v2p (schema {schema}, this one reads up to {SCHEMA}); use that "
+            "version, or another --out",
+        )
+    checksum = values.pop(CHECKSUM_KEY, None)
+    if (schema != 1 or checksum is not None) and checksum != _checksum(values):
+        raise damaged(folder, f"{path} has another content than was written")
+    try:
+        return from_values(Record, values, "the record")
+    except (V2PError, TypeError) as error:
+        raise damaged(folder, f"{path} holds no record ({str(error)[:200]})") from error
+
+
+def demand_whole(folder: Path, root: Path | None = None, below: str = "") -> None:
+    """Raise if a finished folder is not as it was made.
+
+    What has no record, and what was made before records listed files, passes.
+
+    Args:
+        folder: of a result; of the run at `root` or of another one.
+        root: the run that remembers what was compared; without one all is read again.
+        below: compare only what lies below this path in the folder.
+
+    Raises:
+        UnusableError: names the file and says what to do.
+    """
+    record = read_record(folder)
+    if record is None or record.files is None:
+        return
+    files = {name: mark for name, mark in record.files.items() if name.startswith(below)}
+    memory = memory_of(folder, root) if root else None
+    demand_no(damages(folder, files, memory=memory), folder)
+
+
+def _checksum(record: dict[str, Any]) -> str:
+    """Return the first 16 hex digits of the SHA-256 of a record's JSON."""
+    text = json.dumps(json.loads(json.dumps(record)), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def write_json_atomically(path: Path, data: Any) -> None:
@@ -66,9 +135,7 @@ def write_json_atomically(path: Path, data: Any) -> None:
 
 
 def commit_folder(partial: Path, final: Path) -> None:
-    """Rename finished work into place; a leftover without a record is replaced."""
-    if final.exists():
-        shutil.rmtree(final)
+    """Rename finished work into place, where nothing or an empty folder may be."""
     partial.rename(final)
     directory = os.open(final.parent, os.O_RDONLY)
     try:
@@ -99,7 +166,10 @@ def read_rejects(folder: Path) -> list[dict[str, Any]]:
 
 @functools.cache
 def provenance() -> dict[str, Any]:
-    """Return where and with what this process runs; gathered once, best effort, no secrets."""
+    """Return where and with what this process runs; gathered once, best effort, nothing that names its user.
+
+    The command line is as it can be shown to others; `own_command` is the one that was typed.
+    """
     try:
         commit = subprocess.run(
             ["git", "rev-parse", "HEAD"],
@@ -119,9 +189,14 @@ def provenance() -> dict[str, Any]:
             continue
     return {
         "commit": commit,
-        "argv": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "argv": without_places(own_command()),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "packages": versions,
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
+
+
+def own_command() -> list[str]:
+    """Return this process's command line, for records, which stay in the run folder."""
+    return [Path(sys.argv[0]).name, *sys.argv[1:]]

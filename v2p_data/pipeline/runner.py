@@ -12,15 +12,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.errors import ItemRejectedError, UnusableError, V2PError
 from v2p_data.pipeline.artifact import (
+    RECORD_FILE,
+    TRACEBACK_FILE,
     Record,
     commit_folder,
+    demand_whole,
+    own_command,
     provenance,
     read_record,
     rejection,
     write_record,
 )
+from v2p_data.pipeline.contents import damaged, list_files, memory_of, remember_made
 from v2p_data.pipeline.fingerprint import canonical, fingerprint
 
 logger = logging.getLogger(__name__)
@@ -105,11 +110,25 @@ class Outcome:
 
 
 def stored_outcome(stage: Stage, root: Path) -> Outcome | None:
-    """Return the outcome of a complete stage, None if it has still to run."""
+    """Return the outcome of a complete stage, None if it has still to run.
+
+    What is damaged has failed: it is neither used nor deleted.
+    """
     folder = stage.folder(root)
-    record = read_record(folder)
-    if record is None:
-        return None
+    try:
+        record = read_record(folder)
+        if record is None:
+            if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+                raise damaged(folder, f"{folder / RECORD_FILE} is missing")
+            return None
+        if record.fingerprint != stage.fingerprint:
+            raise damaged(folder, f"{folder / RECORD_FILE} is of another result")
+        demand_whole(folder, root)
+    except UnusableError as error:
+        return Outcome(
+            stage=stage.name, item=stage.item, status="failed", folder=folder,
+            reason=error.reason, detail=error.detail,
+        )  # fmt: skip
     if record.rejected:
         return Outcome(
             stage=stage.name,
@@ -117,8 +136,8 @@ def stored_outcome(stage: Stage, root: Path) -> Outcome | None:
             status="rejected",
             folder=folder,
             seconds=record.seconds,
-            reason=str(record.rejected["reason"]),
-            detail=str(record.rejected["detail"]),
+            reason=str(record.rejected.get("reason", "")),
+            detail=str(record.rejected.get("detail", "")),
         )
     return Outcome(
         stage=stage.name, item=stage.item, status="kept", folder=folder, seconds=record.seconds
@@ -128,7 +147,8 @@ def stored_outcome(stage: Stage, root: Path) -> Outcome | None:
 def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
     """Make one result whose inputs are complete, and write its record last.
 
-    A rejected item gets a folder with a record too, so that running again does not try it again.
+    The inputs are compared with what their records list. A rejected item gets a folder with a record too, so that
+    running again does not try it again.
     """
     folder = stage.folder(runtime.root)
     partial = folder.with_name(folder.name + ".partial")
@@ -142,6 +162,8 @@ def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
     status: Status = "made"
     reason = detail = ""
     try:
+        for source in inputs.values():
+            demand_whole(source, runtime.root)
         counts = stage.make(stage.config, inputs, partial, runtime) or {}
     except ItemRejectedError as error:
         rejected = rejection(error)
@@ -149,17 +171,20 @@ def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
     except V2PError as error:
         return Outcome(
             stage=stage.name, item=stage.item, status="failed", folder=folder,
-            seconds=time.monotonic() - started, reason="error", detail=str(error),
+            seconds=time.monotonic() - started,
+            reason=error.reason if isinstance(error, UnusableError) else "error", detail=str(error),
         )  # fmt: skip
     except Exception as error:
-        (partial / "traceback.txt").write_text(traceback.format_exc())
+        (partial / TRACEBACK_FILE).write_text(traceback.format_exc())
         logger.exception("%s of %s failed", stage.name, stage.item)
         return Outcome(
             stage=stage.name, item=stage.item, status="failed", folder=folder,
             seconds=time.monotonic() - started, reason=type(error).__name__,
-            detail=f"{error} (traceback in {partial / 'traceback.txt'})",
+            detail=f"{error} (traceback in {partial / TRACEBACK_FILE})",
         )  # fmt: skip
     seconds = time.monotonic() - started
+    (partial / TRACEBACK_FILE).unlink(missing_ok=True)  # of an earlier try
+    files = list_files(partial)
     write_record(
         partial,
         Record(
@@ -172,10 +197,13 @@ def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
             seconds=round(seconds, 2),
             rejected=rejected,
             counts=counts,
-            provenance=provenance(),
+            provenance=provenance() | {"argv": own_command()},
+            files=files,
         ),
     )
     commit_folder(partial, folder)
+    if (memory := memory_of(folder, runtime.root)) is not None:
+        remember_made(folder, files, memory)
     return Outcome(
         stage=stage.name, item=stage.item, status=status, folder=folder,
         seconds=seconds, reason=reason, detail=detail,

@@ -52,6 +52,8 @@ def from_values[T](kind: type[T], data: Any, place: str) -> T:
 def _convert(value: Any, hint: Any, place: str) -> Any:
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_values(hint, value, place)
+    if hint is Any:
+        return value
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
@@ -70,6 +72,11 @@ def _convert(value: Any, hint: Any, place: str) -> Any:
         if len(entries) != len(arguments):
             raise V2PError(f"{place} must have {len(arguments)} entries, got {len(entries)}")
         return tuple(_convert(v, h, place) for v, h in zip(entries, arguments, strict=True))
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise V2PError(f"{place} must hold 'name: value', got {value!r}")
+        named = cast(dict[Any, Any], value)
+        return {k: _convert(v, arguments[1], f"{place}:{k}") for k, v in named.items()}
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)  # so that 2 and 2.0 are one recipe
     if hint is Path and isinstance(value, str):

@@ -208,7 +208,7 @@ def _add_task(view: ItemView, result: Result) -> None:
 
 
 def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
-    counts = result.counts or read_json(result.folder / "evaluation.json") or {}
+    counts = as_dict(result.counts or read_json(result.folder / "evaluation.json"))
     view.rate = rate_of(counts.get("success"))
     view.charts = training_charts(read_curve(result.folder / "curve.csv"))
     uri = budget.admit(

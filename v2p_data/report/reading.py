@@ -13,7 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from v2p_data.errors import UnusableError
 from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record, read_rejects
+from v2p_data.pipeline.contents import damages
 
 ITEM_STAGES = ("scene", "task", "reward", "expert", "episodes")
 """Stages that each video goes through by itself."""
@@ -59,7 +61,7 @@ class Run:
     root: Path
     results: dict[Key, Result]
     unreadable: list[str] = field(default_factory=list[str])
-    """One sentence for each record that could not be read."""
+    """One sentence for each record that could not be read, and each file that is missing or of another size."""
 
     @property
     def items(self) -> list[str]:
@@ -87,22 +89,32 @@ def read_run(root: Path) -> Run:
     results: dict[Key, Result] = {}
     ages: dict[Key, tuple[bool, str, float]] = {}
     outcomes = _outcomes(root)
+    unreadable = (
+        []
+        if outcomes is not None
+        else [f"{root / RUN_FILE} is damaged; the next command writes it anew"]
+    )
+    outcomes = outcomes or []
     # The folders of what the last command made, kept or turned away.
     asked = {
         (str(o["stage"]), str(o["item"])): Path(str(o.get("folder", ""))).name for o in outcomes
     }
-    unreadable: list[str] = []
     for stage in STAGES:
         for folder in sorted(_folders(root / stage)):
             if folder.name.endswith(PARTIAL_SUFFIX):
                 continue
             try:
                 record = read_record(folder)
-            except (ValueError, TypeError, OSError) as error:
-                unreadable.append(f"{stage}/{folder.name}/{RECORD_FILE} cannot be read: {error}")
+            except UnusableError as error:
+                unreadable.append(error.detail)
                 continue
             if record is None:
+                if any(folder.iterdir()):
+                    unreadable.append(f"{folder / RECORD_FILE} is missing")
                 continue
+            unreadable += [
+                f"{d.path} {d.what}" for d in damages(folder, record.files or {}, sizes_only=True)
+            ]
             key = (stage, str(record.item))
             age = (
                 folder.name == asked.get(key),
@@ -267,14 +279,14 @@ def _from_record(stage: str, folder: Path, record: Record) -> Result:
     )
 
 
-def _outcomes(root: Path) -> list[dict[str, Any]]:
-    """Return what became of each result that the last command asked for."""
+def _outcomes(root: Path) -> list[dict[str, Any]] | None:
+    """Return what became of each result that the last command asked for; None where that cannot be read."""
+    if not (root / RUN_FILE).exists(follow_symlinks=False):
+        return []
     outcomes = read_json(root / RUN_FILE)
-    return [
-        o
-        for o in (outcomes if isinstance(outcomes, list) else [])
-        if isinstance(o, dict) and o.get("stage") in STAGES and "item" in o
-    ]
+    if not isinstance(outcomes, list):
+        return None
+    return [o for o in as_dicts(outcomes) if o.get("stage") in STAGES and "item" in o]
 
 
 def _unfinished(root: Path, outcomes: list[dict[str, Any]]) -> list[Result]:

@@ -1,0 +1,50 @@
+"""Files of this package that stages read beside their inputs: tables, networks, templates and prompts.
+
+Who edits one of them wants other results, so their digests are part of what a stage is.
+"""
+
+import functools
+from collections.abc import Iterable
+from pathlib import Path
+
+from v2p_data.pipeline.fingerprint import file_digest
+
+PACKAGE = Path(__file__).parent
+SCENE_DATA = ("*.tsv", "*.json", "*.safetensors")
+"""Nouns, how likely a thing is meant, and the networks."""
+PROMPTS = ("prompts.py", "example_tasks.py", "vlm_writer.py")
+
+
+def scene_data() -> dict[str, str]:
+    """Return the digest of each file that reconstruction reads."""
+    folder = PACKAGE / "scene"
+    return _digests(path for pattern in SCENE_DATA for path in folder.glob(pattern))
+
+
+def task_data(*, asks_model: bool) -> dict[str, str]:
+    """Return the digest of each template of task code, and of the prompts where a model writes it."""
+    folder = PACKAGE / "task"
+    return _digests((folder / "templates").glob("*.py")) | (prompt_data() if asks_model else {})
+
+
+def prompt_data() -> dict[str, str]:
+    """Return the digest of each file with what a model is told."""
+    return _digests(PACKAGE / "task" / name for name in PROMPTS)
+
+
+def _digests(paths: Iterable[Path]) -> dict[str, str]:
+    return {
+        f"data {path.relative_to(PACKAGE).as_posix()}": _digest(path) for path in sorted(paths)
+    }
+
+
+def _digest(path: Path) -> str:
+    stat = path.stat()
+    return _digest_as_of(path, stat.st_size, stat.st_mtime_ns)
+
+
+@functools.cache
+def _digest_as_of(path: Path, size: int, mtime_ns: int) -> str:
+    """Return a file's digest; read once for all videos of a run."""
+    del size, mtime_ns
+    return file_digest(path)

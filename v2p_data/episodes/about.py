@@ -1,0 +1,108 @@
+"""`meta/v2p.json` of a dataset, read with suspicion: what this engine says of each episode and of how it was made."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from v2p_data.episodes.features import METADATA_FILE, METADATA_SCHEMA
+from v2p_data.episodes.tables import Found, read_json
+from v2p_data.errors import V2PError
+
+CARRIED_TASKS = Path("v2p/tasks")
+"""Of a dataset: the tasks that its episodes were made in, a folder each."""
+TASK_PARTS = ("task.json", "task.py", "scene/scene.json")
+_KINDS: dict[str, type] = {
+    "repo_id": str, "palette": dict, "episodes": list, "provenance": dict,
+}  # fmt: skip
+_KINDS_OF_ENTRY: dict[str, type] = {
+    "id": str, "item": str, "task": str, "seed": int, "length": int, "labels": dict, "params": dict,
+}  # fmt: skip
+
+
+def read_about(root: Path) -> dict[str, Any] | None:
+    """Return a dataset's `meta/v2p.json`, None where there is none.
+
+    Raises:
+        V2PError: it is damaged, or a newer version wrote it.
+    """
+    path = root / METADATA_FILE
+    if not path.exists(follow_symlinks=False):
+        return None
+    about = read_json(path)
+    if not isinstance(about, dict):
+        raise V2PError(f"{path} is damaged: it is no JSON object; {_remedy(root)}")
+    schema = about.get("schema", METADATA_SCHEMA)
+    if isinstance(schema, int) and schema > METADATA_SCHEMA:
+        raise V2PError(
+            f"{path} was written by a newer version of v2p (schema {schema}, this one reads up to {METADATA_SCHEMA}); "
+            "use that version"
+        )
+    wrong = _wrong(about, _KINDS)
+    if wrong is None:
+        for k, entry in enumerate(about["episodes"]):
+            wrong = _wrong(entry, _KINDS_OF_ENTRY)
+            if wrong is not None:
+                wrong = f"{wrong} of episode {k}"
+                break
+    if wrong is not None:
+        raise V2PError(
+            f"{path} is damaged: {wrong} is missing or of another kind; {_remedy(root)}"
+        )
+    return about
+
+
+def about_problems(
+    root: Path, about: Mapping[str, Any], tasks: Sequence[Sequence[str]], lengths: Sequence[int]
+) -> Iterator[Found]:
+    """Yield where `meta/v2p.json` contradicts the episode table or itself, and tasks that should be there.
+
+    Args:
+        root: the dataset.
+        about: what `read_about` returned.
+        tasks: instructions per episode, from the table.
+        lengths: frames per episode, from the table.
+    """
+    entries = about["episodes"]
+    if len(entries) != len(lengths):
+        yield Found(
+            check="about", where=METADATA_FILE,
+            detail=f"tells of {len(entries)} episodes, the episode table of {len(lengths)}",
+        )  # fmt: skip
+    for k, (entry, words, length) in enumerate(zip(entries, tasks, lengths, strict=False)):
+        if (entry["length"], [entry["task"]]) != (length, list(words)):
+            yield Found(
+                check="about", where=f"episode {k}",
+                detail=f"{METADATA_FILE} says {entry['length']} frames of '{entry['task']}', the episode table {length} "
+                f"of '{'; '.join(words)}'",
+            )  # fmt: skip
+        unknown = [label for label in entry["labels"] if label not in about["palette"]]
+        if unknown:
+            yield Found(
+                check="about", where=f"episode {k}",
+                detail=f"{METADATA_FILE} gives no grey for label {', '.join(unknown)}",
+            )  # fmt: skip
+    if len({e["id"] for e in entries}) != len(entries):
+        yield Found(check="about", where=METADATA_FILE, detail="names an episode twice")
+    if about["provenance"].get("items") or (root / CARRIED_TASKS).is_dir():
+        for item in dict.fromkeys(e["item"] for e in entries):
+            for part in TASK_PARTS:
+                if not (root / CARRIED_TASKS / item / part).is_file():
+                    yield Found(
+                        check="missing_file", where=str(CARRIED_TASKS / item / part),
+                        detail=f"is missing, and episodes were made in task '{item}'",
+                    )  # fmt: skip
+
+
+def _wrong(data: Any, kinds: Mapping[str, type]) -> str | None:
+    """Return the first key that is missing or of another kind, None where all is well."""
+    if not isinstance(data, dict):
+        return "an object"
+    for key, kind in kinds.items():
+        value = data.get(key)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            return f"'{key}'"
+    return None
+
+
+def _remedy(root: Path) -> str:
+    return f"delete {root} and make the dataset again, or copy it anew"
