@@ -85,21 +85,32 @@ def expert() -> Expert:
     return Expert(model)
 
 
-def make_run(root: Path) -> Path:
-    """Make task, expert, episodes and dataset; return the dataset."""
+def task_stage(item: str = ITEM) -> Stage:
+    """Return the stage that makes the toy task under this name, from nothing."""
 
     def make_task(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
         scene = replace(bundle().scene, folder=out / "made")
         scene.folder.mkdir()
         scene.save(scene.folder)
-        replace(bundle(), scene=scene).save(out)
+        replace(bundle(), title=item, scene=scene).save(out)
+
+    return Stage(name="task", item=item, config={}, make=make_task)
+
+
+def chain(item: str = ITEM, engine: EngineConfig = ENGINE) -> Stage:
+    """Return the episodes stage of the toy task and of an expert that knows how to do it."""
 
     def make_expert(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
         expert().save(out)
 
-    task = Stage(name="task", item=ITEM, config={}, make=make_task)
-    learned = Stage(name="expert", item=ITEM, config={}, inputs={"task": task}, make=make_expert)
-    stage = dataset_stage([episodes_stage(task, learned, ENGINE)], REPO_ID)
+    task = task_stage(item)
+    learned = Stage(name="expert", item=item, config={}, inputs={"task": task}, make=make_expert)
+    return episodes_stage(task, learned, engine)
+
+
+def make_run(root: Path) -> Path:
+    """Make task, expert, episodes and dataset; return the dataset."""
+    stage = dataset_stage([chain()], REPO_ID)
     outcomes = made([stage], Runtime(root=root))
     assert all(o.is_usable for o in outcomes.values()), [o.detail for o in outcomes.values()]
     return stage.folder(root)
