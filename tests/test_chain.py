@@ -20,7 +20,7 @@ expert:
   num_envs: 128
   eval_episodes: 8
   min_success: 0.0
-  ppo: {total_steps: 60000, window_episodes: 16, min_window_episodes: 8, num_deterministic: 16}
+  ppo: {total_steps: 4096, window_episodes: 16, min_window_episodes: 8, num_deterministic: 16}
 episodes: {num_episodes: 3, batch_worlds: 32, size_px: 64}
 """
 PATIENCE_S = 480

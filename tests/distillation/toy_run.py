@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -85,22 +86,34 @@ def expert() -> Expert:
     return Expert(model)
 
 
-def make_task(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
+def make_task(
+    cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime, *, item: str = ITEM
+) -> None:
     scene = replace(bundle().scene, folder=out / "made")
     scene.folder.mkdir()
     scene.save(scene.folder)
-    replace(bundle(), scene=scene).save(out)
+    replace(bundle(), title=item, scene=scene).save(out)
 
 
 def make_expert(cfg: Any, inputs: Mapping[str, Path], out: Path, runtime: Runtime) -> None:
     expert().save(out)
 
 
+def task_stage(item: str = ITEM) -> Stage:
+    """Return the stage that makes the toy task under this name, from nothing."""
+    return Stage(name="task", item=item, config={}, make=partial(make_task, item=item))
+
+
+def chain(item: str = ITEM, engine: EngineConfig = ENGINE) -> Stage:
+    """Return the episodes stage of the toy task and of an expert that knows how to do it."""
+    task = task_stage(item)
+    learned = Stage(name="expert", item=item, config={}, inputs={"task": task}, make=make_expert)
+    return episodes_stage(task, learned, engine)
+
+
 def last_stage(repo_id: str = REPO_ID) -> Stage:
     """Return the stage that packs the run's episodes."""
-    task = Stage(name="task", item=ITEM, config={}, make=make_task)
-    learned = Stage(name="expert", item=ITEM, config={}, inputs={"task": task}, make=make_expert)
-    return dataset_stage([episodes_stage(task, learned, ENGINE)], repo_id)
+    return dataset_stage([chain()], repo_id)
 
 
 def make_run(root: Path) -> Path:

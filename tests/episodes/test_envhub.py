@@ -2,20 +2,38 @@
 
 import ast
 import os
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import pytest
 from hub_server import TOKEN, Hub
-from toy_task import write_task
+from toy_task import bundle
 
 from v2p_data.episodes.envhub import engine_modules, write_envhub
 from v2p_data.episodes.hub import push_envhub
 from v2p_data.errors import V2PError
 
-LOAD = """
+CODE = """
+from factory.tasks.task import Task
+
+class PushTask(Task):
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, {})
+        self.task_description = "push the cube to the left"
+
+    def compute_success(self, states):
+        return states["eef_pos"][:, 1] > 0.08
+
+    def compute_reward(self, actions, states):
+        left = states["eef_pos"][:, 1]
+        return left, {"left": left}
+"""
+PAGE = Path(__file__).parents[2] / "docs" / "datasets.md"
+UNTRUSTED = """
 import sys
 from pathlib import Path
 
@@ -26,18 +44,28 @@ try:
     make_env("user/tasks")
 except RuntimeError as error:
     print("untrusted:", "trust_remote_code" in str(error))
-envs = make_env("user/tasks", n_envs=2, hub_cache_dir=sys.argv[1], trust_remote_code=True)
+"""
+TRIED = """
 print("tasks:", {suite: list(tasks) for suite, tasks in envs.items()})
 env = envs["v2p"][1]
-first, info = env.reset(seed=[5, 6])
-again, _ = env.reset(seed=[5, 6])
-observation, reward, terminated, truncated, info = env.step(np.zeros((2, 7), np.float32))
+first, info = env.reset(seed=[5, 6, 7, 8])
+again, _ = env.reset(seed=[5, 6, 7, 8])
+observation, reward, terminated, truncated, info = env.step(np.zeros((4, 7), np.float32))
 print("seen:", observation["pixels"]["mask"].shape, observation["agent_pos"].shape)
 print("repeats:", bool((first["pixels"]["mask"] == again["pixels"]["mask"]).all()))
 print("told:", env.call("task_description"), info["is_success"].tolist())
 source = Path(sys.modules["v2p_data"].__file__)
 print("from the cache:", source.is_relative_to(sys.argv[1]))
 """
+
+
+def write_task(folder: Path, title: str) -> Path:
+    scene = folder.parent / f"{title}_scene"
+    scene.mkdir(parents=True)
+    made = bundle()
+    made.scene.save(scene)
+    replace(made, code=CODE, title=title, scene=replace(made.scene, folder=scene)).save(folder)
+    return folder
 
 
 @pytest.fixture
@@ -107,29 +135,31 @@ def test_nothing_is_overwritten_and_a_folder_without_tasks_is_refused(
 
 
 @pytest.mark.slow
-def test_lerobot_loads_a_pushed_environment_by_its_name(
+def test_lerobot_loads_a_pushed_environment_by_its_name_as_our_page_says(
     run_folder: Path, tmp_path: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("HF_ENDPOINT", hub.url)
     monkeypatch.setenv("HF_TOKEN", TOKEN)
     made = write_envhub(run_folder, "user/tasks", tmp_path / "hub")
     push_envhub(made.folder, "user/tasks", tag="v1.0")
-    cache = tmp_path / "cache"
-    env = os.environ | {"HF_HOME": str(tmp_path / "hf"), "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
+    cache = tmp_path / "hf"
+    env = os.environ | {"HF_HOME": str(cache), "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
     env.pop("HF_HUB_OFFLINE", None)
+    (block,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.S | re.M)
+    code = UNTRUSTED + block.replace("USER/TASKS", "user/tasks") + TRIED
 
     done = subprocess.run(
-        [sys.executable, "-c", LOAD, str(cache)],
-        cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300,
+        [sys.executable, "-c", code, str(cache)],
+        cwd=tmp_path, env=env, capture_output=True, text=True, timeout=500,
     )  # fmt: skip
 
     assert done.returncode == 0, done.stderr[-3000:]
     assert [line for line in done.stdout.splitlines() if ": " in line] == [
         "untrusted: True",
         "tasks: {'v2p': [0, 1]}",
-        "seen: (2, 256, 256, 3) (2, 11)",
+        "seen: (4, 256, 256, 3) (4, 11)",
         "repeats: True",
-        "told: ('push the cube to the left', 'push the cube to the left') [False, False]",
+        f"told: {('push the cube to the left',) * 4} {[False] * 4}",
         "from the cache: True",
     ]
     assert set(hub.repos["models/user/tasks"].tags) == {"v1.0"}

@@ -1,6 +1,5 @@
 """A task an expert can be scripted for: bring the open gripper to the left of where it was."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +11,6 @@ from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.task import Task, TaskBundle
 
 POSE = (0.0, 0.0, 0.02, 1.0, 0.0, 0.0, 0.0)
-CODE = """
-from factory.tasks.task import Task
-
-class PushTask(Task):
-    def __init__(self, envs, urdf_assets_root):
-        super().__init__(envs, urdf_assets_root, {})
-        self.task_description = "push the cube to the left"
-
-    def compute_success(self, states):
-        return states["eef_pos"][:, 1] > 0.08
-
-    def compute_reward(self, actions, states):
-        left = states["eef_pos"][:, 1]
-        return left, {"left": left}
-"""
-"""A task of the same scene as text, as a task folder holds it."""
 
 
 class PushTask(Task):
@@ -57,16 +40,6 @@ def bundle() -> TaskBundle:
         title="toy", description="push the cube to the left", kind="push_left",
         class_name="PushTask", code="", scene=scene, horizon_steps=30,
     )  # fmt: skip
-
-
-def write_task(folder: Path, title: str) -> Path:
-    """Save the toy task, with its code as text; return the folder."""
-    scene = folder.parent / f"{title}_scene"
-    scene.mkdir(parents=True)
-    made = bundle()
-    made.scene.save(scene)
-    replace(made, code=CODE, title=title, scene=replace(made.scene, folder=scene)).save(folder)
-    return folder
 
 
 def act(obs: np.ndarray) -> np.ndarray:
