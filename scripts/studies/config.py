@@ -50,6 +50,10 @@ class UnseenConfig:
     """New shapes of things that training clips are about too."""
     categories: tuple[str, ...] = (*("banana", "large_marker", "scissors", "spoon", "foam_brick"),)
     """Things that no training clip is about."""
+    drawn_shapes: tuple[str, ...] = ("mug", "apple", "soup can", "mustard bottle", "pudding box")
+    """Instead of `shapes`, where no folder of scans is given: products that clips are about, other specimens."""
+    drawn_categories: tuple[str, ...] = ("toy duck", "egg", "candle", "jar", "tape")
+    """Instead of `categories`, where no folder of scans is given: products of `pool.held_out`."""
     episodes: int = 50
     """Per object, seed and cell; all cells of a seed start from the same states."""
     films: int = 1

@@ -234,29 +234,32 @@ def _toy_size(form: str, rng: np.random.Generator) -> Size:
 
 
 def draw_unseen(cfg: UnseenConfig, held_out: Iterable[str], folder: Path) -> UnseenConfig:
-    """Write ten drawn meshes in the layout of a folder of scans, where nobody has any; return their names.
+    """Write drawn meshes in the layout of a folder of scans, where nobody has any; return their names.
 
-    Half are other specimens of nouns that clips are about, half of the held-out nouns.
+    Raises:
+        V2PError: a product is not known, or clips may be about a category that is to be new.
     """
-    known = ("mug", "apple", "soup can", "mustard bottle", "pudding box")
-    new = tuple(w for w in held_out if any(w in noun.words for noun in NOUNS))[: len(known)]
-    if len(new) < len(known):
+    products = {word: noun for noun in NOUNS for word in noun.words}
+    wanted = (*cfg.drawn_shapes, *cfg.drawn_categories)
+    if unknown := [word for word in wanted if word not in products]:
         raise V2PError(
-            f"pool.held_out names only {len(new)} of the products that can be drawn ({', '.join(new) or 'none'}); name "
-            f"{len(known)}, or give scans with --unseen"
+            f"unseen.drawn names {unknown}, which cannot be drawn; known: {', '.join(sorted(products))}"
         )
-    for word in (*known, *new):
+    if seen := [word for word in cfg.drawn_categories if is_held_out(word, held_out) is None]:
+        raise V2PError(
+            f"unseen.drawn_categories names {seen}, which clips may be about; add them to pool.held_out"
+        )
+    for word in wanted:
         out = folder / word.replace(" ", "_")
         if not (out / MESH_FILE).is_file():
             out.mkdir(parents=True, exist_ok=True)
-            noun = next(n for n in NOUNS if word in n.words)
-            shape = shape_of(prop_called(noun, rng_for(0, "study_lifting", "unseen", word)))
-            mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=True, merge_tex=True)
-            write_obj(mesh, out / MESH_FILE)
+            prop = prop_called(products[word], rng_for(0, "study_lifting", "unseen", word))
+            shape = shape_of(prop)
+            write_obj(trimesh.Trimesh(shape.vertices, shape.faces), out / MESH_FILE)
     return replace(
         cfg,
-        shapes=tuple(w.replace(" ", "_") for w in known),
-        categories=tuple(w.replace(" ", "_") for w in new),
+        shapes=tuple(w.replace(" ", "_") for w in cfg.drawn_shapes),
+        categories=tuple(w.replace(" ", "_") for w in cfg.drawn_categories),
     )
 
 
