@@ -297,7 +297,7 @@ def make_unseen(
     """Write the scene of a mesh: true shape, mass if it is known, no video."""
     del inputs, runtime
     name = mesh.parent.name
-    whole = read_mesh(mesh, name)
+    whole = mended(read_mesh(mesh, name))
     whole.apply_translation(-whole.bounds.mean(0))
     mass = cfg["mass_kg"]
     estimate = float(np.clip(DENSITY_KG_M3 * whole.convex_hull.volume, 0.01, 0.6))
@@ -317,6 +317,29 @@ def make_unseen(
     )
     _write_scene(thing, whole, [], out, f"Lifting {thing.label} up")
     return {"size_m": list(thing.size_m), "mass_kg": thing.mass_kg}
+
+
+def mended(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh without its texture's seams and a scanner's slips, closed where that is simple.
+
+    Seams part vertices that are one; slips are specks and the few faces where more than two meet at an edge.
+    """
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    for _ in range(5):
+        if mesh.is_watertight:
+            break
+        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+        mesh = max(mesh.split(only_watertight=False), key=lambda body: len(body.faces))
+        _, edge, count = np.unique(
+            mesh.edges_sorted, axis=0, return_inverse=True, return_counts=True
+        )
+        mesh.update_faces(~(count[edge] > 2).reshape(-1, 3).any(1))
+        mesh.remove_unreferenced_vertices()
+        mesh.fill_holes()
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_normals(mesh)
+    return mesh
 
 
 def masses_in(folder: Path) -> dict[str, float]:
