@@ -14,7 +14,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from studies.cells import Study, append_result, cells_of, key_of, results_in
+from studies.cells import Key, Study, append_result, cells_of, key_of, results_in
 from studies.config import ARMS, LiftingConfig
 
 from v2p_data.errors import V2PError
@@ -55,7 +55,7 @@ def make_cells(args: argparse.Namespace) -> None:
         raise V2PError(
             f"--counts {args.counts} are not all among the counts of {args.config}: {list(cfg.counts)}"
         )
-    wanted = [
+    wanted: list[Key] = [
         (arm, n, seed)
         for arm, n, seed in cells_of(
             replace(cfg, **{k: given[k] for k in ("arms", "seeds") if k in given})

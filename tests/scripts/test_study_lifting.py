@@ -1,6 +1,7 @@
 """The study of lifting: subsets are nested, nothing unseen is trained on, a stopped study goes on, sums are right."""
 
 import argparse
+import importlib
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -31,17 +32,9 @@ def study(load_script):
 
 @pytest.fixture(scope="module")
 def parts(study):
-    from studies import cells, config, figure, fits, objects, page, table
-
-    return argparse.Namespace(
-        cells=cells,
-        config=config,
-        figure=figure,
-        fits=fits,
-        objects=objects,
-        page=page,
-        table=table,
-    )
+    names = ("cells", "config", "figure", "fits", "objects", "page", "table")
+    modules = {name: importlib.import_module(f"studies.{name}") for name in names}
+    return argparse.Namespace(**modules)
 
 
 def row(arm: str, n: int, seed: int, once: str, *, other: str = "0000"):
@@ -274,7 +267,7 @@ def test_tables_figure_and_page_hold_every_arm_and_need_nothing_from_outside(par
     assert "| videos | 5 | 37.5 % (" not in text  # percentages as the other tables print them
     assert "| videos | 5 | 37.5% (13.7%-69.4%) | 0.38 | 75% | 0% | 25% | 90% | 4 | 100 |" in text
     assert "| videos - toys | 10 | +0.0 points" in text
-    assert "other scenes, another robot" in text.replace("of other scenes and", "other scenes,")
+    assert "of other scenes and another robot" in text
     page = (tmp_path / "study.html").read_text()
     assert page.count("<tr>") > 15
     assert "http" not in page.replace("http-equiv", "")
