@@ -301,7 +301,8 @@ class Study:
             {
                 "pool": self.cfg.pool,
                 "engine": self.cfg.engine,
-                "unseen": names,
+                "paper": self.cfg.paper_policy,
+                "unseen": replace(names, films=0),
                 "meshes": {name: path.stat().st_size for name, path in meshes.items()},
                 "least": self.cfg.counts[0],
                 "max_training": self.cfg.max_training,

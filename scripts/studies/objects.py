@@ -407,7 +407,7 @@ def mesh_signature(path: Path) -> tuple[int, Float[np.ndarray, "5"]]:
     That is the number of its vertices, and their mean distance, its standard deviation and the principal spreads about
     their centroid [m].
     """
-    vertices = np.asarray(read_mesh(path, path.stem).vertices, float)
+    vertices = np.asarray(mended(read_mesh(path, path.stem)).vertices, float)
     centred = vertices - vertices.mean(0)
     reach = np.linalg.norm(centred, axis=1)
     spreads = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred))

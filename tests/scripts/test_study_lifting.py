@@ -16,8 +16,9 @@ from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import V2PError
 from v2p_data.expert_config import ExpertConfig
-from v2p_data.pipeline.runner import Runtime
+from v2p_data.pipeline.runner import Runtime, blocked_by, in_order, make_stage, stored_outcome
 from v2p_data.pipeline.settings import load_settings
+from v2p_data.pipeline.workers import Event
 from v2p_data.policy_config import PolicyConfig
 from v2p_data.stages import EngineConfig
 from v2p_data.task.generate import TaskConfig
@@ -313,6 +314,27 @@ def tiny(parts):
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def in_this_process(parts):
+    """Stages are made here: worker processes, which have tests of their own, would each import everything anew."""
+
+    def run(stages, runtime, on_event):
+        outcomes = {}
+        for stage in in_order(stages):
+            blocker = blocked_by(stage, outcomes)
+            if blocker is None:
+                outcome = stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
+            else:
+                outcome = replace(blocker, stage=stage.name, item=stage.item, status="blocked")
+            outcomes[stage.name, stage.folder_name] = outcome
+            on_event(Event(kind="ended", stage=stage, outcome=outcome))
+        return outcomes
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parts.cells, "run_stages", run)
+        yield
+
+
 def arguments(out: Path, **given) -> argparse.Namespace:
     usual = {
         "config": ROOT / "unused.yaml", "out": out, "unseen": None, "videos": None, "arms": None, "counts": None,
@@ -323,7 +345,7 @@ def arguments(out: Path, **given) -> argparse.Namespace:
 
 @pytest.mark.slow
 def test_a_study_that_was_stopped_after_a_cell_goes_on_and_ends_with_every_cell_once(
-    study, parts, tiny, tmp_path, monkeypatch, capsys
+    study, parts, tiny, in_this_process, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(study, "load_settings", lambda path, kind: tiny)
     out = tmp_path / "study"
@@ -349,6 +371,10 @@ def test_a_study_that_was_stopped_after_a_cell_goes_on_and_ends_with_every_cell_
             assert sum(judged["failures"].values()) == judged["once"].count("0")
     assert list((out / "films").glob("toys_2_0/*/*.mp4"))
 
+    meshes = {name: out / f"unseen_meshes/{name}/textured.obj" for name in rows[0]["objects"]}
+    parts.objects.demand_apart([out / "run"], meshes)
+    with pytest.raises(V2PError, match="is the unseen object"):
+        parts.objects.demand_apart([out / "unseen"], meshes)
     study.make_cells(arguments(out))
     assert len(parts.cells.results_in(out)) == 3
     other = replace(tiny, max_training=2.0)
