@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator, PercentFormatter
 
 from .config import ARMS, Arm
 from .fits import (
@@ -69,6 +70,7 @@ def _success(axes: Axes, rows: list[Row]) -> None:
 
 
 def _failure(axes: Axes, rows: list[Row]) -> None:
+    counts = sorted({row["n"] for row in rows if row["n"]})
     for arm in ARMS:
         found = {n: r for n, cells in by_count(rows, arm).items() if n and (r := rate(cells))}
         if not found:
@@ -87,6 +89,10 @@ def _failure(axes: Axes, rows: list[Row]) -> None:
         title="Failures; likelier law solid, the other dotted",
         xlabel="training tasks N", ylabel="1 - success once", xscale="log", yscale="log",
     )  # fmt: skip
+    axes.set_xticks(counts, [str(n) for n in counts])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.yaxis.set_minor_formatter(PercentFormatter(1.0))
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=8)
 

@@ -16,7 +16,14 @@ from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import V2PError
 from v2p_data.expert_config import ExpertConfig
-from v2p_data.pipeline.runner import Runtime, blocked_by, in_order, make_stage, stored_outcome
+from v2p_data.pipeline.runner import (
+    Outcome,
+    Runtime,
+    blocked_by,
+    in_order,
+    make_stage,
+    stored_outcome,
+)
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Event
 from v2p_data.policy_config import PolicyConfig
@@ -281,41 +288,91 @@ def test_table_cells_with_markup_do_not_reach_the_page_as_markup(parts):
     assert "<script>" not in html
 
 
-# --- from end to end ------------------------------------------------------------------------------------------------
+# --- a cell, and the study ------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def tiny(parts):
-    return parts.config.LiftingConfig(
-        arms=("cop", "toys"),
-        counts=(1, 2),
-        seeds=(0,),
-        pool=parts.config.PoolConfig(toys=12),
-        unseen=parts.config.UnseenConfig(
-            episodes=3, films=1, drawn_shapes=("pudding box",), drawn_categories=("egg",)
-        ),
-        engine=EngineConfig(
-            task=TaskConfig(num_samples=1),
-            expert=ExpertConfig(
-                num_envs=64,
-                trial_worlds=8,
-                eval_episodes=8,
-                min_success=0.0,
-                imitation=ImitationConfig(rounds=4, least_rounds=4, epochs=3),
-                ppo=PPOConfig(
-                    total_steps=1024, window_episodes=8, min_window_episodes=4, num_deterministic=8,
-                    eval_episodes=8,
-                ),
-            ),
-            episodes=EpisodesConfig(num_episodes=2, batch_worlds=8, max_batches=2),
-            distillation=DistillationConfig(rounds=1, episodes=4, worlds=4, first_steps=2, round_steps=2),
-            policy=PolicyConfig(preset="small", steps=4, batch_size=16),
-        ),
-    )  # fmt: skip
+def test_rejected_objects_are_counted_and_skipped_and_smaller_sets_are_parts_of_larger_ones(
+    parts, tmp_path, monkeypatch
+):
+    cfg = parts.config.LiftingConfig(pool=parts.config.PoolConfig(toys=12))
+    made = parts.cells.Study(cfg=cfg, out=tmp_path, runtime=Runtime(root=tmp_path))
+
+    def outcome(stage, *, is_good: bool):
+        return Outcome(
+            stage=stage.name, item=stage.item, folder=tmp_path,
+            status="made" if is_good else "rejected", reason="" if is_good else "expert_not_learned",
+        )  # fmt: skip
+
+    def run(stages, root=None):
+        """Every other expert learns nothing, and what needs it is blocked."""
+        return {
+            s.folder_name: outcome(
+                s, is_good=s.name not in ("expert", "episodes") or int(s.item[-1]) % 2 == 0
+            )
+            for s in in_order(stages)
+        }
+
+    monkeypatch.setattr(made, "run", run)
+    two, four = (made.find("toys", count, 0) for count in (2, 4))
+
+    items = [f"toy_{k:04d}" for k in made.order("toys", 0) if k % 2 == 0]
+    assert [c.item for c in four.candidates] == items[:4]
+    assert [c.item for c in two.candidates] == items[:2]
+    assert four.rejected == {"expert: expert_not_learned": four.tried - 4}
+    assert made.order("toys", 0)[four.tried - 1] == int(items[3][-4:])
+    with pytest.raises(V2PError, match=r"only 6 of 12 toys became tasks .* raise pool\.toys"):
+        made.find("toys", 7, 0)
 
 
-@pytest.fixture(scope="module")
-def in_this_process(parts):
+def arguments(out: Path, **given) -> argparse.Namespace:
+    usual = {
+        "config": ROOT / "configs/study_lifting_tiny.yaml", "out": out, "unseen": None, "videos": None,
+        "arms": None, "counts": None, "seeds": None, "max_cells": None, "workers": 1, "threads": 1,
+        "device": "cpu", "table": True, "figure": None, "page": None,
+    }  # fmt: skip
+    return argparse.Namespace(**usual | given)
+
+
+def test_a_study_that_was_killed_after_a_cell_goes_on_and_ends_with_every_cell_once(
+    study, parts, tmp_path, monkeypatch, capsys
+):
+    cells = []
+
+    def cell(self, arm, n, seed):
+        if (arm, n) == ("toys", 2) and "toys" not in {c[0] for c in cells}:
+            cells.append((arm, n, seed))
+            raise V2PError("the pool is too small")
+        cells.append((arm, n, seed))
+        return row(arm, n, seed, "1010") | {"study": self.identity, "wall_s": 1.0}
+
+    monkeypatch.setattr(parts.cells.Study, "cell", cell)
+    study.make_cells(arguments(tmp_path, max_cells=2))
+    first = (tmp_path / "results.jsonl").read_text()
+    with (tmp_path / "results.jsonl").open("a") as stream:
+        stream.write('{"arm": "fixed_total", "n": 2')  # as a kill leaves it
+    with pytest.raises(V2PError, match="1 cells could not be made, the others were: toys N=2"):
+        study.make_cells(arguments(tmp_path))
+    study.make_cells(arguments(tmp_path))
+
+    done = [parts.cells.key_of(r) for r in parts.cells.results_in(tmp_path)]
+    assert (tmp_path / "results.jsonl").read_text().startswith(first)
+    assert len(set(done)) == len(done) == 1 + 6 * 2
+    assert sorted(cells) == sorted([*done, ("toys", 2, 0)])  # the failed one alone is tried again
+    study.show(arguments(tmp_path))
+    assert "| bc_cop | 3 |" in capsys.readouterr().out
+    with pytest.raises(V2PError, match="cells of another study"):
+        study.make_cells(arguments(tmp_path, config=ROOT / "configs/study_lifting_laptop.yaml"))
+    with pytest.raises(V2PError, match=r"--counts \[7\] are not all among the counts"):
+        study.make_cells(arguments(tmp_path, counts=[7]))
+
+
+def test_a_study_without_results_says_so(study, tmp_path):
+    with pytest.raises(V2PError, match="holds no results yet; run the study first"):
+        study.show(arguments(tmp_path))
+
+
+@pytest.fixture
+def in_this_process(parts, monkeypatch):
     """Stages are made here: worker processes, which have tests of their own, would each import everything anew."""
 
     def run(stages, runtime, on_event):
@@ -330,67 +387,50 @@ def in_this_process(parts):
             on_event(Event(kind="ended", stage=stage, outcome=outcome))
         return outcomes
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parts.cells, "run_stages", run)
-        yield
-
-
-def arguments(out: Path, **given) -> argparse.Namespace:
-    usual = {
-        "config": ROOT / "unused.yaml", "out": out, "unseen": None, "videos": None, "arms": None, "counts": None,
-        "seeds": None, "max_cells": None, "workers": 1, "threads": 1, "device": "cpu", "figure": None, "page": None,
-    }  # fmt: skip
-    return argparse.Namespace(**usual | given)
+    monkeypatch.setattr(parts.cells, "run_stages", run)
 
 
 @pytest.mark.slow
-def test_a_study_that_was_stopped_after_a_cell_goes_on_and_ends_with_every_cell_once(
-    study, parts, tiny, in_this_process, tmp_path, monkeypatch
+@pytest.mark.e2e
+def test_a_cell_learns_from_a_toy_and_is_judged_on_an_unseen_object_that_nothing_was_trained_on(
+    parts, in_this_process, tmp_path
 ):
-    monkeypatch.setattr(study, "load_settings", lambda path, kind: tiny)
-    out = tmp_path / "study"
-    study.make_cells(arguments(out, max_cells=2))
-    first = (out / "results.jsonl").read_text()
-    with (out / "results.jsonl").open("a") as stream:
-        stream.write('{"arm": "toys", "n": 2')  # as a kill leaves it
+    cfg = parts.config.LiftingConfig(
+        counts=(1, 2),
+        pool=parts.config.PoolConfig(toys=3, seed=3),
+        unseen=parts.config.UnseenConfig(
+            episodes=2, films=1, drawn_shapes=("pudding box",), drawn_categories=()
+        ),
+        engine=EngineConfig(
+            task=TaskConfig(num_samples=1),
+            expert=ExpertConfig(
+                num_envs=128,
+                trial_worlds=4,
+                eval_episodes=4,
+                min_success=0.0,
+                imitation=ImitationConfig(rounds=8, least_rounds=8, teacher_rounds=6),
+                ppo=PPOConfig(
+                    total_steps=512, window_episodes=4, min_window_episodes=2, num_deterministic=4,
+                    eval_episodes=4,
+                ),
+            ),
+            episodes=EpisodesConfig(num_episodes=2, batch_worlds=8, max_batches=4),
+            distillation=DistillationConfig(rounds=1, episodes=4, worlds=4, first_steps=2, round_steps=2),
+            policy=PolicyConfig(preset="small", steps=4, batch_size=16),
+        ),
+    )  # fmt: skip
+    made = parts.cells.Study(cfg=cfg, out=tmp_path, runtime=Runtime(root=tmp_path))
 
-    study.make_cells(arguments(out))
+    found = made.cell("toys", 1, 0)
 
-    rows = parts.cells.results_in(out)
-    assert (out / "results.jsonl").read_text().startswith(first)
-    assert [parts.cells.key_of(r) for r in rows] == [("cop", 0, 0), ("toys", 1, 0), ("toys", 2, 0)]
-    small, large = rows[1], rows[2]
-    assert large["tasks"][:1] == small["tasks"]  # nested
-    assert len(set(large["tasks"])) == 2
-    assert large["episodes"] == 4
-    assert large["frames"] > large["demonstrated_frames"]  # handovers
-    for r in rows:
-        assert list(r["objects"]) == ["pudding_box", "egg"]
-        for judged in r["objects"].values():
-            assert len(judged["once"]) == len(judged["at_end"]) == 3
-            assert sum(judged["failures"].values()) == judged["once"].count("0")
-    assert list((out / "films").glob("toys_2_0/*/*.mp4"))
-
-    meshes = {name: out / f"unseen_meshes/{name}/textured.obj" for name in rows[0]["objects"]}
-    parts.objects.demand_apart([out / "run"], meshes)
-    with pytest.raises(V2PError, match="is the unseen object"):
-        parts.objects.demand_apart([out / "unseen"], meshes)
-    study.make_cells(arguments(out))
-    assert len(parts.cells.results_in(out)) == 3
-    other = replace(tiny, max_training=2.0)
-    monkeypatch.setattr(study, "load_settings", lambda path, kind: other)
-    with pytest.raises(V2PError, match="cells of another study"):
-        study.make_cells(arguments(out))
-    small_pool = replace(tiny, pool=replace(tiny.pool, toys=1))
-    monkeypatch.setattr(study, "load_settings", lambda path, kind: small_pool)
-    with pytest.raises(V2PError, match=r"toys N=2 seed 0: only \d of 1 toys became tasks"):
-        study.make_cells(arguments(tmp_path / "other", arms=["toys"], counts=[2]))
-
-
-def test_counts_that_the_configuration_does_not_have_are_refused(
-    study, tiny, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(study, "load_settings", lambda path, kind: tiny)
-
-    with pytest.raises(V2PError, match=r"--counts \[7\] are not all among the counts"):
-        study.make_cells(arguments(tmp_path, counts=[7]))
+    assert found["episodes"] == found["trajectories"] == 2
+    assert found["tried"] == 1 + sum(found["rejected"].values())
+    assert found["frames"] == found["demonstrated_frames"] + found["handovers"]["frames"]
+    judged = found["objects"]["pudding_box"]
+    assert len(judged["once"]) == len(judged["at_end"]) == 2
+    assert sum(judged["failures"].values()) == judged["once"].count("0")
+    assert list((tmp_path / "films" / "toys_1_0").glob("*/*.mp4"))
+    meshes = {"pudding_box": tmp_path / "unseen_meshes/pudding_box/textured.obj"}
+    parts.objects.demand_apart([tmp_path / "run"], meshes)
+    with pytest.raises(V2PError, match="is the unseen object 'pudding_box'"):
+        parts.objects.demand_apart([tmp_path / "unseen"], meshes)
