@@ -21,7 +21,7 @@ import numpy as np
 
 from v2p_data.episodes.mask_noise import MaskNoiseConfig
 from v2p_data.episodes.pictures import Artist, Render
-from v2p_data.episodes.rollouts import Act, CutConfig, Referee, Rollouts, roll_out
+from v2p_data.episodes.rollouts import Act, CutConfig, InWorlds, Referee, Rollouts, roll_out
 from v2p_data.episodes.staging import (
     EPISODES_FOLDER,
     Episode,
@@ -109,7 +109,7 @@ class Collected:
 
 def collect(
     bundle: TaskBundle,
-    act: Act,
+    act: Act | InWorlds,
     cfg: EpisodesConfig,
     out: Path,
     seed: int,
@@ -123,7 +123,7 @@ def collect(
 
     Args:
         bundle: the task.
-        act: the deterministic expert.
+        act: the deterministic expert, or whoever acts in the worlds themselves.
         cfg: how many, and under what.
         out: `episodes/<id>.npz`, `failed/<batch>.npz`, `rejected.jsonl` and `batches/` are written here.
         seed: decides everything that is drawn.
@@ -142,7 +142,7 @@ def collect(
 
 def _collect(
     bundle: TaskBundle,
-    act: Act,
+    act: Act | InWorlds,
     cfg: EpisodesConfig,
     out: Path,
     seed: int,

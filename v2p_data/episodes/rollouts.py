@@ -22,6 +22,13 @@ Course = Mapping[str, np.ndarray]
 Referee = Callable[[TaskBundle, Course], Bool[np.ndarray, "env"]]
 
 
+@dataclass(frozen=True)
+class InWorlds:
+    """Who sees more than observations: given the worlds of a batch, returns how to act in them."""
+
+    begin: Callable[[BatchEnv], Act]
+
+
 @dataclass(frozen=True, kw_only=True)
 class CutConfig:
     """Where an episode ends."""
@@ -123,7 +130,7 @@ class EpisodeEnds:
 
 def roll_out(
     bundle: TaskBundle,
-    act: Act,
+    act: Act | InWorlds,
     sim: SimConfig,
     *,
     num_worlds: int,
@@ -137,6 +144,7 @@ def roll_out(
     env = BatchEnv(bundle, sim, num_envs=num_worlds, seed=seed, num_threads=num_threads, task=task)
     everyone = np.arange(num_worlds)
     params = tuple(env.episode_params(k) for k in range(num_worlds))
+    acts = act.begin(env) if isinstance(act, InWorlds) else act
     obs = env.observe()
     states, actions, successes, snapshots = [], [], [], []
     trajectory = [_copied(env)]
@@ -144,7 +152,7 @@ def roll_out(
     for t in range(env.horizon):
         states.append(env.robot_state())
         snapshots.append(env.snapshot(everyone))
-        action = np.clip(np.asarray(act(obs), np.float32), -1.0, 1.0)
+        action = np.clip(np.asarray(acts(obs), np.float32), -1.0, 1.0)
         result = env.step(action)
         obs = result.obs
         actions.append(action)

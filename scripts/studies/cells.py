@@ -1,0 +1,498 @@
+"""One cell of the study: training objects are found, a policy is made by the engine's stages, and judged on unseen objects.
+
+Everything but the judgement is stages in `<out>/run`, so that arms, numbers and seeds share what they have in common and a
+stopped study goes on. A candidate that the engine rejects, at any stage, is counted and skipped; nothing stands in for it.
+"""
+
+import json
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2p_data.errors import V2PError
+from v2p_data.evaluation.batch import Judged, judge
+from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.judging import UNSEEN_PX, Play, contestant, play_of
+from v2p_data.pipeline.artifact import Record, provenance, read_record
+from v2p_data.pipeline.fingerprint import fingerprint
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage
+from v2p_data.pipeline.workers import run_stages
+from v2p_data.policy_training import POLICY_FOLDER, sources_of
+from v2p_data.reward.programs import ProgramPolicy
+from v2p_data.seeds import rng_for, seed_for
+from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.stages import (
+    Seeded,
+    dataset_stage,
+    episodes_stage,
+    policy_stage,
+    scene_stage,
+    task_stage,
+)
+from v2p_data.task.task import TaskBundle
+
+from .config import Arm, LiftingConfig, Source, source_of
+from .objects import (
+    Candidate,
+    candidate_of,
+    clip_stage,
+    demand_apart,
+    draw_unseen,
+    instructed_stage,
+    lifting_clips,
+    masses_in,
+    scene_of_clip,
+    toy_stage,
+    unseen_meshes,
+    unseen_stage,
+)
+
+RESULTS = "results.jsonl"
+FILMS_FOLDER = "films"
+Row = dict[str, Any]
+Key = tuple[Arm, int, int]
+
+logger = logging.getLogger(__name__)
+
+
+def cells_of(cfg: LiftingConfig) -> Iterator[Key]:
+    """Yield arm, number of tasks and seed of every cell, cheap ones first; what learns nothing has the number 0."""
+    for seed in cfg.seeds:
+        if "cop" in cfg.arms:
+            yield "cop", 0, seed
+        for count in cfg.counts:
+            for arm in cfg.arms:
+                if arm != "cop":
+                    yield arm, count, seed
+
+
+def results_in(out: Path) -> list[Row]:
+    """Return the lines of a study; a last line that a kill cut short is left out."""
+    path = out / RESULTS
+    if not path.is_file():
+        return []
+    rows: list[Row] = []
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            logger.warning("a line of %s is cut short and left out", path)
+    return rows
+
+
+def key_of(row: Row) -> Key:
+    return row["arm"], row["n"], row["seed"]
+
+
+def append_result(out: Path, row: Row) -> None:
+    """Add a line, on a line of its own even where a kill left half a one."""
+    path = out / RESULTS
+    cut = path.is_file() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
+    with path.open("a") as stream:
+        stream.write(("\n" if cut else "") + json.dumps(row) + "\n")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """Training objects of a cell, and what it took to find them."""
+
+    candidates: tuple[Candidate, ...]
+    episodes: tuple[Stage, ...]
+    """Demonstrations of each, as the pool has them."""
+    tried: int
+    rejected: dict[str, int]
+    """How many candidates were rejected, by stage and reason."""
+
+
+@dataclass(kw_only=True)
+class Study:
+    """A study's folders and settings."""
+
+    cfg: LiftingConfig
+    out: Path
+    runtime: Runtime
+    """Its root is set here."""
+    unseen_folder: Path | None = None
+    """Scans; drawn meshes where None."""
+    videos: Path | None = None
+    """Real clips that join the drawn ones."""
+    tell: Callable[[str], None] = field(default=lambda words: None)
+
+    @property
+    def root(self) -> Path:
+        return self.out / "run"
+
+    def run(self, stages: Sequence[Stage], root: Path | None = None) -> dict[str, Outcome]:
+        """Make stages; return the outcome of each by its folder's name."""
+        runtime = Runtime(
+            root=root or self.root,
+            device=self.runtime.device,
+            num_threads=self.runtime.num_threads,
+            workers=self.runtime.workers,
+        )
+
+        def show(event: Any) -> None:
+            if event.kind == "ended" and event.outcome.status != "kept":
+                o = event.outcome
+                self.tell(
+                    f"{o.stage} {o.item}: {o.status} in {o.seconds:.0f} s {o.reason}".rstrip()
+                )
+
+        outcomes = run_stages(list(stages), runtime, show)
+        return {folder: outcome for (_, folder), outcome in outcomes.items()}
+
+    def made(self, stage: Stage) -> Record:
+        """Make a stage and return its record.
+
+        Raises:
+            V2PError: it cannot be made.
+        """
+        outcomes = self.run([stage])
+        bad = next((o for o in outcomes.values() if o.status in ("failed", "rejected")), None)
+        if bad is not None:
+            raise V2PError(f"{bad.stage} of {bad.item}: {bad.detail}")
+        return record_of(stage.folder(self.root))
+
+    # -- the evaluation's objects
+
+    @cached_property
+    def unseen(self) -> dict[str, tuple[str, Path]]:
+        """Per unseen object its group (`shape`, `category`) and its task's folder; made at the first question.
+
+        Raises:
+            V2PError: a mesh is missing, or the robot cannot do the task.
+        """
+        folder, names, meshes = self._unseen_meshes
+        masses = masses_in(folder)
+        root = self.out / "unseen"
+        tasks = {
+            name: instructed_stage(_task_of(unseen_stage(name, path, masses.get(name)), self.cfg))
+            for name, path in meshes.items()
+        }
+        outcomes = self.run(list(tasks.values()), root)
+        bad = [o for o in outcomes.values() if o.status in ("failed", "rejected")]
+        if bad:
+            raise V2PError(
+                "; ".join(f"{o.stage} of {o.item}: {o.detail}" for o in bad)
+                + "; name other objects in unseen.shapes and unseen.categories"
+            )
+        group = {n: "shape" for n in names.shapes} | {n: "category" for n in names.categories}
+        return {name: (group[name], stage.folder(root)) for name, stage in tasks.items()}
+
+    @cached_property
+    def _unseen_meshes(self):  # noqa: ANN202 - private, three things at once
+        folder, names = self.unseen_folder, self.cfg.unseen
+        if folder is None:
+            folder = self.out / "unseen_meshes"
+            names = draw_unseen(names, self.cfg.pool.held_out, folder)
+        return folder, names, unseen_meshes(folder, names)
+
+    # -- training objects
+
+    def order(self, source: Source, seed: int) -> list[int]:
+        """Return a seed's order of a pool: the first usable ones are its tasks, for every N."""
+        size = self.cfg.pool.toys if source == "toys" else self.cfg.pool.clips + len(self._real)
+        return [int(k) for k in rng_for(seed, "study_lifting", "order", source).permutation(size)]
+
+    @cached_property
+    def _real(self):  # noqa: ANN202 - the engine's own type
+        if self.videos is None:
+            return []
+        taken, refused = lifting_clips(self.videos, self.cfg.pool)
+        self.tell(f"{len(taken)} real clips join, {len(refused)} do not: {refused}")
+        return taken
+
+    def _candidates(self, source: Source, numbers: Sequence[int]) -> list[Candidate | str]:
+        """Return candidates by their places in the pool; a word where not even the clip could be drawn."""
+        engine = self.cfg.pool_engine
+        if source == "toys":
+            return [candidate_of(toy_stage(k, self.cfg.pool), engine) for k in numbers]
+        real = self._real
+        drawn = {k: clip_stage(k - len(real), self.cfg.pool) for k in numbers if k >= len(real)}
+        outcomes = self.run(list(drawn.values()))
+        out: list[Candidate | str] = []
+        for k in numbers:
+            if k < len(real):
+                out.append(candidate_of(scene_stage(real[k], engine), engine))
+            elif outcomes[drawn[k].folder_name].is_usable:
+                out.append(candidate_of(scene_of_clip(drawn[k].folder(self.root), engine), engine))
+            else:
+                out.append("clip: not drawn")
+        return out
+
+    def find(self, source: Source, count: int, seed: int) -> Found:
+        """Return the first `count` usable objects of a seed's order: with a scene, a task, an expert and demonstrations.
+
+        Raises:
+            V2PError: the pool is too small.
+        """
+        order = self.order(source, seed)
+        kept: list[tuple[Candidate, Stage]] = []
+        rejected: Counter[str] = Counter()
+        tried = 0
+        while len(kept) < count:
+            numbers = order[tried : tried + max(count - len(kept), self.runtime.workers)]
+            if not numbers:
+                raise V2PError(
+                    f"only {len(kept)} of {tried} {source} became tasks with an expert (rejected: {dict(rejected)}), and "
+                    f"N is {count}; raise pool.{'toys' if source == 'toys' else 'clips'}"
+                )
+            found = self._candidates(source, numbers)
+            stages = {
+                k: episodes_stage(c.task, c.expert, self.cfg.pool_engine)
+                for k, c in zip(numbers, found, strict=True)
+                if isinstance(c, Candidate)
+            }
+            outcomes = self.run(list(stages.values()))
+            for number, candidate in zip(numbers, found, strict=True):
+                if len(kept) == count:
+                    break
+                tried += 1
+                if isinstance(candidate, str):
+                    rejected[candidate] += 1
+                elif outcomes[stages[number].folder_name].is_usable:
+                    kept.append((candidate, stages[number]))
+                else:
+                    rejected[_why(stages[number], outcomes)] += 1
+        return Found(
+            candidates=tuple(c for c, _ in kept),
+            episodes=tuple(e for _, e in kept),
+            tried=tried,
+            rejected=dict(rejected.most_common()),
+        )
+
+    # -- a cell
+
+    def cell(self, arm: Arm, count: int, seed: int) -> Row:
+        """Make and judge one cell; return its line.
+
+        Raises:
+            V2PError: there are too few training objects, or a stage failed.
+        """
+        began = time.monotonic()
+        row: Row = {"arm": arm, "n": count, "seed": seed, "study": self.identity}
+        if arm == "cop":
+            play: Play = _programs
+            row["seconds"] = {}
+        else:
+            policy, about = self._policy(arm, count, seed)
+            row |= about
+            play = play_of(contestant(policy), seed, self.runtime.device)
+        judging = time.monotonic()
+        row["objects"] = self._judged(play, arm, count, seed)
+        row["seconds"]["judging"] = round(time.monotonic() - judging, 1)
+        row["wall_s"] = round(time.monotonic() - began, 1)
+        about = provenance()
+        row |= {"commit": about["commit"][:12], "machine": about["machine"]}
+        return row
+
+    @property
+    def identity(self) -> str:
+        """A digest of what all cells of a study must have in common."""
+        _, names, meshes = self._unseen_meshes
+        return fingerprint(
+            {
+                "pool": self.cfg.pool,
+                "engine": self.cfg.engine,
+                "paper": self.cfg.paper_policy,
+                "unseen": replace(names, films=0),
+                "meshes": {name: path.stat().st_size for name, path in meshes.items()},
+                "least": self.cfg.counts[0],
+                "max_training": self.cfg.max_training,
+                "videos": [v.item for v in self._real],
+            }
+        )
+
+    def _policy(self, arm: Arm, count: int, seed: int) -> tuple[Path, Row]:
+        """Return the folder of a cell's policy, and what became of its training."""
+        source = source_of(arm)
+        found = self.find(source, count, seed)
+        engine = self.cfg.engine_for(arm, count, seed)
+        demonstrations = [self._demonstrations(arm, count, c) for c in found.candidates]
+        rejected = dict(found.rejected)
+        if arm == "bc_cop":
+            outcomes = self.run(demonstrations)
+            bad = [s for s in demonstrations if not outcomes[s.folder_name].is_usable]
+            reasons = Counter(rejected) + Counter(_why(s, outcomes) for s in bad)
+            rejected = dict(reasons.most_common())
+            demonstrations = [s for s in demonstrations if s not in bad]
+        trajectories = engine.episodes.num_episodes
+        who = "cop" if arm == "bc_cop" else source
+        repo = f"study/{who}_n{count}_s{seed}_t{trajectories}"
+        trained = [c.task.folder(self.root) for c in found.candidates]
+        demand_apart(trained, self._unseen_meshes[2])
+        dataset = dataset_stage(demonstrations, repo)
+        of_dataset = self.made(dataset)
+        folder = dataset.folder(self.root)
+        distils = engine.distillation.rounds > 0
+        policy = policy_stage(
+            folder, of_dataset, engine, sources_of(folder, self.root) if distils else ()
+        )
+        of_policy = self.made(policy)
+        chains = {
+            name: [record_of(stage.folder(self.root)) for stage in stages]
+            for name, stages in {
+                "scene": [c.scene for c in found.candidates],
+                "task": [c.task.inputs["task"] for c in found.candidates],
+                "expert": [c.expert for c in found.candidates],
+                "episodes": demonstrations,
+            }.items()
+        }
+        single = {"dataset": of_dataset, "policy": of_policy} | {
+            name: record_of(stage.folder(self.root)) for name, stage in policy.inputs.items()
+        }
+        experts = [r.counts["success"]["rate"] for r in chains["expert"]]
+        return policy.folder(self.root) / POLICY_FOLDER, {
+            "tasks": [c.item for c in found.candidates],
+            "tried": found.tried,
+            "rejected": rejected,
+            "expert": {
+                "mean": round(float(np.mean(experts)), 4),
+                "least": round(min(experts), 4),
+            },
+            "trajectories": trajectories,
+            "episodes": of_dataset.counts["episodes"],
+            "demonstrated_frames": of_dataset.counts["frames"],
+            "frames": of_policy.counts["frames"],
+            "handovers": single["distillation"].counts if "distillation" in single else None,
+            "steps": of_policy.counts["steps"],
+            "samples_per_s": of_policy.counts["samples_per_s"],
+            "seconds": {
+                **{name: round(sum(r.seconds for r in rs), 1) for name, rs in chains.items()},
+                **{name: round(r.seconds, 1) for name, r in single.items()},
+            },
+        }
+
+    def _demonstrations(self, arm: Arm, count: int, candidate: Candidate) -> Stage:
+        """Return the stage of one task's demonstrations."""
+        engine = replace(self.cfg.pool_engine, episodes=self.cfg.episodes_for(arm, count))
+        if arm != "bc_cop":
+            return episodes_stage(candidate.task, candidate.expert, engine)
+        return Stage(
+            name="episodes",
+            item=candidate.item,
+            config=Seeded(config=engine.episodes, seed=engine.seed),
+            inputs={"task": candidate.task},
+            sources={"player": "programs"},
+            make=make_program_episodes,
+            resumes=True,
+        )
+
+    def _judged(self, play: Play, arm: str, count: int, seed: int) -> Row:
+        from v2p_data.report.films import FilmConfig, write_films
+
+        cfg = self.cfg.unseen
+        rows: Row = {}
+        for name, (group, folder) in self.unseen.items():
+            bundle = TaskBundle.load(folder)
+            actor, size_px = play(bundle)
+            judged = judge(
+                bundle,
+                actor,
+                episodes=cfg.episodes,
+                first_seed=first_start(name, seed),
+                cfg=EvaluationConfig(episodes=cfg.episodes),
+                num_threads=self.runtime.num_threads,
+                size_px=size_px,
+            )
+            rows[name] = {"group": group, **judged_row(judged)}
+            self.tell(f"{arm} N={count} seed {seed}, {name}: {judged.successes.mean():.0%}")
+            if cfg.films:
+                films = self.out / FILMS_FOLDER / f"{arm}_{count}_{seed}" / name
+                shown = FilmConfig(successes=cfg.films, failures=cfg.films, size_px=128)
+                write_films(bundle, judged.shown, films, shown)
+        return rows
+
+
+def first_start(name: str, seed: int) -> int:
+    """Return the seed of an object's first episode: the same in every arm and for every N."""
+    return seed_for(seed, "study_lifting", "judge", name) % 2**31
+
+
+def judged_row(judged: Judged) -> Row:
+    """Return what became of an object's episodes, one letter each in the order of their starts."""
+    at_end = judged.at_end
+    assert at_end is not None
+    return {
+        "once": _letters(judged.successes),
+        "at_end": _letters(at_end),
+        "failures": judged.failure_counts(),
+        "median_success_s": judged.median_success_s,
+    }
+
+
+def _letters(true: np.ndarray) -> str:
+    return "".join("1" if t else "0" for t in true)
+
+
+def record_of(folder: Path) -> Record:
+    """Return the record of a result that is there."""
+    record = read_record(folder)
+    assert record is not None, folder
+    return record
+
+
+def _task_of(scene: Stage, cfg: LiftingConfig) -> Stage:
+    return task_stage(scene, cfg.pool_engine)
+
+
+def _why(stage: Stage, outcomes: Mapping[str, Outcome]) -> str:
+    """Return which stage before this one, or it itself, came to nothing, and why."""
+    for needed in stage.inputs.values():
+        if not outcomes[needed.folder_name].is_usable:
+            return _why(needed, outcomes)
+    outcome = outcomes[stage.folder_name]
+    return f"{outcome.stage}: {outcome.reason or outcome.status}"
+
+
+# --- Code-as-Policies ------------------------------------------------------------------------------------------
+
+
+class ProgramsActor:
+    """Code-as-Policies as in `v2p_data.reward.programs`, for a judge."""
+
+    def begin(self, env: BatchEnv) -> None:
+        """Episodes begin in all worlds."""
+        self._programs = ProgramPolicy(env)
+
+    def act_in(self, env: BatchEnv) -> Any:
+        """Return the programs' actions."""
+        del env  # the programs' own
+        return self._programs.act()
+
+
+def _programs(bundle: TaskBundle) -> tuple[Any, int]:
+    del bundle
+    return ProgramsActor(), UNSEEN_PX
+
+
+def make_program_episodes(
+    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
+) -> dict[str, Any]:
+    """Collect demonstrations of Code-as-Policies, as an expert's are collected."""
+    from v2p_data.episodes.collect import collect
+    from v2p_data.episodes.rollouts import InWorlds
+
+    bundle = TaskBundle.load(inputs["task"])
+    collected = collect(
+        bundle,
+        InWorlds(_program_act),
+        cfg.config,
+        out,
+        seed=seed_for(cfg.seed, "episodes", bundle.title),
+        num_threads=runtime.num_threads,
+        on_progress=runtime.progress,
+    )
+    return collected.counts()
+
+
+def _program_act(env: BatchEnv) -> Any:
+    programs = ProgramPolicy(env)
+    return lambda obs: programs.act()

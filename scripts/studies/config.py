@@ -1,0 +1,151 @@
+"""Settings of the study of lifting: arms, numbers of tasks, and sizes."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from v2p_data.policy_config import PolicyConfig
+from v2p_data.stages import EngineConfig
+
+Arm = Literal["videos", "fixed_total", "toys", "bc", "bc_cop", "paper", "cop"]
+ARMS: dict[Arm, str] = {
+    "videos": "objects from videos, distillation; data grow with N",
+    "fixed_total": "objects from videos, distillation; all data and all training together as at the smallest N",
+    "toys": "random primitive toys, distillation; data grow with N",
+    "bc": "objects from videos, behaviour cloning only, same network",
+    "bc_cop": "objects from videos, demonstrations of Code-as-Policies, behaviour cloning only, same network",
+    "paper": "objects from videos, behaviour cloning only, ResNet18 on two frames",
+    "cop": "Code-as-Policies with our primitives on the simulator's states; learns nothing, hence without N",
+}
+"""What each arm trains on, and how."""
+Source = Literal["videos", "toys"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoolConfig:
+    """Where training objects come from."""
+
+    clips: int = 90
+    """Clips that may be drawn, at most; a clip whose scene, task or expert is rejected counts."""
+    toys: int = 60
+    """Toys that may be made, at most."""
+    fps: int = 12
+    """Of drawn clips, as of Something-Something-v2."""
+    held_out: tuple[str, ...] = (
+        *("banana", "marker", "scissors", "spoon", "brick", "pitcher", "plantain"),
+        *("toy duck", "egg", "candle", "jar", "tape"),
+    )
+    """Categories of the evaluation: no training clip may be about one."""
+    seed: int = 0
+    """Of clips, toys, experts and demonstrations, which all seeds of the study share."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnseenConfig:
+    """The evaluation's objects, by the names of their folders."""
+
+    shapes: tuple[str, ...] = (
+        *("mug", "apple", "tomato_soup_can", "mustard_bottle", "pudding_box"),
+    )
+    """New shapes of things that training clips are about too."""
+    categories: tuple[str, ...] = (*("banana", "large_marker", "scissors", "spoon", "foam_brick"),)
+    """Things that no training clip is about."""
+    drawn_shapes: tuple[str, ...] = ("mug", "apple", "soup can", "mustard bottle", "pudding box")
+    """Instead of `shapes`, where no folder of scans is given: products that clips are about, other specimens."""
+    drawn_categories: tuple[str, ...] = ("toy duck", "egg", "candle", "jar", "tape")
+    """Instead of `categories`, where no folder of scans is given: products of `pool.held_out`."""
+    episodes: int = 50
+    """Per object, seed and cell; all cells of a seed start from the same states."""
+    films: int = 1
+    """Successes and failures filmed per object, each."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*self.shapes, *self.categories)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftingConfig:
+    """The whole study."""
+
+    arms: tuple[Arm, ...] = ("cop", "videos", "fixed_total", "toys", "bc", "bc_cop")
+    counts: tuple[int, ...] = (5, 10, 20, 40)
+    """Numbers of training tasks N; the tasks of a smaller N are among those of a larger one."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of subset, distillation, weights and evaluation."""
+    pool: PoolConfig = field(default_factory=PoolConfig)
+    unseen: UnseenConfig = field(default_factory=UnseenConfig)
+    max_training: float = 4.0
+    """Gradient steps grow with the data up to this multiple of `engine`'s, which are those of the smallest N."""
+    paper_policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(preset="paper"))
+    """The network and training of the arm `paper`."""
+    engine: EngineConfig = field(default_factory=EngineConfig)
+    """All stages at the smallest N: `episodes.num_episodes` trajectories a task, handovers, gradient steps."""
+
+    def __post_init__(self) -> None:
+        if not self.counts or list(self.counts) != sorted(set(self.counts)) or self.counts[0] < 1:
+            raise ValueError(f"counts must grow from 1 or more, got {list(self.counts)}")
+        if not self.arms or not self.seeds:
+            raise ValueError("arms and seeds must each name at least one")
+        if set(self.unseen.shapes) & set(self.unseen.categories) or not self.unseen.names:
+            raise ValueError("unseen.shapes and unseen.categories must name objects, each once")
+        if self.max_training < 1:
+            raise ValueError(f"max_training must be at least 1, got {self.max_training}")
+
+    def engine_for(self, arm: Arm, count: int, seed: int) -> EngineConfig:
+        """Return the engine's settings of a cell: what scales with N, and how its policy learns."""
+        least = self.counts[0]
+        engine, grown = self.engine, min(count / least, self.max_training)
+        if arm == "fixed_total":
+            share, grown = least / count, 1.0
+            engine = replace(
+                engine,
+                episodes=self.episodes_for(arm, count),
+                distillation=replace(
+                    engine.distillation,
+                    episodes=max(1, round(engine.distillation.episodes * share)),
+                    worlds=max(1, min(engine.distillation.worlds, round(engine.distillation.episodes * share))),
+                ),
+            )  # fmt: skip
+        policy = self.paper_policy if arm == "paper" else engine.policy
+        distillation = engine.distillation
+        if arm in ("bc", "bc_cop", "paper"):
+            # Cloning only takes the gradient steps that distillation has in all.
+            steps = policy.steps
+            if arm != "paper" and distillation.rounds:
+                steps += distillation.first_steps + (distillation.rounds - 1) * distillation.round_steps  # fmt: skip
+            policy = replace(policy, steps=steps)
+            distillation = replace(distillation, rounds=0)
+        return replace(
+            engine,
+            seed=seed,
+            distillation=replace(
+                distillation,
+                first_steps=round(distillation.first_steps * grown),
+                round_steps=round(distillation.round_steps * grown),
+            ),
+            policy=replace(policy, steps=round(policy.steps * grown)),
+        )
+
+    def episodes_for(self, arm: Arm, count: int):  # noqa: ANN201 - the engine's own type
+        """Return how demonstrations of one task are collected; a smaller number is the beginning of a larger one."""
+        episodes = self.engine.episodes
+        if arm != "fixed_total":
+            return episodes
+        wanted = max(1, round(episodes.num_episodes * self.counts[0] / count))
+        return replace(
+            episodes, num_episodes=wanted, min_episodes=min(episodes.min_episodes, wanted)
+        )
+
+    @property
+    def pool_engine(self) -> EngineConfig:
+        """The settings of scenes, tasks, experts and demonstrations."""
+        return replace(self.engine, seed=self.pool.seed)
+
+
+def source_of(arm: Arm) -> Source:
+    """Return where an arm's training objects come from."""
+    return "toys" if arm == "toys" else "videos"
+
+
+CONFIGS = Path(__file__).parents[2] / "configs"

@@ -1,0 +1,435 @@
+"""Where the study's objects come from: clips that the engine reconstructs, random toys, and meshes nobody trains on.
+
+Each becomes a scene, the scene a task by the engine's own stage, and the task gets the one instruction of the study, so
+that a policy cannot tell objects by words. Objects of the evaluation live in a run folder of their own;
+`demand_apart` compares meshes by what they are, not by their names.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from v2p_data.errors import V2PError
+from v2p_data.geometry.camera import Camera
+from v2p_data.geometry.mesh import Size, mesh_for, parts_for, write_obj
+from v2p_data.pipeline.fingerprint import file_digest
+from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.seeds import rng_for
+from v2p_data.sim.solids import read_mesh
+from v2p_data.stages import EngineConfig, expert_stage, scene_stage, task_stage
+from v2p_data.video import synthetic
+from v2p_data.video.captions import CAPTIONS_FILE, VideoItem, find_videos
+from v2p_data.video.meaning import parse_caption
+from v2p_data.video.synthetic import random_spec, render
+from v2p_data.video.synthetic_props import NOUNS, prop_called, shape_of
+from v2p_data.video.synthetic_truth import write
+
+from .config import PoolConfig, UnseenConfig
+
+INSTRUCTION = "lift it up"
+LIFT_M = 0.15
+"""As in the sample clips: how far an object that no clip showed is to be lifted."""
+MESH_FILE = "textured.obj"
+MASSES_FILES = "*mass.json"
+DENSITY_KG_M3 = 300.0
+"""Of an object whose mass nobody says, relative to its hull: between a full carton and a wooden block."""
+FRICTION = 0.6
+"""Of objects that no clip showed; the middle of the engine's table of nouns."""
+SAME_MESH = 1e-4
+"""Relative: what writing coordinates as text changes is far less."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One object that may be trained on."""
+
+    scene: Stage
+    task: Stage
+    """With the study's instruction."""
+    expert: Stage
+
+    @property
+    def item(self) -> str:
+        return self.task.item
+
+
+def candidate_of(scene: Stage, engine: EngineConfig) -> Candidate:
+    """Return the stages that make a lifting expert of a scene."""
+    task = instructed_stage(task_stage(scene, engine))
+    return Candidate(scene=scene, task=task, expert=expert_stage(task, engine))
+
+
+def instructed_stage(task: Stage) -> Stage:
+    """Return the stage that gives a task the study's instruction."""
+    return Stage(
+        name="lift",
+        item=task.item,
+        config={"instruction": INSTRUCTION},
+        inputs={"task": task},
+        make=make_instructed,
+    )
+
+
+def make_instructed(
+    cfg: dict[str, str], inputs: Mapping[str, Path], out: Path, runtime: Runtime
+) -> dict[str, Any]:
+    """Write the task with other words; a task that is no lift is refused."""
+    from v2p_data.errors import ItemRejectedError
+    from v2p_data.task.task import TaskBundle
+
+    del runtime
+    bundle = TaskBundle.load(inputs["task"])
+    if bundle.kind != "lift_up":
+        raise ItemRejectedError("not_a_lift", f"'{bundle.description}' is '{bundle.kind}'")
+    replace(bundle, description=cfg["instruction"]).save(out)
+    return {"caption": bundle.description}
+
+
+# --- clips ---------------------------------------------------------------------------------------------------
+
+
+def is_held_out(words: str, held_out: Iterable[str]) -> str | None:
+    """Return which held-out category the words name, singular or plural, if any."""
+    padded = f" {' '.join(words.lower().replace(',', ' ').split())} "
+    return next((w for w in held_out if f" {w} " in padded or f" {w}s " in padded), None)
+
+
+def clip_stage(number: int, pool: PoolConfig) -> Stage:
+    """Return the stage that draws one lifting clip: noun, shape, texture, room, hand and camera at random."""
+    return Stage(
+        name="clip",
+        item=f"clip_{number:04d}",
+        config={"seed": pool.seed, "fps": pool.fps, "held_out": list(pool.held_out)},
+        sources={"drawing": drawing_code()},
+        make=make_clip,
+    )
+
+
+def make_clip(
+    cfg: dict[str, Any], inputs: Mapping[str, Path], out: Path, runtime: Runtime
+) -> dict[str, Any]:
+    """Draw the clip and write it with its caption; the truth beside it is for whoever wants to look."""
+    del inputs, runtime
+    item = out.name.split("-")[0]
+    for attempt in range(100):
+        rng = rng_for(cfg["seed"], "study_lifting", item, attempt)
+        try:
+            spec = random_spec(item, "lift_up", rng)
+        except ValueError:  # no camera sees all of it: other draws
+            continue
+        if is_held_out(spec.story.actors[0].prop.noun, cfg["held_out"]) is None:
+            break
+    else:
+        raise V2PError(
+            f"no clip that may be trained on after 100 draws: {cfg['held_out']} leave no noun"
+        )
+    path = write(render(replace(spec, fps=cfg["fps"])), out)
+    (out / CAPTIONS_FILE).write_text(json.dumps({path.name: spec.caption}))
+    return {"caption": spec.caption, "noun": spec.story.actors[0].prop.noun}
+
+
+@cache
+def drawing_code() -> str:
+    """Return a digest of the code that draws clips."""
+    sources = sorted(Path(synthetic.__file__).parent.glob("synthetic*.py"))
+    return hashlib.sha256(b"".join(s.read_bytes() for s in sources)).hexdigest()[:8]
+
+
+def scene_of_clip(folder: Path, engine: EngineConfig) -> Stage:
+    """Return the scene stage of a drawn clip: `v2p scene` of it, gate and all."""
+    (video,) = find_videos(folder)
+    return scene_stage(video, engine)
+
+
+def lifting_clips(folder: Path, pool: PoolConfig) -> tuple[list[VideoItem], dict[str, str]]:
+    """Return the clips of a folder whose captions tell of lifting one thing, and why others are not taken.
+
+    Raises:
+        V2PError: there is no such folder, or its captions cannot be used.
+    """
+    taken: list[VideoItem] = []
+    refused: dict[str, str] = {}
+    for video in find_videos(folder):
+        word = is_held_out(video.caption, pool.held_out)
+        if parse_caption(video.caption).kind != "lift_up":
+            refused[video.path.name] = "not_a_lift"
+        elif word is not None:
+            refused[video.path.name] = f"held_out: {word}"
+        else:
+            taken.append(replace(video, item=f"real_{video.item}"))
+    return taken, refused
+
+
+# --- toys ----------------------------------------------------------------------------------------------------
+
+
+def toy_stage(number: int, pool: PoolConfig) -> Stage:
+    """Return the stage that makes a random toy: one to three boxes, cylinders, balls and rings on top of each other."""
+    return Stage(
+        name="scene",
+        item=f"toy_{number:04d}",
+        config={"seed": pool.seed, "kind": "toy"},
+        make=make_toy,
+    )
+
+
+def make_toy(
+    cfg: dict[str, Any], inputs: Mapping[str, Path], out: Path, runtime: Runtime
+) -> dict[str, Any]:
+    """Write a toy's scene. Sizes are drawn blindly; what no gripper takes, the task stage refuses as it does videos'."""
+    del inputs, runtime
+    item = out.name.split("-")[0]
+    rng = rng_for(cfg["seed"], "study_lifting", item)
+    forms = [str(f) for f in rng.choice(["box", "cylinder", "sphere", "ring"], rng.integers(1, 4))]
+    parts: list[trimesh.Trimesh] = []
+    meshes: list[trimesh.Trimesh] = []
+    top = 0.0
+    for form in forms:
+        size, bore = _toy_size(form, rng), float(rng.uniform(0.35, 0.7)) if form == "ring" else 0.0
+        kind = "cylinder" if form == "ring" else form
+        lift = [0.0, 0.0, top + size[2] / 2]
+        meshes.append(mesh_for(kind, size, bore=bore).apply_translation(lift))
+        parts += [p.apply_translation(lift) for p in parts_for(kind, size, bore=bore)]
+        top += size[2]
+    whole = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
+    assert isinstance(whole, trimesh.Trimesh)
+    middle = whole.bounds.mean(0)
+    whole.apply_translation(-middle)
+    parts = [p.apply_translation(-middle) for p in parts]
+    density = float(np.exp(rng.uniform(np.log(150), np.log(900))))
+    single = forms[0] if len(forms) == 1 and forms[0] != "ring" else None
+    thing = SceneObject(
+        name="toy",
+        label="toy",
+        role="manipulated",
+        shape=single or "mesh",  # pyright: ignore[reportArgumentType]
+        size_m=_size(whole.extents),
+        mass_kg=float(np.clip(density * sum(p.volume for p in parts), 0.01, 0.6)),
+        friction=float(rng.uniform(0.4, 0.8)),
+        source={"size": "drawn", "mass": "drawn", "friction": "drawn"},
+    )
+    _write_scene(thing, whole, parts, out, "Lifting toy up")
+    return {"forms": forms}
+
+
+def _toy_size(form: str, rng: np.random.Generator) -> Size:
+    wide, deep, high = (float(v) for v in np.exp(rng.uniform(np.log(0.02), np.log(0.11), 3)))
+    if form == "box":
+        return wide, deep, high
+    if form == "sphere":
+        return wide, wide, wide
+    return wide, wide, min(high, 0.04) if form == "ring" else high
+
+
+# --- objects of the evaluation ----------------------------------------------------------------------------------
+
+
+def draw_unseen(cfg: UnseenConfig, held_out: Iterable[str], folder: Path) -> UnseenConfig:
+    """Write drawn meshes in the layout of a folder of scans, where nobody has any; return their names.
+
+    Raises:
+        V2PError: a product is not known, or clips may be about a category that is to be new.
+    """
+    products = {word: noun for noun in NOUNS for word in noun.words}
+    wanted = (*cfg.drawn_shapes, *cfg.drawn_categories)
+    if unknown := [word for word in wanted if word not in products]:
+        raise V2PError(
+            f"unseen.drawn names {unknown}, which cannot be drawn; known: {', '.join(sorted(products))}"
+        )
+    if seen := [word for word in cfg.drawn_categories if is_held_out(word, held_out) is None]:
+        raise V2PError(
+            f"unseen.drawn_categories names {seen}, which clips may be about; add them to pool.held_out"
+        )
+    for word in wanted:
+        out = folder / word.replace(" ", "_")
+        if not (out / MESH_FILE).is_file():
+            out.mkdir(parents=True, exist_ok=True)
+            prop = prop_called(products[word], rng_for(0, "study_lifting", "unseen", word))
+            shape = shape_of(prop)
+            write_obj(trimesh.Trimesh(shape.vertices, shape.faces), out / MESH_FILE)
+    return replace(
+        cfg,
+        shapes=tuple(w.replace(" ", "_") for w in cfg.drawn_shapes),
+        categories=tuple(w.replace(" ", "_") for w in cfg.drawn_categories),
+    )
+
+
+def unseen_meshes(folder: Path, cfg: UnseenConfig) -> dict[str, Path]:
+    """Return the mesh files of the evaluation's objects.
+
+    Raises:
+        V2PError: one is not there.
+    """
+    found = {name: folder / name / MESH_FILE for name in cfg.names}
+    missing = [name for name, path in found.items() if not path.is_file()]
+    if missing:
+        known = sorted(p.parent.name for p in folder.glob(f"*/{MESH_FILE}"))
+        raise V2PError(
+            f"{folder} holds no {MESH_FILE} of {', '.join(missing)}; it has {', '.join(known) or 'none'}. Name others "
+            "in unseen.shapes and unseen.categories"
+        )
+    return found
+
+
+def unseen_stage(name: str, mesh: Path, mass_kg: float | None) -> Stage:
+    """Return the stage that makes a scene of a scanned mesh, which stands on the table as it stands in its file."""
+    return Stage(
+        name="scene",
+        item=f"unseen_{name}",
+        config={"mass_kg": mass_kg, "friction": FRICTION},
+        sources={"mesh": file_digest(mesh)},
+        make=partial(make_unseen, mesh=mesh),
+    )
+
+
+def make_unseen(
+    cfg: dict[str, Any], inputs: Mapping[str, Path], out: Path, runtime: Runtime, *, mesh: Path
+) -> dict[str, Any]:
+    """Write the scene of a mesh: true shape, mass if it is known, no video."""
+    del inputs, runtime
+    name = mesh.parent.name
+    whole = mended(read_mesh(mesh, name))
+    whole.apply_translation(-whole.bounds.mean(0))
+    mass = cfg["mass_kg"]
+    estimate = float(np.clip(DENSITY_KG_M3 * whole.convex_hull.volume, 0.01, 0.6))
+    thing = SceneObject(
+        name=name if name.isidentifier() else "thing",
+        label=name.replace("_", " "),
+        role="manipulated",
+        shape="mesh",
+        size_m=_size(whole.extents),
+        mass_kg=estimate if mass is None else float(mass),
+        friction=cfg["friction"],
+        source={
+            "size": "mesh file",
+            "mass": "estimate" if mass is None else "file of masses",
+            "friction": "estimate",
+        },
+    )
+    _write_scene(thing, whole, [], out, f"Lifting {thing.label} up")
+    return {"size_m": list(thing.size_m), "mass_kg": thing.mass_kg}
+
+
+def mended(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh without its texture's seams and a scanner's slips, closed where that is simple.
+
+    Seams part vertices that are one; slips are specks and the few faces where more than two meet at an edge.
+    """
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    for _ in range(5):
+        if mesh.is_watertight:
+            break
+        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+        mesh = max(mesh.split(only_watertight=False), key=lambda body: len(body.faces))
+        _, edge, count = np.unique(
+            mesh.edges_sorted, axis=0, return_inverse=True, return_counts=True
+        )
+        mesh.update_faces(~(count[edge] > 2).reshape(-1, 3).any(1))
+        mesh.remove_unreferenced_vertices()
+        mesh.fill_holes()
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_normals(mesh)
+    return mesh
+
+
+def masses_in(folder: Path) -> dict[str, float]:
+    """Return the masses [kg] that a folder of scans states; none where it has no such file."""
+    path = next(iter(sorted(folder.glob(MASSES_FILES))), None)
+    return {} if path is None else json.loads(path.read_text())
+
+
+def _write_scene(
+    thing: SceneObject,
+    mesh: trimesh.Trimesh,
+    parts: list[trimesh.Trimesh],
+    out: Path,
+    caption: str,
+) -> None:
+    (out / "meshes").mkdir(parents=True)
+    file = f"meshes/{thing.name}.obj"
+    write_obj(mesh, out / file)
+    files = tuple(f"meshes/{thing.name}_part_{k:02d}.obj" for k in range(len(parts)))
+    for part, path in zip(parts, files, strict=True):
+        write_obj(part, out / path)
+    z = thing.size_m[2] / 2
+    thing = replace(
+        thing,
+        mesh=file,
+        parts=files if len(files) > 1 else (),
+        frames=(0, 1),
+        poses_world=(
+            (0.0, 0.0, z, 1.0, 0.0, 0.0, 0.0),
+            (0.0, 0.0, z + LIFT_M, 1.0, 0.0, 0.0, 0.0),
+        ),
+        confidences=(1.0, 1.0),
+        observed=("full", "full"),
+    )
+    Scene(
+        title=out.name.split("-")[0],
+        video="",
+        description=caption,
+        kind="lift_up",
+        objects=(thing,),
+        camera=Camera(
+            width_px=640,
+            height_px=480,
+            K=np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]),
+            T_world_cam=np.eye(4),
+        ),
+        fps=20.0,
+        num_frames=2,
+        confidence=1.0,
+        folder=out,
+    ).save(out)
+
+
+def _size(extents: np.ndarray) -> Size:
+    x, y, z = (float(v) for v in extents)
+    return x, y, z
+
+
+# --- apart ---------------------------------------------------------------------------------------------------
+
+
+def mesh_signature(path: Path) -> tuple[int, Float[np.ndarray, "5"]]:
+    """Return what stays of a mesh when it is moved, turned and written anew.
+
+    That is the number of its vertices, and their mean distance, its standard deviation and the principal spreads about
+    their centroid [m].
+    """
+    vertices = np.asarray(mended(read_mesh(path, path.stem)).vertices, float)
+    centred = vertices - vertices.mean(0)
+    reach = np.linalg.norm(centred, axis=1)
+    spreads = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred))
+    return len(vertices), np.array([reach.mean(), reach.std(), *spreads])
+
+
+def demand_apart(training: Iterable[Path], unseen: Mapping[str, Path]) -> None:
+    """Demand that no mesh under the training's folders is one of the evaluation's, moved, turned or renamed.
+
+    Args:
+        training: folders of tasks, episodes or datasets.
+        unseen: mesh files by name.
+
+    Raises:
+        V2PError: names the file and the object.
+    """
+    forbidden = {name: mesh_signature(path) for name, path in unseen.items()}
+    for folder in training:
+        for path in sorted(folder.rglob("*.obj")):
+            count, spread = mesh_signature(path)
+            for name, (other_count, other) in forbidden.items():
+                if count == other_count and np.allclose(spread, other, rtol=SAME_MESH, atol=0):
+                    raise V2PError(
+                        f"{path} is the unseen object '{name}': nothing may be trained on it"
+                    )
