@@ -22,7 +22,9 @@ SPEED_LIMIT_RAD_S = np.array([2.175] * 4 + [2.61] * 3)
 """Franka Emika's data sheet, as the next two."""
 ACCELERATION_LIMIT_RAD_S2 = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])
 TORQUE_RATE_LIMIT_NM_S = 1000.0
-BRAKING = (3.0, 12.0)
+SPEEDING_UP = (4.0, 25.0)
+"""Largest acceleration of the reference [m/s2, rad/s2]; Franka's limits are 13 and 25."""
+BRAKING = (3.0, 15.0)
 """The reference slows down in time to stop with these [m/s2, rad/s2], so that it does not overshoot."""
 STIFFNESS_NM_RAD = np.array([600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0])
 DAMPING_NM_S_RAD = np.array([50.0, 50.0, 50.0, 50.0, 30.0, 25.0, 15.0])
@@ -34,6 +36,9 @@ REGISTER_COUNTS = 255
 """The gripper reports its opening in 8 bits, as the 2F-85 does."""
 LEAD_M = 0.006
 """How far the gripper's reference may run ahead of a blocked finger."""
+
+
+_TWIST_PARTS = (slice(0, 3), slice(3, 6))
 
 
 class ArmController:
@@ -58,6 +63,7 @@ class ArmController:
         self.reference = qpos.copy()
         self.speed = np.zeros(NUM_ARM_JOINTS)
         self.acceleration = np.zeros(NUM_ARM_JOINTS)
+        self.twist = np.zeros(6)
         self.commanded = np.zeros(NUM_ARM_JOINTS)
         self.applied = np.zeros(NUM_ARM_JOINTS)
         self._jacobian = np.zeros((6, self.model.nv))
@@ -122,8 +128,11 @@ class ArmController:
         free = np.zeros(NUM_ARM_JOINTS)
         free[2] = -ELBOW_RETURN_HZ * self.reference[2]
         gain = self.parameters.reference_gain_hz
-        twist = np.concatenate([_braked(error[:3], gain, BRAKING[0]), _braked(error[3:], gain, BRAKING[1])])
-        speed = inverse @ (twist - J @ free) + free
+        for part, braking, speeding in zip(_TWIST_PARTS, BRAKING, SPEEDING_UP, strict=True):
+            change = _braked(error[part], gain, braking) - self.twist[part]
+            size = float(np.sqrt(change @ change))
+            self.twist[part] += change * min(1.0, speeding * TIMESTEP_S / max(size, 1e-12))
+        speed = inverse @ (self.twist - J @ free) + free
         over = float(np.max(np.abs(speed) / (share * SPEED_LIMIT_RAD_S)))
         speed = speed / max(over, 1.0)
         change = ACCELERATION_LIMIT_RAD_S2 * TIMESTEP_S

@@ -41,6 +41,9 @@ FACETS = 24
 """Sides of a cylinder."""
 TORQUE_LIMIT_NM = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 """Franka Emika's data sheet."""
+ARMATURE_KG_M2 = (0.4, 0.4, 0.4, 0.4, 0.15, 0.15, 0.15)
+"""Reflected rotor inertia in the arm's own model. Without it joints 1 and 3, whose axes are nearly parallel, swing
+against each other under libfranka's damping."""
 FINGER_KP, FINGER_KV, FINGER_ARMATURE_KG = 10_000.0, 150.0, 0.15
 GRAIN_PX = 256
 
@@ -111,10 +114,13 @@ def build_twin(scene: Scene, parameters: TwinParameters, camera: Camera) -> Twin
 
 def nominal_arm() -> mujoco.MjModel:
     """Return the arm as its maker's data and the calibrated mount say, for controllers: no objects, no errors."""
-    return mujoco.MjModel.from_xml_string(
+    spec = mujoco.MjSpec.from_string(
         f'<mujoco><compiler angle="radian" autolimits="true"/><worldbody>{robot_body_xml(FINE, ServoConfig())}'
         "</worldbody></mujoco>"
     )
+    for k, armature in enumerate(ARMATURE_KG_M2):
+        spec.joint(f"joint{k + 1}").armature = armature
+    return spec.compile()
 
 
 def _located(base: World, model: mujoco.MjModel, p: TwinParameters) -> TwinWorld:
@@ -222,7 +228,7 @@ def _change_robot(spec: Any, p: TwinParameters) -> None:
     """Give the arm its friction and errors, and the pads their rubber."""
     for k in range(NUM_ARM_JOINTS):
         joint = spec.joint(f"joint{k + 1}")
-        joint.armature = p.joint_armature_kg_m2
+        joint.armature = ARMATURE_KG_M2[k] * p.armature_scale
         joint.frictionloss = p.joint_friction_nm
         joint.damping = [0.5, 0.0, 0.0]
         joint.stiffness = [0.0, 0.0, 0.0]
