@@ -118,9 +118,7 @@ class Optics:
             width_px=self.size_px,
             height_px=self.size_px,
             K=self.training.K,
-            T_world_cam=transform(
-                self.training.T_world_cam[:3, :3], self.calibrated_pose[:3, 3]
-            ),
+            T_world_cam=transform(self.training.T_world_cam[:3, :3], self.calibrated_pose[:3, 3]),
         )
 
     def raw_of_rectified(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
@@ -190,7 +188,9 @@ class TwinCamera:
         self._rng = episode_rng(seed, "camera")
         # A noise field per episode, cut elsewhere for each picture: drawing 700,000 numbers takes 8 ms.
         self._noise = self._rng.standard_normal((RAW_PX + 64, RAW_PX + 64, 3), np.float32)
-        self._exposure = np.float32(1 + self.optics.parameters.exposure_jitter * self._rng.normal())
+        self._exposure = np.float32(
+            1 + self.optics.parameters.exposure_jitter * self._rng.normal()
+        )
 
     def picture(self, qpos: Float[np.ndarray, "q"]) -> UInt8[np.ndarray, "h w 3"]:
         """Return the rectified picture.
@@ -215,7 +215,9 @@ class TwinCamera:
         row, column = self._rng.integers(0, 64, 2)
         noise = self._noise[row : row + RAW_PX, column : column + RAW_PX]
         # Shot noise: the variance in electrons is their number; 255 grey levels are the full well.
-        light += noise * np.sqrt(light * np.float32(255 / p.full_well) + np.float32(p.read_noise**2))
+        light += noise * np.sqrt(
+            light * np.float32(255 / p.full_well) + np.float32(p.read_noise**2)
+        )
         grey = np.clip(light + 0.5, 0, 255).astype(np.uint8)
         quality = [cv2.IMWRITE_JPEG_QUALITY, round(p.jpeg_quality)]
         coded = cv2.imencode(".jpg", grey[..., ::-1], quality)[1]

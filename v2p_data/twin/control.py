@@ -120,9 +120,7 @@ class ArmController:
         mujoco.mju_negQuat(own, own)
         mujoco.mju_mulQuat(turn, self._wanted_quat, own)
         mujoco.mju_quat2Vel(error[3:], turn, 1.0)
-        mujoco.mj_jacSite(
-            self.model, self.data, self._jacobian[:3], self._jacobian[3:], self.site
-        )
+        mujoco.mj_jacSite(self.model, self.data, self._jacobian[:3], self._jacobian[3:], self.site)
         J = self._jacobian[:, :NUM_ARM_JOINTS]
         inverse = J.T @ np.linalg.inv(J @ J.T + IK_DAMPING**2 * np.eye(6))
         free = np.zeros(NUM_ARM_JOINTS)
@@ -174,7 +172,9 @@ class Gripper:
         return self.reference_m
 
 
-def _braked(error: Float[np.ndarray, "3"], gain_hz: float, braking: float) -> Float[np.ndarray, "3"]:
+def _braked(
+    error: Float[np.ndarray, "3"], gain_hz: float, braking: float
+) -> Float[np.ndarray, "3"]:
     """Return the speed towards a goal: proportional when near, slow enough to stop when far."""
     distance = float(np.sqrt(error @ error))
     if distance * gain_hz**2 <= 2 * braking:

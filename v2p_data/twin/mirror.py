@@ -93,9 +93,7 @@ class Mirror:
         self.moments = []
         self._note()
 
-    def follow(
-        self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]
-    ) -> StepResult:
+    def follow(self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]) -> StepResult:
         """Take over the moment that an action led to, and say what the task's own success says of it."""
         result = self.env.follow(_followed(truth, target), action[None])
         self._note()

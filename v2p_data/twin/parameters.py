@@ -6,11 +6,13 @@ Every field has a stream of its own, so a new field changes no other. Sweeps rep
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
+from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.seeds import rng_for
 
 TWIN_SEED = 20261125
@@ -117,6 +119,22 @@ def draw(seed: int) -> TwinParameters:
 def nominal() -> TwinParameters:
     """Return the twin that results are reported for."""
     return draw(TWIN_SEED)
+
+
+def changed(change: Mapping[str, float]) -> TwinParameters:
+    """Return the nominal twin with other values of some single numbers, for sweeps.
+
+    Raises:
+        V2PError: there is no such number, or it is not finite.
+    """
+    base = nominal()
+    single = [f.name for f in fields(base) if not f.metadata["count"]]
+    for name, value in change.items():
+        if name not in single:
+            raise V2PError(f"the twin has no single number '{name}'.{did_you_mean(name, single)}")
+        if not np.isfinite(value):
+            raise V2PError(f"the twin's {name} must be a finite number, got {value}")
+    return replace(base, **change)
 
 
 def episode_rng(seed: int, what: str) -> np.random.Generator:

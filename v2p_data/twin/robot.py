@@ -84,7 +84,9 @@ class TwinRobot:
         self.camera = TwinCamera(self.world.like, self.optics)
         self._data = mujoco.MjData(self.world.model)
         p = self.parameters
-        longest = max(p.reading_latency_s + p.latency_jitter_s, p.camera_latency_s + p.camera_jitter_s)
+        longest = max(
+            p.reading_latency_s + p.latency_jitter_s, p.camera_latency_s + p.camera_jitter_s
+        )
         self._past: deque[_Sample] = deque(maxlen=2 + round(longest / TIMESTEP_S))
         self.reset(0)
 
