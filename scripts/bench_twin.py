@@ -84,13 +84,10 @@ def main(cfg: BenchConfig) -> None:
     )
     _tell("twin", twin.successes, twin.at_end if cfg.at_end else None, time.perf_counter() - start)
     print(f"failures in the twin: {_counts(twin)}")
-    both = [
-        int((twin.successes == a) @ (trained_in.successes == b))
-        for a in (True, False)
-        for b in (True, False)
-    ]
+    here, there = twin.successes, trained_in.successes
     print(
-        f"paired: both {both[0]}, twin only {both[1]}, training simulator only {both[2]}, neither {both[3]}"
+        f"paired: both {(here & there).sum()}, twin only {(here & ~there).sum()}, "
+        f"training simulator only {(~here & there).sum()}, neither {(~here & ~there).sum()}"
     )
     if cfg.out is not None:
         _write(cfg, parameters, trained_in.success_step.tolist(), twin)

@@ -169,7 +169,7 @@ def _object_xml(base: World, obj: ObjectModel, p: TwinParameters) -> tuple[str, 
     clouds = [_corners(base.model, geom) * p.size_scale for geom in obj.geom_ids]
     volume = np.array([float(trimesh.convex.convex_hull(c).volume) for c in clouds])
     mass = obj.mass_kg * p.mass_scale * volume / volume.sum()
-    rgba = base.model.geom_rgba[obj.geom_ids[0]]
+    rgba = base.model.geom_rgba[obj.geom_ids[0]].tolist()
     asset, geoms = "", ""
     for k, cloud in enumerate(clouds):
         name = f"{obj.name}_{k}"
@@ -268,5 +268,5 @@ def _fovy_deg(camera: Camera) -> float:
     return float(2 * np.degrees(np.arctan(camera.height_px / 2 / camera.K[1, 1])))
 
 
-def _row(values: Iterable[float]) -> str:
+def _row(values: Iterable[float | int]) -> str:
     return " ".join(f"{v:.9g}" for v in values)
