@@ -20,6 +20,8 @@ BELOW: dict[str, set[str]] = {
     "distillation": {"episodes", "sim", "task", "pipeline", "errors", "seeds"},
     # Loading a LeRobot policy is for `policies.evaluation`; here a policy is whatever has `reset` and `act`.
     "evaluation": {"sim", "task", "scene", "episodes", "pipeline", "errors", "seeds"},
+    # The second simulator shares scenes, states and judges with the first one, which knows nothing of it.
+    "twin": {"evaluation", "episodes", "sim", "task", "scene", "geometry", "errors", "seeds"},
     "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds"},
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }

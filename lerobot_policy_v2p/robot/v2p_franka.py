@@ -16,12 +16,12 @@ from lerobot.robots import Robot
 from scipy.spatial.transform import Rotation
 
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
-from lerobot_policy_v2p.robot.targets import ToolPose, next_target
 from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.sim.batch_env import SimConfig
 from v2p_data.sim.gym_env import V2PEnv
 from v2p_data.sim.masks import labels_to_rgb
+from v2p_data.sim.targets import ToolPose, next_target
 
 logger = logging.getLogger(__name__)
 
