@@ -56,7 +56,9 @@ class Arm:
         }
 
     def read(self) -> dict[str, Any]:
-        _, png = cv2.imencode(".png", self.arm.picture()[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        _, png = cv2.imencode(
+            ".png", self.arm.picture()[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        )
         return {
             "pos_m": self.arm.state()[:3].tolist(),
             "quat_wxyz": self.rotation().as_quat(canonical=True, scalar_first=True).tolist(),

@@ -152,6 +152,7 @@ def make_policy(
 ) -> dict[str, Any]:
     """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
     from policies.bc.trainer import TrainerConfig, write_train_config
+    from v2p_data.deployment.facts import write_facts
     from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
 
     policy: PolicyConfig = cfg.config.resolved
@@ -182,6 +183,7 @@ def make_policy(
         )
     student.save(out / POLICY_FOLDER)
     write_train_config(out / POLICY_FOLDER, student.policy, dataset, repo_id, recipe, seed)
+    write_facts(out / POLICY_FOLDER, dataset)
     return {
         "steps": steps,
         "samples": steps * policy.batch_size,

@@ -156,7 +156,15 @@ class V2PFranka(Robot):
         arm = self._connected()
         wanted = np.array([float(action[name]) for name in ACTION_NAMES])
         if self._guard is not None and self.config.pictures == "mask":
-            reading = Rig(self).reading_of(dict(zip(STATE_NAMES, self._state if self._state is not None else arm.state(), strict=True)))
+            reading = Rig(self).reading_of(
+                dict(
+                    zip(
+                        STATE_NAMES,
+                        self._state if self._state is not None else arm.state(),
+                        strict=True,
+                    )
+                )
+            )
             try:
                 self._guard.look(reading)
                 wanted = self._guard.limit(wanted, reading).action
@@ -186,6 +194,16 @@ class V2PFranka(Robot):
     def hold(self) -> None:
         """Stay there, at once."""
         self._connected().hold()
+
+    @property
+    def has_succeeded(self) -> bool:
+        """Whether a simulated task has; a real one never says so."""
+        return isinstance(self.arm, SimulatedArm) and self.arm.succeeded
+
+    @property
+    def task_description(self) -> str:
+        """The simulated task in words."""
+        return self.arm.env.task_description if isinstance(self.arm, SimulatedArm) else ""
 
     def disconnect(self) -> None:
         if self.arm is not None:

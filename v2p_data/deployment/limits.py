@@ -175,7 +175,9 @@ class Guard:
         target = old + shift
         led = np.clip(target, reading.tool_pos - lead, reading.tool_pos + lead)
         # A target that is too far ahead already may come back, and need not jump.
-        led = np.where(np.abs(target - reading.tool_pos) < np.abs(old - reading.tool_pos), target, led)
+        led = np.where(
+            np.abs(target - reading.tool_pos) < np.abs(old - reading.tool_pos), target, led
+        )
         if np.abs(led - target).max() > 1e-6:
             acted.append("lead")
         # From outside the box any way back in is allowed, none further out.

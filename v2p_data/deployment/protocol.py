@@ -176,7 +176,9 @@ class Driver:
         if not isinstance(said, dict):
             raise self._wrong(f"an answer is no JSON object: {line[:60]!r}")
         if said.get("v") != VERSION:
-            raise self._wrong(f"it speaks version {said.get('v')!r}, and this is version {VERSION}")
+            raise self._wrong(
+                f"it speaks version {said.get('v')!r}, and this is version {VERSION}"
+            )
         if said.get("id") != request["id"]:
             raise self._wrong(f"it answers request {said.get('id')!r} instead of {request['id']}")
         if said.get("ok") is not True:
@@ -223,7 +225,9 @@ class Driver:
 def _connected(address: str, timeout_s: float) -> socket.socket:
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise V2PError(f"a driver's address is HOST:PORT, such as 192.168.1.5:7777; got '{address}'")
+        raise V2PError(
+            f"a driver's address is HOST:PORT, such as 192.168.1.5:7777; got '{address}'"
+        )
     try:
         connection = socket.create_connection((host, int(port)), timeout_s)
     except OSError as error:

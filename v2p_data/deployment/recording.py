@@ -106,4 +106,6 @@ def check_free(out: Path) -> None:
         V2PError: it is.
     """
     if out.exists():
-        raise V2PError(f"{out} exists already; choose another place for the recording with --record")
+        raise V2PError(
+            f"{out} exists already; choose another place for the recording with --record"
+        )

@@ -45,13 +45,17 @@ class Sam2Tracker:
         h, w = picture.shape[:2]
         u, v = click_px
         if not (0 <= u < w and 0 <= v < h):
-            raise V2PError(f"the click at ({u:g}, {v:g}) lies outside the picture, which has {w} x {h} pixels")
+            raise V2PError(
+                f"the click at ({u:g}, {v:g}) lies outside the picture, which has {w} x {h} pixels"
+            )
         if robot[int(v), int(u)]:
             raise V2PError(f"the click at ({u:g}, {v:g}) is on the robot; click on the object")
         self._stream = Stream(self._checkpoint, [np.array([[u, v]])], self._cfg)
         found = self.track(picture, robot)
         if not found.mask.any():
-            raise V2PError(f"SAM 2 sees no object at the click ({u:g}, {v:g}); click on its middle")
+            raise V2PError(
+                f"SAM 2 sees no object at the click ({u:g}, {v:g}); click on its middle"
+            )
         return found.mask
 
     def track(

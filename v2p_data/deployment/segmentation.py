@@ -164,9 +164,7 @@ class ColourTracker:
         main = parts == best
         if count > 2:
             reached = np.unique(parts[grow(main | expected, round(3 * self._scale) + 1)])
-            large = [
-                k for k in reached if k and stats[k, cv2.CC_STAT_AREA] > 0.04 * self._area
-            ]
+            large = [k for k in reached if k and stats[k, cv2.CC_STAT_AREA] > 0.04 * self._area]
             main = np.isin(parts, [best, *large])
         return _without_pinholes(main)
 
@@ -182,7 +180,9 @@ class ColourTracker:
         else:
             self._motion = 0.5 * self._motion
         # Under a robot the outline shrinks to what is seen; where it should be is what it was.
-        self._mask = mask | (expected & grow(mask, round(4 * self._scale))) if hidden > 0.1 else mask
+        self._mask = (
+            mask | (expected & grow(mask, round(4 * self._scale))) if hidden > 0.1 else mask
+        )
 
     def _learn(self, lab: np.ndarray, mask: np.ndarray, robot: np.ndarray) -> None:
         """Bring the picture of what is behind up to date where neither object nor robot is near."""
@@ -207,7 +207,9 @@ def clicked_mask(
     u, v = click_px
     where = f"the click at ({u:g}, {v:g})"
     if not (0 <= u < w and 0 <= v < h):
-        raise V2PError(f"{where} lies outside the picture, which has {w} x {h} pixels; click on the object")
+        raise V2PError(
+            f"{where} lies outside the picture, which has {w} x {h} pixels; click on the object"
+        )
     x, y = int(u), int(v)
     if robot[y, x]:
         raise V2PError(f"{where} is on the robot; click on the object that the task is about")
@@ -249,7 +251,9 @@ def _apart_from_surroundings(picture: np.ndarray, robot: np.ndarray) -> np.ndarr
     border[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = False
     samples = np.ascontiguousarray(lab[usable][::3])
     if len(samples) < 10 * SURROUNDINGS:
-        raise V2PError("the robot fills the picture: the camera sees no object; move the arm aside")
+        raise V2PError(
+            "the robot fills the picture: the camera sees no object; move the arm aside"
+        )
     cv2.setRNGSeed(2)
     _, _, centres = cv2.kmeans(
         samples, SURROUNDINGS, np.empty(0), (3, 20, 1), 1, cv2.KMEANS_PP_CENTERS

@@ -138,6 +138,8 @@ def clicks_from(words: Sequence[str]) -> tuple[tuple[float, float], ...]:
     for word in words:
         match = re.fullmatch(r"(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", word.strip())
         if match is None:
-            raise V2PError(f"a click is X,Y in pixels of the picture, such as 120,80; got '{word}'")
+            raise V2PError(
+                f"a click is X,Y in pixels of the picture, such as 120,80; got '{word}'"
+            )
         found.append((float(match[1]), float(match[2])))
     return tuple(found)
