@@ -86,44 +86,56 @@ class Arm:
         self.goal = None
 
 
+class RefusedError(ValueError):
+    """A request that is not carried out; its words are the answer."""
+
+
 def numbers(request: dict[str, Any], name: str, count: int) -> np.ndarray:
     value = request.get(name)
     flat = value if isinstance(value, list) else [value]
     if len(flat) != count or not all(
         isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in flat
     ):
-        raise ValueError(f"'{name}' must be {count} finite numbers")
+        raise RefusedError(f"'{name}' must be {count} finite numbers")
     return np.array(flat, float)
+
+
+def parsed(line: bytes) -> dict[str, Any]:
+    request = json.loads(line)
+    if not isinstance(request, dict) or request.get("v") != VERSION:
+        raise RefusedError(f"this driver speaks version {VERSION} of the protocol")
+    return request
+
+
+def goal_of(request: dict[str, Any]) -> tuple[np.ndarray, Rotation, float]:
+    quat = numbers(request, "quat_wxyz", 4)
+    if not 0.99 < np.linalg.norm(quat) < 1.01:
+        raise RefusedError("'quat_wxyz' must be a unit quaternion")
+    opening = float(np.clip(numbers(request, "opening", 1)[0], 0, 1))
+    return numbers(request, "pos_m", 3), Rotation.from_quat(quat, scalar_first=True), opening
 
 
 def answer(arm: Arm, line: bytes) -> dict[str, Any]:
     """Return the answer to one line, whatever it holds."""
     head: dict[str, Any] = {"v": VERSION, "id": None}
     try:
-        request = json.loads(line)
-        if not isinstance(request, dict) or request.get("v") != VERSION:
-            raise ValueError(f"this driver speaks version {VERSION} of the protocol")
+        request = parsed(line)
         head["id"] = request.get("id")
+        said: dict[str, Any] = {}
         match request.get("do"):
             case "hello":
-                return {**head, "ok": True, **arm.hello()}
+                said = arm.hello()
             case "read":
-                return {**head, "ok": True, **arm.read()}
+                said = arm.read()
             case "hold":
                 arm.hold()
-                return {**head, "ok": True}
             case "target":
-                quat = numbers(request, "quat_wxyz", 4)
-                if not 0.99 < np.linalg.norm(quat) < 1.01:
-                    raise ValueError("'quat_wxyz' must be a unit quaternion")
-                opening = float(np.clip(numbers(request, "opening", 1)[0], 0, 1))
-                rotation = Rotation.from_quat(quat, scalar_first=True)
-                arm.goal = (numbers(request, "pos_m", 3), rotation, opening)
-                return {**head, "ok": True}
+                arm.goal = goal_of(request)
             case other:
-                raise ValueError(f"there is no request {other!r}")
+                return {**head, "ok": False, "error": f"there is no request {other!r}"[:200]}
     except (ValueError, RecursionError) as error:
         return {**head, "ok": False, "error": str(error)[:200]}
+    return {**head, "ok": True, **said}
 
 
 class Connection(socketserver.StreamRequestHandler):

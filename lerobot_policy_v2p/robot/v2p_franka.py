@@ -84,12 +84,13 @@ class V2PFranka(Robot):
 
     def __init__(self, config: V2PFrankaConfig) -> None:
         super().__init__(config)
+        del self.calibration  # LeRobot's dict of motors, which would hide the camera's calibration
         self.config = config
         self.arm: Arm | None = None
         self._sight: Sight | None = None
         self._is_started = False
         self._guard: Guard | None = None
-        self._state: Float[np.ndarray, "11"] | None = None
+        self._state: np.ndarray | None = None
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -214,14 +215,15 @@ class V2PFranka(Robot):
         reading = Rig(self).reading_of({**state, RGB_NAME: self._seeing().picture()})
         try:
             seen = sight.see(reading) if self._is_started else sight.start(reading)
-            self._is_started = True
-            if max(seen.missed) >= LOST_AFTER:
-                raise V2PError(
-                    f"object {int(np.argmax(seen.missed)) + 1} is no longer seen; the robot holds its position"
-                )
         except V2PError:
             self._connected().hold()
             raise
+        self._is_started = True
+        if max(seen.missed) >= LOST_AFTER:
+            self._connected().hold()
+            raise V2PError(
+                f"object {int(np.argmax(seen.missed)) + 1} is no longer seen; the robot holds its position"
+            )
         return labels_to_rgb(seen.labels)
 
     def _seeing(self) -> SeeingArm:

@@ -4,7 +4,7 @@ import contextlib
 import io
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -211,9 +211,7 @@ def robot_config(words: Sequence[str]) -> Any:
     told = io.StringIO()
     try:
         with contextlib.redirect_stderr(told):
-            return draccus.parse(
-                RobotConfig, args=[f"--{word.removeprefix(ROBOT_PREFIX)}" for word in words]
-            )
+            return draccus.parse(_holder(RobotConfig), args=list(words)).robot
     except SystemExit as error:
         wrong = re.sub(r"\s+", " ", told.getvalue().rpartition("error:")[2]).strip()
         raise V2PError(f"the robot's settings are wrong: {wrong}") from error
@@ -223,6 +221,11 @@ def robot_config(words: Sequence[str]) -> Any:
         raise V2PError(
             f"the robot's settings are wrong: {reason.strip().splitlines()[0]}"
         ) from error
+
+
+def _holder(kind: type) -> type:
+    """Return a config that has a robot: LeRobot's parser takes no choice by itself."""
+    return make_dataclass("Holder", [("robot", kind)])
 
 
 def loaded_policy(folder: Path, task: str, device: str) -> Any:
@@ -258,7 +261,8 @@ def _clicks(args: Deploy, robot: Any, reading: Reading) -> Sequence[tuple[float,
 
     if args.click:
         return clicks_from(args.click)
-    assert reading.picture is not None and reading.joints_rad is not None
+    assert reading.picture is not None
+    assert reading.joints_rad is not None
     drawn = Silhouette(robot.calibration()).draw(reading.joints_rad, fingers_m(reading.opening))
     new_tracker, shown = _tracker_maker(args), reading.picture
     with ClickPage(

@@ -91,7 +91,7 @@ class Guard:
     def __init__(self, cfg: LimitsConfig, scale: ActionScale, step_s: float = STEP_S) -> None:
         self.cfg, self.scale, self.step_s = cfg, scale, step_s
         self.low, self.high = np.array(cfg.workspace_low_m), np.array(cfg.workspace_high_m)
-        self._last: Float[np.ndarray, "3"] | None = None
+        self._last: np.ndarray | None = None
 
     def check_start(self, reading: Reading) -> None:
         """Refuse to begin where the arm is.
