@@ -42,7 +42,8 @@ class LimitsConfig:
     max_tilt_rad: float = SimConfig.tilt_limit_rad
     """How far the gripper may lean from straight down."""
     max_force_n: float = 60.0
-    """Contact force at the tool that stops the run, on robots that report it."""
+    """Contact force at the tool that stops the run, on robots that report it, when it lasts for two readings: the peak of
+    a touch is shorter."""
     max_silence_ms: float = 300.0
     """Without a reading for so long the robot is told to hold and the run ends."""
 
@@ -92,6 +93,7 @@ class Guard:
         self.cfg, self.scale, self.step_s = cfg, scale, step_s
         self.low, self.high = np.array(cfg.workspace_low_m), np.array(cfg.workspace_high_m)
         self._last: np.ndarray | None = None
+        self._is_pressing = False
 
     def check_start(self, reading: Reading) -> None:
         """Refuse to begin where the arm is.
@@ -115,7 +117,9 @@ class Guard:
             LimitStop: too much force, too fast, too far out, leaning too far.
         """
         cfg = self.cfg
-        if reading.force_n is not None and reading.force_n > cfg.max_force_n:
+        is_pressing = reading.force_n is not None and reading.force_n > cfg.max_force_n
+        was_pressing, self._is_pressing = self._is_pressing, is_pressing
+        if is_pressing and was_pressing:
             raise LimitStop(
                 "force",
                 f"the contact force is {reading.force_n:.0f} N, above the limit of {cfg.max_force_n:.0f} N: the tool"

@@ -8,16 +8,16 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, UInt8
 
 from v2p_data.deployment.limits import STEP_S, Guard, LimitStop, Watchdog
 from v2p_data.deployment.recording import Recorder
 from v2p_data.deployment.robot import Reading, Rig
 from v2p_data.deployment.sight import LOST_AFTER, Seen, Sight
 from v2p_data.errors import V2PError
+from v2p_data.evaluation.actors import Actor
 
 REHEARSALS = 8
 """Steps without motion by which the rate is measured beforehand; the first two, which compile, do not count."""
@@ -27,16 +27,6 @@ WINDOW = 20
 Ending = Literal[
     "time", "done", "limit", "lost", "silence", "robot", "slow", "interrupted", "policy"
 ]
-
-
-class Policy(Protocol):
-    """What decides, as `policies.evaluation.actor.PolicyActor` does."""
-
-    def reset(self, n: int) -> None: ...
-
-    def act(
-        self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n state"]
-    ) -> Float32[np.ndarray, "n act"]: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +85,7 @@ class Run:
         self,
         rig: Rig,
         sight: Sight | None,
-        policy: Policy,
+        policy: Actor,
         guard: Guard,
         cfg: LoopConfig,
         *,
