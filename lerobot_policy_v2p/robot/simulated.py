@@ -69,6 +69,8 @@ class SimulatedArm:
 
     def force_n(self) -> float:
         """Return the contact force at the tool, from the joints' torques as a real arm estimates it."""
+        if not self.steps:
+            return 0.0  # nothing has moved yet
         robot, joints = self.env.world.robot, self.joints()
         count = len(joints)
         # The tool's speed per joint, a joint at a time: rows of the transposed Jacobian.

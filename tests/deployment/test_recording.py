@@ -16,7 +16,9 @@ def test_lerobot_reads_back_masks_pictures_states_and_the_actions_that_passed_th
 ):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    rig = restarted(seeing_robot)
+    rig, sent = restarted(seeing_robot), []
+    send = rig.act
+    rig.act = lambda action: sent.append(action) or send(action)
     sight = Sight(seeing_robot.calibration(), [click_on(seeing_robot)])
     recorder, steps = Recorder("lifting the red box"), []
     limits = LimitsConfig(max_speed_m_s=0.3, max_silence_ms=60_000.0)
@@ -32,13 +34,14 @@ def test_lerobot_reads_back_masks_pictures_states_and_the_actions_that_passed_th
     assert packed.num_frames == 6
     dataset = LeRobotDataset("v2p/run", root=tmp_path / "run")
     assert (len(dataset), dataset.fps) == (6, 20)
-    for row, (reading, seen) in zip(dataset, steps, strict=True):
+    assert sent[0][0] == pytest.approx(0.5)  # the policy wanted 1, and 0.3 m/s are half of that
+    for row, (reading, seen), action in zip(dataset, steps, sent, strict=True):
         mask = (row["observation.images.mask"].numpy().transpose(1, 2, 0) * 255).round()
         rgb = row["observation.images.rgb"].numpy().transpose(1, 2, 0) * 255
         np.testing.assert_array_equal(mask, labels_to_rgb(seen.labels))
         assert np.abs(rgb - reading.picture).mean() < 4
         np.testing.assert_allclose(row["observation.state"], reading.state, atol=1e-6)
-        np.testing.assert_allclose(row["action"], [0.5, 0, 0, 0, 0, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(row["action"], action, atol=1e-6)
         assert row["task"] == "lifting the red box"
     assert not (tmp_path / "run.partial").exists()
 

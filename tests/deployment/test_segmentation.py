@@ -92,7 +92,7 @@ def test_clicks_that_are_on_no_object_are_refused(course):
 
 
 def still(course):
-    rows, camera = course
+    rows, _ = course
     reading, labels = rows[0]
     robot = labels == 1
     tracker = ColourTracker()

@@ -5,21 +5,26 @@ Actions are displacements of the controller's target; limits are in metres and s
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from v2p_data.deployment.robot import ActionScale, Reading
 from v2p_data.errors import V2PError
 from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.robot import TARGET_HIGH_M, TARGET_LOW_M
+from v2p_data.sim.robot import QUAT_DOWN, TARGET_HIGH_M, TARGET_LOW_M
 
 STEP_S = 0.05
+DOWN = Rotation.from_quat(QUAT_DOWN, scalar_first=True)
 LAG_S = 0.1
 """The target runs ahead of the tool by at most what the speed limit covers in this time, so that an arm that was held
 up does not shoot forward."""
+PENDING = 2
+"""Steps after which a turn is taken to be done."""
 START_OUTSIDE_M = 0.03
 """So far outside the workspace a run may begin; further out it is refused."""
 ESCAPED_M = 0.06
@@ -94,6 +99,7 @@ class Guard:
         self.low, self.high = np.array(cfg.workspace_low_m), np.array(cfg.workspace_high_m)
         self._last: np.ndarray | None = None
         self._is_pressing = False
+        self._turns: deque[np.ndarray] = deque(maxlen=PENDING)
 
     def check_start(self, reading: Reading) -> None:
         """Refuse to begin where the arm is.
@@ -132,7 +138,7 @@ class Guard:
                 f"the tool is {outside:.2f} m outside the workspace, at {_place(reading.tool_pos)}: something else moves"
                 " the arm, or its calibration is off",
             )
-        lean = _lean(reading)
+        lean = _from_down(_pointing(reading))
         if lean > cfg.max_tilt_rad + 0.15:
             raise LimitStop(
                 "tilt",
@@ -197,9 +203,15 @@ class Guard:
         if angle > farthest * (1 + 1e-9):
             turn = turn * (farthest / angle)
             acted.append("turn")
-        if _lean(reading) >= self.cfg.max_tilt_rad and np.abs(turn[:2]).max() > 1e-9:
+        # Where the tool will point once what was sent has been done, and with this turn.
+        axis = _pointing(reading)
+        for sent in self._turns:
+            axis = Rotation.from_rotvec(sent).apply(axis)
+        after = _from_down(Rotation.from_rotvec(turn).apply(axis))
+        if after > self.cfg.max_tilt_rad and after > _from_down(axis):
             turn = np.array([0.0, 0.0, turn[2]])
             acted.append("tilt")
+        self._turns.append(turn)
         return turn / self.scale.rotation_step_rad
 
     def _outside(self, reading: Reading) -> float:
@@ -244,15 +256,14 @@ class Watchdog:
                 return
 
 
-def _lean(reading: Reading) -> float:
-    """Return how far the gripper leans from straight down [rad], whatever its yaw."""
-    turn = reading.state[3:6]
-    angle = float(np.linalg.norm(turn))
-    if angle < 1e-9:
-        return 0.0
-    # The z axis turned about a unit axis by an angle, against itself: cos + (1 - cos) * axis_z^2.
-    upright = np.cos(angle) + (1 - np.cos(angle)) * (turn[2] / angle) ** 2
-    return float(np.arccos(np.clip(upright, -1.0, 1.0)))
+def _pointing(reading: Reading) -> Float[np.ndarray, "3"]:
+    """Return the direction in which the gripper points, in the world."""
+    return (DOWN * Rotation.from_rotvec(reading.state[3:6])).apply([0.0, 0.0, 1.0])
+
+
+def _from_down(axis: Float[np.ndarray, "3"]) -> float:
+    """Return the angle between a unit vector and straight down [rad]."""
+    return float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
 
 
 def _place(pos: np.ndarray) -> str:
