@@ -15,12 +15,16 @@ import socketserver
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
+from lerobot_policy_v2p.robot.simulated import SimulatedArm
 
 VERSION, LONGEST_LINE = 1, 65536
 STEP_S, DEADMAN_S, IDLE_S = 0.05, 0.25, 60.0
@@ -29,11 +33,8 @@ STEP_S, DEADMAN_S, IDLE_S = 0.05, 0.25, 60.0
 class Arm:
     """The simulated arm as a driver sees one: it moves towards a target and can be read."""
 
-    def __init__(self, task: Path, seed: int) -> None:
-        from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
-        from lerobot_policy_v2p.robot.simulated import SimulatedArm
-
-        self.arm = SimulatedArm(V2PFrankaConfig(task_folder=str(task), seed=seed))
+    def __init__(self, arm: SimulatedArm) -> None:
+        self.arm = arm
         self.goal: tuple[np.ndarray, Rotation, float] | None = None
         self.turned = self.rotation()
 
@@ -170,7 +171,7 @@ def main() -> int:
         "--lockstep", action="store_true", help="time passes only when a target comes"
     )
     args = parser.parse_args()
-    arm = Arm(args.task, args.seed)
+    arm = Arm(SimulatedArm(V2PFrankaConfig(task_folder=str(args.task), seed=args.seed)))
     arm.read()  # the first picture takes seconds
     with Server((args.host, args.port), Connection) as server:
         server.requests = queue.Queue()
@@ -181,10 +182,16 @@ def main() -> int:
     return 0
 
 
-def serve(arm: Arm, requests: "queue.Queue", *, lockstep: bool) -> None:
-    """Answer and move, in one thread, for ever."""
+def serve(
+    arm: Arm,
+    requests: "queue.Queue",
+    *,
+    lockstep: bool,
+    is_over: Callable[[], bool] = lambda: False,
+) -> None:
+    """Answer and move, in one thread."""
     due, told = time.monotonic() + STEP_S, time.monotonic()
-    while True:
+    while not is_over():
         try:
             line, replies = requests.get(timeout=max(0.0, due - time.monotonic()))
         except queue.Empty:

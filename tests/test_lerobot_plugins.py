@@ -366,8 +366,8 @@ def test_a_robot_that_lacks_something_says_what(task_folder, tmp_path):
 def test_targets_move_by_the_action_scale_and_stay_on_their_leashes():
     from scipy.spatial.transform import Rotation
 
-    from lerobot_policy_v2p.robot.targets import DOWN, ToolPose, next_target
     from v2p_data.sim.batch_env import SimConfig
+    from v2p_data.sim.targets import DOWN, ToolPose, next_target
 
     measured = ToolPose(pos=np.array([0.5, 0.0, 0.2]), rotation=DOWN, opening=1.0)
 

@@ -8,12 +8,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
-from lerobot_policy_v2p.robot.targets import ToolPose, next_target
 from v2p_data.deployment.protocol import Driver, Sample
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.sim.batch_env import SimConfig
+from v2p_data.sim.targets import ToolPose, next_target
 from v2p_data.twin.interface import RGB_PX
 
 

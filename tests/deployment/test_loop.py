@@ -76,7 +76,7 @@ def test_ctrl_c_ends_a_run_and_leaves_what_was_seen(blind_robot, restarted, stea
     recorder = Recorder("resting")
 
     def interrupt(reading, seen):
-        if blind_robot.arm.steps == 3:
+        if blind_robot.arm.steps == 4:
             signal.raise_signal(signal.SIGINT)
 
     outcome = run_of(
@@ -86,9 +86,9 @@ def test_ctrl_c_ends_a_run_and_leaves_what_was_seen(blind_robot, restarted, stea
     assert outcome.ending == "interrupted"
     assert (
         outcome.sentence
-        == "stopped by Ctrl-C, after 3 steps (0.1 s); the robot holds its position"
+        == "stopped by Ctrl-C, after 4 steps (0.2 s); the robot holds its position"
     )
-    assert len(recorder) == 3
+    assert len(recorder) == 4
 
 
 def test_a_policy_that_is_too_slow_is_refused_before_anything_moves(

@@ -1,7 +1,10 @@
 """The network driver: the example server in a process of its own, and servers that do not keep to the protocol."""
 
+import contextlib
+import importlib.util
 import json
 import os
+import queue
 import signal
 import socket
 import subprocess
@@ -154,7 +157,7 @@ def odd_driver():
 
         def serve() -> None:
             connection, _ = listening.accept()
-            with connection, connection.makefile("rb") as lines:
+            with contextlib.suppress(OSError), connection, connection.makefile("rb") as lines:
                 made.append(connection)
                 for line in lines:
                     if answer is None:
@@ -222,36 +225,58 @@ def test_an_address_that_is_none_and_one_where_nobody_is(odd_driver):
             Driver(address, 1.0)
 
 
-def test_a_driver_that_dies_ends_the_run_with_one_sentence(
-    task_folder, seeing_robot, restarted, click_on, steady, tmp_path
+def test_the_examples_arm_holds_when_targets_stop_coming(seeing_robot, restarted):
+    path = ROOT / "scripts" / "example_robot_server.py"
+    spec = importlib.util.spec_from_file_location("example_robot_server", path)
+    assert spec is not None
+    assert spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    restarted(seeing_robot)
+    arm, requests, heights = example.Arm(seeing_robot.arm), queue.Queue(), []
+    start = arm.read()
+    goal = {"v": 1, "id": 1, "do": "target", "quat_wxyz": start["quat_wxyz"], "opening": 1}
+    up = [start["pos_m"][0], start["pos_m"][1], start["pos_m"][2] + 0.2]
+    requests.put((json.dumps({**goal, "pos_m": up}).encode(), queue.Queue()))
+    until = time.monotonic() + 1.5
+
+    def is_over():
+        heights.append((time.monotonic(), seeing_robot.arm.state()[2]))
+        return time.monotonic() > until
+
+    example.serve(arm, requests, lockstep=False, is_over=is_over)
+
+    rise = heights[-1][1] - heights[0][1]
+    assert 0.05 < rise < 0.19  # it went a quarter of a second of the way, and a lag
+    late = [height for moment, height in heights if moment > until - 0.4]
+    assert max(late) - min(late) < 0.002
+
+
+def test_a_driver_that_stops_answering_ends_the_run_with_one_sentence(
+    server, seeing_robot, restarted, click_on, steady, tmp_path
 ):
-    served = Served(task_folder)  # time passes by itself
-    robot = robot_at(served.address, tmp_path, timeout_s=5.0)
-    rig = Rig(robot)
-    first = rig.read()
-    Rig(robot).act(np.array([0, 0, 1.0, 0, 0, 0, 0]))
-    time.sleep(1.0)
-    held = [Rig(robot).read().tool_pos[2] for _ in range(2)]  # its own deadman has stopped it
-    assert held[0] > first.tool_pos[2] + 0.015
-    assert abs(held[1] - held[0]) < 0.003
-
-    def stop_then_kill(reading, seen):
-        if len(steps) == 4:
-            os.kill(served.process.pid, signal.SIGSTOP)
-        steps.append(reading)
-
-    steps: list = []
+    """The last test: it ends the server that all others talk to."""
+    robot = robot_at(server.address, tmp_path)
+    rig, steps = Rig(robot), []
     restarted(seeing_robot)
     sight = Sight(robot.calibration(), [click_on(seeing_robot)])
     robot.arm.driver.timeout_s = 1.0
     robot.arm.driver._socket.settimeout(1.0)
+
+    def freeze(reading, seen):
+        steps.append(reading)
+        if len(steps) == 5:
+            os.kill(server.process.pid, signal.SIGSTOP)
+
     outcome = Run(
         rig, sight, steady(0, 0, 0, 0, 0, 0, 0), Guard(PATIENT, rig.scale), LoopConfig(max_seconds=20.0, slow=True),
-        on_step=stop_then_kill,
+        on_step=freeze,
     ).go()  # fmt: skip
-    served.end()
+    server.end()
 
     assert outcome.ending == "robot"
     assert outcome.steps == 5
     assert "did not answer 'read' within 1 s" in outcome.sentence
     assert "\n" not in outcome.sentence
+    with pytest.raises(V2PError, match="no driver answers"):
+        Driver(server.address, 1.0)

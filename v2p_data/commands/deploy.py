@@ -101,8 +101,8 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
     policy = loaded_policy(args.policy, task, args.device)
     sight = None
     if reading.picture is not None:
-        clicks = _clicks(args, robot, reading)
-        sight = Sight(robot.calibration(), clicks, _tracker_maker(args))
+        clicks = _clicks(args, rig, reading)
+        sight = Sight(rig.camera(), clicks, _tracker_maker(args))
     elif args.click:
         raise V2PError("this robot segments by itself; leave --click away")
     num_labels = getattr(policy.loaded.policy.config, "num_labels", None)
@@ -252,7 +252,7 @@ def loaded_policy(folder: Path, task: str, device: str) -> Any:
     return actor
 
 
-def _clicks(args: Deploy, robot: Any, reading: Reading) -> Sequence[tuple[float, float]]:
+def _clicks(args: Deploy, rig: Rig, reading: Reading) -> Sequence[tuple[float, float]]:
     """Return a pixel per object, from the command line or from the page."""
     from v2p_data.deployment.click_page import ClickPage
     from v2p_data.deployment.robot import fingers_m
@@ -263,7 +263,7 @@ def _clicks(args: Deploy, robot: Any, reading: Reading) -> Sequence[tuple[float,
         return clicks_from(args.click)
     assert reading.picture is not None
     assert reading.joints_rad is not None
-    drawn = Silhouette(robot.calibration()).draw(reading.joints_rad, fingers_m(reading.opening))
+    drawn = Silhouette(rig.camera()).draw(reading.joints_rad, fingers_m(reading.opening))
     new_tracker, shown = _tracker_maker(args), reading.picture
     with ClickPage(
         shown, args.objects, lambda click: new_tracker().start(shown, click, drawn)

@@ -153,6 +153,24 @@ class Snapshot:
             return Snapshot.from_arrays(dict(arrays))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Followed:
+    """A moment of another simulator of the same scene, per world; see `BatchEnv.follow`."""
+
+    arm_qpos: Float[np.ndarray, "env 7"]
+    arm_qvel: Float[np.ndarray, "env 7"]
+    fingers: Float[np.ndarray, "env 2"]
+    """Travel of the fingers [m]."""
+    object_qpos: Float[np.ndarray, "env object 7"]
+    object_qvel: Float[np.ndarray, "env object 6"]
+    """Linear in the world frame, angular in the object's frame."""
+    touches: Float[np.ndarray, "env object 2"]
+    """1 where the left, right pad touches the object."""
+    target_pos: Float[np.ndarray, "env 3"]
+    target_quat: Float[np.ndarray, "env 4"]
+    target_finger: Float[np.ndarray, "env"]
+
+
 class BatchEnv:
     """Worlds of one task.
 
@@ -371,6 +389,22 @@ class BatchEnv:
         self._fill(slice(None), self._tool)
         return self._judge(torch.from_numpy(clipped.astype(np.float32).T))
 
+    def begin_following(self, moment: Followed) -> None:
+        """Take over the first moment of episodes of another simulator, in all worlds; `follow` goes on."""
+        self._steps[:] = 0
+        self._held[:] = 0
+        self._last_action[:] = 0
+        self._start_pose[:] = moment.object_qpos
+        self._take_over(moment)
+
+    def follow(self, moment: Followed, action: Float[np.ndarray, "env 7"]) -> StepResult:
+        """Take over the moment that an action led to in another simulator, and judge it as `step` does."""
+        clipped = np.clip(np.nan_to_num(action), -1.0, 1.0)
+        self._last_action[:] = clipped
+        self._steps += 1
+        self._take_over(moment)
+        return self._judge(torch.from_numpy(clipped.astype(np.float32)))
+
     def states(self) -> dict[str, torch.Tensor]:
         """Return the states that success is judged by, never to be given to task code: see `task_states`.
 
@@ -465,6 +499,18 @@ class BatchEnv:
         self._fill(slice(None), self._tool)
 
     # -- inside
+
+    def _take_over(self, moment: Followed) -> None:
+        self._qpos[:, self._robot.arm] = moment.arm_qpos
+        self._qvel[:, self._robot.arm_dofs] = moment.arm_qvel
+        self._qpos[:, self._robot.fingers] = moment.fingers
+        self._object_qpos[:], self._object_qvel[:] = moment.object_qpos, moment.object_qvel
+        self._touches[:] = moment.touches
+        self._target_pos[:], self._target_quat[:] = moment.target_pos, moment.target_quat
+        self._target_finger[:] = moment.target_finger
+        self._find_broken()
+        self._tool = self._tool_of(slice(None))
+        self._fill(slice(None), self._tool)
 
     def _bind(self, num_threads: int) -> None:
         model = self.world.model

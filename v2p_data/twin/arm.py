@@ -1,0 +1,98 @@
+"""The robot's side of an episode in the twin: states and actions of the dataset, and what the referee makes of it.
+
+The same `next_target` that drives a real arm moves the target; the state comes from joint readings. One action lasts
+50 ms. A success is one where the task's own success has held for 0.25 s and the independent referee agrees.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from v2p_data.sim.batch_env import SimConfig
+from v2p_data.sim.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW
+from v2p_data.sim.robot import FINGER_TRAVEL_M
+from v2p_data.sim.targets import ToolPose, next_target
+from v2p_data.task.task import TaskBundle
+from v2p_data.twin.control import tool_pose
+from v2p_data.twin.interface import RGB_PX
+from v2p_data.twin.parameters import TwinParameters
+from v2p_data.twin.robot import Measured, TwinRobot
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What one action led to; for judges only."""
+
+    is_held: bool
+    """The task's own success has held for 0.25 s."""
+    is_broken: bool
+    """The simulation broke down."""
+
+
+class TwinArm:
+    """One episode of a task in the twin.
+
+    Args:
+        bundle: the task.
+        parameters: of the twin; by default the nominal one.
+        size_px: width and height of pictures and labels.
+    """
+
+    def __init__(
+        self, bundle: TaskBundle, parameters: TwinParameters | None = None, size_px: int = RGB_PX
+    ) -> None:
+        self.robot = TwinRobot(bundle, parameters, size_px)
+        self.mirror = self.robot.mirror
+        cfg = self.mirror.env.cfg
+        self.cfg: SimConfig = replace(
+            cfg,
+            position_step_m=cfg.position_step_m * bundle.motion_scale,
+            position_leash_m=cfg.position_leash_m * bundle.motion_scale,
+        )
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Start the episode of a seed, with the gripper open and the target at the tool."""
+        self.robot.reset(seed)
+        self._measure()
+        self.target = replace(self.tool, opening=1.0)
+        self.robot.command(self.target)
+        self.mirror.begin(self.robot.world, self.robot.truth(), self.target)
+
+    @property
+    def measured(self) -> Measured:
+        """The last report of the joints and the gripper; pictures are taken with `picture`."""
+        return self._measured
+
+    def state(self) -> Float32[np.ndarray, "11"]:
+        """Return `observation.state`, within the bounds of the training environment's."""
+        state = np.clip(self.tool.state(self.target), STATE_LOW, STATE_HIGH)
+        return state.astype(np.float32)
+
+    def picture(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the rectified picture.
+
+        Raises:
+            V2PError: there is no OpenGL.
+        """
+        return self.robot.picture()
+
+    def act(self, action: Float[np.ndarray, "7"]) -> Outcome:
+        """Carry out one action in [-1, 1], then measure."""
+        self.target = next_target(self.target, self.tool, action, self.cfg, FINGER_TRAVEL_M)
+        self.robot.command(self.target)
+        self.robot.step(1 / CONTROL_HZ)
+        self._measure()
+        truth = self.robot.truth()
+        result = self.mirror.follow(truth, self.target, np.asarray(action, float))
+        is_broken = truth.is_broken or bool(result.terminated[0])
+        return Outcome(is_held=bool(result.held[0]) and not is_broken, is_broken=is_broken)
+
+    def close(self) -> None:
+        """Free the graphics memory."""
+        self.robot.close()
+
+    def _measure(self) -> None:
+        self._measured = self.robot.measure()
+        self.tool: ToolPose = tool_pose(self._measured.joints, self._measured.opening)

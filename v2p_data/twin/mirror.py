@@ -1,0 +1,136 @@
+"""The training simulator as a mirror of the twin: it draws the starts, and judges what really happened.
+
+No physics runs in it. After each control step the twin's truth is written into one of its worlds, so that experts see
+the states they know, the task's own success is asked, and the independent referee sees the course of the episode.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from v2p_data.errors import V2PError
+from v2p_data.sim import randomize
+from v2p_data.sim.batch_env import BatchEnv, Followed, SimConfig, StepResult, robot_of
+from v2p_data.sim.gym_env import stream_seed
+from v2p_data.sim.robot import FINGER_TRAVEL_M
+from v2p_data.sim.targets import ToolPose
+from v2p_data.sim.verdict import course_keys, referee_verdict
+from v2p_data.task.task import TaskBundle
+from v2p_data.twin.world import TwinWorld
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """How an episode begins in the training simulator."""
+
+    joints: Float[np.ndarray, "7"]
+    object_poses: Float[np.ndarray, "object 7"]
+    """Position [m] and `quat_wxyz` of each object."""
+    rest_height_m: Float[np.ndarray, "object"]
+    """Of each object's centre at rest on the table, at the size that it has in the training simulator."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """A moment of the twin as only its simulator knows it, world frame; for the referee and for experts."""
+
+    joints: Float[np.ndarray, "7"]
+    joint_speeds: Float[np.ndarray, "7"]
+    fingers: Float[np.ndarray, "2"]
+    """Travel of each finger [m]."""
+    object_poses: Float[np.ndarray, "object 7"]
+    object_speeds: Float[np.ndarray, "object 6"]
+    """Linear in the world frame, angular in the object's frame."""
+    touches: Float[np.ndarray, "object 2"]
+    """1 where the left, right pad touches the object."""
+    deepest_m: float
+    """Deepest penetration of any contact."""
+    is_broken: bool
+    """The simulation broke down."""
+
+
+class Mirror:
+    """One world of the training simulator that follows the twin.
+
+    Args:
+        bundle: the task.
+
+    Raises:
+        V2PError: the task is made for another arm than the built-in one.
+        ItemRejectedError: the task cannot be simulated.
+    """
+
+    def __init__(self, bundle: TaskBundle) -> None:
+        sim = SimConfig(fine=True, randomization=randomize.recording())
+        robot = robot_of(bundle, sim)
+        if robot.path:
+            raise V2PError(
+                f"task '{bundle.title}' is made for the arm in {robot.path}; the twin is a Franka arm with a parallel "
+                "gripper, so make the task again without --robot.path"
+            )
+        self.bundle = bundle
+        self.env = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
+        self.moments: list[dict[str, np.ndarray]] = []
+
+    def start(self, seed: int) -> Start:
+        """Return how the episode of `V2PEnv.reset(seed=seed)` begins."""
+        self.env.reset_seeded(np.array([0]), [stream_seed(seed)])
+        seen = self.env.snapshot(np.array([0])).qpos[0]
+        robot, first = self.env.world.robot, self.env.world.objects[0].qpos_adr
+        count = len(self.env.world.objects)
+        drawn = self.env.randomizer.per_world_arrays()
+        return Start(
+            rest_height_m=drawn["height_above_table"][0].copy(),
+            joints=seen[robot.arm].copy(),
+            object_poses=seen[first : first + 7 * count].reshape(count, 7).copy(),
+        )
+
+    def begin(self, world: TwinWorld, truth: Truth, target: ToolPose) -> None:
+        """Take over the first moment of an episode."""
+        self.env.randomizer.size_m[0] = world.size_m
+        self.env.begin_following(_followed(truth, target))
+        self.moments = []
+        self._note()
+
+    def follow(self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]) -> StepResult:
+        """Take over the moment that an action led to, and say what the task's own success says of it."""
+        result = self.env.follow(_followed(truth, target), action[None])
+        self._note()
+        return result
+
+    def course(self) -> dict[str, np.ndarray]:
+        """Return the episode so far, per key of the task interface's `states` an array `(time, 1, ...)`."""
+        return {key: np.stack([m[key] for m in self.moments]) for key in self.moments[0]}
+
+    def verdict(self) -> bool:
+        """Return whether the independent referee calls the episode so far a success."""
+        return bool(referee_verdict(self.bundle, self.course())[0])
+
+    def _note(self) -> None:
+        states = self.env.states()
+        self.moments.append(
+            {key: states[key].numpy().astype(float) for key in course_keys(self.env)}
+        )
+
+
+def _followed(truth: Truth, target: ToolPose) -> Followed:
+    quat = target.rotation.as_quat(scalar_first=True)
+    return Followed(
+        arm_qpos=truth.joints[None],
+        arm_qvel=truth.joint_speeds[None],
+        fingers=truth.fingers[None],
+        object_qpos=truth.object_poses[None],
+        object_qvel=truth.object_speeds[None],
+        touches=truth.touches[None],
+        target_pos=target.pos[None],
+        target_quat=quat[None],
+        target_finger=np.array([target.opening * FINGER_TRAVEL_M]),
+    )
+
+
+def placed(start: Start, world: TwinWorld) -> Float[np.ndarray, "object 7"]:
+    """Return a start's poses for the twin: other heights only, for other sizes and another table."""
+    poses = start.object_poses.copy()
+    poses[:, 2] += world.rest_height_m - start.rest_height_m
+    return poses
