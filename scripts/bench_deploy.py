@@ -30,7 +30,7 @@ from v2p_data.sim.gym_env import CONTROL_HZ
 from v2p_data.sim.masks import FIRST_OBJECT, ROBOT, rgb_to_labels
 from v2p_data.task.task import TaskBundle
 
-PATIENT = LimitsConfig(max_silence_ms=60_000.0)
+PATIENCE_MS = 60_000.0
 """A simulated arm waits, however busy the machine is."""
 
 
@@ -85,8 +85,10 @@ def main() -> None:
     parser.add_argument("--tasks", type=Path, nargs="+", required=True)
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=10_000)
+    parser.add_argument("--max-force-n", type=float, default=LimitsConfig.max_force_n)
     parser.add_argument("--out", type=Path, help="where all numbers go, as JSON")
     args = parser.parse_args()
+    limits = LimitsConfig(max_silence_ms=PATIENCE_MS, max_force_n=args.max_force_n)
     results: dict[str, Any] = {}
     for folder in args.tasks:
         bundle = TaskBundle.load(folder)
@@ -94,7 +96,7 @@ def main() -> None:
         measured = Measured()
         for seed in range(args.first_seed, args.first_seed + args.episodes):
             for pictures in ("rgb", "mask"):
-                episode(folder, bundle, seed, pictures, policy, measured)
+                episode(folder, bundle, seed, pictures, policy, measured, limits)
             done = len(measured.true)
             print(f"{bundle.title} {done}: tracked {sum(measured.tracked)}, true {sum(measured.true)}, {measured.endings[-1]}", flush=True)  # fmt: skip
         results[bundle.title] = asdict(measured)
@@ -104,7 +106,13 @@ def main() -> None:
 
 
 def episode(
-    folder: Path, bundle: TaskBundle, seed: int, pictures: str, policy: TimedPolicy, into: Measured
+    folder: Path,
+    bundle: TaskBundle,
+    seed: int,
+    pictures: str,
+    policy: TimedPolicy,
+    into: Measured,
+    limits: LimitsConfig,
 ) -> None:
     """Play one episode, from tracked masks (`rgb`) or true ones (`mask`)."""
     robot = V2PFranka(V2PFrankaConfig(task_folder=str(folder), seed=seed, pictures=pictures))  # type: ignore[arg-type]
@@ -136,7 +144,7 @@ def episode(
     policy.reset(1)
     cfg = LoopConfig(max_seconds=bundle.policy_steps() / CONTROL_HZ, slow=True)
     run = Run(
-        rig, sight, policy, Guard(PATIENT, rig.scale), cfg,
+        rig, sight, policy, Guard(limits, rig.scale), cfg,
         is_done=lambda: robot.has_succeeded, on_step=compare if sight else lambda reading, seen: None,
     )  # fmt: skip
     try:

@@ -260,8 +260,8 @@ def test_a_driver_that_stops_answering_ends_the_run_with_one_sentence(
     rig, steps = Rig(robot), []
     restarted(seeing_robot)
     sight = Sight(robot.calibration(), [click_on(seeing_robot)])
-    robot.arm.driver.timeout_s = 1.0
-    robot.arm.driver._socket.settimeout(1.0)
+    robot.arm.driver.timeout_s = 4.0
+    robot.arm.driver._socket.settimeout(4.0)
 
     def freeze(reading, seen):
         steps.append(reading)
@@ -276,7 +276,7 @@ def test_a_driver_that_stops_answering_ends_the_run_with_one_sentence(
 
     assert outcome.ending == "robot"
     assert outcome.steps == 5
-    assert "did not answer 'read' within 1 s" in outcome.sentence
+    assert "did not answer 'read' within 4 s" in outcome.sentence
     assert "\n" not in outcome.sentence
     with pytest.raises(V2PError, match="no driver answers"):
         Driver(server.address, 1.0)
