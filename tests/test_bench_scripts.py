@@ -50,3 +50,26 @@ def test_the_episodes_benchmark_finds_every_pixel_equal_and_ends_with_its_ratio(
     )
     assert found is not None
     assert float(found[1]) > 0
+
+
+@pytest.mark.slow
+def test_the_twins_benchmark_pairs_its_episodes_and_ends_with_the_drop(tmp_path):
+    from dataclasses import replace
+
+    from v2p_data.task.benchmark import load_benchmark
+
+    bundle = load_benchmark("lift_up")
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    bundle.scene.save(scene)
+    replace(bundle, scene=replace(bundle.scene, folder=scene)).save(tmp_path / "task")
+    tiny = ["--who=programs", "--episodes=2", "--workers=2", "--no-at-end"]
+    command = [sys.executable, "scripts/bench_twin.py", str(tmp_path / "task"), *tiny]
+
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+
+    assert done.stdout.startswith("sim-to-sim: ")
+    pairs = re.search(r"both (\d), twin only (\d), .* only (\d), neither (\d)", done.stdout)
+    assert pairs is not None
+    assert sum(map(int, pairs.groups())) == 2
+    assert re.fullmatch(r"sim_to_sim_drop: -?\d\.\d+", done.stdout.splitlines()[-1])

@@ -363,6 +363,53 @@ def test_a_robot_that_lacks_something_says_what(task_folder, tmp_path):
         V2PFranka(real).connect()
 
 
+def test_the_twin_is_a_lerobot_robot_that_gives_what_a_real_arm_gives(task_folder, tmp_path):
+    from lerobot.robots import make_robot_from_config
+
+    from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
+    from v2p_data.twin.interface import RobotWithCamera
+
+    robot = make_robot_from_config(
+        V2PTwinConfig(task_folder=str(task_folder), calibration_dir=tmp_path)
+    )
+    assert isinstance(robot, RobotWithCamera)
+    with pytest.raises(V2PError, match="connect"):
+        robot.send_action(dict.fromkeys(ACTION_NAMES, 0.0))
+
+    robot.connect()
+    try:
+        before = robot.get_observation()
+    except V2PError as error:
+        pytest.skip(str(error))  # no OpenGL
+    sent = [robot.send_action(dict.fromkeys(ACTION_NAMES, 0.0) | {"delta_z.pos": 7.0})]
+    sent += [robot.send_action(sent[0]) for _ in range(5)]
+    after = robot.get_observation()
+    camera, joints = robot.calibrated_camera(), robot.joints()
+    robot.disconnect()
+
+    assert [*robot.observation_features] == [*STATE_NAMES, "rgb"] == [*before]
+    assert [*robot.action_features] == ACTION_NAMES
+    assert sent[0]["delta_z.pos"] == 1.0
+    assert after["eef_z.pos"] > before["eef_z.pos"] + 0.02
+    assert after["rgb"].shape == robot.observation_features["rgb"]
+    assert (camera.width_px, camera.K.shape, camera.T_world_cam.shape) == (256, (3, 3), (4, 4))
+    assert joints.shape == (7,)
+    assert not robot.is_connected
+
+
+def test_a_twin_without_a_task_or_with_an_unknown_number_says_so(task_folder, tmp_path):
+    from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
+    from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
+
+    with pytest.raises(ValueError, match="task_folder"):
+        V2PTwinConfig()
+    odd = V2PTwinConfig(
+        task_folder=str(task_folder), change={"latency": 1.0}, calibration_dir=tmp_path
+    )
+    with pytest.raises(V2PError, match="command_latency_s"):
+        V2PTwin(odd).connect()
+
+
 def test_targets_move_by_the_action_scale_and_stay_on_their_leashes():
     from scipy.spatial.transform import Rotation
 

@@ -96,7 +96,7 @@ class V2PTwin(Robot):
             logger.info("task '%s' succeeded in the twin after %d steps", title, self._steps)
         return dict(zip(ACTION_NAMES, clipped.tolist(), strict=True))
 
-    def calibration(self) -> Camera:
+    def calibrated_camera(self) -> Camera:
         """Return the camera of `rgb` as calibrated, in the arm's base frame."""
         return self._connected().robot.calibration()
 

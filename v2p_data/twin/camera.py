@@ -6,6 +6,9 @@ lens and pose. What remains are calibration errors and where the camera really s
 plus one half; OpenCV counts from centres, so maps are shifted by one half.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# mujoco's classes come from a compiled module that declares none of them.
+
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -53,7 +56,7 @@ class Lens:
     def undistort(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """Return rays through raw pixels, with z = 1."""
         points = cv2.undistortPointsIter(
-            np.ascontiguousarray(pixels[:, None]), self.K, self.coefficients, None, None,
+            np.ascontiguousarray(pixels[:, None]), self.K, self.coefficients, np.eye(3), np.eye(3),
             (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-9),
         )  # fmt: skip
         return np.concatenate([points[:, 0], np.ones((len(pixels), 1))], axis=1)
@@ -209,7 +212,9 @@ class TwinCamera:
         """
         p = self.optics.parameters
         ideal = self._drawer.draw_rgb(Posture(qpos=qpos), 0)
-        seen = cv2.remap(ideal, *self.optics.raw_map, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        seen = cv2.remap(
+            ideal, *self.optics.raw_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         light = cv2.GaussianBlur(seen, (0, 0), p.blur_px).astype(np.float32)
         light *= self._gain * self._exposure
         row, column = self._rng.integers(0, 64, 2)
@@ -221,7 +226,8 @@ class TwinCamera:
         grey = np.clip(light + 0.5, 0, 255).astype(np.uint8)
         quality = [cv2.IMWRITE_JPEG_QUALITY, round(p.jpeg_quality)]
         coded = cv2.imencode(".jpg", grey[..., ::-1], quality)[1]
-        return np.ascontiguousarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)[..., ::-1])
+        decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))
+        return np.ascontiguousarray(decoded[..., ::-1])
 
     def labels(self, qpos: Float[np.ndarray, "q"]) -> UInt8[np.ndarray, "h w"]:
         """Return the true labels of the rectified picture's pixels, as `sim.masks` has them; needs no OpenGL."""
