@@ -138,7 +138,7 @@ def episode(
             tuple(points_inside(before[0] == FIRST_OBJECT + k, 1)[0])
             for k in range(len(bundle.scene.objects))
         ]
-        sight = TimedSight(robot.calibration(), clicks)
+        sight = TimedSight(robot.calibrated_camera(), clicks)
         sight.took = into.see_ms
     policy.took = into.decide_ms
     policy.reset(1)

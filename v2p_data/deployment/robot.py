@@ -13,7 +13,6 @@ from jaxtyping import Float, UInt8
 
 from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
-from v2p_data.geometry.camera import Camera
 from v2p_data.sim.batch_env import SimConfig
 from v2p_data.sim.masks import rgb_to_labels
 from v2p_data.sim.robot import FINGER_TRAVEL_M
@@ -70,13 +69,6 @@ class Rig:
     def __init__(self, robot: RobotWithCamera) -> None:
         self.robot = robot
         self.scale: ActionScale = getattr(robot, "action_scale", ActionScale())
-
-    def camera(self) -> Camera:
-        """Return the camera of the pictures.
-
-        LeRobot's base class gives every robot a dict called `calibration`, which would hide the method.
-        """
-        return type(self.robot).calibration(self.robot)
 
     def read(self) -> Reading:
         """Return what the robot says now.
