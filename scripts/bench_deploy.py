@@ -2,21 +2,24 @@
 
     python scripts/bench_deploy.py --policy POLICY --tasks TASK [TASK ...] --episodes 20
 
-The arm is the simulated one and gives what a real one gives: a colour picture, joint angles, force. True masks are looked at
+The arm is the simulated one, or its twin in another simulator, and gives what a real one gives: a colour picture, joint angles, force. True masks are looked at
 only to choose the clicked pixel, as a person would, and to measure. Both runs of an episode pass the same limits.
 """
 
 import argparse
 import json
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
+from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
+from lerobot_policy_v2p.robot.simulated import SimulatedArm
 from lerobot_policy_v2p.robot.v2p_franka import V2PFranka
+from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
 from policies.evaluation.rate import wilson
 from v2p_data.commands.deploy import loaded_policy
 from v2p_data.deployment.limits import Guard, LimitsConfig
@@ -85,6 +88,7 @@ def main() -> None:
     parser.add_argument("--tasks", type=Path, nargs="+", required=True)
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=10_000)
+    parser.add_argument("--robot", choices=("sim", "twin"), default="sim")
     parser.add_argument("--max-force-n", type=float, default=LimitsConfig.max_force_n)
     parser.add_argument("--out", type=Path, help="where all numbers go, as JSON")
     args = parser.parse_args()
@@ -95,65 +99,90 @@ def main() -> None:
         policy = TimedPolicy(loaded_policy(args.policy, bundle.description, "cpu"))
         measured = Measured()
         for seed in range(args.first_seed, args.first_seed + args.episodes):
-            for pictures in ("rgb", "mask"):
-                episode(folder, bundle, seed, pictures, policy, measured, limits)
-            done = len(measured.true)
-            print(f"{bundle.title} {done}: tracked {sum(measured.tracked)}, true {sum(measured.true)}, {measured.endings[-1]}", flush=True)  # fmt: skip
+            for tracked in (True, False):
+                robot = robot_in(args.robot, folder, seed)
+                episode(robot, bundle, policy, limits, measured, tracked=tracked)
+                robot.disconnect()
+            told = f"tracked {sum(measured.tracked)}, true {sum(measured.true)}, {measured.endings[-1]}"
+            print(f"{bundle.title} {len(measured.true)}: {told}", flush=True)
         results[bundle.title] = asdict(measured)
         print(summary(bundle.title, measured), flush=True)
     if args.out:
         args.out.write_text(json.dumps(results))
 
 
-def episode(
-    folder: Path,
-    bundle: TaskBundle,
-    seed: int,
-    pictures: str,
-    policy: TimedPolicy,
-    into: Measured,
-    limits: LimitsConfig,
-) -> None:
-    """Play one episode, from tracked masks (`rgb`) or true ones (`mask`)."""
-    robot = V2PFranka(V2PFrankaConfig(task_folder=str(folder), seed=seed, pictures=pictures))  # type: ignore[arg-type]
+class Noted(Rig):
+    """Keeps the true labels of each reading's moment."""
+
+    true: np.ndarray
+
+    def read(self) -> Reading:
+        reading = super().read()
+        self.true = true_labels(self.robot)
+        return reading
+
+
+class TrueRig(Noted):
+    """Gives the true labels in the picture's place."""
+
+    def read(self) -> Reading:
+        return replace(super().read(), picture=None, labels=self.true)
+
+
+def robot_in(kind: str, folder: Path, seed: int) -> Any:
+    """Return a connected robot before an episode."""
+    robot = (
+        V2PFranka(V2PFrankaConfig(task_folder=str(folder), seed=seed, pictures="rgb"))
+        if kind == "sim"
+        else V2PTwin(V2PTwinConfig(task_folder=str(folder), seed=seed))
+    )
     robot.connect()
+    return robot
+
+
+def true_labels(robot: Any) -> np.ndarray:
+    """Return the simulator's own labels of what the camera sees."""
+    if isinstance(robot, V2PFranka):
+        assert isinstance(robot.arm, SimulatedArm)
+        return rgb_to_labels(robot.arm.mask())
+    return robot.arm.robot.true_labels()
+
+
+def episode(
+    robot: Any, bundle: TaskBundle, policy: TimedPolicy, limits: LimitsConfig, into: Measured, *, tracked: bool
+) -> None:  # fmt: skip
+    """Play one episode, from tracked masks or from true ones."""
+    rig = Noted(robot) if tracked else TrueRig(robot)
     sight = None
-
-    def compare(reading: Reading, seen: Seen) -> None:
-        # The picture was taken before the action, so the labels of that moment are those kept then.
-        for k in range(len(sight.clicks_px) if sight else 0):
-            into.object_iou.append(iou(seen.labels == FIRST_OBJECT + k, before[0] == FIRST_OBJECT + k))  # fmt: skip
-        into.robot_iou.append(iou(seen.labels == ROBOT, before[0] == ROBOT))
-
-    before = [rgb_to_labels(robot.arm.mask())]  # type: ignore[union-attr]
-
-    class Noted(Rig):
-        def read(self) -> Reading:
-            before[0] = rgb_to_labels(robot.arm.mask())  # type: ignore[union-attr]
-            return super().read()
-
-    rig = Noted(robot)
-    if pictures == "rgb":
-        clicks = [
-            tuple(points_inside(before[0] == FIRST_OBJECT + k, 1)[0])
+    if tracked:
+        rig.read()
+        spots = [
+            points_inside(rig.true == FIRST_OBJECT + k, 1)[0]
             for k in range(len(bundle.scene.objects))
         ]
+        clicks = [(float(u), float(v)) for u, v in spots]
         sight = TimedSight(robot.calibrated_camera(), clicks)
         sight.took = into.see_ms
+
+    def compare(reading: Reading, seen: Seen) -> None:
+        if tracked:
+            for label in range(FIRST_OBJECT, FIRST_OBJECT + len(bundle.scene.objects)):
+                into.object_iou.append(iou(seen.labels == label, rig.true == label))
+            into.robot_iou.append(iou(seen.labels == ROBOT, rig.true == ROBOT))
+
     policy.took = into.decide_ms
     policy.reset(1)
     cfg = LoopConfig(max_seconds=bundle.policy_steps() / CONTROL_HZ, slow=True)
     run = Run(
         rig, sight, policy, Guard(limits, rig.scale), cfg,
-        is_done=lambda: robot.has_succeeded, on_step=compare if sight else lambda reading, seen: None,
+        is_done=lambda: robot.has_succeeded, on_step=compare,
     )  # fmt: skip
     try:
         outcome = run.go()
     except V2PError as error:
         outcome = Outcome(ending="robot", sentence=str(error))
-    robot.disconnect()
-    (into.tracked if sight else into.true).append(outcome.ending == "done")
-    if sight:
+    (into.tracked if tracked else into.true).append(outcome.ending == "done")
+    if tracked:
         into.endings.append(outcome.ending if outcome.ending in ("done", "time") else outcome.sentence)  # fmt: skip
         into.work_ms += outcome.work_ms
 
