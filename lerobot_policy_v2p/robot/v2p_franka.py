@@ -142,7 +142,7 @@ class V2PFranka(Robot):
         """
         arm = self._connected()
         self._state = arm.state()
-        state = dict(zip(STATE_NAMES, self._state.tolist(), strict=True))
+        state: dict[str, Any] = dict(zip(STATE_NAMES, self._state.tolist(), strict=True))
         if self.config.pictures == "rgb":
             return {**state, RGB_NAME: self._seeing().picture()}
         if self._sight is None:

@@ -84,7 +84,9 @@ def read_facts(policy: Path) -> Facts:
         said = _json(path)
         lists = ("state", "action", "palette")
         try:
-            fields = {k: tuple(v) if k in lists else v for k, v in said.items() if k != "schema"}
+            fields: dict[str, Any] = {
+                k: tuple(v) if k in lists else v for k, v in said.items() if k != "schema"
+            }
             return Facts(**fields)
         except TypeError as error:
             raise V2PError(
