@@ -23,6 +23,18 @@ BELOW: dict[str, set[str]] = {
     # The second simulator shares scenes, states and judges with the first one, which knows nothing of it.
     "twin": {"evaluation", "episodes", "sim", "task", "scene", "geometry", "errors", "seeds"},
     "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds"},
+    # It sees the arm that policies were trained with, and what a robot is; never the twin's inside.
+    "deployment": {
+        "twin",
+        "episodes",
+        "sim",
+        "task",
+        "scene",
+        "geometry",
+        "pipeline",
+        "errors",
+        "seeds",
+    },
     "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
 }
 TOP = {

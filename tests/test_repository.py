@@ -52,11 +52,11 @@ def test_every_v2p_command_in_the_readme_exists():
 )
 def test_every_v2p_command_in_readme_and_docs_parses(page):
     from v2p_data.cli import parse
-    from v2p_data.commands import camera, edit, review, reward, run, share, show, task
+    from v2p_data.commands import camera, deploy, edit, review, reward, run, share, show, task
 
     kinds = {
         "generate": run.Generate, "train": run.Train, "eval": run.Evaluate, "demo": run.Demo,
-        "distill": run.Distill,
+        "distill": run.Distill, "deploy": deploy.Deploy,
         "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
         "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify,
         "status": show.Shown, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.Review,
@@ -67,7 +67,8 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
     for words in map(shlex.split, shown_commands(page)):
         if words[0] == "v2p":
             name = " ".join(words[1:3]) if " ".join(words[1:3]) in SUBCOMMANDS else words[1]
-            parse(kinds[name], words[1 + len(name.split()) :], name)
+            rest = words[1 + len(name.split()) :]
+            parse(kinds[name], deploy.robot_settings(rest)[1] if name == "deploy" else rest, name)
 
 
 def test_links_between_our_pages_lead_somewhere():

@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "distill": ("run", "a student acts, the experts label and take over: more episodes"),
     "train": ("run", "a dataset becomes a policy, by distillation where its experts are at hand"),
     "eval": ("run", "roll a policy out on tasks, seen and unseen, and give rates with intervals"),
+    "deploy": ("deploy", "run a policy on a robot, from one click per object, within limits"),
     "push": ("share", "push a dataset, a policy or tasks (--envhub) to the Hub"),
     "scene": ("run", "videos -> scenes only: objects, meshes, sizes, poses"),
     "task": ("run", "up to the task code and its audit"),

@@ -161,6 +161,7 @@ def make_policy(
 ) -> dict[str, Any]:
     """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
     from policies.bc.trainer import TrainerConfig, write_train_config
+    from v2p_data.deployment.facts import write_facts
     from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
 
     demand_whole_sources(dataset, sources, runtime.root)
@@ -195,6 +196,7 @@ def make_policy(
     is_own = dataset.is_relative_to(runtime.root.resolve())
     place = dataset.relative_to(runtime.root.resolve()) if is_own else Path(dataset.name)
     write_train_config(out / POLICY_FOLDER, student.policy, place, repo_id, recipe, seed)
+    write_facts(out / POLICY_FOLDER, dataset)
     return {
         "steps": steps,
         "samples": steps * policy.batch_size,

@@ -1,11 +1,14 @@
 """Settings of the robot type `v2p_franka`. LeRobot parses this config, hence it is not frozen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from lerobot.robots import RobotConfig
 
-Backend = Literal["sim", "franky"]
+from v2p_data.deployment.limits import LimitsConfig
+
+Backend = Literal["sim", "network", "franky"]
+Pictures = Literal["mask", "rgb"]
 
 
 @RobotConfig.register_subclass("v2p_franka")
@@ -14,12 +17,25 @@ class V2PFrankaConfig(RobotConfig):
     """A Franka arm with a parallel gripper, real or simulated."""
 
     backend: Backend = "sim"
-    """`sim` simulates a task; `franky` drives a real arm through the library franky and has never been run by us."""
+    """`sim` simulates a task; `network` talks to a driver of yours by the protocol of docs/deploy.md; `franky` drives a
+    real arm through the library franky and has never been run by us."""
+    pictures: Pictures = "mask"
+    """What an observation holds: `mask` for policies, `rgb` for `v2p deploy`, which makes the masks itself."""
+    clicks: str = ""
+    """`mask` only: pixels of the objects in order, `120,80 60,200`. The masks are then tracked in the colour pictures from
+    these pixels on. Needed by `network`; without clicks `sim` and `franky` give masks of their own."""
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
+    """`network` and `franky`: what `send_action` lets through. `v2p deploy` has limits of its own instead."""
 
     task_folder: str = ""
     """`sim`: the task to simulate, as `v2p task` writes it."""
     seed: int = 0
     """`sim`: which episode starts."""
+
+    address: str = ""
+    """`network`: HOST:PORT of the driver."""
+    timeout_s: float = 0.5
+    """`network`: a driver that does not answer for so long counts as gone."""
 
     ip: str = ""
     """`franky`: address of the robot's control interface."""
@@ -37,11 +53,25 @@ class V2PFrankaConfig(RobotConfig):
         super().__post_init__()
         if self.backend == "sim" and not self.task_folder:
             raise ValueError("the simulated robot needs a task: --robot.task_folder=FOLDER")
+        if self.backend == "network" and not self.address:
+            raise ValueError("the network driver needs --robot.address=HOST:PORT")
+        if self.backend == "network" and self.pictures == "mask" and not self.clicks:
+            raise ValueError(
+                "the network driver gives colour pictures; say what to track with --robot.clicks='120,80', the"
+                " object's pixel, or use 'v2p deploy', which asks for the click"
+            )
         if self.backend == "franky" and not (self.ip and self.masks):
             raise ValueError(
                 "the real robot needs --robot.ip=ADDRESS and --robot.masks=package.module:name, because the policy"
                 " sees masks and not pictures"
             )
+        if self.backend == "franky" and (self.pictures == "rgb" or self.clicks):
+            raise ValueError(
+                "the backend 'franky' gives masks only; leave --robot.pictures and --robot.clicks away, or put the arm"
+                " behind the network protocol of docs/deploy.md"
+            )
+        if not self.timeout_s > 0:
+            raise ValueError(f"timeout_s is {self.timeout_s}; it must be above 0")
         if not 0 < self.relative_dynamics <= 1:
             raise ValueError(
                 f"relative_dynamics is {self.relative_dynamics}; it lies between 0 and 1"

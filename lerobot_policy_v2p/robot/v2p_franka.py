@@ -1,144 +1,83 @@
 """The robot type `v2p_franka`: the dataset's state and action names on a simulated or a real Franka arm.
 
-The simulated arm runs the very environment that policies are evaluated in. The real one uses the library
-`franky` (pip install franky-control); that code follows its documentation and HAS NEVER BEEN RUN: no arm was
-at hand. Try it slowly, with the stop button in your hand. Run with `lerobot-rollout`, always with
-`--return_to_initial_position=false`: actions are displacements, so positions must not be played back as actions.
+The simulated arm runs the very environment that policies are evaluated in. A real one stands behind a driver that speaks
+the protocol of docs/deploy.md (`network`), or is driven by the library `franky` (pip install franky-control); the code for
+`franky` follows its documentation and HAS NEVER BEEN RUN: no arm was at hand. Try it slowly, with the stop button in your
+hand. Run with `v2p deploy`, or with `lerobot-rollout`, always with `--return_to_initial_position=false`: actions are
+displacements, so positions must not be played back as actions.
 """
 
-import importlib
-import logging
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 from lerobot.robots import Robot
-from scipy.spatial.transform import Rotation
 
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
+from lerobot_policy_v2p.robot.franky import FrankyArm
+from lerobot_policy_v2p.robot.network import NetworkArm
+from lerobot_policy_v2p.robot.simulated import SimulatedArm
+from v2p_data.deployment.limits import Guard
+from v2p_data.deployment.robot import MASK_NAME, ActionScale, Rig
+from v2p_data.deployment.sight import LOST_AFTER, Sight, clicks_from
 from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.gym_env import V2PEnv
+from v2p_data.geometry.camera import Camera
 from v2p_data.sim.masks import labels_to_rgb
-from v2p_data.sim.targets import ToolPose, next_target
-
-logger = logging.getLogger(__name__)
+from v2p_data.twin.interface import RGB_NAME, RGB_PX
 
 MASK_PX = 256
-GRIPPER_TOLERANCE = 0.05
-"""The real gripper takes a new command when the wanted opening has changed by this share of its width."""
 
 
 class Arm(Protocol):
     """What stands behind the robot."""
 
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return `observation.state` and the mask as greys, h x w x 3 uint8."""
+    action_scale: ActionScale
+
+    def state(self) -> Float[np.ndarray, "11"]:
+        """Ask the arm and return `observation.state`; what follows belongs to the same moment."""
         ...
 
-    def act(self, action: np.ndarray) -> None:
-        """Carry out one action in [-1, 1]."""
+    def mask(self) -> np.ndarray:
+        """Return the label greys, h x w x 3 uint8, of an arm that segments by itself."""
+        ...
+
+    def act(self, action: np.ndarray) -> np.ndarray:
+        """Carry out one action in [-1, 1] and return it as carried out."""
+        ...
+
+    def hold(self) -> None:
+        """Stay there, at once; safe to call while another call waits."""
         ...
 
     def close(self) -> None: ...
 
 
-class SimulatedArm:
-    """One episode of a task."""
+@runtime_checkable
+class SeeingArm(Arm, Protocol):
+    """An arm with a calibrated camera."""
 
-    def __init__(self, config: V2PFrankaConfig) -> None:
-        self.env = V2PEnv(config.task_folder)
-        self.seen, _ = self.env.reset(seed=config.seed)
-        self.steps = 0
-        self.ended = False
+    def picture(self) -> np.ndarray: ...
 
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.seen["agent_pos"], self.seen["pixels"]["mask"]
+    def calibration(self) -> Camera: ...
 
-    def act(self, action: np.ndarray) -> None:
-        self.seen, _, terminated, truncated, info = self.env.step(action)
-        self.steps += 1
-        if (terminated or truncated) and not self.ended:
-            self.ended = True
-            outcome = "succeeded" if info["is_success"] else "ended without success"
-            logger.info("task '%s' %s after %d steps", self.env.task, outcome, self.steps)
+    def joints(self) -> Float[np.ndarray, "7"]: ...
 
-    def close(self) -> None:
-        self.env.close()
+    def opening(self) -> float: ...
+
+    def force_n(self) -> float | None: ...
 
 
-class FrankyArm:
-    """A real arm. Never run by us; see the module's first lines."""
-
-    def __init__(self, config: V2PFrankaConfig) -> None:
-        try:
-            franky = importlib.import_module("franky")
-        except ImportError as error:
-            raise V2PError(
-                "the backend 'franky' needs the library of that name: pip install franky-control"
-            ) from error
-        self.config = config
-        self.cfg = SimConfig()
-        self.labels = _function_named(config.masks)
-        self.franky = franky
-        self.robot = franky.Robot(config.ip)
-        self.robot.relative_dynamics_factor = config.relative_dynamics
-        self.robot.recover_from_errors()
-        self.gripper = franky.Gripper(config.ip)
-        self.max_width_m = float(self.gripper.max_width)
-        self.target = self._measure()
-        self.sent_opening = self.target.opening
-        self.pending: Any = None
-
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._measure().state(self.target), labels_to_rgb(
-            np.asarray(self.labels(), np.uint8)
-        )
-
-    def act(self, action: np.ndarray) -> None:
-        self.target = next_target(
-            self.target, self._measure(), action, self.cfg, self.max_width_m / 2
-        )
-        flange = self.target.pos - self.target.rotation.apply([0, 0, self.config.tool_offset_m])
-        goal = self.franky.Affine(flange.tolist(), self.target.rotation.as_quat().tolist())
-        self.robot.move(self.franky.CartesianMotion(goal), asynchronous=True)
-        self._move_gripper()
-
-    def close(self) -> None:
-        self.robot.stop()
-
-    def _measure(self) -> ToolPose:
-        pose = self.robot.current_cartesian_state.pose.end_effector_pose
-        rotation = Rotation.from_quat(np.asarray(pose.quaternion, float))
-        offset = rotation.apply([0, 0, self.config.tool_offset_m])
-        return ToolPose(
-            pos=np.asarray(pose.translation, float).reshape(3) + offset,
-            rotation=rotation,
-            opening=float(np.clip(self.gripper.width / self.max_width_m, 0, 1)),
-        )
-
-    def _move_gripper(self) -> None:
-        """Send the wanted opening when it has changed and the last command is done: the gripper is no servo."""
-        busy = self.pending is not None and not self.pending.wait(0)
-        change = self.target.opening - self.sent_opening
-        if busy or abs(change) < GRIPPER_TOLERANCE:
-            return
-        width, speed = self.target.opening * self.max_width_m, self.config.gripper_speed_m_s
-        if change < 0:
-            self.pending = self.gripper.grasp_async(
-                width, speed, self.config.grip_force_n, epsilon_inner=1.0, epsilon_outer=1.0
-            )
-        else:
-            self.pending = self.gripper.move_async(width, speed)
-        self.sent_opening = self.target.opening
-
-
-ARMS: dict[str, Callable[[V2PFrankaConfig], Arm]] = {"sim": SimulatedArm, "franky": FrankyArm}
+ARMS: dict[str, Callable[[V2PFrankaConfig], Arm]] = {
+    "sim": SimulatedArm,
+    "network": NetworkArm,
+    "franky": FrankyArm,
+}
 
 
 class V2PFranka(Robot):
-    """A Franka arm as LeRobot sees it."""
+    """A Franka arm as LeRobot sees it, and as `v2p deploy` does."""
 
     config_class = V2PFrankaConfig
     name = "v2p_franka"
@@ -147,10 +86,15 @@ class V2PFranka(Robot):
         super().__init__(config)
         self.config = config
         self.arm: Arm | None = None
+        self._sight: Sight | None = None
+        self._is_started = False
+        self._guard: Guard | None = None
+        self._state: np.ndarray | None = None
 
     @property
     def observation_features(self) -> dict[str, Any]:
-        return {**dict.fromkeys(STATE_NAMES, float), "mask": (MASK_PX, MASK_PX, 3)}
+        size, name = (RGB_PX, RGB_NAME) if self.config.pictures == "rgb" else (MASK_PX, MASK_NAME)
+        return {**dict.fromkeys(STATE_NAMES, float), name: (size, size, 3)}
 
     @property
     def action_features(self) -> dict[str, Any]:
@@ -158,8 +102,12 @@ class V2PFranka(Robot):
 
     @property
     def cameras(self) -> dict[str, Any]:
-        """Return nothing: masks come from the arm's backend, no camera of LeRobot's is opened."""
+        """Return nothing: pictures come from the arm's backend, no camera of LeRobot's is opened."""
         return {}
+
+    @property
+    def action_scale(self) -> ActionScale:
+        return self._connected().action_scale
 
     @property
     def is_connected(self) -> bool:
@@ -173,38 +121,121 @@ class V2PFranka(Robot):
         """Start the simulation, or reach the arm; there is nothing to calibrate."""
         if self.arm is None:
             self.arm = ARMS[self.config.backend](self.config)
+            self._is_started = False
+            self._sight = None
+            if self.config.clicks and self.config.pictures == "mask":
+                self._sight = Sight(
+                    self.calibrated_camera(), clicks_from(self.config.clicks.split())
+                )
+            if self.config.backend != "sim":
+                self._guard = Guard(self.config.limits, self.arm.action_scale)
 
     def calibrate(self) -> None: ...
 
     def configure(self) -> None: ...
 
     def get_observation(self) -> dict[str, Any]:
-        """Return the state's entries by name, and `mask`."""
-        state, mask = self._connected().read()
-        return {**dict(zip(STATE_NAMES, state.tolist(), strict=True)), "mask": mask}
+        """Return the state's entries by name, and `mask` or `rgb`.
+
+        Raises:
+            V2PError: the arm does not answer, or what was clicked is lost; the arm then holds its position.
+        """
+        arm = self._connected()
+        self._state = arm.state()
+        state: dict[str, Any] = dict(zip(STATE_NAMES, self._state.tolist(), strict=True))
+        if self.config.pictures == "rgb":
+            return {**state, RGB_NAME: self._seeing().picture()}
+        if self._sight is None:
+            return {**state, MASK_NAME: arm.mask()}
+        return {**state, MASK_NAME: self._tracked(self._sight, state)}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Carry out an action and return it as it was carried out: clipped to [-1, 1]."""
-        clipped = np.clip([float(action[name]) for name in ACTION_NAMES], -1.0, 1.0)
-        self._connected().act(clipped)
-        return dict(zip(ACTION_NAMES, clipped.tolist(), strict=True))
+        """Carry out an action and return it as it was carried out: clipped to [-1, 1] and, on real arms, to the limits.
+
+        Raises:
+            V2PError: a limit ends the run, and the arm holds its position; or it does not answer.
+        """
+        arm = self._connected()
+        wanted = np.array([float(action[name]) for name in ACTION_NAMES])
+        if self._guard is not None and self.config.pictures == "mask":
+            reading = Rig(self).reading_of(
+                dict(
+                    zip(
+                        STATE_NAMES,
+                        self._state if self._state is not None else arm.state(),
+                        strict=True,
+                    )
+                )
+            )
+            try:
+                self._guard.look(reading)
+                wanted = self._guard.limit(wanted, reading).action
+            except V2PError:
+                arm.hold()
+                raise
+        done = arm.act(np.clip(wanted, -1.0, 1.0))
+        return dict(zip(ACTION_NAMES, done.tolist(), strict=True))
+
+    def calibrated_camera(self) -> Camera:
+        """Return the camera of `rgb`."""
+        return self._seeing().calibration()
+
+    def joints(self) -> Float[np.ndarray, "7"]:
+        """Return the joint angles of the last observation [rad]."""
+        return self._seeing().joints()
+
+    def opening(self) -> float:
+        """Return the gripper's opening of the last observation, 0 closed, 1 open."""
+        return self._seeing().opening()
+
+    def force_n(self) -> float | None:
+        """Return the contact force at the tool [N]; None where the arm does not report it."""
+        arm = self._connected()
+        return arm.force_n() if isinstance(arm, SeeingArm) else None
+
+    def hold(self) -> None:
+        """Stay there, at once."""
+        self._connected().hold()
+
+    @property
+    def has_succeeded(self) -> bool:
+        """Whether a simulated task has; a real one never says so."""
+        return isinstance(self.arm, SimulatedArm) and self.arm.succeeded
+
+    @property
+    def task_description(self) -> str:
+        """The simulated task in words."""
+        return self.arm.env.task_description if isinstance(self.arm, SimulatedArm) else ""
 
     def disconnect(self) -> None:
         if self.arm is not None:
             self.arm.close()
             self.arm = None
 
+    def _tracked(self, sight: Sight, state: dict[str, Any]) -> np.ndarray:
+        reading = Rig(self).reading_of({**state, RGB_NAME: self._seeing().picture()})
+        try:
+            seen = sight.see(reading) if self._is_started else sight.start(reading)
+        except V2PError:
+            self._connected().hold()
+            raise
+        self._is_started = True
+        if max(seen.missed) >= LOST_AFTER:
+            self._connected().hold()
+            raise V2PError(
+                f"object {int(np.argmax(seen.missed)) + 1} is no longer seen; the robot holds its position"
+            )
+        return labels_to_rgb(seen.labels)
+
+    def _seeing(self) -> SeeingArm:
+        arm = self._connected()
+        if not isinstance(arm, SeeingArm):
+            raise V2PError(
+                f"the backend '{self.config.backend}' gives no pictures; use 'sim' or 'network'"
+            )
+        return arm
+
     def _connected(self) -> Arm:
         if self.arm is None:
             raise V2PError("the robot is not connected; call connect() first")
         return self.arm
-
-
-def _function_named(path: str) -> Callable[[], np.ndarray]:
-    module, _, name = path.partition(":")
-    try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise V2PError(
-            f"--robot.masks names '{path}', which cannot be imported ({error}); it must be 'package.module:name'"
-        ) from error

@@ -109,6 +109,16 @@ class V2PTwin(Robot):
         """Return the gripper's opening of the last observation, 0 closed, 1 open."""
         return self._connected().measured.opening
 
+    @property
+    def has_succeeded(self) -> bool:
+        """Whether the task has."""
+        return self._has_succeeded
+
+    @property
+    def task_description(self) -> str:
+        """The task in words."""
+        return self._connected().mirror.bundle.description
+
     def disconnect(self) -> None:
         if self.arm is not None:
             self.arm.close()

@@ -444,6 +444,13 @@ class BatchEnv:
         fields = {name: drawn[name][ids].copy() for name in looks + view}
         return Snapshot(qpos=self._qpos[ids].copy(), qvel=self._qvel[ids].copy(), **fields)
 
+    def contact_torques(self) -> Float[np.ndarray, "env joint"]:
+        """Return the torques that contacts and joint limits put on the arms' joints at the last time step [N m].
+
+        They are kept from the first call on, so that call itself returns those of no step.
+        """
+        return self._batch.bind("qfrc_constraint")[:, self._robot.arm_dofs].copy()
+
     def motion(self) -> tuple[Float[np.ndarray, "env q"], Float[np.ndarray, "env v"]]:
         """Return copies of all worlds' positions and velocities: what changes in a `Snapshot` during an episode."""
         return self._qpos.copy(), self._qvel.copy()

@@ -21,12 +21,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
+from jaxtyping import Float, UInt8
 
 from v2p_data.errors import V2PError
 from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig
+from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.masks import MaskRenderer, labels_to_rgb
 from v2p_data.sim.verdict import Witness
+from v2p_data.sim.world import World
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
 
 ENV_ID = "v2p/Task-v0"
@@ -135,6 +137,27 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             return self._masks.draw_rgb(snapshot, 0)
         except V2PError:  # no OpenGL
             return labels_to_rgb(self._masks.draw(snapshot, 0))
+
+    @property
+    def world(self) -> World:
+        """The compiled model."""
+        return self._world.world
+
+    def moment(self) -> Snapshot:
+        """Return the world as it is now: its joints, its camera, all that is needed to draw it."""
+        return self._world.snapshot(np.array([0]))
+
+    def picture(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the camera's colour picture.
+
+        Raises:
+            V2PError: there is no OpenGL.
+        """
+        return self._masks.draw_rgb(self.moment(), 0)
+
+    def contact_torques(self) -> Float[np.ndarray, "joint"]:
+        """Return the torques that contacts put on the arm's joints at the last time step [N m]."""
+        return self._world.contact_torques()[0]
 
     def close(self) -> None:
         """Free the graphics memory."""

@@ -185,14 +185,41 @@ def _follow(
 
     Backwards the tracker is shown the clip in reverse, as a clip of its own.
     """
-    session = _session(checkpoint, cfg)
-    config = checkpoint.model.config
-    remembered = max(config.num_maskmem, config.max_object_pointers_in_encoder)
-    for k, t in enumerate(order):
-        image = np.asarray(frames[t])
+    stream = Stream(checkpoint, points, cfg)
+    for t in order:
+        logits, sure = stream.next(np.asarray(frames[t]))
+        yield t, logits, sure
+
+
+class Stream:
+    """Pictures that come one at a time, the first of them prompted.
+
+    Args:
+        checkpoint: of SAM 2.
+        points: positive points on each object in the first picture, u right and v down [px].
+        cfg: where memory is kept.
+    """
+
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        points: Sequence[Float[np.ndarray, "_k 2"]],
+        cfg: SegmentConfig,
+    ) -> None:
+        self._checkpoint, self._points = checkpoint, points
+        self._session = _session(checkpoint, cfg)
+        config = checkpoint.model.config
+        self._remembered = max(config.num_maskmem, config.max_object_pointers_in_encoder)
+        self._count = 0
+
+    def next(
+        self, image: UInt8[np.ndarray, "h w 3"]
+    ) -> tuple[Float[np.ndarray, "object h w"], Float[np.ndarray, "object"]]:
+        """Return logits at full size, and per object how sure the model is that it is seen, 0 to 1."""
+        checkpoint, session, k = self._checkpoint, self._session, self._count
         size = (image.shape[0], image.shape[1])
         if k == 0:
-            for i, xy in enumerate(points):
+            for i, xy in enumerate(self._points):
                 checkpoint.processor.add_inputs_to_inference_session(
                     session,
                     0,
@@ -202,15 +229,15 @@ def _follow(
                     original_size=size,
                 )
             # Adding an object replaces the list of those with new prompts.
-            session.obj_with_new_inputs = list(range(len(points)))
+            session.obj_with_new_inputs = list(range(len(self._points)))
         with torch.inference_mode():
             out = checkpoint.model(session, frame=_prepared(checkpoint, image), frame_idx=k)
-        yield (
-            t,
+        _forget(session, k, self._remembered)
+        self._count += 1
+        return (
             _logits(checkpoint, out.pred_masks, size),
             torch.sigmoid(out.object_score_logits.float()).reshape(-1).cpu().numpy(),
         )
-        _forget(session, k, remembered)
 
 
 def _forget(session: Any, now: int, remembered: int) -> None:

@@ -1,0 +1,86 @@
+"""An arm behind a driver that speaks the protocol of docs/deploy.md, for the robot type `v2p_franka`.
+
+Actions become Cartesian targets here, with the scale and the leashes of the training; the driver brings the tool there.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
+from v2p_data.deployment.protocol import Driver, Sample
+from v2p_data.deployment.robot import ActionScale
+from v2p_data.errors import V2PError
+from v2p_data.geometry.camera import Camera
+from v2p_data.sim.batch_env import SimConfig
+from v2p_data.sim.targets import ToolPose, next_target
+from v2p_data.twin.interface import RGB_PX
+
+
+class NetworkArm:
+    """A driver's arm."""
+
+    action_scale = ActionScale()
+
+    def __init__(self, config: V2PFrankaConfig) -> None:
+        self.cfg = SimConfig()
+        self.driver = Driver(config.address, config.timeout_s)
+        self.hello = self.driver.hello()
+        camera = self.hello.camera
+        if (camera.width_px, camera.height_px) != (RGB_PX, RGB_PX):
+            raise V2PError(
+                f"the driver at {config.address} gives pictures of {camera.width_px} x {camera.height_px} pixels, and"
+                f" policies see {RGB_PX} x {RGB_PX}; let it crop and scale them, and K with them"
+            )
+        self.seen: Sample = self._read()
+        self.target = self._measured()
+
+    def state(self) -> Float[np.ndarray, "11"]:
+        """Ask the driver and return `observation.state`."""
+        self.seen = self._read()
+        return self._measured().state(self.target)
+
+    def mask(self) -> np.ndarray:
+        raise V2PError("the network driver gives no masks; say what to track with --robot.clicks")
+
+    def picture(self) -> np.ndarray:
+        return self.seen.picture
+
+    def calibration(self) -> Camera:
+        return self.hello.camera
+
+    def joints(self) -> Float[np.ndarray, "7"]:
+        return self.seen.joints_rad
+
+    def opening(self) -> float:
+        return self.seen.opening
+
+    def force_n(self) -> float | None:
+        return self.seen.force_n
+
+    def act(self, action: np.ndarray) -> np.ndarray:
+        """Send the target after one action."""
+        self.target = next_target(
+            self.target, self._measured(), action, self.cfg, self.hello.finger_travel_m
+        )
+        quat = self.target.rotation.as_quat(canonical=True, scalar_first=True)
+        self.driver.target(self.target.pos, quat, self.target.opening)
+        return action
+
+    def hold(self) -> None:
+        """Tell the driver to stay."""
+        self.driver.hold()
+        self.target = self._measured()
+
+    def close(self) -> None:
+        self.driver.close()
+
+    def _read(self) -> Sample:
+        return self.driver.read((RGB_PX, RGB_PX))
+
+    def _measured(self) -> ToolPose:
+        return ToolPose(
+            pos=self.seen.pos_m,
+            rotation=Rotation.from_quat(self.seen.quat_wxyz, scalar_first=True),
+            opening=self.seen.opening,
+        )

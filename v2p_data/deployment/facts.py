@@ -1,0 +1,126 @@
+"""What a policy's training knew that its network does not say: rate, names, palette, action scale. One file beside it.
+
+`v2p train` writes `v2p.json` into the policy's folder. Policies that came without it are traced to their dataset, by the record
+of the run or LeRobot's `train_config.json`, as long as it is there.
+"""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from v2p_data.episodes.features import ACTION_KEY, METADATA_FILE, STATE_KEY
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import read_record, write_json_atomically
+from v2p_data.sim.batch_env import SimConfig
+from v2p_data.task.task import TASK_FILE
+
+FACTS_FILE = "v2p.json"
+TASKS_IN_DATASET = Path("v2p/tasks")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """Of one policy; None or empty where it is not known."""
+
+    fps: float | None = None
+    state: tuple[str, ...] = ()
+    """Names of the state's entries, in order."""
+    action: tuple[str, ...] = ()
+    palette: tuple[int, ...] = ()
+    """Grey of each label."""
+    position_steps_m: dict[str, float] = field(default_factory=dict[str, float])
+    """Per task in words: how far an action of 1 moves the target in one step."""
+    rotation_step_rad: float | None = None
+    finger_step_m: float | None = None
+
+
+def facts_of_dataset(dataset: Path) -> Facts:
+    """Return what a LeRobot dataset says of itself; parts that are missing stay unknown.
+
+    Raises:
+        V2PError: a file of it cannot be read.
+    """
+    info, ours = _json(dataset / "meta/info.json"), _json(dataset / METADATA_FILE)
+    try:
+        features: dict[str, Any] = info.get("features", {})
+        palette = {int(k): int(grey) for k, grey in ours.get("palette", {}).items()}
+        tasks = [
+            _json(path) for path in sorted((dataset / TASKS_IN_DATASET).glob(f"*/{TASK_FILE}"))
+        ]
+        return Facts(
+            fps=float(info["fps"]) if "fps" in info else None,
+            state=_names(features.get(STATE_KEY)),
+            action=_names(features.get(ACTION_KEY)),
+            palette=tuple(palette[k] for k in sorted(palette)),
+            position_steps_m={
+                str(t["description"]): SimConfig.position_step_m
+                * float(t.get("motion_scale", 1.0))
+                for t in tasks
+            },
+            rotation_step_rad=SimConfig.rotation_step_rad if ours else None,
+            finger_step_m=SimConfig.finger_step_m if ours else None,
+        )
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise V2PError(
+            f"the metadata of dataset {dataset} cannot be understood ({type(error).__name__}: {error}); check it with"
+            " 'v2p verify'"
+        ) from error
+
+
+def write_facts(policy: Path, dataset: Path) -> None:
+    """Put what a policy's dataset says beside the policy."""
+    write_json_atomically(policy / FACTS_FILE, {"schema": 1, **asdict(facts_of_dataset(dataset))})
+
+
+def read_facts(policy: Path) -> Facts:
+    """Return what is known of a policy's training.
+
+    Raises:
+        V2PError: its file is damaged.
+    """
+    path = policy / FACTS_FILE
+    if path.is_file():
+        said = _json(path)
+        lists = ("state", "action", "palette")
+        try:
+            fields: dict[str, Any] = {
+                k: tuple(v) if k in lists else v for k, v in said.items() if k != "schema"
+            }
+            return Facts(**fields)
+        except TypeError as error:
+            raise V2PError(
+                f"{path} is of another version ({error}); delete it, or train anew"
+            ) from error
+    dataset = _dataset_of(policy)
+    return facts_of_dataset(dataset) if dataset is not None else Facts()
+
+
+def _dataset_of(policy: Path) -> Path | None:
+    home = policy.resolve().parent
+    record = read_record(home)
+    if record is not None:
+        name = (record.recipe.get("sources") or {}).get("dataset")
+        found = home.parents[1] / "dataset" / str(name)
+        if name and found.is_dir():
+            return found
+    config = policy / "train_config.json"
+    root = ((_json(config).get("dataset") or {}) if config.is_file() else {}).get("root")
+    return Path(root) if root and Path(root).is_dir() else None
+
+
+def _names(feature: Any) -> tuple[str, ...]:
+    names = (feature or {}).get("names")
+    return tuple(map(str, names)) if isinstance(names, list) else ()
+
+
+def _json(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        said = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise V2PError(f"{path} cannot be read ({error}); make it anew") from error
+    if not isinstance(said, dict):
+        raise V2PError(f"{path} holds no JSON object; make it anew")
+    return said

@@ -1,0 +1,227 @@
+"""The control loop: read, see, decide, limit, act, 20 times a second, until the time is up or something stops it.
+
+It ends in one sentence and with a robot that holds its position. What cannot be done in time is said before the arm
+moves. World frame and units as in `robot`.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from v2p_data.deployment.limits import STEP_S, Guard, LimitStop, Watchdog
+from v2p_data.deployment.recording import Recorder
+from v2p_data.deployment.robot import Reading, Rig
+from v2p_data.deployment.sight import LOST_AFTER, Seen, Sight
+from v2p_data.errors import V2PError
+from v2p_data.evaluation.actors import Actor
+
+REHEARSALS = 8
+"""Steps without motion by which the rate is measured beforehand; the first two, which compile, do not count."""
+WINDOW = 20
+"""Steps whose mean decides whether the rate holds during the run."""
+
+Ending = Literal[
+    "time", "done", "limit", "lost", "silence", "robot", "slow", "interrupted", "policy"
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopConfig:
+    """How a run goes."""
+
+    max_seconds: float = 30.0
+    """Then the arm holds and the run ends."""
+    dry_run: bool = False
+    """Everything but the commands: nothing is sent to the robot, not even to hold."""
+    slow: bool = False
+    """Go on below 20 Hz. The policy then acts on older pictures than in training; its motion is slower and worse."""
+
+    def __post_init__(self) -> None:
+        if not self.max_seconds > 0:
+            raise ValueError(f"max_seconds must be above 0, got {self.max_seconds}")
+
+
+@dataclass(kw_only=True)
+class Outcome:
+    """How a run went."""
+
+    ending: Ending
+    sentence: str
+    steps: int = 0
+    work_ms: list[float] = field(default_factory=list)
+    """Per step the time that reading, seeing, deciding and acting took."""
+    acted: Counter[str] = field(default_factory=Counter)
+    """How often each limit changed an action."""
+
+    @property
+    def mean_ms(self) -> float:
+        return float(np.mean(self.work_ms)) if self.work_ms else 0.0
+
+    @property
+    def went_well(self) -> bool:
+        """Whether nothing had to stop the run."""
+        return self.ending in ("time", "done")
+
+
+class Run:
+    """One run of a policy on a robot.
+
+    Args:
+        rig: the connected robot.
+        sight: what it sees; None for a robot that segments by itself.
+        policy: what decides.
+        guard: the limits.
+        cfg: how long, and whether for real.
+        recorder: notes every step, if given.
+        is_done: asked after every step; true ends the run.
+        on_step: shown every step.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        sight: Sight | None,
+        policy: Actor,
+        guard: Guard,
+        cfg: LoopConfig,
+        *,
+        recorder: Recorder | None = None,
+        is_done: Callable[[], bool] = lambda: False,
+        on_step: Callable[[Reading, Seen], None] = lambda reading, seen: None,
+    ) -> None:
+        self.rig, self.sight, self.policy, self.guard, self.cfg = rig, sight, policy, guard, cfg
+        self.recorder, self.is_done, self.on_step = recorder, is_done, on_step
+        self._is_started = False
+
+    def go(self) -> Outcome:
+        """Run to the end; the robot holds its position afterwards.
+
+        Raises:
+            V2PError: something is wrong before anything moved: a click, the arm's place, the rate.
+        """
+        self.rehearse()
+        outcome = Outcome(ending="time", sentence="")
+        silence = self.guard.cfg.max_silence_ms
+        with Watchdog(silence, self._hold) as watchdog:
+            try:
+                self._steps(outcome, watchdog)
+            except KeyboardInterrupt:
+                outcome.ending, outcome.sentence = "interrupted", "stopped by Ctrl-C"
+            except _StopRunError as stop:
+                outcome.ending, outcome.sentence = stop.ending, str(stop)
+            except LimitStop as stop:
+                outcome.ending, outcome.sentence = "limit", str(stop)
+            except V2PError as error:
+                outcome.ending, outcome.sentence = "robot", str(error)
+            if watchdog.has_bitten:
+                outcome.ending = "silence"
+                outcome.sentence = (
+                    f"no reading came for {silence:g} ms; look after the robot and its connection"
+                )
+        try:
+            self._hold()
+        except V2PError as error:
+            outcome.sentence += f"; it could not be told to hold its position: {error}"
+        else:
+            when = f"after {outcome.steps} steps ({outcome.steps * STEP_S:.1f} s)"
+            held = "nothing was sent" if self.cfg.dry_run else "the robot holds its position"
+            outcome.sentence = f"{outcome.sentence}, {when}; {held}"
+        return outcome
+
+    def rehearse(self) -> None:
+        """Go through a step's work without moving, and say whether it fits into 50 ms.
+
+        Raises:
+            V2PError: it does not, a click is on no object, or the arm stands where it may not.
+        """
+        first = self.rig.read()
+        self.guard.check_start(first)
+        took: list[float] = []
+        for _ in range(REHEARSALS):
+            began = time.perf_counter()
+            reading = self.rig.read()
+            seen = self._see(reading)
+            self._decide(seen, reading)
+            took.append(time.perf_counter() - began)
+        self._is_started = False
+        self.policy.reset(1)
+        mean = float(np.median(took[2:]))
+        if mean > STEP_S and not self.cfg.slow:
+            raise V2PError(_too_slow(mean, "nothing was moved"))
+
+    def _steps(self, outcome: Outcome, watchdog: Watchdog) -> None:
+        due = time.perf_counter()
+        for step in range(max(1, round(self.cfg.max_seconds / STEP_S))):
+            began = time.perf_counter()
+            reading = self.rig.read()
+            watchdog.heard()
+            self.guard.look(reading)
+            seen = self._see(reading)
+            self._check_seen(seen, step)
+            limited = self.guard.limit(self._decide(seen, reading), reading)
+            if watchdog.has_bitten:
+                return
+            done = limited.action if self.cfg.dry_run else self.rig.act(limited.action)
+            outcome.steps += 1
+            outcome.acted.update(limited.acted)
+            if self.recorder is not None:
+                self.recorder.add(reading, seen, done, limited.acted)
+            self.on_step(reading, seen)
+            outcome.work_ms.append(1000 * (time.perf_counter() - began))
+            if self.is_done():
+                outcome.ending, outcome.sentence = "done", "the task succeeded"
+                return
+            self._check_rate(outcome)
+            # A late step is not caught up with: two actions in one would be a jump.
+            due = max(due + STEP_S, time.perf_counter())
+            time.sleep(max(0.0, due - time.perf_counter()))
+        outcome.sentence = f"the {self.cfg.max_seconds:g} s are up"
+
+    def _see(self, reading: Reading) -> Seen:
+        if self.sight is None:
+            if reading.labels is None:
+                raise V2PError("the robot gives pictures; click on the objects with --click X,Y")
+            return Seen(labels=reading.labels, confidences=(), missed=())
+        seen = self.sight.see(reading) if self._is_started else self.sight.start(reading)
+        self._is_started = True
+        return seen
+
+    def _decide(self, seen: Seen, reading: Reading) -> np.ndarray:
+        state = reading.state[None].astype(np.float32)
+        return self.policy.act(seen.labels[None], state)[0].astype(float)
+
+    def _check_seen(self, seen: Seen, step: int) -> None:
+        if max(seen.missed, default=0) >= LOST_AFTER:
+            number = int(np.argmax(seen.missed)) + 1
+            raise _StopRunError(
+                "lost",
+                f"object {number} was lost from sight at step {step}: it is hidden or has left the picture; put it back"
+                " and start again",
+            )
+
+    def _check_rate(self, outcome: Outcome) -> None:
+        recent = outcome.work_ms[-WINDOW:]
+        mean = float(np.mean(recent)) / 1000
+        if len(recent) == WINDOW and mean > STEP_S and not self.cfg.slow:
+            raise _StopRunError("slow", _too_slow(mean, "the run was stopped"))
+
+    def _hold(self) -> None:
+        if not self.cfg.dry_run:
+            self.rig.hold()
+
+
+class _StopRunError(Exception):
+    def __init__(self, ending: Ending, sentence: str) -> None:
+        super().__init__(sentence)
+        self.ending: Ending = ending
+
+
+def _too_slow(seconds: float, consequence: str) -> str:
+    return (
+        f"20 Hz cannot be kept: a step takes {1000 * seconds:.0f} ms ({1 / seconds:.1f} Hz) and {consequence}; stop other"
+        " programs, use a GPU (--device cuda) or a smaller policy, or go on slower with --slow"
+    )

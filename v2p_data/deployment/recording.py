@@ -1,0 +1,111 @@
+"""What was seen and done becomes a LeRobot dataset of one episode: masks, colour pictures, states, actions as carried out.
+
+It is staged and packed as demonstrations are, so that `v2p verify`, `v2p merge` and LeRobot read it.
+"""
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2p_data.deployment.robot import Reading
+from v2p_data.deployment.sight import Seen
+from v2p_data.episodes import stream
+from v2p_data.episodes.staging import MASK_CAMERA, RGB_CAMERA, Episode, refusals_told
+from v2p_data.episodes.writer import Packed, pack
+from v2p_data.errors import V2PError
+
+FEWEST_FRAMES = 2
+STAGED = "staged"
+
+
+class Recorder:
+    """Collects one run.
+
+    Args:
+        task: the instruction in words.
+    """
+
+    def __init__(self, task: str) -> None:
+        self.task = task
+        self._labels: list[np.ndarray] = []
+        self._pictures: list[np.ndarray] = []
+        self._states: list[np.ndarray] = []
+        self._actions: list[np.ndarray] = []
+        self._acted: list[tuple[str, ...]] = []
+        self._confidences: list[tuple[float, ...]] = []
+
+    def add(
+        self, reading: Reading, seen: Seen, action: np.ndarray, acted: tuple[str, ...]
+    ) -> None:
+        """Note one step: what was seen, and what was then done."""
+        self._labels.append(seen.labels)
+        if reading.picture is not None:
+            self._pictures.append(reading.picture)
+        self._states.append(reading.state.astype(np.float32))
+        self._actions.append(action.astype(np.float32))
+        self._acted.append(acted)
+        self._confidences.append(seen.confidences)
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    def save(
+        self, out: Path, repo_id: str, objects: tuple[str, ...], about: Mapping[str, Any]
+    ) -> Packed | None:
+        """Write the dataset at `out`; None where nothing worth keeping was seen.
+
+        Args:
+            out: must not exist.
+            repo_id: `user/name`.
+            objects: names of what was clicked.
+            about: how the run was made and ended, JSON; kept in `meta/v2p.json`.
+
+        Raises:
+            V2PError: something lies at `out`, or it cannot be written.
+        """
+        check_free(out)
+        if len(self) < FEWEST_FRAMES:
+            return None
+        has_rgb = len(self._pictures) == len(self)
+        staged = out.with_name(out.name + ".partial") / STAGED
+        with refusals_told("recording", out.parent):
+            episode = Episode(
+                id="run_00000",
+                item="run",
+                task=self.task,
+                seed=0,
+                labels=np.stack(self._labels),
+                state=np.stack(self._states),
+                action=np.stack(self._actions),
+                # Nobody judges a run on a robot; what a simulated one says of itself is in `about`.
+                success=np.zeros(len(self), bool),
+                referee=False,
+                objects=objects,
+                params={
+                    **about,
+                    "limits_acted": [list(names) for names in self._acted],
+                    "confidences": np.round(np.array(self._confidences), 3).tolist(),
+                },
+                cameras=(MASK_CAMERA, RGB_CAMERA) if has_rgb else (MASK_CAMERA,),
+                rgb_mp4=stream.encode_rgb(np.stack(self._pictures)).mp4 if has_rgb else b"",
+            )
+            path = episode.save(staged)
+            packed = pack([path], repo_id, out, provenance=json.loads(json.dumps(dict(about))))
+            shutil.rmtree(staged.parent, ignore_errors=True)
+        return packed
+
+
+def check_free(out: Path) -> None:
+    """Refuse a place that is taken, before anything moves.
+
+    Raises:
+        V2PError: it is.
+    """
+    if out.exists():
+        raise V2PError(
+            f"{out} exists already; choose another place for the recording with --record"
+        )

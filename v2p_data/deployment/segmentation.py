@@ -1,0 +1,314 @@
+"""One object's mask in every picture of a stream, from one clicked pixel: causal, without weights, a few milliseconds.
+
+The first picture gives three colour models (object, robot, rest) and a picture of what is behind. In each later one a pixel goes to
+the object where its colour is likelier under the object's model than under the others', given where the object was and
+where the robot is drawn. A robot in front hides the object; what is hidden is not lost.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int, UInt8
+
+from v2p_data.errors import V2PError
+from v2p_data.scene.colour import histogram, lab_of
+from v2p_data.scene.segment import bounding_box, grow, largest, refine, shrink, tidy
+
+SURROUNDINGS = 8
+"""Colour clusters of the first picture."""
+BORDER_PX = 6
+LIGHTNESS_WEIGHT = 0.5
+"""Of lightness beside hue in colour distances: faces of one thing differ in lightness."""
+SPECK_PX = 16
+"""At 256 px: nothing smaller is an object."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackerConfig:
+    """How an object is told from table and robot."""
+
+    least_contrast: float = 9.0
+    """Lab distance from the surroundings' colours from which a clicked pixel is a thing."""
+    largest_share: float = 0.25
+    """Of the picture: a larger thing is the table, or the light."""
+    reach_px: float = 12.0
+    """How far an object may get in one step of 50 ms, at 256 px; 0.6 m/s are about 10."""
+    least_visible: float = 0.12
+    """Of the area that should be seen: with less the object counts as not seen in this picture."""
+    background_rate: float = 0.15
+    """Share of each new picture in the picture of what is behind."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracked:
+    """One object in one picture."""
+
+    mask: Bool[np.ndarray, "h w"]
+    score: Float32[np.ndarray, "h w"]
+    """How much likelier each pixel is the object's than not (logarithm)."""
+    confidence: float
+    """0 to 1: the visible share of what should be visible, or what a network says."""
+    is_hidden: bool
+    """The robot covers most of where the object should be."""
+
+
+@runtime_checkable
+class StreamTracker(Protocol):
+    """Follows one object."""
+
+    def start(
+        self,
+        picture: UInt8[np.ndarray, "h w 3"],
+        click_px: tuple[float, float],
+        robot: Bool[np.ndarray, "h w"],
+    ) -> Bool[np.ndarray, "h w"]:
+        """Return the mask of what was clicked (u right, v down).
+
+        Raises:
+            V2PError: no object is there.
+        """
+        ...
+
+    def track(
+        self, picture: UInt8[np.ndarray, "h w 3"], robot: Bool[np.ndarray, "h w"]
+    ) -> Tracked:
+        """Return the object in the next picture."""
+        ...
+
+
+class ColourTracker:
+    """The tracker without weights."""
+
+    def __init__(self, cfg: TrackerConfig | None = None) -> None:
+        self.cfg = cfg or TrackerConfig()
+
+    def start(
+        self,
+        picture: UInt8[np.ndarray, "h w 3"],
+        click_px: tuple[float, float],
+        robot: Bool[np.ndarray, "h w"],
+    ) -> Bool[np.ndarray, "h w"]:
+        """Return the mask of what was clicked, and learn its colours."""
+        mask = clicked_mask(picture, click_px, robot, self.cfg)
+        near, touched = grow(mask, 3), grow(robot, 3)
+        core = shrink(mask, 1)
+        self._object = _log(histogram(picture[core if core.sum() >= SPECK_PX else mask]))
+        self._rest = _log(histogram(picture[~near & ~touched]))
+        # Grey of any lightness until it is seen: an arm may begin outside the picture.
+        inner = shrink(robot, 2) & ~near
+        self._robot = _log(histogram(picture[inner] if inner.sum() >= 50 else _greys()))
+        self._known = ~near & ~touched
+        self._behind = cv2.GaussianBlur(_lab8(picture), (0, 0), 0.8).astype(np.float32)
+        self._mask = mask
+        self._area = float(mask.sum())
+        self._motion = np.zeros(2)
+        self._scale = picture.shape[0] / 256
+        return mask
+
+    def track(
+        self, picture: UInt8[np.ndarray, "h w 3"], robot: Bool[np.ndarray, "h w"]
+    ) -> Tracked:
+        """Return the object in the next picture."""
+        lab = cv2.GaussianBlur(_lab8(picture), (0, 0), 0.8)
+        expected = _moved(self._mask, self._motion)
+        score = self._scores(lab, robot, expected)
+        mask = self._chosen(score, expected)
+        seen, should = float(mask.sum()), max(1.0, float(expected.sum()))
+        hidden = float((expected & robot & ~mask).sum()) / should
+        visible = seen / max(1.0, self._area * (1 - min(0.9, hidden)))
+        found = seen >= SPECK_PX * self._scale**2 and visible >= self.cfg.least_visible
+        if found:
+            self._follow(mask, expected, hidden, visible)
+            self._learn(lab, mask, robot)
+        else:
+            self._mask, self._motion = expected if hidden > 0 else self._mask, 0.5 * self._motion
+            mask = np.zeros_like(mask)
+        return Tracked(
+            mask=mask,
+            score=score,
+            confidence=min(1.0, visible) if found else 0.0,
+            is_hidden=hidden > 0.6,
+        )
+
+    def _scores(self, lab: np.ndarray, robot: np.ndarray, expected: np.ndarray) -> np.ndarray:
+        """Return log-likelihood ratios, with where the object was and the robot is as priors."""
+        cells = _cells8(lab)
+        own = np.take(self._object, cells)
+        rest = np.take(self._rest, cells)
+        difference = lab.astype(np.float32) - self._behind
+        # A shadow is darker than what is behind, and no object.
+        light = np.where(difference[..., 0] < 0, 0.04, 0.15).astype(np.float32)
+        apart = light * difference[..., 0] ** 2
+        apart += difference[..., 1] ** 2
+        apart += difference[..., 2] ** 2
+        rest = np.where(self._known, np.maximum(4.0 - 0.04 * apart, _FLOOR - 2.0), rest)
+        arm = np.take(self._robot, cells) + np.where(robot, 0.0, -4.0).astype(np.float32)
+        arm[grow(robot, 2) & ~robot] += 2.0
+        away = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)
+        reach = self.cfg.reach_px * self._scale
+        return own + 1.0 - (away / reach) ** 2 - np.maximum(rest, arm)
+
+    def _chosen(self, score: np.ndarray, expected: np.ndarray) -> np.ndarray:
+        """Return the part that fits best, with what a finger cuts off it."""
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(
+            tidy(score > 0).astype(np.uint8), connectivity=4
+        )
+        if count < 2:
+            return np.zeros_like(expected)
+        weight = np.bincount(parts.ravel(), np.clip(score, 0, 4).ravel(), count)
+        weight += 4 * np.bincount(parts[expected], minlength=count)
+        weight[0] = -1
+        best = int(weight.argmax())
+        main = parts == best
+        if count > 2:
+            reached = np.unique(parts[grow(main | expected, round(3 * self._scale) + 1)])
+            large = [k for k in reached if k and stats[k, cv2.CC_STAT_AREA] > 0.04 * self._area]
+            main = np.isin(parts, [best, *large])
+        return _without_pinholes(main)
+
+    def _follow(
+        self, mask: np.ndarray, expected: np.ndarray, hidden: float, visible: float
+    ) -> None:
+        if hidden < 0.1 and 0.6 < visible < 1.6:
+            self._area += 0.1 * (float(mask.sum()) - self._area)
+        step = _middle(mask) - _middle(self._mask)
+        fast = self.cfg.reach_px * self._scale
+        if hidden < 0.4:
+            self._motion = 0.5 * self._motion + 0.5 * np.clip(step, -fast, fast)
+        else:
+            self._motion = 0.5 * self._motion
+        # Under a robot the outline shrinks to what is seen; where it should be is what it was.
+        self._mask = (
+            mask | (expected & grow(mask, round(4 * self._scale))) if hidden > 0.1 else mask
+        )
+
+    def _learn(self, lab: np.ndarray, mask: np.ndarray, robot: np.ndarray) -> None:
+        """Bring the picture of what is behind up to date where neither object nor robot is near."""
+        near = grow(mask | self._mask | robot, 4)
+        rate = np.where(self._known, self.cfg.background_rate, 1.0)[..., None].astype(np.float32)
+        self._behind += np.where(near[..., None], 0.0, rate) * (lab - self._behind)
+        self._known |= ~near
+
+
+def clicked_mask(
+    picture: UInt8[np.ndarray, "h w 3"],
+    click_px: tuple[float, float],
+    robot: Bool[np.ndarray, "h w"],
+    cfg: TrackerConfig,
+) -> Bool[np.ndarray, "h w"]:
+    """Return the outline of the thing at a pixel (u right, v down).
+
+    Raises:
+        V2PError: the pixel lies outside the picture, on the robot, on the table, or on something too small or too large.
+    """
+    h, w = picture.shape[:2]
+    u, v = click_px
+    where = f"the click at ({u:g}, {v:g})"
+    if not (0 <= u < w and 0 <= v < h):
+        raise V2PError(
+            f"{where} lies outside the picture, which has {w} x {h} pixels; click on the object"
+        )
+    x, y = int(u), int(v)
+    if robot[y, x]:
+        raise V2PError(f"{where} is on the robot; click on the object that the task is about")
+    apart = _apart_from_surroundings(picture, robot)
+    noise = float(np.median(apart[~robot]))
+    threshold = max(cfg.least_contrast, 4 * noise)
+    around = apart[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2]
+    if np.median(around) < threshold:
+        raise V2PError(
+            f"{where} is on the table or the background: its colour is that of the surroundings; click on the"
+            " middle of the object"
+        )
+    things = tidy((apart > threshold) & ~grow(robot, 1))
+    things[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2] = True
+    _, parts = cv2.connectedComponents(things.astype(np.uint8), connectivity=4)
+    blob = largest(parts == parts[y, x])
+    if blob.sum() > cfg.largest_share * h * w:
+        raise V2PError(
+            f"{where} is on something that fills {blob.mean():.0%} of the picture: the table or the background; click"
+            " on the object"
+        )
+    if blob.sum() < SPECK_PX * (h / 256) ** 2:
+        raise V2PError(
+            f"{where} is on a speck of {int(blob.sum())} pixels: no object is seen there; click on its middle"
+        )
+    mask = refine(picture, blob, never=robot)
+    return mask if mask[y, x] else blob
+
+
+def _apart_from_surroundings(picture: np.ndarray, robot: np.ndarray) -> np.ndarray:
+    """Return each pixel's distance in Lab from the nearest colour that the surroundings have.
+
+    Colours count as surroundings if much of the picture, or of its border, has them.
+    """
+    weights = np.array([LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32)
+    lab = cv2.GaussianBlur(lab_of(picture), (0, 0), 0.8) * weights
+    usable = ~grow(robot, 3)
+    border = np.ones_like(robot)
+    border[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = False
+    samples = np.ascontiguousarray(lab[usable][::3])
+    if len(samples) < 10 * SURROUNDINGS:
+        raise V2PError(
+            "the robot fills the picture: the camera sees no object; move the arm aside"
+        )
+    cv2.setRNGSeed(2)
+    _, _, centres = cv2.kmeans(
+        samples, SURROUNDINGS, np.empty(0), (3, 20, 1), 1, cv2.KMEANS_PP_CENTERS
+    )
+    distance = np.linalg.norm(lab[:, :, None] - centres[None, None], axis=-1)
+    nearest = distance.argmin(-1)
+    share = np.bincount(nearest[usable], minlength=SURROUNDINGS) / usable.sum()
+    rim = border & usable
+    at_rim = np.bincount(nearest[rim], minlength=SURROUNDINGS) / max(1, rim.sum())
+    common = (share > 0.08) | (at_rim > 0.03)
+    return distance[..., common].min(-1)
+
+
+_BINS = np.array([12, 24, 24])
+"""As `scene.colour.histogram` counts."""
+_FLOOR = -4.0
+
+
+def _log(hist: np.ndarray) -> Float32[np.ndarray, "cell"]:
+    """Return log-likelihoods over those of a colour drawn evenly, with a floor: no colour is impossible."""
+    density = hist.ravel() * hist.size
+    return np.log(np.maximum(density, np.exp(_FLOOR))).astype(np.float32)
+
+
+def _lab8(picture: np.ndarray) -> np.ndarray:
+    return cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2LAB)
+
+
+def _cells8(lab: UInt8[np.ndarray, "h w 3"]) -> Int[np.ndarray, "h w"]:
+    """Return the histogram's cell of each pixel."""
+    table = [(np.arange(256) * bins // 256).astype(np.int32) for bins in _BINS]
+    light, a, b = (np.take(t, lab[..., k]) for k, t in enumerate(table))
+    return (light * _BINS[1] + a) * _BINS[2] + b
+
+
+def _greys() -> UInt8[np.ndarray, "n 3"]:
+    return np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
+
+
+def _moved(mask: np.ndarray, by: np.ndarray) -> np.ndarray:
+    if not np.rint(by).any():
+        return mask
+    shift = np.array([[1, 0, round(float(by[0]))], [0, 1, round(float(by[1]))]], np.float32)
+    return cv2.warpAffine(mask.astype(np.uint8), shift, mask.shape[::-1]) > 0
+
+
+def _middle(mask: np.ndarray) -> np.ndarray:
+    x, y, w, h = bounding_box(mask)
+    return np.array([x + w / 2, y + h / 2])
+
+
+def _without_pinholes(mask: np.ndarray) -> np.ndarray:
+    """Return the mask with holes filled that are smaller than what a finger would leave."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(
+        (~mask).astype(np.uint8), connectivity=4
+    )
+    small = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] < 0.05 * mask.sum()]
+    return mask | np.isin(parts, small) if small else mask
