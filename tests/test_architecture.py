@@ -26,6 +26,7 @@ BELOW: dict[str, set[str]] = {
     # It sees the arm that policies were trained with, and what a robot is; never the twin's inside.
     "deployment": {
         "twin",
+        "evaluation",
         "episodes",
         "sim",
         "task",

@@ -3,6 +3,7 @@
 import json
 import logging
 import shutil
+import signal
 import warnings
 
 import numpy as np
@@ -143,11 +144,14 @@ def test_lerobots_own_rollout_sees_by_tracking_from_a_click(
     )  # fmt: skip
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         main()
     root.handlers[:] = handlers
     root.setLevel(level)
+    for number, handler in signals.items():
+        signal.signal(number, handler)
 
     assert len(seen) > 3
     overlaps = [(a & b).sum() / (a | b).sum() for a, b in seen]

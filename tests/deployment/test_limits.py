@@ -116,6 +116,7 @@ def test_actions_are_changed_by_what_is_said_and_no_more(reading):
 
     free = guard.limit(np.array([0.2, 0, -0.3, 0, 0, 0.1, 1.0]), reading())
     fast = guard.limit(np.array([1.0, 0, 0, 0, 0, 0, 0]), reading())
+    both = guard.limit(np.array([1.0, 0, 0, 0, 0, 0.4, 0]), reading())
     wide = guard.limit(np.array([0, 0, 0, 0, 0, 0, -9.0]), reading())
     ahead = guard.limit(np.array([0.5, 0, 0, 0, 0, 0, 0]), reading(lead=(0.025, 0, 0)))
     low = guard.limit(np.array([0, 0, -0.5, 0, 0, 0, 0]), reading(pos=(0.5, 0, 0.027)))
@@ -124,6 +125,7 @@ def test_actions_are_changed_by_what_is_said_and_no_more(reading):
     assert free.acted == ()
     np.testing.assert_allclose(fast.action[0], 0.5)  # 0.3 m/s are 15 mm of the 30 of a full action
     assert fast.acted == ("speed",)
+    np.testing.assert_allclose(both.action[[0, 5]], [0.5, 0.2])  # the same way, half as fast
     assert (wide.action[6], wide.acted) == (-1.0, ("range",))
     np.testing.assert_allclose(ahead.action[0], 5 / 30)  # 30 mm ahead at most, 25 already
     assert ahead.acted == ("lead",)

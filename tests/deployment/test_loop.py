@@ -79,9 +79,14 @@ def test_ctrl_c_ends_a_run_and_leaves_what_was_seen(blind_robot, restarted, stea
         if blind_robot.arm.steps == 4:
             signal.raise_signal(signal.SIGINT)
 
-    outcome = run_of(
+    run = run_of(
         rig, steady(0, 0, 0, 0, 0, 0, 0), seconds=5.0, recorder=recorder, on_step=interrupt
-    ).go()
+    )
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # LeRobot's tools leave theirs
+    outcome = run.go()
+    signal.signal(signal.SIGINT, before)
 
     assert outcome.ending == "interrupted"
     assert (
@@ -146,3 +151,18 @@ def test_a_robot_that_falls_silent_is_told_to_hold(blind_robot, restarted, stead
     assert "no reading came for 500 ms" in outcome.sentence
     assert blind_robot.arm.steps == 5  # nothing was done after the silence
     assert held[1] - held[0] > 0.3  # once by the watchdog in time, once at the end
+
+
+def test_a_policy_that_breaks_leaves_the_arm_at_rest(blind_robot, restarted, steady):
+    class Broken(steady):
+        def act(self, labels, state):
+            if blind_robot.arm.steps == 3:
+                raise RuntimeError("shapes do not fit")
+            return super().act(labels, state)
+
+    rig, held = restarted(blind_robot), []
+    rig.hold = lambda: held.append(blind_robot.arm.steps)
+
+    with pytest.raises(RuntimeError, match="shapes"):
+        run_of(rig, Broken(0, 0, 0, 0, 0, 0, 0)).go()
+    assert held == [3]

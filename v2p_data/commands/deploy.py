@@ -172,10 +172,13 @@ def connected(words: Sequence[str]) -> Iterator[Any]:
     """
     from lerobot.robots import make_robot_from_config
 
+    named = {
+        word.partition("=")[0].removeprefix(ROBOT_PREFIX): word.partition("=")[2] for word in words
+    }
+    gives_pictures = named.get("type") == OURS and named.get("backend") != "franky"
+    if gives_pictures and not {"pictures", "clicks"} & set(named):
+        words = [*words, f"{ROBOT_PREFIX}pictures=rgb"]
     config = robot_config(words)
-    if config.type == OURS and config.backend != "franky" and not config.clicks:
-        given = any(word.startswith("--robot.pictures=") for word in words)
-        config.pictures = config.pictures if given else "rgb"
     robot = make_robot_from_config(config)
     robot.connect()
     try:

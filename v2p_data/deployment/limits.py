@@ -36,10 +36,11 @@ OVERSPEED = 1.8
 class LimitsConfig:
     """Bounds of every action and of what the robot reports."""
 
-    max_speed_m_s: float = 0.6
-    """Of the tool's target. 0.6 is a full action of the training; begin with 0.1 on a real arm."""
-    max_turn_rad_s: float = 2.0
-    """Of the tool's target, about any axis."""
+    max_speed_m_s: float = 1.04
+    """Of the tool's target. The default is a full action of the training along all axes; begin with 0.1 on a real arm."""
+    max_turn_rad_s: float = 4.0
+    """Of the tool's target, about any axis; a full action of the training about one. Whichever of the two limits acts
+    slows both motions down alike."""
     workspace_low_m: tuple[float, float, float] = TARGET_LOW_M
     """Lowest x, y, z of the tool's target; the training's by default, 17 mm above the table."""
     workspace_high_m: tuple[float, float, float] = TARGET_HIGH_M
@@ -169,25 +170,36 @@ class Guard:
         allowed = np.clip(action, -1.0, 1.0)
         if np.abs(action - allowed).max() > 1e-6:
             acted.append("range")
-        shift = self._shift(allowed[:3] * self.scale.position_step_m, reading, acted)
+        shift = allowed[:3] * self.scale.position_step_m
+        turn = allowed[3:6] * self.scale.rotation_step_rad
+        # One factor for both: the arm goes the same way, later.
+        slower = min(
+            1.0,
+            self._share(shift, self.cfg.max_speed_m_s, "speed", acted),
+            self._share(turn, self.cfg.max_turn_rad_s, "turn", acted),
+        )
+        shift = self._shift(slower * shift, reading, acted)
+        turn = self._turn(slower * turn, reading, acted)
         allowed[:3] = np.clip(shift / self.scale.position_step_m, -1.0, 1.0)
-        allowed[3:6] = self._turn(allowed[3:6] * self.scale.rotation_step_rad, reading, acted)
+        allowed[3:6] = turn / self.scale.rotation_step_rad
         return Limited(action=allowed, acted=tuple(acted))
 
+    def _share(self, motion: np.ndarray, limit_per_s: float, name: str, acted: list[str]) -> float:
+        """Return how much of a step's motion a limit leaves."""
+        length = float(np.linalg.norm(motion))
+        share = limit_per_s * self.step_s / max(length, 1e-12)
+        if share < 1 - 1e-9:
+            acted.append(name)
+        return min(1.0, share)
+
     def _shift(self, shift: np.ndarray, reading: Reading, acted: list[str]) -> np.ndarray:
-        farthest = self.cfg.max_speed_m_s * self.step_s
-        length = float(np.linalg.norm(shift))
-        if length > farthest * (1 + 1e-9):
-            shift = shift * (farthest / length)
-            acted.append("speed")
         old = reading.target_pos
         lead = self.cfg.max_speed_m_s * LAG_S
         target = old + shift
         led = np.clip(target, reading.tool_pos - lead, reading.tool_pos + lead)
         # A target that is too far ahead already may come back, and need not jump.
-        led = np.where(
-            np.abs(target - reading.tool_pos) < np.abs(old - reading.tool_pos), target, led
-        )
+        is_nearer = np.abs(target - reading.tool_pos) < np.abs(old - reading.tool_pos)
+        led = np.where(is_nearer, target, led)
         if np.abs(led - target).max() > 1e-6:
             acted.append("lead")
         # From outside the box any way back in is allowed, none further out.
@@ -198,11 +210,6 @@ class Guard:
         return boxed - old
 
     def _turn(self, turn: np.ndarray, reading: Reading, acted: list[str]) -> np.ndarray:
-        farthest = self.cfg.max_turn_rad_s * self.step_s
-        angle = float(np.linalg.norm(turn))
-        if angle > farthest * (1 + 1e-9):
-            turn = turn * (farthest / angle)
-            acted.append("turn")
         # Where the tool will point once what was sent has been done, and with this turn.
         axis = _pointing(reading)
         for sent in self._turns:
@@ -212,7 +219,7 @@ class Guard:
             turn = np.array([0.0, 0.0, turn[2]])
             acted.append("tilt")
         self._turns.append(turn)
-        return turn / self.scale.rotation_step_rad
+        return turn
 
     def _outside(self, reading: Reading) -> float:
         pos = reading.tool_pos

@@ -112,11 +112,15 @@ class Rig:
         sent = self.robot.send_action(dict(zip(ACTION_NAMES, action.tolist(), strict=True)))
         return np.array([float(sent[name]) for name in ACTION_NAMES])
 
+    @property
+    def can_hold(self) -> bool:
+        """Whether the robot can be told to hold at any time, from another thread too."""
+        return hasattr(self.robot, "hold")
+
     def hold(self) -> None:
         """Let the arm stay where it is, fingers as they are."""
-        hold = getattr(self.robot, "hold", None)
-        if hold is not None:
-            hold()
+        if self.can_hold:
+            self.robot.hold()  # pyright: ignore[reportAttributeAccessIssue]
         else:
             self.act(np.zeros(len(ACTION_NAMES)))
 
