@@ -9,7 +9,8 @@ from pathlib import Path
 
 from policies.ppo.policy import EXPERT_FILE, WEIGHTS_FILE
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.artifact import read_record
+from v2p_data.pipeline.artifact import demand_whole, read_record
+from v2p_data.pipeline.contents import damaged
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.task.nearest import Solved
 from v2p_data.task.task import TaskBundle
@@ -19,19 +20,24 @@ def find_solved(runs: Path) -> list[Solved]:
     """Return the experts in a folder of runs that were finished and not rejected.
 
     Raises:
-        V2PError: there is none.
+        V2PError: there is none, or one of them, or its task, is not as it was made.
     """
     found: list[Solved] = []
     for folder in sorted(runs.glob("expert/*")):
         record = read_record(folder)
         if record is None or record.rejected is not None:
             continue
-        places = (runs / stage / record.inputs["task"] for stage in ("task", "reward"))
+        places = (runs / stage / record.inputs.get("task", "") for stage in ("task", "reward"))
         task = next((place for place in places if place.is_dir()), None)
         if task is None:
             continue  # cleared away: what the expert can do is not known any more
-        about = json.loads((folder / EXPERT_FILE).read_text())
-        found.append(Solved(bundle=TaskBundle.load(task), folder=folder, obs_dim=about["obs_dim"]))
+        demand_whole(folder, runs)
+        demand_whole(task, runs)
+        try:
+            obs_dim = int(json.loads((folder / EXPERT_FILE).read_text())["obs_dim"])
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise damaged(folder, f"{folder / EXPERT_FILE} cannot be read") from error
+        found.append(Solved(bundle=TaskBundle.load(task), folder=folder, obs_dim=obs_dim))
     if not found:
         raise V2PError(
             f"there is no finished expert in {runs}; --expert.warm-start names a folder of runs, "

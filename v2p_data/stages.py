@@ -50,7 +50,6 @@ from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
 from v2p_data.solved import find_solved, solved_digests
 from v2p_data.task.generate import TaskConfig
-from v2p_data.task.nearest import Solved
 from v2p_data.task.task import CODE_FILE, TASK_FILE
 from v2p_data.task.vlm_config import VlmConfig
 from v2p_data.video.captions import VideoItem
@@ -333,7 +332,7 @@ def make_expert(
         seed=seed_for(cfg.seed, "expert", bundle.title),
         num_threads=runtime.num_threads,
         device=runtime.device,
-        solved=_whole(find_solved(warm_start), runtime.root) if warm_start else (),
+        solved=find_solved(warm_start) if warm_start else (),
         success_bonus=success_bonus,
         on_progress=lambda share, words: runtime.progress(0.95 * share, words),
     )
@@ -366,13 +365,6 @@ def make_expert(
     if teaches_model:  # an example for the tasks that come after
         add_solved(runtime.root / SOLVED_POOL_FOLDER, bundle, rate.value)
     return counts
-
-
-def _whole(solved: Sequence[Solved], root: Path) -> Sequence[Solved]:
-    for other in solved:
-        demand_whole(other.folder, root)
-        demand_whole(other.bundle.folder, root)
-    return solved
 
 
 # --- expert -> episodes --------------------------------------------------------------------------------------

@@ -1,9 +1,8 @@
 """From a dataset to a policy: sources, the distillation and policy stages with a real student, and their kills."""
 
-import json
 import shutil
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.rounds import handover_episodes
 from v2p_data.episodes.collect import staged_episodes
 from v2p_data.episodes.verify import verify
+from v2p_data.pipeline.artifact import write_record
 from v2p_data.pipeline.runner import Outcome, Runtime
 from v2p_data.policy_config import PolicyConfig
 from v2p_data.policy_training import POLICY_FOLDER, recorded_under, sources_of
@@ -50,11 +50,11 @@ def make(root: Path, engine=ENGINE) -> dict[str, Outcome]:
     return {stage: outcome for (stage, _), outcome in outcomes.items()}
 
 
-def change_record(folder: Path, change) -> None:
-    path = folder / "record.json"
-    record = json.loads(path.read_text())
-    change(record)
-    path.write_text(json.dumps(record))
+def change_record(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Write a record anew as if the result had been made so."""
+    data = asdict(record_of(folder))
+    change(data)
+    write_record(folder, replace(record_of(folder), recipe=data["recipe"]))
 
 
 def test_the_task_and_expert_behind_a_dataset_are_found(finished: Path):

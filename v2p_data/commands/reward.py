@@ -12,6 +12,7 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import demand_whole
 from v2p_data.reward.candidate import (
     CANDIDATE_FILE,
     FEEDBACK_FILE,
@@ -243,4 +244,5 @@ def _task(task: Path) -> TaskBundle:
 
     if not task.exists() and str(task) in benchmark_names():
         return load_benchmark(str(task))
+    demand_whole(task)
     return TaskBundle.load(task)

@@ -350,7 +350,8 @@ def _seen_tasks(who: Contestant) -> dict[str, Path]:
     root = _home_of(who, ())
     record = read_record(who.folder.parent if who.kind == "policy" else who.folder)
     if record is not None and (who.kind, record.stage) == ("policy", "policy"):
-        for dataset in sorted((root / "dataset").glob(record.recipe["sources"]["dataset"])):
+        named = (record.recipe.get("sources") or {}).get("dataset")
+        for dataset in sorted((root / "dataset").glob(str(named))):
             # The run's own tasks first: those in the dataset do not say where the file of another arm lies.
             own = {source.item: source.task for source in sources_of(dataset, root)}
             return own or task_folders(dataset / ROOT_OF_TASKS)
@@ -373,7 +374,11 @@ def _dataset_record(dataset: Path) -> Record:
         V2PError: it is none.
     """
     record = read_record(dataset)
-    if record is None or record.stage != "dataset":
+    if (
+        record is None
+        or record.stage != "dataset"
+        or not is_repo_id(str(record.counts.get("repo_id")))
+    ):
         raise V2PError(
             f"{dataset} is no dataset of v2p generate; for others use"
             " 'lerobot-train --policy.type=v2p_bc --dataset.root=...'"

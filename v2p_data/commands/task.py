@@ -9,6 +9,7 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import demand_whole
 from v2p_data.task.task import TASK_FILE, TaskBundle
 
 
@@ -37,6 +38,7 @@ def tasks_in(folder: Path) -> list[Path]:
 
 def shown(folder: Path) -> str:
     """Return a task in words: caption, audit table, code."""
+    demand_whole(folder)
     bundle = TaskBundle.load(folder)
     return "\n".join(
         [

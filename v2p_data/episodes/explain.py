@@ -14,9 +14,17 @@ from typing import Any
 from v2p_data.episodes.about import CARRIED_TASKS, read_about
 from v2p_data.episodes.features import METADATA_FILE
 from v2p_data.episodes.handovers import who_acted
-from v2p_data.episodes.tables import INFO_FILE, damage_told, episodes_of, read_info, read_json
+from v2p_data.episodes.tables import (
+    INFO_FILE,
+    READING_ERRORS,
+    damage_told,
+    episodes_of,
+    read_info,
+    read_json,
+)
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import RECORD_FILE, read_record
+from v2p_data.pipeline.contents import damaged
 
 STAGES = ("scene", "task", "reward", "expert", "episodes")
 ABSENT = "(absent)"
@@ -49,7 +57,10 @@ def explain(path: Path, episode: int | None = None) -> list[str]:
         )
     if episode is not None:
         raise V2PError(f"{path} is no dataset, so it has no episode {episode}")
-    return _record(path)
+    try:
+        return _record(path)
+    except READING_ERRORS as error:
+        raise damaged(path, f"{path / RECORD_FILE} holds no record of ours") from error
 
 
 def differences(first: Path, second: Path) -> list[Difference]:

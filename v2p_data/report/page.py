@@ -23,6 +23,8 @@ from v2p_data.report.reading import (
     STAGES,
     Dropped,
     Run,
+    as_dict,
+    as_list,
     dropped,
     model_use,
     number,
@@ -95,8 +97,8 @@ def render_page(root: Path, cfg: PageConfig) -> str:
         total_seconds=sum((r.seconds or 0.0 for r in run.results.values()), 0.0),
         use=model_use(run),
         provenance=provenance,
-        command=shlex.join(str(a) for a in provenance.get("argv", [])),
-        packages=provenance.get("packages", {}),
+        command=shlex.join(map(str, as_list(provenance.get("argv")))),
+        packages=as_dict(provenance.get("packages")),
         commands=_commands(run),
         unreadable=run.unreadable,
         left_out=budget.left_out,
@@ -130,10 +132,10 @@ def _summary(run: Run, items: Sequence[ItemView], evaluation: Sequence[Evaluatio
     if any(v.results["expert"] for v in own):
         sentences.append(f"{_plural(learned, 'task was', 'tasks were')} learned by an expert.")
     for result in run.made("dataset"):
-        episodes, frames = result.counts.get("episodes", 0), result.counts.get("frames", 0)
+        episodes, frames = (int(number(result.counts.get(k)) or 0) for k in ("episodes", "frames"))
         sentences.append(
             f"The dataset {result.counts.get('repo_id', result.item)} holds "
-            f"{_plural(int(episodes), 'successful episode')}, {_plural(int(frames), 'frame')}."
+            f"{_plural(episodes, 'successful episode')}, {_plural(frames, 'frame')}."
         )
     for is_seen, words in ((True, "it was trained on"), (False, "it has never seen")):
         rates = [r.rate for r in evaluation if r.is_policy and r.is_seen == is_seen]

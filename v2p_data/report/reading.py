@@ -252,9 +252,14 @@ def as_dict(data: Any) -> dict[str, Any]:
     return data if isinstance(data, dict) else {}
 
 
+def as_list(data: Any) -> list[Any]:
+    """Return JSON that should be a list, an empty one if it is anything else."""
+    return data if isinstance(data, list) else []
+
+
 def as_dicts(data: Any) -> list[dict[str, Any]]:
     """Return the objects in JSON that should be a list of them."""
-    return [row for row in data if isinstance(row, dict)] if isinstance(data, list) else []
+    return [row for row in as_list(data) if isinstance(row, dict)]
 
 
 def span(values: Iterable[Any]) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from v2p_data.report.reading import as_dict, as_dicts, number, read_json
+from v2p_data.report.reading import as_dict, as_dicts, as_list, number, read_json
 
 SEARCH_FOLDER = "search"
 """In the result of the stage `reward`."""
@@ -120,11 +120,11 @@ def read_search(folder: Path) -> Search | None:
     if not recipe and not found:
         return None
     rows = as_dicts(table.get("candidates"))
-    shares = [s for v in _list(config.get("rungs")) if (s := number(v)) and s > 0]
+    shares = [s for v in as_list(config.get("rungs")) if (s := number(v)) and s > 0]
     rungs = tuple(round(share / shares[0]) for share in shares) or (1,)
     return Search(
         method=str(config.get("method") or table.get("method") or ""),
-        without=tuple(str(part) for part in _list(config.get("without"))),
+        without=tuple(str(part) for part in as_list(config.get("without"))),
         candidates={c.number: c for c in found},
         rungs=rungs,
         steps_per_evaluation=(number(config.get("steps")) or 1.0) / rungs[-1],
@@ -157,7 +157,7 @@ def _candidate(folder: Path, search: Path, num_seeds: int) -> Candidate | None:
         iteration=iteration,
         parent=parent if isinstance(parent, int) else None,
         origin=str(data.get("origin") or "unknown")[:MAX_SENTENCE_CHARS],
-        reasons=tuple(str(r)[:MAX_SENTENCE_CHARS] for r in _list(data.get("reasons"))[:20]),
+        reasons=tuple(str(r)[:MAX_SENTENCE_CHARS] for r in as_list(data.get("reasons"))[:20]),
         code=_text(folder / "code.py", search),
         trials=tuple(_trial(folder / f"seed-{k}", search) for k in range(num_seeds)),
     )
@@ -183,7 +183,7 @@ def _trial(folder: Path, search: Path) -> Trial:
 def _choice(found: dict[str, Any]) -> Choice | None:
     if not isinstance(found.get("chosen"), int):
         return None
-    rates = [number(rate) for rate in _list(found.get("per_seed"))]
+    rates = [number(rate) for rate in as_list(found.get("per_seed"))]
     return Choice(
         number=found["chosen"],
         success=number(found.get("success")),
@@ -212,10 +212,6 @@ def _own_file(path: Path, inside: Path) -> Path | None:
     except (OSError, RuntimeError):
         return None
     return path if is_own else None
-
-
-def _list(data: Any) -> list[Any]:
-    return data if isinstance(data, list) else []
 
 
 def _count(data: Any) -> int | None:
