@@ -384,7 +384,7 @@ def test_the_twin_is_a_lerobot_robot_that_gives_what_a_real_arm_gives(task_folde
     sent = [robot.send_action(dict.fromkeys(ACTION_NAMES, 0.0) | {"delta_z.pos": 7.0})]
     sent += [robot.send_action(sent[0]) for _ in range(5)]
     after = robot.get_observation()
-    camera, joints = robot.calibrated_camera(), robot.joints()
+    camera, joints = robot.calibration(), robot.joints()
     robot.disconnect()
 
     assert [*robot.observation_features] == [*STATE_NAMES, "rgb"] == [*before]
@@ -434,6 +434,6 @@ def test_targets_move_by_the_action_scale_and_stay_on_their_leashes():
     np.testing.assert_allclose(after([0, 0, 0, 0, 0, 0, 1], 1).opening, 0.8)
     np.testing.assert_allclose(after([0, 0, 0, 0, 0, 0, 1 / 3], 1).opening, 0.9)
     turned = ToolPose(
-        pos=measured.pos, rotation=Rotation.from_rotvec([0, 0, 0.3]) * DOWN, opening=0
+        pos=measured.pos, rotation=Rotation.from_rotvec([0, 0, 0.3]) * DOWN, opening=0.0
     )
     np.testing.assert_allclose(turned.state(turned)[3:7], [0, 0, -0.3, 0], atol=1e-12)

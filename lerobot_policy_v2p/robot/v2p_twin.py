@@ -32,6 +32,7 @@ class V2PTwin(Robot):
 
     def __init__(self, config: V2PTwinConfig) -> None:
         super().__init__(config)
+        del self.calibration  # LeRobot's dict of motors, which would hide the method
         self.config = config
         self.arm: TwinArm | None = None
         self._steps = 0
@@ -96,7 +97,7 @@ class V2PTwin(Robot):
             logger.info("task '%s' succeeded in the twin after %d steps", title, self._steps)
         return dict(zip(ACTION_NAMES, clipped.tolist(), strict=True))
 
-    def calibrated_camera(self) -> Camera:
+    def calibration(self) -> Camera:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Return the camera of `rgb` as calibrated, in the arm's base frame."""
         return self._connected().robot.calibration()
 

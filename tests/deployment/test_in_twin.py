@@ -26,7 +26,7 @@ def test_the_twin_is_seen_from_one_click_and_kept_within_limits(task_folder, ste
     except V2PError as error:
         pytest.skip(str(error))
     u, v = points_inside(robot.arm.robot.true_labels() == 2, 1)[0]
-    sight = Sight(robot.calibrated_camera(), [(float(u), float(v))])
+    sight = Sight(robot.calibration(), [(float(u), float(v))])
 
     read = rig.read
 

@@ -23,7 +23,7 @@ class RobotWithCamera(Protocol):
     def get_observation(self) -> dict[str, Any]:
         """Return the entries of `episodes.features.STATE_NAMES` as floats, and `rgb`.
 
-        The picture is rectified: a pinhole picture with the matrix and orientation of `calibrated_camera()`.
+        The picture is rectified: a pinhole picture with the matrix and orientation of `calibration()`.
         """
         ...
 
@@ -31,7 +31,7 @@ class RobotWithCamera(Protocol):
         """Carry out an action for one control step of 50 ms; return it as carried out, clipped to [-1, 1]."""
         ...
 
-    def calibrated_camera(self) -> Camera:
+    def calibration(self) -> Camera:
         """Return the camera of `rgb` as calibrated: `K` in pixels and `T_world_cam`, OpenCV axes.
 
         The world frame is the arm's base frame. The true camera differs by the calibration error.

@@ -125,16 +125,51 @@ def changed(change: Mapping[str, float]) -> TwinParameters:
     """Return the nominal twin with other values of some single numbers, for sweeps.
 
     Raises:
-        V2PError: there is no such number, or it is not finite.
+        V2PError: there is no such number, or it cannot have such a value.
     """
     base = nominal()
     single = [f.name for f in fields(base) if not f.metadata["count"]]
     for name, value in change.items():
         if name not in single:
             raise V2PError(f"the twin has no single number '{name}'.{did_you_mean(name, single)}")
-        if not np.isfinite(value):
-            raise V2PError(f"the twin's {name} must be a finite number, got {value}")
+        low, high = _possible(name)
+        if not low <= value <= high:  # also where it is no number
+            raise V2PError(f"the twin's {name} lies between {low:g} and {high:g}, got {value}")
     return replace(base, **change)
+
+
+def _possible(name: str) -> tuple[float, float]:
+    """Return the bounds of what a number may be at all: wide, for sweeps until nothing works."""
+    if name in _BOUNDS:
+        return _BOUNDS[name]
+    low = {f.name: f.metadata["low"] for f in fields(TwinParameters)}[name]
+    return (0.0, 1e3) if low >= 0 else (-1.0, 1.0)
+
+
+_BOUNDS = {
+    "contact_time_s": (0.004, 0.1),
+    "mass_scale": (0.01, 100.0),
+    "size_scale": (0.5, 2.0),
+    "reference_gain_hz": (0.5, 40.0),
+    "speed_share": (0.01, 1.0),
+    "stiffness_scale": (0.1, 3.0),
+    "damping_scale": (0.1, 3.0),
+    "motor_lag_s": (0.0, 0.01),
+    "armature_scale": (0.2, 5.0),
+    "gripper_speed_m_s": (0.005, 1.0),
+    "grip_force_n": (1.0, 235.0),
+    "gripper_deadband": (0.0, 0.5),
+    "command_latency_s": (0.0, 2.0),
+    "reading_latency_s": (0.0, 2.0),
+    "camera_latency_s": (0.0, 2.0),
+    "focal_scale": (0.95, 1.05),
+    "calibration_focal_scale": (0.8, 1.2),
+    "blur_px": (0.1, 10.0),
+    "vignette": (0.0, 1.0),
+    "full_well": (10.0, 1e6),
+    "jpeg_quality": (1.0, 100.0),
+}
+"""Of numbers that may not be zero, or beyond which nothing is simulated faithfully."""
 
 
 def episode_rng(seed: int, what: str) -> np.random.Generator:
