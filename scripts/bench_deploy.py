@@ -161,7 +161,7 @@ def episode(
             for k in range(len(bundle.scene.objects))
         ]
         clicks = [(float(u), float(v)) for u, v in spots]
-        sight = TimedSight(robot.calibrated_camera(), clicks)
+        sight = TimedSight(robot.calibration(), clicks)
         sight.took = into.see_ms
 
     def compare(reading: Reading, seen: Seen) -> None:

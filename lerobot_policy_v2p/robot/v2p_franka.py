@@ -84,6 +84,7 @@ class V2PFranka(Robot):
 
     def __init__(self, config: V2PFrankaConfig) -> None:
         super().__init__(config)
+        del self.calibration  # LeRobot's dict of motors, which would hide the method
         self.config = config
         self.arm: Arm | None = None
         self._sight: Sight | None = None
@@ -124,9 +125,7 @@ class V2PFranka(Robot):
             self._is_started = False
             self._sight = None
             if self.config.clicks and self.config.pictures == "mask":
-                self._sight = Sight(
-                    self.calibrated_camera(), clicks_from(self.config.clicks.split())
-                )
+                self._sight = Sight(self.calibration(), clicks_from(self.config.clicks.split()))
             if self.config.backend != "sim":
                 self._guard = Guard(self.config.limits, self.arm.action_scale)
 
@@ -176,7 +175,7 @@ class V2PFranka(Robot):
         done = arm.act(np.clip(wanted, -1.0, 1.0))
         return dict(zip(ACTION_NAMES, done.tolist(), strict=True))
 
-    def calibrated_camera(self) -> Camera:
+    def calibration(self) -> Camera:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Return the camera of `rgb`."""
         return self._seeing().calibration()
 

@@ -54,7 +54,7 @@ def test_a_dry_run_sends_nothing(blind_robot, restarted, steady):
 def test_losing_the_object_stops_the_arm(seeing_robot, restarted, steady, click_on):
     rig = restarted(seeing_robot)
     arm = seeing_robot.arm
-    sight = Sight(seeing_robot.calibrated_camera(), [click_on(seeing_robot)])
+    sight = Sight(seeing_robot.calibration(), [click_on(seeing_robot)])
     address = arm.env.world.objects[0].qpos_adr
 
     def take_away(reading, seen):

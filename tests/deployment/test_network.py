@@ -80,7 +80,7 @@ def test_a_driver_reads_and_moves_like_the_arm_behind_it(
     np.testing.assert_array_equal(far.picture, near.picture)
     np.testing.assert_allclose(far.joints_rad, near.joints_rad, atol=1e-9)
     np.testing.assert_allclose(
-        robot.calibrated_camera().T_world_cam, seeing_robot.calibrated_camera().T_world_cam
+        robot.calibration().T_world_cam, seeing_robot.calibration().T_world_cam
     )
     for action in ([0.5, 0.2, -0.3, 0, 0, 0.4, 1.0], [0.5, 0.2, -0.3, 0, 0, 0.4, 1.0], [0] * 7):
         Rig(robot).act(np.array(action, float))
@@ -101,7 +101,7 @@ def test_the_loop_runs_over_the_network_and_a_limit_holds_there_too(
     robot = robot_at(server.address, tmp_path)
     rig, places = Rig(robot), []
     restarted(seeing_robot)
-    sight = Sight(robot.calibrated_camera(), [click_on(seeing_robot)])
+    sight = Sight(robot.calibration(), [click_on(seeing_robot)])
     limits = LimitsConfig(max_silence_ms=60_000.0, max_speed_m_s=0.1)
 
     outcome = Run(
@@ -259,7 +259,7 @@ def test_a_driver_that_stops_answering_ends_the_run_with_one_sentence(
     robot = robot_at(server.address, tmp_path)
     rig, steps = Rig(robot), []
     restarted(seeing_robot)
-    sight = Sight(robot.calibrated_camera(), [click_on(seeing_robot)])
+    sight = Sight(robot.calibration(), [click_on(seeing_robot)])
     robot.arm.driver.timeout_s = 4.0
     robot.arm.driver._socket.settimeout(4.0)
 

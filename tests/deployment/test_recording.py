@@ -19,7 +19,7 @@ def test_lerobot_reads_back_masks_pictures_states_and_the_actions_that_passed_th
     rig, sent = restarted(seeing_robot), []
     send = rig.act
     rig.act = lambda action: sent.append(action) or send(action)
-    sight = Sight(seeing_robot.calibrated_camera(), [click_on(seeing_robot)])
+    sight = Sight(seeing_robot.calibration(), [click_on(seeing_robot)])
     recorder, steps = Recorder("lifting the red box"), []
     limits = LimitsConfig(max_speed_m_s=0.3, max_silence_ms=60_000.0)
     run = Run(

@@ -28,7 +28,7 @@ def course(make_robot, two_objects):
             [-0.08, 0, 0.05] if step < 12 else [0.0, 0, 0.0] if step < 30 else [0, 0.1, 0.1]
         )
         rig.act(np.r_[np.clip((goal - tool) / 0.03, -0.8, 0.8), 0, 0, 0, 1.0])
-    camera = robot.calibrated_camera()
+    camera = robot.calibration()
     robot.disconnect()
     return rows, camera
 

@@ -17,7 +17,7 @@ def drawn(robot, camera):
 def test_the_silhouette_is_the_robots_true_mask(blind_robot, restarted):
     restarted(blind_robot, seed=3)
 
-    mask = drawn(blind_robot, blind_robot.calibrated_camera())
+    mask = drawn(blind_robot, blind_robot.calibration())
 
     true = rgb_to_labels(blind_robot.arm.mask()) == ROBOT
     assert true.sum() > 2000
@@ -26,7 +26,7 @@ def test_the_silhouette_is_the_robots_true_mask(blind_robot, restarted):
 
 def test_a_moved_principal_point_moves_the_silhouette(blind_robot, restarted):
     restarted(blind_robot)
-    camera = blind_robot.calibrated_camera()
+    camera = blind_robot.calibration()
     K = camera.K + np.array([[0, 0, 7.0], [0, 0, -4.0], [0, 0, 0]])
 
     moved = drawn(blind_robot, replace(camera, K=K))
@@ -37,7 +37,7 @@ def test_a_moved_principal_point_moves_the_silhouette(blind_robot, restarted):
 
 def test_a_wider_pixel_narrows_the_silhouette(blind_robot, restarted):
     restarted(blind_robot)
-    camera = blind_robot.calibrated_camera()
+    camera = blind_robot.calibration()
     K = camera.K.copy()
     K[0, 0] /= 2
 

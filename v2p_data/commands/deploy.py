@@ -102,7 +102,7 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
     sight = None
     if reading.picture is not None:
         clicks = _clicks(args, rig, reading)
-        sight = Sight(rig.robot.calibrated_camera(), clicks, _tracker_maker(args))
+        sight = Sight(rig.robot.calibration(), clicks, _tracker_maker(args))
     elif args.click:
         raise V2PError("this robot segments by itself; leave --click away")
     num_labels = getattr(policy.loaded.policy.config, "num_labels", None)
@@ -266,7 +266,7 @@ def _clicks(args: Deploy, rig: Rig, reading: Reading) -> Sequence[tuple[float, f
         return clicks_from(args.click)
     assert reading.picture is not None
     assert reading.joints_rad is not None
-    drawn = Silhouette(rig.robot.calibrated_camera()).draw(
+    drawn = Silhouette(rig.robot.calibration()).draw(
         reading.joints_rad, fingers_m(reading.opening)
     )
     new_tracker, shown = _tracker_maker(args), reading.picture

@@ -1,0 +1,50 @@
+"""The loop in the twin: another simulator, whose pictures and readings are as late and as wrong as a real arm's."""
+
+import numpy as np
+import pytest
+
+from v2p_data.deployment.limits import Guard, LimitsConfig
+from v2p_data.deployment.loop import LoopConfig, Run
+from v2p_data.deployment.robot import Rig
+from v2p_data.deployment.sight import Sight
+from v2p_data.errors import V2PError
+from v2p_data.scene.backends.segment import points_inside
+from v2p_data.scene.segment import iou
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_twin_is_seen_from_one_click_and_kept_within_limits(task_folder, steady, tmp_path):
+    from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
+    from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
+
+    robot = V2PTwin(V2PTwinConfig(task_folder=str(task_folder), calibration_dir=tmp_path))
+    robot.connect()
+    rig, places, seen_labels, true = Rig(robot), [], [], []
+    try:
+        rig.read()
+    except V2PError as error:
+        pytest.skip(str(error))
+    u, v = points_inside(robot.arm.robot.true_labels() == 2, 1)[0]
+    sight = Sight(robot.calibration(), [(float(u), float(v))])
+
+    read = rig.read
+
+    def noted():
+        reading = read()
+        true.append(robot.arm.robot.true_labels())
+        return reading
+
+    rig.read = noted
+    limits = LimitsConfig(max_speed_m_s=0.2, max_silence_ms=60_000.0)
+    outcome = Run(
+        rig, sight, steady(0.3, 0, 1, 0, 0, 0, 0), Guard(limits, rig.scale), LoopConfig(max_seconds=0.6, slow=True),
+        on_step=lambda reading, seen: (places.append(reading.tool_pos), seen_labels.append(seen.labels)),
+    ).go()  # fmt: skip
+    robot.disconnect()
+
+    assert (outcome.ending, outcome.steps) == ("time", 12)
+    assert outcome.acted["speed"] == 12
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() * 20 < 0.2 * 1.3
+    overlaps = [iou(a == 2, b == 2) for a, b in zip(seen_labels, true[-12:], strict=True)]
+    assert np.mean(overlaps) > 0.8
