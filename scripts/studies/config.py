@@ -45,12 +45,12 @@ class UnseenConfig:
     """The evaluation's objects, by the names of their folders."""
 
     shapes: tuple[str, ...] = (
-        *("mug", "apple", "tomato_soup_can", "mustard_bottle", "pudding_box"),
+        *("apple", "cracker_box", "e_cups", "mustard_bottle", "tomato_soup_can"),
     )
-    """New shapes of things that training clips are about too."""
+    """New shapes of things that training clips are about too: one of each noun that the gripper spans as it stands."""
     categories: tuple[str, ...] = (*("banana", "large_marker", "scissors", "spoon", "foam_brick"),)
     """Things that no training clip is about."""
-    drawn_shapes: tuple[str, ...] = ("mug", "apple", "soup can", "mustard bottle", "pudding box")
+    drawn_shapes: tuple[str, ...] = ("apple", "cracker box", "cup", "mustard bottle", "soup can")
     """Instead of `shapes`, where no folder of scans is given: products that clips are about, other specimens."""
     drawn_categories: tuple[str, ...] = ("toy duck", "egg", "candle", "jar", "tape")
     """Instead of `categories`, where no folder of scans is given: products of `pool.held_out`."""

@@ -99,7 +99,9 @@ def _failure(axes: Axes, rows: list[Row]) -> None:
 
 def _objects(axes: Axes, rows: list[Row]) -> None:
     names = list(rows[0]["objects"])
-    shown = [(arm, list(found.items())[-1]) for arm in ARMS if (found := by_count(rows, arm))]
+    shown: list[tuple[Arm, tuple[int, list[Row]]]] = [
+        (arm, list(found.items())[-1]) for arm in ARMS if (found := by_count(rows, arm))
+    ]
     width = 0.8 / len(shown)
     for k, (arm, (n, cells)) in enumerate(shown):
         rates = [rate([{"objects": {name: c["objects"][name]}} for c in cells]) for name in names]

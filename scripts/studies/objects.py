@@ -297,8 +297,7 @@ def make_unseen(
     """Write the scene of a mesh: true shape, mass if it is known, no video."""
     del inputs, runtime
     name = mesh.parent.name
-    whole = mended(read_mesh(mesh, name))
-    whole.apply_translation(-whole.bounds.mean(0))
+    whole = turned_square(mended(read_mesh(mesh, name)))
     mass = cfg["mass_kg"]
     estimate = float(np.clip(DENSITY_KG_M3 * whole.convex_hull.volume, 0.01, 0.6))
     thing = SceneObject(
@@ -340,6 +339,21 @@ def mended(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_normals(mesh)
     return mesh
+
+
+def turned_square(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh about its bounding box's middle, turned about the vertical until that box is smallest.
+
+    Reconstructed objects lie along their own axes; a scanner's axes are anyhow, and features of how an object lies
+    between the pads are told along them.
+    """
+    T_flat, _ = trimesh.bounds.oriented_bounds_2D(np.asarray(mesh.vertices)[:, :2])
+    turn = np.eye(4)
+    turn[:2, :2] = T_flat[:2, :2]
+    out = mesh.copy()
+    out.apply_transform(turn)
+    out.apply_translation(-out.bounds.mean(0))
+    return out
 
 
 def masses_in(folder: Path) -> dict[str, float]:

@@ -15,6 +15,7 @@ from v2p_data.episodes.collect import (
     roll_out,
     staged_episodes,
 )
+from v2p_data.episodes.rollouts import InWorlds
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.artifact import read_rejects
@@ -40,6 +41,22 @@ def collected(tmp_path_factory) -> Path:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_who_acts_in_the_worlds_themselves_is_given_them_and_asked_at_every_step(rollouts):
+    given = []
+
+    def begin(env):
+        given.append(env.num_envs)
+        return act
+
+    same = roll_out(
+        bundle(), InWorlds(begin), SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
+        task=PushTask, referee=agree,
+    )  # fmt: skip
+
+    assert given == [6]
+    assert (same.action == rollouts.action).all()
 
 
 def test_an_episode_ends_six_steps_after_success_held(rollouts):

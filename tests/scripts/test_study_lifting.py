@@ -179,6 +179,19 @@ def test_an_unseen_mesh_is_found_among_the_trainings_also_turned_moved_and_renam
         parts.objects.demand_apart([tmp_path / "task"], {"thing": unseen})
 
 
+def test_a_scan_is_turned_about_the_vertical_until_its_sides_are_its_own(parts):
+    box = trimesh.creation.box((0.03, 0.11, 0.09))
+    box.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0, 0, 1]))
+    box.apply_translation([0.2, 0.0, 0.5])
+
+    square = parts.objects.turned_square(box)
+
+    assert sorted(square.extents) == pytest.approx([0.03, 0.09, 0.11])
+    assert square.extents[2] == pytest.approx(0.09)
+    assert square.bounds.mean(0) == pytest.approx([0, 0, 0], abs=1e-12)
+    assert square.volume == pytest.approx(0.03 * 0.11 * 0.09)
+
+
 def test_a_missing_scan_is_named_with_those_that_are_there(parts, tmp_path):
     (tmp_path / "mug").mkdir()
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "mug" / "textured.obj")
