@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ import torch
 from v2p_data.cli import run
 from v2p_data.errors import V2PError
 from v2p_data.scene.files import copy_folder, is_plain_path, own_file
-from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.scene.scene import SCHEMA, Scene, SceneObject
 from v2p_data.scene.schema import ObjectEntry, SceneFile
 from v2p_data.sim.arms import RobotConfig
 from v2p_data.sim.batch_env import BatchEnv
@@ -219,6 +220,7 @@ def test_the_files_have_the_fields_of_what_they_become():
     assert set(TaskFile.model_fields) == names(TaskBundle) - {"scene", "code", "folder"}
     assert set(RobotEntry.model_fields) == names(RobotConfig)
     assert set(AuditEntry.model_fields) == names(Audit) | {"acceptable"}
+    assert get_args(SceneFile.model_fields["version"].annotation) == (SCHEMA,)
 
 
 def test_reading_gives_back_what_was_written(good: Path, tmp_path: Path):

@@ -20,7 +20,7 @@ from pydantic import (
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.files import is_plain_path, own_file, read_own
-from v2p_data.scene.scene import SCHEMA, Observed, Role, Shape, Symmetry
+from v2p_data.scene.scene import Observed, Role, Shape, Symmetry
 
 MAX_SCENE_BYTES = 32_000_000
 """An hour of two objects at 10 Hz."""
@@ -264,6 +264,3 @@ def _check_course(thing: ObjectEntry, path: Path) -> None:
     if len(set(given.values())) > 1:
         told = ", ".join(f"{n} {name}" for name, n in given.items())
         raise V2PError(f"{path}: object '{thing.name}' has {told}; there must be one per frame")
-
-
-assert SceneFile.model_fields["version"].annotation.__args__[0] == SCHEMA  # pyright: ignore[reportOptionalMemberAccess]
