@@ -242,7 +242,12 @@ def test_a_paired_difference_is_taken_start_by_start(parts):
     assert found.pairs == 8
     assert found.value == pytest.approx(2 / 8)
     assert found.seeds == (0.25,)
-    assert found.high - found.value == pytest.approx(1.96 * np.sqrt(12 / 64 * 8 / 7 / 8), rel=1e-3)
+    # two of eight pairs differ, both in our favour; with half a pair more in each cell: (3 - 2^2 / 10) / 10^2
+    assert (found.low + found.high) / 2 == pytest.approx(2 / 10)
+    assert found.high - found.low == pytest.approx(2 * 1.96 * np.sqrt(0.026), rel=1e-3)
+    equal = parts.fits.paired(ours, ours)
+    assert equal.value == 0
+    assert equal.low < -0.05 < 0.05 < equal.high
     assert parts.fits.paired(ours, [row("toys", 5, 7, "1111")]) is None
 
 
