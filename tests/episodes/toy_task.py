@@ -1,5 +1,6 @@
 """A task an expert can be scripted for: bring the open gripper to the left of where it was."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ def act(obs: np.ndarray) -> np.ndarray:
     return action
 
 
-def agree(_: object, trajectory: dict) -> np.ndarray:
+def agree(_: object, trajectory: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.ones(trajectory["eef_pos"].shape[1], bool)
 
 
