@@ -51,7 +51,10 @@ def test_a_reward_search_measures_as_an_experts_training_does(
     quick = partial(ImitationConfig, least_rounds=1, round_steps=30, epochs=2, minibatch=256)
     monkeypatch.setattr(candidate_worker, "ImitationConfig", quick)
     bundle = load_benchmark("lift_up")
-    bundle.save(tmp_path / "bundle")
+    scene = replace(bundle.scene, folder=tmp_path / "made")
+    scene.folder.mkdir()
+    scene.save(scene.folder)
+    replace(bundle, scene=scene).save(tmp_path / "bundle")
     (tmp_path / HEARTBEAT_FILE).touch()
     request = {
         "bundle": str(tmp_path / "bundle"),
