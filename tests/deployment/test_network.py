@@ -238,7 +238,7 @@ def test_the_examples_arm_holds_when_targets_stop_coming(seeing_robot, restarted
     goal = {"v": 1, "id": 1, "do": "target", "quat_wxyz": start["quat_wxyz"], "opening": 1}
     up = [start["pos_m"][0], start["pos_m"][1], start["pos_m"][2] + 0.2]
     requests.put((json.dumps({**goal, "pos_m": up}).encode(), queue.Queue()))
-    until = time.monotonic() + 1.5
+    until = time.monotonic() + 3.0
 
     def is_over():
         heights.append((time.monotonic(), seeing_robot.arm.state()[2]))
@@ -249,7 +249,7 @@ def test_the_examples_arm_holds_when_targets_stop_coming(seeing_robot, restarted
     rise = heights[-1][1] - heights[0][1]
     assert 0.05 < rise < 0.19  # it went a quarter of a second of the way, and a lag
     late = [height for moment, height in heights if moment > until - 0.4]
-    assert max(late) - min(late) < 0.002
+    assert max(late) - min(late) < 0.004
 
 
 def test_a_driver_that_stops_answering_ends_the_run_with_one_sentence(

@@ -21,6 +21,11 @@ SURROUNDINGS = 8
 BORDER_PX = 6
 LIGHTNESS_WEIGHT = 0.5
 """Of lightness beside hue in colour distances: faces of one thing differ in lightness."""
+LIT_WEIGHT, SHADED_COST, DARKEST = 0.15, 9.0, 0.2
+"""Of what is behind: weight of squared lightness, what being in a shadow costs, and the darkest a shadow gets."""
+GREY = 128.0
+"""Where 8-bit Lab has no colour."""
+MOST_GROWTH = 1.5
 SPECK_PX = 16
 """At 256 px: nothing smaller is an object."""
 
@@ -113,8 +118,9 @@ class ColourTracker:
         """Return the object in the next picture."""
         lab = cv2.GaussianBlur(_lab8(picture), (0, 0), 0.8)
         expected = _moved(self._mask, self._motion)
-        score = self._scores(lab, robot, expected)
-        mask = self._chosen(score, expected)
+        own = np.take(self._object, _cells8(lab))
+        score = self._scores(lab, own, robot, expected)
+        mask = self._chosen(score, own, expected)
         seen, should = float(mask.sum()), max(1.0, float(expected.sum()))
         hidden = float((expected & robot & ~mask).sum()) / should
         visible = seen / max(1.0, self._area * (1 - min(0.9, hidden)))
@@ -132,17 +138,13 @@ class ColourTracker:
             is_hidden=hidden > 0.6,
         )
 
-    def _scores(self, lab: np.ndarray, robot: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    def _scores(
+        self, lab: np.ndarray, own: np.ndarray, robot: np.ndarray, expected: np.ndarray
+    ) -> np.ndarray:
         """Return log-likelihood ratios, with where the object was and the robot is as priors."""
         cells = _cells8(lab)
-        own = np.take(self._object, cells)
         rest = np.take(self._rest, cells)
-        difference = lab.astype(np.float32) - self._behind
-        # A shadow is darker than what is behind, and no object.
-        light = np.where(difference[..., 0] < 0, 0.04, 0.15).astype(np.float32)
-        apart = light * difference[..., 0] ** 2
-        apart += difference[..., 1] ** 2
-        apart += difference[..., 2] ** 2
+        apart = self._unlike_behind(lab.astype(np.float32))
         rest = np.where(self._known, np.maximum(4.0 - 0.04 * apart, _FLOOR - 2.0), rest)
         arm = np.take(self._robot, cells) + np.where(robot, 0.0, -4.0).astype(np.float32)
         arm[grow(robot, 2) & ~robot] += 2.0
@@ -150,7 +152,27 @@ class ColourTracker:
         reach = self.cfg.reach_px * self._scale
         return own + 1.0 - (away / reach) ** 2 - np.maximum(rest, arm)
 
-    def _chosen(self, score: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    def _unlike_behind(self, lab: np.ndarray) -> np.ndarray:
+        """Return squared distances from the picture of what is behind, which may lie in a shadow now."""
+        difference = lab - self._behind
+        tint = (difference[..., 1:] ** 2).sum(-1)
+        lit = LIT_WEIGHT * difference[..., 0] ** 2 + tint
+        # In a shadow hue stays and colour fades with the light.
+        share = lab[..., 0] / np.maximum(self._behind[..., 0], 1.0)
+        faded = (lab[..., 1:] - GREY) - share[..., None] * (self._behind[..., 1:] - GREY)
+        is_darker = (share < 1.0) & (share > DARKEST)
+        shaded = np.where(is_darker, SHADED_COST + (faded**2).sum(-1), np.inf)
+        return np.minimum(lit, shaded)
+
+    def _chosen(self, score: np.ndarray, own: np.ndarray, expected: np.ndarray) -> np.ndarray:
+        """Return the part that fits best; nothing grows by half in a step, so what else has come is left out."""
+        mask = self._best_part(score, expected)
+        if mask.sum() > MOST_GROWTH * self._area:
+            near = grow(expected, round(self.cfg.reach_px * self._scale / 2))
+            mask = self._best_part(np.where((own > 0) & near, score, -1.0), expected)
+        return mask
+
+    def _best_part(self, score: np.ndarray, expected: np.ndarray) -> np.ndarray:
         """Return the part that fits best, with what a finger cuts off it."""
         count, parts, stats, _ = cv2.connectedComponentsWithStats(
             tidy(score > 0).astype(np.uint8), connectivity=4
