@@ -4,7 +4,7 @@ Training tasks come from drawn clips, and real ones where `--videos` gives some,
 training sees are judged, from the scans in `--unseen` or drawn. A cell (arm, N, seed) is one line in `results.jsonl`; a
 stopped study goes on. `--table`, `--figure` and `--page` show what is there. `docs/study_lifting.md` explains arms and results.
 
-    python scripts/study_lifting.py --config configs/study_lifting_laptop.yaml --out outputs/study_lifting --unseen MESHES
+    python scripts/study_lifting.py --config configs/studies/lifting_laptop.yaml --out outputs/study_lifting --unseen MESHES
 """
 
 import argparse
@@ -22,7 +22,7 @@ from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import only_run_in
 
-CONFIG = Path(__file__).parents[1] / "configs" / "study_lifting_laptop.yaml"
+CONFIG = Path(__file__).parents[1] / "configs" / "studies" / "lifting_laptop.yaml"
 
 
 def main() -> None:

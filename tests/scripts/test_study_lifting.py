@@ -344,7 +344,7 @@ def test_rejected_objects_are_counted_and_skipped_and_smaller_sets_are_parts_of_
 
 def arguments(out: Path, **given) -> argparse.Namespace:
     usual = {
-        "config": ROOT / "configs/study_lifting_tiny.yaml", "out": out, "unseen": None, "videos": None,
+        "config": ROOT / "configs/studies/lifting_tiny.yaml", "out": out, "unseen": None, "videos": None,
         "arms": None, "counts": None, "seeds": None, "max_cells": None, "workers": 1, "threads": 1,
         "device": "cpu", "table": True, "figure": None, "page": None,
     }  # fmt: skip
@@ -379,7 +379,7 @@ def test_a_study_that_was_killed_after_a_cell_goes_on_and_ends_with_every_cell_o
     study.show(arguments(tmp_path))
     assert "| bc_cop | 3 |" in capsys.readouterr().out
     with pytest.raises(V2PError, match="cells of another study"):
-        study.make_cells(arguments(tmp_path, config=ROOT / "configs/study_lifting_laptop.yaml"))
+        study.make_cells(arguments(tmp_path, config=ROOT / "configs/studies/lifting_laptop.yaml"))
     with pytest.raises(V2PError, match=r"--counts \[7\] are not all among the counts"):
         study.make_cells(arguments(tmp_path, counts=[7]))
 
