@@ -1,6 +1,6 @@
 """Studies that drive the engine's stages many times over: what a generalist policy owes to its training objects.
 
-In: `configs/study_lifting_*.yaml`, a folder of meshes for the evaluation, and optionally one of real clips. Out: one
+In: `configs/studies/lifting_*.yaml`, a folder of meshes for the evaluation, and optionally one of real clips. Out: one
 JSON line a cell (arm, number of training tasks, seed), then a table, a figure and a page.
 
 Read `config` (arms and sizes), `objects` (where training and evaluation objects come from), `cells` (one cell's
