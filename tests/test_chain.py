@@ -17,9 +17,11 @@ STAGES = ("scene", "task", "expert", "episodes", "dataset")
 SETTINGS = """
 task: {num_samples: 2}
 expert:
-  num_envs: 128
+  num_envs: 96
+  trial_worlds: 16
   eval_episodes: 8
   min_success: 0.0
+  imitation: {target_success: 0.8}
   ppo: {total_steps: 4096, window_episodes: 16, min_window_episodes: 8, num_deterministic: 16}
 episodes: {num_episodes: 3, batch_worlds: 32, size_px: 64}
 """
