@@ -75,7 +75,7 @@ def row(arm: str, n: int, seed: int, once: str, *, other: str = "0000"):
 
 @pytest.mark.parametrize("size", ["tiny", "laptop", "gpu"])
 def test_every_size_of_the_study_can_be_loaded_and_asks_for_the_arms_of_the_question(size, parts):
-    cfg = load_settings(ROOT / f"configs/study_lifting_{size}.yaml", parts.config.LiftingConfig)
+    cfg = load_settings(ROOT / f"configs/studies/lifting_{size}.yaml", parts.config.LiftingConfig)
 
     assert {"cop", "videos", "fixed_total", "toys", "bc_cop"} <= set(cfg.arms)
 
