@@ -289,7 +289,7 @@ def _outcomes(root: Path) -> list[dict[str, Any]] | None:
     if not (root / RUN_FILE).exists(follow_symlinks=False):
         return []
     outcomes = read_json(root / RUN_FILE)
-    if not isinstance(outcomes, list):
+    if not isinstance(outcomes, list) or len(as_dicts(outcomes)) < len(outcomes):
         return None
     return [o for o in as_dicts(outcomes) if o.get("stage") in STAGES and "item" in o]
 
