@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from v2p_data.episodes.about import CARRIED_TASKS, TASK_PARTS
 from v2p_data.episodes.edit import drop, merge
 from v2p_data.episodes.staging import Episode
 from v2p_data.episodes.verify import verify
@@ -48,6 +49,10 @@ def more_staged(tmp_path_factory: pytest.TempPathFactory, make_episode) -> list[
 def more(tmp_path_factory: pytest.TempPathFactory, more_staged: list[Path]) -> Path:
     root = tmp_path_factory.mktemp("dataset") / "more"
     pack(more_staged, "user/more", root, provenance={"items": {"toy": {"stage": "episodes"}}})
+    for part in TASK_PARTS:
+        file = root / CARRIED_TASKS / "toy" / part
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("")
     return root
 
 
@@ -142,7 +147,7 @@ def test_a_task_dropped_can_be_added_again_and_tasks_of_other_code_stay_apart(
 def carrying(root: Path, copy: Path, code: str) -> Path:
     """Return a copy of the dataset that carries its task."""
     shutil.copytree(root, copy)
-    (copy / "v2p/tasks/toy").mkdir(parents=True)
+    (copy / "v2p/tasks/toy").mkdir(parents=True, exist_ok=True)
     (copy / "v2p/tasks/toy/task.py").write_text(code)
     return copy
 
