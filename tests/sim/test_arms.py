@@ -431,7 +431,8 @@ def test_the_robots_file_and_settings_are_part_of_the_tasks_recipe(
         video = Stage(name="scene", item="clip", config={}, make=lambda *_: {})
         return task_stage(video, EngineConfig(sim=SimulatorConfig(robot=robot))).recipe
 
-    assert recipe(RobotConfig())["sources"] == {}
+    assert not any(name.startswith("robot") for name in recipe(RobotConfig())["sources"])
+    assert {"robot", "robot file"} <= set(recipe(six)["sources"])
     before = recipe(six)
     assert recipe(replace(six, base_yaw_rad=0.1)) != before
     copy = tmp_path / "copy.xml"
