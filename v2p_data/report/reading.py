@@ -88,13 +88,10 @@ def read_run(root: Path) -> Run:
     """
     results: dict[Key, Result] = {}
     ages: dict[Key, tuple[bool, str, float]] = {}
-    outcomes = _outcomes(root)
+    outcomes, is_whole = _outcomes(root)
     unreadable = (
-        []
-        if outcomes is not None
-        else [f"{root / RUN_FILE} is damaged; the next command writes it anew"]
+        [] if is_whole else [f"{root / RUN_FILE} is damaged; the next command writes it anew"]
     )
-    outcomes = outcomes or []
     # The folders of what the last command made, kept or turned away.
     asked = {
         (str(o["stage"]), str(o["item"])): Path(str(o.get("folder", ""))).name for o in outcomes
@@ -284,14 +281,14 @@ def _from_record(stage: str, folder: Path, record: Record) -> Result:
     )
 
 
-def _outcomes(root: Path) -> list[dict[str, Any]] | None:
-    """Return what became of each result that the last command asked for; None where that cannot be read."""
+def _outcomes(root: Path) -> tuple[list[dict[str, Any]], bool]:
+    """Return what became of each result that the last command asked for, and whether all of it can be read."""
     if not (root / RUN_FILE).exists(follow_symlinks=False):
-        return []
-    outcomes = read_json(root / RUN_FILE)
-    if not isinstance(outcomes, list) or len(as_dicts(outcomes)) < len(outcomes):
-        return None
-    return [o for o in as_dicts(outcomes) if o.get("stage") in STAGES and "item" in o]
+        return [], True
+    found = read_json(root / RUN_FILE)
+    outcomes = as_dicts(found)
+    is_whole = isinstance(found, list) and len(outcomes) == len(found)
+    return [o for o in outcomes if o.get("stage") in STAGES and "item" in o], is_whole
 
 
 def _unfinished(root: Path, outcomes: list[dict[str, Any]]) -> list[Result]:
