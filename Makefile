@@ -3,7 +3,7 @@ VENV  ?= .venv
 PY    := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-fast check setup lock format clean
+.PHONY: demo test test-long test-fast check setup lock format clean
 
 setup: $(STAMP)
 
@@ -16,7 +16,11 @@ demo: $(STAMP)
 
 # Two processes, files whole (their fixtures are dear), one thread each: half the time of one process on two cores.
 test: $(STAMP)
-	@OMP_NUM_THREADS=1 $(PY) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+	@OMP_NUM_THREADS=1 $(PY) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not long"
+
+# What would take the tests beyond a quarter of an hour.
+test-long: $(STAMP)
+	@OMP_NUM_THREADS=1 $(PY) -m pytest -q -m long
 
 test-fast: $(STAMP)
 	@$(PY) -m pytest -q -m "not slow and not gpu and not live_llm"

@@ -53,6 +53,7 @@ def test_the_episodes_benchmark_finds_every_pixel_equal_and_ends_with_its_ratio(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_twins_benchmark_pairs_its_episodes_and_ends_with_the_drop(tmp_path):
     from dataclasses import replace
 

@@ -148,7 +148,9 @@ def test_status_and_report_go_on_and_name_the_file(capsys, root: Path, pattern: 
 
 
 @pytest.mark.parametrize("kind", OF_DATASETS, ids=lambda k: k.name)
-@pytest.mark.parametrize("harm", [flip(0.5), delete], ids=["flipped", "deleted"])
+@pytest.mark.parametrize(
+    "harm", [flip(0.5), pytest.param(delete, marks=pytest.mark.long)], ids=["flipped", "deleted"]
+)
 def test_a_damaged_dataset_is_not_trained_on_pushed_or_edited(
     capsys, whole: Path, tmp_path: Path, kind: Kind, harm
 ):

@@ -409,6 +409,7 @@ def in_this_process(parts, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.e2e
 def test_a_cell_learns_from_a_toy_and_is_judged_on_an_unseen_object_that_nothing_was_trained_on(
     parts, in_this_process, tmp_path
