@@ -29,7 +29,7 @@ class ClickPage:
     Args:
         picture: what is clicked on.
         objects: what to ask for.
-        mask_at: the mask of what lies at a pixel (u right, v down), to be shown.
+        mask_at: returns the mask of the object at a pixel (u right, v down); the page shows it.
     """
 
     def __init__(

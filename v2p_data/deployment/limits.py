@@ -29,7 +29,7 @@ START_OUTSIDE_M = 0.03
 """So far outside the workspace a run may begin; further out it is refused."""
 ESCAPED_M = 0.06
 OVERSPEED = 1.8
-"""A tool measured at this multiple of the speed limit stops the run: what moves it is not the policy."""
+"""A tool measured at this multiple of the speed limit stops the run: the policy cannot cause such a speed."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -105,7 +105,7 @@ def demand_whole(folder: Path, root: Path | None = None, below: str = "") -> Non
     Args:
         folder: of a result; of the run at `root` or of another one.
         root: the run that remembers what was compared; without one all is read again.
-        below: compare only what lies below this path in the folder.
+        below: compare only the files under this path of the folder.
 
     Raises:
         UnusableError: names the file and says what to do.

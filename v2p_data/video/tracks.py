@@ -83,7 +83,7 @@ def promise_of(
     """Return how much of the film there should be, as its edit list cuts it; sound may last longer."""
     seconds = 0.0
     if film.duration and film.time_base:
-        # in fragmented files what lies before zero is cut off and still counted
+        # Fragmented files: frames before time zero are not shown, but the container still counts them.
         seconds = float((film.duration + min(0, film.start_time or 0)) * film.time_base)
     if seconds <= 0:
         seconds = _tagged_s(film.metadata)
