@@ -7,6 +7,7 @@ on; a network namespace of its own where the container lets us make one; another
 `confine` returns the names of those that took hold.
 """
 
+import math
 import os
 import resource
 from contextlib import suppress
@@ -71,13 +72,15 @@ def confine(
         limits.append((resource.RLIMIT_AS, mapped + memory_bytes))
     if seconds is not None:
         used = resource.getrusage(resource.RUSAGE_SELF)
-        limits.append((resource.RLIMIT_CPU, int(used.ru_utime + used.ru_stime + seconds) + 1))
+        limits.append((resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds) + 1))
     kernel_rules.no_new_privileges()
     if kernel_rules.write_only_in(folder):
         held.append("landlock")
     limits.append((resource.RLIMIT_NOFILE, open_files))
     for limit, value in limits:
-        resource.setrlimit(limit, (value, value))
+        # The kernel sends SIGXCPU at the soft limit and SIGKILL at the hard one: only the first names the cause.
+        hard = value + 1 if limit == resource.RLIMIT_CPU else value
+        resource.setrlimit(limit, (value, hard))
     if os.geteuid() == 0 and give_up_root:
         os.setgroups([])
         os.setgid(NOBODY)
