@@ -167,8 +167,8 @@ def episode(
     def compare(reading: Reading, seen: Seen) -> None:
         if tracked:
             for label in range(FIRST_OBJECT, FIRST_OBJECT + len(bundle.scene.objects)):
-                into.object_iou.append(iou(seen.labels == label, rig.true == label))
-            into.robot_iou.append(iou(seen.labels == ROBOT, rig.true == ROBOT))
+                into.object_iou.append(iou(seen.in_picture == label, rig.true == label))
+            into.robot_iou.append(iou(seen.in_picture == ROBOT, rig.true == ROBOT))
 
     policy.took = into.decide_ms
     policy.reset(1)

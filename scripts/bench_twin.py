@@ -16,12 +16,13 @@ from pathlib import Path
 import tyro
 
 from policies.evaluation.rate import wilson
+from v2p_data.deployment.view import allowing_for_place
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.judging import Contestant, contestant, play_of
 from v2p_data.task.task import TaskBundle
-from v2p_data.twin.judge import TwinJudged, judge_in_twin
+from v2p_data.twin.judge import TwinJudged, judge_in_twin, true_labels
 from v2p_data.twin.parameters import TwinParameters, changed
 
 
@@ -42,6 +43,8 @@ class BenchConfig:
     """Episodes go on after their first success."""
     change: dict[str, float] = field(default_factory=dict[str, float])
     """Names and values of the twin's parameters."""
+    allow_for_camera: bool = True
+    """Labels are carried over to the training camera by the calibrated pose, as `v2p deploy` does."""
     out: Path | None = None
     """JSON file with every episode's outcome."""
 
@@ -80,8 +83,9 @@ def main(cfg: BenchConfig) -> None:
     start = time.perf_counter()
     seeds = range(cfg.first_seed, cfg.first_seed + cfg.episodes)
     twin = judge_in_twin(
-        cfg.task, load, seeds=seeds, cfg=how, parameters=parameters, workers=cfg.workers
-    )
+        cfg.task, load, seeds=seeds, cfg=how, parameters=parameters, workers=cfg.workers,
+        look=allowing_for_place if cfg.allow_for_camera else true_labels,
+    )  # fmt: skip
     _tell("twin", twin.successes, twin.at_end if cfg.at_end else None, time.perf_counter() - start)
     print(f"failures in the twin: {_counts(twin)}")
     here, there = twin.successes, trained_in.successes

@@ -39,7 +39,7 @@ def test_the_twin_is_seen_from_one_click_and_kept_within_limits(task_folder, ste
     limits = LimitsConfig(max_speed_m_s=0.2, max_silence_ms=60_000.0)
     outcome = Run(
         rig, sight, steady(0.3, 0, 1, 0, 0, 0, 0), Guard(limits, rig.scale), LoopConfig(max_seconds=0.6, slow=True),
-        on_step=lambda reading, seen: (places.append(reading.tool_pos), seen_labels.append(seen.labels)),
+        on_step=lambda reading, seen: (places.append(reading.tool_pos), seen_labels.append(seen.in_picture)),
     ).go()  # fmt: skip
     robot.disconnect()
 

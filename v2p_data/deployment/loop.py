@@ -190,7 +190,9 @@ class Run:
         if self.sight is None:
             if reading.labels is None:
                 raise V2PError("the robot gives pictures; click on the objects with --click X,Y")
-            return Seen(labels=reading.labels, confidences=(), missed=())
+            return Seen(
+                labels=reading.labels, confidences=(), missed=(), in_picture=reading.labels
+            )
         seen = self.sight.see(reading) if self._is_started else self.sight.start(reading)
         self._is_started = True
         return seen

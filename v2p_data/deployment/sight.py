@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from v2p_data.deployment.robot import Reading, fingers_m
 from v2p_data.deployment.segmentation import ColourTracker, StreamTracker, Tracked
 from v2p_data.deployment.silhouette import Silhouette
+from v2p_data.deployment.view import view_for
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.sim.masks import BACKGROUND, FIRST_OBJECT, PALETTE, ROBOT
@@ -32,22 +33,25 @@ class Seen:
     """One picture, understood."""
 
     labels: UInt8[np.ndarray, "h w"]
+    """As the camera of training would see the scene: what a policy gets."""
     confidences: tuple[float, ...]
     """Per object, 0 to 1; 0 where it is not seen."""
     missed: tuple[int, ...]
     """Per object: the weight of the pictures on end in which it was not seen; `LOST_AFTER` is too much."""
+    in_picture: UInt8[np.ndarray, "h w"]
+    """Labels of the robot's own picture."""
 
 
 class Sight:
     """Sees one robot's scene from the clicks on.
 
     Args:
-        camera: of the pictures, calibrated.
+        camera: of the pictures, calibrated. It may stand elsewhere than the camera of training.
         clicks_px: a pixel (u right, v down) on each object, the manipulated one first.
         new_tracker: makes what follows one object.
 
     Raises:
-        V2PError: no click, or more than there are greys.
+        V2PError: no click, or more than there are greys; the camera sees too little of the table.
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class Sight:
         self.clicks_px = tuple(clicks_px)
         self._new_tracker = new_tracker
         self._silhouette = Silhouette(camera)
+        self._view = view_for(camera)
         self._trackers: list[StreamTracker] = []
         self._missed: list[int] = []
 
@@ -90,7 +95,8 @@ class Sight:
                         f"the click at ({u:g}, {v:g}) is on the same thing as click {other + 1}; click on each object once"
                     )
             labels[mask] = FIRST_OBJECT + k
-        return Seen(labels=labels, confidences=(1.0,) * len(masks), missed=(0,) * len(masks))
+        count = len(masks)
+        return self._seen(labels, reading, confidences=(1.0,) * count, missed=(0,) * count)
 
     def see(self, reading: Reading) -> Seen:
         """Return the labels of the next reading."""
@@ -103,11 +109,27 @@ class Sight:
             labels[mine] = FIRST_OBJECT + k
             best[mine] = found.score[mine]
             self._missed[k] = 0 if found.confidence > 0 else self._missed[k] + _weight(found)
-        return Seen(
-            labels=labels,
+        return self._seen(
+            labels,
+            reading,
             confidences=tuple(found.confidence for found in tracked),
             missed=tuple(self._missed),
         )
+
+    def _seen(
+        self,
+        labels: np.ndarray,
+        reading: Reading,
+        *,
+        confidences: tuple[float, ...],
+        missed: tuple[int, ...],
+    ) -> Seen:
+        assert reading.joints_rad is not None
+        for_policy = labels
+        if self._view is not None:
+            fingers = fingers_m(reading.opening)
+            for_policy = self._view.labels(labels, reading.joints_rad, fingers)
+        return Seen(labels=for_policy, confidences=confidences, missed=missed, in_picture=labels)
 
     def _picture(self, reading: Reading) -> np.ndarray:
         if reading.picture is None or reading.joints_rad is None:

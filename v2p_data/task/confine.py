@@ -72,7 +72,9 @@ def confine(
         limits.append((resource.RLIMIT_AS, mapped + memory_bytes))
     if seconds is not None:
         used = resource.getrusage(resource.RUSAGE_SELF)
-        limits.append((resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds) + 1))
+        limits.append(
+            (resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds) + 1)
+        )
     kernel_rules.no_new_privileges()
     if kernel_rules.write_only_in(folder):
         held.append("landlock")

@@ -18,10 +18,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from v2p_data.geometry.camera import Camera, intrinsics, look_at
+from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.geometry.pose import transform
+from v2p_data.sim.camera import training_camera
 from v2p_data.sim.masks import MaskRenderer
-from v2p_data.sim.world import CAMERA_FOVY_DEG, CAMERA_POS, CAMERA_TARGET, World
+from v2p_data.sim.world import World
 from v2p_data.twin.interface import RGB_PX
 from v2p_data.twin.parameters import TwinParameters, episode_rng
 
@@ -72,9 +73,7 @@ class Optics:
     @cached_property
     def training(self) -> Camera:
         """The training simulator's camera, which the rectified picture copies up to the camera's place."""
-        pose = look_at(np.array(CAMERA_POS), np.array(CAMERA_TARGET))
-        K = intrinsics(self.size_px, self.size_px, np.radians(CAMERA_FOVY_DEG))
-        return Camera(width_px=self.size_px, height_px=self.size_px, K=K, T_world_cam=pose)
+        return training_camera(self.size_px)
 
     @cached_property
     def true_pose(self) -> Float[np.ndarray, "4 4"]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.actors import Actor, WorldActor
@@ -27,6 +27,15 @@ from v2p_data.twin.parameters import TwinParameters
 
 Load = Callable[[TaskBundle], tuple[Actor | WorldActor, int | tuple[int, int]]]
 """From a task to who acts in it, and the size of the pictures that it sees [px]."""
+
+
+Look = Callable[[TwinArm], Callable[[], UInt8[np.ndarray, "h w"]]]
+"""From a twin to what gives the label image of now; `deployment.view` has one that allows for the camera's place."""
+
+
+def true_labels(arm: TwinArm) -> Callable[[], UInt8[np.ndarray, "h w"]]:
+    """Return the true labels as the twin's camera sees them."""
+    return arm.robot.true_labels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,15 +75,30 @@ class TwinJudged:
 
 
 def play(
-    arm: TwinArm, actor: Actor | WorldActor, seed: int, steps: int, *, at_end: bool
+    arm: TwinArm,
+    actor: Actor | WorldActor,
+    seed: int,
+    steps: int,
+    *,
+    at_end: bool,
+    labels: Callable[[], UInt8[np.ndarray, "h w"]] | None = None,
 ) -> Played:
     """Play one episode of at most `steps` control steps; without `at_end` it is over with its first success.
+
+    Args:
+        arm: the twin.
+        actor: who acts.
+        seed: of the episode.
+        steps: the most.
+        at_end: go on after a success.
+        labels: what a policy sees; by default the true labels of the twin's camera.
 
     Raises:
         V2PError: an action is not finite or has another shape.
     """
     start = time.perf_counter()
     bundle = arm.mirror.bundle
+    labels = labels or true_labels(arm)
     arm.reset(seed)
     if isinstance(actor, Actor):
         actor.reset(1)
@@ -82,7 +106,7 @@ def play(
         actor.begin(arm.mirror.env)
     success_step, last, broke = NEVER, False, False
     for t in range(steps):
-        outcome = arm.act(_action(actor, arm))
+        outcome = arm.act(_action(actor, arm, labels))
         broke = outcome.is_broken
         if broke:
             break
@@ -112,6 +136,7 @@ def judge_in_twin(
     cfg: EvaluationConfig,
     parameters: TwinParameters | None = None,
     workers: int = 1,
+    look: Look = true_labels,
 ) -> TwinJudged:
     """Play one episode per seed.
 
@@ -122,11 +147,12 @@ def judge_in_twin(
         cfg: how long they last and whether they go on after a success.
         parameters: of the twin; by default the nominal one.
         workers: processes that share out the episodes; changes no result.
+        look: how a policy sees the twin; picklable.
 
     Raises:
         V2PError: the folder holds no task, or the actor does not suit the twin.
     """
-    settings = (task_folder, load, cfg, parameters)
+    settings = (task_folder, load, cfg, parameters, look)
     if workers == 1:
         table = _Table(*settings)
         try:
@@ -148,6 +174,7 @@ class _Table:
         load: Load,
         cfg: EvaluationConfig,
         parameters: TwinParameters | None,
+        look: Look,
     ) -> None:
         bundle = TaskBundle.load(task_folder)
         self.actor, size_px = load(bundle)
@@ -159,9 +186,12 @@ class _Table:
         self.cfg = cfg
         self.steps = bundle.policy_steps(cfg.horizon_scale)
         self.arm = TwinArm(bundle, parameters, height)
+        self.labels = look(self.arm)
 
     def play(self, seed: int) -> Played:
-        return play(self.arm, self.actor, seed, self.steps, at_end=self.cfg.at_end)
+        return play(
+            self.arm, self.actor, seed, self.steps, at_end=self.cfg.at_end, labels=self.labels
+        )
 
 
 _table: _Table | None = None
@@ -181,9 +211,11 @@ def _play_here(seed: int) -> Played:
     return _table.play(seed)
 
 
-def _action(actor: Actor | WorldActor, arm: TwinArm) -> Float[np.ndarray, "7"]:
+def _action(
+    actor: Actor | WorldActor, arm: TwinArm, labels: Callable[[], UInt8[np.ndarray, "h w"]]
+) -> Float[np.ndarray, "7"]:
     if isinstance(actor, Actor):
-        actions = actor.act(arm.robot.true_labels()[None], arm.state()[None])
+        actions = actor.act(labels()[None], arm.state()[None])
     else:
         actions = actor.act_in(arm.mirror.env)
     action = np.asarray(actions, float)
