@@ -14,8 +14,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from studies.cells import Key, Study, append_result, cells_of, key_of, results_in
+from studies.cells import Key, Study, cells_of, key_of
 from studies.config import ARMS, LiftingConfig
+from studies.results import append_result, results_in
 
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Runtime

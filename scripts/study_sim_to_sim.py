@@ -10,7 +10,6 @@ that are there are kept. No real robot was asked for any number.
 """
 
 import argparse
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,8 @@ from typing import Any
 
 import numpy as np
 from bench_deploy import PATIENCE_MS, Measured, TimedPolicy, episode, robot_in
-from studies.sim_to_sim import RESULTS, rows_in, table
+from studies.results import Row, append_result, results_in
+from studies.sim_to_sim import table
 from studies.sweeps import SWEEPS, FaultyLook
 
 from v2p_data.commands.deploy import loaded_policy
@@ -32,7 +32,6 @@ from v2p_data.task.task import TaskBundle
 from v2p_data.twin.judge import TwinJudged, judge_in_twin, true_labels
 from v2p_data.twin.parameters import nominal
 
-Row = dict[str, Any]
 PLACES = ("training", "twin", "twin_raw", "tracked")
 """Training simulator; twin with true masks carried over to the training camera, and not carried over; tracked masks."""
 
@@ -71,7 +70,7 @@ def play(args: argparse.Namespace) -> None:
         V2PError: a policy or task cannot be read, or the lines are of other episodes.
     """
     args.out.mkdir(parents=True, exist_ok=True)
-    done = {(r["policy"], r["task"], r["place"], r["value"]) for r in rows_in(args.out)}
+    done = {(r["policy"], r["task"], r["place"], r["value"]) for r in results_in(args.out)}
     for word in args.policies:
         name, _, folder = word.partition("=")
         if not folder:
@@ -90,8 +89,7 @@ def play(args: argparse.Namespace) -> None:
                 row = {"policy": name, "task": title, "place": place, "value": value}
                 row |= {"first_seed": asked.first_seed, "episodes": asked.episodes}
                 row |= _played(asked, place, value)
-                with (args.out / RESULTS).open("a") as stream:
-                    stream.write(json.dumps(row) + "\n")
+                append_result(args.out, row)
                 at = "" if value is None else f" {value:g}"
                 print(f"{name}, {title}, {place}{at}: {row['once'].count('1')} of {len(row['once'])}", flush=True)  # fmt: skip
 
@@ -102,7 +100,7 @@ def show(args: argparse.Namespace) -> None:
     Raises:
         V2PError: there is no result yet.
     """
-    rows = rows_in(args.out)
+    rows = results_in(args.out)
     if not rows:
         raise V2PError(f"{args.out} holds no results; give --policies and --tasks")
     if args.table:

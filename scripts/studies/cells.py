@@ -4,7 +4,6 @@ Everything but the judgement is stages in `<out>/run`, so that arms, numbers and
 stopped study goes on. A candidate that the engine rejects, at any stage, is counted and skipped; nothing stands in for it.
 """
 
-import json
 import logging
 import time
 from collections import Counter
@@ -53,10 +52,9 @@ from .objects import (
     unseen_meshes,
     unseen_stage,
 )
+from .results import Row
 
-RESULTS = "results.jsonl"
 FILMS_FOLDER = "films"
-Row = dict[str, Any]
 Key = tuple[Arm, int, int]
 
 logger = logging.getLogger(__name__)
@@ -73,30 +71,8 @@ def cells_of(cfg: LiftingConfig) -> Iterator[Key]:
                     yield arm, count, seed
 
 
-def results_in(out: Path) -> list[Row]:
-    """Return the lines of a study; a last line that a kill cut short is left out."""
-    path = out / RESULTS
-    if not path.is_file():
-        return []
-    rows: list[Row] = []
-    for line in path.read_text().splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            logger.warning("a line of %s is cut short and left out", path)
-    return rows
-
-
 def key_of(row: Row) -> Key:
     return row["arm"], row["n"], row["seed"]
-
-
-def append_result(out: Path, row: Row) -> None:
-    """Add a line, on a line of its own even where a kill left half a one."""
-    path = out / RESULTS
-    cut = path.is_file() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
-    with path.open("a") as stream:
-        stream.write(("\n" if cut else "") + json.dumps(row) + "\n")
 
 
 @dataclass(frozen=True, kw_only=True)

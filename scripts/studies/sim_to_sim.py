@@ -1,10 +1,7 @@
 """Results of the sim-to-sim study as Markdown: rates, agreement between the simulators, sweeps."""
 
-import json
 import math
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,10 +9,9 @@ from policies.evaluation.rate import wilson
 from v2p_data.seeds import rng_for
 
 from .agreement import NAMES, Agreement, agreement, bootstrap, leave_one_out
+from .results import Row
 from .sweeps import SWEEPS
 
-Row = dict[str, Any]
-RESULTS = "results.jsonl"
 FEWEST_POLICIES = 3
 LABELS = {
     "pearson": "Pearson r",
@@ -23,18 +19,6 @@ LABELS = {
     "mmrv": "MMRV",
     "mean_gap": "mean gap (training - twin)",
 }
-
-
-def rows_in(out: Path) -> list[Row]:
-    """Return the lines of a study; a last line that a kill cut short is left out."""
-    path = out / RESULTS
-    rows: list[Row] = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return rows
 
 
 def table(rows: list[Row]) -> str:

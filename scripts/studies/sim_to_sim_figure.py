@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from policies.evaluation.rate import wilson
 
 from .figure import COLOURS
-from .sim_to_sim import Row, means, pairs
+from .results import Row
+from .sim_to_sim import means, pairs
 from .sweeps import SWEEPS
 
 COLUMNS = 4

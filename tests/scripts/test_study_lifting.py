@@ -372,7 +372,7 @@ def test_a_study_that_was_killed_after_a_cell_goes_on_and_ends_with_every_cell_o
         study.make_cells(arguments(tmp_path))
     study.make_cells(arguments(tmp_path))
 
-    done = [parts.cells.key_of(r) for r in parts.cells.results_in(tmp_path)]
+    done = [parts.cells.key_of(r) for r in study.results_in(tmp_path)]
     assert (tmp_path / "results.jsonl").read_text().startswith(first)
     assert len(set(done)) == len(done) == 1 + 6 * 2
     assert sorted(cells) == sorted([*done, ("toys", 2, 0)])  # the failed one alone is tried again

@@ -1,0 +1,33 @@
+"""Results of a study: one JSON object a line, which a kill may cut short."""
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+RESULTS = "results.jsonl"
+Row = dict[str, Any]
+
+logger = logging.getLogger(__name__)
+
+
+def results_in(out: Path) -> list[Row]:
+    """Return the lines of a study; a last line that a kill cut short is left out."""
+    path = out / RESULTS
+    if not path.is_file():
+        return []
+    rows: list[Row] = []
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            logger.warning("a line of %s is cut short and left out", path)
+    return rows
+
+
+def append_result(out: Path, row: Row) -> None:
+    """Add a line, on a line of its own even where a kill left half a one."""
+    path = out / RESULTS
+    cut = path.is_file() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
+    with path.open("a") as stream:
+        stream.write(("\n" if cut else "") + json.dumps(row) + "\n")
