@@ -28,7 +28,7 @@ from v2p_data.deployment.robot import Reading, Rig
 from v2p_data.deployment.sight import Seen, Sight
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.segment import points_inside
-from v2p_data.scene.segment import iou
+from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.sim.gym_env import CONTROL_HZ
 from v2p_data.sim.masks import FIRST_OBJECT, ROBOT, rgb_to_labels
 from v2p_data.task.task import TaskBundle

@@ -31,8 +31,8 @@ from bench_reconstruction import (
     table,
 )
 
-from v2p_data.scene.one_camera import FEWEST, Filmed, shared_camera
 from v2p_data.scene.reconstruct import SceneConfig
+from v2p_data.scene.scale.shared_camera import FEWEST, Filmed, shared_camera
 from v2p_data.seeds import rng_for
 from v2p_data.video.synthetic import MotionKind, VideoSpec, random_spec
 

@@ -48,9 +48,9 @@ from policies.evaluation.rate import wilson
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import apply, transform_from_pose
-from v2p_data.scene.footage import WIDTH_PX
-from v2p_data.scene.one_camera import filmed
+from v2p_data.scene.frames.working_clip import WIDTH_PX
 from v2p_data.scene.reconstruct import Reconstruction, SceneConfig, reconstruct
+from v2p_data.scene.scale.shared_camera import filmed
 from v2p_data.scene.score import (
     STAGES,
     FoundClip,
@@ -74,7 +74,7 @@ ROOT = Path(__file__).parents[1]
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 FINAL_RUNS = "final_runs.jsonl"
 _IMPORTED_ONCE = (
-    "v2p_data.scene.network",
+    "v2p_data.scene.frames.network",
     "v2p_data.scene.reconstruct",
     "v2p_data.video.synthetic",
 )

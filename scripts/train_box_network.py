@@ -1,7 +1,7 @@
-"""Train the box network (`v2p_data/scene/boxes.py`) on rendered boxes, from nothing, on a CPU.
+"""Train the box network (`v2p_data/scene/fitting/cuboid_network.py`) on rendered boxes, from nothing, on a CPU.
 
     python scripts/train_box_network.py data --out DATA --scenes 1500 --jobs 2
-    python scripts/train_box_network.py train DATA --out v2p_data/scene/boxes.safetensors --minutes 30
+    python scripts/train_box_network.py train DATA --out v2p_data/scene/fitting/boxes.safetensors --minutes 30
 
 `data` draws random scenes with boxes in them - boxes, books, bins -, each through some cameras, and keeps what a camera that
 looks straight at a box would see of it. `train` shows windows that are a little off, prints how well the network says which
@@ -32,7 +32,7 @@ from training import (
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import apply, transform
-from v2p_data.scene.boxes import (
+from v2p_data.scene.fitting.cuboid_network import (
     INPUT_PX,
     LOG_SD,
     TAIL,
@@ -41,8 +41,8 @@ from v2p_data.scene.boxes import (
     aim_at,
     planes_of,
 )
-from v2p_data.scene.footage import WIDTH_PX
-from v2p_data.scene.segment import bounding_box, is_cut
+from v2p_data.scene.frames.mask_ops import bounding_box, is_cut
+from v2p_data.scene.frames.working_clip import WIDTH_PX
 from v2p_data.seeds import rng_for
 from v2p_data.video.synthetic import (
     LABEL_THING,

@@ -1,7 +1,7 @@
-"""Train the hand ruler (`v2p_data/scene/ruler.py`) on rendered hands, from nothing, on a CPU.
+"""Train the hand ruler (`v2p_data/scene/fitting/hand_scale.py`) on rendered hands, from nothing, on a CPU.
 
     python scripts/train_hand_ruler.py data --out DATA --scenes 1500 --jobs 2
-    python scripts/train_hand_ruler.py train DATA --out v2p_data/scene/ruler.safetensors --minutes 30
+    python scripts/train_hand_ruler.py train DATA --out v2p_data/scene/fitting/ruler.safetensors --minutes 30
 
 `data` draws random scenes in moments at which a hand touches a thing at rest, each through twelve cameras, and keeps what
 lies within half a metre around the hand's end. `train` shows windows that are too large or too small by chance, prints how well
@@ -28,8 +28,7 @@ from training import (
     recoloured,
 )
 
-from v2p_data.scene.hand import gap_px, hand_end
-from v2p_data.scene.ruler import (
+from v2p_data.scene.fitting.hand_scale import (
     GUESS_SPREAD,
     REACH_M,
     TOUCHING_M,
@@ -39,7 +38,8 @@ from v2p_data.scene.ruler import (
     planes_of,
     window,
 )
-from v2p_data.scene.scale import table_width_m
+from v2p_data.scene.frames.hand import gap_px, hand_end
+from v2p_data.scene.scale.camera_height import table_width_m
 from v2p_data.seeds import rng_for
 from v2p_data.video.synthetic import (
     LABEL_HAND,

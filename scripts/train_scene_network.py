@@ -1,11 +1,11 @@
-"""Train the scene network (`v2p_data/scene/network.py`) on rendered clips, from nothing, on a CPU.
+"""Train the scene network (`v2p_data/scene/frames/network.py`) on rendered clips, from nothing, on a CPU.
 
     python scripts/train_scene_network.py data --out DATA --clips 5500 --jobs 2
     python scripts/train_scene_network.py data --out DATA --clips 750 --jobs 2 --start 80000 --kind push_with
     python scripts/train_scene_network.py train DATA --out a.safetensors --minutes 30
     python scripts/train_scene_network.py train DATA --out b.safetensors --minutes 30 --start-from a.safetensors --seed 1
-    python scripts/train_scene_network.py average a.safetensors b.safetensors --out v2p_data/scene/network.safetensors
-    python scripts/train_scene_network.py camera b.safetensors --out v2p_data/scene/camera.safetensors
+    python scripts/train_scene_network.py average a.safetensors b.safetensors --out v2p_data/scene/frames/network.safetensors
+    python scripts/train_scene_network.py camera b.safetensors --out v2p_data/scene/frames/camera.safetensors
 
 `data` renders clips of all kinds at low resolution and keeps six frames of each with the two stills that the scene room
 makes of the whole clip. `train` prints the intersection over union of each class on clips that it does not train on. No real
@@ -28,17 +28,11 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 from training import HELD_OUT, add_commands, compressed, descend, draw_all, half_precision, write
 
 from v2p_data.geometry.camera import between_centres
-from v2p_data.scene.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
-from v2p_data.scene.footage import still_of
-from v2p_data.scene.network import (
-    CameraNetwork,
-    SceneNetwork,
-    inputs_of,
-    net_size,
-    resized,
-)
-from v2p_data.scene.pose import camera_above
-from v2p_data.scene.scale import table_width_m
+from v2p_data.scene.fitting.silhouette import camera_above
+from v2p_data.scene.frames.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.frames.network import CameraNetwork, SceneNetwork, inputs_of, net_size, resized
+from v2p_data.scene.frames.working_clip import still_of
+from v2p_data.scene.scale.camera_height import table_width_m
 from v2p_data.seeds import rng_for
 from v2p_data.video.synthetic import (
     LABEL_HAND,

@@ -1,7 +1,7 @@
-"""Learn from drawn clips which of the things that stand there a caption means (`v2p_data/scene/stand.py`).
+"""Learn from drawn clips which of the things that stand there a caption means (`v2p_data/scene/grounding/static_objects.py`).
 
     python scripts/train_standing.py data --out DATA --clips 120 --jobs 2
-    python scripts/train_standing.py train DATA --out v2p_data/scene/standing.json
+    python scripts/train_standing.py train DATA --out v2p_data/scene/grounding/standing.json
 
 `data` draws clips with a second object, lets the scene network watch them, and keeps the cues of all candidates with how
 well each overlaps the thing that is meant. `train` fits a conditional logit (McFadden 1974): the odds between candidates are
@@ -26,11 +26,12 @@ from scipy.special import expit, log_expit, log_softmax, logsumexp, softmax
 from training import draw_all
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.find import watch
-from v2p_data.scene.footage import footage_of
-from v2p_data.scene.segment import iou
-from v2p_data.scene.sight import sight
-from v2p_data.scene.stand import (
+from v2p_data.scene.frames.mask_ops import iou
+from v2p_data.scene.frames.segmentation import watch
+from v2p_data.scene.frames.stabilise import steadied
+from v2p_data.scene.frames.working_clip import footage_of
+from v2p_data.scene.grounding.ground_objects import sight
+from v2p_data.scene.grounding.static_objects import (
     TELLING_KINDS,
     Candidate,
     Search,
@@ -38,7 +39,6 @@ from v2p_data.scene.stand import (
     odds_of,
     overlaps_of,
 )
-from v2p_data.scene.steady import steadied
 from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos, parse_caption
 from v2p_data.video.clip import Clip

@@ -36,8 +36,23 @@ BELOW: dict[str, set[str]] = {
         "errors",
         "seeds",
     },
-    "report": {"episodes", "sim", "task", "scene", "geometry", "pipeline", "errors"},
+    "report": {"episodes", "sim", "task", "scene", "video", "geometry", "pipeline", "errors"},
 }
+SCENE_BELOW: dict[str, set[str]] = {
+    # The artefact, which other rooms of the house read.
+    "files": set(),
+    "schema": {"files"},
+    "scene": {"schema"},
+    # Learned models know pictures and numbers, nothing of ours.
+    "backends": set(),
+    "scale": {"schema"},
+    "frames": {"scale"},
+    "data_types": {"frames", "scale", "schema"},
+    "grounding": {"data_types", "frames", "scale", "backends", "schema"},
+    "shapes": {"data_types", "frames", "scale", "backends"},
+    "fitting": {"shapes", "grounding", "data_types", "frames", "scale", "backends", "schema"},
+}
+"""The rooms of `scene`. What is not named here stands above them all: the order of the steps, and what is written."""
 TOP = {
     *("stages", "learning", "expert_config", "policy_training", "policy_config", "craft_data"),
     *("solved", "candidate_worker", "judging", "cli", "commands"),
@@ -69,6 +84,30 @@ def test_a_room_imports_only_rooms_below_it(path):
     ours = {n.split(".")[1] for n in imported_modules(path) if n.startswith("v2p_data.")}
 
     assert ours - BELOW[room] - {room} == set()
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "v2p_data/scene").rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT))
+)
+def test_a_room_of_scene_imports_only_rooms_below_it(path):
+    room = path.relative_to(ROOT / "v2p_data/scene").parts[0].removesuffix(".py")
+    if room not in SCENE_BELOW:
+        return
+    ours = {n.split(".")[2] for n in imported_modules(path) if n.startswith("v2p_data.scene.")}
+
+    assert ours - SCENE_BELOW[room] - {room} == set()
+
+
+@pytest.mark.parametrize("room", ["scene", "video", "report"])
+def test_no_module_imports_itself_over_others(room):
+    def name(path: Path) -> str:
+        return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+    left = {name(p): imported_modules(p) for p in (ROOT / "v2p_data" / room).rglob("*.py")}
+    while leaves := {module for module, used in left.items() if not used & left.keys()}:
+        left = {module: used for module, used in left.items() if module not in leaves}
+
+    assert sorted(left) == []
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,9 @@ from v2p_data.video.captions import find_videos
 SAMPLES = Path(__file__).parents[1] / "datasets" / "sample_videos"
 PACKAGE = craft_data.PACKAGE
 SCENE_FILES = sorted(
-    p.name for p in (PACKAGE / "scene").iterdir() if p.suffix in (".tsv", ".safetensors", ".json")
+    p.relative_to(PACKAGE / "scene").as_posix()
+    for p in (PACKAGE / "scene").rglob("*.*")
+    if p.suffix in (".tsv", ".safetensors", ".json")
 )
 TEMPLATES = sorted(p.name for p in (PACKAGE / "task/templates").glob("*.py"))
 
@@ -27,6 +29,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ):
         (tmp_path / folder).mkdir(parents=True, exist_ok=True)
         for name in names:
+            (tmp_path / folder / name).parent.mkdir(exist_ok=True)
             (tmp_path / folder / name).write_bytes((PACKAGE / folder / name).read_bytes())
     monkeypatch.setattr(craft_data, "PACKAGE", tmp_path)
     return tmp_path
@@ -44,11 +47,12 @@ def edit(path: Path) -> None:
 
 
 def test_all_that_reconstruction_reads_is_known():
-    assert {"nouns.tsv", "standing.json", "network.safetensors", "camera.safetensors"} <= set(
-        SCENE_FILES
-    )
-    assert {"boxes.safetensors", "ruler.safetensors"} <= set(SCENE_FILES)
-    assert set(craft_data.scene_data()) == {f"data scene/{name}" for name in SCENE_FILES}
+    names = {Path(name).name for name in SCENE_FILES}
+
+    assert {"nouns.tsv", "standing.json", "network.safetensors", "camera.safetensors"} <= names
+    assert {"boxes.safetensors", "ruler.safetensors"} <= names
+    assert len(names) == len(SCENE_FILES)
+    assert set(craft_data.scene_data()) == {f"data scene/{name}" for name in names}
 
 
 @pytest.mark.parametrize("name", SCENE_FILES)

@@ -11,14 +11,15 @@ from v2p_data.pipeline.fingerprint import file_digest
 
 PACKAGE = Path(__file__).parent
 SCENE_DATA = ("*.tsv", "*.json", "*.safetensors")
-"""Nouns, how likely a thing is meant, and the networks."""
+"""Nouns, how likely a thing is meant, and the networks; they lie in the rooms of `scene`."""
 PROMPTS = ("prompts.py", "example_tasks.py", "vlm_writer.py")
 
 
 def scene_data() -> dict[str, str]:
     """Return the digest of each file that reconstruction reads."""
-    folder = PACKAGE / "scene"
-    return _digests(path for pattern in SCENE_DATA for path in folder.glob(pattern))
+    # Under the files' names alone: which room one lies in changes no result.
+    files = [path for pattern in SCENE_DATA for path in (PACKAGE / "scene").rglob(pattern)]
+    return {f"data scene/{path.name}": _digest(path) for path in sorted(files)}
 
 
 def task_data(*, asks_model: bool) -> dict[str, str]:

@@ -9,7 +9,7 @@ from v2p_data.deployment.robot import Rig
 from v2p_data.deployment.sight import Sight
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.segment import points_inside
-from v2p_data.scene.segment import iou
+from v2p_data.scene.frames.mask_ops import iou
 
 pytestmark = pytest.mark.slow
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from v2p_data.geometry.mesh import outline_points
-from v2p_data.scene.classes import CLASSES, TABLE
-from v2p_data.scene.find import Watched
-from v2p_data.scene.footage import Footage, footage_of
-from v2p_data.scene.pose import camera_above
-from v2p_data.scene.scale import SeenCamera
+from v2p_data.scene.fitting.silhouette import camera_above
+from v2p_data.scene.frames.classes import CLASSES, TABLE
+from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.working_clip import Footage, footage_of
+from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.video.clip import Clip
 
 SIZE_M = (0.09, 0.07, 0.05)

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.mesh import mesh_for
 from v2p_data.geometry.pose import transform
-from v2p_data.scene.nouns import noun_for
-from v2p_data.scene.pose import camera_above
+from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.reconstruct import Estimate, Reconstruction
+from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.score import (
     FoundClip,
     FoundThing,
@@ -27,7 +27,7 @@ from v2p_data.scene.score import (
     size_sides,
     turn_between,
 )
-from v2p_data.scene.spoon import spoons
+from v2p_data.scene.shapes.spoon import spoons
 from v2p_data.video.clip import Clip
 
 BOX_M = (0.12, 0.08, 0.04)

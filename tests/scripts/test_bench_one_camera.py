@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import pytest
 
-from v2p_data.scene.one_camera import Filmed
+from v2p_data.scene.scale.shared_camera import Filmed
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import apply, transform
-from v2p_data.scene.pose import camera_above
+from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.seeds import rng_for
 from v2p_data.video.synthetic import random_spec
 

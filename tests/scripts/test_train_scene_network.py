@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from v2p_data.scene.pose import camera_above
+from v2p_data.scene.fitting.silhouette import camera_above
 
 H, W = 240, 320
 PITCH_RAD, FOV_RAD, HEIGHT_M = 0.7, 0.9, 0.6

@@ -17,7 +17,7 @@ from v2p_data.cli import command_of, parse
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.report.reading import Result, number, read_run
-from v2p_data.scene.review import ReviewClip, Stills, stills_of, write_review
+from v2p_data.report.review_page import ReviewClip, Stills, stills_of, write_review
 from v2p_data.video.captions import (
     VideoItem,
     find_videos,

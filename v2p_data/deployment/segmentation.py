@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.colour import histogram, lab_of
-from v2p_data.scene.segment import bounding_box, grow, largest, refine, shrink, tidy
+from v2p_data.scene.frames.colour import histogram, lab_of
+from v2p_data.scene.frames.mask_ops import bounding_box, grow, largest, refine, shrink, tidy
 
 SURROUNDINGS = 8
 """Colour clusters of the first picture."""

@@ -19,7 +19,8 @@ from v2p_data.geometry.mesh import mass_properties, mesh_for, parts_for, write_o
 from v2p_data.geometry.pose import pose_from_transform
 from v2p_data.scene.overlay import write_overlay
 from v2p_data.scene.reconstruct import Estimate, Reconstruction
-from v2p_data.scene.scene import Scene, SceneObject, Shape, StageConfidence, write_masks
+from v2p_data.scene.scene import Scene, SceneObject, StageConfidence, write_masks
+from v2p_data.scene.schema import Shape
 
 MJCF_FILE = "scene.xml"
 

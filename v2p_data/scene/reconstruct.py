@@ -23,11 +23,7 @@ from v2p_data.scene.backends.config import (
     PoseConfig,
     SegmentConfig,
 )
-from v2p_data.scene.bore import pierced
-from v2p_data.scene.crop import View
-from v2p_data.scene.find import Watched, passed, watch
-from v2p_data.scene.footage import Footage, camera_shift_px, footage_of
-from v2p_data.scene.gate import (
+from v2p_data.scene.confidence import (
     Cue,
     by_stage,
     check_confidence,
@@ -36,22 +32,22 @@ from v2p_data.scene.gate import (
     cues_of,
     held_at_first,
 )
-from v2p_data.scene.learned import (
-    DETECTORS,
-    camera_from_depth,
-    detected,
-    mesh_by_worker,
-    poses_by_worker,
-    segmented,
-)
-from v2p_data.scene.nouns import Noun
-from v2p_data.scene.placement import UNSEEN_IOU, CameraGuess, Placed, Placement, place, with_forms
-from v2p_data.scene.pose import three
-from v2p_data.scene.refit import bent, refit
-from v2p_data.scene.scene import Observed, Role, Symmetry
-from v2p_data.scene.shape import ShapeChoice, ShapeConfig, best_shape
-from v2p_data.scene.sight import Sighting, Sights, sight, without_asides
-from v2p_data.scene.steady import steadied
+from v2p_data.scene.data_types import CameraGuess, Placed, Placement, Sighting, Sights
+from v2p_data.scene.fitting.by_model import camera_from_depth, poses_by_worker
+from v2p_data.scene.fitting.placement import UNSEEN_IOU, place, with_forms
+from v2p_data.scene.fitting.refine_pose import bent, refit
+from v2p_data.scene.fitting.ring_mask import pierced
+from v2p_data.scene.fitting.silhouette import three
+from v2p_data.scene.frames.segmentation import Watched, passed, watch
+from v2p_data.scene.frames.stabilise import steadied
+from v2p_data.scene.frames.working_clip import Footage, camera_shift_px, footage_of
+from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
+from v2p_data.scene.grounding.ground_objects import sight, without_asides
+from v2p_data.scene.scale.nouns import Noun
+from v2p_data.scene.schema import Observed, Role, Symmetry
+from v2p_data.scene.shapes.by_worker import mesh_by_worker
+from v2p_data.scene.shapes.shape import ShapeChoice, ShapeConfig, best_shape
+from v2p_data.scene.shapes.silhouette_view import View
 from v2p_data.video.captions import parse_caption
 from v2p_data.video.clip import Clip
 

@@ -9,7 +9,6 @@ import json
 import zipfile
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,11 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
+from v2p_data.scene.schema import Observed, Role, Shape, Symmetry, read_scene_file
 
-Role = Literal["manipulated", "reference", "tool", "container", "cover"]
-Shape = Literal["box", "cylinder", "sphere", "mesh"]
-Symmetry = Literal["none", "box", "round", "sphere"]
-Observed = Literal["full", "no_depth"]
 SCENE_FILE = "scene.json"
 SCHEMA = 2
 GRAVITY_M_S2 = (0.0, 0.0, -9.81)
@@ -279,8 +275,6 @@ class Scene:
         Raises:
             V2PError: there is none, it was written by another version, or it says what `schema` does not allow.
         """
-        from v2p_data.scene.schema import read_scene_file
-
         if not (folder / SCENE_FILE).exists():
             raise V2PError(
                 f"{folder} holds no {SCENE_FILE}: it is no scene; make one with 'v2p scene'"

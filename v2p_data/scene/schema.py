@@ -20,8 +20,11 @@ from pydantic import (
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.files import is_plain_path, own_file, read_own
-from v2p_data.scene.scene import Observed, Role, Shape, Symmetry
 
+Role = Literal["manipulated", "reference", "tool", "container", "cover"]
+Shape = Literal["box", "cylinder", "sphere", "mesh"]
+Symmetry = Literal["none", "box", "round", "sphere"]
+Observed = Literal["full", "no_depth"]
 MAX_SCENE_BYTES = 32_000_000
 """An hour of two objects at 10 Hz."""
 MAX_FILE_BYTES = 200_000_000

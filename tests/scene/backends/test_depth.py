@@ -12,7 +12,7 @@ from v2p_data.geometry.pose import transform
 from v2p_data.scene.backends.checkpoint import load_checkpoint
 from v2p_data.scene.backends.config import DepthConfig
 from v2p_data.scene.backends.depth import predict_depth, table_from_depth
-from v2p_data.scene.pose import camera_above
+from v2p_data.scene.fitting.silhouette import camera_above
 
 
 def config(backend: str, checkpoint, **more) -> DepthConfig:

@@ -14,12 +14,13 @@ from v2p_data.scene.backends.config import (
     MeshConfig,
     SegmentConfig,
 )
-from v2p_data.scene.footage import footage_of
-from v2p_data.scene.learned import camera_from_depth, detected, mesh_by_worker, segmented
-from v2p_data.scene.nouns import noun_for
-from v2p_data.scene.placement import CameraGuess
+from v2p_data.scene.data_types import CameraGuess, Sighting
+from v2p_data.scene.fitting.by_model import camera_from_depth
+from v2p_data.scene.frames.working_clip import footage_of
+from v2p_data.scene.grounding.by_model import detected, segmented
 from v2p_data.scene.reconstruct import SceneConfig, reconstruct
-from v2p_data.scene.sight import Sighting
+from v2p_data.scene.scale.nouns import noun_for
+from v2p_data.scene.shapes.by_worker import mesh_by_worker
 
 WORKER = Path(__file__).parents[3] / "scripts" / "example_worker.py"
 COMMAND = f"{shlex.quote(sys.executable)} {shlex.quote(str(WORKER))}"

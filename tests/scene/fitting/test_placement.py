@@ -1,0 +1,231 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from v2p_data.geometry.mesh import outline_points
+from v2p_data.scene.confidence import held_at_first
+from v2p_data.scene.data_types import CameraGuess, Sighting, Sights
+from v2p_data.scene.fitting.placement import _body, _hidden, place, with_forms
+from v2p_data.scene.fitting.silhouette import camera_above
+from v2p_data.scene.frames.classes import CLASSES, HAND
+from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.table import find_table
+from v2p_data.scene.frames.working_clip import footage_of
+from v2p_data.scene.reconstruct import SceneConfig, told
+from v2p_data.scene.scale.camera_height import SeenCamera
+from v2p_data.scene.scale.nouns import noun_for
+from v2p_data.video.clip import Clip
+
+W, H = 320, 240
+PITCH, FOV = 0.7, 1.0
+
+
+def block(x: int, y: int, side: int = 36) -> np.ndarray:
+    out = np.zeros((H, W), bool)
+    out[y : y + side, x : x + side] = True
+    return out
+
+
+def filmed(frames: np.ndarray) -> Clip:
+    n = len(frames)
+    return Clip(
+        item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=frames, fps=12.0,
+        total_frames=n, source_fps=12.0, source_frame=np.arange(n), times_s=np.arange(n) / 12,
+        source_size_px=(W, H), warnings=(),
+    )  # fmt: skip
+
+
+def cup_at(x: float, y: float, above: float) -> np.ndarray:
+    """Return the outline of a cup so far above the table, in camera heights."""
+    camera = camera_above((H, W), PITCH, FOV)
+    noun = noun_for("cup")
+    points = outline_points(noun.form, tuple(2 * np.array(noun.size_m)), noun.taper)
+    points = points + np.array([x, y, above + noun.size_m[2]])
+    hull = cv2.convexHull(camera.project(points).astype(np.float32))
+    return cv2.fillConvexPoly(np.zeros((H, W), np.uint8), hull.round().astype(np.int32), 1) > 0
+
+
+def test_what_comes_later_hides_nothing_now_but_an_arm_does():
+    """A red block is pushed beside a blue one; at first an arm lies on the blue one's other side."""
+    places = [block(60 + 100 * min(12, max(0, i - 6)) // 12, 100) for i in range(24)]
+    stands, arm = block(200, 100), block(238, 100)
+    frames = np.full((24, H, W, 3), 150, np.uint8)
+    frames[:, stands] = 30, 40, 200
+    for frame, spot in zip(frames, places, strict=True):
+        frame[spot] = 200, 30, 30
+    frames[:4, arm] = 220, 170, 140
+    clip = filmed(frames)
+    common = {"quality": np.ones(24), "at": 0, "known_m": None, "sure": 0.9, "why": ""}
+    pushed = Sighting(
+        phrase="red block", role="manipulated", noun=noun_for("block"), masks=np.stack(places), moves=True, **common
+    )  # fmt: skip
+    other = Sighting(
+        phrase="blue block", role="reference", noun=noun_for("block"), masks=np.stack([stands] * 24), moves=False,
+        **common,
+    )  # fmt: skip
+
+    hidden = _hidden(footage_of(clip), (pushed, other), stands, 0)
+
+    assert hidden[arm].mean() > 0.2
+    assert not hidden[block(160, 100)].any()
+
+
+@pytest.mark.parametrize(
+    ("above", "by_a_hand", "held"),
+    [(0.3, True, True), (0.3, False, False), (0.0, True, False)],
+)
+def test_a_cup_that_a_hand_holds_in_the_air_at_first_is_told_from_one_that_stands(
+    above: float, by_a_hand: bool, held: bool
+):
+    way = [cup_at(1.15, 0.25 - 0.5 * k / 23, above * (1 - k / 23)) for k in range(24)]
+    frames = np.full((24, H, W, 3), 150, np.uint8)
+    for frame, outline in zip(frames, way, strict=True):
+        frame[outline] = 200, 30, 30
+    footage = footage_of(filmed(frames))
+    thing = Sighting(
+        phrase="cup", role="manipulated", noun=noun_for("cup"), masks=np.stack(way), quality=np.ones(24), moves=True,
+        at=0, known_m=None, sure=0.9, why="",
+    )  # fmt: skip
+    guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV)
+    shares = np.zeros((24, len(CLASSES), H, W), np.float32)
+    if by_a_hand:
+        x = int(np.nonzero(way[0])[1].min())
+        shares[:, HAND, :100, x - 20 : x] = 1
+    watched = Watched(
+        idx=np.arange(24), shares=shares, early=shares[0], late=shares[-1],
+        camera=SeenCamera(
+            pitch_rad=PITCH, pitch_sd_rad=0.1, focal_widths=1.0, table_width_m=0.8, table_width_sd=0.2
+        ),
+    )  # fmt: skip
+    table = find_table(footage.always, np.ones((H, W), bool))
+    sights = Sights(objects=(thing,), footage=footage, table=table, watched=watched, warnings=())
+
+    placement = place(footage, (thing,), "place_onto", guess, 10)
+
+    assert (placement.objects[0].grown > 0.2) == (above > 0)
+    assert held_at_first(sights, placement) == held
+
+
+def outline_of(noun, size, x: float, y: float, above: float = 0.0) -> np.ndarray:
+    """Return the outline of something upright, in camera heights."""
+    camera = camera_above((H, W), PITCH, FOV)
+    points = outline_points(noun.form, size, noun.taper) + np.array([x, y, above + size[2] / 2])
+    hull = cv2.convexHull(camera.project(points).astype(np.float32))
+    return cv2.fillConvexPoly(np.zeros((H, W), np.uint8), hull.round().astype(np.int32), 1) > 0
+
+
+def resting(phrase: str, role: str, masks: np.ndarray, **given) -> Sighting:
+    common = {
+        "quality": np.ones(len(masks)),
+        "at": 0,
+        "known_m": None,
+        "sure": 0.9,
+        "why": "",
+        "moves": False,
+    }
+    return Sighting(
+        phrase=phrase, role=role, noun=noun_for(phrase), masks=masks, **(common | given)
+    )  # fmt: skip
+
+
+def test_a_pan_is_fitted_without_its_handle():
+    pan = noun_for("frying pan")
+    body = outline_of(pan, (0.4, 0.4, 0.08), 1.15, 0.1)
+    rows, columns = np.nonzero(body)
+    handle = np.zeros_like(body)
+    middle = int(rows.mean())
+    handle[middle - 3 : middle + 4, columns.max() - 4 : columns.max() + 60] = True
+    hidden = np.zeros_like(body)
+
+    kept, unknown = _body(body | handle, hidden, pan)
+    bowl, nothing = _body(body | handle, hidden, noun_for("bowl"))
+
+    assert (kept & body).sum() > 0.97 * body.sum()
+    assert unknown[handle & ~body].mean() > 0.9
+    assert (bowl == body | handle).all()
+    assert not nothing.any()
+
+
+@pytest.mark.parametrize(("across_m", "word"), [(0.09, "lid"), (0.21, "pot lid")])
+def test_lids_of_jars_and_of_pots_are_told_by_their_size(across_m: float, word: str):
+    height_m = 0.5
+    flat, domed = noun_for("lid"), noun_for("pot lid")
+    seen = flat if word == "lid" else domed
+    size = tuple(float(v) for v in across_m / height_m * np.array(seen.size_m) / seen.size_m[0])
+    mask = outline_of(seen, size, 1.1, 0.0)
+    frames = np.full((12, H, W, 3), 150, np.uint8)
+    guess = CameraGuess(
+        pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=height_m, height_sd=0.12
+    )
+
+    lid = resting("lid", "manipulated", np.stack([mask] * 12))
+
+    (told,) = with_forms(footage_of(filmed(frames)), (lid,), guess, "lift_up")
+
+    assert told.noun.size_m == noun_for(word).size_m
+
+
+@pytest.mark.parametrize(("vessel", "word"), [("jar", "lid"), ("pot", "pot lid")])
+def test_a_lid_is_about_as_wide_as_what_it_covers(vessel: str, word: str):
+    """Halfway between a jar's and a pot's, its own size does not tell."""
+    size = (0.27, 0.27, 0.06)
+    masks = [
+        outline_of(noun_for("lid"), size, 1.1, 0.0),
+        outline_of(noun_for(vessel), size, 1.1, 0.5),
+    ]
+    frames = np.full((12, H, W, 3), 150, np.uint8)
+    objects = tuple(
+        resting(name, role, np.stack([mask] * 12))
+        for name, role, mask in zip(("lid", vessel), ("cover", "reference"), masks, strict=True)
+    )
+    guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=0.5)
+
+    told, _ = with_forms(footage_of(filmed(frames)), objects, guess, "cover")
+
+    assert told.noun.size_m == noun_for(word).size_m
+
+
+def test_a_lid_that_is_taken_off_lay_on_what_it_covered():
+    lid, pot = noun_for("pot lid"), noun_for("pot")
+    size, under = (0.36, 0.36, 0.08), (0.34, 0.34, 0.2)
+    there = (1.15, 0.3)
+    first = outline_of(lid, size, *there, above=under[2])
+    last = outline_of(lid, size, 1.1, -0.3)
+    masks = np.stack([first] * 12 + [last] * 12)
+    frames = np.full((24, H, W, 3), 150, np.uint8)
+    frames[:12, first] = frames[12:, last] = 200, 30, 30
+    below = outline_of(pot, under, *there)
+    frames[12:, below] = 30, 40, 200
+    stands = np.stack([below & ~first] * 12 + [below] * 12)
+    objects = (
+        resting("pot lid", "manipulated", masks, moves=True),
+        resting("pot", "reference", stands, at=23),
+    )
+    guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV)
+
+    placed, other = place(footage_of(filmed(frames)), objects, "uncover", guess, 10).objects
+
+    start, stop = placed.T_world_objs[0][:3, 3], placed.T_world_objs[-1][:3, 3]
+    assert placed.taken_off
+    assert start[2] - stop[2] == pytest.approx(other.first.size[2], rel=0.01)
+    assert start[:2] == pytest.approx(there, abs=0.06)
+    assert stop[:2] == pytest.approx((1.1, -0.3), abs=0.06)
+    assert placed.first.size == pytest.approx(size, rel=0.25)
+
+
+def test_a_measured_height_says_as_much_of_lengths_as_is_known_of_pitch_and_focal_length():
+    """A low camera with a long lens sees what a high one with a short lens does."""
+    guess = CameraGuess(pitch_rad=np.pi / 4, pitch_sd_rad=0.1, fov_rad=1.0)
+
+    height = told(guess, SceneConfig(camera_height_m=0.5))
+    seen_too = told(guess, SceneConfig(camera_height_m=0.5, fov_rad=0.9))
+    whole = told(guess, SceneConfig(camera_height_m=0.5, fov_rad=0.9, pitch_rad=0.7))
+
+    assert height.height_m == seen_too.height_m == whole.height_m == 0.5
+    assert whole.height_sd == pytest.approx(0.02)
+    assert seen_too.height_sd == pytest.approx(np.hypot(0.02, 0.1)), "at 45 degrees"
+    assert height.height_sd > 1.5 * seen_too.height_sd
+    assert (whole.fov_rad, whole.pitch_rad) == (0.9, 0.7)
+    assert told(guess, SceneConfig()) == guess

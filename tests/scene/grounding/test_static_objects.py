@@ -1,0 +1,261 @@
+"""Which of the things that stand there is meant: the network's word is drawn by hand here, the weights are the learned ones."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from v2p_data.scene.frames.classes import BACKGROUND, HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.frames.mask_ops import iou
+from v2p_data.scene.frames.table import find_table
+from v2p_data.scene.grounding.ground_objects import stands_on
+from v2p_data.scene.grounding.static_objects import (
+    WEIGHTS,
+    Candidate,
+    Search,
+    candidates,
+    find_standing,
+    seen_standing,
+    usual_area_px,
+)
+from v2p_data.scene.scale.camera_height import SeenCamera
+from v2p_data.scene.scale.nouns import noun_for
+
+RED, BLUE, GREEN, SKIN = (190, 40, 40), (40, 60, 190), (40, 150, 60), (224, 172, 140)
+CAMERA = SeenCamera(
+    pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.9, table_width_sd=0.2
+)
+
+
+def square(x, y, size=14):
+    mask = np.zeros((90, 120), bool)
+    mask[y : y + size, x : x + size] = True
+    return mask
+
+
+def large(mask, footage):
+    """Return a mask at working size."""
+    h, w = footage.shape
+    return mask[(np.arange(h) * 90) // h][:, (np.arange(w) * 120) // w]
+
+
+def pushed_to(x, others):
+    """A red square goes along y = 40 from x = 5 to x; others stand there."""
+    return [
+        [*((mask, rgb, OTHER) for mask, rgb in others), (square(round(5 + (x - 5) * i / 11), 40), RED, MOVED)]
+        for i in range(12)
+    ]  # fmt: skip
+
+
+def searched(watched_of, frames, phrase, kind, ends, moved="thing"):
+    footage, watched = watched_of(frames)
+    first, last = (large(mask, footage) for mask in ends)
+    return Search(
+        footage=footage,
+        table=find_table(footage.always, watched.early[TABLE] > 0.5),
+        watched=watched,
+        phrase=phrase,
+        moved=noun_for(moved),
+        kind=kind,
+        ends=(first, last),
+        taken=np.zeros(footage.shape, bool),
+    )
+
+
+def meant(*asked):
+    search = searched(*asked)
+    return find_standing(search), search.footage
+
+
+def test_of_two_things_the_one_that_was_pushed_to_is_meant(watched_of):
+    near, far = square(70, 40), square(100, 5)
+    frames = pushed_to(52, [(near, BLUE), (far, BLUE)])
+
+    found, footage = meant(
+        watched_of, frames, "box", "push_next_to", (square(5, 40), square(52, 40))
+    )
+
+    assert iou(found.mask, large(near, footage)) > 0.8
+
+
+def test_a_basket_that_fills_a_third_of_the_picture_is_still_a_thing(watched_of):
+    basket, small = square(50, 20, 62), square(5, 5)
+    frames = pushed_to(60, [(basket, BLUE), (small, BLUE)])
+
+    found, footage = meant(
+        watched_of, frames, "laundry basket", "throw_into", (square(5, 40), square(60, 40))
+    )
+
+    assert iou(found.mask, large(basket, footage)) > 0.8
+
+
+def test_a_table_that_seems_to_be_a_thing_is_too_large_to_be_a_cup(watched_of):
+    table, cup = square(50, 20, 62), square(66, 44, 12)
+    frames = pushed_to(60, [(table, GREEN), (cup, BLUE)])
+    ends = square(5, 40), square(60, 40)
+
+    search = searched(watched_of, frames, "cup", "throw_into", ends)
+
+    assert max(one.mask.mean() for one in candidates(search)) < 0.2
+
+
+def test_a_named_colour_outweighs_a_little_distance(watched_of):
+    near, far = square(60, 62), square(70, 15)
+    frames = pushed_to(60, [(near, BLUE), (far, GREEN)])
+    ends = square(5, 40), square(60, 40)
+
+    blue, footage = meant(watched_of, frames, "blue box", "push_next_to", ends)
+    green, _ = meant(watched_of, frames, "green box", "push_next_to", ends)
+
+    assert iou(blue.mask, large(near, footage)) > 0.8
+    assert iou(green.mask, large(far, footage)) > 0.8
+
+
+def test_a_whole_that_was_cut_out_twice_is_meant_rather_than_something_likelier_by_itself(
+    watched_of, monkeypatch
+):
+    """What two candidates nearly agree on is likelier than the one candidate that agrees with none."""
+    ends = square(5, 40), square(50, 40)
+    search = searched(watched_of, pushed_to(50, [(square(72, 28, 20), BLUE)]), "box", "push_next_to", ends)  # fmt: skip
+    usual = candidates(search)[0]
+    shapes = [(square(72, 28, 20), 0.70), (square(73, 29, 19), 0.69), (square(5, 5), 0.75)]
+    found = [
+        Candidate(
+            mask=large(mask, search.footage),
+            cues={**dict.fromkeys(usual.cues, 0.0), "seen": seen},
+        )
+        for mask, seen in shapes
+    ]
+    monkeypatch.setattr("v2p_data.scene.grounding.static_objects.candidates", lambda _: found)
+
+    assert iou(find_standing(search).mask, found[0].mask) > 0.7
+
+    monkeypatch.setattr("v2p_data.scene.grounding.static_objects.candidates", lambda _: found[1:])
+    assert iou(find_standing(search).mask, found[2].mask) > 0.7
+
+
+def test_one_alone_is_surer_than_one_of_two_that_are_alike(watched_of):
+    ends = square(5, 40), square(50, 40)
+    one, two = square(72, 28), square(72, 52)
+
+    alone, _ = meant(watched_of, pushed_to(50, [(one, BLUE)]), "box", "push_next_to", ends)
+    either, _ = meant(
+        watched_of, pushed_to(50, [(one, BLUE), (two, BLUE)]), "box", "push_next_to", ends
+    )
+
+    assert either.score < alone.score - 0.1
+
+
+def test_what_an_arm_hides_at_first_is_found_where_it_is_seen_later(watched_of):
+    bin_, arm = square(70, 30, 24), square(60, 20, 40)
+    frames = pushed_to(30, [(bin_, BLUE)])
+    for parts in frames[:4]:
+        parts.append((arm, SKIN, HAND))
+    found, footage = meant(
+        watched_of, frames, "blue bin", "throw_into", (square(5, 40), square(72, 34, 10))
+    )
+
+    assert iou(found.mask, large(bin_, footage)) > 0.8
+
+
+def test_where_nothing_stands_nothing_is_believed(watched_of):
+    """The edge of the moved thing's trace may stand out from the table."""
+    ends = square(5, 40), square(50, 40)
+    found, _ = meant(watched_of, pushed_to(50, []), "box", "push_next_to", ends)
+
+    assert found is None or found.score < 0.2
+
+
+def test_print_on_the_table_is_no_part_of_what_stands_beside_it(watched_of):
+    thing, print_ = square(70, 40), square(72, 54, 10)
+    frames = [[(print_, BLUE, TABLE), *parts] for parts in pushed_to(52, [(thing, BLUE)])]
+
+    found, footage = meant(
+        watched_of, frames, "blue box", "push_next_to", (square(5, 40), square(52, 40))
+    )
+
+    assert iou(found.mask, large(thing, footage)) > 0.85
+
+
+def test_what_is_uncovered_is_looked_for_where_the_cover_stood(watched_of):
+    under, beside = square(22, 44, 8), square(90, 60, 8)
+    frames = [
+        [(beside, BLUE, OTHER), (under, BLUE, MOVED), (square(18 + 4 * i, 36, 20), RED, MOVED)]
+        for i in range(12)
+    ]
+    found, footage = meant(
+        watched_of, frames, "box", "uncover", (square(18, 36, 20), square(62, 36, 20))
+    )
+
+    assert iou(found.mask, large(under, footage)) > 0.6
+
+
+def test_pixels_count_in_the_frames_that_show_them(watched_of):
+    bin_ = square(70, 30, 24)
+    frames = pushed_to(30, [(bin_, BLUE)])
+    for parts in frames[:8]:
+        parts.append((bin_, SKIN, HAND))
+    footage, watched = watched_of(frames)
+
+    assert seen_standing(watched, "insert")[large(bin_, footage)].min() > 0.7
+
+
+def test_where_all_seems_too_small_things_are_compared_with_what_moves(watched_of):
+    """The camera is taken to be near, and the scene is far away: then the box that is pushed looks like a matchbox."""
+    frames, ends = pushed_to(50, [(square(72, 28), BLUE)]), (square(5, 40), square(50, 40))
+
+    alone, beside = (
+        searched(watched_of, frames, "blue suitcase", "slide_to", ends, moved)
+        for moved in ("thing", "suitcase")
+    )
+
+    assert alone.log_scale == 0
+    assert beside.log_scale < -0.3
+    cues = [max(candidates(one), key=lambda c: c.cues["seen"]).cues for one in (alone, beside)]
+    assert cues[1]["smaller than usual"] == pytest.approx(
+        cues[0]["smaller than usual"] + beside.log_scale
+    )
+
+
+@pytest.mark.parametrize("kind", ["insert", "slide_to", "uncover", "lift_up"])
+def test_every_candidate_has_the_cues_that_were_learned(watched_of, kind):
+    frames, ends = pushed_to(50, [(square(72, 28), BLUE)]), (square(5, 40), square(50, 40))
+    learned = json.loads(WEIGHTS.read_text())
+    assert set(learned["sure"]) == {"offset", "odds", *learned["choice"]}
+
+    for one in candidates(searched(watched_of, frames, "blue box", kind, ends)):
+        assert set(one.cues) == set(learned["choice"])
+
+
+def test_what_stands_is_apart_from_table_and_wall(watched_of):
+    thing = square(60, 50)
+    parts = [(square(0, 0, 30), (90, 90, 90), BACKGROUND), (thing, RED, OTHER)]
+    footage, watched = watched_of([parts for _ in range(12)])
+
+    assert iou(seen_standing(watched, "push_left") > 0.5, large(thing, footage)) > 0.8
+
+
+def test_what_has_table_beneath_it_stands_on_the_table_whatever_its_colours_say(watched_of):
+    on, off = square(60, 50), square(5, 5)
+    wall = square(0, 0, 40)
+    parts = [(wall, (90, 90, 90), BACKGROUND), (on, RED, OTHER), (off, RED, OTHER)]
+    footage, watched = watched_of([parts for _ in range(12)])
+    nowhere = replace(find_table(footage.always), hull=np.zeros(footage.shape, bool))
+
+    assert not stands_on(nowhere, large(on, footage))
+    assert stands_on(nowhere, large(on, footage), watched)
+    assert not stands_on(nowhere, large(off, footage), watched)
+
+
+@pytest.mark.parametrize(("phrase", "far"), [("ball", False), ("plate", False), ("box", True)])
+def test_usual_things_cover_as_many_pixels_as_their_size_says(phrase, far):
+    noun = noun_for(phrase)
+    row = 40.0 if far else 120.0
+    area = usual_area_px(noun, CAMERA, (240, 320), row)
+
+    # The middle row shows 0.9 m of the table on 320 pixels; things above it are farther away, and smaller.
+    across_px = 320 / 0.9 * np.array(noun.size_m)
+    most, least = across_px[0] * (across_px[1] + across_px[2]), 0.4 * across_px.min() ** 2
+    assert least < area < most
+    assert far == (area < usual_area_px(noun, CAMERA, (240, 320), 120.0) * 0.9)

@@ -1,0 +1,178 @@
+"""How sure each step of a reconstruction is and why, and whether the motion found is the one that the caption tells of.
+
+A scene's confidence is the product of its cues; each cue belongs to one stage, whose confidence is the product of its own.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.scene.data_types import Placement, Sights
+from v2p_data.scene.fitting.placement import vote_of
+from v2p_data.scene.fitting.trajectory import TOUCH_PX
+from v2p_data.scene.frames.colour import balance, colour_match, named_colours
+from v2p_data.scene.frames.mask_ops import attainable_iou, grow
+from v2p_data.scene.frames.segmentation import hand_at
+from v2p_data.scene.grounding.ground_objects import stands_on
+from v2p_data.scene.grounding.moved_by_change import NEARING_KINDS, TOUCHING_KINDS
+from v2p_data.scene.grounding.moved_by_network import SWALLOWING_KINDS
+from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
+from v2p_data.scene.scale.nouns import is_clear
+
+_COLOURED = 0.25
+"""Share of a thing's pixels that need its colour: few things are one colour all over."""
+_OUT_OF_SIGHT = 0.8
+"""What went into a bin lies in it, and what a fist lifts goes with it, but nobody sees where."""
+_GROWN = 0.2
+"""Logarithm: of twelve drawn things that a hand touches at first where they rest, none seems so much larger there than at the end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cue:
+    """One reason to trust a scene or not."""
+
+    stage: str
+    what: str
+    value: float
+    """0 to 1."""
+
+
+def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
+    """Return everything that the scene's confidence is the product of."""
+    cues: list[Cue] = []
+
+    def add(stage: str, what: str, value: float) -> None:
+        cues.append(Cue(stage=stage, what=what, value=float(np.clip(value, 0, 1))))
+
+    for s, placed in zip(sights.objects, placement.objects, strict=True):
+        which = f"'{s.phrase}'"
+        add("grounding", f"finding {which}" + (f" ({s.why})" if s.why else ""), s.sure)
+        if not s.hinted and (words := named_colours(s.phrase)):
+            image = sights.footage.rgb[s.at]
+            match = float(colour_match(balance(image), words)[s.first].mean())
+            add("grounding", f"colour of {which}", 0.4 + 0.6 * match / _COLOURED)
+        if s.moves:
+            add("segmentation", f"track of {which} from start to end", 0.8 + 0.7 * s.meets)
+        off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
+        add("size", f"size of {which}", np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2))
+        covers = placed.first.iou / attainable_iou(s.first)
+        add("shape", f"outline of {which}", max(0.1, 0.5 + (covers - 0.6) / 0.6))
+        if not s.moves:
+            continue
+        if s.swallowed or placed.in_fist:
+            add("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
+            continue
+        covers = placed.last.iou / attainable_iou(placed.last_mask)
+        add("pose", f"outline of {which} at the end", max(0.1, 0.6 + (covers - 0.45) / 0.875))
+        seen = placed.last.visible / max(0.2, placed.first.visible)
+        # Of what is put into something only the upper part is left to see.
+        least = 0.8 if kind in SWALLOWING_KINDS else 0.5
+        add("pose", f"{which} seen at the end", max(0.1, least + seen))
+    thing = sights.objects[0]
+    add("camera", "camera height", height_plausibility(placement.height_m))
+    if not stands_on(sights.table, thing.first, sights.watched):
+        add("grounding", "standing on the table at first", 0.6)
+    if not (thing.noun.known or thing.known_m):
+        add("size", f"knowing what '{thing.phrase}' is", 0.9)
+    matter = "clear" if is_clear(thing.phrase) else thing.noun.matter
+    if matter != "rigid":
+        add("shape", f"'{thing.phrase}' is {matter}", {"soft": 0.8, "clear": 0.7}[matter])
+    if kind == "generic":
+        add("grounding", "understanding the caption", 0.85)
+    return tuple(cues)
+
+
+def held_at_first(sights: Sights, placement: Placement) -> bool:
+    """Return whether a hand seems to hold the manipulated object in the air when the clip begins.
+
+    Then it seems larger than where it ends, and has a hand beside it or no table under it.
+    """
+    thing = sights.objects[0]
+    if placement.objects[0].grown < _GROWN:
+        return False
+    if not stands_on(sights.table, thing.first, sights.watched):
+        return True
+    hand = None if sights.watched is None else hand_at(sights.watched, thing.at)
+    return hand is not None and bool((hand & grow(thing.first, TOUCH_PX)).any())
+
+
+def by_stage(cues: tuple[Cue, ...]) -> dict[str, tuple[float, str]]:
+    """Return each stage's confidence, and in words its weakest cue where that is below 0.9."""
+    out: dict[str, tuple[float, str]] = {}
+    for stage in dict.fromkeys(cue.stage for cue in cues):
+        own = [cue for cue in cues if cue.stage == stage]
+        weakest = min(own, key=lambda cue: cue.value)
+        reason = f"{weakest.what}: {weakest.value:.2f}" if weakest.value < 0.9 else ""
+        out[stage] = round(float(np.prod([cue.value for cue in own])), 4), reason
+    return out
+
+
+def confidence_of(cues: tuple[Cue, ...]) -> float:
+    """Return the scene's confidence, 0 to 1."""
+    return float(np.prod([cue.value for cue in cues]))
+
+
+def check_confidence(cues: tuple[Cue, ...], least: float) -> float:
+    """Return the scene's confidence.
+
+    Raises:
+        ItemRejectedError: `low_confidence`, where it is below `least`.
+    """
+    confidence = confidence_of(cues)
+    if confidence < least:
+        weakest = min(cues, key=lambda cue: cue.value)
+        raise ItemRejectedError(
+            "low_confidence",
+            f"the scene is sure to {confidence:.3f}, below {least:g}; weakest is {weakest.what} with "
+            f"{weakest.value:.2f}; in captions.json a box around each object helps, or a known size",
+            round(confidence, 3),
+        )
+    return confidence
+
+
+def check_motion(
+    kind: str,
+    sights: Sights,
+    placement: Placement,
+    T_world_objs: list[Float[np.ndarray, "_ 4 4"]],
+    size_m: tuple[float, float, float],
+) -> None:
+    """Turn away what does not do what its caption says: then something else was followed.
+
+    Raises:
+        ItemRejectedError: `motion_contradicts_caption`.
+    """
+    own, said = T_world_objs[0], ""
+    move = own[-1][:3, 3] - own[0][:3, 3]
+    several = len(T_world_objs) > 1
+    if kind == "lift_up":
+        value, least, said = float(move[2]), 0.05, "rises"
+    elif kind in ("push_left", "push_right"):
+        value = float(move[1] if kind == "push_left" else -move[1])
+        least = max(0.04, 0.25 * max(size_m))
+        said = "moves to the left" if kind == "push_left" else "moves to the right"
+    elif kind == "tip_over":
+        value, least = placement.upright_cost - placement.objects[0].last.cost, -0.03
+        said = "fits the picture better tipped than upright"
+    elif kind in NEARING_KINDS and several and not sights.objects[1].moves:
+        gaps = [
+            float(np.linalg.norm((T[:3, 3] - T_world_objs[1][0][:3, 3])[:2]))
+            for T in (own[0], own[-1])
+        ]
+        value, least, said = gaps[0] - gaps[1], 0.02, "comes nearer to the other"
+    elif kind in TOUCHING_KINDS and several:
+        goal, last = grow(sights.objects[1].first, 6), sights.objects[0].last
+        # What is covered may be far smaller than what covers it.
+        value, least = float((goal & last).sum() / max(1, min(last.sum(), goal.sum()))), 0.25
+        said = "ends at the other"
+    else:
+        value, least, said = float(np.linalg.norm(move)), 0.02, "moves"
+    if value < least:
+        raise ItemRejectedError(
+            "motion_contradicts_caption",
+            f"what was followed as '{sights.objects[0].phrase}' hardly {said} ({value:.2f}, at least {least:.2f} needed), "
+            "so it is probably something else; mark it with a box in captions.json",
+            round(value, 3),
+        )

@@ -1,0 +1,159 @@
+"""What the rooms of this package hand to each other: objects in the picture, then a camera and poses.
+
+`frames` and `scale` lie below this file, `grounding`, `shapes` and `fitting` above it.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from v2p_data.geometry.camera import Camera
+from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.table import Table
+from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.scale.camera_height import table_width_m
+from v2p_data.scene.scale.nouns import Noun
+from v2p_data.scene.schema import Observed, Role
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sighting:
+    """One object of the caption in the picture, before geometry."""
+
+    phrase: str
+    role: Role
+    noun: Noun
+    masks: Bool[np.ndarray, "time h w"] = field(repr=False)
+    """Its visible pixels in every footage frame."""
+    quality: Float[np.ndarray, "time"] = field(repr=False)
+    """How far to believe each mask, 0 to 1."""
+    moves: bool
+    at: int
+    """Footage frame that shows where it stands at first; the last one for what is uncovered."""
+    known_m: tuple[float, float, float] | None
+    """Its size where the user gave it."""
+    sure: float
+    """That these are the object's pixels, 0 to 1."""
+    why: str
+    """Why not surer."""
+    meets: float = 1.0
+    """How well the track from the start agrees with the one from the end, 0 to 1."""
+    hinted: bool = False
+    swallowed: bool = False
+    """Whether it was last seen going into what hides it at the end; the masks from then on repeat the last one seen."""
+    in_hand: bool = False
+    """Whether a hand brings it and takes it away: it never rests on the table."""
+
+    @property
+    def first(self) -> Bool[np.ndarray, "h w"]:
+        return self.masks[self.at]
+
+    @property
+    def last(self) -> Bool[np.ndarray, "h w"]:
+        return self.masks[-1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sights:
+    """Everything seen in a clip."""
+
+    objects: tuple[Sighting, ...]
+    """The manipulated one first."""
+    footage: Footage
+    """As given, now knowing the hand's colours."""
+    table: Table
+    watched: Watched | None
+    """None where the network was not asked."""
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraGuess:
+    """What is known of the camera before the outlines are looked at."""
+
+    pitch_rad: float
+    pitch_sd_rad: float
+    fov_rad: float
+    """Horizontal field of view."""
+    height_m: float | None = None
+    """Over the table, where something measured it."""
+    height_sd: float = 0.12
+    """Standard deviation of its logarithm."""
+    table_width_m: float | None = None
+    """How much of the table the picture shows from left to right at its middle, where something saw it."""
+    table_width_sd: float = 0.2
+    """Standard deviation of its logarithm."""
+
+    def heights(self, pitch_rad: float) -> list[tuple[float, float]]:
+        """Return what this says of the height [m], with the logarithm's standard deviation, at a fitted pitch."""
+        out = []
+        if self.height_m is not None:
+            out.append((self.height_m, self.height_sd))
+        if self.table_width_m is not None:
+            focal_widths = 0.5 / np.tan(self.fov_rad / 2)
+            shown = table_width_m(pitch_rad, focal_widths, 1.0)
+            out.append((self.table_width_m / shown, self.table_width_sd))
+        return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """A shape whose silhouette matches a mask, in camera heights."""
+
+    size: tuple[float, float, float]
+    T_world_obj: Float[np.ndarray, "4 4"]
+    iou: float
+    visible: float
+    """Share of the silhouette that the mask confirms; the rest is hidden or wrong."""
+    cost: float
+    """1 - IoU plus what the proportions cost: comparable between fits of one mask."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    """One object in camera heights."""
+
+    first: Fit
+    last: Fit
+    last_i: int
+    """Footage frame of the last pose."""
+    last_mask: Bool[np.ndarray, "h w"]
+    hidden: Bool[np.ndarray, "h w"]
+    """Where something may stand in front of it at first."""
+    last_hidden: Bool[np.ndarray, "h w"]
+    """The same at the last pose."""
+    frames: tuple[int, ...]
+    """Footage frames with a pose, the first and the last among them."""
+    T_world_objs: Float[np.ndarray, "pose 4 4"]
+    confidences: tuple[float, ...]
+    observed: tuple[Observed, ...]
+    rival: float | None
+    """By how much the next best way of lying covers the outlines worse; None where there is no other."""
+    in_fist: bool = False
+    """Whether a hand hides it from the camera: then its poses go with the hand."""
+    unseen: bool = False
+    """Whether nothing shows where it ends: then it lies in the middle of what swallowed it."""
+    grown: float = 0.0
+    """Logarithm of how much larger it seems where it starts than where it ends, if it lies on the table at both: what is held
+    in the air is nearer to the camera, and seems larger."""
+    taken_off: bool = False
+    """Whether it lies on something at first: then its last outline, on the table, shows its shape."""
+    T_world_seen: Float[np.ndarray, "4 4"] | None = None
+    """Where the sighting's first outline shows it, if that is not its first pose."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """Camera and objects, in the order of the sightings."""
+
+    camera: Camera
+    """At working size, one camera height above the table."""
+    pitch_rad: float
+    objects: tuple[Placed, ...]
+    height_m: float
+    """Metres per camera height."""
+    scale_spread: float
+    """Standard deviation of the logarithm of `height_m`."""
+    upright_cost: float
+    """What standing as at first would have cost the manipulated object at the end."""

@@ -1,0 +1,8 @@
+"""A clip becomes working frames, and the scene network says of every pixel what it shows.
+
+Comes in: a `Clip`. Goes out: a `Footage` (frames 320 px wide with their stills), the table's colour, and the network's class
+probabilities for every frame (`Watched`).
+
+Reading order: working_clip, stabilise (a camera that sways), colour, table, mask_ops (outlines and small helpers on masks), classes,
+network, segmentation (the network over a whole clip), hand (where a hand ends).
+"""

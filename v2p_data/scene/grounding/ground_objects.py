@@ -1,0 +1,550 @@
+"""Which pixels are which object of the caption, in every frame: grounding, then segmentation, by the chosen backends.
+
+A user's box, points or a detector's box say where an object is in one frame; without them what moved and what stands
+there decides. Everything works at the footage's size.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.scene.data_types import Sighting, Sights
+from v2p_data.scene.frames.classes import HAND, MOVED, TABLE
+from v2p_data.scene.frames.colour import histogram
+from v2p_data.scene.frames.mask_ops import bounding_box, grow, largest
+from v2p_data.scene.frames.segmentation import (
+    LEAST_SHARE,
+    Watched,
+    hand_at,
+    seen_at_first,
+    table_seen,
+)
+from v2p_data.scene.frames.table import Table, find_table
+from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.grounding.held_tool import HeldTool, find_tool
+from v2p_data.scene.grounding.hint_masks import Box, Mark, marks_of
+from v2p_data.scene.grounding.moved_by_change import Moved, find_moved, find_other
+from v2p_data.scene.grounding.moved_by_network import SWALLOWING_KINDS, find_movers, rated
+from v2p_data.scene.grounding.outlines import apart, settled
+from v2p_data.scene.grounding.static_objects import Search, find_standing
+from v2p_data.scene.grounding.tracking import carried, track
+from v2p_data.scene.scale.nouns import noun_for
+from v2p_data.scene.schema import Role
+from v2p_data.video.clip import Clip
+from v2p_data.video.meaning import Meaning
+
+_CHANGE_TELLS = 4.0
+"""Score of the hand-written cues from which their finding is an opinion."""
+_CLEARLY_BETTER = 1.6
+"""What those cues found is preferred where the network's own measures rate it so many times as high."""
+_LIES_WITHIN = 0.8
+"""Share of the one outline in the other from which both see the same thing, one of them with something beside it."""
+_AS_A_PART, _AS_A_PIECE = 0.5, 0.35
+"""What overlap such a finding counts as at least: the network's within that of those cues, and theirs within the network's."""
+_NO_OPINION = 0.75
+"""What the finding of the network alone counts where those cues have none."""
+_LEAST_HAND = 0.002
+"""Share of the picture that a hand covers when it is seen best."""
+_LITTLE = 0.2
+"""Of a thing's first outline: when no more than this is seen of it, it is hidden."""
+_TOUCH_PX = 6
+_BELOW_PX, _SEEN_BELOW = 5, 0.5
+"""How far below a thing the network must see table, and how surely in the mean."""
+_SETS_OUT, _WELL_SEEN = 0.05, 0.6
+"""Share of its way that a thing has gone when it moves; and the share of its largest area that shows a tool well."""
+_OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
+"""What the caption says of other objects is an aside here: such a scene makes sense without them."""
+
+
+def sight(
+    clip: Clip,
+    footage: Footage,
+    meaning: Meaning,
+    watched: Watched | None,
+    min_found: float,
+    boxes: Mapping[str, Box] | None = None,
+) -> Sights:
+    """Return the masks of all objects that the caption names.
+
+    `watched` is what the network sees, where it was asked; `boxes` are what a detector says, by phrase: a user's hint
+    for the phrase goes before it.
+
+    Raises:
+        ItemRejectedError: `no_hand`, `not_there_at_first`, `object_not_found` or `reference_not_found`, with the number that decided.
+    """
+    if watched is not None:
+        _check_hand(clip, watched)
+        footage = _knowing_hand(footage, watched)
+    table = find_table(footage.always, table_seen(watched) if watched else None)
+    marked = marks_of(clip, footage, watched, boxes or {})
+    tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
+    own = marked.get(meaning.manipulated)
+    if own is not None and own.at_end(footage):
+        _check_there_at_first(clip, meaning.manipulated, watched)
+    moved, held = _find_movers(clip, footage, table, watched, meaning, tool, marked)
+    sure, why = _sureness(moved, watched, own)
+    if sure < min_found:
+        _check_there_at_first(clip, meaning.manipulated, watched)
+        raise ItemRejectedError(
+            "object_not_found",
+            f"the best match for '{meaning.manipulated}' in {clip.item} is sure to {sure:.3f}, below {min_found:g} "
+            f"({why}); mark it, and each other object of the caption, with a box in captions.json",
+            round(sure, 3),
+        )
+    if watched is None:
+        footage = footage.knowing(moved.look)
+    thing = _mover(
+        _sighting(clip, meaning.manipulated, "manipulated"), footage, watched, moved, own
+    )
+    moved = replace(moved, last=thing.masks[-1])
+    scene = _Scene(clip, footage, table, watched, meaning, moved, thing, min_found)
+    objects, warnings = [thing], list[str]()
+    taken = np.zeros(footage.shape, bool)
+    for phrase, role in meaning.others:
+        thing, mark = _sighting(clip, phrase, role), marked.get(phrase)
+        if role == "tool" and (watched is not None or mark is not None):
+            seen = _tool(scene, thing, mark, held)
+        else:
+            seen = _stander(scene, thing, mark, taken)
+        if seen is None:
+            warnings.append(f"the '{phrase}' was not found and is left out")
+            continue
+        if not seen.moves:
+            taken |= grow(seen.first, 2)
+        objects.append(seen)
+    may_be_hidden = own is None or not own.at_end(footage)
+    if watched is not None and meaning.kind in SWALLOWING_KINDS and may_be_hidden and objects[1:]:
+        objects[0] = swallowed(watched, objects[0], objects[1])
+    return Sights(
+        objects=tuple(objects),
+        footage=footage,
+        table=table,
+        watched=watched,
+        warnings=tuple(warnings),
+    )
+
+
+def without_asides(
+    sights: Sights, meaning: Meaning, clip: Clip
+) -> tuple[list[int], tuple[str, ...]]:
+    """Return the numbers of the objects without those of which the caption does not speak, and a warning for each of these.
+
+    What is only listed beside the caption of a lift, push or tip is no part of the task: such a scene makes sense without it.
+    """
+    left_out = [
+        k
+        for k, s in enumerate(sights.objects)
+        if k and meaning.kind in _OPTIONAL_KINDS and not (s.hinted or _is_said(s.phrase, clip))
+    ]
+    return [k for k in range(len(sights.objects)) if k not in left_out], tuple(
+        f"the '{sights.objects[k].phrase}', of which the caption does not speak, was not found surely enough and is left out"
+        for k in left_out
+    )
+
+
+def _is_said(phrase: str, clip: Clip) -> bool:
+    return phrase.lower() in clip.caption.lower()
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What the search for the other objects goes by."""
+
+    clip: Clip
+    footage: Footage
+    table: Table
+    watched: Watched | None
+    meaning: Meaning
+    moved: Moved
+    mover: Sighting
+    """The manipulated object."""
+    min_found: float
+
+
+def _mover(
+    thing: Sighting,
+    footage: Footage,
+    watched: Watched | None,
+    moved: Moved,
+    mark: Mark | None,
+) -> Sighting:
+    """Return a thing that moves, followed from its first outline to its last."""
+    sure, why = _sureness(moved, watched, mark)
+    course = track(
+        footage,
+        moved,
+        every=_every(footage),
+        moving=None if watched is None else lambda i: watched.at(i)[MOVED],
+        bare=None if watched is None else lambda i: watched.at(i)[TABLE],
+    )
+    if mark is not None and mark.on_its_way(footage):
+        course.masks[mark.frame], course.quality[mark.frame] = mark.mask, 1.0
+    return replace(
+        thing,
+        masks=course.masks,
+        quality=course.quality,
+        meets=course.meets,
+        moves=True,
+        sure=sure,
+        why=why,
+        hinted=mark is not None,
+    )
+
+
+def _every(footage: Footage) -> int:
+    """Return every how-manieth frame is tracked."""
+    return 1 if len(footage.rgb) < 80 else 2
+
+
+def swallowed(watched: Watched, thing: Sighting, other: Sighting) -> Sighting:
+    """Return the thing as last seen, where it goes into the other and nothing that moved is seen at the end: bins are deep.
+
+    Where the user marked the other, only what is seen there counts: hands and legs uncover things elsewhere.
+    """
+    little = _LITTLE * float(thing.first.sum())
+    goal = grow(other.first, _TOUCH_PX)
+    left = watched.at(len(thing.masks) - 1)[MOVED] > 0.5
+    if not other.noun.hollow or (left & goal if other.hinted else left).sum() > little:
+        return thing
+    entering = [
+        (int(i), mask)
+        for i in watched.idx[len(watched.idx) // 3 :]
+        if (mask := (watched.at(int(i))[MOVED] > 0.5) & goal).sum() > little
+    ]
+    if not entering:
+        return thing
+    i, mask = entering[-1]
+    masks, quality = thing.masks.copy(), thing.quality.copy()
+    masks[i:], quality[i + 1 :] = largest(mask), 0.0
+    return replace(thing, masks=masks, quality=quality, swallowed=True)
+
+
+def _tool(
+    scene: _Scene, thing: Sighting, mark: Mark | None, held: Moved | None
+) -> Sighting | None:
+    """Return a tool: in a hand that brings it, else what moves as well, or what is marked, followed.
+
+    None where it is not found and the caption can do without.
+
+    Raises:
+        ItemRejectedError: `reference_not_found`.
+    """
+    found, sure = None, 0.0
+    if scene.watched is not None:
+        box = None if mark is None else (mark.frame, mark.box)
+        found = find_tool(scene.footage, scene.watched, scene.mover.masks, thing.noun, box)
+    if found is not None:
+        sure = found.sure if mark is None else mark.sure
+    if found is not None and sure >= scene.min_found:
+        return replace(
+            thing,
+            masks=found.masks,
+            quality=found.quality,
+            moves=True,
+            at=_first_pushing(found, scene.mover),
+            sure=sure,
+            why=found.why,
+            hinted=mark is not None,
+            in_hand=True,
+        )
+    seen = None
+    if mark is not None:
+        seen = _held(scene, thing, mark)
+    elif held is not None:
+        seen = _mover(thing, scene.footage, scene.watched, held, mark)
+    if seen is None:
+        _check_needed(scene, thing.phrase, sure)
+    return seen
+
+
+def _first_pushing(tool: HeldTool, pushed: Sighting) -> int:
+    """Return the footage frame that shows a tool first and well while what it pushes moves, or shortly before or after."""
+    spots = {i: np.argwhere(m).mean(0) for i, m in enumerate(pushed.masks) if m.any()}
+    start = np.argwhere(pushed.first).mean(0)
+    way = np.argwhere(pushed.last).mean(0) - start
+    gone = {i: float((spot - start) @ way) / max(1e-6, way @ way) for i, spot in spots.items()}
+    moves = [i for i, share in gone.items() if _SETS_OUT < share < 1 - _SETS_OUT]
+    if not moves:
+        return tool.at
+    area = tool.masks.sum((1, 2)) * (tool.quality > 0)
+    around = range(max(0, moves[0] - 1), min(len(area), moves[-1] + 2))
+    seen = [i for i in around if area[i]]
+    return next((i for i in seen if area[i] > _WELL_SEEN * area[seen].max()), tool.at)
+
+
+def _held(scene: _Scene, thing: Sighting, mark: Mark) -> Sighting | None:
+    """Return a marked tool, followed from that frame on; None where the mark is empty."""
+    if not mark.mask.any():
+        return None
+    footage, watched = scene.footage, scene.watched
+    course = carried(
+        footage,
+        mark.mask,
+        mark.frame,
+        every=_every(footage),
+        moving=None
+        if watched is None
+        else lambda i: watched.at(i)[MOVED] + 0.5 * watched.at(i)[HAND],
+    )
+    return replace(
+        thing,
+        masks=course.masks,
+        quality=course.quality,
+        moves=True,
+        at=mark.frame,
+        sure=mark.sure,
+        hinted=True,
+        in_hand=True,
+    )
+
+
+def _stander(
+    scene: _Scene, thing: Sighting, mark: Mark | None, taken: Bool[np.ndarray, "h w"]
+) -> Sighting | None:
+    """Return a thing that stands still; None where it is not found and the caption can do without.
+
+    Raises:
+        ItemRejectedError: `reference_not_found`.
+    """
+    phrase, kind, watched = thing.phrase, scene.meaning.kind, scene.watched
+    late = kind == "uncover" if mark is None else mark.frame > 0
+    if mark is not None:
+        mask, sure = mark.mask, mark.sure
+    else:
+        if watched is not None:
+            search = Search(
+                footage=scene.footage,
+                table=scene.table,
+                watched=watched,
+                phrase=phrase,
+                moved=scene.mover.noun,
+                kind=kind,
+                ends=(scene.moved.first, scene.moved.last),
+                taken=taken,
+            )
+            found = find_standing(search)
+            sure = found.score if found else 0.0
+        else:
+            found = find_other(scene.footage, scene.table, phrase, kind, scene.moved, taken)
+            sure = _rise(found.score, 1.0, 0.5) if found else 0.0
+        mask = found.mask if found else np.zeros_like(taken)
+    if sure < scene.min_found or not mask.any():
+        _check_needed(scene, phrase, sure)
+        return None
+    masks = _less_what_passes(scene, mask)
+    at = len(masks) - 1 if late else 0
+    masks[at] = mask
+    return replace(
+        thing,
+        masks=masks,
+        quality=masks.sum((1, 2)) / max(1, mask.sum()),
+        at=at,
+        sure=sure,
+        why="" if mark else "what stands there fits the words only so far",
+        hinted=mark is not None,
+    )
+
+
+def _check_needed(scene: _Scene, phrase: str, sure: float) -> None:
+    """Turn away a clip whose task makes no sense without an object that was not found."""
+    clip = scene.clip
+    if _is_said(phrase, clip) and scene.meaning.kind not in _OPTIONAL_KINDS:
+        raise ItemRejectedError(
+            "reference_not_found",
+            f"the '{phrase}' was not found in {clip.item} (sure to {sure:.3f}, below {scene.min_found:g}); mark it with a box in captions.json",
+            round(sure, 3),
+        )
+
+
+def _sighting(clip: Clip, phrase: str, role: Role) -> Sighting:
+    """Return an object of which nothing is seen yet."""
+    hint = clip.hints.get(phrase, {})
+    size = hint.get("size_m")
+    return Sighting(
+        phrase=phrase,
+        role=role,
+        noun=noun_for(hint.get("name") or phrase),
+        masks=np.zeros((0, 0, 0), bool),
+        quality=np.zeros(0),
+        moves=False,
+        at=0,
+        known_m=(size[0], size[1], size[2]) if size else None,
+        sure=0.0,
+        why="",
+    )
+
+
+def _check_hand(clip: Clip, watched: Watched) -> None:
+    most = float((watched.shares[:, HAND] > 0.5).mean((1, 2)).max())
+    if most < _LEAST_HAND:
+        raise ItemRejectedError(
+            "no_hand",
+            f"no hand is seen in {clip.item}: it covers {most:.2%} of the picture at most; what moves by itself shows no "
+            "manipulation",
+            round(most, 5),
+        )
+
+
+def _check_there_at_first(clip: Clip, phrase: str, watched: Watched | None) -> None:
+    seen = None if watched is None else seen_at_first(watched)
+    if seen is not None:
+        raise ItemRejectedError(
+            "not_there_at_first",
+            f"what moves in {clip.item} is not in the picture when it begins (it covers {seen:.2%} of it, at least {LEAST_SHARE:.2%} "
+            f"needed): let the clip begin where '{phrase}' lies on the table",
+            round(seen, 5),
+        )
+
+
+def _knowing_hand(footage: Footage, watched: Watched) -> Footage:
+    """Return the footage with the colours of the hand that the network saw."""
+    pixels = [footage.rgb[i][hand_at(watched, int(i))] for i in watched.idx]
+    hand = np.concatenate(pixels)
+    if len(hand) < 300:
+        return footage
+    return replace(
+        footage, hand_hist=histogram(hand[:: max(1, len(hand) // 60000)]), skin_only=False
+    )
+
+
+def _find_movers(
+    clip: Clip,
+    footage: Footage,
+    table: Table,
+    watched: Watched | None,
+    meaning: Meaning,
+    tool: str,
+    marked: dict[str, Mark],
+) -> tuple[Moved, Moved | None]:
+    mark = marked.get(meaning.manipulated)
+    at_end = mark is not None and mark.at_end(footage)
+    first = mark.mask if mark and not at_end else None
+    last = mark.mask if mark and at_end else None
+    look = None
+    if mark is not None and watched is not None and mark.on_its_way(footage):
+        first, last, look = None, None, histogram(footage.rgb[mark.frame][mark.mask])
+    moved, held = None, None
+    if watched is not None:
+        goal = next(
+            (marked[phrase].mask for phrase, _ in meaning.others if phrase in marked), None
+        )
+        found = find_movers(
+            footage,
+            watched,
+            meaning.manipulated,
+            meaning.kind,
+            tool,
+            first,
+            last,
+            goal,
+            look,
+        )
+        moved, held = found or (None, None)
+    if moved is None or (mark is None and not tool):
+        by_change = find_moved(
+            footage, table, meaning.manipulated, meaning.kind, first=first, last=last
+        )
+        moved = (
+            by_change
+            if moved is None or watched is None
+            else _agreed(footage, watched, meaning, moved, by_change)
+        )
+    if moved is None:
+        _check_there_at_first(clip, meaning.manipulated, watched)
+        raise ItemRejectedError(
+            "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
+        )
+    given = [end for end, mask in enumerate((first, last)) if mask is not None]
+    if watched is not None:
+        moved = _settled(footage, watched, moved, given)
+    return apart(footage, moved, given), held
+
+
+def _settled(footage: Footage, watched: Watched, moved: Moved, keep: Sequence[int]) -> Moved:
+    """Return both outlines without what the network surely sees as table; those in `keep` are taken as they are."""
+    first, last = (
+        mask if end in keep else settled(mask, watched.at(i))
+        for end, (mask, i) in enumerate(((moved.first, 0), (moved.last, int(watched.idx[-1]))))
+    )
+    return replace(moved, first=first, last=last, look=histogram(footage.rgb[0][first]))
+
+
+def _agreed(
+    footage: Footage, watched: Watched, meaning: Meaning, moved: Moved, by_change: Moved | None
+) -> Moved:
+    """Return what the network found, weighed by what colours and vanishing edges say.
+
+    The two ways err differently: the network takes people who move for things; the other takes shadows and hands along.
+    What the other found is preferred where it is clearly better by the network's own cues.
+    """
+    if by_change is None or by_change.score < _CHANGE_TELLS:
+        return replace(
+            moved,
+            cues={**moved.cues, "second opinion": _NO_OPINION},
+            score=_NO_OPINION * moved.score,
+        )
+    if by_change.first.any() and by_change.last.any():
+        other = rated(footage, watched, meaning.manipulated, meaning.kind, by_change)
+        if other.score > _CLEARLY_BETTER * moved.score:
+            rivalry = float(1 / (1 + (moved.score / other.score) ** 2))
+            cues = {**other.cues, "no rival": rivalry}
+            return replace(other, score=other.score * rivalry, cues=cues)
+    overlaps = []
+    for own, other in ((moved.first, by_change.first), (moved.last, by_change.last)):
+        common = float((own & other).sum())
+        overlap = common / max(1.0, float((own | other).sum()))
+        if common > _LIES_WITHIN * own.sum():
+            overlap = max(overlap, _AS_A_PART)
+        elif common > _LIES_WITHIN * other.sum():  # its most colourful piece
+            overlap = max(overlap, _AS_A_PIECE)
+        overlaps.append(overlap)
+    opinion = float(np.clip(0.55 + 0.75 * max(0.0, overlaps[0]), 0, 1)) * float(
+        np.clip(0.75 + 0.5 * overlaps[1], 0, 1)
+    )
+    cues = {**moved.cues, "second opinion": opinion}
+    return replace(moved, score=moved.score * opinion, cues=cues)
+
+
+def _sureness(moved: Moved, watched: Watched | None, mark: Mark | None) -> tuple[float, str]:
+    if mark is not None:
+        return mark.sure, ""
+    if watched is None or "no rival" not in moved.cues:
+        return _rise(moved.score, 3.6, 0.8), f"its cues add up to {moved.score:.1f}"
+    weakest = min(moved.cues, key=lambda cue: moved.cues[cue])
+    sure = moved.score**0.5
+    return sure, f"weakest is '{weakest}' with {moved.cues[weakest]:.2f}"
+
+
+def _less_what_passes(
+    scene: _Scene, mask: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "time h w"]:
+    """Return a standing thing's mask over time, less what passes in front of it."""
+    out = np.repeat(mask[None], len(scene.mover.masks), axis=0)
+    for i, hidden in enumerate(scene.mover.masks):
+        if scene.watched is not None:
+            shares = scene.watched.at(i)
+            hidden = hidden | (shares[HAND] + shares[MOVED] > 0.5)
+        out[i] &= ~hidden
+    return out
+
+
+def stands_on(table: Table, mask: Bool[np.ndarray, "h w"], watched: Watched | None = None) -> bool:
+    """Return whether the mask's foot lies on the table's part of the picture, or the network sees table beneath it."""
+    x, y, w, h = bounding_box(mask)
+    foot = np.zeros_like(mask)
+    foot[y + int(0.75 * h) : y + h, x : x + w] = True
+    foot &= mask
+    if float((foot & grow(table.hull, 6)).sum()) > 0.3 * float(foot.sum()):
+        return True
+    if watched is None:
+        return False
+    below = grow(foot, _BELOW_PX) & ~grow(mask, 1)
+    below[: y + int(0.75 * h)] = False
+    return bool(below.any()) and float(watched.early[TABLE][below].mean()) > _SEEN_BELOW
+
+
+def _rise(x: float, middle: float, width: float) -> float:
+    return float(1 / (1 + np.exp(-(x - middle) / width)))

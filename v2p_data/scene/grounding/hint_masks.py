@@ -1,0 +1,126 @@
+"""What somebody marked in one frame - a box or points of a user's, a detector's box - becomes an outline there."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from v2p_data.scene.frames.classes import MOVED, OTHER
+from v2p_data.scene.frames.mask_ops import (
+    DRAWN_OFF_PX,
+    bounding_box,
+    ellipse_in,
+    from_box,
+    from_points,
+    grow,
+    refine,
+    spans,
+)
+from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.grounding.outlines import filled, less_table
+from v2p_data.video.clip import Clip
+
+_HINTED_SURE = 0.97
+_ELSEWHERE_LAB = 12.0
+"""Where a thing is, and where it is not, a picture differs by so much and more."""
+_SMALL_PX, _FILLED = 1500, 0.85
+"""At working size, 320 px wide: of smaller things the network, which sees them enlarged, knows more than their colours tell. People draw
+boxes tightly: of a larger outline that spans less of its box a part is missing."""
+_BESIDE_PX = 3
+"""At working size, 320 px wide: so far beside a box an edge may lie. People are off by a pixel or two."""
+_RAN_AWAY = 0.2
+"""Of the box: an outline that agrees with it so much less than before went on into something alike beside it."""
+_LEAST_SPAN = 0.55
+"""Of a person's box: what has a face in the table's colours is outlined without it; then the box itself says more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """Where a detector sees a phrase."""
+
+    frame: int
+    """Of the clip."""
+    box_xyxy: tuple[float, float, float, float]
+    """[px] of the clip's frames."""
+    score: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mark:
+    """A mask that a user or a detector stands for."""
+
+    mask: Bool[np.ndarray, "h w"]
+    frame: int
+    """Footage frame."""
+    sure: float
+    box: Bool[np.ndarray, "h w"]
+    """What was drawn, or the box around the mask."""
+
+    def at_end(self, footage: Footage) -> bool:
+        return self.frame > 0.5 * (len(footage.rgb) - 1)
+
+    def on_its_way(self, footage: Footage) -> bool:
+        """Return whether what is marked is elsewhere at the nearer end of the clip: then the mark shows how it looks, not where it ends."""
+        end = -1 if self.at_end(footage) else 0
+        off = np.linalg.norm(footage.lab[self.frame] - footage.lab[end], axis=-1)[self.mask]
+        return bool(off.size and np.median(off) > _ELSEWHERE_LAB)
+
+
+def marks_of(
+    clip: Clip, footage: Footage, watched: Watched | None, boxes: Mapping[str, Box]
+) -> dict[str, Mark]:
+    """Return the masks that users' boxes and points mean, and detectors' boxes, by phrase."""
+    out = {}
+    for phrase, box in boxes.items():
+        i = int(np.abs(footage.frame_idx - box.frame).argmin())
+        out[phrase] = _boxed(footage, watched, i, box.box_xyxy, box.score)
+    for phrase, hint in clip.hints.items():
+        i = int(np.abs(footage.frame_idx - hint.get("frame", 0)).argmin())
+        if "box" in hint:
+            out[phrase] = _boxed(footage, watched, i, hint["box"], _HINTED_SURE)
+        elif "points" in hint:
+            spots = [(x * footage.px_scale, y * footage.px_scale) for x, y in hint["points"]]
+            mask = from_points(footage.rgb[i], spots)
+            x, y, w, h = bounding_box(mask)
+            inside = _inside_of((x, y, x + w, y + h), footage.shape)
+            out[phrase] = Mark(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
+    return out
+
+
+def _boxed(
+    footage: Footage, watched: Watched | None, i: int, box_xyxy: Sequence[float], sure: float
+) -> Mark:
+    """Return what a box in the clip's pixels means at footage frame `i`."""
+    x0, y0, x1, y1 = (v * footage.px_scale for v in box_xyxy)
+    box = (x0, y0, x1, y1)
+    mask = from_box(footage.rgb[i], box, _thing_at(watched, i))
+    inside = _inside_of(box, footage.shape)
+    drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
+    if watched is not None:
+        if mask.sum() < _SMALL_PX or spans(mask, drawn) < _FILLED:
+            mask = filled(mask, watched.at(i), grow(inside, DRAWN_OFF_PX))
+        mask = less_table(mask, watched.at(i))
+    beside = refine(footage.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
+    if spans(beside, drawn) > spans(mask, drawn) - _RAN_AWAY:
+        mask = beside
+    if watched is not None and spans(mask, drawn) < _LEAST_SPAN:
+        mask = ellipse_in(drawn, footage.shape)
+    return Mark(mask=mask, frame=i, sure=sure, box=inside)
+
+
+def _inside_of(
+    box_xyxy: tuple[float, float, float, float], shape: tuple[int, int]
+) -> Bool[np.ndarray, "h w"]:
+    x0, y0, x1, y1 = (max(0, round(v)) for v in box_xyxy)
+    inside = np.zeros(shape, bool)
+    inside[y0:y1, x0:x1] = True
+    return inside
+
+
+def _thing_at(watched: Watched | None, i: int) -> Float[np.ndarray, "h w"] | None:
+    if watched is None:
+        return None
+    shares = watched.at(i)
+    return shares[MOVED] + shares[OTHER]

@@ -1,0 +1,356 @@
+"""Which pixels are the thing that moved and which are the others, from the scene network: the default way.
+
+The network says of every pixel what it is; this module cuts that into things, takes those that fit the caption, and
+says from 0 to 1 how sure that is and why not surer.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from v2p_data.scene.frames.classes import HAND, MOVED
+from v2p_data.scene.frames.colour import (
+    balance,
+    colour_match,
+    colour_words,
+    histogram,
+    lab_of,
+    likelihood,
+    named_colours,
+    similarity,
+)
+from v2p_data.scene.frames.mask_ops import (
+    edge_contrast,
+    grow,
+    is_cut,
+    largest,
+    refine,
+    tidy,
+)
+from v2p_data.scene.frames.segmentation import LEAST_SHARE, Watched, hand_at
+from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.grounding.moved_by_change import Moved
+
+_LIKELY, _POSSIBLE = 0.5, 0.25
+_GAP_PX = 7
+"""Of a picture 320 px wide: parts of one thing lie as near as this."""
+SWALLOWING_KINDS = ("insert", "throw_into")
+"""What is moved so may be hidden at the end."""
+_END_WEIGHT = {"insert": 0.4, "throw_into": 0.4, "place_onto": 0.5, "cover": 0.5}
+"""How much the last outline counts: a rim, or the hand that still holds it, hides part of what was put there."""
+_SAME_THING = 0.5
+"""Share of the smaller outline in the larger, from which both are the same thing."""
+_PIECE = 0.85
+"""What a piece of an outline counts: it must be clearly better than the whole."""
+_MOSTLY_OTHER = 0.5
+"""Share of an outline: with less of the named colour it is taken along with something else."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Blob:
+    mask: Bool[np.ndarray, "h w"]
+    area: int
+    hist: np.ndarray
+    parts: dict[str, float]
+    """What its rating is the product of, each 0 to 1."""
+
+    @property
+    def rating(self) -> float:
+        return float(np.prod(list(self.parts.values())))
+
+    def weighed(self, what: str, part: float) -> "_Blob":
+        """Return the blob with one factor more in its rating."""
+        return replace(self, parts={**self.parts, what: part})
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """One thing at both ends of the clip."""
+
+    first: _Blob
+    last: _Blob
+    parts: dict[str, float]
+    """What speaks for their being the same thing, each 0 to 1."""
+
+    @property
+    def rating(self) -> float:
+        return self.first.rating * self.last.rating * float(np.prod(list(self.parts.values())))
+
+
+def find_movers(
+    footage: Footage,
+    watched: Watched,
+    phrase: str,
+    kind: str,
+    tool: str = "",
+    first: Bool[np.ndarray, "h w"] | None = None,
+    last: Bool[np.ndarray, "h w"] | None = None,
+    goal: Bool[np.ndarray, "h w"] | None = None,
+    look: Float[np.ndarray, "l a b"] | None = None,
+) -> tuple[Moved, Moved | None] | None:
+    """Return the manipulated object and, where the caption names one that a hand holds, the tool.
+
+    A mask given by the user for either end is taken as it is; `goal` is what the user marked as that into, onto or over
+    which it goes; `look` its colours, where the user marked it on its way. None where nothing that moved was seen.
+    """
+    starts = _ends(footage, watched, phrase, 0, first)
+    stops = _ends(footage, watched, phrase, len(footage.rgb) - 1, last)
+    if look is not None:
+        starts, stops = ([_alike(blob, look) for blob in ends] for ends in (starts, stops))
+    if starts and not stops and kind in SWALLOWING_KINDS:
+        stops = _last_seen(footage, watched, phrase, starts[0].area)
+    stops = [_hidden_end(blob, _END_WEIGHT.get(kind, 0.7)) for blob in stops]
+    if goal is not None and kind in _END_WEIGHT:
+        near = grow(goal, _GAP_PX)
+        stops = [_at_goal(blob, near) for blob in stops]
+    pairs = sorted(
+        (
+            _Pair(a, b, _pair_parts(a, b, kind, footage.shape))
+            for a in starts
+            for b in stops
+        ),
+        key=lambda pair: -pair.rating,
+    )  # fmt: skip
+    if not pairs:
+        return None
+    if not tool:
+        return _moved(pairs, pairs[0]), None
+    # The tool is what the hand holds; the object is pushed by it and lies farther from the hand.
+    best = pairs[0]
+    rest = [pair for pair in pairs[1:] if _is_another(pair, best)]
+    if not rest:
+        return _moved(pairs, best), None
+    second = rest[0]
+    held = [_held(footage, watched, pair.first.hist) for pair in (best, second)]
+    words = [colour_words(text) for text in (phrase, tool)]
+    by_colour = [
+        _named(footage.rgb[0], best.first.mask, words[0]) * _named(footage.rgb[0], second.first.mask, words[1]),
+        _named(footage.rgb[0], second.first.mask, words[0]) * _named(footage.rgb[0], best.first.mask, words[1]),
+    ]  # fmt: skip
+    if by_colour[1] * (0.3 + held[0]) > by_colour[0] * (0.3 + held[1]):
+        best, second = second, best
+    return _moved(pairs, best), _moved(pairs, second)
+
+
+def mask_of_mover(
+    footage: Footage, watched: Watched, i: int, blob: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return a blob's outline at footage frame `i` at working size, the hand cut away."""
+    never = grow(hand_at(watched, i) & ~blob, 1) & ~blob
+    return refine(footage.rgb[i], blob, never)
+
+
+def _ends(
+    footage: Footage,
+    watched: Watched,
+    phrase: str,
+    i: int,
+    given: Bool[np.ndarray, "h w"] | None,
+) -> list[_Blob]:
+    if given is not None:
+        hist = histogram(footage.rgb[i][given])
+        return [_Blob(mask=given, area=int(given.sum()), hist=hist, parts={"given": 1.0})]
+    moved = watched.at(i)[MOVED]
+    h, w = footage.shape
+    cores: list[Bool[np.ndarray, "h w"]] = []
+    masks: list[Bool[np.ndarray, "h w"]] = []
+    hand = hand_at(watched, i)
+    for level in (_LIKELY, _POSSIBLE):
+        # Print on a thing and what lies in it break it up: gaps are closed, but not over the hand.
+        whole = tidy(moved > level, _GAP_PX) & ~(hand & (moved < _POSSIBLE))
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(whole.astype(np.uint8))
+        for k in range(1, count):
+            mask = parts == k
+            if stats[k, cv2.CC_STAT_AREA] < LEAST_SHARE * h * w or any(
+                (mask & other).any() for other in masks
+            ):
+                continue
+            cores.append(mask)
+            masks.append(mask_of_mover(footage, watched, i, largest(_grown_to(mask, moved))))
+    pieces = _of_named_colour(footage.rgb[i], phrase, cores)
+    blobs = _rated(footage, watched, phrase, i, masks, cores)
+    cut = [mask_of_mover(footage, watched, i, piece) for piece in pieces]
+    blobs += [
+        blob.weighed("cut by colour", _PIECE)
+        for blob in _rated(footage, watched, phrase, i, cut, pieces)
+    ]
+    return sorted(blobs, key=lambda blob: -blob.rating)[:8]
+
+
+def _of_named_colour(
+    image: UInt8[np.ndarray, "h w 3"], phrase: str, wholes: Sequence[Bool[np.ndarray, "h w"]]
+) -> list[Bool[np.ndarray, "h w"]]:
+    """Return what of each whole has the colour that the phrase names, where an arm may have been taken along.
+
+    An arm reaches the picture's edge, and most of such a whole has another colour.
+    """
+    if not named_colours(phrase):
+        return []
+    match = colour_match(balance(image), colour_words(phrase)) > _LIKELY
+    out = []
+    for whole in wholes:
+        if is_cut(whole) and (whole & match).any():
+            piece = largest(tidy(whole & match, _GAP_PX))
+            if LEAST_SHARE * piece.size <= piece.sum() < _MOSTLY_OTHER * whole.sum():
+                out.append(piece)
+    return out
+
+
+def _rated(
+    footage: Footage,
+    watched: Watched,
+    phrase: str,
+    i: int,
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    cores: Sequence[Bool[np.ndarray, "h w"]],
+) -> list[_Blob]:
+    """Return what speaks for each mask being what the phrase names, at footage frame `i`, the first or one near the end.
+
+    `cores` are what the network saw of each before its outline was refined: noise is small there.
+    """
+    image, moved = footage.rgb[i], watched.at(i)[MOVED]
+    words = colour_words(phrase)
+    match = colour_match(balance(image), words) if words else None
+    lab, gone = lab_of(image), lab_of(footage.late if i == 0 else footage.early)
+    return [
+        _Blob(
+            mask=mask,
+            area=int(mask.sum()),
+            hist=histogram(image[mask]),
+            parts={
+                "moved": min(1.0, 0.4 + 0.75 * float(moved[mask].mean())),
+                "size": float(1 - np.exp(-core.mean() / 0.002)),
+                "colour": _named_by(match, mask) ** (1.0 if named_colours(phrase) else 0.3),
+                "whole": 0.75 if is_cut(mask) else 1.0,
+                "vanishing": _vanishing(lab, gone, mask),
+            },
+        )
+        for mask, core in zip(masks, cores, strict=True)
+    ]
+
+
+def rated(footage: Footage, watched: Watched, phrase: str, kind: str, moved: Moved) -> Moved:
+    """Return outlines found in another way, with the cues that the network's own are judged by."""
+    stop = len(footage.rgb) - 1
+    (a,), (b,) = (
+        _rated(footage, watched, phrase, i, [mask], [mask])
+        for i, mask in ((0, moved.first), (stop, moved.last))
+    )
+    b = _hidden_end(b, _END_WEIGHT.get(kind, 0.7))
+    pair = _Pair(a, b, _pair_parts(a, b, kind, footage.shape))
+    return _moved([pair], pair)
+
+
+def _last_seen(footage: Footage, watched: Watched, phrase: str, area: int) -> list[_Blob]:
+    """Return the blobs of the last frame that shows half of something this large, before all is hidden."""
+    for i in watched.idx[: len(watched.idx) // 3 : -1].tolist():
+        blobs = _ends(footage, watched, phrase, i, None)
+        if any(blob.area > area / 2 for blob in blobs):
+            return blobs
+    return []
+
+
+def _hidden_end(blob: _Blob, weight: float) -> _Blob:
+    """Return a blob of the last frame with ratings that count by this exponent."""
+    return replace(blob, parts={name: part**weight for name, part in blob.parts.items()})
+
+
+def _alike(blob: _Blob, look: Float[np.ndarray, "l a b"]) -> _Blob:
+    """Return a blob that counts little where it has other colours than what the user marked."""
+    return blob.weighed("alike what is marked", 0.2 + 0.8 * similarity(blob.hist, look))
+
+
+def _at_goal(blob: _Blob, goal: Bool[np.ndarray, "h w"]) -> _Blob:
+    """Return a blob of the last frame that counts little where it is not at the goal: hands uncover other things."""
+    share = float((blob.mask & goal).sum()) / blob.area
+    return blob.weighed("at the goal", min(1.0, 0.2 + 2 * share))
+
+
+def _grown_to(
+    core: Bool[np.ndarray, "h w"], moved: Float32[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the core with what adjoins it and may be part of it, unless that would more than double it."""
+    _, parts = cv2.connectedComponents(((moved > 0.35) | core).astype(np.uint8))
+    labels = np.unique(parts[core])
+    wider = tidy(np.isin(parts, labels[labels > 0])) | core
+    return wider if wider.sum() < 2 * core.sum() else core
+
+
+def _vanishing(
+    lab: Float32[np.ndarray, "h w 3"],
+    gone: Float32[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+) -> float:
+    """Return whether the mask's outline is an edge here and none once the thing is gone: 0.2 to 1.
+
+    Both where a thing was and where it goes the picture changes; only where it is there is an edge.
+    """
+    here, after = edge_contrast(lab, mask), edge_contrast(gone, mask)
+    return float(np.clip(0.6 + 0.6 * (here - after) / (here + after + 4), 0.2, 1))
+
+
+def _pair_parts(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[str, float]:
+    ratio = abs(float(np.log(a.area / b.area)))
+    weight = _END_WEIGHT.get(kind, 0.7)
+    parts = {
+        "alike": (0.3 + 0.7 * similarity(a.hist, b.hist)) ** weight,
+        "same size": float(np.exp(-0.5 * (max(0.0, ratio - 0.4) / 0.7) ** 2)) ** weight,
+    }
+    spots = [np.argwhere(blob.mask).mean(0) for blob in (a, b)]
+    (rise, across) = (spots[0] - spots[1]) / shape[1]
+    if kind in ("push_left", "push_right"):
+        along = -across if kind == "push_right" else across
+        parts["direction"] = float(np.clip(0.5 + along / 0.06, 0.1, 1))
+    elif kind == "lift_up":
+        # What is lifted may be put down again before the clip ends.
+        parts["direction"] = float(np.clip(0.8 + rise / 0.08, 0.6, 1))
+    return parts
+
+
+def _moved(pairs: list[_Pair], chosen: _Pair) -> Moved:
+    a, b = chosen.first, chosen.last
+    rival = max((pair.rating for pair in pairs if _is_another(pair, chosen)), default=0.0)
+    cues = {
+        **{f"first {k}": v for k, v in a.parts.items()},
+        **{f"last {k}": v for k, v in b.parts.items()},
+        **chosen.parts,
+        "no rival": float(1 / (1 + (rival / max(chosen.rating, 1e-6)) ** 2)),
+    }
+    score = float(np.prod(list(cues.values())))
+    return Moved(first=a.mask, last=b.mask, score=score, look=a.hist, cues=cues)
+
+
+def _is_another(pair: _Pair, chosen: _Pair) -> bool:
+    """Return whether a pair is another thing than the chosen one, and no part of it, at both ends."""
+    ends = ((pair.first, chosen.first), (pair.last, chosen.last))
+    return all((a.mask & b.mask).sum() < _SAME_THING * min(a.area, b.area) for a, b in ends)
+
+
+def _held(footage: Footage, watched: Watched, hist: np.ndarray) -> float:
+    """Return how much of the time a hand adjoins what looks like this (0 to 1)."""
+    touches = []
+    for i in watched.idx[len(watched.idx) // 4 : -(len(watched.idx) // 4) or None]:
+        shares = watched.at(int(i))
+        hand = shares[HAND] > _LIKELY
+        if hand.sum() < 30:
+            continue
+        alike = (shares[MOVED] > _LIKELY) & (likelihood(hist, footage.rgb[i]) > 2e-4)
+        near = grow(hand, 5) & alike
+        touches.append(min(1.0, near.sum() / max(1.0, 0.25 * alike.sum())))
+    return float(np.mean(touches)) if touches else 0.0
+
+
+def _named(
+    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], words: tuple[str, ...]
+) -> float:
+    return _named_by(colour_match(balance(image), words) if words else None, mask)
+
+
+def _named_by(match: Float32[np.ndarray, "h w"] | None, mask: Bool[np.ndarray, "h w"]) -> float:
+    """Return 1 for a mask of the colour its phrase names, down to 0.4; 1 where it names none."""
+    if match is None or not mask.any():
+        return 1.0
+    return 0.4 + 0.6 * min(1.0, float(match[mask].mean()) / 0.4)

@@ -1,0 +1,381 @@
+"""Which of the things that stand there is the one that the caption names, from what the scene network sees.
+
+The network says of every pixel in every frame whether it shows a thing that never moved. That is cut into candidates, and
+cues - how large each is, of which colour, where - say which of them is meant. How much each cue counts was learned from
+drawn clips (`scripts/train_standing.py`); the weights lie beside this file.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.special import softmax
+
+from v2p_data.scene.frames.classes import HAND, MOVED, OTHER
+from v2p_data.scene.frames.colour import balance, colour_match, colour_words, lab_of
+from v2p_data.scene.frames.mask_ops import (
+    bounding_box,
+    edge_contrast,
+    grow,
+    iou,
+    refine,
+    solidity,
+    tidy,
+)
+from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.table import Table
+from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.grounding.moved_by_change import (
+    NEARING_KINDS,
+    TOUCHING_KINDS,
+    Found,
+    pieces_of,
+)
+from v2p_data.scene.scale.camera_height import SeenCamera, px_per_m
+from v2p_data.scene.scale.nouns import Noun, noun_for
+
+WEIGHTS = Path(__file__).with_name("standing.json")
+_UNDER_KINDS = ("uncover",)
+TELLING_KINDS = (*TOUCHING_KINDS, *NEARING_KINDS, *_UNDER_KINDS)
+"""Tasks that tell where the other stands. What the captions of others mention may stand anywhere: how sure it is follows from its
+rivals alone."""
+_LEVELS = (0.75, 0.5, 0.25, 0.12)
+"""Probabilities at which what the network sees is cut into things."""
+_LEAST_SHARE, _MOST_SHARE = 0.0005, 0.2
+"""Of the picture."""
+_MOST_SEEN_SHARE, _TOO_LARGE = 0.45, 0.3
+"""The same where the network says it is a thing, and the logarithm of how much larger than usual that may be: bowls and baskets are
+filmed from near, but so are tables that seem to be things."""
+_KINDS_VARY = 0.3
+"""Logarithm: what moves may be so much larger or smaller than usual without anybody's doubting the camera."""
+_FOOT = 0.8
+"""Of a thing's height in the picture, from the top: there it stands on the table, as far as its width is concerned."""
+_LEAST_FREE = 2.0
+"""Frames in which nothing passes in front of a pixel, for what is seen there to count in full."""
+_SAME = 0.9
+"""IoU from which two candidates are one."""
+_ALIKE = 0.5
+"""IoU from which two candidates are the same thing, cut out differently."""
+_SOFTER = 0.7
+"""For what can be expected of a candidate, ratings count so much: the odds that they were learned for are too sure."""
+_LEAST_CHANCE = 0.01
+"""No candidate is likelier or less likely than by this."""
+_MOST_WITH_HANDLE = 1.5
+"""How much larger than its body a pan is in the picture."""
+_MOST_GAP = 3.0
+"""Of the moved thing's extent: how much farther away something is says nothing."""
+_SEEN_AS_THING = 0.35
+"""What the network says in the mean of a thing that it knows as one; of others it knows no pixel."""
+_SURELY, _NO_THING = 0.9, 0.08
+"""What the network says of pixels that are part of an outline, and are not, whatever the edges say."""
+_LESS_HIDDEN = 0.1
+"""The late still shows a thing better, if so much less of it is hidden there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """A thing that may be the one that is meant."""
+
+    mask: Bool[np.ndarray, "h w"]
+    cues: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """What is looked for, and where."""
+
+    footage: Footage
+    table: Table
+    watched: Watched
+    phrase: str
+    """What the caption calls it."""
+    moved: Noun
+    """What the manipulated object is."""
+    kind: str
+    """Of the task."""
+    ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]
+    """The manipulated object's first and last outline."""
+    taken: Bool[np.ndarray, "h w"]
+    """What other phrases mean."""
+
+    @property
+    def late(self) -> bool:
+        """Whether what is meant is seen at the end only."""
+        return self.kind in _UNDER_KINDS
+
+    @cached_property
+    def stands(self) -> Float32[np.ndarray, "h w"]:
+        """How likely each pixel shows a thing that stands there."""
+        return seen_standing(self.watched, self.kind)
+
+    @cached_property
+    def log_scale(self) -> float:
+        """By how much all seems larger than it is, as far as what moves seems too large for its kind by more than kinds vary."""
+        mask = self.ends[0]
+        if not (self.moved.known and mask.any()):
+            return 0.0
+        off = larger_than_usual(self.moved, self.watched.camera, mask)
+        return float(np.sign(off) * max(0.0, abs(off) - _KINDS_VARY))
+
+
+def find_standing(search: Search) -> Found | None:
+    """Return the thing that the phrase means, its score being how likely it is the right one; None where nothing stands.
+
+    It is the candidate from which most overlap with what is meant can be expected: a whole rather than its likelier half.
+    """
+    found = candidates(search)
+    if not found:
+        return None
+    learned = _learned()
+    rating = np.array([_sum(learned["choice"], one.cues) for one in found])
+    likely = softmax(rating)
+    overlaps = overlaps_of(found)
+    k = int((overlaps @ softmax(_SOFTER * rating)).argmax())
+    best = found[k]
+    mask = best.mask
+    said = {"offset": 1.0, "odds": odds_of(likely, overlaps[k])}
+    if search.kind in TELLING_KINDS:
+        odds = _sum(learned["sure"], {**said, **best.cues})
+    else:
+        odds = _sum(learned["aside"], said)
+    if noun_for(search.phrase).handled:
+        mask = max((c.mask for c in found if _is_with_handle(c.mask, mask)), key=np.sum)
+    mask = _outlined(search, mask)
+    return Found(mask=mask, score=float(1 / (1 + np.exp(-odds))))
+
+
+def overlaps_of(found: list[Candidate]) -> Float[np.ndarray, "n n"]:
+    """Return how far each candidate overlaps each (IoU)."""
+    masks = np.stack([one.mask.ravel() for one in found]).astype(np.float32)
+    common, area = masks @ masks.T, masks.sum(1)
+    return common / np.maximum(1, area[:, None] + area - common)
+
+
+def odds_of(likely: Float[np.ndarray, "n"], alike: Float[np.ndarray, "n"]) -> float:
+    """Return the log odds of the likeliest candidate and those like it among all; `alike` is how far each overlaps it."""
+    share = float(np.clip(likely[alike > _ALIKE].sum(), _LEAST_CHANCE, 1 - _LEAST_CHANCE))
+    return float(np.log(share / (1 - share)))
+
+
+def seen_standing(watched: Watched, kind: str) -> Float32[np.ndarray, "h w"]:
+    """Return how likely each pixel shows a thing that stands there, over all frames in which nothing passes before it.
+
+    What is uncovered is only seen at the end, and the network may say that it moved.
+    """
+    if kind == "uncover":
+        return watched.late[OTHER] + watched.late[MOVED]
+    free = 1 - watched.shares[:, HAND] - watched.shares[:, MOVED]
+    return watched.shares[:, OTHER].sum(0) / np.maximum(free.sum(0), _LEAST_FREE)
+
+
+def usual_area_px(noun: Noun, camera: SeenCamera, shape: tuple[int, int], row_px: float) -> float:
+    """Return how many pixels a thing of the noun's usual size covers, its foot in that row of a picture of this shape.
+
+    Its top seen from above and its side, the mean over all yaws (of a convex outline the mean width is its girth over pi).
+    """
+    per_m = px_per_m(camera, shape, row_px)
+    below = (row_px - shape[0] / 2) / shape[1]
+    down = max(0.05, camera.pitch_rad + float(np.arctan(below / camera.focal_widths)))
+    length, width, height = noun.size_m
+    if noun.form == "sphere":
+        return per_m**2 * np.pi / 4 * length**2
+    if noun.form == "cylinder":
+        narrow = min(noun.taper, 1 / noun.taper)
+        top, side = np.pi / 4 * length * width, length * height * (1 + narrow) / 2
+    else:
+        top, side = length * width, 2 / np.pi * (length + width) * height
+    return per_m**2 * float(top * np.sin(down) + side * np.cos(down))
+
+
+def larger_than_usual(noun: Noun, camera: SeenCamera, mask: Bool[np.ndarray, "h w"]) -> float:
+    """Return the logarithm of how much larger a mask's object seems than its kind usually is, of its forms the likelier."""
+    y, tall = bounding_box(mask)[1::2]
+    area, row_px = float(mask.sum()), y + _FOOT * tall
+    forms = [one for one in (noun, noun.other) if one is not None]
+    offs = [
+        float(np.log(area / usual_area_px(one, camera, mask.shape, row_px))) / 2 for one in forms
+    ]
+    return min(offs, key=abs)
+
+
+def candidates(search: Search) -> list[Candidate]:
+    """Return all that may be meant by the phrase, with its cues."""
+    footage, table, watched, late = search.footage, search.table, search.watched, search.late
+    still, here = (footage.late, watched.late) if late else (footage.early, watched.early)
+    words = colour_words(search.phrase)
+    colour = colour_match(balance(still), words) if words else None
+    apart = table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5)
+    free = ~search.taken & ~grow(search.ends[1], 2) if late else ~search.taken
+    lab, way = lab_of(still), _Way.of(search)
+    usual = float(colour[table.seen].mean()) if colour is not None and table.seen.any() else 0.0
+    found = []
+    for mask, is_part in _masks(search.stands, apart, free, colour):
+        own = _own_cues(search, mask, lab, colour, usual)
+        if mask.mean() > _MOST_SHARE and own["larger than usual"] > _TOO_LARGE:
+            continue
+        cues = {"part": float(is_part), **own, **way.cues(mask, search.kind)}
+        found.append(Candidate(mask=mask, cues=cues))
+    return found
+
+
+def _own_cues(
+    search: Search,
+    mask: Bool[np.ndarray, "h w"],
+    lab: Float32[np.ndarray, "h w 3"],
+    colour: Float32[np.ndarray, "h w"] | None,
+    usual: float,
+) -> dict[str, float]:
+    """Return what a candidate looks like; `colour` is how well each pixel has the colour that the phrase names, `usual` the table's mean."""
+    stands, seen = search.stands, search.table.seen
+    h, w = mask.shape
+    x, y, bw, bh = bounding_box(mask)
+    area = float(mask.sum())
+    ring = grow(mask, 4) & ~grow(mask, 1)
+    noun = noun_for(search.phrase)
+    off = larger_than_usual(noun, search.watched.camera, mask) - search.log_scale
+    return {
+        "seen": float(stands[mask].mean()),
+        "seen around": float(stands[ring].mean()) if ring.any() else 0.0,
+        "sides cut": float(sum((x <= 1, x + bw >= w - 1, y <= 1, y + bh >= h - 1))),
+        "larger than usual": max(0.0, off),
+        "smaller than usual": max(0.0, -off),
+        "area": float(np.log(area / (h * w))),
+        "solidity": solidity(mask),
+        "fill": area / (bw * bh),
+        "edge": min(40.0, edge_contrast(lab, mask)) / 40,
+        "table around": float(seen[ring].mean()) if ring.any() else 0.0,
+        "colour": 0.0 if colour is None else float(colour[mask].mean()) - usual,
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Way:
+    """From where to where something moved, as far as that tells which thing is meant."""
+
+    own: Bool[np.ndarray, "h w"]
+    """Where what moved is itself in the picture that is searched."""
+    goal_zone: Bool[np.ndarray, "h w"]
+    """Around where it went; what is uncovered is where it came from."""
+    foot: Bool[np.ndarray, "h w"]
+    """The lower half of that."""
+    from_goal: Float32[np.ndarray, "h w"]
+    """Distances [px]."""
+    from_first: Float32[np.ndarray, "h w"]
+    reach_px: float
+    """The moved thing's extent."""
+    length_px: float
+
+    @classmethod
+    def of(cls, search: Search) -> "_Way":
+        first, last = search.ends
+        goal, own = (first, last) if search.late else (last, first)
+        zone = grow(goal, 6)
+        foot = zone.copy()
+        top, tall = bounding_box(goal)[1::2]
+        foot[: top + tall // 2] = False
+        from_goal, from_first = (
+            cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+            for mask in (goal, first)
+        )
+        spots = [np.argwhere(mask).mean(0) for mask in search.ends if mask.any()]
+        return cls(
+            own=own,
+            goal_zone=zone,
+            foot=foot,
+            from_goal=from_goal,
+            from_first=from_first,
+            reach_px=float(np.sqrt(max(1, goal.sum()))),
+            length_px=max(8.0, float(np.linalg.norm(spots[-1] - spots[0])) if spots else 0.0),
+        )
+
+    def cues(self, mask: Bool[np.ndarray, "h w"], kind: str) -> dict[str, float]:
+        """Return how a candidate lies to it, under the names for the kind of task."""
+        area = float(mask.sum())
+        to_goal, to_first = (
+            float(distance[mask].min()) for distance in (self.from_goal, self.from_first)
+        )
+        gap = min(_MOST_GAP, to_goal / self.reach_px)
+        reached = min(float(self.goal_zone.sum()), area)
+        there = {
+            "gap": gap,
+            "at the end": float((mask & self.goal_zone).sum() / max(1.0, reached)),
+            "nearer": float(np.clip((to_first - to_goal) / self.length_px, -1, 1)),
+        }
+        under = {"gap": gap, "foot": float((mask & self.foot).sum() / area)}
+        out = {"moved": float((mask & self.own).sum() / area), "gap": gap}
+        for name, kinds, cues in (
+            ("into", TOUCHING_KINDS, there),
+            ("towards", NEARING_KINDS, there),
+            ("under", _UNDER_KINDS, under),
+        ):
+            out |= {f"{name}: {what}": cue * (kind in kinds) for what, cue in cues.items()}
+        return out
+
+
+def _is_with_handle(mask: Bool[np.ndarray, "h w"], body: Bool[np.ndarray, "h w"]) -> bool:
+    """Return whether a mask is that body, alone or with no more beside it than a handle."""
+    return (
+        mask & body
+    ).sum() >= _SAME * body.sum() and mask.sum() <= _MOST_WITH_HANDLE * body.sum()
+
+
+@cache
+def _learned() -> dict[str, dict[str, float]]:
+    """Return what a unit of each cue counts, for which candidate it is and for whether that is right."""
+    return json.loads(WEIGHTS.read_text())
+
+
+def _sum(weights: dict[str, float], cues: dict[str, float]) -> float:
+    return sum(weights[cue] * value for cue, value in cues.items())
+
+
+def _masks(
+    stands: Float32[np.ndarray, "h w"],
+    apart: Bool[np.ndarray, "h w"],
+    free: Bool[np.ndarray, "h w"],
+    colour: Float32[np.ndarray, "h w"] | None,
+) -> Iterator[tuple[Bool[np.ndarray, "h w"], bool]]:
+    """Yield candidates, each with whether it is cut out of a larger one: by a neck, or by its colour."""
+    sets = [(tidy((stands > level) & free), False, _MOST_SEEN_SHARE) for level in _LEVELS]
+    sets.append((tidy(apart & free, 5), False, _MOST_SHARE))
+    if colour is not None:
+        named = free & (colour > 0.5)
+        sets += [
+            (tidy(pixels & named, 5), True, _MOST_SHARE)
+            for pixels in (apart, *(stands > level for level in _LEVELS[1:]))
+        ]
+    known: list[Bool[np.ndarray, "h w"]] = []
+    least = _LEAST_SHARE * free.size
+    for pixels, is_part, most_share in sets:
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(pixels.astype(np.uint8))
+        for k in range(1, count):
+            if not least <= stats[k, cv2.CC_STAT_AREA] <= most_share * free.size:
+                continue
+            whole = parts == k
+            for mask in (whole, *pieces_of(whole, least)):
+                if all(iou(mask, other) < _SAME for other in known):
+                    known.append(mask)
+                    yield mask, is_part or mask is not whole
+
+
+def _outlined(search: Search, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the outline that follows the edges around a thing, as far as the network lets it."""
+    footage, watched, stands = search.footage, search.watched, search.stands
+    late, never = search.late, search.ends[1]
+    if not late:
+        passes = [shares[HAND] + shares[MOVED] for shares in (watched.early, watched.late)]
+        hidden = [float(plane[mask].mean()) for plane in passes]
+        late = hidden[1] + _LESS_HIDDEN < hidden[0]
+        never = passes[int(late)] > 0.5
+    still: UInt8[np.ndarray, "h w 3"] = footage.late if late else footage.early
+    tells = stands[mask].mean() > _SEEN_AS_THING
+    none = (stands < _NO_THING) if tells else np.zeros_like(mask)
+    fine = refine(still, mask, never | none)
+    if not 0.5 <= fine.sum() / mask.sum() <= 1.8:
+        fine = mask
+    return (fine & ~none) | (mask & (stands > _SURELY))

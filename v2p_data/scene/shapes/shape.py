@@ -1,0 +1,185 @@
+"""The mesh of an object: the primitive that was fitted, a solid of revolution, or the inflated silhouette, by outline.
+
+The fit says where the object is and how large; here its outline says more: the neck of a bottle, the bulge of a bowl, a
+banana's bend. The primitive stays unless another shape covers the outline clearly better, because a hand, a shadow or a
+handle deforms outlines too. One view does not show the back: it is taken to be like the front.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from v2p_data.geometry.camera import Camera
+from v2p_data.geometry.mesh import mesh_for, parts_for
+from v2p_data.scene.frames.mask_ops import handle_of
+from v2p_data.scene.scale.nouns import Form, Noun
+from v2p_data.scene.shapes.handles import handle_of_body, with_handle
+from v2p_data.scene.shapes.inflation import inflation
+from v2p_data.scene.shapes.mesh_hypothesis import Candidate, Kind, Size, iou_of
+from v2p_data.scene.shapes.revolved import revolution
+from v2p_data.scene.shapes.silhouette_view import Crop, View
+from v2p_data.scene.shapes.spoon import is_spoon, spoons
+
+_OTHER_END = 0.03
+"""By so much, in units of IoU, a spoon must cover its outline better with its bowl at the end at which hands hold spoons."""
+_OTHER_SIDES = 1.8
+"""An inflated silhouette's sides are at most by this factor others than the fitted primitive's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeConfig:
+    """By how much another shape must cover the outline better than the primitive, in units of IoU."""
+
+    revolution_margin: float = 0.025
+    ball_margin: float = 0.06
+    """For round fruit: a pear is no ball, but most outlines of balls are dented by noise."""
+    irregular_margin: float = -0.06
+    """For an inflated silhouette of what is known to have no simple shape: there the primitive must cover the outline better."""
+    regular_margin: float = 0.15
+    """For an inflated silhouette of anything else."""
+    min_px: int = 80
+    """Of the mask, below which an outline has no form."""
+    handles: bool = True
+    """Whether vessels get the handle that their outline shows."""
+    max_hidden: float = 0.25
+    """Where more of the primitive than this is hidden, its outline is not trusted to say more."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.max_hidden <= 1:
+            raise ValueError(f"max_hidden must lie in 0..1, got {self.max_hidden}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeChoice:
+    """The mesh that covers the outline best for what it costs."""
+
+    kind: Kind
+    form: Form
+    """The primitive that is nearest, which other modules compute with."""
+    mesh: trimesh.Trimesh
+    """Closed, turned outwards, centred on its bounding box, in its own frame [m]."""
+    parts: tuple[trimesh.Trimesh, ...]
+    """Convex solids that together are the mesh; what is hollow stays free."""
+    size_m: Size
+    """The mesh's full extents."""
+    T_obj_shape: Float[np.ndarray, "4 4"]
+    """From the mesh's frame to the fitted primitive's: poses become `T_world_obj @ T_obj_shape`."""
+    iou: float
+    """Of the mesh's silhouette with the mask where it can be seen, averaged over the views."""
+    confidence: float
+    """0 to 1."""
+    reason: str
+    """Why this shape, with the numbers."""
+
+
+def best_shape(
+    views: Sequence[View],
+    camera: Camera,
+    size_m: Size,
+    noun: Noun,
+    cfg: ShapeConfig | None = None,
+) -> ShapeChoice:
+    """Return the mesh of an object that was fitted with its noun's primitive.
+
+    Args:
+        views: the first is the one from which shapes are made, resting on the table; all are compared with.
+        camera: of the masks, in the world frame, the table's top at z = 0 [m].
+        size_m: of the fitted primitive, along its own axes.
+        noun: which primitive, whether hollow, whether irregular.
+        cfg: how clearly the primitive must be beaten.
+    """
+    cfg = cfg or ShapeConfig()
+    crops = [Crop(view, camera) for view in views]
+    primitive = _primitive(size_m, noun)
+    if is_spoon(noun):
+        held, other = spoons(size_m, views[0].T_world_obj)
+        gain = iou_of(other, views, crops) - iou_of(held, views, crops)
+        primitive = other if gain > _OTHER_END else held
+    plain = iou_of(primitive, views, crops)
+    hidden = crops[0].hidden_share(crops[0].drawn(primitive.mesh, views[0].T_world_obj))
+    best, best_iou, best_gain = primitive, plain, 0.0
+    reason = f"the {_word(noun)} covers the outline to {plain:.2f}"
+    pixels = int(views[0].mask.sum())
+    if pixels < cfg.min_px:
+        reason += f"; with {pixels} pixels it is too small in the picture for anything finer"
+    elif hidden > cfg.max_hidden:
+        reason += f"; {hidden:.0%} of it is hidden, so nothing finer was tried"
+    else:
+        for candidate, margin in _others(views[0], crops[0], size_m, noun, cfg):
+            if candidate.kind == "inflated" and not _as_large(candidate, size_m):
+                continue
+            iou = iou_of(candidate, views, crops)
+            if iou - margin - plain > best_gain:
+                best, best_iou, best_gain = candidate, iou, iou - margin - plain
+        if best is not primitive:
+            what = {"revolution": "a solid of revolution", "inflated": "the inflated silhouette"}
+            reason = f"{what[best.kind]} covers the outline to {best_iou:.2f}, the {_word(noun)} to {plain:.2f}"
+        if cfg.handles and noun.handled:
+            handle = handle_of_body(best)
+            handled = with_handle(best, handle, views[0], crops[0])
+            iou = -1.0 if handled is None else iou_of(handled, views, crops)
+            if handled is not None and iou > best_iou + handle.gain:
+                best, best_iou = handled, iou
+                reason += f"; with a handle to {iou:.2f}"
+    confidence = float(np.clip((best_iou - 0.4) / 0.5, 0.05, 1) * (1 - 0.6 * hidden))
+    x, y, z = (float(v) for v in best.mesh.extents)
+    return ShapeChoice(
+        kind=best.kind,
+        form=noun.form,
+        mesh=best.mesh,
+        parts=best.parts,
+        size_m=(x, y, z) if best is not primitive else size_m,
+        T_obj_shape=best.T_obj_shape,
+        iou=best_iou,
+        confidence=round(confidence, 3),
+        reason=reason,
+    )
+
+
+def _primitive(size_m: Size, noun: Noun) -> Candidate:
+    return Candidate(
+        kind="primitive",
+        mesh=mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
+        parts=parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
+        T_obj_shape=np.eye(4),
+    )
+
+
+def _others(
+    view: View, crop: Crop, size_m: Size, noun: Noun, cfg: ShapeConfig
+) -> list[tuple[Candidate, float]]:
+    """Return what else the object may be, with the margin by which each must win."""
+    if noun.bore:
+        return []
+    found: list[tuple[Candidate | None, float]] = []
+    if noun.form != "box":
+        margin = cfg.revolution_margin if noun.form == "cylinder" else cfg.ball_margin
+        body = crop
+        if noun.handled:
+            handle = handle_of(view.mask)
+            unknown = handle if view.hidden is None else view.hidden | handle
+            body = Crop(replace(view, mask=view.mask & ~handle, hidden=unknown), crop.camera)
+        found.append((revolution(view, body, size_m, noun), margin))
+    if not noun.hollow and noun.symmetry != "sphere" and not crop.at_border:
+        irregular = noun.form == "box" and noun.symmetry == "none" and not is_spoon(noun)
+        margin = cfg.irregular_margin if irregular else cfg.regular_margin
+        found.append((inflation(view, crop, size_m), margin))
+    return [(candidate, margin) for candidate, margin in found if candidate is not None]
+
+
+def _as_large(shape: Candidate, size_m: Size) -> bool:
+    """Return whether its sides are about the fit's: seen aslant, what is flat can be inflated to any depth."""
+    ratio = np.sort(shape.mesh.extents) / np.sort(size_m)
+    return bool((np.maximum(ratio, 1 / ratio) < _OTHER_SIDES).all())
+
+
+def _word(noun: Noun) -> str:
+    if is_spoon(noun):
+        return "spoon"
+    if noun.bore:
+        return "ring"
+    hollow = "hollow " if noun.hollow else ""
+    return hollow + {"box": "box", "cylinder": "cylinder", "sphere": "ball"}[noun.form]
