@@ -142,8 +142,8 @@ def all_phases() -> dict[str, Phase]:
     """Return what is killed, in order. Heavy imports happen here, once, before anything is forked."""
     import lerobot.datasets.aggregate
     import lerobot.datasets.lerobot_dataset  # noqa: F401
-    from bench_episodes import lift
 
+    from bench_episodes import lift
     from v2p_data.episodes import shards
     from v2p_data.episodes.collect import EpisodesConfig, collect
     from v2p_data.episodes.edit import merge

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from bench_reconstruction import (
     FPS,
     KINDS,
@@ -30,11 +31,10 @@ from bench_reconstruction import (
     summarised,
     table,
 )
-
+from drawn_clips.clips import MotionKind, VideoSpec, random_spec
 from v2p_data.scene.reconstruct import SceneConfig
 from v2p_data.scene.scale.shared_camera import FEWEST, Filmed, shared_camera
 from v2p_data.seeds import rng_for
-from v2p_data.video.synthetic import MotionKind, VideoSpec, random_spec
 
 _TRIES = 100
 """Cameras, until one sees clips of all kinds that its stand is to have."""

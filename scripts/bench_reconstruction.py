@@ -1,7 +1,7 @@
 """Measure reconstruction on drawn clips with known truth: which stage fails how often, and by how much.
 
 Clips of every kind of task are drawn (and kept: a second run only reconstructs), reconstructed with the gate open, and
-compared with their truth; `v2p_data.scene.score` says what counts as a failure. Then the gate is asked: which of them
+compared with their truth; `drawn_clips.score` says what counts as a failure. Then the gate is asked: which of them
 would have been accepted, and how many of those are usable? Seeds are split: `tune` has the even ones, for looking
 at while working; `final` the odd ones, on which NOTHING may be tuned, neither code nor thresholds. Each run on `final` is
 written down beside its result with the commit that ran it.
@@ -35,7 +35,6 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast, get_args
 
@@ -44,14 +43,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, UInt8
 
-from policies.evaluation.rate import wilson
-from v2p_data.errors import ItemRejectedError
-from v2p_data.geometry.camera import Camera
-from v2p_data.geometry.pose import apply, transform_from_pose
-from v2p_data.scene.frames.working_clip import WIDTH_PX
-from v2p_data.scene.reconstruct import Reconstruction, SceneConfig, reconstruct
-from v2p_data.scene.scale.shared_camera import filmed
-from v2p_data.scene.score import (
+from drawn_clips.clips import MotionKind, VideoSpec, drawing_code, random_spec, render
+from drawn_clips.score import (
     STAGES,
     FoundClip,
     Symmetry,
@@ -62,13 +55,18 @@ from v2p_data.scene.score import (
     score_clip,
     shown_at,
 )
+from drawn_clips.truth import Truth, load_truth, write
+from policies.evaluation.rate import wilson
+from v2p_data.errors import ItemRejectedError
+from v2p_data.geometry.camera import Camera
+from v2p_data.geometry.pose import apply, transform_from_pose
+from v2p_data.scene.frames.working_clip import WIDTH_PX
+from v2p_data.scene.reconstruct import Reconstruction, SceneConfig, reconstruct
+from v2p_data.scene.scale.shared_camera import filmed
 from v2p_data.seeds import rng_for
-from v2p_data.video import synthetic
 from v2p_data.video.captions import find_videos
 from v2p_data.video.clip import Clip
 from v2p_data.video.decode import read_clip
-from v2p_data.video.synthetic import MotionKind, random_spec, render
-from v2p_data.video.synthetic_truth import Truth, load_truth, write
 
 ROOT = Path(__file__).parents[1]
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
@@ -76,7 +74,7 @@ FINAL_RUNS = "final_runs.jsonl"
 _IMPORTED_ONCE = (
     "v2p_data.scene.frames.network",
     "v2p_data.scene.reconstruct",
-    "v2p_data.video.synthetic",
+    "drawn_clips.clips",
 )
 """By the process that all others are forked from: importing torch anew for each takes seconds."""
 JITTER_PX = 3.0
@@ -117,7 +115,7 @@ class Drawn(Protocol):
     def kind(self) -> MotionKind: ...
     @property
     def seed(self) -> int: ...
-    def spec(self) -> synthetic.VideoSpec:
+    def spec(self) -> VideoSpec:
         """Return all that is drawn."""
         ...
 
@@ -135,7 +133,7 @@ class Job:
     def name(self) -> str:
         return f"{self.kind}_{self.seed:04d}"
 
-    def spec(self) -> synthetic.VideoSpec:
+    def spec(self) -> VideoSpec:
         rng = rng_for(self.seed, "bench_reconstruction", self.kind)
         spec = random_spec(self.name, self.kind, rng)
         return spec if self.fps is None else replace(spec, fps=self.fps)
@@ -468,16 +466,9 @@ def each(jobs: int, function: Any, tasks: list[tuple[Any, ...]], done: str) -> I
 def folder_of(job: Drawn, clips: Path, old_code: bool) -> Path:
     """Return where the clip is, or where it belongs if this very clip was not drawn before by the same code."""
     recipe = _digest(json.dumps(asdict(job.spec()), sort_keys=True, default=str).encode())
-    code = _drawing_code()
+    code = drawing_code()
     older = sorted(clips.glob(f"{job.name}-{recipe}-{'[0-9a-f]' * len(code)}"))
     return older[-1] if old_code and older else clips / f"{job.name}-{recipe}-{code}"
-
-
-@cache
-def _drawing_code() -> str:
-    """Return a digest of the code that draws clips."""
-    sources = sorted(Path(synthetic.__file__).parent.glob("synthetic*.py"))
-    return _digest(b"".join(source.read_bytes() for source in sources))
 
 
 def draw_clip(job: Drawn, folder: Path) -> None:

@@ -17,7 +17,6 @@ from pathlib import Path
 from studies.cells import Key, Study, cells_of, key_of
 from studies.config import ARMS, LiftingConfig
 from studies.results import append_result, results_in
-
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import load_settings

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from bench_deploy import PATIENCE_MS, Measured, TimedPolicy, episode, robot_in
 from studies.results import Row, append_result, results_in
 from studies.sim_to_sim import table
 from studies.sweeps import SWEEPS, FaultyLook
-
 from v2p_data.commands.deploy import loaded_policy
 from v2p_data.deployment.limits import LimitsConfig
 from v2p_data.deployment.view import allowing_for_place

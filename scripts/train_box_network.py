@@ -18,6 +18,17 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, UInt8
+
+from drawn_clips.camera import View
+from drawn_clips.clips import (
+    LABEL_THING,
+    MOTION_KINDS,
+    VideoSpec,
+    motion_of,
+    random_spec,
+    render_views,
+)
+from drawn_clips.props import Prop
 from training import (
     Scene,
     add_commands,
@@ -28,7 +39,6 @@ from training import (
     learn,
     recoloured,
 )
-
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import apply, transform
@@ -44,16 +54,6 @@ from v2p_data.scene.fitting.cuboid_network import (
 from v2p_data.scene.frames.mask_ops import bounding_box, is_cut
 from v2p_data.scene.frames.working_clip import WIDTH_PX
 from v2p_data.seeds import rng_for
-from v2p_data.video.synthetic import (
-    LABEL_THING,
-    MOTION_KINDS,
-    VideoSpec,
-    motion_of,
-    random_spec,
-    render_views,
-)
-from v2p_data.video.synthetic_camera import View
-from v2p_data.video.synthetic_props import Prop
 
 BOXES = ("box", "book", "bin")
 ALONG = ("duck", "bottle")

@@ -17,6 +17,18 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, UInt8
+
+from drawn_clips.camera import View
+from drawn_clips.clips import (
+    LABEL_HAND,
+    LABEL_THING,
+    MOTION_KINDS,
+    VideoSpec,
+    motion_of,
+    random_spec,
+    render_views,
+)
+from drawn_clips.motion import Motion
 from training import (
     Scene,
     add_commands,
@@ -27,7 +39,6 @@ from training import (
     learn,
     recoloured,
 )
-
 from v2p_data.scene.fitting.hand_scale import (
     GUESS_SPREAD,
     REACH_M,
@@ -41,17 +52,6 @@ from v2p_data.scene.fitting.hand_scale import (
 from v2p_data.scene.frames.hand import gap_px, hand_end
 from v2p_data.scene.scale.camera_height import table_width_m
 from v2p_data.seeds import rng_for
-from v2p_data.video.synthetic import (
-    LABEL_HAND,
-    LABEL_THING,
-    MOTION_KINDS,
-    VideoSpec,
-    motion_of,
-    random_spec,
-    render_views,
-)
-from v2p_data.video.synthetic_camera import View
-from v2p_data.video.synthetic_motion import Motion
 
 KINDS = tuple(kind for kind in MOTION_KINDS if kind != "push_with")
 """A hand that pushes with something touches nothing that rests."""

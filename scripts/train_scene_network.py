@@ -25,16 +25,8 @@ from jaxtyping import Float, Float32, UInt8
 from safetensors.torch import load_file, save_file
 from scipy.spatial.transform import Rotation
 from torch.nn import functional as F  # noqa: N812  (the usual name)
-from training import HELD_OUT, add_commands, compressed, descend, draw_all, half_precision, write
 
-from v2p_data.geometry.camera import between_centres
-from v2p_data.scene.fitting.silhouette import camera_above
-from v2p_data.scene.frames.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
-from v2p_data.scene.frames.network import CameraNetwork, SceneNetwork, inputs_of, net_size, resized
-from v2p_data.scene.frames.working_clip import still_of
-from v2p_data.scene.scale.camera_height import table_width_m
-from v2p_data.seeds import rng_for
-from v2p_data.video.synthetic import (
+from drawn_clips.clips import (
     LABEL_HAND,
     LABEL_TABLE,
     LABEL_THING,
@@ -44,6 +36,14 @@ from v2p_data.video.synthetic import (
     random_spec,
     render_views,
 )
+from training import HELD_OUT, add_commands, compressed, descend, draw_all, half_precision, write
+from v2p_data.geometry.camera import between_centres
+from v2p_data.scene.fitting.silhouette import camera_above
+from v2p_data.scene.frames.classes import BACKGROUND, CLASSES, HAND, MOVED, OTHER, TABLE
+from v2p_data.scene.frames.network import CameraNetwork, SceneNetwork, inputs_of, net_size, resized
+from v2p_data.scene.frames.working_clip import still_of
+from v2p_data.scene.scale.camera_height import table_width_m
+from v2p_data.seeds import rng_for
 
 DRAWN_OVER_SEEN = 1.5
 """Clips are drawn larger than the network sees them, so that a part of a picture can be shown enlarged and still sharp."""

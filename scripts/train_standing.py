@@ -19,12 +19,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from bench_reconstruction import FPS, true_of
 from jaxtyping import Float
 from scipy.optimize import minimize
 from scipy.special import expit, log_expit, log_softmax, logsumexp, softmax
-from training import draw_all
 
+from bench_reconstruction import FPS, true_of
+from drawn_clips.clips import MOTION_KINDS, random_spec, render
+from drawn_clips.truth import load_truth, write
+from training import draw_all
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.frames.segmentation import watch
@@ -43,8 +45,6 @@ from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos, parse_caption
 from v2p_data.video.clip import Clip
 from v2p_data.video.decode import read_clip
-from v2p_data.video.synthetic import MOTION_KINDS, random_spec, render
-from v2p_data.video.synthetic_truth import load_truth, write
 
 KINDS = tuple(kind for kind in MOTION_KINDS if kind in TELLING_KINDS)
 RIGHT_IOU = 0.5

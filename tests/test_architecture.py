@@ -117,6 +117,19 @@ def test_policies_know_nothing_of_the_engine(path):
     assert not [n for n in imported_modules(path) if n.split(".")[0] == "v2p_data"]
 
 
+def test_the_engine_imports_no_drawn_clips_and_no_scripts():
+    scripts = {p.stem for p in (ROOT / "scripts").iterdir() if p.suffix == ".py" or p.is_dir()}
+
+    packages = ("v2p_data", "policies", "lerobot_policy_v2p")
+    used = {
+        name.split(".")[0]
+        for package in packages
+        for path in (ROOT / package).rglob("*.py")
+        for name in imported_modules(path)
+    }
+    assert not used & (scripts | {"scripts", "tests"})
+
+
 def test_the_engine_knows_policies_only_at_the_top():
     users = {
         room_of(p)

@@ -5,11 +5,10 @@ that a policy cannot tell objects by words. Objects of the evaluation live in a 
 `demand_apart` compares meshes by what they are, not by their names.
 """
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from drawn_clips.clips import drawing_code, random_spec, render
+from drawn_clips.props import NOUNS, prop_called, shape_of
+from drawn_clips.truth import write
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import Size, mesh_for, parts_for, write_obj
@@ -26,12 +28,8 @@ from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
 from v2p_data.sim.solids import read_mesh
 from v2p_data.stages import EngineConfig, expert_stage, scene_stage, task_stage
-from v2p_data.video import synthetic
 from v2p_data.video.captions import CAPTIONS_FILE, VideoItem, find_videos
 from v2p_data.video.meaning import parse_caption
-from v2p_data.video.synthetic import random_spec, render
-from v2p_data.video.synthetic_props import NOUNS, prop_called, shape_of
-from v2p_data.video.synthetic_truth import write
 
 from .config import PoolConfig, UnseenConfig
 
@@ -135,13 +133,6 @@ def make_clip(
     path = write(render(replace(spec, fps=cfg["fps"])), out)
     (out / CAPTIONS_FILE).write_text(json.dumps({path.name: spec.caption}))
     return {"caption": spec.caption, "noun": spec.story.actors[0].prop.noun}
-
-
-@cache
-def drawing_code() -> str:
-    """Return a digest of the code that draws clips."""
-    sources = sorted(Path(synthetic.__file__).parent.glob("synthetic*.py"))
-    return hashlib.sha256(b"".join(s.read_bytes() for s in sources)).hexdigest()[:8]
 
 
 def scene_of_clip(folder: Path, engine: EngineConfig) -> Stage:

@@ -11,7 +11,7 @@ from v2p_data.deployment.view import PLANE_M, ViewTransfer, view_for
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
-from v2p_data.scene.segment import iou
+from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.sim.camera import training_camera
 from v2p_data.sim.masks import FIRST_OBJECT, ROBOT
 

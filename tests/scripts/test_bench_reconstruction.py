@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from drawn_clips.camera import View
+from drawn_clips.score import TrueClip, TrueThing
 from v2p_data.geometry.camera import Camera, intrinsics
-from v2p_data.scene.score import TrueClip, TrueThing
-from v2p_data.video.synthetic_camera import View
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from drawn_clips.clips import random_spec
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import apply, transform
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.seeds import rng_for
-from v2p_data.video.synthetic import random_spec
 
 EXTENTS = np.array([0.3, 0.15, 0.1])
 

@@ -14,7 +14,13 @@ from v2p_data.cli import command_of, parse
 from v2p_data.errors import UnusableError, V2PError, did_you_mean
 from v2p_data.pipeline.artifact import Record, read_record
 from v2p_data.report.reading import PARTIAL_SUFFIX
-from v2p_data.scene.scale.shared_camera import FEWEST, Filmed, SharedCamera, filmed, shared_camera
+from v2p_data.scene.scale.shared_camera import (
+    FEWEST,
+    Filmed,
+    SharedCamera,
+    filmed,
+    shared_camera,
+)
 from v2p_data.scene.scene import Scene
 
 _SETTINGS = ("camera_height_m", "pitch_rad", "fov_rad", "camera_spread")

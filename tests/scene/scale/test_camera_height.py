@@ -3,7 +3,11 @@ import pytest
 
 from v2p_data.scene.data_types import CameraGuess
 from v2p_data.scene.fitting.silhouette import camera_above
-from v2p_data.scene.scale.camera_height import SizeVote, camera_height_m, table_width_m
+from v2p_data.scene.scale.camera_height import (
+    SizeVote,
+    camera_height_m,
+    table_width_m,
+)
 from v2p_data.scene.scale.nouns import Noun
 
 H, W = 240, 320

@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from v2p_data.video.synthetic_hand import Hand, Pose, skin_of
-from v2p_data.video.synthetic_props import Prop, shape_of
-from v2p_data.video.synthetic_shapes import Shape, patch_uv, revolved
-from v2p_data.video.synthetic_textures import (
+from drawn_clips.hand import Hand, Pose, skin_of
+from drawn_clips.props import Prop, shape_of
+from drawn_clips.shapes import Shape, patch_uv, revolved
+from drawn_clips.textures import (
     Rgb,
     any_colour,
     colour_called,

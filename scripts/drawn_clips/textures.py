@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from v2p_data.video.synthetic_shapes import PATCH_ROWS
+from drawn_clips.shapes import PATCH_ROWS
 
 Rgb = tuple[float, float, float]
 Print = Literal["plain", "label", "stripes", "checker", "speckle", "gradient", "photo", "wood"]

@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from v2p_data.errors import V2PError
-from v2p_data.geometry.pose import apply, transform_from_pose
-from v2p_data.seeds import rng_for
-from v2p_data.video.captions import find_videos, parse_caption
-from v2p_data.video.decode import read_clip
-from v2p_data.video.synthetic import (
+from drawn_clips.clips import (
     LABEL_HAND,
     LABEL_TABLE,
     LABEL_THING,
@@ -22,8 +17,13 @@ from v2p_data.video.synthetic import (
     render,
     render_views,
 )
-from v2p_data.video.synthetic_props import NOUNS, prop_called, shape_of
-from v2p_data.video.synthetic_truth import load_truth, write
+from drawn_clips.props import NOUNS, prop_called, shape_of
+from drawn_clips.truth import load_truth, write
+from v2p_data.errors import V2PError
+from v2p_data.geometry.pose import apply, transform_from_pose
+from v2p_data.seeds import rng_for
+from v2p_data.video.captions import find_videos, parse_caption
+from v2p_data.video.decode import read_clip
 
 
 def corners(size_m):

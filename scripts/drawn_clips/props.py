@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from v2p_data.video.synthetic_shapes import (
+from drawn_clips.shapes import (
     Shape,
     bin_shape,
     box,
@@ -26,7 +26,7 @@ from v2p_data.video.synthetic_shapes import (
     revolved,
     tube,
 )
-from v2p_data.video.synthetic_textures import PRINTS, Print, Rgb, any_colour, colour_called
+from drawn_clips.textures import PRINTS, Print, Rgb, any_colour, colour_called
 
 Form = Literal["box", "cylinder", "sphere", "mesh"]
 Symmetry = Literal["none", "box", "round", "sphere"]

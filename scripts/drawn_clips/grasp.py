@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from drawn_clips.props import Prop, wall_m
+from drawn_clips.story import GRIP_MAX_M, Actor, handle_offset_m
 from v2p_data.geometry.pose import transform
-from v2p_data.video.synthetic_props import Prop, wall_m
-from v2p_data.video.synthetic_story import GRIP_MAX_M, Actor, handle_offset_m
 
 UP = np.array([0.0, 0.0, 1.0])
 

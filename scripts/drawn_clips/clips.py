@@ -8,46 +8,35 @@ heading, +y left, +z up), so truth and reconstruction compare number by number.
 # mujoco's classes come from a compiled module that declares none of them.
 # pyright: reportAttributeAccessIssue=false
 
+import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from drawn_clips.camera import Drawer, Sensor, View, developed, random_sensor
+from drawn_clips.hand import WRIST, Hand
+from drawn_clips.motion import Motion, Timing, animate
+from drawn_clips.room import LABEL_HAND, Room, build, labels_of, random_room
+from drawn_clips.room import LABEL_TABLE as LABEL_TABLE
+from drawn_clips.room import LABEL_THING as LABEL_THING
+from drawn_clips.story import MOTION_KINDS as MOTION_KINDS
+from drawn_clips.story import MotionKind, Story, random_story
+from drawn_clips.textures import Rgb, any_colour
 from v2p_data.geometry.camera import CV_FROM_GL, Camera
 from v2p_data.geometry.pose import apply, inverse, pose_from_transform, quat_from_matrix
 from v2p_data.seeds import rng_for
-from v2p_data.video.synthetic_camera import Drawer, Sensor, View, developed, random_sensor
-from v2p_data.video.synthetic_hand import WRIST, Hand
-from v2p_data.video.synthetic_motion import Motion, Timing, animate
-from v2p_data.video.synthetic_room import (
-    LABEL_HAND,
-    Room,
-    build,
-    labels_of,
-    random_room,
-)
-from v2p_data.video.synthetic_room import (
-    LABEL_TABLE as LABEL_TABLE,
-)
-from v2p_data.video.synthetic_room import (
-    LABEL_THING as LABEL_THING,
-)
-from v2p_data.video.synthetic_story import (
-    MOTION_KINDS as MOTION_KINDS,
-)
-from v2p_data.video.synthetic_story import (
-    MotionKind,
-    Story,
-    random_story,
-)
-from v2p_data.video.synthetic_textures import Rgb, any_colour
 
 NUM_MASKS = 16
 """Evenly spaced frames whose masks are kept."""
+_NOT_DRAWING = ("__init__.py", "score.py")
+"""Files of this package that change no clip."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +89,13 @@ class SyntheticVideo:
     masks: UInt8[np.ndarray, "some_time h w"] = field(repr=False)
     """Labels: 0 background, 1 hand and arm, 2 and on the things in their order, 255 the bare table."""
     hand_in_view: Bool[np.ndarray, "all_time"] = field(repr=False)
+
+
+@cache
+def drawing_code() -> str:
+    """Return a digest of the code that draws clips: with other code the same seed may give another clip."""
+    sources = sorted(p for p in Path(__file__).parent.glob("*.py") if p.name not in _NOT_DRAWING)
+    return hashlib.sha256(b"".join(p.read_bytes() for p in sources)).hexdigest()[:8]
 
 
 def motion_of(spec: VideoSpec) -> Motion:

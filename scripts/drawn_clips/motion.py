@@ -5,17 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from drawn_clips.grasp import UP, frame_of, grasp_of, standing, stood, unit
+from drawn_clips.hand import WRIST, Hand, Pose, anchor_of, flat, grip, pointing
+from drawn_clips.story import Actor, Story
 from v2p_data.geometry.pose import transform
-from v2p_data.video.synthetic_grasp import (
-    UP,
-    frame_of,
-    grasp_of,
-    standing,
-    stood,
-    unit,
-)
-from v2p_data.video.synthetic_hand import WRIST, Hand, Pose, anchor_of, flat, grip, pointing
-from v2p_data.video.synthetic_story import Actor, Story
 
 GRAVITY = 9.81
 

@@ -10,10 +10,10 @@ import av
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from drawn_clips.clips import LABEL_HAND, LABEL_TABLE, LABEL_THING, SyntheticVideo
+from drawn_clips.props import shape_of
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
-from v2p_data.video.synthetic import LABEL_HAND, LABEL_TABLE, LABEL_THING, SyntheticVideo
-from v2p_data.video.synthetic_props import shape_of
 
 
 @dataclass(frozen=True, kw_only=True)

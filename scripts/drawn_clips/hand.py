@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from drawn_clips.shapes import Shape, blended, patch_uv
+from drawn_clips.textures import Rgb
 from v2p_data.geometry.pose import transform
-from v2p_data.video.synthetic_shapes import Shape, blended, patch_uv
-from v2p_data.video.synthetic_textures import Rgb
 
 WRIST = np.array([-0.058, 0.0, 0.014])
 _KNUCKLES = np.array(

@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from drawn_clips.props import NOUNS, Noun, Prop, prop_called, shape_of
 from v2p_data.video.meaning import Kind
-from v2p_data.video.synthetic_props import NOUNS, Noun, Prop, prop_called, shape_of
 
 MotionKind = Literal["push_left", "push_right", "lift_up", "tip_over", "cover", "uncover", "push_with", "push_next_to",
                      "drop_in_front_of", "insert", "slide_to", "throw_into", "place_onto"]  # fmt: skip

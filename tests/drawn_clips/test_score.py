@@ -8,12 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from v2p_data.geometry.mesh import mesh_for
-from v2p_data.geometry.pose import transform
-from v2p_data.scene.fitting.silhouette import camera_above
-from v2p_data.scene.reconstruct import Estimate, Reconstruction
-from v2p_data.scene.scale.nouns import noun_for
-from v2p_data.scene.score import (
+from drawn_clips.score import (
     FoundClip,
     FoundThing,
     TrueClip,
@@ -27,6 +22,11 @@ from v2p_data.scene.score import (
     size_sides,
     turn_between,
 )
+from v2p_data.geometry.mesh import mesh_for
+from v2p_data.geometry.pose import transform
+from v2p_data.scene.fitting.silhouette import camera_above
+from v2p_data.scene.reconstruct import Estimate, Reconstruction
+from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.shapes.spoon import spoons
 from v2p_data.video.clip import Clip
 
