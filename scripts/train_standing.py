@@ -28,13 +28,13 @@ from drawn_clips.clips import MOTION_KINDS, random_spec, render
 from drawn_clips.truth import load_truth, write
 from training import draw_all
 from v2p_data.errors import ItemRejectedError
+from v2p_data.kinds import KINDS as TASK_KINDS
 from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.frames.segmentation import watch
 from v2p_data.scene.frames.stabilise import steadied
 from v2p_data.scene.frames.working_clip import footage_of
 from v2p_data.scene.grounding.ground_objects import sight
 from v2p_data.scene.grounding.static_objects import (
-    TELLING_KINDS,
     Candidate,
     Search,
     candidates,
@@ -46,7 +46,7 @@ from v2p_data.video.captions import find_videos, parse_caption
 from v2p_data.video.clip import Clip
 from v2p_data.video.decode import read_clip
 
-KINDS = tuple(kind for kind in MOTION_KINDS if kind in TELLING_KINDS)
+KINDS = tuple(kind for kind in MOTION_KINDS if TASK_KINDS[kind].locates_other)
 RIGHT_IOU = 0.5
 FULLY_RIGHT_IOU = 0.9
 """Overlaps from which a candidate counts as right at all, and in full."""

@@ -9,20 +9,31 @@ ROOT = Path(__file__).parents[1]
 BELOW: dict[str, set[str]] = {
     "errors": set(),
     "seeds": set(),
+    "kinds": {"errors"},
     "pipeline": {"errors"},
     "geometry": {"errors"},
-    "video": {"geometry", "errors", "seeds"},
-    "scene": {"video", "geometry", "errors", "seeds"},
-    "task": {"scene", "video", "geometry", "errors", "seeds"},
+    "video": {"geometry", "errors", "seeds", "kinds"},
+    "scene": {"video", "geometry", "errors", "seeds", "kinds"},
+    "task": {"scene", "video", "geometry", "errors", "seeds", "kinds"},
     # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
-    "sim": {"task", "scene", "geometry", "errors", "seeds"},
-    "episodes": {"sim", "task", "scene", "geometry", "pipeline", "errors", "seeds"},
-    "distillation": {"episodes", "sim", "task", "pipeline", "errors", "seeds"},
+    "sim": {"task", "scene", "geometry", "errors", "seeds", "kinds"},
+    "episodes": {"sim", "task", "scene", "geometry", "pipeline", "errors", "seeds", "kinds"},
+    "distillation": {"episodes", "sim", "task", "pipeline", "errors", "seeds", "kinds"},
     # Loading a LeRobot policy is for `policies.evaluation`; here a policy is whatever has `reset` and `act`.
-    "evaluation": {"sim", "task", "scene", "episodes", "pipeline", "errors", "seeds"},
+    "evaluation": {"sim", "task", "scene", "episodes", "pipeline", "errors", "seeds", "kinds"},
     # The second simulator shares scenes, states and judges with the first one, which knows nothing of it.
-    "twin": {"evaluation", "episodes", "sim", "task", "scene", "geometry", "errors", "seeds"},
-    "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds"},
+    "twin": {
+        "evaluation",
+        "episodes",
+        "sim",
+        "task",
+        "scene",
+        "geometry",
+        "errors",
+        "seeds",
+        "kinds",
+    },
+    "reward": {"task", "sim", "scene", "pipeline", "errors", "seeds", "kinds"},
     # It sees the arm that policies were trained with, and what a robot is; never the twin's inside.
     "deployment": {
         "twin",

@@ -20,6 +20,7 @@ from scipy.spatial import QhullError
 
 from v2p_data.geometry.mesh import mesh_for
 from v2p_data.geometry.pose import angle_between, apply, inverse
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.reconstruct import Reconstruction
 from v2p_data.scene.schema import Symmetry
 
@@ -53,8 +54,6 @@ SAME_SIDES = 1.15
 _AT_REST_M = 0.002
 FRAME_SLACK = 2
 """File frames between two masks that still show the same moment, for clips thinned out while decoding."""
-HOLLOW_KINDS = ("insert", "throw_into", "throw", "cover", "uncover")
-"""Kinds of task where something goes into or under what is hollow."""
 _GRID = 40
 
 
@@ -81,7 +80,7 @@ class TrueThing:
 class TrueClip:
     """What a rendered clip really shows."""
 
-    kind: str
+    kind: Kind
     things: tuple[TrueThing, ...]
     """The named objects, the manipulated one first."""
     T_world_cam: Float[np.ndarray, "4 4"]
@@ -118,7 +117,7 @@ class FoundThing:
 class FoundClip:
     """What was understood of a clip."""
 
-    kind: str
+    kind: Kind
     things: tuple[FoundThing, ...]
     """The manipulated one first."""
     T_world_cam: Float[np.ndarray, "4 4"]
@@ -420,7 +419,7 @@ def _score_thing(
     T_first, T_last = true.T_world_objs[begins], true.T_world_objs[last]
     sides, ours = size_sides(true, found)
     ratio = np.maximum(sides / ours, ours / sides)
-    hollow_matters = true.hollow and clip.kind in HOLLOW_KINDS
+    hollow_matters = true.hollow and KINDS[clip.kind].needs_hollow
     volume_iou, shape_iou = shape_ious(
         true.mesh,
         found.mesh,

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from v2p_data.kinds import KINDS
 from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.teacher import GOOD_ENOUGH, MEANT, Teacher, programs_for
+from v2p_data.sim.teacher import GOOD_ENOUGH, Teacher, programs_for
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.task import Task
 
@@ -48,7 +49,7 @@ class Raised(MovedLeft):
 @pytest.mark.parametrize("name", benchmark_names())
 def test_a_program_that_does_what_the_words_say_solves_the_task(name: str):
     env = worlds(name, 24)
-    meant = [p for p in programs_for(env) if p.startswith(MEANT[env.bundle.kind])]
+    meant = [p for p in programs_for(env) if p.startswith(KINDS[env.bundle.kind].programs)]
 
     assert max(playing(env, p).play() for p in meant) >= LEAST.get(name, 0.9)
 
@@ -57,7 +58,7 @@ def test_a_program_that_does_what_the_words_say_solves_the_task(name: str):
 def test_every_benchmark_task_has_a_program_that_is_meant(name: str):
     env = worlds(name, 1)
 
-    assert any(p.startswith(MEANT[env.bundle.kind]) for p in programs_for(env))
+    assert any(p.startswith(KINDS[env.bundle.kind].programs) for p in programs_for(env))
 
 
 @pytest.mark.parametrize("name", ["push_left", "insert", "throw_into"])

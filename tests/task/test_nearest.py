@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.task.benchmark import benchmark_names
 from v2p_data.task.benchmark import load_benchmark as load
-from v2p_data.task.nearest import FAMILIES, Solved, likeness, rank_solved
+from v2p_data.task.nearest import Solved, likeness, rank_solved
 
 load_benchmark = functools.cache(load)
 
@@ -16,13 +17,9 @@ def solved(name: str, *, obs_dim: int = 90, **changes: object) -> Solved:
     return Solved(bundle=bundle, folder=Path(f"{name}-0000"), obs_dim=obs_dim)
 
 
-def nearest_to(name: str) -> str:
+def nearest_to(name: str) -> Kind:
     others = [solved(other) for other in benchmark_names() if other != name]
     return rank_solved(load_benchmark(name), 90, others)[0].bundle.kind
-
-
-def test_every_benchmark_task_has_a_family():
-    assert {load_benchmark(name).kind for name in benchmark_names()} <= set(FAMILIES)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +32,7 @@ def test_the_nearest_task_is_the_one_a_person_would_name(name: str, nearest: str
 
 @pytest.mark.parametrize("name", ["insert", "drop_in_front_of", "push_next_to", "slide_to"])
 def test_the_nearest_task_moves_in_the_same_way(name: str):
-    assert FAMILIES[nearest_to(name)] == FAMILIES[load_benchmark(name).kind]
+    assert KINDS[nearest_to(name)].family == KINDS[load_benchmark(name).kind].family
 
 
 def test_likeness_is_the_same_both_ways_and_largest_for_the_task_itself():

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from v2p_data.kinds import KINDS
 from v2p_data.task.task import TaskBundle
 
 SIMULATION_BROKE = "simulation_broke"
@@ -45,13 +46,6 @@ STILL_STEPS = 20
 """Control steps: the last second."""
 STILL_M = 0.01
 """A tool that stays within a box of this diagonal stands still."""
-
-LETS_GO = frozenset({"drop_in_front_of", "insert", "place_onto", "cover"})
-"""Kinds that end with the thing let go beside, in or on the other one."""
-NEEDS_GRASP = LETS_GO | {"lift_up", "uncover", "throw_into"}
-STAYS_UPRIGHT = frozenset(
-    {"push_left", "push_right", "push_next_to", "push_with", "slide_to", "cover", "uncover"}
-)
 
 Course = Mapping[str, np.ndarray]
 """Per key of the task interface's `states` an array `(time, env, ...)`, the moment after the reset first."""
@@ -90,7 +84,7 @@ class _Case:
 
     def first_touched(self) -> str:
         """Return the name of the object that the gripper has to touch."""
-        by_tool = self.bundle.kind == "push_with" and self.other is not None
+        by_tool = KINDS[self.bundle.kind].grasps == "tool" and self.other is not None
         return str(self.other) if by_tool else self.thing
 
     def leaned_rad(self) -> Float[np.ndarray, "env"]:
@@ -120,21 +114,21 @@ class _Case:
 
 
 def _kinds_of_sound(case: _Case) -> np.ndarray:
-    kind = case.bundle.kind
+    kind = KINDS[case.bundle.kind]
     never = np.zeros(case.course["eef_pos"].shape[1], bool)
     touched = (case.of(case.first_touched(), "touched") > 0).any(0)
-    leans = case.leaned_rad() > TOPPLED_RAD if kind in STAYS_UPRIGHT else never
+    leans = case.leaned_rad() > TOPPLED_RAD if kind.stays_upright else never
     last_held = case.last_held()
     was_held = last_held >= 0
     is_held = (case.of(case.thing, "grasped")[-END_STEPS:] > 0).any(0)
     let_go = was_held & ~is_held
     not_grasped, dropped, misplaced = never, never, never
-    if kind in NEEDS_GRASP:
+    if kind.must_grasp:
         not_grasped = ~was_held
-        if kind in LETS_GO:
+        if kind.is_put_down:
             dropped = let_go & (case.gap_m(last_held) > FAR_M)
             misplaced = let_go & ~dropped
-        elif kind == "throw_into":
+        elif kind.family == "throw":
             misplaced = let_go
         else:
             dropped = let_go

@@ -9,8 +9,9 @@ between the program sees the robot and the objects at every step, as the paper's
 import numpy as np
 from jaxtyping import Float
 
+from v2p_data.kinds import KINDS
 from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.teacher import MEANT, Teacher
+from v2p_data.sim.teacher import Teacher
 
 EVERY_STEPS = 50
 """The paper's number."""
@@ -28,7 +29,7 @@ class ProgramPolicy:
     def __init__(self, env: BatchEnv) -> None:
         self.env = env
         self.teacher = Teacher(env)
-        meant = MEANT.get(env.bundle.kind, ())
+        meant = KINDS[env.bundle.kind].programs
         self.names = sorted(self.teacher.programs, key=lambda name: not name.startswith(meant))
         self.restart()
 

@@ -11,6 +11,7 @@ from typing import override
 
 import numpy as np
 
+from v2p_data.kinds import KINDS
 from v2p_data.reward.expressions import names_in, number, stored_names
 from v2p_data.reward.function_body import (
     FUNCTION,
@@ -25,16 +26,6 @@ from v2p_data.task.templates.reward_text import paid_lines
 from v2p_data.task.templates.variants import VARIANTS
 from v2p_data.task.templates.write import write_task
 
-GRASPED_KINDS = {
-    "lift_up",
-    "insert",
-    "place_onto",
-    "drop_in_front_of",
-    "cover",
-    "uncover",
-    "throw_into",
-    "push_with",
-}
 GRIP_DEPTH_M = 0.035
 """Fingers reach about this far down from an object's top."""
 MAX_LOOKUPS = 200
@@ -53,7 +44,7 @@ class Design:
 
 def target_of(scene: Scene) -> tuple[str, float]:
     """Return the object that the gripper must go to, and how far above its centre to hold it [m]."""
-    with_tool = scene.kind == "push_with" and scene.others
+    with_tool = KINDS[scene.kind].grasps == "tool" and scene.others
     obj = scene.others[0] if with_tool else scene.manipulated
     return obj.name, round(max(obj.size_m[2] / 2 - GRIP_DEPTH_M, 0.0), 3)
 
@@ -61,7 +52,8 @@ def target_of(scene: Scene) -> tuple[str, float]:
 def must_grasp(scene: Scene, code: str) -> bool:
     """Return whether the task needs the object in the gripper."""
     asks = f'"{scene.manipulated.name}_grasped"' in code.replace("'", '"')
-    return scene.kind in GRASPED_KINDS or (scene.kind == "generic" and asks)
+    grasps = KINDS[scene.kind].grasps
+    return grasps in ("manipulated", "tool") or (grasps == "unknown" and asks)
 
 
 # --- stages --------------------------------------------------------------------------------------------------
@@ -155,7 +147,7 @@ def from_success(code: str, scene: Scene, rng: np.random.Generator | None = None
     ]
     if grasp:
         parts.append(("grasp", f"{number(0.3 * jitter())} * {grasp_text(scene)}"))
-        if scene.kind != "push_with":
+        if KINDS[scene.kind].grasps != "tool":
             parts.append(("raise", f"{number(0.3 * jitter())} * {raise_text(scene)}"))
     else:
         parts.append(("touch", f"{number(0.05 * jitter())} * {touch_text(scene)}"))

@@ -8,6 +8,7 @@ import ast
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from v2p_data.kinds import KINDS
 from v2p_data.reward import redesign
 from v2p_data.reward.expressions import split_constant
 from v2p_data.reward.feedback import ComponentFeedback, Feedback
@@ -115,7 +116,7 @@ def stages(scene: Scene, code: str, feedback: Feedback) -> list[tuple[str, float
         found.append(
             ("grasp", obj.grasped, f"0.3 * {redesign.grasp_text(scene)}", {f"{name}_grasped"})
         )
-        if scene.kind != "push_with":
+        if KINDS[scene.kind].grasps != "tool":
             keys = {f"{name}_pos", f"{name}_start_pos"}
             found.append(("raise", obj.raised, f"0.6 * {redesign.raise_text(scene)}", keys))
     else:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.data_types import Placement, Sights
 from v2p_data.scene.fitting.placement import vote_of
 from v2p_data.scene.fitting.trajectory import TOUCH_PX
@@ -16,8 +17,6 @@ from v2p_data.scene.frames.colour import balance, colour_match, named_colours
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
 from v2p_data.scene.frames.segmentation import hand_at
 from v2p_data.scene.grounding.ground_objects import stands_on
-from v2p_data.scene.grounding.moved_by_change import NEARING_KINDS, TOUCHING_KINDS
-from v2p_data.scene.grounding.moved_by_network import SWALLOWING_KINDS
 from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
 from v2p_data.scene.scale.nouns import is_clear
 
@@ -39,7 +38,7 @@ class Cue:
     """0 to 1."""
 
 
-def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
+def cues_of(sights: Sights, placement: Placement, kind: Kind) -> tuple[Cue, ...]:
     """Return everything that the scene's confidence is the product of."""
     cues: list[Cue] = []
 
@@ -68,7 +67,7 @@ def cues_of(sights: Sights, placement: Placement, kind: str) -> tuple[Cue, ...]:
         add("pose", f"outline of {which} at the end", max(0.1, 0.6 + (covers - 0.45) / 0.875))
         seen = placed.last.visible / max(0.2, placed.first.visible)
         # Of what is put into something only the upper part is left to see.
-        least = 0.8 if kind in SWALLOWING_KINDS else 0.5
+        least = 0.8 if KINDS[kind].hides else 0.5
         add("pose", f"{which} seen at the end", max(0.1, least + seen))
     thing = sights.objects[0]
     add("camera", "camera height", height_plausibility(placement.height_m))
@@ -133,7 +132,7 @@ def check_confidence(cues: tuple[Cue, ...], least: float) -> float:
 
 
 def check_motion(
-    kind: str,
+    kind: Kind,
     sights: Sights,
     placement: Placement,
     T_world_objs: list[Float[np.ndarray, "_ 4 4"]],
@@ -156,13 +155,13 @@ def check_motion(
     elif kind == "tip_over":
         value, least = placement.upright_cost - placement.objects[0].last.cost, -0.03
         said = "fits the picture better tipped than upright"
-    elif kind in NEARING_KINDS and several and not sights.objects[1].moves:
+    elif KINDS[kind].comes_near and several and not sights.objects[1].moves:
         gaps = [
             float(np.linalg.norm((T[:3, 3] - T_world_objs[1][0][:3, 3])[:2]))
             for T in (own[0], own[-1])
         ]
         value, least, said = gaps[0] - gaps[1], 0.02, "comes nearer to the other"
-    elif kind in TOUCHING_KINDS and several:
+    elif KINDS[kind].touches and several:
         goal, last = grow(sights.objects[1].first, 6), sights.objects[0].last
         # What is covered may be far smaller than what covers it.
         value, least = float((goal & last).sum() / max(1, min(last.sum(), goal.sum()))), 0.25

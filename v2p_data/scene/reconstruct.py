@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
+from v2p_data.kinds import Kind
 from v2p_data.scene.backends.config import (
     DepthConfig,
     GroundConfig,
@@ -155,7 +156,7 @@ class Reconstruction:
     """A scene before it is written; `clip` is kept for the overlay."""
 
     clip: Clip = field(repr=False)
-    kind: str
+    kind: Kind
     objects: tuple[Estimate, ...]
     """The manipulated one first."""
     camera: Camera
@@ -369,7 +370,7 @@ def _estimates(
     sights: Sights,
     placement: Placement,
     shaped: list[_Shaped],
-    kind: str,
+    kind: Kind,
     cfg: SceneConfig,
 ) -> list[Estimate]:
     footage, height = sights.footage, placement.height_m
@@ -483,7 +484,7 @@ def _with_hole(
     }
 
 
-def _remarks(kind: str, sights: Sights, placement: Placement, num_frames: int) -> list[str]:
+def _remarks(kind: Kind, sights: Sights, placement: Placement, num_frames: int) -> list[str]:
     spread = placement.scale_spread
     by_network = " and from what the network makes of the picture" if sights.watched else ""
     out = [

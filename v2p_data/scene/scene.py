@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
+from v2p_data.kinds import Kind, kind_named
 from v2p_data.scene.schema import Observed, Role, Shape, Symmetry, read_scene_file
 
 SCENE_FILE = "scene.json"
@@ -199,8 +200,8 @@ class Scene:
     """The video's file name."""
     description: str
     """The caption."""
-    kind: str
-    """Task kind the caption names, e.g. `lift_up`; `generic` when it names none (see task/kinds.py)."""
+    kind: Kind
+    """Task kind the caption names, e.g. `lift_up`; `generic` when it names none."""
     objects: tuple[SceneObject, ...]
     """The manipulated object first."""
     camera: Camera
@@ -283,6 +284,7 @@ class Scene:
         same = {f.name: getattr(read, f.name) for f in fields(Scene) if f.name in _AS_WRITTEN}
         return Scene(
             **same,
+            kind=kind_named(read.kind, str(folder / SCENE_FILE)),
             objects=tuple(
                 SceneObject(**{f.name: getattr(thing, f.name) for f in fields(SceneObject)})
                 for thing in read.objects
@@ -303,7 +305,7 @@ class Scene:
 
 
 _AS_WRITTEN = {f.name for f in fields(Scene)} - {
-    *("objects", "confidences", "table", "camera", "folder")
+    *("kind", "objects", "confidences", "table", "camera", "folder")
 }
 """Fields that stand in the file as they are."""
 

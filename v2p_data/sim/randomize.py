@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.kinds import KINDS, TaskKind
 from v2p_data.scene.scene import FLOOR_MAX_M, Scene
 from v2p_data.sim.world import (
     CAMERA,
@@ -278,12 +279,13 @@ class Randomizer:
         count = len(self.world.objects)
         radius = self._radius[ids]
         offsets = scene_offsets(self.world.scene)
-        low, high = _placement_boxes(self.world.scene.kind, count)
+        kind = KINDS[self.world.scene.kind]
+        low, high = _placement_boxes(kind, count)
         centre = np.array([WORKSPACE_CENTRE_M[0], (low[0, 1] + high[0, 1]) / 2])
         pair = self._cover_pair()
         if pair is not None:
             self._check_covered_fits(ids, *pair)
-            pair = pair if self.world.scene.kind == "uncover" else None  # else they start apart
+            pair = pair if kind.starts_over else None  # else they start apart
         xy = np.zeros((n, count, 2))
         todo = np.arange(n)
         for attempt in range(PLACEMENT_TRIES):
@@ -308,7 +310,7 @@ class Randomizer:
             # The whole group moves back into the box where it can.
             over = np.maximum(spot - high, 0).max(1) - np.maximum(low - spot, 0).max(1)
             spot -= over[:, None]
-            if self.world.scene.kind == "throw_into" and count > 1:
+            if kind.other_starts == "beyond_reach" and count > 1:
                 spot[:, 0] = centre + shift
                 spot[:, 1:] = rng.uniform(BEYOND_LOW_M, BEYOND_HIGH_M, (m, 1, 2))
             inside = ((spot >= low - 1e-9) & (spot <= high + 1e-9)).all((1, 2))
@@ -406,7 +408,7 @@ class Randomizer:
         """Return cover and what it covers, in tasks about covering."""
         scene = self.world.scene
         cover = cover_of(scene)
-        if scene.kind not in {"cover", "uncover"} or cover is None:
+        if not KINDS[scene.kind].has_cover or cover is None:
             return None
         return cover, 1 if cover == 0 else 0
 
@@ -524,15 +526,15 @@ def scene_offsets(scene: Scene) -> Float[np.ndarray, "object 2"]:
     return offsets
 
 
-def _placement_boxes(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _placement_boxes(kind: TaskKind, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return per object the lowest and highest x and y of its centre [m]."""
     low, high = np.tile(OBJECT_LOW_M, (count, 1)), np.tile(OBJECT_HIGH_M, (count, 1))
-    if kind == "push_left":
+    if kind.side > 0:
         high[:, 1] -= PUSH_ROOM_M
-    elif kind == "push_right":
+    elif kind.side < 0:
         low[:, 1] += PUSH_ROOM_M
-    elif kind == "throw_into":
+    elif kind.other_starts == "beyond_reach":
         low[1:], high[1:] = BEYOND_LOW_M, BEYOND_HIGH_M
-    elif kind == "drop_in_front_of":
+    elif kind.other_starts == "far_side":
         low[1:, 0] += 0.1  # what is in front of it must be within reach, too
     return low, high

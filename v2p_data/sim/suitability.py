@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.sim.robot import FINGER_TRAVEL_M
 
@@ -26,10 +27,6 @@ MIN_THICKNESS_M = 0.01
 """Thinner extents are thickened to this: the coarse time step cannot hold them apart."""
 MAX_MASS_KG = 3.0
 MIN_MASS_KG = 1e-4
-GRASP_KINDS = frozenset(
-    {"lift_up", "place_onto", "insert", "cover", "uncover", "throw_into", "drop_in_front_of"}
-)
-"""Kinds of task that cannot be done without taking hold of the manipulated object."""
 GRIP_MARGIN_M = 0.002
 """What must be left between the open pads and what they take."""
 _DIRECTIONS = 36
@@ -135,7 +132,7 @@ def check_grasp(
     Raises:
         ItemRejectedError: `not_graspable`.
     """
-    if obj is not scene.manipulated or scene.kind not in GRASP_KINDS:
+    if obj is not scene.manipulated or not KINDS[scene.kind].must_grasp:
         return
     R = Rotation.from_quat(rest_quat, scalar_first=True).as_matrix()
     width = min(narrowest_m(points @ R.T) for points in corners)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from v2p_data.kinds import KINDS
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.sim.primitives import (
     CLOSE,
@@ -33,22 +34,10 @@ logger = logging.getLogger(__name__)
 
 Program = Callable[[Moment], Actions]
 
-MEANT: dict[str, tuple[str, ...]] = {
-    "lift_up": ("lift",),
-    "uncover": ("lift",),
-    "push_left": ("push as",),
-    "push_right": ("push as",),
-    "tip_over": ("tip",),
-    "push_next_to": ("push next",),
-    "slide_to": ("drag next", "push next"),
-    "push_with": ("push with",),
-    "drop_in_front_of": ("put in front",),
-    "insert": ("put into",),
-    "place_onto": ("put onto",),
-    "cover": ("put over",),
-    "throw_into": ("throw",),
-}
-"""How the programs begin that do what the words of a kind say."""
+LIFT, PUSH_AS, CARRY_AS, TIP = "lift", "push as in the video", "carry as in the video", "tip over"
+"""Names of the programs that need no second object."""
+THROWN_OVER_M = 0.3
+"""An object nearer than this needs no throw."""
 GOOD_ENOUGH = 0.4
 """A program that is meant and succeeds this often is not compared with others."""
 
@@ -95,7 +84,7 @@ class Teacher:
         What the task's words name is tried first and kept if it succeeds well: the task's own success sees only
         how an episode ends, and an object may also have been carried to where it should be pushed.
         """
-        meant = MEANT.get(self.env.bundle.kind, ())
+        meant = KINDS[self.env.bundle.kind].programs
         names = sorted(self.programs, key=lambda name: not name.startswith(meant))
         player = Teacher(env)
         trials: list[Trial] = []
@@ -138,32 +127,24 @@ def programs_for(env: BatchEnv) -> dict[str, Program]:
     move = poses[-1, :3] - poses[0, :3] if len(poses) else np.zeros(3)
     way = float(np.linalg.norm(move[:2]))
     lift = float(poses[:, 2].max() - poses[0, 2]) if len(poses) else 0.0
-    programs: dict[str, Program] = {
-        "lift": lambda m: _lift(m, height_m=max(0.13, min(lift, 0.16)))
-    }
+    programs: dict[str, Program] = {LIFT: lambda m: _lift(m, height_m=max(0.13, min(lift, 0.16)))}
     if way > 0.03:
         direction = move[:2] / way
         side = np.array([0.0, np.sign(move[1])]) if abs(move[1]) > abs(move[0]) else None
-        programs["push as in the video"] = lambda m: _push(
+        programs[PUSH_AS] = lambda m: _push(
             m, side if side is not None else direction, np.clip(0.75 * way, 0.1, 0.16)
         )
         offset = np.array([*move[:2], 0.0])
-        programs["carry as in the video"] = lambda m: _put(
+        programs[CARRY_AS] = lambda m: _put(
             m, m.bodies[0].start + offset, over_m=np.full(len(m.tool), 0.05)
         )
-    programs["tip over"] = _tip
+    programs[TIP] = _tip
     for k in range(1, len(objects)):
         far = np.linalg.norm(first_pose(objects[k])[:2] - first_pose(objects[0])[:2])
         label = objects[k].name
-        programs[f"push next to {label}"] = lambda m, k=k: _push_next_to(m, k)
-        programs[f"drag next to {label}"] = lambda m, k=k: _drag_next_to(m, k)
-        programs[f"put into {label}"] = lambda m, k=k: _put_into(m, k)
-        programs[f"put over {label}"] = lambda m, k=k: _put_over(m, k)
-        programs[f"put in front of {label}"] = lambda m, k=k: _put_in_front(m, k)
-        programs[f"put onto {label}"] = lambda m, k=k: _put_onto(m, k)
-        programs[f"push with {label}"] = lambda m, k=k: _push_with(m, k)
-        if far > 0.3:
-            programs[f"throw into {label}"] = lambda m, k=k: _throw(m, k)
+        for words, program in WITH_OTHER.items():
+            if program is not _throw or far > THROWN_OVER_M:
+                programs[f"{words} {label}"] = lambda m, k=k, program=program: program(m, k)
     return programs
 
 
@@ -323,3 +304,35 @@ def _throw(m: Moment, k: int) -> Actions:
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)
+
+
+WITH_OTHER: dict[str, Callable[[Moment, int], Actions]] = {
+    "push next to": _push_next_to,
+    "drag next to": _drag_next_to,
+    "put into": _put_into,
+    "put over": _put_over,
+    "put in front of": _put_in_front,
+    "put onto": _put_onto,
+    "push with": _push_with,
+    "throw into": _throw,
+}
+"""Programs that act on the manipulated object and another one; that one's name follows in the program's name."""
+
+
+def _check_preferred_programs() -> None:
+    """Demand that every kind prefers programs that there are.
+
+    Raises:
+        ValueError: one of them is no beginning of a program's name.
+    """
+    known = (LIFT, PUSH_AS, CARRY_AS, TIP, *WITH_OTHER)
+    for kind in KINDS.values():
+        for start in kind.programs:
+            if not any(name.startswith(start) for name in known):
+                raise ValueError(
+                    f"task kind '{kind.name}' prefers the scripted policy '{start}'; add it to v2p_data/sim/teacher.py "
+                    f"or name one of: {', '.join(known)}"
+                )
+
+
+_check_preferred_programs()

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene, SceneObject, hollow_floor_m
 from v2p_data.sim.arms import BUILT_IN, Robot, RobotConfig, read_arm, sensor_ends
 from v2p_data.sim.robot import (
@@ -176,7 +177,7 @@ def cover_of(scene: Scene) -> int | None:
     for k, obj in enumerate(scene.objects):
         if obj.role == "cover":
             return k
-    return 0 if scene.kind in {"cover", "uncover"} and len(scene.objects) > 1 else None
+    return 0 if KINDS[scene.kind].has_cover and len(scene.objects) > 1 else None
 
 
 def hollow_parts(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene
 from v2p_data.task.probes import (
     GRIPPER_OPENING_M,
@@ -50,8 +51,6 @@ VETO_WORDS = {
     "reachable": "its success is true in none of the states that were tried all over the workspace",
 }
 ALWAYS_TRUE = "its success is always true"
-CARRIED_KINDS = {"lift_up", "uncover", "generic"}
-"""Kinds in which success may be high above the table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +171,7 @@ def _path(scene: Scene) -> tuple[list[Poses], tuple[float, ...]]:
     tracked = _tracked(scene)
     name = scene.manipulated.name
     first, last = tracked[0][name], tracked[-1][name]
-    if scene.kind == "lift_up":  # hands often set things down again before the clip ends
+    if KINDS[scene.kind].end == "in_air":  # hands often set things down again before the clip ends
         last = max((p[name] for p in tracked), key=lambda pose: float(pose[2]))
     turn = Slerp([0, 1], Rotation.from_quat(np.stack([first[3:], last[3:]]), scalar_first=True))
     out: list[Poses] = []
@@ -285,8 +284,9 @@ def _in_the_air(scene: Scene) -> Probe:
     """For kinds that end on the table: the end of the path, but 25 cm up. For lifting: 1 cm up."""
     tracked = _tracked(scene)
     name = scene.manipulated.name
-    pose = (tracked[0] if scene.kind in CARRIED_KINDS else _path(scene)[0][AT_END])[name].copy()
-    pose[2] += 0.01 if scene.kind in CARRIED_KINDS else 0.25
+    may_end_high = KINDS[scene.kind].may_end_high
+    pose = (tracked[0] if may_end_high else _path(scene)[0][AT_END])[name].copy()
+    pose[2] += 0.01 if may_end_high else 0.25
     return _at_pose(scene, [{**tracked[0], name: pose}], "held")
 
 
@@ -373,11 +373,13 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
     length = probes.path_m[-1] / PATH_END
     tracked = any_hand("tracked")
     last = bool(any_hand("last").any())
-    if scene.kind == "lift_up":  # true at the highest pose will do: the clip may set it down again
+    if (
+        KINDS[scene.kind].end == "in_air"
+    ):  # true at the highest pose will do: the clip may set it down again
         last = last or bool(tracked.any())
 
     rises = _reward_rises(probes, reward, num_hands)
-    turns = scene.kind == "tip_over"
+    turns = KINDS[scene.kind].end == "on_side"
     threshold_good = threshold is not None and (
         turns or SMALLEST_M <= threshold <= max(1.3 * length, 0.15)
     )

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.geometry.camera import Camera
+from v2p_data.kinds import KINDS, kind_named
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.task.generate import HORIZON_STEPS, MOTION_SCALE, TaskConfig
+from v2p_data.task.generate import TaskConfig
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
@@ -54,8 +55,8 @@ def load_benchmark(name: str, folder: Path = FOLDER) -> TaskBundle:
         class_name=class_name(code),
         code=code,
         scene=scene,
-        horizon_steps=HORIZON_STEPS.get(scene.kind, TaskConfig().horizon_steps),
-        motion_scale=MOTION_SCALE.get(scene.kind, 1.0),
+        horizon_steps=KINDS[scene.kind].horizon_steps or TaskConfig().horizon_steps,
+        motion_scale=KINDS[scene.kind].motion_scale,
     )
 
 
@@ -69,7 +70,7 @@ def _scene(name: str, data: Any) -> Scene:
         title=name,
         video=f"{name}.mp4",
         description=data["description"],
-        kind=data["kind"],
+        kind=kind_named(data["kind"], name),
         objects=objects,
         camera=Camera(
             width_px=640,

@@ -197,6 +197,6 @@ def block_scene() -> Scene:
         T_world_cam=look_at(np.array([-0.6, 0.0, 0.6]), np.zeros(3)),
     )  # fmt: skip
     return Scene(
-        title="block", video="", description="grasp the block", kind="grasp", objects=(block,), camera=camera,
+        title="block", video="", description="grasp the block", kind="generic", objects=(block,), camera=camera,
         fps=20.0, num_frames=5, confidence=1.0,
     )  # fmt: skip

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
 from v2p_data.task.audit import Audit, audit, build_probes
@@ -27,10 +28,6 @@ AUDIT_FILE = "audit.json"
 SAMPLES_FOLDER = "samples"
 CALLS_FOLDER = "calls"
 """In the samples' folder: every call to a model that had a part in this task."""
-HORIZON_STEPS = {"lift_up": 60, "push_left": 60, "push_right": 60, "tip_over": 60}
-"""Control steps (20 Hz) per episode, by kind; `TaskConfig.horizon_steps` for the others."""
-MOTION_SCALE = {"throw_into": 2.0}
-"""Of kinds in which the gripper must be faster than 0.6 m/s."""
 
 logger = logging.getLogger(__name__)
 
@@ -252,8 +249,8 @@ def _bundle(scene: Scene, cfg: TaskConfig, chosen: Sample) -> TaskBundle:
         class_name=class_name(chosen.code),
         code=chosen.code,
         scene=scene,
-        horizon_steps=HORIZON_STEPS.get(scene.kind, cfg.horizon_steps),
-        motion_scale=MOTION_SCALE.get(scene.kind, 1.0),
+        horizon_steps=KINDS[scene.kind].horizon_steps or cfg.horizon_steps,
+        motion_scale=KINDS[scene.kind].motion_scale,
         audit=chosen.audit.as_dict(),
     )
 

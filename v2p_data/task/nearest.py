@@ -9,24 +9,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.task import TaskBundle
 
-FAMILIES: dict[str, str] = {
-    "lift_up": "carry",
-    "uncover": "carry",
-    "cover": "carry",
-    "insert": "carry",
-    "place_onto": "carry",
-    "drop_in_front_of": "carry",
-    "push_left": "push",
-    "push_right": "push",
-    "push_next_to": "push",
-    "push_with": "push",
-    "slide_to": "push",
-    "tip_over": "tip",
-    "throw_into": "throw",
-}
 FAMILY_POINTS = 4.0
 KIND_POINTS = 2.0
 COUNT_POINTS = 1.0
@@ -62,7 +48,7 @@ def rank_solved(bundle: TaskBundle, obs_dim: int, solved: Iterable[Solved]) -> l
 
 def likeness(a: TaskBundle, b: TaskBundle) -> float:
     """Return how alike two tasks are, in points: 0 for nothing in common, about 9 for the same task."""
-    points = FAMILY_POINTS * (FAMILIES.get(a.kind, a.kind) == FAMILIES.get(b.kind, b.kind))
+    points = FAMILY_POINTS * (KINDS[a.kind].family == KINDS[b.kind].family)
     points += KIND_POINTS * (a.kind == b.kind)
     points += COUNT_POINTS * (len(a.scene.objects) == len(b.scene.objects))
     return points + _alike(a.scene, b.scene)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
+from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.task import BASE_OBSERVATION_DIM
 
@@ -175,6 +176,6 @@ def _spread(probe: Probe, scene: Scene) -> None:
         distance = np.linalg.norm(gap, axis=1, keepdims=True)
         wanted = 0.02 + (max(obj.size_m[:2]) + max(scene.manipulated.size_m[:2])) / 2
         direction = np.where(distance > 1e-3, gap / np.maximum(distance, 1e-3), [1.0, 0.0])
-        if scene.kind != "uncover":
+        if not KINDS[scene.kind].starts_over:
             other.pos[:, :2] = main.pos[:, :2] + direction * np.maximum(distance, wanted)
         other.start_pos = other.pos.copy()

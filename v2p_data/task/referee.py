@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.errors import V2PError
+from v2p_data.kinds import KINDS, Kind, check_every_kind
 from v2p_data.scene.scene import Scene, SceneObject, hollow_floor_m
 
 LAST = 5
@@ -172,17 +173,14 @@ class Case:
 Verdict = Bool[np.ndarray, "env"]
 
 
-def referee_success(kind: str, scene: Scene, trajectory: Trajectory) -> Bool[np.ndarray, "env"]:
+def referee_success(kind: Kind, scene: Scene, trajectory: Trajectory) -> Bool[np.ndarray, "env"]:
     """Return per world whether the episode did what its kind of task says.
 
     Raises:
-        V2PError: no such kind, or it needs an object that the scene lacks.
+        V2PError: the kind needs an object that the scene lacks.
     """
-    rule = RULES.get(kind)
-    if rule is None:
-        raise V2PError(f"no referee knows the task kind '{kind}'.{did_you_mean(kind, RULES)}")
     case = Case(scene=scene, trajectory=trajectory)
-    return np.asarray(rule(case) & case.is_above_table(), bool)
+    return np.asarray(RULES[kind](case) & case.is_above_table(), bool)
 
 
 def _lifted(case: Case) -> Verdict:
@@ -291,10 +289,10 @@ def _moved_as_in_the_video(case: Case) -> Verdict:
     return (np.linalg.norm(got - wanted, axis=-1) < near) & case.thing.is_at_rest
 
 
-RULES: dict[str, Callable[[Case], Verdict]] = {
+RULES: dict[Kind, Callable[[Case], Verdict]] = {
     "lift_up": _lifted,
-    "push_left": _pushed(1),
-    "push_right": _pushed(-1),
+    "push_left": _pushed(KINDS["push_left"].side),
+    "push_right": _pushed(KINDS["push_right"].side),
     "tip_over": _tipped,
     "push_next_to": _pushed_next_to,
     "slide_to": _pushed_next_to,
@@ -307,3 +305,6 @@ RULES: dict[str, Callable[[Case], Verdict]] = {
     "uncover": _uncovered,
     "generic": _moved_as_in_the_video,
 }
+"""Which rule judges each kind."""
+
+check_every_kind(RULES, "referee rule", "RULES in v2p_data/task/referee.py")

@@ -19,6 +19,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.kinds import Kind, kind_named
 from v2p_data.scene.files import copy_folder, own_file, read_own_text
 from v2p_data.scene.scene import SCENE_FILE, Scene, SceneObject
 
@@ -131,7 +132,7 @@ class TaskBundle:
     title: str
     description: str
     """The caption; the episodes' language instruction."""
-    kind: str
+    kind: Kind
     class_name: str
     code: str
     scene: Scene
@@ -205,7 +206,7 @@ class TaskBundle:
         return TaskBundle(
             title=read.title,
             description=read.description,
-            kind=read.kind,
+            kind=kind_named(read.kind, str(folder / TASK_FILE)),
             class_name=read.class_name,
             horizon_steps=read.horizon_steps,
             motion_scale=read.motion_scale,

@@ -1,32 +1,18 @@
 """What a caption asks for: the kind of task, which object is manipulated, and what the others are for.
 
 A caption is read in three steps. It is cut into clauses at its verbs; each clause is cut at its prepositions
-("Pushing plate | from left to right | next to brown box"); and one table, `_KINDS`, says what a verb with a
+("Pushing plate | from left to right | next to brown box"); and `TaskKind.phrases` says what a verb with a
 preposition means. The first preposition in the order of `_RANK` that the table knows decides, so a direction
 outranks a neighbour, and a neighbour outranks a tool. The last clause with a known kind wins: it tells how the
-clip ends. To teach a new phrase, add a row.
+clip ends. To teach a new phrase, add it to its kind in `v2p_data/kinds.py`.
 """
 
 import re
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal[
-    "lift_up",
-    "push_left",
-    "push_right",
-    "tip_over",
-    "push_next_to",
-    "cover",
-    "uncover",
-    "push_with",
-    "drop_in_front_of",
-    "insert",
-    "slide_to",
-    "throw_into",
-    "place_onto",
-    "generic",
-]
+from v2p_data.kinds import KINDS, Kind
+
 Role = Literal["reference", "tool", "container", "cover"]
 
 
@@ -87,38 +73,31 @@ _RANK = {"left": 0, "right": 0, "up": 2, "over": 2, "with": 3}
 _PARTICLES = {"left", "right", "over", "upright", "up", "down", "off"}
 """These may stand without a phrase of their own ("lift the box up")."""
 
-_KINDS: dict[tuple[str, str], Kind] = {
-    ("push", "right"): "push_right",
-    ("push", "left"): "push_left",
-    ("push", "next"): "push_next_to",
-    ("push", "to"): "slide_to",
-    ("push", "into"): "insert",
-    ("push", "onto"): "place_onto",
-    ("push", "over"): "tip_over",
-    ("push", "up"): "lift_up",
-    ("push", "with"): "push_with",
-    ("lift", "into"): "insert",
-    ("lift", "onto"): "place_onto",
-    ("lift", "next"): "push_next_to",
-    ("lift", ""): "lift_up",
-    ("tip", "into"): "generic",
-    ("tip", ""): "tip_over",
-    ("poke", "over"): "tip_over",
-    ("cover", ""): "cover",
-    ("uncover", ""): "uncover",
-    ("drop", "front"): "drop_in_front_of",
-    ("drop", "into"): "insert",
-    ("drop", "onto"): "place_onto",
-    ("put", "front"): "drop_in_front_of",
-    ("put", "into"): "insert",
-    ("put", "onto"): "place_onto",
-    ("put", "next"): "push_next_to",
-    ("put", "over"): "cover",
-    ("insert", ""): "insert",
-    ("throw", "into"): "throw_into",
-    ("take", "up"): "lift_up",
-}
-"""(verb, preposition) -> kind; the empty preposition is what the verb means by itself."""
+
+def _phrases() -> dict[tuple[str, str], Kind]:
+    """Return which kind each verb with a preposition asks for.
+
+    Raises:
+        ValueError: a kind has a phrase of unknown words, or the phrase of another kind.
+    """
+    found: dict[tuple[str, str], Kind] = {}
+    for kind in KINDS.values():
+        for verb, preposition in kind.phrases:
+            if verb not in _VERBS or preposition not in (*_PREPOSITIONS, ""):
+                raise ValueError(
+                    f"task kind '{kind.name}' has the phrase ('{verb}', '{preposition}'); add its words to "
+                    "_VERBS and _PREPOSITIONS in v2p_data/video/meaning.py"
+                )
+            if (verb, preposition) in found:
+                raise ValueError(
+                    f"task kinds '{found[verb, preposition]}' and '{kind.name}' both have the phrase "
+                    f"('{verb}', '{preposition}'); give it to one of them"
+                )
+            found[verb, preposition] = kind.name
+    return found
+
+
+_phrases()  # refuses wrong rows when this module is loaded
 
 _NEGATIONS = r"\b(?:pretend\w*|try\w*|fail\w*|unsuccessful\w*|almost|one end of)\b"
 """Words after which the caption no longer says what its verb says."""
@@ -247,23 +226,24 @@ def _read(verb: str, before: str, after: str) -> tuple[Kind, str, list[tuple[str
     direct = direct or _phrase(before)
     others: list[tuple[str, Role]] = [(p, _role(name)) for name, p in parts if p]
 
+    kinds = _phrases()
     if verb in ("cover", "uncover"):
         hand_moves = {"cover": "with", "uncover": "by"}[verb]
         moved = next((p for name, p in parts if name == hand_moves), "")
         stays: list[tuple[str, Role]] = [(direct, "reference")] if direct else []
-        return _KINDS[verb, ""], moved, stays + [o for o in others if o[0] != moved]
+        return kinds[verb, ""], moved, stays + [o for o in others if o[0] != moved]
     if verb == "take" and re.search(_LIDS, direct):
         return "uncover", direct, others
 
     for name, phrase in sorted(parts, key=lambda part: _RANK.get(part[0], 1)):
-        kind = _KINDS.get((verb, name))
+        kind = kinds.get((verb, name))
         if (
             kind
             and (phrase or name in _PARTICLES)
             and not (name == "over" and verb == "put" and not phrase)
         ):
             return kind, direct, others
-    return _KINDS.get((verb, ""), "generic"), direct, others
+    return kinds.get((verb, ""), "generic"), direct, others
 
 
 def _role(preposition: str) -> Role:
@@ -330,5 +310,5 @@ def _named(
         manipulated = left.pop(0)
     for unsaid in left:
         named.append((unsaid, "reference"))
-    unnamed = "cover" if kind in ("cover", "uncover") else _ANYTHING[0]
+    unnamed = "cover" if KINDS[kind].has_cover else _ANYTHING[0]
     return Meaning(kind=kind, manipulated=manipulated or unnamed, others=tuple(named))

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.data_types import CameraGuess, Fit, Placed, Placement, Sighting
 from v2p_data.scene.fitting.silhouette import (
     Silhouette,
@@ -36,16 +37,11 @@ from v2p_data.scene.frames.colour import lab_of
 from v2p_data.scene.frames.mask_ops import bounding_box, grow, handle_of, tidy
 from v2p_data.scene.frames.segmentation import Watched
 from v2p_data.scene.frames.working_clip import Footage
-from v2p_data.scene.grounding.moved_by_network import SWALLOWING_KINDS
 from v2p_data.scene.scale.camera_height import SizeVote, camera_height_m
 from v2p_data.scene.scale.nouns import Noun
 
-_INSIDE_KINDS = (*SWALLOWING_KINDS, "place_onto")
 UNSEEN_IOU = 0.35
 """An outline at the end that fits the object no better shows something else."""
-_CARRY_KINDS = ("uncover", "generic", "drop_in_front_of")
-_LEAVING_TABLE = ("lift_up", "tip_over")
-"""Kinds after which it does not rest as it did."""
 _HAS_ITS_SHAPE = 0.8
 """IoU: an outline that is covered no better tells no size."""
 _TURN_COST = 0.007
@@ -104,7 +100,7 @@ class _Fits:
 def place(
     footage: Footage,
     objects: tuple[Sighting, ...],
-    kind: str,
+    kind: Kind,
     guess: CameraGuess,
     max_poses: int,
     watched: Watched | None = None,
@@ -129,7 +125,7 @@ def place(
             fits[k] = _fit_both_ends(shown[k], role, camera, support, within)
             if k == 0 and kind == "uncover" and 1 in fits and _is_lid(thing.noun):
                 fits[0] = _fit_taken_off(shown[0], fits[0], fits[1].first, camera)
-            if k == 0 and kind not in _LEAVING_TABLE and not fits[k].unseen:
+            if k == 0 and KINDS[kind].end not in ("in_air", "on_side") and not fits[k].unseen:
                 fits[k] = replace(fits[k], grown=_grown(shown[k], fits[k], camera))
     votes = [vote_of(objects[k], fits[k].first) for k in resting]
     known = guess.heights(pitch_rad)
@@ -160,7 +156,7 @@ def place(
     )
 
 
-def _shown(footage: Footage, objects: tuple[Sighting, ...], s: Sighting, kind: str) -> _Shown:
+def _shown(footage: Footage, objects: tuple[Sighting, ...], s: Sighting, kind: Kind) -> _Shown:
     thing = objects[0]
     hidden = _hidden(footage, objects, s.first, s.at) | _others(objects, s, s.at)
     last_i, last_mask = _end_of(s, kind)
@@ -180,7 +176,7 @@ def _shown(footage: Footage, objects: tuple[Sighting, ...], s: Sighting, kind: s
 
 
 def _fit_both_ends(
-    see: _Shown, kind: str, camera: Camera, support: float, within: Within | None
+    see: _Shown, kind: Kind, camera: Camera, support: float, within: Within | None
 ) -> _Fits:
     """Return the pair of poses that costs least: one outline often fits a standing and a lying box alike, both ends seldom do.
 
@@ -193,7 +189,7 @@ def _fit_both_ends(
     costs = [a.cost + b.cost for a, (b, _) in zip(options, found, strict=True)]
     best = int(np.argmin(costs))
     last, as_before = found[best]
-    unseen = kind in SWALLOWING_KINDS and (see.s.swallowed or last.iou < UNSEEN_IOU)
+    unseen = KINDS[kind].hides and (see.s.swallowed or last.iou < UNSEEN_IOU)
     if unseen and within is not None:
         last = _inside(last, support, within)
     return _Fits(
@@ -241,7 +237,7 @@ def _height_by_hand(
     watched: Watched,
     see: _Shown,
     fits: _Fits,
-    kind: str,
+    kind: Kind,
     camera: Camera,
     known: tuple[float, float],
 ) -> tuple[float, float] | None:
@@ -254,7 +250,7 @@ def _height_by_hand(
     return height_by_hand(footage, watched, see.s.masks, stands, camera, *known)
 
 
-def _course(see: _Shown, fits: _Fits, kind: str, camera: Camera, max_poses: int) -> Course:
+def _course(see: _Shown, fits: _Fits, kind: Kind, camera: Camera, max_poses: int) -> Course:
     if see.s.moves:
         end = (see.last_i, see.last_mask)
         return course_between(see.s, kind, fits.first, fits.last, end, camera, max_poses)
@@ -293,7 +289,7 @@ def _placed(see: _Shown, fits: _Fits, course: Course) -> Placed:
 
 
 def with_forms(
-    footage: Footage, objects: tuple[Sighting, ...], guess: CameraGuess, kind: str
+    footage: Footage, objects: tuple[Sighting, ...], guess: CameraGuess, kind: Kind
 ) -> tuple[Sighting, ...]:
     """Return the sightings with their nouns in the form that their outlines fit, where a noun has two; a lid is about as wide as what it covers."""
     beneath = objects[1].noun if kind in ("cover", "uncover") and len(objects) > 1 else None
@@ -362,7 +358,7 @@ def _best_pitch(shown: list[_Shown], guess: CameraGuess) -> tuple[float, list[Fi
     return best[1], fits_at(best[1], thorough=len(shown) > 1)
 
 
-def _rests(s: Sighting, kind: str) -> _Rests:
+def _rests(s: Sighting, kind: Kind) -> _Rests:
     """Return the ways an object may rest at first, each with what it costs: a cover lies with its mouth down."""
     if s.noun.hollow and kind == "uncover":
         return [(_MOUTH_DOWN, 0.0)]
@@ -394,7 +390,7 @@ def _body(
     return mask & ~handle, hidden | handle
 
 
-def _end_of(s: Sighting, kind: str) -> tuple[int, Bool[np.ndarray, "h w"]]:
+def _end_of(s: Sighting, kind: Kind) -> tuple[int, Bool[np.ndarray, "h w"]]:
     """Return the footage frame of an object's last pose, and its mask there."""
     if s.role == "manipulated" and kind == "lift_up":
         i = peak(s)
@@ -408,7 +404,7 @@ def _end_of(s: Sighting, kind: str) -> tuple[int, Bool[np.ndarray, "h w"]]:
 def _fit_last(
     silhouette: Silhouette,
     s: Sighting,
-    kind: str,
+    kind: Kind,
     first: Fit,
     support: float,
     within: Within | None,
@@ -427,7 +423,7 @@ def _fit_last(
     if kind == "uncover" and noun.hollow:  # put down either way
         upright = fit_pose(silhouette, noun, first.size, np.eye(3), yaw_near=yaw)
         same = upright if upright.cost + 0.1 < same.cost else same
-    if kind in _CARRY_KINDS:
+    if KINDS[kind].may_end_held:
         held = fit_lifted(silhouette, noun, first.size, first.T_world_obj)
         if held.cost + 0.1 < same.cost:  # the clip ends before it is put down
             return held, same.cost
@@ -507,10 +503,10 @@ def _unknown(footage: Footage, thing: Sighting, s: Sighting, i: int) -> Bool[np.
 
 
 def _goal(
-    kind: str, objects: tuple[Sighting, ...], own_fit: Fit, goal_fit: Fit
+    kind: Kind, objects: tuple[Sighting, ...], own_fit: Fit, goal_fit: Fit
 ) -> tuple[float, Within | None]:
     """Return how high above the table the manipulated object comes to rest, and over which disc [camera heights]."""
-    if kind not in (*_INSIDE_KINDS, "cover") or len(objects) < 2:
+    if not KINDS[kind].touches or len(objects) < 2:
         return 0.0, None
     thing, other = objects[0].noun, objects[1].noun
     own, there = np.array(own_fit.size), np.array(goal_fit.size)

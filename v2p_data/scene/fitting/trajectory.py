@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.data_types import Fit, Sighting
 from v2p_data.scene.fitting.silhouette import on_wall
 from v2p_data.scene.frames.classes import MOVED
@@ -19,7 +20,6 @@ from v2p_data.scene.schema import Observed
 
 TOUCH_PX = 5
 """What is so near to a thing's outline touches it."""
-_SLIDING_KINDS = ("push_left", "push_right", "push_next_to", "slide_to", "push_with")
 _SEEN_RISING = 0.5
 """Of its height in the picture: a thing that is seen to rise less than this is hidden by the hand that lifts it."""
 _LEFT_IN_SIGHT = 0.3
@@ -56,7 +56,7 @@ class Course:
 
 def course_between(
     s: Sighting,
-    kind: str,
+    kind: Kind,
     first_fit: Fit,
     last_fit: Fit,
     end: tuple[int, Bool[np.ndarray, "h w"]],
@@ -71,7 +71,7 @@ def course_between(
     course = Course([s.at], [first], [float(np.clip(first_fit.iou, 0, 1))], [depth])
     count = min(max_poses, last_i - s.at + 1)
     spots = np.unique(np.linspace(s.at, last_i, count).round().astype(int))
-    on_table = kind in _SLIDING_KINDS
+    on_table = KINDS[kind].slides
     turn = Rotation.from_matrix(last[:3, :3] @ first[:3, :3].T).as_rotvec()
     ends = [_centre(s.first), _centre(last_mask)]
     bias = [

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.kinds import KINDS
 from v2p_data.scene.data_types import Sighting, Sights
 from v2p_data.scene.frames.classes import HAND, MOVED, TABLE
 from v2p_data.scene.frames.colour import histogram
@@ -27,7 +28,7 @@ from v2p_data.scene.frames.working_clip import Footage
 from v2p_data.scene.grounding.held_tool import HeldTool, find_tool
 from v2p_data.scene.grounding.hint_masks import Box, Mark, marks_of
 from v2p_data.scene.grounding.moved_by_change import Moved, find_moved, find_other
-from v2p_data.scene.grounding.moved_by_network import SWALLOWING_KINDS, find_movers, rated
+from v2p_data.scene.grounding.moved_by_network import find_movers, rated
 from v2p_data.scene.grounding.outlines import apart, settled
 from v2p_data.scene.grounding.static_objects import Search, find_standing
 from v2p_data.scene.grounding.tracking import carried, track
@@ -55,8 +56,6 @@ _BELOW_PX, _SEEN_BELOW = 5, 0.5
 """How far below a thing the network must see table, and how surely in the mean."""
 _SETS_OUT, _WELL_SEEN = 0.05, 0.6
 """Share of its way that a thing has gone when it moves; and the share of its largest area that shows a tool well."""
-_OPTIONAL_KINDS = ("lift_up", "push_left", "push_right", "tip_over")
-"""What the caption says of other objects is an aside here: such a scene makes sense without them."""
 
 
 def sight(
@@ -116,7 +115,7 @@ def sight(
             taken |= grow(seen.first, 2)
         objects.append(seen)
     may_be_hidden = own is None or not own.at_end(footage)
-    if watched is not None and meaning.kind in SWALLOWING_KINDS and may_be_hidden and objects[1:]:
+    if watched is not None and KINDS[meaning.kind].hides and may_be_hidden and objects[1:]:
         objects[0] = swallowed(watched, objects[0], objects[1])
     return Sights(
         objects=tuple(objects),
@@ -137,7 +136,9 @@ def without_asides(
     left_out = [
         k
         for k, s in enumerate(sights.objects)
-        if k and meaning.kind in _OPTIONAL_KINDS and not (s.hinted or _is_said(s.phrase, clip))
+        if k
+        and KINDS[meaning.kind].other == "ignored"
+        and not (s.hinted or _is_said(s.phrase, clip))
     ]
     return [k for k in range(len(sights.objects)) if k not in left_out], tuple(
         f"the '{sights.objects[k].phrase}', of which the caption does not speak, was not found surely enough and is left out"
@@ -351,7 +352,7 @@ def _stander(
 def _check_needed(scene: _Scene, phrase: str, sure: float) -> None:
     """Turn away a clip whose task makes no sense without an object that was not found."""
     clip = scene.clip
-    if _is_said(phrase, clip) and scene.meaning.kind not in _OPTIONAL_KINDS:
+    if _is_said(phrase, clip) and KINDS[scene.meaning.kind].other != "ignored":
         raise ItemRejectedError(
             "reference_not_found",
             f"the '{phrase}' was not found in {clip.item} (sure to {sure:.3f}, below {scene.min_found:g}); mark it with a box in captions.json",

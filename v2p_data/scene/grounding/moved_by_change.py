@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.frames.colour import (
     balance,
     colour_match,
@@ -49,13 +50,8 @@ _SPLIT_COST = 0.6
 _LEAST_STANDING, _MOST_STANDING = 0.0025, 0.2
 """Shares of the picture, of a thing that stands still."""
 _NECKS = (0.4, 0.6, 0.8)
-NEARING_KINDS = ("push_next_to", "drop_in_front_of", "slide_to")
-"""What is moved comes nearer to the other."""
 _APPROACH_WEIGHT = 1.0
 """Of coming straight towards something."""
-TOUCHING_KINDS = ("cover", "insert", "throw_into", "place_onto")
-"""What is moved ends in, on or over the other."""
-_NEAR_KINDS = (*NEARING_KINDS, *TOUCHING_KINDS, "push_with")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +92,7 @@ def find_moved(
     footage: Footage,
     table: Table,
     phrase: str,
-    kind: str,
+    kind: Kind,
     *,
     first: Bool[np.ndarray, "h w"] | None = None,
     last: Bool[np.ndarray, "h w"] | None = None,
@@ -166,7 +162,7 @@ def find_other(
     footage: Footage,
     table: Table,
     phrase: str,
-    kind: str,
+    kind: Kind,
     moved: Moved,
     taken: Bool[np.ndarray, "h w"] | None = None,
 ) -> Found | None:
@@ -209,15 +205,15 @@ def find_other(
             area = int(mask.sum())
             score = -_border_sides((x, y, bw, bh), w, h) * 0.8
             score -= _SPLIT_COST if k >= len(wholes) else 0.0
-            if kind in TOUCHING_KINDS or late:
+            if KINDS[kind].touches or late:
                 score += 3 * min(0.6, float((mask & goal_zone).sum() / goal_zone.sum()))
             if late:  # what was under the cover stands where its foot was
                 score += 2.5 * float((mask & foot).sum() / area - 0.6)
             gap = float(distance[mask].min())
-            if kind in NEARING_KINDS:
+            if KINDS[kind].comes_near:
                 nearer = float(before[mask].min()) - gap
                 score += _APPROACH_WEIGHT * float(np.clip(nearer / max(8.0, way), -1, 1))
-            near = 20 if kind in _NEAR_KINDS or late else 60
+            near = 20 if KINDS[kind].ends_near or late else 60
             score -= min(gap / near, 4.0)
             ring = grow(mask, 3) & ~mask
             score += float(table.seen[ring].mean()) if ring.any() else 0.0
@@ -267,7 +263,7 @@ def _best_pair(
     footage: Footage,
     table: Table,
     words: tuple[str, ...],
-    kind: str,
+    kind: Kind,
     first: np.ndarray | None,
     last: np.ndarray | None,
     look: np.ndarray | None = None,
@@ -327,7 +323,7 @@ def _blobs(
     footage: Footage,
     table: Table,
     words: tuple[str, ...],
-    kind: str,
+    kind: Kind,
     *,
     at_end: bool,
     look: np.ndarray | None,
@@ -400,9 +396,7 @@ def _blobs(
                 "fleeting": 0.0 if words else -0.8 * float(fleeting[mask].mean()),
                 "ragged": -float(np.std(stays[mask])),
                 "small": -0.4 * max(0.0, float(np.log(0.004 * h * w / area))),
-                "ring": 0.5
-                if at_end and kind in TOUCHING_KINDS
-                else float(table.seen[ring].mean()),
+                "ring": 0.5 if at_end and KINDS[kind].touches else float(table.seen[ring].mean()),
                 "whole": (whole * share - 0.4) if whole else 0.0,
                 "off table": -1.2 if on_table < 0.5 and not at_end else 0.0,
             }
@@ -470,7 +464,7 @@ def _joined(pieces: np.ndarray, core: np.ndarray) -> np.ndarray:
     return keep
 
 
-def _pair_cues(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[str, float]:
+def _pair_cues(a: _Blob, b: _Blob, kind: Kind, shape: tuple[int, int]) -> dict[str, float]:
     h, w = shape
     overlap = float((a.mask & b.mask).sum() / min(a.area, b.area))
     ax, ay = a.box[0] + a.box[2] / 2, a.box[1] + a.box[3] / 2

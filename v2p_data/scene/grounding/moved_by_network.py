@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.frames.classes import HAND, MOVED
 from v2p_data.scene.frames.colour import (
     balance,
@@ -37,10 +38,6 @@ from v2p_data.scene.grounding.moved_by_change import Moved
 _LIKELY, _POSSIBLE = 0.5, 0.25
 _GAP_PX = 7
 """Of a picture 320 px wide: parts of one thing lie as near as this."""
-SWALLOWING_KINDS = ("insert", "throw_into")
-"""What is moved so may be hidden at the end."""
-_END_WEIGHT = {"insert": 0.4, "throw_into": 0.4, "place_onto": 0.5, "cover": 0.5}
-"""How much the last outline counts: a rim, or the hand that still holds it, hides part of what was put there."""
 _SAME_THING = 0.5
 """Share of the smaller outline in the larger, from which both are the same thing."""
 _PIECE = 0.85
@@ -84,7 +81,7 @@ def find_movers(
     footage: Footage,
     watched: Watched,
     phrase: str,
-    kind: str,
+    kind: Kind,
     tool: str = "",
     first: Bool[np.ndarray, "h w"] | None = None,
     last: Bool[np.ndarray, "h w"] | None = None,
@@ -100,10 +97,10 @@ def find_movers(
     stops = _ends(footage, watched, phrase, len(footage.rgb) - 1, last)
     if look is not None:
         starts, stops = ([_alike(blob, look) for blob in ends] for ends in (starts, stops))
-    if starts and not stops and kind in SWALLOWING_KINDS:
+    if starts and not stops and KINDS[kind].hides:
         stops = _last_seen(footage, watched, phrase, starts[0].area)
-    stops = [_hidden_end(blob, _END_WEIGHT.get(kind, 0.7)) for blob in stops]
-    if goal is not None and kind in _END_WEIGHT:
+    stops = [_hidden_end(blob, KINDS[kind].end_weight) for blob in stops]
+    if goal is not None and KINDS[kind].touches:
         near = grow(goal, _GAP_PX)
         stops = [_at_goal(blob, near) for blob in stops]
     pairs = sorted(
@@ -232,14 +229,14 @@ def _rated(
     ]
 
 
-def rated(footage: Footage, watched: Watched, phrase: str, kind: str, moved: Moved) -> Moved:
+def rated(footage: Footage, watched: Watched, phrase: str, kind: Kind, moved: Moved) -> Moved:
     """Return outlines found in another way, with the cues that the network's own are judged by."""
     stop = len(footage.rgb) - 1
     (a,), (b,) = (
         _rated(footage, watched, phrase, i, [mask], [mask])
         for i, mask in ((0, moved.first), (stop, moved.last))
     )
-    b = _hidden_end(b, _END_WEIGHT.get(kind, 0.7))
+    b = _hidden_end(b, KINDS[kind].end_weight)
     pair = _Pair(a, b, _pair_parts(a, b, kind, footage.shape))
     return _moved([pair], pair)
 
@@ -292,9 +289,9 @@ def _vanishing(
     return float(np.clip(0.6 + 0.6 * (here - after) / (here + after + 4), 0.2, 1))
 
 
-def _pair_parts(a: _Blob, b: _Blob, kind: str, shape: tuple[int, int]) -> dict[str, float]:
+def _pair_parts(a: _Blob, b: _Blob, kind: Kind, shape: tuple[int, int]) -> dict[str, float]:
     ratio = abs(float(np.log(a.area / b.area)))
-    weight = _END_WEIGHT.get(kind, 0.7)
+    weight = KINDS[kind].end_weight
     parts = {
         "alike": (0.3 + 0.7 * similarity(a.hist, b.hist)) ** weight,
         "same size": float(np.exp(-0.5 * (max(0.0, ratio - 0.4) / 0.7) ** 2)) ** weight,

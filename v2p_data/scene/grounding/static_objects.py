@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.special import softmax
 
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.frames.classes import HAND, MOVED, OTHER
 from v2p_data.scene.frames.colour import balance, colour_match, colour_words, lab_of
 from v2p_data.scene.frames.mask_ops import (
@@ -31,8 +32,6 @@ from v2p_data.scene.frames.segmentation import Watched
 from v2p_data.scene.frames.table import Table
 from v2p_data.scene.frames.working_clip import Footage
 from v2p_data.scene.grounding.moved_by_change import (
-    NEARING_KINDS,
-    TOUCHING_KINDS,
     Found,
     pieces_of,
 )
@@ -40,10 +39,6 @@ from v2p_data.scene.scale.camera_height import SeenCamera, px_per_m
 from v2p_data.scene.scale.nouns import Noun, noun_for
 
 WEIGHTS = Path(__file__).with_name("standing.json")
-_UNDER_KINDS = ("uncover",)
-TELLING_KINDS = (*TOUCHING_KINDS, *NEARING_KINDS, *_UNDER_KINDS)
-"""Tasks that tell where the other stands. What the captions of others mention may stand anywhere: how sure it is follows from its
-rivals alone."""
 _LEVELS = (0.75, 0.5, 0.25, 0.12)
 """Probabilities at which what the network sees is cut into things."""
 _LEAST_SHARE, _MOST_SHARE = 0.0005, 0.2
@@ -96,7 +91,7 @@ class Search:
     """What the caption calls it."""
     moved: Noun
     """What the manipulated object is."""
-    kind: str
+    kind: Kind
     """Of the task."""
     ends: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]
     """The manipulated object's first and last outline."""
@@ -106,7 +101,7 @@ class Search:
     @property
     def late(self) -> bool:
         """Whether what is meant is seen at the end only."""
-        return self.kind in _UNDER_KINDS
+        return KINDS[self.kind].starts_over
 
     @cached_property
     def stands(self) -> Float32[np.ndarray, "h w"]:
@@ -139,7 +134,7 @@ def find_standing(search: Search) -> Found | None:
     best = found[k]
     mask = best.mask
     said = {"offset": 1.0, "odds": odds_of(likely, overlaps[k])}
-    if search.kind in TELLING_KINDS:
+    if KINDS[search.kind].locates_other:
         odds = _sum(learned["sure"], {**said, **best.cues})
     else:
         odds = _sum(learned["aside"], said)
@@ -162,7 +157,7 @@ def odds_of(likely: Float[np.ndarray, "n"], alike: Float[np.ndarray, "n"]) -> fl
     return float(np.log(share / (1 - share)))
 
 
-def seen_standing(watched: Watched, kind: str) -> Float32[np.ndarray, "h w"]:
+def seen_standing(watched: Watched, kind: Kind) -> Float32[np.ndarray, "h w"]:
     """Return how likely each pixel shows a thing that stands there, over all frames in which nothing passes before it.
 
     What is uncovered is only seen at the end, and the network may say that it moved.
@@ -293,7 +288,7 @@ class _Way:
             length_px=max(8.0, float(np.linalg.norm(spots[-1] - spots[0])) if spots else 0.0),
         )
 
-    def cues(self, mask: Bool[np.ndarray, "h w"], kind: str) -> dict[str, float]:
+    def cues(self, mask: Bool[np.ndarray, "h w"], kind: Kind) -> dict[str, float]:
         """Return how a candidate lies to it, under the names for the kind of task."""
         area = float(mask.sum())
         to_goal, to_first = (
@@ -308,12 +303,13 @@ class _Way:
         }
         under = {"gap": gap, "foot": float((mask & self.foot).sum() / area)}
         out = {"moved": float((mask & self.own).sum() / area), "gap": gap}
-        for name, kinds, cues in (
-            ("into", TOUCHING_KINDS, there),
-            ("towards", NEARING_KINDS, there),
-            ("under", _UNDER_KINDS, under),
+        of_kind = KINDS[kind]
+        for name, counts, cues in (
+            ("into", of_kind.touches, there),
+            ("towards", of_kind.comes_near, there),
+            ("under", of_kind.starts_over, under),
         ):
-            out |= {f"{name}: {what}": cue * (kind in kinds) for what, cue in cues.items()}
+            out |= {f"{name}: {what}": cue * counts for what, cue in cues.items()}
         return out
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from v2p_data.kinds import Kind
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.probes import first_pose
 
@@ -12,7 +13,7 @@ from v2p_data.task.probes import first_pose
 class Measured:
     """What the video says about the manipulated object's motion, and about the sizes."""
 
-    kind: str
+    kind: Kind
     obj: SceneObject
     ref: SceneObject | None
     """The first other object."""

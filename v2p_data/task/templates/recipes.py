@@ -4,36 +4,19 @@ from collections.abc import Callable
 
 import numpy as np
 
+from v2p_data.kinds import KINDS, Kind, check_every_kind
 from v2p_data.task.templates import carrying, pushing
 from v2p_data.task.templates.draft import Draft, Measured
 from v2p_data.task.templates.phrases import GRASP_SETUP, is_still, push_point_setup, shifted
 from v2p_data.task.templates.variants import Variant
 
 Recipe = Callable[[Measured, Variant], Draft]
-_WITH_ONE_OBJECT: dict[str, Recipe] = {
-    "lift_up": carrying.lift,
-    "push_left": pushing.push,
-    "push_right": pushing.push,
-    "tip_over": pushing.tip_over,
-}
-_WITH_TWO_OBJECTS: dict[str, Recipe] = {
-    "push_next_to": pushing.push_next_to,
-    "slide_to": pushing.push_next_to,
-    "insert": carrying.insert,
-    "place_onto": carrying.place_onto,
-    "drop_in_front_of": carrying.drop_in_front_of,
-    "cover": carrying.cover,
-    "uncover": carrying.uncover,
-    "throw_into": carrying.throw_into,
-    "push_with": pushing.push_with,
-}
 
 
 def draft_of(measured: Measured, variant: Variant) -> Draft:
     """Return the task in expressions; a kind that needs a second object follows the tracked motion where there is none."""
-    recipe = _WITH_ONE_OBJECT.get(measured.kind, _generic)
-    if measured.ref is not None:
-        recipe = _WITH_TWO_OBJECTS.get(measured.kind, recipe)
+    lacks_other = KINDS[measured.kind].other == "needed" and measured.ref is None
+    recipe = _generic if lacks_other else RECIPES[measured.kind]
     return recipe(measured, variant)
 
 
@@ -74,3 +57,24 @@ def _generic(m: Measured, v: Variant) -> Draft:
         remaining="remaining",
         goal="goal_point",
     )
+
+
+RECIPES: dict[Kind, Recipe] = {
+    "lift_up": carrying.lift,
+    "push_left": pushing.push,
+    "push_right": pushing.push,
+    "tip_over": pushing.tip_over,
+    "push_next_to": pushing.push_next_to,
+    "slide_to": pushing.push_next_to,
+    "insert": carrying.insert,
+    "place_onto": carrying.place_onto,
+    "drop_in_front_of": carrying.drop_in_front_of,
+    "cover": carrying.cover,
+    "uncover": carrying.uncover,
+    "throw_into": carrying.throw_into,
+    "push_with": pushing.push_with,
+    "generic": _generic,
+}
+"""Which recipe writes the code of each kind."""
+
+check_every_kind(RECIPES, "template", "RECIPES in v2p_data/task/templates/recipes.py")

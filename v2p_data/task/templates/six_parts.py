@@ -3,6 +3,7 @@
 import pprint
 import re
 
+from v2p_data.kinds import Kind
 from v2p_data.scene.scene import Scene
 from v2p_data.task.probes import first_pose
 from v2p_data.task.templates.draft import Draft, Measured
@@ -63,7 +64,7 @@ def _class_body(caption: str, known: list[str], v: Variant, d: Draft) -> list[st
     ]
 
 
-def _class_name(caption: str, kind: str) -> str:
+def _class_name(caption: str, kind: Kind) -> str:
     words = re.findall(r"[A-Za-z][A-Za-z0-9]*", caption)[:10] or kind.split("_")
     return "".join(w[0].upper() + w[1:] for w in words)[:60] + "Task"
 
