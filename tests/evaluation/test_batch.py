@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
-from v2p_data.evaluation.actors import BASE_PROGRESS, ExpertActor, ProgramActor
+from v2p_data.evaluation.actors import ExpertActor, ProgramActor
 from v2p_data.evaluation.batch import NEVER, Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.sim.batch_env import HELD_STEPS, BatchEnv
+from v2p_data.sim.observation import PROGRESS_COLUMN
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import Task, TaskBundle
 
@@ -132,7 +133,7 @@ def test_an_expert_is_never_told_that_more_than_its_time_has_passed(bundle):
     seen = []
 
     def act(obs):
-        seen.append(obs[:, BASE_PROGRESS].max())
+        seen.append(obs[:, PROGRESS_COLUMN].max())
         return np.zeros((len(obs), 7), np.float32)
 
     judged(bundle, ExpertActor(act, obs_dim=90))

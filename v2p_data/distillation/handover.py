@@ -17,8 +17,8 @@ from v2p_data.episodes.rollouts import CutConfig, EpisodeEnds
 from v2p_data.seeds import rng_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.masks import MaskRenderer
+from v2p_data.sim.observation import PROGRESS_COLUMN
 from v2p_data.sim.randomize import RandomizationConfig
-from v2p_data.sim.states import PROGRESS_COLUMN
 from v2p_data.sim.verdict import Witness
 from v2p_data.task.task import TaskBundle
 

@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32, UInt8
 from v2p_data.errors import V2PError
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.observation import PROGRESS_COLUMN
 from v2p_data.sim.teacher import Teacher
 
 TRIAL_WORLDS = 64
@@ -118,16 +119,12 @@ class ProgramActor:
         return self._teacher.act()
 
 
-BASE_PROGRESS = 72
-"""Column of `base_observation` that holds the share of the episode that has passed."""
-
-
 def _progress_columns(env: BatchEnv) -> list[int]:
     states = env.task_states()
     found, start = [], 0
     for key in env.task.observed_keys(states):
         if key == "base_observation":
-            found.append(start + BASE_PROGRESS)
+            found.append(start + PROGRESS_COLUMN)
         elif key == "progress":
             found.append(start)
         start += states[key].shape[1] if states[key].ndim == 2 else 1

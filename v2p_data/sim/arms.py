@@ -19,6 +19,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.geometry.pose import matrix_from_quat
 from v2p_data.sim.robot import (
     FINGER_TRAVEL_M,
     NUM_ARM_JOINTS,
@@ -198,7 +199,7 @@ def read_arm(cfg: RobotConfig, physics: PhysicsConfig, servo: ServoConfig) -> Ar
     _prepare(spec, cfg, names, servo)
     _prepare_geoms(spec, cfg, [model.body(b).name for b in chain], kind, physics)
     base = np.eye(4)
-    base[:3, :3] = Rotation.from_euler("z", cfg.base_yaw_rad).as_matrix()
+    base[:3, :3] = Rotation.from_euler("z", cfg.base_yaw_rad).asmatrix_from_quat()
     base[:3, 3] = cfg.base_pos_m
     return ArmFile(
         cfg=cfg,
@@ -231,7 +232,7 @@ class Kinematics:
     ) -> None:
         self._base, self._place, self._cfg = base, place, cfg
         self._bodies = [
-            (model.body_pos[b].copy(), _matrix(model.body_quat[b]), _joints_of(model, b))
+            (model.body_pos[b].copy(), matrix_from_quat(model.body_quat[b]), _joints_of(model, b))
             for b in chain
         ]
         ids = [j for _, _, js in self._bodies for j in js]
@@ -248,7 +249,7 @@ class Kinematics:
         """Return the tool's state from joint angles and speeds."""
         R, pos, jacobian = self._forward(qpos)
         twist = np.einsum("njk,nk->nj", jacobian, qvel)
-        quat = Rotation.from_matrix(np.nan_to_num(R)).as_quat(scalar_first=True)
+        quat = Rotation.frommatrix_from_quat(np.nan_to_num(R)).as_quat(scalar_first=True)
         return ToolState(
             pos=pos,
             rotation=R,
@@ -275,7 +276,7 @@ class Kinematics:
         error = np.full((len(pos), 6), np.inf)
         for _ in range(IK_STEPS):
             R, at, jacobian = self._forward(qpos)
-            turn = (wanted * Rotation.from_matrix(R).inv()).as_rotvec()
+            turn = (wanted * Rotation.frommatrix_from_quat(R).inv()).as_rotvec()
             error = np.concatenate([pos - at, turn], axis=1)
             if np.abs(error).max() < 1e-9:
                 break
@@ -330,13 +331,13 @@ class Kinematics:
 def _tool(cfg: RobotConfig, model: mujoco.MjModel) -> tuple[int, np.ndarray]:
     """Return the body that carries the tool, and the tool's place in it, 4 x 4."""
     offset = np.eye(4)
-    offset[:3, :3] = _matrix(np.asarray(cfg.eef_turn_wxyz))
+    offset[:3, :3] = matrix_from_quat(np.asarray(cfg.eef_turn_wxyz))
     offset[:3, 3] = cfg.eef_offset_m
     if cfg.eef_site in _names(model, "body")[1:]:
         return int(model.body(cfg.eef_site).id), offset
     site = _named(model, "site", cfg.eef_site, cfg, "eef_site")
     place = np.eye(4)
-    place[:3, :3], place[:3, 3] = _matrix(model.site_quat[site]), model.site_pos[site]
+    place[:3, :3], place[:3, 3] = matrix_from_quat(model.site_quat[site]), model.site_pos[site]
     return int(model.site_bodyid[site]), place @ offset
 
 
@@ -458,12 +459,8 @@ def _turns(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.eye(3) + sin * K + (1 - cos) * (K @ K)
 
 
-def _matrix(quat_wxyz: np.ndarray) -> np.ndarray:
-    return Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
-
-
 def _quat(R: np.ndarray) -> np.ndarray:
-    return Rotation.from_matrix(R).as_quat(scalar_first=True)
+    return Rotation.frommatrix_from_quat(R).as_quat(scalar_first=True)
 
 
 def sensor_ends(arm: ArmFile | None, pads: Iterable[str]) -> list[str]:

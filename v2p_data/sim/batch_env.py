@@ -23,6 +23,14 @@ from jaxtyping import Bool, Float, Float32, Int
 from mujoco.batch import Batch
 
 from v2p_data.errors import V2PError
+from v2p_data.geometry.rotation import (
+    exp,
+    limited_to,
+    product,
+    quats_pointing_down,
+    rotvec_from_down,
+    tilt_limited,
+)
 from v2p_data.seeds import rng_for
 from v2p_data.sim import randomize, task_code
 from v2p_data.sim.arms import RobotConfig, robot_from_json
@@ -284,7 +292,7 @@ class BatchEnv:
         self._qpos[ids, self._robot.arm] = arm
         self._qpos[ids, self._robot.fingers] = self._robot.finger_travel_m
         self._target_pos[ids] = tool_pos
-        self._target_quat[ids] = _turned_down(yaw)
+        self._target_quat[ids] = quats_pointing_down(yaw).T
         self._target_finger[ids] = self._robot.finger_travel_m
         poses = self.task.reset_poses(torch.from_numpy(ids), self.object_names)
         for k, name in enumerate(self.object_names):
@@ -427,7 +435,7 @@ class BatchEnv:
         return np.concatenate(
             [
                 self._tool.pos,
-                _rotvec_from_down(self._tool.quat_wxyz),
+                rotvec_from_down(self._tool.quat_wxyz.T).T,
                 np.clip(fingers / (2 * travel), 0.0, 1.0),
                 self._target_pos - self._tool.pos,
                 self._target_finger[:, None] / travel,
@@ -563,10 +571,10 @@ class BatchEnv:
         leash = cfg.position_leash_m * scale
         pos = np.minimum(np.maximum(pos, tool_pos - leash), tool_pos + leash)
         pos = np.minimum(np.maximum(pos, _TARGET_LOW_M), _TARGET_HIGH_M)
-        turn = _exp(action[3:6] * cfg.rotation_step_rad)
-        quat = _product(turn, self._target_quat.T)
-        quat = _leashed(quat, tool.quat_wxyz.T, cfg.rotation_leash_rad)
-        quat = _limit_tilt(quat, cfg.tilt_limit_rad)
+        turn = exp(action[3:6] * cfg.rotation_step_rad)
+        quat = product(turn, self._target_quat.T)
+        quat = limited_to(quat, tool.quat_wxyz.T, cfg.rotation_leash_rad)
+        quat = tilt_limited(quat, cfg.tilt_limit_rad)
         left, right = self._qpos[:, self._robot.fingers].T
         travel = 0.5 * (left + right)
         finger = self._target_finger - action[6] * cfg.finger_step_m
@@ -701,81 +709,3 @@ def _history_layout(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     if len(set(controls)) != NUM_CONTROLS:
         raise RuntimeError("every control needs a delay line")
     return np.array(places), np.array(controls)
-
-
-def _turned_down(yaw: np.ndarray) -> np.ndarray:
-    zero = np.zeros_like(yaw)
-    return np.stack([zero, np.cos(yaw / 2), np.sin(yaw / 2), zero], axis=1)
-
-
-def _product(a: Float[np.ndarray, "4 n"], b: Float[np.ndarray, "4 n"]) -> np.ndarray:
-    """Return the product of quaternions wxyz, worlds last as in all of these functions."""
-    p = a[:, None] * b
-    out = np.empty_like(b)
-    out[0] = p[0, 0] - p[1, 1] - p[2, 2] - p[3, 3]
-    out[1] = p[0, 1] + p[1, 0] + p[2, 3] - p[3, 2]
-    out[2] = p[0, 2] - p[1, 3] + p[2, 0] + p[3, 1]
-    out[3] = p[0, 3] + p[1, 2] - p[2, 1] + p[3, 0]
-    return out
-
-
-def _exp(rotvec: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "4 n"]:
-    """Return the turn by a rotation vector."""
-    half = 0.5 * np.sqrt(_dot(rotvec, rotvec))
-    tangent = np.tan(0.5 * half)  # numpy's sine and cosine take ten times as long
-    scale = 1.0 / (1.0 + tangent * tangent)
-    out = np.empty((4, rotvec.shape[1]))
-    out[0] = (1.0 - tangent * tangent) * scale
-    out[1:] = rotvec * (tangent * scale / np.maximum(half, 1e-12))
-    return out
-
-
-def _dot(a: Float[np.ndarray, "k n"], b: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "n"]:
-    if (
-        a.shape[1] == 1
-    ):  # einsum rounds a single column otherwise, and a world must not know how many others there are
-        return _dot(np.repeat(a, 2, axis=1), np.repeat(b, 2, axis=1))[:1]
-    return np.einsum("kn,kn->n", a, b)
-
-
-def _leashed(
-    quat: Float[np.ndarray, "4 n"], anchor: Float[np.ndarray, "4 n"], limit_rad: float
-) -> Float[np.ndarray, "4 n"]:
-    """Return `quat`, turned back towards `anchor` where it is further than the limit away; normalised."""
-    quat = quat / np.sqrt(_dot(quat, quat))
-    dot = _dot(quat, anchor)
-    far = np.flatnonzero(np.abs(dot) < np.cos(limit_rad / 2))
-    if len(far):
-        a, b = np.take(anchor, far, axis=1), np.take(quat, far, axis=1) * np.sign(dot[far])
-        half = np.arccos(np.clip(np.abs(dot[far]), 0, 1))
-        part = limit_rad / 2
-        quat[:, far] = (np.sin(half - part) * a + np.sin(part) * b) / np.sin(half)
-    return quat
-
-
-def _limit_tilt(quat: Float[np.ndarray, "4 n"], limit_rad: float) -> Float[np.ndarray, "4 n"]:
-    """Return `quat`, leaned back where its z axis is further than the limit from straight down."""
-    w, x, y, z = quat
-    axis_z = 1 - 2 * (x * x + y * y)
-    far = np.flatnonzero(-axis_z < np.cos(limit_rad))
-    if len(far):
-        w, x, y, z = leaning = np.take(quat, far, axis=1)
-        # The axis crossed with (0, 0, -1), its length the sine of how far it leans.
-        back = np.zeros((3, len(far)))
-        back[0] = 2 * (w * x - y * z)
-        back[1] = 2 * (x * z + w * y)
-        over = np.arccos(np.clip(-axis_z[far], -1, 1)) - limit_rad
-        back *= over / np.maximum(np.sqrt(_dot(back, back)), 1e-12)
-        quat[:, far] = _product(_exp(back), leaning)
-    return quat
-
-
-def _rotvec_from_down(quat: np.ndarray) -> np.ndarray:
-    """Return the rotation vector of `R_down^T R`, with angle at most pi."""
-    w, x, y, z = quat.T
-    # conj(0, 1, 0, 0) * quat
-    relative = np.stack([x, -w, z, -y], axis=1)
-    relative *= np.where(relative[:, :1] < 0, -1.0, 1.0)
-    sine = np.linalg.norm(relative[:, 1:], axis=1, keepdims=True)
-    angle = 2 * np.arctan2(sine, relative[:, :1])
-    return relative[:, 1:] * np.where(sine < 1e-9, 2.0, angle / np.maximum(sine, 1e-12))

@@ -11,7 +11,7 @@ GRIPS_UP_TO_M = 0.078
 """Sides narrower than this fit between the open pads with some room."""
 LEVEL = 0.5
 """An own axis lies flat enough to be gripped along while its vertical part is below this."""
-_TOO_WIDE, _NARROW_IS_BETTER, _NOT_LEVEL = 60.0, 3.0, 100.0
+TOO_WIDE, NARROW_IS_BETTER, NOT_LEVEL = 60.0, 3.0, 100.0
 """Costs in radians per metre: a side is chosen by how far to turn and by how wide it is."""
 
 
@@ -40,9 +40,9 @@ def turn_to_grip(
     turns = _within(np.arctan2(rotation[1], rotation[0]) - heading)
     costs = (
         np.abs(turns)
-        + _TOO_WIDE * np.maximum(size - GRIPS_UP_TO_M, 0)
-        + _NARROW_IS_BETTER * size
-        + _NOT_LEVEL * (np.abs(rotation[2]) > LEVEL)
+        + TOO_WIDE * np.maximum(size - GRIPS_UP_TO_M, 0)
+        + NARROW_IS_BETTER * size
+        + NOT_LEVEL * (np.abs(rotation[2]) > LEVEL)
     )
     turn = np.where(costs[1] < costs[0], turns[1], turns[0])
     return np.where(costs[2] < np.minimum(costs[0], costs[1]), turns[2], turn)

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from v2p_data.geometry.rotation import matrices
 from v2p_data.sim.grips import turn_to_grip
+from v2p_data.sim.observation import value_of
 from v2p_data.sim.robot import FINGERTIP_BELOW_TCP_M, TARGET_HIGH_M, TARGET_LOW_M
-from v2p_data.sim.states import matrices
 from v2p_data.sim.world import ObjectModel
 
 Points = Float[np.ndarray, "env 3"]
@@ -107,7 +108,7 @@ class Moment:
             Body(
                 model=o,
                 pos=get(f"{o.name}_pos"),
-                rotation=matrices(get(f"{o.name}_quat")),
+                rotation=_rotations(get(f"{o.name}_quat")),
                 vel=get(f"{o.name}_vel_linear"),
                 size=get(f"{o.name}_size"),
                 start=get(f"{o.name}_start_pos"),
@@ -118,8 +119,8 @@ class Moment:
         )
         return Moment(
             tool=tool,
-            target=tool + get("base_observation")[:, 11:14] / 20,
-            rotation=matrices(get("eef_quat")),
+            target=tool + value_of(get("base_observation"), "target_ahead"),
+            rotation=_rotations(get("eef_quat")),
             vel=get("eef_vel_linear"),
             width=get("gripper_width"),
             bodies=bodies,
@@ -347,3 +348,7 @@ def choose(condition: Flags, then: Actions, otherwise: Actions) -> Actions:
 def _ramp(value: Numbers, low: float | Numbers, high: float | Numbers) -> Numbers:
     """Return 0 below `low`, 1 above `high`, and a slope between: a learner cannot imitate a step well."""
     return np.clip((value - low) / (np.asarray(high) - low), 0.0, 1.0)
+
+
+def _rotations(quat_wxyz: Float[np.ndarray, "env 4"]) -> Float[np.ndarray, "env 3 3"]:
+    return np.ascontiguousarray(np.moveaxis(matrices(quat_wxyz.T), -1, 0))

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.geometry.rotation import product, quats_about_z
 from v2p_data.kinds import KINDS, TaskKind
 from v2p_data.scene.scene import FLOOR_MAX_M, Scene
 from v2p_data.sim.world import (
@@ -396,12 +397,9 @@ class Randomizer:
         poses[:, :, :2] = xy
         poses[:, :, 2] = self._height_above_table[ids] + 5e-4
         for k, obj in enumerate(self.world.objects):
-            yaw = rng.uniform(-cfg.yaw_rad, cfg.yaw_rad, n) / 2
-            c, s = np.cos(yaw), np.sin(yaw)
-            w, x, y, z = obj.rest_quat
-            poses[:, k, 3:] = np.stack(
-                [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=1
-            )
+            yaw = rng.uniform(-cfg.yaw_rad, cfg.yaw_rad, n)
+            rest = np.tile(np.array([obj.rest_quat]).T, n)
+            poses[:, k, 3:] = product(quats_about_z(yaw), rest).T
         return poses
 
     def _cover_pair(self) -> tuple[int, int] | None:

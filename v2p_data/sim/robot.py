@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from v2p_data.geometry.rotation import conjugates, product
+
 HOME_QPOS = (0.0, 0.1, 0.0, -2.15, 0.0, 2.25, 0.7853981633974483)
 """Joint angles [rad] with the gripper pointing down in front of the robot."""
 NUM_ARM_JOINTS = 7
@@ -340,17 +342,8 @@ def _chain(qpos: Float[np.ndarray, "n 7"]) -> _Chain:
 
 def _rotation_error(wanted: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """Return twice the vector part of `wanted * conj(quat)`, `(3, n)`."""
-    w1, x1, y1, z1 = wanted
-    w2, x2, y2, z2 = quat * np.array([[1.0], [-1.0], [-1.0], [-1.0]])
-    w = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
-    vector = np.stack(
-        [
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ]
-    )
-    return 2 * np.where(w < 0, -1.0, 1.0) * vector
+    error = product(wanted, conjugates(quat))
+    return 2 * np.where(error[0] < 0, -1.0, 1.0) * error[1:]
 
 
 def _row(values: Iterable[float | int]) -> str:

@@ -12,21 +12,31 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from v2p_data.geometry.rotation import matrices
 from v2p_data.sim.grips import grip_features
-from v2p_data.sim.robot import FINGER_TRAVEL_M, ToolState
+from v2p_data.sim.observation import (
+    COLUMNS,
+    GRIP_COLUMNS,
+    IN_SLOT,
+    LIMIT,
+    MOVED_COLUMNS,
+    OBJECT_CENTRE_M,
+    OBJECT_SLOTS,
+    PROGRESS_COLUMN,
+    SCALES,
+    SIZE_COLUMNS,
+    SLOT_COLUMNS,
+    SLOT_WIDTH,
+    TOOL_CENTRE_M,
+    TOUCH_COLUMNS,
+)
+from v2p_data.sim.robot import ToolState
 from v2p_data.sim.world import World
 from v2p_data.task.task import BASE_OBSERVATION_DIM
 
-OBSERVATION_LIMIT = 5.0
-OBJECT_SLOTS = 2
-"""Objects that the base observation describes: the manipulated one, then the first other."""
-
-PROGRESS_COLUMN = 72
-"""Of the base observation: the share of the horizon that has passed. Experts know values up to 1."""
-
 NUM_ROBOT_COLUMNS = 16
 NUM_OBJECT_COLUMNS = 26
-_ROBOT_COLUMNS = {
+ROBOT_COLUMNS = {
     "eef_pos": slice(0, 3),
     "eef_quat": slice(3, 7),
     "eef_vel_linear": slice(7, 10),
@@ -35,7 +45,7 @@ _ROBOT_COLUMNS = {
     "table_height": 14,
     "progress": 15,
 }
-_OBJECT_COLUMNS = {
+OBJECT_COLUMNS = {
     "pos": slice(0, 3),
     "quat": slice(3, 7),
     "vel_linear": slice(7, 10),
@@ -122,12 +132,12 @@ class StateBlock:
         return dict(self._copied)
 
     def _views(self, rows: torch.Tensor, base: torch.Tensor) -> dict[str, torch.Tensor]:
-        states = {key: rows[:, columns] for key, columns in _ROBOT_COLUMNS.items()}
+        states = {key: rows[:, columns] for key, columns in ROBOT_COLUMNS.items()}
         states["base_observation"] = base.T
         for k, name in enumerate(self._names):
             start = NUM_ROBOT_COLUMNS + NUM_OBJECT_COLUMNS * k
             block = rows[:, start : start + NUM_OBJECT_COLUMNS]
-            for key, columns in _OBJECT_COLUMNS.items():
+            for key, columns in OBJECT_COLUMNS.items():
                 states[f"{name}_{key}"] = block[:, columns]
         return states
 
@@ -156,7 +166,7 @@ def _fill(
     touching = touches[:, 0] + touches[:, 1]
     velocity = seen.object_qvel.transpose(1, 2, 0).astype(np.float32)
     objects[:, 0:7] = seen.object_qpos.transpose(1, 2, 0)
-    rotation = _matrices(objects[:, 3:7])
+    rotation = matrices(objects[:, 3:7])
     objects[:, 7:10] = velocity[:, :3]
     np.sum(rotation * velocity[:, None, 3:], axis=2, out=objects[:, 10:13])
     objects[:, 13:16] = seen.object_size.transpose(1, 2, 0)
@@ -164,18 +174,16 @@ def _fill(
     objects[:, 23] = rotation[:, 2, 2]
     objects[:, 24] = (touching > 1.5) & (opening < holds_below_m)
     objects[:, 25] = touching > 0.5
-    _fill_base(base, robot, objects[:OBJECT_SLOTS], rotation[:OBJECT_SLOTS], seen)
-    base[9:11] = fingers
-    base[70:72] = touches[0]
+    _fill_base(base, robot, objects[: len(OBJECT_SLOTS)], rotation[: len(OBJECT_SLOTS)], seen)
+    base[COLUMNS["fingers"]] = fingers
     tool_axes = tool.rotation.transpose(1, 2, 0).astype(np.float32)
-    for k in range(min(OBJECT_SLOTS, len(objects))):
-        base[80 + 4 * k : 84 + 4 * k] = grip_features(
+    for k in range(min(len(OBJECT_SLOTS), len(objects))):
+        base[TOUCH_COLUMNS[k]] = touches[k]
+        base[GRIP_COLUMNS[k]] = grip_features(
             tool_axes, rotation[k], objects[k, 13:16], is_round=is_round[k]
         )
-    if len(objects) > 1:
-        base[88:90] = touches[1]
-    base *= _SCALES
-    np.clip(base, -OBSERVATION_LIMIT, OBSERVATION_LIMIT, out=base)
+    base *= SCALES[:, None]
+    np.clip(base, -LIMIT, LIMIT, out=base)
 
 
 def _fill_base(
@@ -185,68 +193,32 @@ def _fill_base(
     rotation: Float[np.ndarray, "slot 3 3 env"],
     seen: Observed,
 ) -> None:
-    """Write the first 80 of the 90 numbers every policy sees; scaled by `_SCALES` they are of order one, clipped to +-5.
-
-    22 of the robot (tool position, two axes of its rotation, fingers, how far its target is ahead, last
-    action); 21 of each of two objects (position from the tool in world and gripper axes, relative rotation,
-    up axis, position on the table, velocity); then sizes (6), touches of the manipulated object (2),
-    progress (1), displacement from the start of both objects (6), and whether there is a second object (1).
-    The last ten are `grips.grip_features` of both objects (8) and touches of the second one (2).
-    """
+    """Write the terms of `observation.TERMS` without their scales, except fingers, touches and grips."""
     slots, n = len(objects), base.shape[-1]
     axes = seen.tool.rotation.transpose(2, 1, 0).astype(np.float32)
     pos = objects[:, 0:3]
-    np.subtract(robot[0:3], _TOOL_CENTRE, out=base[0:3])
-    base[3:9] = axes[:2].reshape(6, n)
-    base[11:14] = (seen.target_pos - seen.tool.pos).T
-    base[14] = seen.target_finger
-    base[15:22] = seen.last_action.T
-    slot = base[22:64].reshape(OBJECT_SLOTS, 21, n)[:slots]
+    np.subtract(robot[0:3], _TOOL_CENTRE, out=base[COLUMNS["tool_pos"]])
+    base[COLUMNS["tool_axis_x"]] = axes[0]
+    base[COLUMNS["tool_axis_y"]] = axes[1]
+    base[COLUMNS["target_ahead"]] = (seen.target_pos - seen.tool.pos).T
+    base[COLUMNS["target_finger"]] = seen.target_finger
+    base[COLUMNS["last_action"]] = seen.last_action.T
+    slot = base[SLOT_COLUMNS].reshape(len(OBJECT_SLOTS), SLOT_WIDTH, n)[:slots]
     away = pos - robot[0:3]
-    slot[:, 0:3] = away
-    np.sum(axes * away[:, None], axis=2, out=slot[:, 3:6])
+    slot[:, IN_SLOT["away"]] = away
+    np.sum(axes * away[:, None], axis=2, out=slot[:, IN_SLOT["away_in_gripper"]])
     relative = np.sum(axes[:, :, None] * rotation[:, None, :, :2], axis=2)
-    slot[:, 6:9] = relative[:, :, 0]
-    slot[:, 9:12] = relative[:, :, 1]
-    slot[:, 12:15] = rotation[:, :, 2]
-    np.subtract(pos, _OBJECT_CENTRE, out=slot[:, 15:18])
-    slot[:, 18:21] = objects[:, 7:10]
-    base[64:70].reshape(OBJECT_SLOTS, 3, n)[:slots] = objects[:, 13:16]
+    slot[:, IN_SLOT["axis_x"]] = relative[:, :, 0]
+    slot[:, IN_SLOT["axis_y"]] = relative[:, :, 1]
+    slot[:, IN_SLOT["up"]] = rotation[:, :, 2]
+    np.subtract(pos, _OBJECT_CENTRE, out=slot[:, IN_SLOT["pos"]])
+    slot[:, IN_SLOT["vel"]] = objects[:, 7:10]
+    base[SIZE_COLUMNS].reshape(len(OBJECT_SLOTS), 3, n)[:slots] = objects[:, 13:16]
     base[PROGRESS_COLUMN] = seen.progress
-    np.subtract(pos, objects[:, 16:19], out=base[73:79].reshape(OBJECT_SLOTS, 3, n)[:slots])
-    base[79] = float(slots > 1)
+    moved = base[MOVED_COLUMNS].reshape(len(OBJECT_SLOTS), 3, n)[:slots]
+    np.subtract(pos, objects[:, 16:19], out=moved)
+    base[COLUMNS["has_other"]] = float(slots > 1)
 
 
-_TOOL_CENTRE = np.array([[0.5], [0.0], [0.15]], np.float32)
-_OBJECT_CENTRE = np.array([[0.5], [0.0], [0.05]], np.float32)
-_SLOT_SCALES = [10.0] * 6 + [1.0] * 9 + [5.0] * 3 + [1.0] * 3
-_SCALES = np.array(
-    [5.0] * 3 + [1.0] * 6 + [1 / FINGER_TRAVEL_M] * 2 + [20.0] * 3 + [1 / FINGER_TRAVEL_M] + [0.5] * 7
-    + _SLOT_SCALES * OBJECT_SLOTS + [15.0] * 6 + [1.0] * 3 + [5.0] * 6 + [1.0]
-    + [1.0, 10.0, 10.0, 10.0] * OBJECT_SLOTS + [1.0] * 2,
-    np.float32,
-)[:, None]  # fmt: skip
-
-
-def matrices(quat_wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Return rotation matrices of unit quaternions."""
-    return _matrices(quat_wxyz[..., None])[..., 0]
-
-
-def _matrices(quat_wxyz: Float[np.ndarray, "*batch 4 n"]) -> Float[np.ndarray, "*batch 3 3 n"]:
-    twice = 2 * quat_wxyz
-    wx, wy, wz = np.moveaxis(quat_wxyz[..., :1, :] * twice[..., 1:, :], -2, 0)
-    xx, xy, xz = np.moveaxis(quat_wxyz[..., 1:2, :] * twice[..., 1:, :], -2, 0)
-    yy, yz = np.moveaxis(quat_wxyz[..., 2:3, :] * twice[..., 2:, :], -2, 0)
-    zz = quat_wxyz[..., 3, :] * twice[..., 3, :]
-    out = np.empty((*quat_wxyz.shape[:-2], 3, 3, quat_wxyz.shape[-1]), quat_wxyz.dtype)
-    out[..., 0, 0, :] = 1 - (yy + zz)
-    out[..., 0, 1, :] = xy - wz
-    out[..., 0, 2, :] = xz + wy
-    out[..., 1, 0, :] = xy + wz
-    out[..., 1, 1, :] = 1 - (xx + zz)
-    out[..., 1, 2, :] = yz - wx
-    out[..., 2, 0, :] = xz - wy
-    out[..., 2, 1, :] = yz + wx
-    out[..., 2, 2, :] = 1 - (xx + yy)
-    return out
+_TOOL_CENTRE = np.array([TOOL_CENTRE_M], np.float32).T
+_OBJECT_CENTRE = np.array([OBJECT_CENTRE_M], np.float32).T

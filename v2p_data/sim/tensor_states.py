@@ -4,23 +4,25 @@ A policy is trained on one backend and judged on the other: `tests/sim/test_tens
 same values. There it is numpy with the worlds last, which is fastest on a CPU; here rows are worlds.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 
+from v2p_data.geometry.rotation_torch import exp, limited_to, matrices, product, tilt_limited
 from v2p_data.sim import grips
-from v2p_data.sim.robot import FINGER_TRAVEL_M, TARGET_HIGH_M, TARGET_LOW_M
-from v2p_data.sim.states import (
-    _OBJECT_COLUMNS,
-    _ROBOT_COLUMNS,
-    NEARLY_OPEN_M,
+from v2p_data.sim.observation import (
+    COLUMNS,
+    GRIP_COLUMNS,
+    LIMIT,
+    OBJECT_CENTRE_M,
     OBJECT_SLOTS,
-    OBSERVATION_LIMIT,
-    PROGRESS_COLUMN,
+    SCALES,
+    TOOL_CENTRE_M,
 )
+from v2p_data.sim.robot import FINGER_TRAVEL_M, TARGET_HIGH_M, TARGET_LOW_M
+from v2p_data.sim.states import NEARLY_OPEN_M, OBJECT_COLUMNS, ROBOT_COLUMNS
 from v2p_data.task.task import BASE_OBSERVATION_DIM
 
 
@@ -52,10 +54,10 @@ def named_states(
     names: list[str],
 ) -> dict[str, torch.Tensor]:
     """Return the columns of the three blocks by the names that task code knows, as views."""
-    states = {key: robot[:, columns] for key, columns in _ROBOT_COLUMNS.items()}
+    states = {key: robot[:, columns] for key, columns in ROBOT_COLUMNS.items()}
     states["base_observation"] = base
     for k, name in enumerate(names):
-        for key, columns in _OBJECT_COLUMNS.items():
+        for key, columns in OBJECT_COLUMNS.items():
             states[f"{name}_{key}"] = objects[:, k, columns]
     return states
 
@@ -106,43 +108,42 @@ def base_observation(
         seen: the worlds.
         is_round: per object, whether it is round about its own z axis.
     """
-    pos, slots = seen.tool_pos, min(len(is_round), OBJECT_SLOTS)
+    pos, slots = seen.tool_pos, min(len(is_round), len(OBJECT_SLOTS))
     out = pos.new_zeros(len(pos), BASE_OBSERVATION_DIM)
-    out[:, 0:3] = (pos - _vector(pos, (0.5, 0.0, 0.15))) * 5
-    out[:, 3:6] = seen.tool_rotation[:, :, 0]
-    out[:, 6:9] = seen.tool_rotation[:, :, 1]
-    out[:, 9:11] = seen.fingers / FINGER_TRAVEL_M
-    out[:, 11:14] = (seen.target_pos - pos) * 20
-    out[:, 14] = seen.target_finger / FINGER_TRAVEL_M
-    out[:, 15:22] = seen.last_action * 0.5
+
+    def put(name: str, value: torch.Tensor) -> None:
+        out[:, COLUMNS[name]] = value
+
+    put("tool_pos", pos - _vector(pos, TOOL_CENTRE_M))
+    put("tool_axis_x", seen.tool_rotation[:, :, 0])
+    put("tool_axis_y", seen.tool_rotation[:, :, 1])
+    put("fingers", seen.fingers)
+    put("target_ahead", seen.target_pos - pos)
+    put("target_finger", seen.target_finger[:, None])
+    put("last_action", seen.last_action)
+    put("progress", seen.progress[:, None])
+    out[:, COLUMNS["has_other"]] = float(slots > 1)
     gripper_axes = seen.tool_rotation.mT
     rotation = matrices(seen.object_qpos[:, :slots, 3:])
-    centre = _vector(pos, (0.5, 0.0, 0.05))
-    for k in range(slots):
+    for k, slot in enumerate(OBJECT_SLOTS[:slots]):
         place = seen.object_qpos[:, k, :3]
-        rel = place - pos
+        away = place - pos
         relative = gripper_axes @ rotation[:, k]
-        parts = (
-            rel * 10,
-            (gripper_axes @ rel[:, :, None])[:, :, 0] * 10,
-            relative[:, :, 0],
-            relative[:, :, 1],
-            rotation[:, k, :, 2],
-            (place - centre) * 5,
-            seen.object_qvel[:, k, :3],
-        )
-        out[:, 22 + 21 * k : 43 + 21 * k] = torch.cat(parts, dim=1)
-        out[:, 64 + 3 * k : 67 + 3 * k] = seen.object_size[:, k] * 15
-        out[:, 73 + 3 * k : 76 + 3 * k] = (place - seen.start_pose[:, k, :3]) * 5
-        out[:, 80 + 4 * k : 84 + 4 * k] = grip_features(
+        put(f"{slot}_away", away)
+        put(f"{slot}_away_in_gripper", (gripper_axes @ away[:, :, None])[:, :, 0])
+        put(f"{slot}_axis_x", relative[:, :, 0])
+        put(f"{slot}_axis_y", relative[:, :, 1])
+        put(f"{slot}_up", rotation[:, k, :, 2])
+        put(f"{slot}_pos", place - _vector(pos, OBJECT_CENTRE_M))
+        put(f"{slot}_vel", seen.object_qvel[:, k, :3])
+        put(f"{slot}_size", seen.object_size[:, k])
+        put(f"{slot}_moved", place - seen.start_pose[:, k, :3])
+        put(f"{slot}_touches", seen.touches[:, k])
+        out[:, GRIP_COLUMNS[k]] = grip_features(
             seen.tool_rotation, rotation[:, k], seen.object_size[:, k], is_round=is_round[k]
         )
-    out[:, 70:72] = seen.touches[:, 0]
-    if slots > 1:
-        out[:, 88:90] = seen.touches[:, 1]
-    out[:, PROGRESS_COLUMN] = seen.progress
-    out[:, 79] = float(slots > 1)
-    return out.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    scales = torch.from_numpy(SCALES).to(out.device, out.dtype)
+    return (out * scales).clamp_(-LIMIT, LIMIT)
 
 
 def grip_features(
@@ -152,7 +153,7 @@ def grip_features(
     *,
     is_round: bool,
 ) -> Float[torch.Tensor, "env 4"]:
-    """Return `grips.grip_features`, scaled as the base observation has them."""
+    """Return `grips.grip_features`."""
     heading = torch.atan2(tool[:, 1, 1], tool[:, 0, 1])
     if is_round:
         axis = torch.atan2(rotation[:, 1, 2], rotation[:, 0, 2]) + torch.pi / 2
@@ -162,13 +163,13 @@ def grip_features(
         turns = _within(torch.atan2(rotation[:, 1], rotation[:, 0]) - heading[:, None])
         costs = (
             turns.abs()
-            + grips._TOO_WIDE * (size - grips.GRIPS_UP_TO_M).clamp_min(0)
-            + grips._NARROW_IS_BETTER * size
-            + grips._NOT_LEVEL * (rotation[:, 2].abs() > grips.LEVEL)
+            + grips.TOO_WIDE * (size - grips.GRIPS_UP_TO_M).clamp_min(0)
+            + grips.NARROW_IS_BETTER * size
+            + grips.NOT_LEVEL * (rotation[:, 2].abs() > grips.LEVEL)
         )
         turn = turns.gather(1, costs.argmin(1, keepdim=True))[:, 0]
     extents = ((tool.mT @ rotation).abs() * size[:, None]).sum(2)
-    return torch.cat([turn[:, None] / (torch.pi / 2), extents * 10], dim=1)
+    return torch.cat([turn[:, None] / (torch.pi / 2), extents], dim=1)
 
 
 def moved_position(
@@ -197,73 +198,12 @@ def moved_rotation(
     tilt_rad: float,
 ) -> Float[torch.Tensor, "env 4"]:
     """Return the tool's wanted orientation, on its leash and leaning no further than its limit."""
-    quat = product(_exp(action * step_rad), target)
-    return _limit_tilt(_leashed(quat, tool_quat, leash_rad), tilt_rad)
-
-
-def matrices(quat_wxyz: Float[torch.Tensor, "*batch 4"]) -> Float[torch.Tensor, "*batch 3 3"]:
-    """Return rotation matrices of unit quaternions."""
-    w, x, y, z = quat_wxyz.unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
-def product(
-    a: Float[torch.Tensor, "env 4"], b: Float[torch.Tensor, "env 4"]
-) -> Float[torch.Tensor, "env 4"]:
-    """Return the quaternion products `a b`."""
-    w1, x1, y1, z1 = a.unbind(1)
-    w2, x2, y2, z2 = b.unbind(1)
-    return torch.stack(
-        [
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ],
-        dim=1,
-    )
+    quat = product(exp(action * step_rad), target)
+    return tilt_limited(limited_to(quat, tool_quat, leash_rad), tilt_rad)
 
 
 def _within(angle: torch.Tensor) -> torch.Tensor:
     return torch.remainder(angle + torch.pi / 2, torch.pi) - torch.pi / 2
-
-
-def _exp(rotvec: torch.Tensor) -> torch.Tensor:
-    half = rotvec.norm(dim=1, keepdim=True) / 2
-    return torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * rotvec], dim=1)
-
-
-def _leashed(quat: torch.Tensor, anchor: torch.Tensor, limit_rad: float) -> torch.Tensor:
-    """Return `quat`, turned back towards `anchor` where it is further than the limit away; normalised.
-
-    The angle between them comes from the sine: in float32 the arc cosine is off by 0.03 degrees near zero.
-    """
-    quat = quat / quat.norm(dim=1, keepdim=True)
-    dot = (quat * anchor).sum(1, keepdim=True)
-    near = quat * torch.where(dot < 0, -1.0, 1.0)
-    half = torch.atan2((near - anchor * dot.abs()).norm(dim=1, keepdim=True), dot.abs())
-    part = limit_rad / 2
-    sine = half.sin().clamp_min(1e-6)
-    back = ((half - part).sin() * anchor + math.sin(part) * near) / sine
-    return torch.where(half > part, back, quat)
-
-
-def _limit_tilt(quat: torch.Tensor, limit_rad: float) -> torch.Tensor:
-    """Return `quat`, leaned back where its z axis is further than the limit from straight down."""
-    w, x, y, z = quat.unbind(1)
-    axis_x, axis_y = 2 * (x * z + w * y), 2 * (y * z - w * x)
-    axis_z = 1 - 2 * (x * x + y * y)
-    level = torch.hypot(axis_x, axis_y)
-    over = torch.atan2(level, -axis_z) - limit_rad
-    back = torch.stack([-axis_y, axis_x, torch.zeros_like(axis_x)], dim=1)
-    back = back / level.clamp_min(1e-12)[:, None]
-    leaned = product(_exp(back * over.clamp_min(0)[:, None]), quat)
-    return torch.where((over > 0)[:, None], leaned, quat)
 
 
 def _vector(like: torch.Tensor, values: tuple[float, ...]) -> torch.Tensor:

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 
 from v2p_data.errors import V2PError
+from v2p_data.geometry.rotation import quats_pointing_down
 from v2p_data.seeds import rng_for, torch_rng_for
 from v2p_data.sim import task_code
 from v2p_data.sim.batch_env import ACT_DIM, HELD_STEPS, SimConfig, robot_of
@@ -155,10 +156,8 @@ class WarpBatchEnv:
         self._object_size[ids] = self._to_device(self.randomizer.size_m[rows])
         arm_and_fingers = np.concatenate([arm, np.full((n, 2), FINGER_TRAVEL_M)], axis=1)
         sim.qpos[ids, : NUM_ARM_JOINTS + 2] = self._to_device(arm_and_fingers)
-        zero = np.zeros(n)
-        down = np.stack([zero, np.cos(yaw / 2), np.sin(yaw / 2), zero], axis=1)
         self._target_pos[ids] = self._to_device(tool_pos)
-        self._target_quat[ids] = self._to_device(down)
+        self._target_quat[ids] = self._to_device(quats_pointing_down(yaw).T)
         self._target_finger[ids] = FINGER_TRAVEL_M
         poses = self.task.reset_poses(ids, self.object_names)
         for k, name in enumerate(self.object_names):
