@@ -23,6 +23,8 @@ LIGHTNESS_WEIGHT = 0.5
 """Of lightness beside hue in colour distances: faces of one thing differ in lightness."""
 LIT_WEIGHT, SHADED_COST, DARKEST = 0.15, 9.0, 0.2
 """Of what is behind: weight of squared lightness, what being in a shadow costs, and the darkest a shadow gets."""
+OTHER_LIGHT = {0.4: 0.08, 0.55: 0.08, 0.7: 0.08, 0.85: 0.08, 1.2: 0.08}
+"""Weights of colour models in other light, by the factor on RGB values: hard shadows of a lamp leave 0.4."""
 GREY = 128.0
 """Where 8-bit Lab has no colour."""
 MOST_GROWTH = 1.5
@@ -99,8 +101,9 @@ class ColourTracker:
         mask = clicked_mask(picture, click_px, robot, self.cfg)
         near, touched = grow(mask, 3), grow(robot, 3)
         core = shrink(mask, 1)
-        self._object = _log(histogram(picture[core if core.sum() >= SPECK_PX else mask]))
-        self._rest = _log(histogram(picture[~near & ~touched]))
+        mine = picture[core if core.sum() >= SPECK_PX else mask]
+        self._object, self._as_clicked = _log(_in_any_light(mine)), _log(histogram(mine))
+        self._rest = _log(_in_any_light(picture[~near & ~touched]))
         # Grey of any lightness until it is seen: an arm may begin outside the picture.
         inner = shrink(robot, 2) & ~near
         self._robot = _log(histogram(picture[inner] if inner.sum() >= 50 else _greys()))
@@ -118,7 +121,9 @@ class ColourTracker:
         """Return the object in the next picture."""
         lab = cv2.GaussianBlur(_lab8(picture), (0, 0), 0.8)
         expected = _moved(self._mask, self._motion)
-        own = np.take(self._object, _cells8(lab))
+        # A dark hand looks like many things in a shadow: before the robot, only the clicked colours count.
+        cells = _cells8(lab)
+        own = np.where(robot, np.take(self._as_clicked, cells), np.take(self._object, cells))
         score = self._scores(lab, own, robot, expected)
         mask = self._chosen(score, own, expected)
         seen, should = float(mask.sum()), max(1.0, float(expected.sum()))
@@ -145,7 +150,7 @@ class ColourTracker:
         cells = _cells8(lab)
         rest = np.take(self._rest, cells)
         apart = self._unlike_behind(lab.astype(np.float32))
-        rest = np.where(self._known, np.maximum(4.0 - 0.04 * apart, _FLOOR - 2.0), rest)
+        rest = np.where(self._known, np.maximum(9.0 - 0.10 * apart, _FLOOR - 2.0), rest)
         arm = np.take(self._robot, cells) + np.where(robot, 0.0, -4.0).astype(np.float32)
         arm[grow(robot, 2) & ~robot] += 2.0
         away = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)
@@ -160,8 +165,9 @@ class ColourTracker:
         # In a shadow hue stays and colour fades with the light.
         share = lab[..., 0] / np.maximum(self._behind[..., 0], 1.0)
         faded = (lab[..., 1:] - GREY) - share[..., None] * (self._behind[..., 1:] - GREY)
-        is_darker = (share < 1.0) & (share > DARKEST)
-        shaded = np.where(is_darker, SHADED_COST + (faded**2).sum(-1), np.inf)
+        # What was in a shadow at first is brighter without it.
+        is_other_light = (share < 1 / DARKEST) & (share > DARKEST)
+        shaded = np.where(is_other_light, SHADED_COST + (faded**2).sum(-1), np.inf)
         return np.minimum(lit, shaded)
 
     def _chosen(self, score: np.ndarray, own: np.ndarray, expected: np.ndarray) -> np.ndarray:
@@ -292,6 +298,15 @@ def _apart_from_surroundings(picture: np.ndarray, robot: np.ndarray) -> np.ndarr
 _BINS = np.array([12, 24, 24])
 """As `scene.colour.histogram` counts."""
 _FLOOR = -4.0
+
+
+def _in_any_light(pixels: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "light a b"]:
+    """Return the colours' histogram, with some weight on the same colours in shadows and in more light."""
+    total = (1 - sum(OTHER_LIGHT.values())) * histogram(pixels)
+    for factor, weight in OTHER_LIGHT.items():
+        lit = np.clip(factor * pixels.astype(np.float32), 0, 255).astype(np.uint8)
+        total = total + weight * histogram(lit)
+    return total.astype(np.float32)
 
 
 def _log(hist: np.ndarray) -> Float32[np.ndarray, "cell"]:
