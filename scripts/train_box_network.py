@@ -47,7 +47,7 @@ from v2p_data.scene.fitting.cuboid_network import (
     LOG_SD,
     TAIL,
     WINDOW_SHARE,
-    BoxNetwork,
+    CuboidNetwork,
     aim_at,
     planes_of,
 )
@@ -304,7 +304,7 @@ def loss_of(said: Float[torch.Tensor, "n 7"], truth: Float[torch.Tensor, "n 3"])
 
 
 @torch.inference_mode()
-def measure(net: BoxNetwork, held_out: list[Scene]) -> str:
+def measure(net: CuboidNetwork, held_out: list[Scene]) -> str:
     """Return how far the network is off on views of scenes held out, all changed the same way each time, in words."""
     net.eval()
     rng, said, truth = rng_for(0, "box network", "held out"), [], []
@@ -341,7 +341,7 @@ def main() -> None:
         numbers = range(args.start, args.start + args.scenes)
         draw_all(partial(make_scene, args.along), numbers, args.out, args.jobs)
     else:
-        learn(BoxNetwork, varied, loss_of, measure, BATCH, "box network", args)
+        learn(CuboidNetwork, varied, loss_of, measure, BATCH, "box network", args)
 
 
 if __name__ == "__main__":

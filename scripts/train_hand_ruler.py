@@ -45,7 +45,7 @@ from v2p_data.scene.fitting.hand_scale import (
     TOUCHING_M,
     TOWARDS_ARM,
     WINDOW_M,
-    RulerNetwork,
+    HandScaleNetwork,
     planes_of,
     window,
 )
@@ -224,7 +224,7 @@ def loss_of(said: Float[torch.Tensor, "n 2"], off: Float[torch.Tensor, "n"]) -> 
 
 
 @torch.inference_mode()
-def measure(net: RulerNetwork, held_out: list[Scene]) -> str:
+def measure(net: HandScaleNetwork, held_out: list[Scene]) -> str:
     """Return how far the network is off on views of scenes held out, all changed the same way each time, in words."""
     net.eval()
     rng, off, stated = rng_for(0, "hand network", "held out"), [], []
@@ -251,7 +251,7 @@ def main() -> None:
         numbers = range(args.start, args.start + args.scenes)
         draw_all(make_scene, numbers, args.out, args.jobs)
     else:
-        learn(RulerNetwork, varied, loss_of, measure, BATCH, "hand network", args)
+        learn(HandScaleNetwork, varied, loss_of, measure, BATCH, "hand network", args)
 
 
 if __name__ == "__main__":

@@ -30,13 +30,13 @@ from training import draw_all
 from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS as TASK_KINDS
 from v2p_data.scene.frames.mask_ops import iou
-from v2p_data.scene.frames.segmentation import watch
-from v2p_data.scene.frames.stabilise import steadied
-from v2p_data.scene.frames.working_clip import footage_of
-from v2p_data.scene.grounding.ground_objects import sight
+from v2p_data.scene.frames.segmentation import segment_clip
+from v2p_data.scene.frames.stabilise import stabilised
+from v2p_data.scene.frames.working_clip import working_clip_of
+from v2p_data.scene.grounding.ground_objects import ground_objects
 from v2p_data.scene.grounding.static_objects import (
-    Candidate,
-    Search,
+    StaticCandidate,
+    StaticSearch,
     candidates,
     odds_of,
     overlaps_of,
@@ -103,24 +103,24 @@ def make_clip(job: tuple[int, Path]) -> str:
     return ""
 
 
-def candidates_in(clip: Clip, phrase: str) -> list[Candidate]:
+def candidates_in(clip: Clip, phrase: str) -> list[StaticCandidate]:
     """Return the candidates for a phrase of a clip's caption."""
     meaning = parse_caption(clip.caption, clip.objects)
-    footage = footage_of(clip)
-    steady = steadied(clip, footage)
+    working = working_clip_of(clip)
+    steady = stabilised(clip, working)
     if steady is not clip:
-        clip, footage = steady, footage_of(steady)
-    seen = sight(clip, footage, meaning, watch(clip, footage), min_found=0.0)
-    assert seen.watched is not None
-    search = Search(
-        footage=seen.footage,
+        clip, working = steady, working_clip_of(steady)
+    seen = ground_objects(clip, working, meaning, segment_clip(clip, working), min_found=0.0)
+    assert seen.segmentation is not None
+    search = StaticSearch(
+        working=seen.working,
         table=seen.table,
-        watched=seen.watched,
+        segmentation=seen.segmentation,
         phrase=phrase,
         moved=seen.objects[0].noun,
         kind=meaning.kind,
         ends=(seen.objects[0].first, seen.objects[0].last),
-        taken=np.zeros(footage.shape, bool),
+        taken=np.zeros(working.shape, bool),
     )
     return candidates(search)
 

@@ -10,8 +10,8 @@ import pytest
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.classes import CLASSES, TABLE
-from v2p_data.scene.frames.segmentation import Watched
-from v2p_data.scene.frames.working_clip import Footage, footage_of
+from v2p_data.scene.frames.segmentation import Segmentation
+from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
 from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.video.clip import Clip
 
@@ -96,16 +96,16 @@ def draw() -> Callable[..., Clip]:
 
 
 PARTS_PX, PARTS_TABLE = (90, 120), (150, 140, 120)
-"""(height, width) and table colour of what `watched_of` draws."""
+"""(height, width) and table colour of what `segmentation_of` draws."""
 type Parts = list[tuple[np.ndarray, tuple[int, int, int], int]]
 """Per thing in one frame its mask, colour and class, drawn in order."""
 
 
 @pytest.fixture(scope="session")
-def watched_of() -> Callable[[list[Parts]], tuple[Footage, Watched]]:
-    """Return what makes footage of coloured masks on a table, and the word of a network that sees their classes."""
+def segmentation_of() -> Callable[[list[Parts]], tuple[WorkingClip, Segmentation]]:
+    """Return what makes working clip of coloured masks on a table, and the word of a network that sees their classes."""
 
-    def make(parts_by_frame: list[Parts]) -> tuple[Footage, Watched]:
+    def make(parts_by_frame: list[Parts]) -> tuple[WorkingClip, Segmentation]:
         frames, planes = [], []
         for parts in parts_by_frame:
             image = np.full((*PARTS_PX, 3), PARTS_TABLE, np.uint8)
@@ -115,8 +115,8 @@ def watched_of() -> Callable[[list[Parts]], tuple[Footage, Watched]]:
             frames.append(image)
             planes.append(0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None]))
         n, (h0, w0) = len(frames), PARTS_PX
-        footage = footage_of(_clip(np.stack(frames)))
-        h, w = footage.shape
+        working = working_clip_of(_clip(np.stack(frames)))
+        h, w = working.shape
         rows, columns = (np.arange(h) * h0) // h, (np.arange(w) * w0) // w
         large = np.stack(planes).astype(np.float32)[:, :, rows][..., columns]
         camera = SeenCamera(
@@ -126,7 +126,7 @@ def watched_of() -> Callable[[list[Parts]], tuple[Footage, Watched]]:
             table_width_m=0.9,
             table_width_sd=0.2,
         )
-        return footage, Watched(
+        return working, Segmentation(
             idx=np.arange(n), shares=large, early=large[0], late=large[-1], camera=camera
         )
 

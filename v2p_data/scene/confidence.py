@@ -10,13 +10,13 @@ from jaxtyping import Float
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.scene.data_types import Placement, Sights
+from v2p_data.scene.data_types import GroundedObjects, Placement
 from v2p_data.scene.fitting.placement import vote_of
 from v2p_data.scene.fitting.trajectory import TOUCH_PX
 from v2p_data.scene.frames.colour import balance, colour_match, named_colours
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
 from v2p_data.scene.frames.segmentation import hand_at
-from v2p_data.scene.grounding.ground_objects import stands_on
+from v2p_data.scene.grounding.ground_objects import rests_on_table
 from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
 from v2p_data.scene.scale.nouns import is_clear
 
@@ -38,29 +38,29 @@ class Cue:
     """0 to 1."""
 
 
-def cues_of(sights: Sights, placement: Placement, kind: Kind) -> tuple[Cue, ...]:
+def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tuple[Cue, ...]:
     """Return everything that the scene's confidence is the product of."""
     cues: list[Cue] = []
 
     def add(stage: str, what: str, value: float) -> None:
         cues.append(Cue(stage=stage, what=what, value=float(np.clip(value, 0, 1))))
 
-    for s, placed in zip(sights.objects, placement.objects, strict=True):
+    for s, placed in zip(grounded.objects, placement.objects, strict=True):
         which = f"'{s.phrase}'"
         add("grounding", f"finding {which}" + (f" ({s.why})" if s.why else ""), s.sure)
         if not s.hinted and (words := named_colours(s.phrase)):
-            image = sights.footage.rgb[s.at]
+            image = grounded.working.rgb[s.at]
             match = float(colour_match(balance(image), words)[s.first].mean())
             add("grounding", f"colour of {which}", 0.4 + 0.6 * match / _COLOURED)
         if s.moves:
-            add("segmentation", f"track of {which} from start to end", 0.8 + 0.7 * s.meets)
+            add("segmentation", f"track of {which} from start to end", 0.8 + 0.7 * s.agreement)
         off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
         add("size", f"size of {which}", np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2))
         covers = placed.first.iou / attainable_iou(s.first)
         add("shape", f"outline of {which}", max(0.1, 0.5 + (covers - 0.6) / 0.6))
         if not s.moves:
             continue
-        if s.swallowed or placed.in_fist:
+        if s.hidden_in_container or placed.hidden_in_hand:
             add("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
             continue
         covers = placed.last.iou / attainable_iou(placed.last_mask)
@@ -69,9 +69,9 @@ def cues_of(sights: Sights, placement: Placement, kind: Kind) -> tuple[Cue, ...]
         # Of what is put into something only the upper part is left to see.
         least = 0.8 if KINDS[kind].hides else 0.5
         add("pose", f"{which} seen at the end", max(0.1, least + seen))
-    thing = sights.objects[0]
+    thing = grounded.objects[0]
     add("camera", "camera height", height_plausibility(placement.height_m))
-    if not stands_on(sights.table, thing.first, sights.watched):
+    if not rests_on_table(grounded.table, thing.first, grounded.segmentation):
         add("grounding", "standing on the table at first", 0.6)
     if not (thing.noun.known or thing.known_m):
         add("size", f"knowing what '{thing.phrase}' is", 0.9)
@@ -83,17 +83,17 @@ def cues_of(sights: Sights, placement: Placement, kind: Kind) -> tuple[Cue, ...]
     return tuple(cues)
 
 
-def held_at_first(sights: Sights, placement: Placement) -> bool:
+def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:
     """Return whether a hand seems to hold the manipulated object in the air when the clip begins.
 
     Then it seems larger than where it ends, and has a hand beside it or no table under it.
     """
-    thing = sights.objects[0]
-    if placement.objects[0].grown < _GROWN:
+    thing = grounded.objects[0]
+    if placement.objects[0].log_growth < _GROWN:
         return False
-    if not stands_on(sights.table, thing.first, sights.watched):
+    if not rests_on_table(grounded.table, thing.first, grounded.segmentation):
         return True
-    hand = None if sights.watched is None else hand_at(sights.watched, thing.at)
+    hand = None if grounded.segmentation is None else hand_at(grounded.segmentation, thing.at)
     return hand is not None and bool((hand & grow(thing.first, TOUCH_PX)).any())
 
 
@@ -133,7 +133,7 @@ def check_confidence(cues: tuple[Cue, ...], least: float) -> float:
 
 def check_motion(
     kind: Kind,
-    sights: Sights,
+    grounded: GroundedObjects,
     placement: Placement,
     T_world_objs: list[Float[np.ndarray, "_ 4 4"]],
     size_m: tuple[float, float, float],
@@ -155,14 +155,14 @@ def check_motion(
     elif kind == "tip_over":
         value, least = placement.upright_cost - placement.objects[0].last.cost, -0.03
         said = "fits the picture better tipped than upright"
-    elif KINDS[kind].comes_near and several and not sights.objects[1].moves:
+    elif KINDS[kind].comes_near and several and not grounded.objects[1].moves:
         gaps = [
             float(np.linalg.norm((T[:3, 3] - T_world_objs[1][0][:3, 3])[:2]))
             for T in (own[0], own[-1])
         ]
         value, least, said = gaps[0] - gaps[1], 0.02, "comes nearer to the other"
     elif KINDS[kind].touches and several:
-        goal, last = grow(sights.objects[1].first, 6), sights.objects[0].last
+        goal, last = grow(grounded.objects[1].first, 6), grounded.objects[0].last
         # What is covered may be far smaller than what covers it.
         value, least = float((goal & last).sum() / max(1, min(last.sum(), goal.sum()))), 0.25
         said = "ends at the other"
@@ -171,7 +171,7 @@ def check_motion(
     if value < least:
         raise ItemRejectedError(
             "motion_contradicts_caption",
-            f"what was followed as '{sights.objects[0].phrase}' hardly {said} ({value:.2f}, at least {least:.2f} needed), "
+            f"what was followed as '{grounded.objects[0].phrase}' hardly {said} ({value:.2f}, at least {least:.2f} needed), "
             "so it is probably something else; mark it with a box in captions.json",
             round(value, 3),
         )

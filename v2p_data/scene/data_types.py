@@ -9,38 +9,38 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from v2p_data.geometry.camera import Camera
-from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.table import Table
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.camera_height import table_width_m
 from v2p_data.scene.scale.nouns import Noun
 from v2p_data.scene.schema import Observed, Role
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sighting:
+class ObjectTrack:
     """One object of the caption in the picture, before geometry."""
 
     phrase: str
     role: Role
     noun: Noun
     masks: Bool[np.ndarray, "time h w"] = field(repr=False)
-    """Its visible pixels in every footage frame."""
+    """Its visible pixels in every working frame."""
     quality: Float[np.ndarray, "time"] = field(repr=False)
     """How far to believe each mask, 0 to 1."""
     moves: bool
     at: int
-    """Footage frame that shows where it stands at first; the last one for what is uncovered."""
+    """Working frame that shows where it stands at first; the last one for what is uncovered."""
     known_m: tuple[float, float, float] | None
     """Its size where the user gave it."""
     sure: float
     """That these are the object's pixels, 0 to 1."""
     why: str
     """Why not surer."""
-    meets: float = 1.0
+    agreement: float = 1.0
     """How well the track from the start agrees with the one from the end, 0 to 1."""
     hinted: bool = False
-    swallowed: bool = False
+    hidden_in_container: bool = False
     """Whether it was last seen going into what hides it at the end; the masks from then on repeat the last one seen."""
     in_hand: bool = False
     """Whether a hand brings it and takes it away: it never rests on the table."""
@@ -55,15 +55,15 @@ class Sighting:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sights:
+class GroundedObjects:
     """Everything seen in a clip."""
 
-    objects: tuple[Sighting, ...]
+    objects: tuple[ObjectTrack, ...]
     """The manipulated one first."""
-    footage: Footage
+    working: WorkingClip
     """As given, now knowing the hand's colours."""
     table: Table
-    watched: Watched | None
+    segmentation: Segmentation | None
     """None where the network was not asked."""
     warnings: tuple[str, ...]
 
@@ -111,46 +111,46 @@ class Fit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placed:
+class PlacedObject:
     """One object in camera heights."""
 
     first: Fit
     last: Fit
     last_i: int
-    """Footage frame of the last pose."""
+    """Working frame of the last pose."""
     last_mask: Bool[np.ndarray, "h w"]
     hidden: Bool[np.ndarray, "h w"]
     """Where something may stand in front of it at first."""
     last_hidden: Bool[np.ndarray, "h w"]
     """The same at the last pose."""
     frames: tuple[int, ...]
-    """Footage frames with a pose, the first and the last among them."""
+    """Working frames with a pose, the first and the last among them."""
     T_world_objs: Float[np.ndarray, "pose 4 4"]
     confidences: tuple[float, ...]
     observed: tuple[Observed, ...]
     rival: float | None
     """By how much the next best way of lying covers the outlines worse; None where there is no other."""
-    in_fist: bool = False
+    hidden_in_hand: bool = False
     """Whether a hand hides it from the camera: then its poses go with the hand."""
     unseen: bool = False
     """Whether nothing shows where it ends: then it lies in the middle of what swallowed it."""
-    grown: float = 0.0
+    log_growth: float = 0.0
     """Logarithm of how much larger it seems where it starts than where it ends, if it lies on the table at both: what is held
     in the air is nearer to the camera, and seems larger."""
-    taken_off: bool = False
+    lifted_off: bool = False
     """Whether it lies on something at first: then its last outline, on the table, shows its shape."""
     T_world_seen: Float[np.ndarray, "4 4"] | None = None
-    """Where the sighting's first outline shows it, if that is not its first pose."""
+    """Where the object tracks's first outline shows it, if that is not its first pose."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Placement:
-    """Camera and objects, in the order of the sightings."""
+    """Camera and objects, in the order of the object tracks."""
 
     camera: Camera
     """At working size, one camera height above the table."""
     pitch_rad: float
-    objects: tuple[Placed, ...]
+    objects: tuple[PlacedObject, ...]
     height_m: float
     """Metres per camera height."""
     scale_spread: float

@@ -1,6 +1,6 @@
 """The order of steps from a clip to a scene.
 
-footage -> camera still? -> what moved, what stayed, frame by frame -> camera, shapes and poses in camera heights -> metres
+working clip -> camera still? -> what moved, what stayed, frame by frame -> camera, shapes and poses in camera heights -> metres
 -> does the motion fit the caption? -> confidence
 """
 
@@ -33,22 +33,28 @@ from v2p_data.scene.confidence import (
     cues_of,
     held_at_first,
 )
-from v2p_data.scene.data_types import CameraGuess, Placed, Placement, Sighting, Sights
+from v2p_data.scene.data_types import (
+    CameraGuess,
+    GroundedObjects,
+    ObjectTrack,
+    PlacedObject,
+    Placement,
+)
 from v2p_data.scene.fitting.by_model import camera_from_depth, poses_by_worker
-from v2p_data.scene.fitting.placement import UNSEEN_IOU, place, with_forms
-from v2p_data.scene.fitting.refine_pose import bent, refit
-from v2p_data.scene.fitting.ring_mask import pierced
+from v2p_data.scene.fitting.placement import UNSEEN_IOU, place, with_noun_variants
+from v2p_data.scene.fitting.refine_pose import refine_pose, warped_trajectory
+from v2p_data.scene.fitting.ring_mask import without_hole
 from v2p_data.scene.fitting.silhouette import three
-from v2p_data.scene.frames.segmentation import Watched, passed, watch
-from v2p_data.scene.frames.stabilise import steadied
-from v2p_data.scene.frames.working_clip import Footage, camera_shift_px, footage_of
+from v2p_data.scene.frames.segmentation import Segmentation, passers_by, segment_clip
+from v2p_data.scene.frames.stabilise import stabilised
+from v2p_data.scene.frames.working_clip import WorkingClip, camera_shift_px, working_clip_of
 from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
-from v2p_data.scene.grounding.ground_objects import sight, without_asides
+from v2p_data.scene.grounding.ground_objects import ground_objects, without_asides
 from v2p_data.scene.scale.nouns import Noun
 from v2p_data.scene.schema import Observed, Role, Symmetry
 from v2p_data.scene.shapes.by_worker import mesh_by_worker
 from v2p_data.scene.shapes.shape import ShapeChoice, ShapeConfig, best_shape
-from v2p_data.scene.shapes.silhouette_view import View
+from v2p_data.scene.shapes.silhouette_view import SilhouetteView
 from v2p_data.video.captions import parse_caption
 from v2p_data.video.clip import Clip
 
@@ -183,51 +189,57 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
             `motion_contradicts_caption` or `low_confidence`, with the number that decided.
     """
     meaning = parse_caption(clip.caption, clip.objects)
-    footage = footage_of(clip)
-    _check_change(footage)
-    steady = steadied(clip, footage)
+    working = working_clip_of(clip)
+    _check_change(working)
+    steady = stabilised(clip, working)
     if steady is not clip:
-        clip, footage = steady, footage_of(steady)
-    watched = watch(clip, footage) if cfg.ground.backend == "network" else None
-    _check_still(footage, watched, cfg)
+        clip, working = steady, working_clip_of(steady)
+    segmentation = segment_clip(clip, working) if cfg.ground.backend == "network" else None
+    _check_still(working, segmentation, cfg)
     boxes = None
     if cfg.ground.backend in DETECTORS:
-        boxes = detected(clip, footage, meaning.phrases, cfg.ground)
-    sights = sight(clip, footage, meaning, watched, cfg.min_found, boxes)
+        boxes = detected(clip, working, meaning.phrases, cfg.ground)
+    grounded = ground_objects(clip, working, meaning, segmentation, cfg.min_found, boxes)
     if cfg.segment.backend != "flow":
-        sights = replace(
-            sights, objects=segmented(clip, sights.footage, sights.objects, cfg.segment)
+        grounded = replace(
+            grounded, objects=segmented(clip, grounded.working, grounded.objects, cfg.segment)
         )
-    guess = _camera_guess(sights, cfg)
-    sights = replace(
-        sights, objects=with_forms(sights.footage, sights.objects, guess, meaning.kind)
+    guess = _camera_guess(grounded, cfg)
+    grounded = replace(
+        grounded,
+        objects=with_noun_variants(grounded.working, grounded.objects, guess, meaning.kind),
     )
     if cfg.depth.backend != "none":
-        guess = camera_from_depth(clip, sights.footage, sights.objects, guess, cfg.depth, rng)
+        guess = camera_from_depth(clip, grounded.working, grounded.objects, guess, cfg.depth, rng)
     placement = place(
-        sights.footage, sights.objects, meaning.kind, guess, cfg.max_poses, sights.watched
+        grounded.working,
+        grounded.objects,
+        meaning.kind,
+        guess,
+        cfg.max_poses,
+        grounded.segmentation,
     )
-    placement, shaped = _shaped(sights, placement)
-    objects = _estimates(clip, sights, placement, shaped, meaning.kind, cfg)
+    placement, shaped = _shaped(grounded, placement)
+    objects = _estimates(clip, grounded, placement, shaped, meaning.kind, cfg)
     contradiction = None
     try:
         poses = [thing.T_world_objs for thing in objects]
-        check_motion(meaning.kind, sights, placement, poses, objects[0].size_m)
+        check_motion(meaning.kind, grounded, placement, poses, objects[0].size_m)
     except ItemRejectedError as error:
         if cfg.check_motion:
             raise
         contradiction = error.detail
-    cues = cues_of(sights, placement, meaning.kind)
+    cues = cues_of(grounded, placement, meaning.kind)
     if confidence_of(cues) < cfg.min_confidence:
-        kept, warnings = without_asides(sights, meaning, clip)
+        kept, warnings = without_asides(grounded, meaning, clip)
         objects = [objects[k] for k in kept]
         placement = replace(placement, objects=tuple(placement.objects[k] for k in kept))
-        sights = replace(
-            sights,
-            objects=tuple(sights.objects[k] for k in kept),
-            warnings=(*sights.warnings, *warnings),
+        grounded = replace(
+            grounded,
+            objects=tuple(grounded.objects[k] for k in kept),
+            warnings=(*grounded.warnings, *warnings),
         )
-        cues = cues_of(sights, placement, meaning.kind)
+        cues = cues_of(grounded, placement, meaning.kind)
     origin = _origin(placement)
     return Reconstruction(
         clip=clip,
@@ -238,9 +250,12 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
         stages=by_stage(cues),
         cues=cues,
         scale_spread=placement.scale_spread,
-        least_found=min(s.sure for s in sights.objects),
+        least_found=min(s.sure for s in grounded.objects),
         contradiction=contradiction,
-        warnings=(*sights.warnings, *_remarks(meaning.kind, sights, placement, len(clip.frames))),
+        warnings=(
+            *grounded.warnings,
+            *_remarks(meaning.kind, grounded, placement, len(clip.frames)),
+        ),
     )
 
 
@@ -255,8 +270,10 @@ def slug_for(phrase: str, taken: set[str]) -> str:
     return name
 
 
-def _check_still(footage: Footage, watched: Watched | None, cfg: SceneConfig) -> None:
-    shift = camera_shift_px(footage, None if watched is None else passed(watched))
+def _check_still(
+    working: WorkingClip, segmentation: Segmentation | None, cfg: SceneConfig
+) -> None:
+    shift = camera_shift_px(working, None if segmentation is None else passers_by(segmentation))
     if shift > cfg.max_camera_shift_px:
         raise ItemRejectedError(
             "camera_moves",
@@ -266,10 +283,10 @@ def _check_still(footage: Footage, watched: Watched | None, cfg: SceneConfig) ->
         )
 
 
-def _check_change(footage: Footage) -> None:
-    change = np.zeros(footage.shape, np.float32)
-    for lab in footage.lab[1:]:
-        np.maximum(change, np.linalg.norm(lab - footage.lab[0], axis=-1), out=change)
+def _check_change(working: WorkingClip) -> None:
+    change = np.zeros(working.shape, np.float32)
+    for lab in working.lab[1:]:
+        np.maximum(change, np.linalg.norm(lab - working.lab[0], axis=-1), out=change)
     share = float((change > 15).mean())
     if share < 0.003:
         raise ItemRejectedError(
@@ -279,9 +296,9 @@ def _check_change(footage: Footage) -> None:
         )
 
 
-def _camera_guess(sights: Sights, cfg: SceneConfig) -> CameraGuess:
+def _camera_guess(grounded: GroundedObjects, cfg: SceneConfig) -> CameraGuess:
     """Return what is known of the camera: the user's word goes before the network's, that before what is usual."""
-    seen = None if sights.watched is None else sights.watched.camera
+    seen = None if grounded.segmentation is None else grounded.segmentation.camera
     guess = CameraGuess(
         pitch_rad=_USUAL_PITCH_RAD, pitch_sd_rad=cfg.pitch_spread_rad, fov_rad=_USUAL_FOV_RAD
     )
@@ -293,10 +310,10 @@ def _camera_guess(sights: Sights, cfg: SceneConfig) -> CameraGuess:
             table_width_m=seen.table_width_m,
             table_width_sd=_WIDTH_DOUBT * seen.table_width_sd,
         )
-    return told(guess, cfg)
+    return with_measured_camera(guess, cfg)
 
 
-def told(guess: CameraGuess, cfg: SceneConfig) -> CameraGuess:
+def with_measured_camera(guess: CameraGuess, cfg: SceneConfig) -> CameraGuess:
     """Return a guess of the camera with what the user measured in place of what was guessed.
 
     How large things are that one sees follows from the height together with pitch and focal length: where these are guessed,
@@ -329,12 +346,12 @@ class _Shaped:
     T_world_objs: Float[np.ndarray, "pose 4 4"]
 
 
-def _shaped(sights: Sights, placement: Placement) -> tuple[Placement, list[_Shaped]]:
+def _shaped(grounded: GroundedObjects, placement: Placement) -> tuple[Placement, list[_Shaped]]:
     """Return the objects' meshes and poses, and the placement knowing how well the meshes cover the last outlines."""
     origin, height = _origin(placement), placement.height_m
     work = _metric(placement.camera, origin, height)
     objects, out = list(placement.objects), []
-    for k, (s, placed) in enumerate(zip(sights.objects, placement.objects, strict=True)):
+    for k, (s, placed) in enumerate(zip(grounded.objects, placement.objects, strict=True)):
         length, width, tall = (float(v) * height for v in placed.first.size)
         seen = placed.T_world_objs[0] if placed.T_world_seen is None else placed.T_world_seen
         at_first, *rest = (
@@ -342,23 +359,30 @@ def _shaped(sights: Sights, placement: Placement) -> tuple[Placement, list[_Shap
             for T in (seen, *placed.T_world_objs)
         )
         poses = np.stack(rest)
-        first = View(mask=s.first, T_world_obj=at_first, hidden=placed.hidden)
-        last = View(mask=placed.last_mask, T_world_obj=poses[-1], hidden=placed.last_hidden)
+        first = SilhouetteView(mask=s.first, T_world_obj=at_first, hidden=placed.hidden)
+        last = SilhouetteView(
+            mask=placed.last_mask, T_world_obj=poses[-1], hidden=placed.last_hidden
+        )
         shape = best_shape(
-            [last if placed.taken_off else first],
+            [last if placed.lifted_off else first],
             work,
             (length, width, tall),
             s.noun,
             ShapeConfig(handles=s.known_m is None),
         )
         poses = poses @ shape.T_obj_shape
-        shows_it = s.moves and not s.swallowed and placed.last.iou > UNSEEN_IOU and not s.in_hand
-        if shows_it and shape.kind != "primitive" and not placed.taken_off:
+        shows_it = (
+            s.moves
+            and not s.hidden_in_container
+            and placed.last.iou > UNSEEN_IOU
+            and not s.in_hand
+        )
+        if shows_it and shape.kind != "primitive" and not placed.lifted_off:
             in_air = placed.observed[-1] == "no_depth"
             view = replace(last, T_world_obj=poses[-1])
-            found = refit(view, poses[0], shape.mesh, work, in_air=in_air)
+            found = refine_pose(view, poses[0], shape.mesh, work, in_air=in_air)
             if found is not None:
-                poses = bent(poses, found.T_world_mesh)
+                poses = warped_trajectory(poses, found.T_world_mesh)
                 covered = replace(placed.last, iou=max(placed.last.iou, found.iou))
                 objects[k] = replace(placed, last=covered)
         out.append(_Shaped(shape=shape, T_world_objs=poses))
@@ -367,22 +391,22 @@ def _shaped(sights: Sights, placement: Placement) -> tuple[Placement, list[_Shap
 
 def _estimates(
     clip: Clip,
-    sights: Sights,
+    grounded: GroundedObjects,
     placement: Placement,
     shaped: list[_Shaped],
     kind: Kind,
     cfg: SceneConfig,
 ) -> list[Estimate]:
-    footage, height = sights.footage, placement.height_m
+    working, height = grounded.working, placement.height_m
     work = _metric(placement.camera, _origin(placement), height)
     taken: set[str] = set()
     out = []
-    for s, placed, made in zip(sights.objects, placement.objects, shaped, strict=True):
+    for s, placed, made in zip(grounded.objects, placement.objects, shaped, strict=True):
         name = slug_for(s.phrase, taken)
         taken.add(name)
         shape, poses = made.shape, made.T_world_objs
         frames, sure, observed = placed.frames, placed.confidences, placed.observed
-        if not out and held_at_first(sights, placement):
+        if not out and held_at_first(grounded, placement):
             sure = (min(sure[0], _HELD_SURE), *sure[1:])
         size, mesh, parts, how = shape.size_m, shape.mesh, shape.parts, shape.reason
         plain = shape.kind == "primitive" and not s.noun.bore and not cfg.mesh.worker
@@ -395,20 +419,20 @@ def _estimates(
             poses = poses @ _OVER
             mesh, parts = _turned(mesh), tuple(_turned(part) for part in parts)
         if cfg.mesh.worker:
-            mesh, repair = mesh_by_worker(clip, footage, s, size, cfg.mesh)
+            mesh, repair = mesh_by_worker(clip, working, s, size, cfg.mesh)
             parts, how = (), "made by the mesh worker from one picture, scaled to the outline"
             if repair != "none":
                 how += f"; its mesh was not closed and was mended ({repair})"
             size = three(mesh.extents)
         if cfg.pose.worker and s.moves:
             camera = _clip_camera(clip, placement, _origin(placement))
-            poses, marks = poses_by_worker(clip, footage, s.masks, mesh, camera, cfg.pose)
+            poses, marks = poses_by_worker(clip, working, s.masks, mesh, camera, cfg.pose)
             frames, sure = tuple(range(len(poses))), tuple(float(c) for c in marks)
             observed = ("full",) * len(poses)
-        image = footage.rgb[s.at] if s.moves else footage.late if s.at else footage.early
-        masks = _mask_track(footage, s, placed)
+        image = working.rgb[s.at] if s.moves else working.late if s.at else working.early
+        masks = _mask_track(working, s, placed)
         if s.noun.bore:
-            masks = _with_hole(masks, s.noun.bore, size, frames, footage, poses, work)
+            masks = _with_hole(masks, s.noun.bore, size, frames, working, poses, work)
         out.append(
             Estimate(
                 name=name,
@@ -417,7 +441,7 @@ def _estimates(
                 noun=s.noun,
                 size_m=size,
                 rgba=_colour_in(image, s.first),
-                frames=tuple(int(footage.frame_idx[i]) for i in frames),
+                frames=tuple(int(working.frame_idx[i]) for i in frames),
                 T_world_objs=poses,
                 confidences=tuple(round(c, 3) for c in sure),
                 masks=masks,
@@ -453,17 +477,17 @@ def _metric(camera: Camera, origin: Float[np.ndarray, "3"], height_m: float) -> 
 
 
 def _mask_track(
-    footage: Footage, s: Sighting, placed: Placed
+    working: WorkingClip, s: ObjectTrack, placed: PlacedObject
 ) -> dict[int, Bool[np.ndarray, "h w"]]:
     """Return the believable masks by clip frame."""
     masks = {
-        int(footage.frame_idx[i]): s.masks[i]
+        int(working.frame_idx[i]): s.masks[i]
         for i in range(len(s.masks))
         if s.quality[i] > _LEAST_QUALITY and s.masks[i].any()
     }
-    masks[int(footage.frame_idx[s.at])] = s.first
-    if s.moves and not (s.swallowed or placed.in_fist):
-        masks[int(footage.frame_idx[placed.last_i])] = placed.last_mask
+    masks[int(working.frame_idx[s.at])] = s.first
+    if s.moves and not (s.hidden_in_container or placed.hidden_in_hand):
+        masks[int(working.frame_idx[placed.last_i])] = placed.last_mask
     return dict(sorted(masks.items()))
 
 
@@ -472,49 +496,51 @@ def _with_hole(
     bore: float,
     size_m: tuple[float, float, float],
     frames: tuple[int, ...],
-    footage: Footage,
+    working: WorkingClip,
     T_world_objs: Float[np.ndarray, "pose 4 4"],
     camera: Camera,
 ) -> dict[int, Bool[np.ndarray, "h w"]]:
     """Return a ring's masks without what is seen through it, posed as in the nearest frame that has a pose."""
-    posed = footage.frame_idx[list(frames)]
+    posed = working.frame_idx[list(frames)]
     return {
-        i: pierced(mask, size_m, bore, T_world_objs[int(np.abs(posed - i).argmin())], camera)
+        i: without_hole(mask, size_m, bore, T_world_objs[int(np.abs(posed - i).argmin())], camera)
         for i, mask in masks.items()
     }
 
 
-def _remarks(kind: Kind, sights: Sights, placement: Placement, num_frames: int) -> list[str]:
+def _remarks(
+    kind: Kind, grounded: GroundedObjects, placement: Placement, num_frames: int
+) -> list[str]:
     spread = placement.scale_spread
-    by_network = " and from what the network makes of the picture" if sights.watched else ""
+    by_network = " and from what the network makes of the picture" if grounded.segmentation else ""
     out = [
         f"scale comes from usual sizes{by_network}: all lengths may be off by {spread:.0%} together"
     ]
     out += [
         f"'{s.phrase}' is no known noun; its size is a guess"
-        for s in sights.objects
+        for s in grounded.objects
         if not s.noun.known
     ]
     out += [
         f"outlines hardly tell how '{s.phrase}' lies: the next best way covers them {placed.rival:.3f} worse"
-        for s, placed in zip(sights.objects, placement.objects, strict=True)
+        for s, placed in zip(grounded.objects, placement.objects, strict=True)
         if placed.rival is not None and placed.rival < _CLOSE_RIVAL
     ]
     thing = placement.objects[0]
     if thing.unseen:
-        phrase, goal = (s.phrase for s in sights.objects[:2])
+        phrase, goal = (s.phrase for s in grounded.objects[:2])
         out.append(
             f"nothing shows where '{phrase}' ends: it is taken to lie in the middle of '{goal}'"
         )
-    if held_at_first(sights, placement):
+    if held_at_first(grounded, placement):
         out.append(
-            f"'{sights.objects[0].phrase}' seems {np.expm1(thing.grown):.0%} larger at first than at the end, as if a hand held it in the "
+            f"'{grounded.objects[0].phrase}' seems {np.expm1(thing.log_growth):.0%} larger at first than at the end, as if a hand held it in the "
             "air: its first pose is where it would stand on the table"
         )
-    last_frame = int(sights.footage.frame_idx[thing.last_i])
+    last_frame = int(grounded.working.frame_idx[thing.last_i])
     if kind == "lift_up":
         out.append("one view shows no depth in mid-air: the lift is taken to go straight up")
-        if thing.in_fist:
+        if thing.hidden_in_hand:
             out.append("the hand hides what it lifts: it is taken to go with the hand")
         if last_frame < num_frames - 1:
             out.append(f"the lift is highest at frame {last_frame}; what comes after is left out")
@@ -535,7 +561,7 @@ def _colour_in(
     return round(float(r), 3), round(float(g), 3), round(float(b), 3), 1.0
 
 
-def _sources(s: Sighting) -> dict[str, str]:
+def _sources(s: ObjectTrack) -> dict[str, str]:
     word = f"usual for '{s.noun.word}'" if s.noun.known else "a guess for an unknown noun"
     size = "given by the user" if s.known_m else f"outline in the video, scale {word}"
     return {"size": size, "mass": f"{word}, scaled with volume", "friction": word}

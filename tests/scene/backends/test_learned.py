@@ -14,9 +14,9 @@ from v2p_data.scene.backends.config import (
     MeshConfig,
     SegmentConfig,
 )
-from v2p_data.scene.data_types import CameraGuess, Sighting
+from v2p_data.scene.data_types import CameraGuess, ObjectTrack
 from v2p_data.scene.fitting.by_model import camera_from_depth
-from v2p_data.scene.frames.working_clip import footage_of
+from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.scene.grounding.by_model import detected, segmented
 from v2p_data.scene.reconstruct import SceneConfig, reconstruct
 from v2p_data.scene.scale.nouns import noun_for
@@ -33,15 +33,15 @@ def clip(draw):
 
 
 @pytest.fixture(scope="module")
-def footage(clip):
-    return footage_of(clip)
+def working(clip):
+    return working_clip_of(clip)
 
 
 @pytest.fixture(scope="module")
-def box(footage):
-    red, _, blue = np.moveaxis(footage.rgb.astype(int), -1, 0)
+def box(working):
+    red, _, blue = np.moveaxis(working.rgb.astype(int), -1, 0)
     masks = blue > red + 60
-    return Sighting(
+    return ObjectTrack(
         phrase="blue box",
         role="manipulated",
         noun=noun_for("blue box"),
@@ -55,10 +55,10 @@ def box(footage):
     )
 
 
-def test_a_worker_s_mesh_is_brought_to_the_fitted_size(clip, footage, box):
+def test_a_worker_s_mesh_is_brought_to_the_fitted_size(clip, working, box):
     size_m = (0.09, 0.07, 0.05)
 
-    mesh, repair = mesh_by_worker(clip, footage, box, size_m, MeshConfig(worker=COMMAND))
+    mesh, repair = mesh_by_worker(clip, working, box, size_m, MeshConfig(worker=COMMAND))
 
     assert mesh.is_watertight
     assert repair == "none"
@@ -66,10 +66,10 @@ def test_a_worker_s_mesh_is_brought_to_the_fitted_size(clip, footage, box):
     np.testing.assert_allclose(mesh.bounds.mean(0), 0, atol=1e-9)
 
 
-def test_a_depth_worker_s_table_sets_the_camera(clip, footage, box):
+def test_a_depth_worker_s_table_sets_the_camera(clip, working, box):
     cfg = DepthConfig(backend="worker", worker=COMMAND)
 
-    guess = camera_from_depth(clip, footage, [box], GUESS, cfg, np.random.default_rng(0))
+    guess = camera_from_depth(clip, working, [box], GUESS, cfg, np.random.default_rng(0))
 
     # what scripts/example_worker.py says of its camera
     assert guess.height_m == pytest.approx(0.5, rel=0.02)
@@ -77,7 +77,7 @@ def test_a_depth_worker_s_table_sets_the_camera(clip, footage, box):
     assert guess.fov_rad == pytest.approx(1.01, abs=1e-6)
 
 
-def test_a_detector_s_boxes_lie_in_the_picture_and_are_one_per_phrase(clip, footage, checkpoint):
+def test_a_detector_s_boxes_lie_in_the_picture_and_are_one_per_phrase(clip, working, checkpoint):
     cfg = GroundConfig(
         backend="grounding_dino",
         model=checkpoint("grounding_dino"),
@@ -85,7 +85,7 @@ def test_a_detector_s_boxes_lie_in_the_picture_and_are_one_per_phrase(clip, foot
         text_threshold=0.0,
     )
 
-    boxes = detected(clip, footage, ("blue box", "red cup"), cfg)
+    boxes = detected(clip, working, ("blue box", "red cup"), cfg)
 
     h, w = clip.frames.shape[1:3]
     assert set(boxes) <= {"blue box", "red cup"}
@@ -97,11 +97,11 @@ def test_a_detector_s_boxes_lie_in_the_picture_and_are_one_per_phrase(clip, foot
 
 
 def test_a_video_model_s_masks_replace_the_track_and_keep_the_found_mask_where_it_sees_nothing(
-    clip, footage, box, checkpoint
+    clip, working, box, checkpoint
 ):
     cfg = SegmentConfig(backend="sam2", model=checkpoint("sam2"))
 
-    (seen,) = segmented(clip, footage, [box], cfg)
+    (seen,) = segmented(clip, working, [box], cfg)
 
     assert seen.masks.shape == box.masks.shape
     assert seen.masks[0].any()

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.errors import V2PError
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.fitting import cuboid_network
-from v2p_data.scene.fitting.cuboid_network import BoxGuess, aim_at, box_guess, box_network
+from v2p_data.scene.fitting.cuboid_network import CuboidGuess, aim_at, box_network, cuboid_guess
 from v2p_data.scene.fitting.silhouette import camera_above
 
 SHAPE, PITCH_RAD, FOV_RAD = (240, 320), 0.6, 0.9
@@ -46,7 +46,7 @@ def standing(size, yaw_rad, x=1.4, y=0.1):
     return transform(turned(yaw_rad), np.array([x, y, size[2] / 2]))
 
 
-GUESS = BoxGuess(
+GUESS = CuboidGuess(
     azimuth_rad=0.1,
     fourfold=(8 * np.cos(4 * 0.4), 8 * np.sin(4 * 0.4)),
     twofold=(0.7 * np.cos(2 * 0.4), 0.7 * np.sin(2 * 0.4)),
@@ -109,7 +109,7 @@ def test_a_cube_s_yaw_is_seen_by_its_faces(yaw_deg):
     size, yaw = (0.2, 0.2, 0.2), np.radians(yaw_deg)
     rgb, mask = drawn(size, standing(size, yaw), camera)
 
-    guess = box_guess(rgb, mask, camera)
+    guess = cuboid_guess(rgb, mask, camera)
 
     right = guess.cost(size, standing(size, yaw))
     for off in (20, 45, 70):
@@ -122,7 +122,7 @@ def test_the_longer_side_is_seen(yaw_deg):
     size, yaw = (0.3, 0.15, 0.12), np.radians(yaw_deg)
     rgb, mask = drawn(size, standing(size, yaw), camera)
 
-    guess = box_guess(rgb, mask, camera)
+    guess = cuboid_guess(rgb, mask, camera)
 
     across = standing(size, yaw + np.pi / 2)
     assert guess.cost(size, standing(size, yaw)) + 3 < guess.cost(size, across)

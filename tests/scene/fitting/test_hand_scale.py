@@ -8,12 +8,17 @@ import pytest
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.fitting import hand_scale
-from v2p_data.scene.fitting.hand_scale import height_by_hand, look_at, planes_of, ruler_network
+from v2p_data.scene.fitting.hand_scale import (
+    hand_scale_network,
+    height_from_hand,
+    planes_of,
+    view_hand,
+)
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.classes import HAND
 from v2p_data.scene.frames.hand import HandEnd
-from v2p_data.scene.frames.segmentation import watch
-from v2p_data.scene.frames.working_clip import footage_of
+from v2p_data.scene.frames.segmentation import segment_clip
+from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.video.captions import find_videos
 from v2p_data.video.decode import read_clip
 
@@ -40,10 +45,10 @@ def test_twice_as_many_pixels_per_metre_show_the_same():
     end = HandEnd(tip_px=(104.0, 81.0), entry_px=(0.0, 81.0))
     foot = np.array([120.0, 90.0])
 
-    one = look_at(rgb, hand, end, foot, 200.0, 0.6, 0.1)
+    one = view_hand(rgb, hand, end, foot, 200.0, 0.6, 0.1)
     big, big_hand = (cv2.resize(x, None, fx=2, fy=2) for x in (rgb, hand))
     far = HandEnd(tip_px=(208.0, 162.0), entry_px=(0.0, 162.0))
-    two = look_at(big, big_hand, far, 2 * foot, 400.0, 0.6, 0.1)
+    two = view_hand(big, big_hand, far, 2 * foot, 400.0, 0.6, 0.1)
 
     np.testing.assert_allclose(one.known, two.known, rtol=1e-6)
     assert np.abs(one.planes[3] - two.planes[3]).mean() < 0.01
@@ -57,24 +62,24 @@ def seen(item: str):
     labels = cv2.imread(str(SAMPLES / "truth" / truth["masks"]["first"]), cv2.IMREAD_UNCHANGED)
     assert labels is not None
     clip = read_clip(video)
-    footage = footage_of(clip)
-    h, w = footage.shape
+    working = working_clip_of(clip)
+    h, w = working.shape
     small = cv2.resize(labels, (w, h), interpolation=cv2.INTER_NEAREST)
     mask = small == truth["mask_labels"]["object"]
     T = np.array(truth["camera"]["T_world_cam"])
     K = np.array(truth["camera"]["K"])
     pitch, height = float(np.arcsin(-T[2, 2])), float(T[2, 3])
     camera = camera_above((h, w), pitch, float(2 * np.arctan(320 / K[0, 0])))
-    masks = np.repeat(mask[None], len(footage.rgb), 0)
+    masks = np.repeat(mask[None], len(working.rgb), 0)
     first = np.array(truth["object"]["poses_world"][0][:3])
     foot = (first - [T[0, 3], T[1, 3], 0]) / height
-    return footage, watch(clip, footage), masks, [(mask, foot)], camera, pitch, height
+    return working, segment_clip(clip, working), masks, [(mask, foot)], camera, pitch, height
 
 
 def test_the_height_of_a_sample_clip_s_camera_is_told_by_its_hand_from_a_wrong_guess():
     *given, true = seen("push_blue_box_left")
 
-    high, low = (height_by_hand(*given, guess) for guess in (1.25 * true, true / 1.25))
+    high, low = (height_from_hand(*given, guess) for guess in (1.25 * true, true / 1.25))
 
     for found in (high, low):
         assert found is not None
@@ -83,26 +88,26 @@ def test_the_height_of_a_sample_clip_s_camera_is_told_by_its_hand_from_a_wrong_g
 
 
 def test_a_hand_that_touches_nothing_says_nothing():
-    footage, watched, masks, stands, camera, pitch, height = seen("push_blue_box_left")
-    gone = replace(watched, shares=watched.shares.copy())
+    working, segmentation, masks, stands, camera, pitch, height = seen("push_blue_box_left")
+    gone = replace(segmentation, shares=segmentation.shares.copy())
     gone.shares[:, HAND] = 0
 
-    assert height_by_hand(footage, gone, masks, stands, camera, pitch, height) is None
+    assert height_from_hand(working, gone, masks, stands, camera, pitch, height) is None
     away = np.zeros_like(masks)
     away[:, 5:20, 5:20] = True  # where no hand comes
     far = [(away[0], stands[0][1])]
-    assert height_by_hand(footage, watched, away, far, camera, pitch, height) is None
+    assert height_from_hand(working, segmentation, away, far, camera, pitch, height) is None
 
 
 def test_missing_weights_are_one_clear_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(hand_scale, "RULER_WEIGHTS", tmp_path / "some.safetensors")
-    ruler_network.cache_clear()
+    monkeypatch.setattr(hand_scale, "HAND_SCALE_WEIGHTS", tmp_path / "some.safetensors")
+    hand_scale_network.cache_clear()
 
     with pytest.raises(V2PError, match=r"some\.safetensors .*train_hand_ruler\.py"):
-        ruler_network()
+        hand_scale_network()
 
-    ruler_network.cache_clear()
+    hand_scale_network.cache_clear()
 
 
 def test_the_weights_are_small_enough_to_travel_with_the_code():
-    assert hand_scale.RULER_WEIGHTS.stat().st_size < 1_000_000
+    assert hand_scale.HAND_SCALE_WEIGHTS.stat().st_size < 1_000_000

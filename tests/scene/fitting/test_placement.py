@@ -6,14 +6,14 @@ import pytest
 
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.scene.confidence import held_at_first
-from v2p_data.scene.data_types import CameraGuess, Sighting, Sights
-from v2p_data.scene.fitting.placement import _body, _hidden, place, with_forms
+from v2p_data.scene.data_types import CameraGuess, GroundedObjects, ObjectTrack
+from v2p_data.scene.fitting.placement import _body, _hidden, place, with_noun_variants
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.classes import CLASSES, HAND
-from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.table import find_table
-from v2p_data.scene.frames.working_clip import footage_of
-from v2p_data.scene.reconstruct import SceneConfig, told
+from v2p_data.scene.frames.working_clip import working_clip_of
+from v2p_data.scene.reconstruct import SceneConfig, with_measured_camera
 from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.video.clip import Clip
@@ -58,15 +58,15 @@ def test_what_comes_later_hides_nothing_now_but_an_arm_does():
     frames[:4, arm] = 220, 170, 140
     clip = filmed(frames)
     common = {"quality": np.ones(24), "at": 0, "known_m": None, "sure": 0.9, "why": ""}
-    pushed = Sighting(
+    pushed = ObjectTrack(
         phrase="red block", role="manipulated", noun=noun_for("block"), masks=np.stack(places), moves=True, **common
     )  # fmt: skip
-    other = Sighting(
+    other = ObjectTrack(
         phrase="blue block", role="reference", noun=noun_for("block"), masks=np.stack([stands] * 24), moves=False,
         **common,
     )  # fmt: skip
 
-    hidden = _hidden(footage_of(clip), (pushed, other), stands, 0)
+    hidden = _hidden(working_clip_of(clip), (pushed, other), stands, 0)
 
     assert hidden[arm].mean() > 0.2
     assert not hidden[block(160, 100)].any()
@@ -83,8 +83,8 @@ def test_a_cup_that_a_hand_holds_in_the_air_at_first_is_told_from_one_that_stand
     frames = np.full((24, H, W, 3), 150, np.uint8)
     for frame, outline in zip(frames, way, strict=True):
         frame[outline] = 200, 30, 30
-    footage = footage_of(filmed(frames))
-    thing = Sighting(
+    working = working_clip_of(filmed(frames))
+    thing = ObjectTrack(
         phrase="cup", role="manipulated", noun=noun_for("cup"), masks=np.stack(way), quality=np.ones(24), moves=True,
         at=0, known_m=None, sure=0.9, why="",
     )  # fmt: skip
@@ -93,19 +93,21 @@ def test_a_cup_that_a_hand_holds_in_the_air_at_first_is_told_from_one_that_stand
     if by_a_hand:
         x = int(np.nonzero(way[0])[1].min())
         shares[:, HAND, :100, x - 20 : x] = 1
-    watched = Watched(
+    segmentation = Segmentation(
         idx=np.arange(24), shares=shares, early=shares[0], late=shares[-1],
         camera=SeenCamera(
             pitch_rad=PITCH, pitch_sd_rad=0.1, focal_widths=1.0, table_width_m=0.8, table_width_sd=0.2
         ),
     )  # fmt: skip
-    table = find_table(footage.always, np.ones((H, W), bool))
-    sights = Sights(objects=(thing,), footage=footage, table=table, watched=watched, warnings=())
+    table = find_table(working.always, np.ones((H, W), bool))
+    grounded = GroundedObjects(
+        objects=(thing,), working=working, table=table, segmentation=segmentation, warnings=()
+    )
 
-    placement = place(footage, (thing,), "place_onto", guess, 10)
+    placement = place(working, (thing,), "place_onto", guess, 10)
 
-    assert (placement.objects[0].grown > 0.2) == (above > 0)
-    assert held_at_first(sights, placement) == held
+    assert (placement.objects[0].log_growth > 0.2) == (above > 0)
+    assert held_at_first(grounded, placement) == held
 
 
 def outline_of(noun, size, x: float, y: float, above: float = 0.0) -> np.ndarray:
@@ -116,7 +118,7 @@ def outline_of(noun, size, x: float, y: float, above: float = 0.0) -> np.ndarray
     return cv2.fillConvexPoly(np.zeros((H, W), np.uint8), hull.round().astype(np.int32), 1) > 0
 
 
-def resting(phrase: str, role: str, masks: np.ndarray, **given) -> Sighting:
+def resting(phrase: str, role: str, masks: np.ndarray, **given) -> ObjectTrack:
     common = {
         "quality": np.ones(len(masks)),
         "at": 0,
@@ -125,7 +127,7 @@ def resting(phrase: str, role: str, masks: np.ndarray, **given) -> Sighting:
         "why": "",
         "moves": False,
     }
-    return Sighting(
+    return ObjectTrack(
         phrase=phrase, role=role, noun=noun_for(phrase), masks=masks, **(common | given)
     )  # fmt: skip
 
@@ -162,9 +164,11 @@ def test_lids_of_jars_and_of_pots_are_told_by_their_size(across_m: float, word: 
 
     lid = resting("lid", "manipulated", np.stack([mask] * 12))
 
-    (told,) = with_forms(footage_of(filmed(frames)), (lid,), guess, "lift_up")
+    (with_measured_camera,) = with_noun_variants(
+        working_clip_of(filmed(frames)), (lid,), guess, "lift_up"
+    )
 
-    assert told.noun.size_m == noun_for(word).size_m
+    assert with_measured_camera.noun.size_m == noun_for(word).size_m
 
 
 @pytest.mark.parametrize(("vessel", "word"), [("jar", "lid"), ("pot", "pot lid")])
@@ -182,9 +186,11 @@ def test_a_lid_is_about_as_wide_as_what_it_covers(vessel: str, word: str):
     )
     guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=0.5)
 
-    told, _ = with_forms(footage_of(filmed(frames)), objects, guess, "cover")
+    with_measured_camera, _ = with_noun_variants(
+        working_clip_of(filmed(frames)), objects, guess, "cover"
+    )
 
-    assert told.noun.size_m == noun_for(word).size_m
+    assert with_measured_camera.noun.size_m == noun_for(word).size_m
 
 
 def test_a_lid_that_is_taken_off_lay_on_what_it_covered():
@@ -205,10 +211,10 @@ def test_a_lid_that_is_taken_off_lay_on_what_it_covered():
     )
     guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV)
 
-    placed, other = place(footage_of(filmed(frames)), objects, "uncover", guess, 10).objects
+    placed, other = place(working_clip_of(filmed(frames)), objects, "uncover", guess, 10).objects
 
     start, stop = placed.T_world_objs[0][:3, 3], placed.T_world_objs[-1][:3, 3]
-    assert placed.taken_off
+    assert placed.lifted_off
     assert start[2] - stop[2] == pytest.approx(other.first.size[2], rel=0.01)
     assert start[:2] == pytest.approx(there, abs=0.06)
     assert stop[:2] == pytest.approx((1.1, -0.3), abs=0.06)
@@ -219,13 +225,15 @@ def test_a_measured_height_says_as_much_of_lengths_as_is_known_of_pitch_and_foca
     """A low camera with a long lens sees what a high one with a short lens does."""
     guess = CameraGuess(pitch_rad=np.pi / 4, pitch_sd_rad=0.1, fov_rad=1.0)
 
-    height = told(guess, SceneConfig(camera_height_m=0.5))
-    seen_too = told(guess, SceneConfig(camera_height_m=0.5, fov_rad=0.9))
-    whole = told(guess, SceneConfig(camera_height_m=0.5, fov_rad=0.9, pitch_rad=0.7))
+    height = with_measured_camera(guess, SceneConfig(camera_height_m=0.5))
+    seen_too = with_measured_camera(guess, SceneConfig(camera_height_m=0.5, fov_rad=0.9))
+    whole = with_measured_camera(
+        guess, SceneConfig(camera_height_m=0.5, fov_rad=0.9, pitch_rad=0.7)
+    )
 
     assert height.height_m == seen_too.height_m == whole.height_m == 0.5
     assert whole.height_sd == pytest.approx(0.02)
     assert seen_too.height_sd == pytest.approx(np.hypot(0.02, 0.1)), "at 45 degrees"
     assert height.height_sd > 1.5 * seen_too.height_sd
     assert (whole.fov_rad, whole.pitch_rad) == (0.9, 0.7)
-    assert told(guess, SceneConfig()) == guess
+    assert with_measured_camera(guess, SceneConfig()) == guess

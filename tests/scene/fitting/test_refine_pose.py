@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.mesh import lathe
 from v2p_data.geometry.pose import angle_between, transform
-from v2p_data.scene.fitting.refine_pose import bent, refit
+from v2p_data.scene.fitting.refine_pose import refine_pose, warped_trajectory
 from v2p_data.scene.fitting.silhouette import camera_above
-from v2p_data.scene.shapes.silhouette_view import View
+from v2p_data.scene.shapes.silhouette_view import SilhouetteView
 
 CAMERA = camera_above((240, 320), 0.6, 1.01, 0.5)
 
@@ -46,8 +46,12 @@ def test_a_spout_tells_how_a_jug_was_turned(yaw_deg):
     mesh, T_true = jug(), pose(0.75, -0.08, 0.05, yaw_deg)
     T_first, guess = pose(0.65, 0.1, 0.05, 20), pose(0.77, -0.09, 0.05, 20)
 
-    found = refit(
-        View(mask=seen(mesh, T_true), T_world_obj=guess), T_first, mesh, CAMERA, in_air=False
+    found = refine_pose(
+        SilhouetteView(mask=seen(mesh, T_true), T_world_obj=guess),
+        T_first,
+        mesh,
+        CAMERA,
+        in_air=False,
     )
 
     assert found is not None
@@ -59,7 +63,9 @@ def test_a_spout_tells_how_a_jug_was_turned(yaw_deg):
 def test_what_fits_already_stays_as_it_is():
     mesh, T = jug(), pose(0.7, 0.0, 0.05, 45)
 
-    found = refit(View(mask=seen(mesh, T), T_world_obj=T), T, mesh, CAMERA, in_air=False)
+    found = refine_pose(
+        SilhouetteView(mask=seen(mesh, T), T_world_obj=T), T, mesh, CAMERA, in_air=False
+    )
 
     assert found is not None
     np.testing.assert_array_equal(found.T_world_mesh, T)
@@ -69,8 +75,12 @@ def test_what_is_held_up_moves_across_the_view_only():
     mesh, T_true = jug(), pose(0.7, 0.05, 0.2, 90)
     guess = pose(0.7, 0.02, 0.17, 90)
 
-    found = refit(
-        View(mask=seen(mesh, T_true), T_world_obj=guess), guess, mesh, CAMERA, in_air=True
+    found = refine_pose(
+        SilhouetteView(mask=seen(mesh, T_true), T_world_obj=guess),
+        guess,
+        mesh,
+        CAMERA,
+        in_air=True,
     )
 
     assert found is not None
@@ -86,16 +96,19 @@ def test_a_speck_and_what_a_hand_hides_say_nothing():
     hand = np.zeros_like(mask)
     hand[: int(rows.mean()) + 8] = True
 
-    assert refit(View(mask=speck, T_world_obj=T), T, mesh, CAMERA, in_air=False) is None
-    hidden = View(mask=mask & ~hand, T_world_obj=T, hidden=hand)
-    assert refit(hidden, T, mesh, CAMERA, in_air=False) is None
+    assert (
+        refine_pose(SilhouetteView(mask=speck, T_world_obj=T), T, mesh, CAMERA, in_air=False)
+        is None
+    )
+    hidden = SilhouetteView(mask=mask & ~hand, T_world_obj=T, hidden=hand)
+    assert refine_pose(hidden, T, mesh, CAMERA, in_air=False) is None
 
 
 def test_poses_on_the_way_bend_towards_the_new_last_one():
     poses = np.stack([pose(0.6 + 0.05 * k, 0.0, 0.05, 0) for k in range(5)])
     T_new = pose(0.8, 0.04, 0.05, 80)
 
-    out = bent(poses, T_new)
+    out = warped_trajectory(poses, T_new)
 
     np.testing.assert_array_equal(out[0], poses[0])
     np.testing.assert_allclose(out[-1], T_new)

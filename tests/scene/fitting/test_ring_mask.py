@@ -6,7 +6,7 @@ import pytest
 
 from v2p_data.geometry.mesh import ring
 from v2p_data.geometry.pose import apply, transform
-from v2p_data.scene.fitting.ring_mask import pierced, seen_through
+from v2p_data.scene.fitting.ring_mask import seen_through, without_hole
 from v2p_data.scene.fitting.silhouette import camera_above
 
 
@@ -54,7 +54,7 @@ def test_a_mask_keeps_its_hole_filled_where_the_ring_is_not_as_posed():
     )
     faces, whole = drawn(ring(size[0], size[2], bore), here, camera)
 
-    assert (pierced(whole, size, bore, here, camera) & ~faces).sum() < 0.05 * (
+    assert (without_hole(whole, size, bore, here, camera) & ~faces).sum() < 0.05 * (
         whole & ~faces
     ).sum()
-    np.testing.assert_array_equal(pierced(whole, size, bore, elsewhere, camera), whole)
+    np.testing.assert_array_equal(without_hole(whole, size, bore, elsewhere, camera), whole)

@@ -6,7 +6,7 @@ import pytest
 
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import quat_from_yaw, transform, transform_from_pose
-from v2p_data.scene.data_types import Sighting
+from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.fitting.silhouette import (
     Silhouette,
     camera_above,
@@ -17,9 +17,9 @@ from v2p_data.scene.fitting.silhouette import (
     on_wall,
     orientations,
 )
-from v2p_data.scene.fitting.trajectory import Course, carried_by_hand, course_in_hand, peak
+from v2p_data.scene.fitting.trajectory import Trajectory, carried_by_hand, peak, trajectory_in_hand
 from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED
-from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.scale.camera_height import (
     SeenCamera,
     SizeVote,
@@ -209,7 +209,7 @@ def test_a_lift_ends_where_the_thing_was_last_seen_highest(believed, ends_at):
         top = 30 - 3 * max(0, i - 3)
         masks[i, top : top + 6, 10:16] = True
     quality = np.where(np.arange(9) <= believed, 1.0, 0.3)
-    thing = Sighting(
+    thing = ObjectTrack(
         phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks, quality=quality,
         moves=True, at=0, known_m=None, sure=0.9, why="",
     )  # fmt: skip
@@ -217,7 +217,9 @@ def test_a_lift_ends_where_the_thing_was_last_seen_highest(believed, ends_at):
     assert peak(thing) == ends_at
 
 
-def lifted_in_a_fist(rises_px: int, *, seen_rising: bool = False) -> tuple[Sighting, Watched]:
+def lifted_in_a_fist(
+    rises_px: int, *, seen_rising: bool = False
+) -> tuple[ObjectTrack, Segmentation]:
     """Ten frames: a hand comes from the right, takes hold of a cube at (40, 90), stays, and goes up; it hides the cube."""
     tips = [(110, 90), (70, 96), (40, 90), (40, 90), (40, 90)]
     tips += [(40, 90 - rises_px * k // 5) for k in range(1, 6)]
@@ -230,7 +232,7 @@ def lifted_in_a_fist(rises_px: int, *, seen_rising: bool = False) -> tuple[Sight
         masks[i, 84 - up : 96 - up, 34:46] = True
         shares[i, HAND] = cv2.line(np.zeros((120, 160), np.uint8), (159, tip[1]), tip, 1, 16)
     quality = np.where((np.arange(10) < 2) | seen_rising, 1.0, 0.2)
-    thing = Sighting(
+    thing = ObjectTrack(
         phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks, quality=quality,
         moves=True, at=0, known_m=None, sure=0.9, why="",
     )  # fmt: skip
@@ -238,36 +240,38 @@ def lifted_in_a_fist(rises_px: int, *, seen_rising: bool = False) -> tuple[Sight
         pitch_rad=PITCH, pitch_sd_rad=0.1, focal_widths=1.0, table_width_m=0.8, table_width_sd=0.2
     )
     none = shares[0]
-    return thing, Watched(idx=np.arange(10), shares=shares, early=none, late=none, camera=seen)
+    return thing, Segmentation(
+        idx=np.arange(10), shares=shares, early=none, late=none, camera=seen
+    )
 
 
 def test_what_a_fist_hides_goes_up_with_it():
-    thing, watched = lifted_in_a_fist(50)
+    thing, segmentation = lifted_in_a_fist(50)
     camera = camera_above((120, 160), PITCH, FOV)
     start = transform(np.eye(3), np.array([*camera.on_plane(np.array([[40.0, 90.0]]), 0.05)[0]]))
 
-    carried = carried_by_hand(thing, watched)
-    course = course_in_hand(Course([0], [start], [0.9], ["full"]), carried, camera)
+    carried = carried_by_hand(thing, segmentation)
+    trajectory = trajectory_in_hand(Trajectory([0], [start], [0.9], ["full"]), carried, camera)
 
     assert carried[-1][0] == 9
     np.testing.assert_allclose(carried[-1][1], (0, -50), atol=2)
-    assert course.frames[0] == 0
-    assert course.frames[-1] == 9
-    assert set(course.observed[1:]) == {"no_depth"}
-    heights = [T[2, 3] for T in course.poses]
+    assert trajectory.frames[0] == 0
+    assert trajectory.frames[-1] == 9
+    assert set(trajectory.observed[1:]) == {"no_depth"}
+    heights = [T[2, 3] for T in trajectory.poses]
     assert heights == sorted(heights)
-    pixel = camera.project(course.poses[-1][None, :3, 3])[0]
+    pixel = camera.project(trajectory.poses[-1][None, :3, 3])[0]
     np.testing.assert_allclose(pixel, (40, 40), atol=2)
-    assert course.poses[-1][0, 3] == pytest.approx(start[0, 3])
+    assert trajectory.poses[-1][0, 3] == pytest.approx(start[0, 3])
 
 
 def test_a_hand_that_is_not_recognised_for_a_moment_takes_nothing_elsewhere():
     """A striped sleeve: what the network takes for a hand there ends far from the hand's own end."""
-    thing, watched = lifted_in_a_fist(50)
-    shares = watched.shares.copy()
+    thing, segmentation = lifted_in_a_fist(50)
+    shares = segmentation.shares.copy()
     shares[6, HAND] = cv2.line(np.zeros((120, 160), np.uint8), (159, 10), (120, 10), 1, 16)
 
-    carried = dict(carried_by_hand(thing, replace(watched, shares=shares)))
+    carried = dict(carried_by_hand(thing, replace(segmentation, shares=shares)))
 
     assert 6 not in carried
     np.testing.assert_allclose(carried[9], (0, -50), atol=2)
@@ -282,16 +286,16 @@ def test_nothing_goes_with_a_fist_that_does_not_lift_it_out_of_sight(rises_px, s
 
 
 def test_nothing_goes_with_a_hand_that_does_not_come_to_it():
-    thing, watched = lifted_in_a_fist(50)
-    away = np.roll(watched.shares, 60, axis=2)
+    thing, segmentation = lifted_in_a_fist(50)
+    away = np.roll(segmentation.shares, 60, axis=2)
 
-    assert carried_by_hand(thing, replace(watched, shares=away)) == []
+    assert carried_by_hand(thing, replace(segmentation, shares=away)) == []
 
 
 def test_what_is_still_in_sight_is_not_in_the_fist():
     """A pen is picked up and put down elsewhere, where its track does not follow it."""
-    thing, watched = lifted_in_a_fist(50)
-    shares = watched.shares.copy()
+    thing, segmentation = lifted_in_a_fist(50)
+    shares = segmentation.shares.copy()
     shares[8:, MOVED, 20:32, 100:112] = 1
 
-    assert carried_by_hand(thing, replace(watched, shares=shares)) == []
+    assert carried_by_hand(thing, replace(segmentation, shares=shares)) == []

@@ -10,10 +10,10 @@ from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Fit
 from v2p_data.scene.fitting.silhouette import Silhouette, camera_above, three
-from v2p_data.scene.fitting.tool_pose import Push, fit_held, push_of
-from v2p_data.scene.fitting.trajectory import Course
+from v2p_data.scene.fitting.tool_pose import PushMotion, fit_tool_pose, push_motion
+from v2p_data.scene.fitting.trajectory import Trajectory
 from v2p_data.scene.frames.classes import CLASSES, HAND
-from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.scene.scale.nouns import noun_for
 
@@ -25,17 +25,17 @@ SIDE = 0.1
 FROM, TO = np.array([1.2, 0.25]), np.array([1.3, -0.15])
 
 
-def block() -> tuple[Course, Fit]:
+def block() -> tuple[Trajectory, Fit]:
     """Return the block's poses: it moves in frames 5 to 15."""
     poses = [
         transform(np.eye(3), np.array([*(FROM + share * (TO - FROM)), SIDE / 2]))
         for share in np.clip((np.arange(FRAMES) - 5) / 10, 0, 1)
     ]
     fit = Fit(size=(SIDE, SIDE, SIDE), T_world_obj=poses[0], iou=0.9, visible=1.0, cost=0.1)
-    return Course(list(range(FRAMES)), poses, [1.0] * FRAMES, ["full"] * FRAMES), fit
+    return Trajectory(list(range(FRAMES)), poses, [1.0] * FRAMES, ["full"] * FRAMES), fit
 
 
-def arm_from(spot: np.ndarray) -> Watched:
+def arm_from(spot: np.ndarray) -> Segmentation:
     """Return what the network sees of an arm that comes in from the picture's edge to a spot of the table."""
     tip = CAMERA.project(spot[None])[0].round().astype(int)
     hand = np.zeros((H, W), np.uint8)
@@ -45,18 +45,18 @@ def arm_from(spot: np.ndarray) -> Watched:
     camera = SeenCamera(
         pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.6, table_width_sd=0.2
     )
-    return Watched(
+    return Segmentation(
         idx=np.arange(FRAMES), shares=shares, early=shares[0], late=shares[-1], camera=camera
     )
 
 
-def pushed(watched: Watched | None = None) -> Push:
-    course, fit = block()
-    return push_of(course, fit, "box", FRAMES, np.zeros(2), CAMERA, HEIGHT_M, watched)
+def pushed(segmentation: Segmentation | None = None) -> PushMotion:
+    trajectory, fit = block()
+    return push_motion(trajectory, fit, "box", FRAMES, np.zeros(2), CAMERA, HEIGHT_M, segmentation)
 
 
 def stick(
-    push: Push, yaw: float, tilt: float, longer: float
+    push: PushMotion, yaw: float, tilt: float, longer: float
 ) -> tuple[np.ndarray, tuple[float, float, float]]:
     """Return the stick's pose when the block is where it was at first, and its size."""
     size = np.array(STICK.size_m) / HEIGHT_M * (longer, 1, 1)
@@ -91,10 +91,10 @@ def test_a_push_begins_and_ends_with_the_motion_and_comes_from_behind():
 
 
 def test_what_goes_nowhere_is_pushed_from_where_the_tool_is():
-    course, fit = block()
-    still = replace(course, poses=[course.poses[0]] * FRAMES)
+    trajectory, fit = block()
+    still = replace(trajectory, poses=[trajectory.poses[0]] * FRAMES)
 
-    push = push_of(still, fit, "box", FRAMES, FROM - [0.4, 0], CAMERA, HEIGHT_M, None)
+    push = push_motion(still, fit, "box", FRAMES, FROM - [0.4, 0], CAMERA, HEIGHT_M, None)
 
     assert push.frames == (0, FRAMES - 1)
     np.testing.assert_allclose(push.way, [1, 0], atol=1e-6)
@@ -109,7 +109,9 @@ def test_a_stick_is_found_tip_down_behind_the_block_with_the_length_that_is_seen
     T, size = stick(push, yaw, tilt, longer)
     views = [(i, seen(T, size, push.spots[i] - push.spots[0])) for i in (5, 10, 15)]
 
-    held = fit_held(views, push, STICK, three(np.array(STICK.size_m) / HEIGHT_M), STICK.spread)
+    held = fit_tool_pose(
+        views, push, STICK, three(np.array(STICK.size_m) / HEIGHT_M), STICK.spread
+    )
 
     assert float(held.fit.T_world_obj[:3, 0] @ T[:3, 0]) > np.cos(np.radians(15))
     assert held.fit.size[0] == pytest.approx(size[0], rel=0.15)
@@ -124,7 +126,7 @@ def test_what_is_seen_only_before_it_pushes_is_put_behind_the_block_with_the_sam
     T, size = stick(push, 2.4, 0.5, 1.0)
     away = np.array([-0.05, 0.15])
 
-    held = fit_held([(2, seen(T, size, away))], push, STICK, size, STICK.spread)
+    held = fit_tool_pose([(2, seen(T, size, away))], push, STICK, size, STICK.spread)
 
     tip = held.fit.T_world_obj[:3, 3] - held.fit.T_world_obj[:3, 0] * held.fit.size[0] / 2
     np.testing.assert_allclose(tip[:2], FROM + push.behind, atol=1e-6)

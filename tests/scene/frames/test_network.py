@@ -9,9 +9,9 @@ import torch
 from v2p_data.errors import V2PError
 from v2p_data.scene.frames import network
 from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED
-from v2p_data.scene.frames.network import SceneNetwork, inputs_of, look, net_size
-from v2p_data.scene.frames.segmentation import watch
-from v2p_data.scene.frames.working_clip import footage_of
+from v2p_data.scene.frames.network import SceneNetwork, classify, inputs_of, net_size
+from v2p_data.scene.frames.segmentation import segment_clip
+from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.video.captions import find_videos
 from v2p_data.video.decode import read_clip
 
@@ -35,7 +35,7 @@ def test_shares_are_probabilities_at_the_frames_own_size():
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 255, (3, 90, 120, 3), dtype=np.uint8)
 
-    seen = look(frames, *_stills(frames), batch=2)
+    seen = classify(frames, *_stills(frames), batch=2)
 
     assert seen.shares.shape == (3, len(CLASSES), 90, 120)
     np.testing.assert_allclose(seen.shares.sum(1), 1, atol=1e-3)
@@ -47,7 +47,7 @@ def test_the_batch_size_does_not_change_what_is_seen():
     rng = np.random.default_rng(1)
     frames = rng.integers(0, 255, (3, 48, 64, 3), dtype=np.uint8)
 
-    together, apart = (look(frames, *_stills(frames), batch=n) for n in (3, 1))
+    together, apart = (classify(frames, *_stills(frames), batch=n) for n in (3, 1))
 
     np.testing.assert_allclose(together.shares, apart.shares, atol=1e-4)
 
@@ -79,12 +79,12 @@ def test_missing_weights_are_one_clear_sentence(which, load, tmp_path, monkeypat
 def test_the_camera_does_not_depend_on_what_the_other_network_sees(monkeypatch):
     rng = np.random.default_rng(2)
     frames = rng.integers(0, 255, (3, 48, 64, 3), dtype=np.uint8)
-    before = look(frames, *_stills(frames))
+    before = classify(frames, *_stills(frames))
 
     with torch.random.fork_rng():
         torch.random.default_generator.manual_seed(0)
         monkeypatch.setattr(network, "network", SceneNetwork().eval)
-    after = look(frames, *_stills(frames))
+    after = classify(frames, *_stills(frames))
 
     assert after.camera == before.camera
     assert np.abs(after.shares - before.shares).max() > 0.05
@@ -101,16 +101,16 @@ def test_hand_and_moved_thing_of_a_sample_clip_are_seen_where_they_were_drawn(it
     folder = SAMPLES / "truth"
     truth = json.loads((folder / f"{video.path.stem}.json").read_text())
     clip = read_clip(video)
-    footage = footage_of(clip)
+    working = working_clip_of(clip)
 
-    watched = watch(clip, footage)
+    segmentation = segment_clip(clip, working)
 
     for when, i in (("first", 0), ("last", -1)):
         labels = cv2.imread(str(folder / truth["masks"][when]), cv2.IMREAD_UNCHANGED)
         assert labels is not None
-        h, w = footage.shape
+        h, w = working.shape
         labels = cv2.resize(labels, (w, h), interpolation=cv2.INTER_NEAREST)
         true = labels == truth["mask_labels"]["object"]
-        seen = watched.shares[i].argmax(0) == MOVED
+        seen = segmentation.shares[i].argmax(0) == MOVED
         assert (true & seen).sum() / (true | seen).sum() > 0.5, when
-    assert any((one.argmax(0) == HAND).mean() > 0.01 for one in watched.shares)
+    assert any((one.argmax(0) == HAND).mean() > 0.01 for one in segmentation.shares)

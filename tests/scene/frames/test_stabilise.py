@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from v2p_data.geometry.camera import between_centres
-from v2p_data.scene.frames.stabilise import steadied
-from v2p_data.scene.frames.working_clip import camera_shift_px, footage_of
+from v2p_data.scene.frames.stabilise import stabilised
+from v2p_data.scene.frames.working_clip import camera_shift_px, working_clip_of
 from v2p_data.video.clip import Clip, Hint
 
 BOX = [150.0, 120.0, 190.0, 150.0]
@@ -30,12 +30,12 @@ def swaying(clip: Clip, far_px: float) -> tuple[Clip, list[np.ndarray]]:
 
 def test_frames_of_a_swaying_camera_come_back_to_the_first(draw):
     clip, moves = swaying(draw(), 6.0)
-    before = camera_shift_px(footage_of(clip))
+    before = camera_shift_px(working_clip_of(clip))
 
-    steady = steadied(clip, footage_of(clip))
+    steady = stabilised(clip, working_clip_of(clip))
 
     assert before > 3
-    assert camera_shift_px(footage_of(steady)) < 0.5
+    assert camera_shift_px(working_clip_of(steady)) < 0.5
     assert "the camera swayed" in steady.warnings[-1]
     spots = np.array([[[60.0, 60.0], [250, 80], [160, 200]]])
     for own, true in zip(steady.to_filmed, moves, strict=True):
@@ -52,7 +52,7 @@ def test_a_hint_goes_along_with_its_frame(draw):
         "spot": Hint(frame=20, points=[corners[0].tolist()]),
     }
 
-    steady = steadied(replace(clip, hints=hints), footage_of(clip))
+    steady = stabilised(replace(clip, hints=hints), working_clip_of(clip))
 
     assert steady.hints["blue box"]["box"] == pytest.approx(BOX, abs=2.5)
     assert steady.hints["spot"]["points"][0] == pytest.approx(BOX[:2], abs=2)
@@ -62,20 +62,20 @@ def test_a_hint_goes_along_with_its_frame(draw):
 def test_a_clip_from_a_stand_stays_as_it_is(draw):
     clip = draw()
 
-    assert steadied(clip, footage_of(clip)) is clip
+    assert stabilised(clip, working_clip_of(clip)) is clip
 
 
 def test_a_camera_that_travels_is_left_to_be_turned_away(draw):
     clip, _ = swaying(draw(), 50.0)
 
-    assert steadied(clip, footage_of(clip)) is clip
+    assert stabilised(clip, working_clip_of(clip)) is clip
 
 
 def test_a_picture_without_anything_to_follow_is_left_alone(draw):
     clip = draw()
     plain = replace(clip, frames=np.full_like(clip.frames, 120))
 
-    assert steadied(plain, footage_of(plain)) is plain
+    assert stabilised(plain, working_clip_of(plain)) is plain
 
 
 def test_doubling_a_picture_takes_pixel_centres_to_pixel_centres():

@@ -9,9 +9,9 @@ import pytest
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED, TABLE
 from v2p_data.scene.frames.mask_ops import bounding_box
-from v2p_data.scene.frames.segmentation import Watched
-from v2p_data.scene.frames.working_clip import footage_of
-from v2p_data.scene.grounding.ground_objects import sight
+from v2p_data.scene.frames.segmentation import Segmentation
+from v2p_data.scene.frames.working_clip import working_clip_of
+from v2p_data.scene.grounding.ground_objects import ground_objects
 from v2p_data.scene.grounding.held_tool import find_tool
 from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.scene.scale.nouns import noun_for
@@ -71,10 +71,10 @@ def drawn(colour=GREEN, shadow=True, with_stick=True):
     camera = SeenCamera(
         pitch_rad=0.9, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.6, table_width_sd=0.2
     )
-    watched = Watched(
+    segmentation = Segmentation(
         idx=np.arange(FRAMES), shares=shares, early=shares[0], late=shares[-1], camera=camera
     )
-    return clip, watched, np.stack(blocks), np.stack(sticks)
+    return clip, segmentation, np.stack(blocks), np.stack(sticks)
 
 
 def iou(a, b):
@@ -82,9 +82,9 @@ def iou(a, b):
 
 
 def test_a_stick_that_the_network_takes_for_hand_is_found_and_followed():
-    clip, watched, blocks, sticks = drawn()
+    clip, segmentation, blocks, sticks = drawn()
 
-    tool = find_tool(footage_of(clip), watched, blocks, noun_for("stick"))
+    tool = find_tool(working_clip_of(clip), segmentation, blocks, noun_for("stick"))
 
     assert tool.sure > 0.5
     seen = np.flatnonzero(tool.masks.any((1, 2)))
@@ -95,52 +95,55 @@ def test_a_stick_that_the_network_takes_for_hand_is_found_and_followed():
 
 
 def test_a_bare_hand_is_no_tool():
-    clip, watched, blocks, _ = drawn(with_stick=False, shadow=False)
+    clip, segmentation, blocks, _ = drawn(with_stick=False, shadow=False)
 
-    tool = find_tool(footage_of(clip), watched, blocks, noun_for("stick"))
+    tool = find_tool(working_clip_of(clip), segmentation, blocks, noun_for("stick"))
 
     assert tool is None or tool.sure < 0.5
 
 
 def test_nothing_that_passes_is_no_tool():
-    clip, watched, blocks, _ = drawn()
-    footage = footage_of(clip)
-    still = np.repeat(footage.rgb[:1], FRAMES, 0)
-    lab = np.repeat(footage.lab[:1], FRAMES, 0)
-    bare = type(footage)(
-        **{**vars(footage), "rgb": still, "lab": lab, "early": still[0], "late": still[0]}
+    clip, segmentation, blocks, _ = drawn()
+    working = working_clip_of(clip)
+    still = np.repeat(working.rgb[:1], FRAMES, 0)
+    lab = np.repeat(working.lab[:1], FRAMES, 0)
+    bare = type(working)(
+        **{**vars(working), "rgb": still, "lab": lab, "early": still[0], "late": still[0]}
     )
 
-    assert find_tool(bare, watched, blocks, noun_for("stick")) is None
+    assert find_tool(bare, segmentation, blocks, noun_for("stick")) is None
 
 
 @pytest.mark.parametrize("frame", [7, 12])
 def test_a_box_around_the_tool_decides_which_piece_it_is(frame):
     """The sleeve is marked: nobody would take it for a stick otherwise."""
-    clip, watched, blocks, sticks = drawn()
+    clip, segmentation, blocks, sticks = drawn()
     y, x = np.nonzero(sticks[frame])
     box = np.zeros((H, W), bool)
     box[y.min() : y.max() + 1, x.min() : x.max() + 1] = True
     elsewhere = np.zeros((H, W), bool)
     elsewhere[200:230, 20:60] = True
 
-    tool = find_tool(footage_of(clip), watched, blocks, noun_for("stick"), (frame, box))
+    tool = find_tool(working_clip_of(clip), segmentation, blocks, noun_for("stick"), (frame, box))
 
     assert tool.at == frame
     assert iou(tool.masks[frame], sticks[frame]) > 0.6
     assert (
-        find_tool(footage_of(clip), watched, blocks, noun_for("stick"), (frame, elsewhere)) is None
+        find_tool(
+            working_clip_of(clip), segmentation, blocks, noun_for("stick"), (frame, elsewhere)
+        )
+        is None
     )
 
 
 @pytest.mark.parametrize("frame", [9, 12, 15])
 def test_a_tool_of_the_colours_of_the_hand_lies_across_its_box(frame):
-    clip, watched, blocks, sticks = drawn(colour=(208, 158, 132))
+    clip, segmentation, blocks, sticks = drawn(colour=(208, 158, 132))
     y, x = np.nonzero(sticks[frame])
     box = np.zeros((H, W), bool)
     box[y.min() : y.max() + 1, x.min() : x.max() + 1] = True
 
-    tool = find_tool(footage_of(clip), watched, blocks, noun_for("stick"), (frame, box))
+    tool = find_tool(working_clip_of(clip), segmentation, blocks, noun_for("stick"), (frame, box))
 
     found = tool.masks[frame]
     assert found[sticks[frame]].mean() > 0.7
@@ -152,21 +155,21 @@ def test_a_tool_of_the_colours_of_the_hand_lies_across_its_box(frame):
 
 def test_the_picture_edge_may_cut_the_tool():
     """Cut off at the right, so that no hand is seen until late: what is seen of it grows."""
-    clip, watched, blocks, sticks = drawn()
-    footage, cut = footage_of(clip), 260
-    narrow = type(footage)(
+    clip, segmentation, blocks, sticks = drawn()
+    working, cut = working_clip_of(clip), 260
+    narrow = type(working)(
         **{
-            **vars(footage),
-            **{name: getattr(footage, name)[:, :, :cut] for name in ("rgb", "lab")},
-            **{name: getattr(footage, name)[:, :cut] for name in ("early", "late", "always")},
+            **vars(working),
+            **{name: getattr(working, name)[:, :, :cut] for name in ("rgb", "lab")},
+            **{name: getattr(working, name)[:, :cut] for name in ("early", "late", "always")},
         }
     )
-    seen = Watched(
-        idx=watched.idx,
-        shares=watched.shares[..., :cut],
-        early=watched.early[..., :cut],
-        late=watched.late[..., :cut],
-        camera=watched.camera,
+    seen = Segmentation(
+        idx=segmentation.idx,
+        shares=segmentation.shares[..., :cut],
+        early=segmentation.early[..., :cut],
+        late=segmentation.late[..., :cut],
+        camera=segmentation.camera,
     )
 
     tool = find_tool(narrow, seen, blocks[..., :cut], noun_for("stick"))
@@ -177,16 +180,16 @@ def test_the_picture_edge_may_cut_the_tool():
 
 
 def test_a_scene_holds_the_tool_in_the_hand_and_makes_no_sense_without_it():
-    clip, watched, _, sticks = drawn()
+    clip, segmentation, _, sticks = drawn()
     bare, seen, _, _ = drawn(with_stick=False, shadow=False)
     meaning = parse_caption(clip.caption, ())
 
-    block, stick = sight(clip, footage_of(clip), meaning, watched, 0.5).objects
+    block, stick = ground_objects(clip, working_clip_of(clip), meaning, segmentation, 0.5).objects
 
     assert (block.role, block.in_hand) == ("manipulated", False)
     assert (stick.role, stick.in_hand, stick.moves) == ("tool", True, True)
     assert iou(stick.masks[12], sticks[12]) > 0.6
     assert 7 <= stick.at <= 9  # the block sets out in frame 9
     with pytest.raises(ItemRejectedError, match="the 'stick' was not found") as error:
-        sight(bare, footage_of(bare), meaning, seen, 0.5)
+        ground_objects(bare, working_clip_of(bare), meaning, seen, 0.5)
     assert error.value.reason == "reference_not_found"

@@ -8,9 +8,9 @@ import pytest
 
 from v2p_data.scene.frames.classes import CLASSES, OTHER, TABLE
 from v2p_data.scene.frames.mask_ops import bounding_box, iou
-from v2p_data.scene.frames.segmentation import Watched
-from v2p_data.scene.frames.working_clip import Footage, footage_of
-from v2p_data.scene.grounding.hint_masks import Box, marks_of
+from v2p_data.scene.frames.segmentation import Segmentation
+from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
+from v2p_data.scene.grounding.hint_masks import Box, hint_masks_of
 from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.video.clip import Clip
 
@@ -20,7 +20,7 @@ X, Y, WIDE, TALL = 140, 100, 40, 30
 
 
 @pytest.fixture
-def drawn() -> tuple[Clip, Footage]:
+def drawn() -> tuple[Clip, WorkingClip]:
     grain = np.random.default_rng(0).integers(-6, 7, (H, W, 3))
     image = np.full((H, W, 3), GREY) + grain
     image[Y : Y + TALL, X : X + WIDE] = RED + grain[Y : Y + TALL, X : X + WIDE]
@@ -30,14 +30,14 @@ def drawn() -> tuple[Clip, Footage]:
         total_frames=10, source_fps=12.0, source_frame=np.arange(10), times_s=np.arange(10) / 12,
         source_size_px=(W, H), warnings=(),
     )  # fmt: skip
-    return clip, footage_of(clip)
+    return clip, working_clip_of(clip)
 
 
 def outlined(drawn, *box):
-    clip, footage = drawn
+    clip, working = drawn
     x0, y0, x1, y1 = (float(v) for v in box)
     said = Box(frame=0, box_xyxy=(x0, y0, x1, y1), score=0.9)
-    return marks_of(clip, footage, None, {"box": said})["box"]
+    return hint_masks_of(clip, working, None, {"box": said})["box"]
 
 
 @pytest.mark.parametrize("off_px", [-3, 3])
@@ -63,15 +63,15 @@ def test_far_beside_a_box_nothing_belongs_to_it(drawn):
 
 
 def test_a_face_in_the_colours_of_the_table_is_completed_by_what_the_network_sees(drawn):
-    clip, footage = drawn
-    image = footage.rgb[0].copy()
+    clip, working = drawn
+    image = working.rgb[0].copy()
     face = np.zeros((H, W), bool)
     face[Y + TALL // 2 : Y + TALL, X + 5 : X + WIDE] = True
     image[face] = image[: TALL // 2, : WIDE - 5].reshape(-1, 3)
     frames = np.stack([image] * 10)
     clip, whole = replace(clip, frames=frames), np.zeros((H, W), bool)
     whole[Y : Y + TALL, X : X + WIDE] = True
-    footage = footage_of(clip)
+    working = working_clip_of(clip)
     said = Box(frame=0, box_xyxy=(140.0, 100.0, 180.0, 130.0), score=0.9)
     label = np.where(whole, OTHER, TABLE)
     shares = 0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None])
@@ -79,11 +79,13 @@ def test_a_face_in_the_colours_of_the_table_is_completed_by_what_the_network_see
     camera = SeenCamera(
         pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.6, table_width_sd=0.2
     )
-    watched = Watched(
+    segmentation = Segmentation(
         idx=np.array([0, 9]), shares=np.stack([shares] * 2), early=shares, late=shares, camera=camera
     )  # fmt: skip
 
-    alone, told = (marks_of(clip, footage, w, {"box": said})["box"].mask for w in (None, watched))
+    alone, told = (
+        hint_masks_of(clip, working, w, {"box": said})["box"].mask for w in (None, segmentation)
+    )
 
     assert iou(told, whole) > 0.85
     assert iou(alone, whole) < 0.75

@@ -5,13 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from v2p_data.scene.data_types import Sighting
+from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.colour import histogram
-from v2p_data.scene.grounding.ground_objects import sight, swallowed
+from v2p_data.scene.grounding.ground_objects import ground_objects, hidden_in_container
 from v2p_data.scene.grounding.moved_by_change import Moved
-from v2p_data.scene.grounding.moved_by_network import find_movers, rated
-from v2p_data.scene.grounding.outlines import apart, completed, filled, less_table, settled
+from v2p_data.scene.grounding.moved_by_network import find_moved_by_network, rated
+from v2p_data.scene.grounding.outlines import (
+    completed,
+    disjoint_ends,
+    filled,
+    without_shadow,
+    without_table,
+)
 from v2p_data.scene.grounding.tracking import carried, track
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.video.captions import parse_caption
@@ -46,68 +52,68 @@ def iou(mask, truth):
     return (mask & truth).sum() / (mask | truth).sum()
 
 
-def large(mask, footage):
+def large(mask, working):
     """Return a mask of the drawn frames at working size."""
-    h, w = footage.shape
+    h, w = working.shape
     return mask[(np.arange(h) * H) // h][:, (np.arange(w) * W) // w]
 
 
 @pytest.mark.parametrize(("phrase", "y"), [("red box", 20), ("blue box", 60)])
-def test_of_two_things_that_move_the_one_of_the_named_colour_is_taken(watched_of, phrase, y):
-    footage, watched = watched_of(pushed(RED, BLUE))
+def test_of_two_things_that_move_the_one_of_the_named_colour_is_taken(segmentation_of, phrase, y):
+    working, segmentation = segmentation_of(pushed(RED, BLUE))
 
-    found, _ = find_movers(footage, watched, phrase, "push_right")
+    found, _ = find_moved_by_network(working, segmentation, phrase, "push_right")
 
     assert iou(found.first, square(15, y)) > 0.8
     assert iou(found.last, square(48, y)) > 0.8
 
 
-def test_a_rival_makes_the_finding_less_sure(watched_of):
-    footage, watched = watched_of(pushed(RED, BLUE))
-    alone, seen = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
+def test_a_rival_makes_the_finding_less_sure(segmentation_of):
+    working, segmentation = segmentation_of(pushed(RED, BLUE))
+    alone, seen = segmentation_of([[parts[0]] for parts in pushed(RED, BLUE)])
 
-    between_two, _ = find_movers(footage, watched, "box", "push_right")
-    only_one, _ = find_movers(alone, seen, "box", "push_right")
+    between_two, _ = find_moved_by_network(working, segmentation, "box", "push_right")
+    only_one, _ = find_moved_by_network(alone, seen, "box", "push_right")
 
     assert between_two.cues["no rival"] < 0.7 < only_one.cues["no rival"]
     assert between_two.score < only_one.score
 
 
-def test_the_wrong_direction_makes_the_finding_less_sure(watched_of):
-    footage, watched = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
+def test_the_wrong_direction_makes_the_finding_less_sure(segmentation_of):
+    working, segmentation = segmentation_of([[parts[0]] for parts in pushed(RED, BLUE)])
 
-    right, _ = find_movers(footage, watched, "red box", "push_right")
-    left, _ = find_movers(footage, watched, "red box", "push_left")
+    right, _ = find_moved_by_network(working, segmentation, "red box", "push_right")
+    left, _ = find_moved_by_network(working, segmentation, "red box", "push_left")
 
     assert left.score < 0.3 * right.score
 
 
-def test_the_tool_is_what_the_hand_holds(watched_of):
+def test_the_tool_is_what_the_hand_holds(segmentation_of):
     frames = pushed(RED, BLUE)
     for i, parts in enumerate(frames):
         if 2 < i < 10:
             parts.append((square(15 + 3 * i - 8, 58, 8), (200, 150, 120), HAND))
             parts.append((square(15 + 3 * i - 8, 66, 20), (200, 150, 120), HAND))
-    footage, watched = watched_of(frames)
+    working, segmentation = segmentation_of(frames)
 
-    thing, tool = find_movers(footage, watched, "box", "push_with", "stick")
+    thing, tool = find_moved_by_network(working, segmentation, "box", "push_with", "stick")
 
     assert iou(thing.first, square(15, 20)) > 0.8
     assert iou(tool.first, square(15, 60)) > 0.8
 
 
-def test_nothing_that_moved_is_nothing_found(watched_of):
-    footage, watched = watched_of([[(square(40, 40), RED, OTHER)] for _ in range(12)])
+def test_nothing_that_moved_is_nothing_found(segmentation_of):
+    working, segmentation = segmentation_of([[(square(40, 40), RED, OTHER)] for _ in range(12)])
 
-    assert find_movers(footage, watched, "red box", "push_right") is None
+    assert find_moved_by_network(working, segmentation, "red box", "push_right") is None
 
 
-def test_a_mask_given_by_hand_is_taken_as_it_is(watched_of):
-    footage, watched = watched_of([[parts[0]] for parts in pushed(RED, BLUE)])
-    given = np.zeros(footage.shape, bool)
+def test_a_mask_given_by_hand_is_taken_as_it_is(segmentation_of):
+    working, segmentation = segmentation_of([[parts[0]] for parts in pushed(RED, BLUE)])
+    given = np.zeros(working.shape, bool)
     given[60:100, 50:90] = True
 
-    found, _ = find_movers(footage, watched, "box", "push_right", first=given)
+    found, _ = find_moved_by_network(working, segmentation, "box", "push_right", first=given)
 
     np.testing.assert_array_equal(found.first, given)
 
@@ -123,68 +129,72 @@ def put_into(bin_shows_at_the_end):
 
 
 @pytest.mark.parametrize("seen_at_the_end", [False, True])
-def test_what_goes_into_a_bin_and_is_gone_was_swallowed(watched_of, seen_at_the_end):
-    footage, watched = watched_of(put_into(seen_at_the_end))
-    h, w = footage.shape
-    masks = watched.shares[:, MOVED] > 0.5
+def test_what_goes_into_a_bin_and_is_gone_was_swallowed(segmentation_of, seen_at_the_end):
+    working, segmentation = segmentation_of(put_into(seen_at_the_end))
+    h, w = working.shape
+    masks = segmentation.shares[:, MOVED] > 0.5
     lost = np.zeros((h, w), bool)
     lost[:5, :5] = True
     masks[9:] = masks[9:] if seen_at_the_end else lost  # where the tracker went astray
     common = {"moves": True, "at": 0, "known_m": None, "sure": 0.9, "why": ""}
-    thing = Sighting(
+    thing = ObjectTrack(
         phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks,
         quality=np.ones(12), **common,
     )  # fmt: skip
     bin_ = replace(
         thing, role="container", noun=noun_for("bin"), moves=False,
-        masks=np.repeat((watched.early[OTHER] > 0.5)[None], 12, 0),
+        masks=np.repeat((segmentation.early[OTHER] > 0.5)[None], 12, 0),
     )  # fmt: skip
 
-    found = swallowed(watched, thing, bin_)
+    found = hidden_in_container(segmentation, thing, bin_)
 
-    assert found.swallowed is not seen_at_the_end
-    if found.swallowed:
+    assert found.hidden_in_container is not seen_at_the_end
+    if found.hidden_in_container:
         np.testing.assert_array_equal(found.last, masks[8])
         assert (found.quality[9:] == 0).all()
-    assert not swallowed(watched, thing, replace(bin_, noun=noun_for("cereal box"))).swallowed
+    assert not hidden_in_container(
+        segmentation, thing, replace(bin_, noun=noun_for("cereal box"))
+    ).hidden_in_container
 
 
-def test_what_a_leg_uncovers_elsewhere_does_not_hide_that_the_marked_bin_swallowed_it(watched_of):
+def test_what_a_leg_uncovers_elsewhere_does_not_hide_that_the_marked_bin_swallowed_it(
+    segmentation_of,
+):
     frames = put_into(bin_shows_at_the_end=False)
     plug = (square(3, 3), BLUE, MOVED)
-    _, watched = watched_of([*frames[:10], [*frames[10], plug], [*frames[11], plug]])
-    thing = Sighting(
+    _, segmentation = segmentation_of([*frames[:10], [*frames[10], plug], [*frames[11], plug]])
+    thing = ObjectTrack(
         phrase="red cube", role="manipulated", noun=noun_for("cube"),
-        masks=watched.shares[:, MOVED] > 0.5, quality=np.ones(12), moves=True, at=0, known_m=None, sure=0.9, why="",
+        masks=segmentation.shares[:, MOVED] > 0.5, quality=np.ones(12), moves=True, at=0, known_m=None, sure=0.9, why="",
     )  # fmt: skip
     bin_ = replace(
         thing, role="container", noun=noun_for("bin"), moves=False,
-        masks=np.repeat((watched.early[OTHER] > 0.5)[None], 12, 0),
+        masks=np.repeat((segmentation.early[OTHER] > 0.5)[None], 12, 0),
     )  # fmt: skip
 
-    assert not swallowed(watched, thing, bin_).swallowed
-    assert swallowed(watched, thing, replace(bin_, hinted=True)).swallowed
+    assert not hidden_in_container(segmentation, thing, bin_).hidden_in_container
+    assert hidden_in_container(segmentation, thing, replace(bin_, hinted=True)).hidden_in_container
 
 
-def test_an_outline_at_the_end_that_shows_something_else_is_not_believed(watched_of):
+def test_an_outline_at_the_end_that_shows_something_else_is_not_believed(segmentation_of):
     frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
     frames[-1] = [(square(76, 40), BLUE, MOVED)]
-    footage, watched = watched_of(frames)
-    first, last = large(square(10, 40), footage), large(square(76, 40), footage)
+    working, segmentation = segmentation_of(frames)
+    first, last = large(square(10, 40), working), large(square(76, 40), working)
     moved = Moved(
-        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+        first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
 
-    course = track(footage, moved, moving=lambda i: watched.at(i)[MOVED])
+    tracked = track(working, moved, moving=lambda i: segmentation.at(i)[MOVED])
 
-    assert course.quality[0] == 1
-    assert course.quality[5] > 0.5
-    assert course.quality[-1] < 0.4
+    assert tracked.quality[0] == 1
+    assert tracked.quality[5] > 0.5
+    assert tracked.quality[-1] < 0.4
 
 
 @pytest.mark.parametrize(("lies_there_from", "believed"), [(0, 0.0), (8, 1.0)])
 def test_a_look_alike_that_lay_there_all_along_is_not_the_thing_at_the_end(
-    watched_of, lies_there_from, believed
+    segmentation_of, lies_there_from, believed
 ):
     """A thing disappears behind an arm; what is taken for it at the end was there from a frame on."""
     gone, there = square(10, 40), square(80, 20)
@@ -193,35 +203,37 @@ def test_a_look_alike_that_lay_there_all_along_is_not_the_thing_at_the_end(
         parts = [(gone, RED, MOVED)] if i < 4 else []
         parts += [(square(6, 36, 40), SKIN, HAND)] if 4 <= i < 8 else []
         frames.append([*parts, (there, RED, OTHER)] if i >= lies_there_from else parts)
-    footage, _ = watched_of(frames)
-    first, last = large(gone, footage), large(there, footage)
+    working, _ = segmentation_of(frames)
+    first, last = large(gone, working), large(there, working)
     moved = Moved(
-        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+        first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
 
-    course = track(footage, moved)
+    tracked = track(working, moved)
 
-    assert course.quality[0] == 1
-    assert course.quality[-1] == believed
+    assert tracked.quality[0] == 1
+    assert tracked.quality[-1] == believed
 
 
-def test_where_the_network_surely_sees_bare_table_nothing_is_followed(watched_of):
+def test_where_the_network_surely_sees_bare_table_nothing_is_followed(segmentation_of):
     """It knows the thing at first; what looks like it later is table to the network, while a fist hides the thing."""
     frames = [[(square(10 + 6 * i, 40), RED, MOVED if i < 6 else TABLE)] for i in range(12)]
-    footage, watched = watched_of(frames)
-    first, last = large(square(10, 40), footage), large(square(76, 40), footage)
+    working, segmentation = segmentation_of(frames)
+    first, last = large(square(10, 40), working), large(square(76, 40), working)
     moved = Moved(
-        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+        first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
 
     def told(**also):
-        return track(footage, moved, moving=lambda i: watched.at(i)[MOVED], **also).quality
+        return track(working, moved, moving=lambda i: segmentation.at(i)[MOVED], **also).quality
 
-    assert (told(bare=lambda i: watched.at(i)[TABLE]) > 0.5).tolist() == [True] * 6 + [False] * 6
+    assert (told(bare=lambda i: segmentation.at(i)[TABLE]) > 0.5).tolist() == [True] * 6 + [
+        False
+    ] * 6
     assert (told()[:10] > 0.5).all()
 
 
-def test_what_lies_there_still_keeps_its_whole_outline(watched_of):
+def test_what_lies_there_still_keeps_its_whole_outline(segmentation_of):
     """The network sees half of a thing that nobody has touched yet; the other half has nearly the table's colours."""
     frames = []
     for i in range(12):
@@ -229,58 +241,60 @@ def test_what_lies_there_still_keeps_its_whole_outline(watched_of):
         upper, lower = square(x, 40), square(x, 40)
         upper[47:], lower[:47] = False, False
         frames.append([(upper, RED, MOVED), (lower, (165, 150, 110), MOVED)])
-    footage, _ = watched_of(frames)
-    first, last = large(square(10, 40), footage), large(square(46, 40), footage)
+    working, _ = segmentation_of(frames)
+    first, last = large(square(10, 40), working), large(square(46, 40), working)
     half = first.copy()
     half[: round(47 / H * len(half))] = False
     moved = Moved(
-        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+        first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
 
-    course = track(footage, moved, moving=lambda i: np.where(half, 0.0, 0.7 * first))
+    tracked = track(working, moved, moving=lambda i: np.where(half, 0.0, 0.7 * first))
 
     for i in range(1, 7):
-        assert iou(course.masks[i], square(10, 40)) > 0.9, i
+        assert iou(tracked.masks[i], square(10, 40)) > 0.9, i
 
 
-def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours(watched_of):
+def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours(segmentation_of):
     frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
     arm = square(76, 54, 30)
     frames[-1] = [(arm, SKIN, MOVED), (square(76, 40), RED, MOVED)]
-    footage, watched = watched_of(frames)
-    hand = replace(footage, hand_hist=histogram(np.tile(np.array(SKIN, np.uint8), (400, 1))))
-    first, thing = large(square(10, 40), footage), large(square(76, 40), footage)
-    last = thing | large(arm, footage)
+    working, segmentation = segmentation_of(frames)
+    hand = replace(working, hand_hist=histogram(np.tile(np.array(SKIN, np.uint8), (400, 1))))
+    first, thing = large(square(10, 40), working), large(square(76, 40), working)
+    last = thing | large(arm, working)
     moved = Moved(
-        first=first, last=last, score=1.0, look=histogram(footage.rgb[0][first]), cues={}
+        first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
 
-    course = track(hand, moved, moving=lambda i: watched.at(i)[MOVED])
+    tracked = track(hand, moved, moving=lambda i: segmentation.at(i)[MOVED])
 
-    assert (course.masks[-1] & thing).sum() > 0.85 * thing.sum()
-    assert (course.masks[-1] & ~thing).sum() < 0.15 * thing.sum()
+    assert (tracked.masks[-1] & thing).sum() > 0.85 * thing.sum()
+    assert (tracked.masks[-1] & ~thing).sum() < 0.15 * thing.sum()
 
 
-def test_where_a_thing_will_stand_is_not_part_of_its_first_outline(watched_of):
-    footage, _ = watched_of([[(square(30 + 2 * i, 40), RED, MOVED)] for i in range(10)])
-    first, last = large(square(30, 40), footage), large(square(48, 40), footage)
-    moved = Moved(first=first | last, last=last, score=1.0, look=np.zeros((12, 24, 24)))
+def test_where_a_thing_will_stand_is_not_part_of_its_first_outline(segmentation_of):
+    working, _ = segmentation_of([[(square(30 + 2 * i, 40), RED, MOVED)] for i in range(10)])
+    first, last = large(square(30, 40), working), large(square(48, 40), working)
+    moved = Moved(first=first | last, last=last, score=1.0, colour_hist=np.zeros((12, 24, 24)))
 
-    freed = apart(footage, moved)
+    freed = disjoint_ends(working, moved)
 
     assert iou(freed.first, square(30, 40)) > 0.9
     assert (freed.last == last).all()
-    assert freed.look.sum() == pytest.approx(1)
-    assert (apart(footage, moved, keep=(0,)).first == (first | last)).all()
+    assert freed.colour_hist.sum() == pytest.approx(1)
+    assert (disjoint_ends(working, moved, keep=(0,)).first == (first | last)).all()
 
 
 def test_what_is_covered_by_both_outlines_stays_with_both_where_it_shows_the_thing_twice(
-    watched_of,
+    segmentation_of,
 ):
-    footage, _ = watched_of([[(square(30 + i, 40), RED, MOVED)] for i in range(8)])
-    first, last = large(square(30, 40), footage), large(square(37, 40), footage)
+    working, _ = segmentation_of([[(square(30 + i, 40), RED, MOVED)] for i in range(8)])
+    first, last = large(square(30, 40), working), large(square(37, 40), working)
 
-    same = apart(footage, Moved(first=first, last=last, score=1.0, look=np.zeros((12, 24, 24))))
+    same = disjoint_ends(
+        working, Moved(first=first, last=last, score=1.0, colour_hist=np.zeros((12, 24, 24)))
+    )
 
     assert (same.first == first).all()
     assert (same.last == last).all()
@@ -297,7 +311,7 @@ def seen_as(**sure):
 def test_a_shadow_in_the_outline_that_the_network_sees_as_table_is_cut_off():
     thing, shadow = square(40, 30, 20), square(60, 36, 14)
 
-    found = settled(thing | shadow, seen_as(moved=thing))
+    found = without_shadow(thing | shadow, seen_as(moved=thing))
 
     assert np.array_equal(found, thing)
 
@@ -305,7 +319,9 @@ def test_a_shadow_in_the_outline_that_the_network_sees_as_table_is_cut_off():
 def test_a_marked_outline_loses_what_surely_is_table_but_no_part_of_the_thing():
     body, beside, handle = square(40, 30, 20), square(60, 36, 8), square(60, 48, 14)
 
-    found = less_table(body | beside | handle, seen_as(other=body | handle & ~square(60, 48, 2)))
+    found = without_table(
+        body | beside | handle, seen_as(other=body | handle & ~square(60, 48, 2))
+    )
 
     assert not found[beside & ~handle].any()
     assert found[body].all()
@@ -317,14 +333,14 @@ def test_a_thin_thing_that_is_marked_stays_what_it_was():
     pen[40:42, 20:80] = True
     shadow[42:44, 20:80] = True
 
-    assert np.array_equal(less_table(pen, seen_as(moved=pen)), pen)
-    assert np.array_equal(less_table(pen | shadow, seen_as(moved=pen)), pen)
+    assert np.array_equal(without_table(pen, seen_as(moved=pen)), pen)
+    assert np.array_equal(without_table(pen | shadow, seen_as(moved=pen)), pen)
 
 
 def test_where_the_network_does_not_know_the_thing_its_outline_stays():
     thing = square(40, 30, 20)
 
-    assert np.array_equal(settled(thing, seen_as(moved=square(40, 30, 6))), thing)
+    assert np.array_equal(without_shadow(thing, seen_as(moved=square(40, 30, 6))), thing)
 
 
 def test_what_adjoins_an_outline_and_surely_is_a_thing_belongs_to_it():
@@ -345,40 +361,44 @@ def test_an_outline_is_completed_within_its_box_and_by_its_own_kind():
     assert np.array_equal(filled(part, shares, part), part), "nothing beyond the box"
 
 
-def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen(watched_of):
-    footage, watched = watched_of(put_into(bin_shows_at_the_end=False))
+def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen(segmentation_of):
+    working, segmentation = segmentation_of(put_into(bin_shows_at_the_end=False))
 
-    found = find_movers(footage, watched, "red cube", "insert")
+    found = find_moved_by_network(working, segmentation, "red cube", "insert")
 
     assert found is not None
     assert iou(found[0].first, square(10, 50)) > 0.7
     assert iou(found[0].last, square(10 + 8 * 8, 50)) > 0.7
-    assert find_movers(footage, watched, "red cube", "push_right") is None
+    assert find_moved_by_network(working, segmentation, "red cube", "push_right") is None
 
 
-def test_a_tool_marked_in_one_frame_is_followed_both_ways_until_it_is_gone(watched_of):
+def test_a_tool_marked_in_one_frame_is_followed_both_ways_until_it_is_gone(segmentation_of):
     path = [None, None, *((20 + 6 * i, 40) for i in range(8)), None, None]
-    footage, watched = watched_of([[(square(*at), RED, MOVED)] if at else [] for at in path])
-    mask = watched.shares[5, MOVED] > 0.5
+    working, segmentation = segmentation_of(
+        [[(square(*at), RED, MOVED)] if at else [] for at in path]
+    )
+    mask = segmentation.shares[5, MOVED] > 0.5
 
-    course = carried(footage, mask, 5, moving=lambda i: watched.at(i)[MOVED])
+    tracked = carried(working, mask, 5, moving=lambda i: segmentation.at(i)[MOVED])
 
     for i, at in enumerate(path):
         if at is None:
-            assert not course.masks[i].any(), i
+            assert not tracked.masks[i].any(), i
         else:
-            assert iou(course.masks[i], square(*at)) > 0.6, i
-    assert course.quality[5] == 1
+            assert iou(tracked.masks[i], square(*at)) > 0.6, i
+    assert tracked.quality[5] == 1
 
 
-def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(watched_of):
+def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(segmentation_of):
     frames = pushed(RED, RED)
-    footage, watched = watched_of(frames)
+    working, segmentation = segmentation_of(frames)
     start, near, far = square(15, 20), square(44, 14, 26), square(44, 54, 26)
-    first, goals = large(start, footage), [large(goal, footage) for goal in (near, far)]
+    first, goals = large(start, working), [large(goal, working) for goal in (near, far)]
 
     ends = [
-        find_movers(footage, watched, "red box", "insert", first=first, goal=goal)[0].last
+        find_moved_by_network(working, segmentation, "red box", "insert", first=first, goal=goal)[
+            0
+        ].last
         for goal in goals
     ]
 
@@ -386,37 +406,37 @@ def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(wa
     assert iou(ends[1], square(48, 60)) > 0.8
 
 
-def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(watched_of):
+def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(segmentation_of):
     """Of two that move alike the blue one is meant: a mark in the middle says so, and is no outline of either end."""
     frames = pushed(RED, BLUE)
-    footage, watched = watched_of(frames)
-    there = large(square(15 + 3 * 6, 60), footage)
+    working, segmentation = segmentation_of(frames)
+    there = large(square(15 + 3 * 6, 60), working)
 
-    moved, _ = find_movers(
-        footage, watched, "thing", "push_right", look=histogram(footage.rgb[6][there])
+    moved, _ = find_moved_by_network(
+        working, segmentation, "thing", "push_right", colour_hist=histogram(working.rgb[6][there])
     )
 
     assert iou(moved.first, square(15, 60)) > 0.8
     assert iou(moved.last, square(15 + 33, 60)) > 0.8
 
 
-def test_a_box_says_more_than_an_outline_that_fills_half_of_it(watched_of, draw):
+def test_a_box_says_more_than_an_outline_that_fills_half_of_it(segmentation_of, draw):
     """A cube whose top has the table's colour: neither edges nor the network show more than its front."""
     fronts = [square(20 + 3 * i, 40, 20) & (np.arange(H) >= 50)[:, None] for i in range(12)]
-    footage, watched = watched_of([[(front, RED, MOVED)] for front in fronts])
+    working, segmentation = segmentation_of([[(front, RED, MOVED)] for front in fronts])
     clip = replace(
         draw(num_frames=12),
         caption="Pushing cube from left to right",
         hints={"cube": {"frame": 0, "box": [20.0, 40.0, 40.0, 60.0]}},
     )
-    hand = watched.shares.copy()
+    hand = segmentation.shares.copy()
     hand[6, HAND, :20] = 1.0
 
-    seen = sight(
+    seen = ground_objects(
         clip,
-        footage,
+        working,
         parse_caption(clip.caption, ()),
-        replace(watched, shares=hand),
+        replace(segmentation, shares=hand),
         min_found=0.5,
     )
 
@@ -424,7 +444,7 @@ def test_a_box_says_more_than_an_outline_that_fills_half_of_it(watched_of, draw)
     assert iou(seen.objects[0].last, fronts[-1]) > 0.7
 
 
-def test_a_thing_is_cut_by_its_colour_from_the_arm_that_was_taken_along(watched_of):
+def test_a_thing_is_cut_by_its_colour_from_the_arm_that_was_taken_along(segmentation_of):
     """At first the network takes the arm for a part of what moves; it comes from outside of the picture."""
     arm = np.zeros((H, W), bool)
     arm[26:36, :30] = True
@@ -432,23 +452,23 @@ def test_a_thing_is_cut_by_its_colour_from_the_arm_that_was_taken_along(watched_
     frames = [parts[:1] for parts in frames]
     frames[0] = [(arm | square(15, 20), SKIN, MOVED), (square(15, 20), RED, MOVED)]
     frames[1] = [(arm, SKIN, HAND), *frames[1]]
-    footage, watched = watched_of(frames)
+    working, segmentation = segmentation_of(frames)
 
-    red, _ = find_movers(footage, watched, "red box", "push_right")
-    any_, _ = find_movers(footage, watched, "box", "push_right")
+    red, _ = find_moved_by_network(working, segmentation, "red box", "push_right")
+    any_, _ = find_moved_by_network(working, segmentation, "box", "push_right")
 
     assert iou(red.first, square(15, 20)) > 0.8
-    assert any_.first[large(arm & ~square(13, 18, 18), footage)].mean() > 0.5, "nothing says which"
+    assert any_.first[large(arm & ~square(13, 18, 18), working)].mean() > 0.5, "nothing says which"
     assert red.score > 0.3, "the whole is no rival of its piece"
 
 
-def test_outlines_from_elsewhere_are_rated_like_the_networks_own(watched_of):
-    footage, watched = watched_of(pushed(RED, BLUE))
-    own, _ = find_movers(footage, watched, "red box", "push_right")
+def test_outlines_from_elsewhere_are_rated_like_the_networks_own(segmentation_of):
+    working, segmentation = segmentation_of(pushed(RED, BLUE))
+    own, _ = find_moved_by_network(working, segmentation, "red box", "push_right")
 
-    same = rated(footage, watched, "red box", "push_right", own)
-    other = replace(own, first=large(square(15, 60), footage), last=large(square(48, 60), footage))
-    blue = rated(footage, watched, "red box", "push_right", other)
+    same = rated(working, segmentation, "red box", "push_right", own)
+    other = replace(own, first=large(square(15, 60), working), last=large(square(48, 60), working))
+    blue = rated(working, segmentation, "red box", "push_right", other)
 
     alike = {cue: value for cue, value in own.cues.items() if cue != "no rival"}
     assert same.cues == pytest.approx({**alike, "no rival": 1.0}, abs=0.02)

@@ -9,14 +9,14 @@ import pytest
 from v2p_data.scene.frames.classes import BACKGROUND, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.frames.table import find_table
-from v2p_data.scene.grounding.ground_objects import stands_on
+from v2p_data.scene.grounding.ground_objects import rests_on_table
 from v2p_data.scene.grounding.static_objects import (
     WEIGHTS,
-    Candidate,
-    Search,
+    StaticCandidate,
+    StaticSearch,
     candidates,
-    find_standing,
-    seen_standing,
+    find_static_object,
+    static_share,
     usual_area_px,
 )
 from v2p_data.scene.scale.camera_height import SeenCamera
@@ -34,9 +34,9 @@ def square(x, y, size=14):
     return mask
 
 
-def large(mask, footage):
+def large(mask, working):
     """Return a mask at working size."""
-    h, w = footage.shape
+    h, w = working.shape
     return mask[(np.arange(h) * 90) // h][:, (np.arange(w) * 120) // w]
 
 
@@ -48,165 +48,165 @@ def pushed_to(x, others):
     ]  # fmt: skip
 
 
-def searched(watched_of, frames, phrase, kind, ends, moved="thing"):
-    footage, watched = watched_of(frames)
-    first, last = (large(mask, footage) for mask in ends)
-    return Search(
-        footage=footage,
-        table=find_table(footage.always, watched.early[TABLE] > 0.5),
-        watched=watched,
+def searched(segmentation_of, frames, phrase, kind, ends, moved="thing"):
+    working, segmentation = segmentation_of(frames)
+    first, last = (large(mask, working) for mask in ends)
+    return StaticSearch(
+        working=working,
+        table=find_table(working.always, segmentation.early[TABLE] > 0.5),
+        segmentation=segmentation,
         phrase=phrase,
         moved=noun_for(moved),
         kind=kind,
         ends=(first, last),
-        taken=np.zeros(footage.shape, bool),
+        taken=np.zeros(working.shape, bool),
     )
 
 
 def meant(*asked):
     search = searched(*asked)
-    return find_standing(search), search.footage
+    return find_static_object(search), search.working
 
 
-def test_of_two_things_the_one_that_was_pushed_to_is_meant(watched_of):
+def test_of_two_things_the_one_that_was_pushed_to_is_meant(segmentation_of):
     near, far = square(70, 40), square(100, 5)
     frames = pushed_to(52, [(near, BLUE), (far, BLUE)])
 
-    found, footage = meant(
-        watched_of, frames, "box", "push_next_to", (square(5, 40), square(52, 40))
+    found, working = meant(
+        segmentation_of, frames, "box", "push_next_to", (square(5, 40), square(52, 40))
     )
 
-    assert iou(found.mask, large(near, footage)) > 0.8
+    assert iou(found.mask, large(near, working)) > 0.8
 
 
-def test_a_basket_that_fills_a_third_of_the_picture_is_still_a_thing(watched_of):
+def test_a_basket_that_fills_a_third_of_the_picture_is_still_a_thing(segmentation_of):
     basket, small = square(50, 20, 62), square(5, 5)
     frames = pushed_to(60, [(basket, BLUE), (small, BLUE)])
 
-    found, footage = meant(
-        watched_of, frames, "laundry basket", "throw_into", (square(5, 40), square(60, 40))
+    found, working = meant(
+        segmentation_of, frames, "laundry basket", "throw_into", (square(5, 40), square(60, 40))
     )
 
-    assert iou(found.mask, large(basket, footage)) > 0.8
+    assert iou(found.mask, large(basket, working)) > 0.8
 
 
-def test_a_table_that_seems_to_be_a_thing_is_too_large_to_be_a_cup(watched_of):
+def test_a_table_that_seems_to_be_a_thing_is_too_large_to_be_a_cup(segmentation_of):
     table, cup = square(50, 20, 62), square(66, 44, 12)
     frames = pushed_to(60, [(table, GREEN), (cup, BLUE)])
     ends = square(5, 40), square(60, 40)
 
-    search = searched(watched_of, frames, "cup", "throw_into", ends)
+    search = searched(segmentation_of, frames, "cup", "throw_into", ends)
 
     assert max(one.mask.mean() for one in candidates(search)) < 0.2
 
 
-def test_a_named_colour_outweighs_a_little_distance(watched_of):
+def test_a_named_colour_outweighs_a_little_distance(segmentation_of):
     near, far = square(60, 62), square(70, 15)
     frames = pushed_to(60, [(near, BLUE), (far, GREEN)])
     ends = square(5, 40), square(60, 40)
 
-    blue, footage = meant(watched_of, frames, "blue box", "push_next_to", ends)
-    green, _ = meant(watched_of, frames, "green box", "push_next_to", ends)
+    blue, working = meant(segmentation_of, frames, "blue box", "push_next_to", ends)
+    green, _ = meant(segmentation_of, frames, "green box", "push_next_to", ends)
 
-    assert iou(blue.mask, large(near, footage)) > 0.8
-    assert iou(green.mask, large(far, footage)) > 0.8
+    assert iou(blue.mask, large(near, working)) > 0.8
+    assert iou(green.mask, large(far, working)) > 0.8
 
 
 def test_a_whole_that_was_cut_out_twice_is_meant_rather_than_something_likelier_by_itself(
-    watched_of, monkeypatch
+    segmentation_of, monkeypatch
 ):
     """What two candidates nearly agree on is likelier than the one candidate that agrees with none."""
     ends = square(5, 40), square(50, 40)
-    search = searched(watched_of, pushed_to(50, [(square(72, 28, 20), BLUE)]), "box", "push_next_to", ends)  # fmt: skip
+    search = searched(segmentation_of, pushed_to(50, [(square(72, 28, 20), BLUE)]), "box", "push_next_to", ends)  # fmt: skip
     usual = candidates(search)[0]
     shapes = [(square(72, 28, 20), 0.70), (square(73, 29, 19), 0.69), (square(5, 5), 0.75)]
     found = [
-        Candidate(
-            mask=large(mask, search.footage),
+        StaticCandidate(
+            mask=large(mask, search.working),
             cues={**dict.fromkeys(usual.cues, 0.0), "seen": seen},
         )
         for mask, seen in shapes
     ]
     monkeypatch.setattr("v2p_data.scene.grounding.static_objects.candidates", lambda _: found)
 
-    assert iou(find_standing(search).mask, found[0].mask) > 0.7
+    assert iou(find_static_object(search).mask, found[0].mask) > 0.7
 
     monkeypatch.setattr("v2p_data.scene.grounding.static_objects.candidates", lambda _: found[1:])
-    assert iou(find_standing(search).mask, found[2].mask) > 0.7
+    assert iou(find_static_object(search).mask, found[2].mask) > 0.7
 
 
-def test_one_alone_is_surer_than_one_of_two_that_are_alike(watched_of):
+def test_one_alone_is_surer_than_one_of_two_that_are_alike(segmentation_of):
     ends = square(5, 40), square(50, 40)
     one, two = square(72, 28), square(72, 52)
 
-    alone, _ = meant(watched_of, pushed_to(50, [(one, BLUE)]), "box", "push_next_to", ends)
+    alone, _ = meant(segmentation_of, pushed_to(50, [(one, BLUE)]), "box", "push_next_to", ends)
     either, _ = meant(
-        watched_of, pushed_to(50, [(one, BLUE), (two, BLUE)]), "box", "push_next_to", ends
+        segmentation_of, pushed_to(50, [(one, BLUE), (two, BLUE)]), "box", "push_next_to", ends
     )
 
     assert either.score < alone.score - 0.1
 
 
-def test_what_an_arm_hides_at_first_is_found_where_it_is_seen_later(watched_of):
+def test_what_an_arm_hides_at_first_is_found_where_it_is_seen_later(segmentation_of):
     bin_, arm = square(70, 30, 24), square(60, 20, 40)
     frames = pushed_to(30, [(bin_, BLUE)])
     for parts in frames[:4]:
         parts.append((arm, SKIN, HAND))
-    found, footage = meant(
-        watched_of, frames, "blue bin", "throw_into", (square(5, 40), square(72, 34, 10))
+    found, working = meant(
+        segmentation_of, frames, "blue bin", "throw_into", (square(5, 40), square(72, 34, 10))
     )
 
-    assert iou(found.mask, large(bin_, footage)) > 0.8
+    assert iou(found.mask, large(bin_, working)) > 0.8
 
 
-def test_where_nothing_stands_nothing_is_believed(watched_of):
+def test_where_nothing_stands_nothing_is_believed(segmentation_of):
     """The edge of the moved thing's trace may stand out from the table."""
     ends = square(5, 40), square(50, 40)
-    found, _ = meant(watched_of, pushed_to(50, []), "box", "push_next_to", ends)
+    found, _ = meant(segmentation_of, pushed_to(50, []), "box", "push_next_to", ends)
 
     assert found is None or found.score < 0.2
 
 
-def test_print_on_the_table_is_no_part_of_what_stands_beside_it(watched_of):
+def test_print_on_the_table_is_no_part_of_what_stands_beside_it(segmentation_of):
     thing, print_ = square(70, 40), square(72, 54, 10)
     frames = [[(print_, BLUE, TABLE), *parts] for parts in pushed_to(52, [(thing, BLUE)])]
 
-    found, footage = meant(
-        watched_of, frames, "blue box", "push_next_to", (square(5, 40), square(52, 40))
+    found, working = meant(
+        segmentation_of, frames, "blue box", "push_next_to", (square(5, 40), square(52, 40))
     )
 
-    assert iou(found.mask, large(thing, footage)) > 0.85
+    assert iou(found.mask, large(thing, working)) > 0.85
 
 
-def test_what_is_uncovered_is_looked_for_where_the_cover_stood(watched_of):
+def test_what_is_uncovered_is_looked_for_where_the_cover_stood(segmentation_of):
     under, beside = square(22, 44, 8), square(90, 60, 8)
     frames = [
         [(beside, BLUE, OTHER), (under, BLUE, MOVED), (square(18 + 4 * i, 36, 20), RED, MOVED)]
         for i in range(12)
     ]
-    found, footage = meant(
-        watched_of, frames, "box", "uncover", (square(18, 36, 20), square(62, 36, 20))
+    found, working = meant(
+        segmentation_of, frames, "box", "uncover", (square(18, 36, 20), square(62, 36, 20))
     )
 
-    assert iou(found.mask, large(under, footage)) > 0.6
+    assert iou(found.mask, large(under, working)) > 0.6
 
 
-def test_pixels_count_in_the_frames_that_show_them(watched_of):
+def test_pixels_count_in_the_frames_that_show_them(segmentation_of):
     bin_ = square(70, 30, 24)
     frames = pushed_to(30, [(bin_, BLUE)])
     for parts in frames[:8]:
         parts.append((bin_, SKIN, HAND))
-    footage, watched = watched_of(frames)
+    working, segmentation = segmentation_of(frames)
 
-    assert seen_standing(watched, "insert")[large(bin_, footage)].min() > 0.7
+    assert static_share(segmentation, "insert")[large(bin_, working)].min() > 0.7
 
 
-def test_where_all_seems_too_small_things_are_compared_with_what_moves(watched_of):
+def test_where_all_seems_too_small_things_are_compared_with_what_moves(segmentation_of):
     """The camera is taken to be near, and the scene is far away: then the box that is pushed looks like a matchbox."""
     frames, ends = pushed_to(50, [(square(72, 28), BLUE)]), (square(5, 40), square(50, 40))
 
     alone, beside = (
-        searched(watched_of, frames, "blue suitcase", "slide_to", ends, moved)
+        searched(segmentation_of, frames, "blue suitcase", "slide_to", ends, moved)
         for moved in ("thing", "suitcase")
     )
 
@@ -219,33 +219,33 @@ def test_where_all_seems_too_small_things_are_compared_with_what_moves(watched_o
 
 
 @pytest.mark.parametrize("kind", ["insert", "slide_to", "uncover", "lift_up"])
-def test_every_candidate_has_the_cues_that_were_learned(watched_of, kind):
+def test_every_candidate_has_the_cues_that_were_learned(segmentation_of, kind):
     frames, ends = pushed_to(50, [(square(72, 28), BLUE)]), (square(5, 40), square(50, 40))
     learned = json.loads(WEIGHTS.read_text())
     assert set(learned["sure"]) == {"offset", "odds", *learned["choice"]}
 
-    for one in candidates(searched(watched_of, frames, "blue box", kind, ends)):
+    for one in candidates(searched(segmentation_of, frames, "blue box", kind, ends)):
         assert set(one.cues) == set(learned["choice"])
 
 
-def test_what_stands_is_apart_from_table_and_wall(watched_of):
+def test_what_stands_is_apart_from_table_and_wall(segmentation_of):
     thing = square(60, 50)
     parts = [(square(0, 0, 30), (90, 90, 90), BACKGROUND), (thing, RED, OTHER)]
-    footage, watched = watched_of([parts for _ in range(12)])
+    working, segmentation = segmentation_of([parts for _ in range(12)])
 
-    assert iou(seen_standing(watched, "push_left") > 0.5, large(thing, footage)) > 0.8
+    assert iou(static_share(segmentation, "push_left") > 0.5, large(thing, working)) > 0.8
 
 
-def test_what_has_table_beneath_it_stands_on_the_table_whatever_its_colours_say(watched_of):
+def test_what_has_table_beneath_it_stands_on_the_table_whatever_its_colours_say(segmentation_of):
     on, off = square(60, 50), square(5, 5)
     wall = square(0, 0, 40)
     parts = [(wall, (90, 90, 90), BACKGROUND), (on, RED, OTHER), (off, RED, OTHER)]
-    footage, watched = watched_of([parts for _ in range(12)])
-    nowhere = replace(find_table(footage.always), hull=np.zeros(footage.shape, bool))
+    working, segmentation = segmentation_of([parts for _ in range(12)])
+    nowhere = replace(find_table(working.always), hull=np.zeros(working.shape, bool))
 
-    assert not stands_on(nowhere, large(on, footage))
-    assert stands_on(nowhere, large(on, footage), watched)
-    assert not stands_on(nowhere, large(off, footage), watched)
+    assert not rests_on_table(nowhere, large(on, working))
+    assert rests_on_table(nowhere, large(on, working), segmentation)
+    assert not rests_on_table(nowhere, large(off, working), segmentation)
 
 
 @pytest.mark.parametrize(("phrase", "far"), [("ball", False), ("plate", False), ("box", True)])

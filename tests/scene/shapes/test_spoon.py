@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.scale.nouns import noun_for
-from v2p_data.scene.shapes.shape import View, best_shape
+from v2p_data.scene.shapes.shape import SilhouetteView, best_shape
 from v2p_data.scene.shapes.spoon import is_spoon, spoons
 
 SIZE = (0.19, 0.04, 0.02)
@@ -80,7 +80,7 @@ def test_a_hand_that_pushes_with_it_holds_the_rod():
 def test_the_outline_says_which_end_is_the_bowl(which):
     T = lying(65)
     true = spoons(SIZE, T)[which].mesh
-    view = View(mask=seen(true, T), T_world_obj=T)
+    view = SilhouetteView(mask=seen(true, T), T_world_obj=T)
 
     choice = best_shape([view], CAMERA, SIZE, noun_for("spoon"))
 

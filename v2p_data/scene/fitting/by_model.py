@@ -17,9 +17,9 @@ from v2p_data.scene.backends.config import (
     DepthConfig,
     PoseConfig,
 )
-from v2p_data.scene.data_types import CameraGuess, Sighting
+from v2p_data.scene.data_types import CameraGuess, ObjectTrack
 from v2p_data.scene.frames.mask_ops import grow
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.video.clip import Clip
 
 _PITCH_SD_RAD = 0.04
@@ -30,8 +30,8 @@ _HEIGHT_SD = 0.12
 
 def camera_from_depth(
     clip: Clip,
-    footage: Footage,
-    objects: Sequence[Sighting],
+    working: WorkingClip,
+    objects: Sequence[ObjectTrack],
     guess: CameraGuess,
     cfg: DepthConfig,
     rng: np.random.Generator,
@@ -42,14 +42,14 @@ def camera_from_depth(
     """
     from v2p_data.scene.backends.depth import predict_depth, table_from_depth
 
-    ends = [int(footage.frame_idx[0]), int(footage.frame_idx[-1])]
+    ends = [int(working.frame_idx[0]), int(working.frame_idx[-1])]
     depth = predict_depth([clip.frames[i] for i in ends], cfg)
     h, w = clip.frames.shape[1:3]
     fov = guess.fov_rad if depth.fov_rad is None else float(np.median(depth.fov_rad))
     f = w / 2 / np.tan(fov / 2)
     K = np.array([[f, 0, w / 2], [0, f, h / 2], [0, 0, 1.0]])
     planes = []
-    for k, i in enumerate((0, len(footage.rgb) - 1)):
+    for k, i in enumerate((0, len(working.rgb) - 1)):
         things = np.any([grow(s.masks[i], 3) for s in objects], axis=0)
         not_table = cv2.resize(things.astype(np.uint8), (w, h)) > 0
         plane = table_from_depth(depth.depth_m[k], K, not_table, rng=rng)
@@ -70,13 +70,13 @@ def camera_from_depth(
 
 def poses_by_worker(
     clip: Clip,
-    footage: Footage,
+    working: WorkingClip,
     masks: Bool[np.ndarray, "time h w"],
     mesh: trimesh.Trimesh,
     camera: Camera,
     cfg: PoseConfig,
 ) -> tuple[Float[np.ndarray, "time 4 4"], Float[np.ndarray, "time"]]:
-    """Return the worker's `T_world_obj` for every footage frame, and how sure it is of each (0 to 1).
+    """Return the worker's `T_world_obj` for every working frame, and how sure it is of each (0 to 1).
 
     `camera` is the metric one of the clip's frames.
 
@@ -86,7 +86,7 @@ def poses_by_worker(
     """
     from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
-    images = np.stack([clip.frames[i] for i in footage.frame_idx])
+    images = np.stack([clip.frames[i] for i in working.frame_idx])
     h, w = images.shape[1:3]
     large = np.stack(
         [

@@ -50,7 +50,7 @@ class Aim:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoxGuess:
+class CuboidGuess:
     """What the network says of a box that stands or lies level."""
 
     azimuth_rad: float
@@ -87,7 +87,7 @@ class BoxGuess:
         return lost + (TAIL + 1) / 2 * math.log1p(off)
 
 
-class BoxNetwork(Encoder):
+class CuboidNetwork(Encoder):
     """How a box is turned, and how its sides compare."""
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ class BoxNetwork(Encoder):
     def forward(
         self, planes: Float[torch.Tensor, "n 6 h w"], known: Float[torch.Tensor, "n 2"]
     ) -> Float[torch.Tensor, "n 7"]:
-        """Return `fourfold`, `twofold` and the logarithm of its deviation, `height` and the logarithm of its, as in `BoxGuess`.
+        """Return `fourfold`, `twofold` and the logarithm of its deviation, `height` and the logarithm of its, as in `CuboidGuess`.
 
         `known` is how far the line of sight points below the horizon [rad], and the logarithm of the outline's extent.
         """
@@ -108,13 +108,13 @@ class BoxNetwork(Encoder):
 
 
 @lru_cache(maxsize=1)
-def box_network() -> BoxNetwork:
+def box_network() -> CuboidNetwork:
     """Return the trained network, on the CPU.
 
     Raises:
         V2PError: its weights are missing or belong to another version.
     """
-    return trained(BoxNetwork(), BOX_WEIGHTS, "scripts/train_box_network.py")
+    return trained(CuboidNetwork(), BOX_WEIGHTS, "scripts/train_box_network.py")
 
 
 def aim_at(
@@ -153,9 +153,9 @@ def planes_of(
 
 
 @torch.inference_mode()
-def box_guess(
+def cuboid_guess(
     image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], camera: Camera
-) -> BoxGuess:
+) -> CuboidGuess:
     """Return what the network says of a box that is seen level; `mask` is its outline."""
     aim = aim_at(mask, camera, INPUT_PX, WINDOW_SHARE)
     size, flags = (INPUT_PX, INPUT_PX), cv2.INTER_LINEAR
@@ -169,7 +169,7 @@ def box_guess(
     said[1, [1, 3]] *= -1  # mirrored, yaws turn the other way
     x, y, u, v, twofold, height, height_sd = said.mean(0).tolist()
     less = min(1.0, _MOST_KAPPA / max(math.hypot(x, y), 1e-9))
-    return BoxGuess(
+    return CuboidGuess(
         azimuth_rad=aim.azimuth_rad,
         fourfold=(less * x, less * y),
         twofold=(u, v),

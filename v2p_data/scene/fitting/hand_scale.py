@@ -22,11 +22,11 @@ from v2p_data.scene.frames.classes import HAND
 from v2p_data.scene.frames.hand import HandEnd, gap_px, hand_end
 from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.frames.network import Encoder, trained
-from v2p_data.scene.frames.segmentation import Watched
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.segmentation import Segmentation
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.camera_height import table_width_m
 
-RULER_WEIGHTS = Path(__file__).with_name("ruler.safetensors")
+HAND_SCALE_WEIGHTS = Path(__file__).with_name("ruler.safetensors")
 GUESS_SPREAD = 0.25
 """Standard deviation of the logarithm by which windows are too large or small in training."""
 REACH_M = 0.25
@@ -38,14 +38,14 @@ _WIDTHS = (16, 32, 56, 96)
 TOUCHING_M = 0.02
 _IN_PLACE = 0.4
 """Overlap of a thing's outline with the one where it rests, from which on it rests there still, or already."""
-_MOST_LOOKS = 12
+_MOST_VIEWS = 12
 _DOUBT = 0.15
 """Added to the spread that the network states: it learned from drawn hands, and real ones differ from those."""
 _LEAST_PX_PER_M = 40.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look:
+class HandView:
     """A hand that touches a thing at rest."""
 
     planes: Float32[np.ndarray, "4 112 112"]
@@ -55,7 +55,7 @@ class Look:
     from the hand's end, (right, down) [windows]."""
 
 
-class RulerNetwork(Encoder):
+class HandScaleNetwork(Encoder):
     """How much too large a window around a hand is."""
 
     def __init__(self) -> None:
@@ -73,16 +73,16 @@ class RulerNetwork(Encoder):
 
 
 @lru_cache(maxsize=1)
-def ruler_network() -> RulerNetwork:
+def hand_scale_network() -> HandScaleNetwork:
     """Return the trained network, on the CPU.
 
     Raises:
         V2PError: its weights are missing or belong to another version.
     """
-    return trained(RulerNetwork(), RULER_WEIGHTS, "scripts/train_hand_ruler.py")
+    return trained(HandScaleNetwork(), HAND_SCALE_WEIGHTS, "scripts/train_hand_ruler.py")
 
 
-def look_at(
+def view_hand(
     rgb: UInt8[np.ndarray, "h w 3"],
     hand: Float32[np.ndarray, "h w"],
     end: HandEnd,
@@ -90,14 +90,14 @@ def look_at(
     px_per_m: float,
     pitch_rad: float,
     below: float,
-) -> Look:
+) -> HandView:
     """Return a hand as the network sees it, in a window for so many pixels per metre; `below` as in `table_width_m`."""
     side_px = WINDOW_M * px_per_m
     tip = np.array(end.tip_px)
     centre = tip + np.array(end.way) * TOWARDS_ARM * side_px
     colours, outline = window(rgb, hand, centre, side_px)
     offset = (foot_px - tip) / side_px
-    return Look(
+    return HandView(
         planes=planes_of(colours, outline),
         known=np.array([pitch_rad, below, *offset], np.float32),
     )
@@ -130,9 +130,9 @@ def planes_of(
     return np.concatenate([colours, hand[None]]).astype(np.float32)
 
 
-def height_by_hand(
-    footage: Footage,
-    watched: Watched,
+def height_from_hand(
+    working: WorkingClip,
+    segmentation: Segmentation,
     masks: Bool[np.ndarray, "time h w"],
     stands: Sequence[tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "3"]]],
     camera: Camera,
@@ -142,9 +142,9 @@ def height_by_hand(
     """Return the camera's height [m] by the hand that moves a thing, and the standard deviation of its logarithm.
 
     Args:
-        footage: frames.
-        watched: what the network sees in them.
-        masks: of the thing, in every footage frame.
+        working: frames.
+        segmentation: what the network sees in them.
+        masks: of the thing, in every working frame.
         stands: its outlines where it rests, at first and at last, and its positions there [camera heights].
         camera: one camera height above the table.
         pitch_rad: how far it looks below the horizon.
@@ -153,23 +153,23 @@ def height_by_hand(
     Returns:
         None where no hand is seen that touches the thing at rest.
     """
-    looks = _looks(footage, watched, masks, stands, camera, pitch_rad, height_m)
-    if not looks:
+    views = _views(working, segmentation, masks, stands, camera, pitch_rad, height_m)
+    if not views:
         return None
-    off, stated = _said(looks)
+    off, stated = _said(views)
     return float(height_m * np.exp(-off)), float(np.hypot(stated, _DOUBT))
 
 
-def _looks(
-    footage: Footage,
-    watched: Watched,
+def _views(
+    working: WorkingClip,
+    segmentation: Segmentation,
     masks: Bool[np.ndarray, "time h w"],
     stands: Sequence[tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "3"]]],
     camera: Camera,
     pitch_rad: float,
     height_m: float,
-) -> list[Look]:
-    h, w = footage.shape
+) -> list[HandView]:
+    h, w = working.shape
     feet = []
     for _, position in stands:
         foot = camera.project((position * [1, 1, 0])[None])[0]
@@ -177,34 +177,34 @@ def _looks(
         px_per_m = w / table_width_m(pitch_rad, float(camera.K[0, 0]) / w, height_m, below)
         feet.append((foot, below, px_per_m))
     out = []
-    for k, i in enumerate(watched.idx):
+    for k, i in enumerate(segmentation.idx):
         overlaps = [iou(masks[i], mask) for mask, _ in stands]
         best = int(np.argmax(overlaps))
         foot, below, px_per_m = feet[best]
         if overlaps[best] < _IN_PLACE or not px_per_m > _LEAST_PX_PER_M:
             continue
-        share = watched.shares[k, HAND].astype(np.float32)
+        share = segmentation.shares[k, HAND].astype(np.float32)
         hand = share > 0.5
         end = hand_end(hand)
         if end is None or gap_px(hand, masks[i]) > TOUCHING_M * px_per_m:
             continue
         if np.linalg.norm(foot - end.tip_px) > REACH_M * px_per_m:
             continue
-        out.append(look_at(footage.rgb[i], share, end, foot, px_per_m, pitch_rad, below))
-    few = np.linspace(0, len(out) - 1, min(len(out), _MOST_LOOKS)).round().astype(int)
+        out.append(view_hand(working.rgb[i], share, end, foot, px_per_m, pitch_rad, below))
+    few = np.linspace(0, len(out) - 1, min(len(out), _MOST_VIEWS)).round().astype(int)
     return [out[k] for k in few]
 
 
 @torch.inference_mode()
-def _said(looks: list[Look]) -> tuple[float, float]:
+def _said(views: list[HandView]) -> tuple[float, float]:
     """Return the logarithm of true over guessed pixels per metre, and its standard deviation.
 
     That is the mean of the frames' own: one hand held one way errs alike in all of them.
     """
-    planes = torch.from_numpy(np.stack([look.planes for look in looks]))
-    known = torch.from_numpy(np.stack([look.known for look in looks]))
+    planes = torch.from_numpy(np.stack([view.planes for view in views]))
+    known = torch.from_numpy(np.stack([view.known for view in views]))
     mirrored = known * torch.tensor([1.0, 1.0, -1.0, 1.0])
-    net = ruler_network()
+    net = hand_scale_network()
     said = torch.stack([net(planes, known), net(planes.flip(-1), mirrored)]).mean(0).numpy()
     weight = np.exp(-2 * said[:, 1])
     return float(weight @ said[:, 0] / weight.sum()), float(np.exp(said[:, 1]).mean())

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.scene.data_types import CameraGuess, Fit, Placed, Placement, Sighting
+from v2p_data.scene.data_types import CameraGuess, Fit, ObjectTrack, PlacedObject, Placement
 from v2p_data.scene.fitting.silhouette import (
     Silhouette,
     Within,
@@ -25,18 +25,18 @@ from v2p_data.scene.fitting.silhouette import (
     three,
     yaw_of,
 )
-from v2p_data.scene.fitting.tool_pose import fit_held, push_of
+from v2p_data.scene.fitting.tool_pose import fit_tool_pose, push_motion
 from v2p_data.scene.fitting.trajectory import (
-    Course,
+    Trajectory,
     carried_by_hand,
-    course_between,
-    course_in_hand,
     peak,
+    trajectory_between,
+    trajectory_in_hand,
 )
 from v2p_data.scene.frames.colour import lab_of
 from v2p_data.scene.frames.mask_ops import bounding_box, grow, handle_of, tidy
-from v2p_data.scene.frames.segmentation import Watched
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.segmentation import Segmentation
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.camera_height import SizeVote, camera_height_m
 from v2p_data.scene.scale.nouns import Noun
 
@@ -69,10 +69,10 @@ type _Rests = list[tuple[Float[np.ndarray, "3 3"], float]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Shown:
+class _ObjectView:
     """An object as it is seen at both ends, and what may hide it there."""
 
-    s: Sighting
+    s: ObjectTrack
     image: UInt8[np.ndarray, "h w 3"]
     rests: _Rests
     """How it may rest at first."""
@@ -84,7 +84,7 @@ class _Shown:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Fits:
+class _EndPoses:
     """An object at both ends."""
 
     first: Fit
@@ -93,29 +93,33 @@ class _Fits:
     as_before: float = 0.0
     """What standing as at first would have cost at the end."""
     unseen: bool = False
-    grown: float = 0.0
-    taken_off: bool = False
+    log_growth: float = 0.0
+    lifted_off: bool = False
 
 
 def place(
-    footage: Footage,
-    objects: tuple[Sighting, ...],
+    working: WorkingClip,
+    objects: tuple[ObjectTrack, ...],
     kind: Kind,
     guess: CameraGuess,
     max_poses: int,
-    watched: Watched | None = None,
+    segmentation: Segmentation | None = None,
 ) -> Placement:
     """Return camera, shapes and poses such that all outlines fit their masks, the manipulated object's at both ends.
 
-    `watched` is what the network sees, where it was asked: then the hand helps to tell the scale.
+    `segmentation` is what the network sees, where it was asked: then the hand helps to tell the scale.
     """
     thing = objects[0]
-    shown = [_shown(footage, objects, s, kind) for s in objects]
+    shown = [_shown(working, objects, s, kind) for s in objects]
     resting = [k for k, s in enumerate(objects) if not s.in_hand]
     pitch_rad, firsts = _best_pitch([shown[k] for k in resting], guess)
-    camera = camera_above(footage.shape, pitch_rad, guess.fov_rad)
-    carried = carried_by_hand(thing, watched) if kind == "lift_up" and watched is not None else []
-    fits = {k: _Fits(first=fit, last=fit) for k, fit in zip(resting, firsts, strict=True)}
+    camera = camera_above(working.shape, pitch_rad, guess.fov_rad)
+    carried = (
+        carried_by_hand(thing, segmentation)
+        if kind == "lift_up" and segmentation is not None
+        else []
+    )
+    fits = {k: _EndPoses(first=fit, last=fit) for k, fit in zip(resting, firsts, strict=True)}
     for k in resting:
         if objects[k].moves and not (k == 0 and carried):
             role = kind if k == 0 else "push_with"
@@ -124,28 +128,30 @@ def place(
                 support, within = _goal(kind, objects, fits[0].first, fits[1].first)
             fits[k] = _fit_both_ends(shown[k], role, camera, support, within)
             if k == 0 and kind == "uncover" and 1 in fits and _is_lid(thing.noun):
-                fits[0] = _fit_taken_off(shown[0], fits[0], fits[1].first, camera)
+                fits[0] = _fit_lifted_off(shown[0], fits[0], fits[1].first, camera)
             if k == 0 and KINDS[kind].end not in ("in_air", "on_side") and not fits[k].unseen:
-                fits[k] = replace(fits[k], grown=_grown(shown[k], fits[k], camera))
+                fits[k] = replace(fits[k], log_growth=_log_growth(shown[k], fits[k], camera))
     votes = [vote_of(objects[k], fits[k].first) for k in resting]
     known = guess.heights(pitch_rad)
     height_m, spread = camera_height_m(votes, known)
-    if watched is not None and len(resting) == len(objects):
+    if segmentation is not None and len(resting) == len(objects):
         guessed = (pitch_rad, height_m)
-        by_hand = _height_by_hand(footage, watched, shown[0], fits[0], kind, camera, guessed)
+        by_hand = _height_from_hand(
+            working, segmentation, shown[0], fits[0], kind, camera, guessed
+        )
         if by_hand is not None:
             height_m, spread = camera_height_m(votes, [*known, by_hand])
-    placed: list[Placed] = []
+    placed: list[PlacedObject] = []
     for k, see in enumerate(shown):
         if k == 0 and carried:
-            placed.append(_in_fist(see, fits[k], carried, camera))
+            placed.append(_hidden_in_hand(see, fits[k], carried, camera))
         elif see.s.in_hand:
             placed.append(
-                _pushing(see, thing, placed[0], camera, height_m, footage, watched, max_poses)
+                _pushing(see, thing, placed[0], camera, height_m, working, segmentation, max_poses)
             )
         else:
-            course = _course(see, fits[k], kind, camera, max_poses)
-            placed.append(_placed(see, fits[k], course))
+            trajectory = _course(see, fits[k], kind, camera, max_poses)
+            placed.append(_placed(see, fits[k], trajectory))
     return Placement(
         camera=camera,
         pitch_rad=pitch_rad,
@@ -156,28 +162,30 @@ def place(
     )
 
 
-def _shown(footage: Footage, objects: tuple[Sighting, ...], s: Sighting, kind: Kind) -> _Shown:
+def _shown(
+    working: WorkingClip, objects: tuple[ObjectTrack, ...], s: ObjectTrack, kind: Kind
+) -> _ObjectView:
     thing = objects[0]
-    hidden = _hidden(footage, objects, s.first, s.at) | _others(objects, s, s.at)
+    hidden = _hidden(working, objects, s.first, s.at) | _others(objects, s, s.at)
     last_i, last_mask = _end_of(s, kind)
     last_hidden = hidden
     if s.moves:
-        last_hidden = _hidden(footage, objects, last_mask, last_i) | _others(objects, s, last_i)
-    return _Shown(
+        last_hidden = _hidden(working, objects, last_mask, last_i) | _others(objects, s, last_i)
+    return _ObjectView(
         s=s,
-        image=footage.rgb[s.at],
+        image=working.rgb[s.at],
         rests=_rests(s, kind if s is thing else "generic"),
         hidden=hidden,
         last_i=last_i,
-        last_image=footage.rgb[last_i],
+        last_image=working.rgb[last_i],
         last_mask=last_mask,
         last_hidden=last_hidden,
     )
 
 
 def _fit_both_ends(
-    see: _Shown, kind: Kind, camera: Camera, support: float, within: Within | None
-) -> _Fits:
+    see: _ObjectView, kind: Kind, camera: Camera, support: float, within: Within | None
+) -> _EndPoses:
     """Return the pair of poses that costs least: one outline often fits a standing and a lying box alike, both ends seldom do.
 
     The last pose is `support` above the table [camera heights], over the disc `within`.
@@ -189,10 +197,10 @@ def _fit_both_ends(
     costs = [a.cost + b.cost for a, (b, _) in zip(options, found, strict=True)]
     best = int(np.argmin(costs))
     last, as_before = found[best]
-    unseen = KINDS[kind].hides and (see.s.swallowed or last.iou < UNSEEN_IOU)
+    unseen = KINDS[kind].hides and (see.s.hidden_in_container or last.iou < UNSEEN_IOU)
     if unseen and within is not None:
         last = _inside(last, support, within)
-    return _Fits(
+    return _EndPoses(
         first=options[best],
         last=last,
         rival=float(np.partition(costs, 1)[1] - min(costs)) if len(costs) > 1 else None,
@@ -206,7 +214,9 @@ def _is_lid(noun: Noun) -> bool:
     return not noun.hollow and noun.matter == "rigid"
 
 
-def _fit_taken_off(see: _Shown, lying: _Fits, other_fit: Fit, camera: Camera) -> _Fits:
+def _fit_lifted_off(
+    see: _ObjectView, lying: _EndPoses, other_fit: Fit, camera: Camera
+) -> _EndPoses:
     """Return the poses of a lid that lies on the other thing at first and on the table at the end.
 
     `lying` are its poses if it lay on the table at both ends: they stay where they fit much better.
@@ -219,10 +229,10 @@ def _fit_taken_off(see: _Shown, lying: _Fits, other_fit: Fit, camera: Camera) ->
     first = fit_pose(start, noun, last.size, np.eye(3), support=support, within=within)
     if first.cost + last.cost > lying.first.cost + lying.last.cost + _LYING_TELLS:
         return lying
-    return replace(lying, first=first, last=last, taken_off=True)
+    return replace(lying, first=first, last=last, lifted_off=True)
 
 
-def _grown(see: _Shown, fits: _Fits, camera: Camera) -> float:
+def _log_growth(see: _ObjectView, fits: _EndPoses, camera: Camera) -> float:
     """Return the logarithm of how much larger an object is at first than its last outline says by itself, as far as that has its shape."""
     rest = _rest_of(fits.last.T_world_obj[:3, :3])
     silhouette = Silhouette(*_body(see.last_mask, see.last_hidden, see.s.noun), camera)
@@ -232,80 +242,87 @@ def _grown(see: _Shown, fits: _Fits, camera: Camera) -> float:
     return float(np.log(np.array(fits.first.size) / np.array(alone.size)).mean())
 
 
-def _height_by_hand(
-    footage: Footage,
-    watched: Watched,
-    see: _Shown,
-    fits: _Fits,
+def _height_from_hand(
+    working: WorkingClip,
+    segmentation: Segmentation,
+    see: _ObjectView,
+    fits: _EndPoses,
     kind: Kind,
     camera: Camera,
     known: tuple[float, float],
 ) -> tuple[float, float] | None:
-    """Return the camera's height by the hand that moves the object, as `ruler.height_by_hand` does; `known` is pitch and height."""
-    from v2p_data.scene.fitting.hand_scale import height_by_hand  # torch takes a second to import
+    """Return the camera's height by the hand that moves the object, as `hand_scale.height_from_hand` does; `known` is pitch and height."""
+    from v2p_data.scene.fitting.hand_scale import (
+        height_from_hand,  # torch takes a second to import
+    )
 
     stands = [(see.s.first, fits.first.T_world_obj[:3, 3])]
     if kind != "lift_up":  # it ends in mid-air
         stands.append((see.last_mask, fits.last.T_world_obj[:3, 3]))
-    return height_by_hand(footage, watched, see.s.masks, stands, camera, *known)
+    return height_from_hand(working, segmentation, see.s.masks, stands, camera, *known)
 
 
-def _course(see: _Shown, fits: _Fits, kind: Kind, camera: Camera, max_poses: int) -> Course:
+def _course(
+    see: _ObjectView, fits: _EndPoses, kind: Kind, camera: Camera, max_poses: int
+) -> Trajectory:
     if see.s.moves:
         end = (see.last_i, see.last_mask)
-        return course_between(see.s, kind, fits.first, fits.last, end, camera, max_poses)
+        return trajectory_between(see.s, kind, fits.first, fits.last, end, camera, max_poses)
     pose, iou = fits.first.T_world_obj, fits.first.iou
-    return Course([0], [pose], [iou], ["full"]).then(len(see.s.masks) - 1, pose, iou, "full")
+    return Trajectory([0], [pose], [iou], ["full"]).append(len(see.s.masks) - 1, pose, iou, "full")
 
 
-def _in_fist(
-    see: _Shown, fits: _Fits, carried: list[tuple[int, Float[np.ndarray, "2"]]], camera: Camera
-) -> Placed:
+def _hidden_in_hand(
+    see: _ObjectView,
+    fits: _EndPoses,
+    carried: list[tuple[int, Float[np.ndarray, "2"]]],
+    camera: Camera,
+) -> PlacedObject:
     """Return what a hand hides and carries as far in the picture."""
-    start = Course([0], [fits.first.T_world_obj], [fits.first.iou], ["full"])
-    course = course_in_hand(start, carried, camera)
-    last = replace(fits.first, T_world_obj=course.poses[-1], iou=0.0, visible=0.0)
+    start = Trajectory([0], [fits.first.T_world_obj], [fits.first.iou], ["full"])
+    trajectory = trajectory_in_hand(start, carried, camera)
+    last = replace(fits.first, T_world_obj=trajectory.poses[-1], iou=0.0, visible=0.0)
     see = replace(see, last_i=carried[-1][0], last_mask=np.zeros_like(see.last_mask))
-    return replace(_placed(see, replace(fits, last=last), course), in_fist=True)
+    return replace(_placed(see, replace(fits, last=last), trajectory), hidden_in_hand=True)
 
 
-def _placed(see: _Shown, fits: _Fits, course: Course) -> Placed:
-    return Placed(
+def _placed(see: _ObjectView, fits: _EndPoses, trajectory: Trajectory) -> PlacedObject:
+    return PlacedObject(
         first=fits.first,
         last=fits.last,
         last_i=see.last_i,
         last_mask=see.last_mask,
         hidden=see.hidden,
         last_hidden=see.last_hidden,
-        frames=tuple(course.frames),
-        T_world_objs=np.stack(course.poses),
-        confidences=tuple(course.sure),
-        observed=tuple(course.observed),
+        frames=tuple(trajectory.frames),
+        T_world_objs=np.stack(trajectory.poses),
+        confidences=tuple(trajectory.sure),
+        observed=tuple(trajectory.observed),
         rival=fits.rival,
         unseen=fits.unseen,
-        grown=fits.grown,
-        taken_off=fits.taken_off,
+        log_growth=fits.log_growth,
+        lifted_off=fits.lifted_off,
     )
 
 
-def with_forms(
-    footage: Footage, objects: tuple[Sighting, ...], guess: CameraGuess, kind: Kind
-) -> tuple[Sighting, ...]:
-    """Return the sightings with their nouns in the form that their outlines fit, where a noun has two; a lid is about as wide as what it covers."""
+def with_noun_variants(
+    working: WorkingClip, objects: tuple[ObjectTrack, ...], guess: CameraGuess, kind: Kind
+) -> tuple[ObjectTrack, ...]:
+    """Return the object tracks with their nouns in the form that their outlines fit, where a noun has two; a lid is about as wide as what it covers."""
     beneath = objects[1].noun if kind in ("cover", "uncover") and len(objects) > 1 else None
-    camera = camera_above(footage.shape, guess.pitch_rad, guess.fov_rad)
+    camera = camera_above(working.shape, guess.pitch_rad, guess.fov_rad)
     out = []
     for k, s in enumerate(objects):
-        if s.noun.other is not None:
+        if s.noun.variant is not None:
             unknown = _others(objects, s, s.at)
             silhouette = Silhouette(s.first, unknown, camera)
             under = beneath if k == 0 and _is_lid(s.noun) else None
             usual, other = (
                 _cost_of(fit_shape(silhouette, noun, np.eye(3)), noun, guess, under)
-                for noun in (s.noun, s.noun.other)
+                for noun in (s.noun, s.noun.variant)
             )
-            freer = _OTHER_FORM_COST if s.noun.other.form == "box" != s.noun.form else 0.0
-            s = replace(s, noun=s.noun.other if other + freer < usual else s.noun)
+            freer = _OTHER_FORM_COST if s.noun.variant.form == "box" != s.noun.form else 0.0
+            s = replace(s, noun=s.noun.variant if other + freer < usual else s.noun)
         out.append(s)
     return tuple(out)
 
@@ -320,14 +337,14 @@ def _cost_of(fit: Fit, noun: Noun, guess: CameraGuess, beneath: Noun | None) -> 
         (sizes + np.log(height_m)) / np.hypot(noun.spread, sd)
         for height_m, sd in guess.heights(guess.pitch_rad)
     ]
-    told = _SIZE_TELLS * float(np.square(np.clip(offs, -_MOST_OFF, _MOST_OFF)).sum())
+    size_cost = _SIZE_TELLS * float(np.square(np.clip(offs, -_MOST_OFF, _MOST_OFF)).sum())
     if beneath is not None and beneath.form == "cylinder":
         wider = np.log(noun.size_m[0] / beneath.size_m[0]) / np.hypot(noun.spread, beneath.spread)
-        told += _COVERED_TELLS * float(np.clip(wider, -_MOST_OFF, _MOST_OFF)) ** 2
-    return fit.cost + told
+        size_cost += _COVERED_TELLS * float(np.clip(wider, -_MOST_OFF, _MOST_OFF)) ** 2
+    return fit.cost + size_cost
 
 
-def _best_pitch(shown: list[_Shown], guess: CameraGuess) -> tuple[float, list[Fit]]:
+def _best_pitch(shown: list[_ObjectView], guess: CameraGuess) -> tuple[float, list[Fit]]:
     """Try pitches around the guess; the silhouettes decide, as far as the guess lets them."""
     best: tuple[float, float, list[Fit]] | None = None
     tried: list[float] = []
@@ -358,7 +375,7 @@ def _best_pitch(shown: list[_Shown], guess: CameraGuess) -> tuple[float, list[Fi
     return best[1], fits_at(best[1], thorough=len(shown) > 1)
 
 
-def _rests(s: Sighting, kind: Kind) -> _Rests:
+def _rests(s: ObjectTrack, kind: Kind) -> _Rests:
     """Return the ways an object may rest at first, each with what it costs: a cover lies with its mouth down."""
     if s.noun.hollow and kind == "uncover":
         return [(_MOUTH_DOWN, 0.0)]
@@ -367,7 +384,7 @@ def _rests(s: Sighting, kind: Kind) -> _Rests:
     return orientations(s.noun)
 
 
-def _options(see: _Shown, camera: Camera, *, thorough: bool = True) -> list[Fit]:
+def _options(see: _ObjectView, camera: Camera, *, thorough: bool = True) -> list[Fit]:
     """Return the best fit for every way in which the object may rest."""
     noun = see.s.noun
     silhouette = Silhouette(*_body(see.s.first, see.hidden, noun), camera, see.image)
@@ -390,8 +407,8 @@ def _body(
     return mask & ~handle, hidden | handle
 
 
-def _end_of(s: Sighting, kind: Kind) -> tuple[int, Bool[np.ndarray, "h w"]]:
-    """Return the footage frame of an object's last pose, and its mask there."""
+def _end_of(s: ObjectTrack, kind: Kind) -> tuple[int, Bool[np.ndarray, "h w"]]:
+    """Return the working frame of an object's last pose, and its mask there."""
     if s.role == "manipulated" and kind == "lift_up":
         i = peak(s)
         return i, s.masks[i]
@@ -403,7 +420,7 @@ def _end_of(s: Sighting, kind: Kind) -> tuple[int, Bool[np.ndarray, "h w"]]:
 
 def _fit_last(
     silhouette: Silhouette,
-    s: Sighting,
+    s: ObjectTrack,
     kind: Kind,
     first: Fit,
     support: float,
@@ -438,27 +455,27 @@ def _fit_last(
 
 
 def _pushing(
-    see: _Shown,
-    thing: Sighting,
-    pushed: Placed,
+    see: _ObjectView,
+    thing: ObjectTrack,
+    pushed: PlacedObject,
     camera: Camera,
     height_m: float,
-    footage: Footage,
-    watched: Watched | None,
+    working: WorkingClip,
+    segmentation: Segmentation | None,
     max_poses: int,
-) -> Placed:
+) -> PlacedObject:
     """Return the poses of a tool in a hand, from when what it pushes sets out until that has come to rest."""
     s = see.s
     ground = camera.on_plane(np.argwhere(s.first).mean(0)[None, ::-1])[0][:2]
-    push = push_of(
-        Course(list(pushed.frames), list(pushed.T_world_objs), [], []),
+    push = push_motion(
+        Trajectory(list(pushed.frames), list(pushed.T_world_objs), [], []),
         pushed.first,
         thing.noun.form,
         len(s.masks),
         ground if np.isfinite(ground).all() else np.zeros(2),
         camera,
         height_m,
-        watched,
+        segmentation,
     )
     begins, ends = push.frames
     seen = [
@@ -469,9 +486,9 @@ def _pushing(
     few = np.unique(np.linspace(0, len(seen) - 1, _MOST_VIEWS).round().astype(int))
     views = []
     for i in (seen[k] for k in few):
-        views.append((i, Silhouette(s.masks[i], _unknown(footage, thing, s, i), camera)))
+        views.append((i, Silhouette(s.masks[i], _unknown(working, thing, s, i), camera)))
     size, spread = (s.known_m, _NO_SPREAD) if s.known_m else (s.noun.size_m, s.noun.spread)
-    held = fit_held(views, push, s.noun, three(np.array(size) / height_m), spread)
+    held = fit_tool_pose(views, push, s.noun, three(np.array(size) / height_m), spread)
     fit = held.fit
     gone = np.linalg.norm(push.spots - push.spots[0], axis=1)
     late = begins <= seen[-1] <= ends and gone[seen[-1]] >= _LATE * gone[-1]
@@ -485,25 +502,27 @@ def _pushing(
     def sure(i: int) -> float:
         return float(np.clip(fit.iou, 0, 1)) if i in seen else _UNSEEN_SURE
 
-    course = Course([begins], [pose(begins)], [sure(begins)], ["no_depth"])
+    trajectory = Trajectory([begins], [pose(begins)], [sure(begins)], ["no_depth"])
     count = min(max_poses, last_i - begins + 1)
     for i in np.unique(np.linspace(begins, last_i, count).round().astype(int)).tolist():
-        course.then(i, pose(i), sure(i), "no_depth")
+        trajectory.append(i, pose(i), sure(i), "no_depth")
     mask = s.masks[last_i] if late else np.zeros_like(s.first)
-    unknown = _unknown(footage, thing, s, last_i) if late else mask
+    unknown = _unknown(working, thing, s, last_i) if late else mask
     see = replace(see, last_i=last_i, last_mask=mask, last_hidden=unknown)
-    first, last = (replace(fit, T_world_obj=course.poses[k]) for k in (0, -1))
-    placed = _placed(see, _Fits(first=first, last=last), course)
-    return replace(placed, in_fist=not late, T_world_seen=held.T_world_seen)
+    first, last = (replace(fit, T_world_obj=trajectory.poses[k]) for k in (0, -1))
+    placed = _placed(see, _EndPoses(first=first, last=last), trajectory)
+    return replace(placed, hidden_in_hand=not late, T_world_seen=held.T_world_seen)
 
 
-def _unknown(footage: Footage, thing: Sighting, s: Sighting, i: int) -> Bool[np.ndarray, "h w"]:
+def _unknown(
+    working: WorkingClip, thing: ObjectTrack, s: ObjectTrack, i: int
+) -> Bool[np.ndarray, "h w"]:
     """Return what may hide a tool in a frame: the hand, and what it pushes."""
-    return _hidden(footage, (thing, s), s.masks[i], i) | _others((thing, s), s, i)
+    return _hidden(working, (thing, s), s.masks[i], i) | _others((thing, s), s, i)
 
 
 def _goal(
-    kind: Kind, objects: tuple[Sighting, ...], own_fit: Fit, goal_fit: Fit
+    kind: Kind, objects: tuple[ObjectTrack, ...], own_fit: Fit, goal_fit: Fit
 ) -> tuple[float, Within | None]:
     """Return how high above the table the manipulated object comes to rest, and over which disc [camera heights]."""
     if not KINDS[kind].touches or len(objects) < 2:
@@ -539,15 +558,15 @@ def _floor(size: Float[np.ndarray, "3"]) -> float:
 
 
 def _hidden(
-    footage: Footage, objects: tuple[Sighting, ...], mask: Bool[np.ndarray, "h w"], i: int
+    working: WorkingClip, objects: tuple[ObjectTrack, ...], mask: Bool[np.ndarray, "h w"], i: int
 ) -> Bool[np.ndarray, "h w"]:
     """Return pixels near a mask of frame `i` that say nothing: what passes there (the hand, a shadow) may hide the object.
 
     What passes differs from the still of the other end, except where that shows what has moved.
     """
-    early = i < len(footage.rgb) / 2
-    background = footage.late if early else footage.early
-    passing = np.linalg.norm(footage.lab[i] - lab_of(background), axis=-1) > 12
+    early = i < len(working.rgb) / 2
+    background = working.late if early else working.early
+    passing = np.linalg.norm(working.lab[i] - lab_of(background), axis=-1) > 12
     hidden = tidy(passing) & ~mask
     for s in objects:
         if s.moves and not s.in_hand:
@@ -559,8 +578,8 @@ def _hidden(
     return hidden & near
 
 
-def _others(objects: tuple[Sighting, ...], s: Sighting, i: int) -> Bool[np.ndarray, "h w"]:
-    """Return where other objects are seen at footage frame `i`: this one may go on behind them."""
+def _others(objects: tuple[ObjectTrack, ...], s: ObjectTrack, i: int) -> Bool[np.ndarray, "h w"]:
+    """Return where other objects are seen at working frame `i`: this one may go on behind them."""
     shown = [other.masks[i] for other in objects if other is not s]
     return np.any(shown, axis=0) & ~s.masks[i] if shown else np.zeros_like(s.first)
 
@@ -595,7 +614,7 @@ def _tipped_along(fit: Fit, T_first: Float[np.ndarray, "4 4"]) -> Fit:
     return replace(fit, T_world_obj=T)
 
 
-def vote_of(s: Sighting, fit: Fit) -> SizeVote:
+def vote_of(s: ObjectTrack, fit: Fit) -> SizeVote:
     """Return what a fitted object says about the scale."""
     trust = max(0.1, fit.iou) * max(0.1, s.sure)
     return SizeVote(size=fit.size, noun=s.noun, trust=trust, known_m=s.known_m)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import angle_between, transform
-from v2p_data.scene.shapes.silhouette_view import Crop, View, middle_of
+from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView, middle_of
 
 _LEAST_PX = 80
 """Of the last outline, below which it has no form."""
@@ -40,8 +40,8 @@ class Refit:
     """Of the silhouette with the mask, where the object could be seen."""
 
 
-def refit(
-    view: View,
+def refine_pose(
+    view: SilhouetteView,
     T_first: Float[np.ndarray, "4 4"],
     mesh: trimesh.Trimesh,
     camera: Camera,
@@ -62,7 +62,7 @@ def refit(
     Returns:
         None where the outline is too small or too much of the mesh is hidden to tell.
     """
-    crop, T_usual = Crop(view, camera), view.T_world_obj
+    crop, T_usual = SilhouetteCrop(view, camera), view.T_world_obj
     if view.mask.sum() < _LEAST_PX:
         return None
     if crop.hidden_share(crop.drawn(mesh, T_usual)) > _MOST_HIDDEN:
@@ -102,7 +102,7 @@ def refit(
     return best if cost < usual_cost - _GAIN else usual
 
 
-def bent(
+def warped_trajectory(
     poses: Float[np.ndarray, "pose 4 4"], T_last: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "pose 4 4"]:
     """Return the poses, the last one replaced and those before changed the more the farther on their way they are."""
@@ -128,7 +128,7 @@ def _turned(T: Float[np.ndarray, "4 4"], yaw: float) -> Float[np.ndarray, "4 4"]
 
 
 def _aligned(
-    crop: Crop,
+    crop: SilhouetteCrop,
     mesh: trimesh.Trimesh,
     T: Float[np.ndarray, "4 4"],
     ways: Float[np.ndarray, "3 2"],

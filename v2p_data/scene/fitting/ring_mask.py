@@ -15,7 +15,7 @@ _LIES_THERE = 0.6
 """Overlap of the posed ring with the mask, below which the pose does not tell where the hole is: in a hand a ring is tilted."""
 
 
-def pierced(
+def without_hole(
     mask: Bool[np.ndarray, "h w"],
     size_m: tuple[float, float, float],
     bore: float,
@@ -43,7 +43,7 @@ def seen_through(
     T_world_obj: Float[np.ndarray, "4 4"],
     camera: Camera,
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels in which the camera looks through a ring: within both of its inner rims. Arguments as of `pierced`."""
+    """Return the pixels in which the camera looks through a ring: within both of its inner rims. Arguments as of `without_hole`."""
     below, above = (_hull(rim, camera) for rim in _rims(size_m, bore, T_world_obj))
     return below & above
 

@@ -24,7 +24,7 @@ from v2p_data.scene.frames.mask_ops import bounding_box, is_cut
 from v2p_data.scene.scale.nouns import Noun
 
 if TYPE_CHECKING:
-    from v2p_data.scene.fitting.cuboid_network import BoxGuess
+    from v2p_data.scene.fitting.cuboid_network import CuboidGuess
 
 _WORK_PX = 110
 """Longer side of the crop in which silhouettes are compared."""
@@ -96,14 +96,14 @@ class Silhouette:
         self._picture = image if min(w, h) >= _LEAST_FACE_PX else None
 
     @cached_property
-    def _guess(self) -> "BoxGuess":
+    def _guess(self) -> "CuboidGuess":
         """What the box network says, asked where a box is fitted."""
         from v2p_data.scene.fitting.cuboid_network import (
-            box_guess,
+            cuboid_guess,
         )  # torch takes a second to import
 
         assert self._picture is not None
-        return box_guess(self._picture, self.mask, self.camera)
+        return cuboid_guess(self._picture, self.mask, self.camera)
 
     def iou(self, points_world: Float[np.ndarray, "n 3"], hidden_weight: float = 0.0) -> float:
         """Return how well the convex hull of the projected points covers the mask, where it could be seen.
@@ -116,7 +116,7 @@ class Silhouette:
         common, wrong, hidden, _ = overlap
         return common / max(1.0, self._area + wrong + hidden_weight * hidden)
 
-    def unlike(
+    def appearance_cost(
         self,
         form: str,
         size: Float[np.ndarray, "3"] | tuple[float, float, float],
@@ -219,9 +219,9 @@ def fit_shape(
         T = posed(v, size)
         points = (unit * size) @ T[:3, :3].T + T[:3, 3]
         off = (v[3:] - v[3:].mean()) / spread
-        look = silhouette.unlike(noun.form, size, T)
+        appearance = silhouette.appearance_cost(noun.form, size, T)
         held = _PRIOR_WEIGHT * float((off**2).sum())
-        return 1 - silhouette.iou(points, _HIDDEN_WEIGHT) + held + look
+        return 1 - silhouette.iou(points, _HIDDEN_WEIGHT) + held + appearance
 
     def posed(v: np.ndarray, size: np.ndarray) -> np.ndarray:
         return _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
@@ -290,9 +290,9 @@ def fit_pose(
         if within is not None:
             outside = float(np.linalg.norm(T[:2, 3] - within.xy)) - within.radius
             held += max(0.0, outside) / max(within.radius, 0.5 * float(extents.max()))
-        look = silhouette.unlike(noun.form, extents, T)
+        appearance = silhouette.appearance_cost(noun.form, extents, T)
         outline = points0 @ T[:3, :3].T + T[:3, 3]
-        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + held + look
+        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + held + appearance
 
     turns = _yaw_starts(noun, rest, thorough=True)
     if yaw_near is not None:
@@ -344,10 +344,10 @@ def fit_lifted(
 
     def cost(v: np.ndarray) -> float:
         T = place(v)
-        look = silhouette.unlike(noun.form, size, T)
+        appearance = silhouette.appearance_cost(noun.form, size, T)
         outline = points0 @ T[:3, :3].T + T[:3, 3]
         turned = 0.01 * (1 - np.cos(v[2]))
-        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + turned + look
+        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + turned + appearance
 
     best = search(
         cost,

@@ -16,9 +16,9 @@ from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Fit
 from v2p_data.scene.fitting.silhouette import Silhouette, search, three
-from v2p_data.scene.fitting.trajectory import Course
+from v2p_data.scene.fitting.trajectory import Trajectory
 from v2p_data.scene.frames.hand import hand_end
-from v2p_data.scene.frames.segmentation import Watched, hand_at
+from v2p_data.scene.frames.segmentation import Segmentation, hand_at
 from v2p_data.scene.scale.nouns import Noun
 
 _HIDDEN_WEIGHT = 0.15
@@ -49,13 +49,13 @@ _LEAST_TRAVEL = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Push:
+class PushMotion:
     """What is pushed, in camera heights, and what is known of who pushes it."""
 
     frames: tuple[int, int]
-    """Footage frames: it begins to move, and has come to rest."""
+    """Working frames: it begins to move, and has come to rest."""
     spots: Float[np.ndarray, "time 2"]
-    """Where its middle is on the table, in every footage frame."""
+    """Where its middle is on the table, in every working frame."""
     behind: Float[np.ndarray, "2"]
     """From its middle to where it is pushed."""
     way: Float[np.ndarray, "2"]
@@ -67,31 +67,31 @@ class Push:
     """Metres per camera height."""
 
 
-def push_of(
-    course: Course,
+def push_motion(
+    trajectory: Trajectory,
     fit: Fit,
     form: str,
     num_frames: int,
     tool_xy: Float[np.ndarray, "2"],
     camera: Camera,
     height_m: float,
-    watched: Watched | None,
-) -> Push:
+    segmentation: Segmentation | None,
+) -> PushMotion:
     """Return how a thing is pushed.
 
     Args:
-        course: its poses.
+        trajectory: its poses.
         fit: it at first.
         form: its shape.
-        num_frames: of the footage.
+        num_frames: of the working clip.
         tool_xy: where the tool is seen, roughly: from there a thing is pushed that hardly moves.
         camera: one camera height above the table.
         height_m: metres per camera height.
-        watched: what the network sees, where it was asked.
+        segmentation: what the network sees, where it was asked.
     """
-    known = np.array([T[:2, 3] for T in course.poses])
+    known = np.array([T[:2, 3] for T in trajectory.poses])
     times = np.arange(num_frames)
-    spots = np.stack([np.interp(times, course.frames, known[:, k]) for k in range(2)], 1)
+    spots = np.stack([np.interp(times, trajectory.frames, known[:, k]) for k in range(2)], 1)
     whole = spots[-1] - spots[0]
     begins, ends = 0, num_frames - 1
     if np.linalg.norm(whole) < _LEAST_TRAVEL * max(fit.size):
@@ -105,10 +105,10 @@ def push_of(
     behind = float((points[:, :2] @ way).min()) * way
     tall = float(np.ptp(points[:, 2]))
     arm = None
-    if watched is not None:
+    if segmentation is not None:
         at = spots + behind
-        arm = _arm_heading(watched, at, (begins, ends), camera, height_m)
-    return Push(
+        arm = _arm_heading(segmentation, at, (begins, ends), camera, height_m)
+    return PushMotion(
         frames=(begins, ends),
         spots=spots,
         behind=behind,
@@ -120,7 +120,7 @@ def push_of(
 
 
 def _arm_heading(
-    watched: Watched,
+    segmentation: Segmentation,
     at: Float[np.ndarray, "time 2"],
     frames: tuple[int, int],
     camera: Camera,
@@ -128,8 +128,8 @@ def _arm_heading(
 ) -> float | None:
     """Return the heading from the tool's tip to where the arm comes from; None where none comes in from the picture's edge."""
     ways = []
-    for i in watched.idx.tolist():
-        end = hand_end(hand_at(watched, i)) if frames[0] <= i <= frames[1] else None
+    for i in segmentation.idx.tolist():
+        end = hand_end(hand_at(segmentation, i)) if frames[0] <= i <= frames[1] else None
         if end is None:
             continue
         entry = np.array([end.entry_px])
@@ -146,7 +146,7 @@ def _arm_heading(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Held:
+class ToolPose:
     """A tool in a hand."""
 
     fit: Fit
@@ -155,20 +155,20 @@ class Held:
     """Where the first of the views shows it: elsewhere, if it does not push there."""
 
 
-def fit_held(
+def fit_tool_pose(
     views: Sequence[tuple[int, Silhouette]],
-    push: Push,
+    push: PushMotion,
     noun: Noun,
     size: tuple[float, float, float],
     spread: float,
-) -> Held:
+) -> ToolPose:
     """Return where something long is that a hand pushes with.
 
     It keeps its turn, and goes where that goes. How steep it is follows from the height of a fist, from which the outlines
     may pull it a little.
 
     Args:
-        views: footage frames, and its outlines there.
+        views: working frames, and its outlines there.
         push: what it pushes, and whence.
         noun: its shape.
         size: its usual one, along its own axes, in camera heights like all lengths here.
@@ -260,7 +260,7 @@ def fit_held(
     )
     seen = place(best)
     seen[:3, 3] += shifts[0]
-    return Held(fit=fit, T_world_seen=seen)
+    return ToolPose(fit=fit, T_world_seen=seen)
 
 
 def _between(a: float, b: float) -> float:

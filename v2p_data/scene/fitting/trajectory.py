@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.scene.data_types import Fit, Sighting
+from v2p_data.scene.data_types import Fit, ObjectTrack
 from v2p_data.scene.fitting.silhouette import on_wall
 from v2p_data.scene.frames.classes import MOVED
 from v2p_data.scene.frames.hand import hand_end
 from v2p_data.scene.frames.mask_ops import bounding_box, grow
-from v2p_data.scene.frames.segmentation import Watched, hand_at
+from v2p_data.scene.frames.segmentation import Segmentation, hand_at
 from v2p_data.scene.schema import Observed
 
 TOUCH_PX = 5
@@ -32,20 +32,20 @@ _GOES_WITH_HAND = 0.5
 
 
 @dataclass
-class Course:
+class Trajectory:
     """Poses in the world frame, growing with time."""
 
     frames: list[int]
-    """Of the footage."""
+    """Of the working clip."""
     poses: list[Float[np.ndarray, "4 4"]]
     sure: list[float]
     """How far to believe each pose, 0 to 1."""
     observed: list[Observed]
 
-    def then(
+    def append(
         self, frame: int, pose: Float[np.ndarray, "4 4"], sure: float, observed: Observed
-    ) -> "Course":
-        """Return the course with one pose more, unless it has one at that frame."""
+    ) -> "Trajectory":
+        """Return the trajectory with one pose more, unless it has one at that frame."""
         if frame > self.frames[-1]:
             self.frames.append(frame)
             self.poses.append(pose)
@@ -54,21 +54,21 @@ class Course:
         return self
 
 
-def course_between(
-    s: Sighting,
+def trajectory_between(
+    s: ObjectTrack,
     kind: Kind,
     first_fit: Fit,
     last_fit: Fit,
     end: tuple[int, Bool[np.ndarray, "h w"]],
     camera: Camera,
     max_poses: int,
-) -> Course:
+) -> Trajectory:
     """Return poses at well-tracked frames: position from the mask's centre, rotation blended."""
     first, last = first_fit.T_world_obj, last_fit.T_world_obj
     last_i, last_mask = end
     depth: Observed = "no_depth" if s.in_hand else "full"
     # What a hand brings has no pose before it comes.
-    course = Course([s.at], [first], [float(np.clip(first_fit.iou, 0, 1))], [depth])
+    trajectory = Trajectory([s.at], [first], [float(np.clip(first_fit.iou, 0, 1))], [depth])
     count = min(max_poses, last_i - s.at + 1)
     spots = np.unique(np.linspace(s.at, last_i, count).round().astype(int))
     on_table = KINDS[kind].slides
@@ -96,18 +96,18 @@ def course_between(
             continue
         rotation = Rotation.from_rotvec(share * turn).as_matrix() @ first[:3, :3]
         free = position[2] > max(first[2, 3], last[2, 3]) + 0.02
-        course.then(
+        trajectory.append(
             i,
             transform(rotation, position),
             0.7 * float(s.quality[i]),
             "no_depth" if free else depth,
         )
     in_air = kind == "lift_up" or s.in_hand
-    return course.then(last_i, last, last_fit.iou, "no_depth" if in_air else "full")
+    return trajectory.append(last_i, last, last_fit.iou, "no_depth" if in_air else "full")
 
 
-def peak(s: Sighting) -> int:
-    """Return the footage frame at which a lift is highest in the picture, among the believable ones.
+def peak(s: ObjectTrack) -> int:
+    """Return the working frame at which a lift is highest in the picture, among the believable ones.
 
     Where it is never higher than at first, that is the last believable one: a sleeve hides it from then on.
     """
@@ -123,7 +123,9 @@ def peak(s: Sighting) -> int:
     return int(np.flatnonzero(near)[-1]) if near.any() else n - 1
 
 
-def carried_by_hand(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.ndarray, "2"]]]:
+def carried_by_hand(
+    s: ObjectTrack, segmentation: Segmentation
+) -> list[tuple[int, Float[np.ndarray, "2"]]]:
     """Return by how far the hand has moved in the picture since it took hold of a thing that it hides, in the frames since.
 
     It takes hold where its end stays longest, low and beside the thing. Nothing where the thing itself is seen going up, where
@@ -133,8 +135,8 @@ def carried_by_hand(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.n
     if _centre(s.first)[1] - _centre(s.masks[i])[1] > _SEEN_RISING * tall:
         return []
     home = grow(s.first, TOUCH_PX)
-    tips = _tips(watched)
-    holding = [at for at in tips if (hand_at(watched, at) & home).any()]
+    tips = _tips(segmentation)
+    holding = [at for at in tips if (hand_at(segmentation, at) & home).any()]
     if not holding:
         return []
     middle = np.mean([max(tips[at][1] for at in holding), min(tip[1] for tip in tips.values())])
@@ -153,18 +155,18 @@ def carried_by_hand(s: Sighting, watched: Watched) -> list[tuple[int, Float[np.n
         return []
     since = since[: risen[-1] + 1]
     ending = since[-max(1, len(since) // 3) :]
-    in_sight = np.median([(watched.at(at)[MOVED] > 0.5).sum() for at, _ in ending])
+    in_sight = np.median([(segmentation.at(at)[MOVED] > 0.5).sum() for at, _ in ending])
     return [] if in_sight > _LEFT_IN_SIGHT * s.first.sum() else since
 
 
-def _tips(watched: Watched) -> dict[int, Float[np.ndarray, "2"]]:
-    """Return where the hand ends, by footage frame, but where that jumps: there something else was taken for the hand."""
-    ends = {at: hand_end(hand_at(watched, at)) for at in watched.idx.tolist()}
+def _tips(segmentation: Segmentation) -> dict[int, Float[np.ndarray, "2"]]:
+    """Return where the hand ends, by working frame, but where that jumps: there something else was taken for the hand."""
+    ends = {at: hand_end(hand_at(segmentation, at)) for at in segmentation.idx.tolist()}
     tips = {at: np.array(end.tip_px) for at, end in ends.items() if end is not None}
     if not tips:
         return {}
     usual = median_filter(np.array(list(tips.values())), (_TIPS_BESIDE, 1), mode="nearest")
-    far = _JUMP * watched.early.shape[2]
+    far = _JUMP * segmentation.early.shape[2]
     return {
         at: tip
         for (at, tip), there in zip(tips.items(), usual, strict=True)
@@ -172,17 +174,17 @@ def _tips(watched: Watched) -> dict[int, Float[np.ndarray, "2"]]:
     }
 
 
-def course_in_hand(
-    course: "Course", carried: list[tuple[int, Float[np.ndarray, "2"]]], camera: Camera
-) -> "Course":
-    """Return the course of what goes with a hand, as far away as it stood."""
-    T_first = course.poses[0]
+def trajectory_in_hand(
+    trajectory: "Trajectory", carried: list[tuple[int, Float[np.ndarray, "2"]]], camera: Camera
+) -> "Trajectory":
+    """Return the trajectory of what goes with a hand, as far away as it stood."""
+    T_first = trajectory.poses[0]
     start = camera.project(T_first[None, :3, 3])[0]
     for i, by in carried:
         position = on_wall(camera, start + by, float(T_first[0, 3]))
         position[2] = max(position[2], T_first[2, 3])
-        course.then(i, transform(T_first[:3, :3], position), _GOES_WITH_HAND, "no_depth")
-    return course
+        trajectory.append(i, transform(T_first[:3, :3], position), _GOES_WITH_HAND, "no_depth")
+    return trajectory
 
 
 def _centre(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:

@@ -190,7 +190,7 @@ def trained[N: nn.Module](
 
 
 @torch.inference_mode()
-def look(
+def classify(
     frames: UInt8[np.ndarray, "n h w 3"],
     early: UInt8[np.ndarray, "n h w 3"],
     late: UInt8[np.ndarray, "n h w 3"],

@@ -9,7 +9,7 @@ from scipy.ndimage import median_filter
 
 from v2p_data.scene.frames.classes import HAND, LONG_SIDE_PX, MOVED, TABLE
 from v2p_data.scene.frames.mask_ops import bounding_box, grow, tidy
-from v2p_data.scene.frames.working_clip import Footage, end_quarters, still_of
+from v2p_data.scene.frames.working_clip import WorkingClip, end_quarters, still_of
 from v2p_data.scene.scale.camera_height import SeenCamera, table_width_m
 from v2p_data.video.clip import Clip
 
@@ -27,11 +27,11 @@ LEAST_SHARE = 0.0007
 
 
 @dataclass(frozen=True, kw_only=True)
-class Watched:
+class Segmentation:
     """What the network sees over a clip, at working size."""
 
     idx: Int[np.ndarray, "n"]
-    """Footage frames it looked at, the first and the last among them."""
+    """Working frames it looked at, the first and the last among them."""
     shares: Float32[np.ndarray, "n 5 h w"]
     early: Float32[np.ndarray, "5 h w"]
     """In the still of the beginning."""
@@ -40,27 +40,27 @@ class Watched:
     camera: SeenCamera
 
     def at(self, i: int) -> Float32[np.ndarray, "5 h w"]:
-        """Return the probabilities at the footage frame nearest to `i`."""
+        """Return the probabilities at the working frame nearest to `i`."""
         return self.shares[int(np.abs(self.idx - i).argmin())]
 
 
-def watch(clip: Clip, footage: Footage) -> Watched:
+def segment_clip(clip: Clip, working: WorkingClip) -> Segmentation:
     """Return what the network sees in the clip's frames and in its two stills.
 
     Where what moves is small, the network looks at it a second time, enlarged.
     """
-    from v2p_data.scene.frames.network import look  # torch takes a second to import
+    from v2p_data.scene.frames.network import classify  # torch takes a second to import
 
-    n = len(footage.rgb)
+    n = len(working.rgb)
     idx = np.unique(np.linspace(0, n - 1, min(n, MOST_FRAMES)).round().astype(int))
-    pictures = np.concatenate([footage.rgb[idx], footage.early[None], footage.late[None]])
-    seen = look(
+    pictures = np.concatenate([working.rgb[idx], working.early[None], working.late[None]])
+    seen = classify(
         pictures,
-        np.broadcast_to(footage.early, pictures.shape),
-        np.broadcast_to(footage.late, pictures.shape),
+        np.broadcast_to(working.early, pictures.shape),
+        np.broadcast_to(working.late, pictures.shape),
     )
-    camera = _look_closer(clip, footage, idx, seen.shares, seen.camera)
-    return Watched(
+    camera = _classify_enlarged(clip, working, idx, seen.shares, seen.camera)
+    return Segmentation(
         idx=idx,
         shares=seen.shares[:-2],
         early=seen.shares[-2],
@@ -69,9 +69,9 @@ def watch(clip: Clip, footage: Footage) -> Watched:
     )
 
 
-def _look_closer(
+def _classify_enlarged(
     clip: Clip,
-    footage: Footage,
+    working: WorkingClip,
     idx: Int[np.ndarray, "n"],
     shares: Float32[np.ndarray, "n+2 5 h w"],
     camera: SeenCamera,
@@ -81,20 +81,20 @@ def _look_closer(
     The window keeps its size and goes along. The last two shares are those of the stills, of the beginning and the end.
     Both looks say how much of the table the picture shows; the camera comes back with both in it.
     """
-    from v2p_data.scene.frames.network import look, resized
+    from v2p_data.scene.frames.network import classify, resized
 
     windows = _windows(shares[:-2, MOVED])
     if windows is None:
         return camera
     w, h = windows.size
     zoom = LONG_SIDE_PX / max(w, h)
-    size = (round(footage.shape[0] * zoom), round(footage.shape[1] * zoom))
+    size = (round(working.shape[0] * zoom), round(working.shape[1] * zoom))
 
     def large(picks: Int[np.ndarray, "k"]) -> UInt8[np.ndarray, "k y x 3"]:
-        frames = (clip.frames[i] for i in footage.frame_idx[picks])
+        frames = (clip.frames[i] for i in working.frame_idx[picks])
         return np.stack([resized(frame, size) for frame in frames])
 
-    n = len(footage.rgb)
+    n = len(working.rgb)
     early, late = (still_of(large(np.arange(n)[quarter])) for quarter in end_quarters(n))
     pictures = np.concatenate([large(idx), early[None], late[None]])
     corners = windows.corners[[*range(len(idx)), 0, -1]]
@@ -102,7 +102,7 @@ def _look_closer(
         (slice(y, y + round(h * zoom)), slice(x, x + round(w * zoom)))
         for x, y in (corners * zoom).astype(int)
     ]
-    near = look(
+    near = classify(
         np.stack([picture[spot] for picture, spot in zip(pictures, spots, strict=True)]),
         np.stack([early[spot] for spot in spots]),
         np.stack([late[spot] for spot in spots]),
@@ -114,8 +114,8 @@ def _look_closer(
         there = whole[:, y : y + h, x : x + w]
         own = [cv2.resize(plane, (w, h), interpolation=cv2.INTER_AREA) for plane in part]
         there += inside * (np.stack(own) - there)
-    below = (corners[:, 1] + h / 2 - footage.shape[0] / 2) / footage.shape[1]
-    return _both(camera, near.camera, w / footage.shape[1], below)
+    below = (corners[:, 1] + h / 2 - working.shape[0] / 2) / working.shape[1]
+    return _both(camera, near.camera, w / working.shape[1], below)
 
 
 def _both(
@@ -170,29 +170,29 @@ def _windows(moved: Float32[np.ndarray, "n h w"]) -> _Windows | None:
     return _Windows(size=(int(size[0]), int(size[1])), corners=corners.astype(int))
 
 
-def seen_at_first(watched: Watched) -> float | None:
+def share_at_first(segmentation: Segmentation) -> float | None:
     """Return how much of the picture what moves covers at the beginning, where it only comes into the picture later.
 
     None where it is there from the beginning, or not seen at the end.
     """
     early, late = (
         float(tidy(still[MOVED] > least).mean())
-        for still, least in ((watched.early, _POSSIBLE), (watched.late, _LIKELY))
+        for still, least in ((segmentation.early, _POSSIBLE), (segmentation.late, _LIKELY))
     )
     return early if early < LEAST_SHARE <= late else None
 
 
-def hand_at(watched: Watched, i: int) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels that are hand or arm at a footage frame."""
-    return watched.at(i)[HAND] > _LIKELY
+def hand_at(segmentation: Segmentation, i: int) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels that are hand or arm at a working frame."""
+    return segmentation.at(i)[HAND] > _LIKELY
 
 
-def passed(watched: Watched) -> Bool[np.ndarray, "h w"]:
+def passers_by(segmentation: Segmentation) -> Bool[np.ndarray, "h w"]:
     """Return the pixels where at some time a hand or what it moves is seen."""
-    shares = watched.shares[:, HAND] + watched.shares[:, MOVED]
+    shares = segmentation.shares[:, HAND] + segmentation.shares[:, MOVED]
     return grow(shares.max(0) > _LIKELY, 3)
 
 
-def table_seen(watched: Watched) -> Bool[np.ndarray, "h w"]:
+def table_seen(segmentation: Segmentation) -> Bool[np.ndarray, "h w"]:
     """Return the pixels that are bare table both at the beginning and at the end."""
-    return (watched.early[TABLE] > _LIKELY) & (watched.late[TABLE] > _LIKELY)
+    return (segmentation.early[TABLE] > _LIKELY) & (segmentation.late[TABLE] > _LIKELY)

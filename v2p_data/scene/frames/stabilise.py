@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.geometry.camera import between_centres
-from v2p_data.scene.frames.working_clip import WIDTH_PX, Footage, camera_shift_px, followed
+from v2p_data.scene.frames.working_clip import WIDTH_PX, WorkingClip, camera_shift_px, followed
 from v2p_data.video.clip import Clip, Hint
 
 MAX_SWAY = 0.1
@@ -35,15 +35,15 @@ _STANDS_PX = 1.0
 """A camera whose picture moves less than this at working size stands still."""
 
 
-def steadied(clip: Clip, footage: Footage) -> Clip:
+def stabilised(clip: Clip, working: WorkingClip) -> Clip:
     """Return the clip with its frames aligned with the first one; as it is where the camera stood still or no way is found.
 
     What the aligned frames no longer show at their edges is filled with the first frame's pixels; hints go along.
     """
-    if camera_shift_px(footage) < _STANDS_PX:
+    if camera_shift_px(working) < _STANDS_PX:
         return clip
     h, w = clip.frames.shape[1:3]
-    small_h, small_w = footage.shape
+    small_h, small_w = working.shape
     small = _moves(_greys(clip.frames, (small_w, small_h)))
     if small is None:
         return clip

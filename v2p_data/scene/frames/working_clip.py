@@ -27,7 +27,7 @@ _FEW_CORNERS = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class Footage:
+class WorkingClip:
     """Frames at working size with what follows from them directly."""
 
     rgb: UInt8[np.ndarray, "time h w 3"]
@@ -92,25 +92,25 @@ class Footage:
         # Where an arm rests most of the time, the bare table "passes": it has no colour of an arm.
         return passing & ((touches & (share > 0.05)) | (skin_share > 0.6))[parts]
 
-    def knowing(self, look: Float[np.ndarray, "l a b"]) -> "Footage":
-        """Return the footage with a hand that is everything that passes, less the object.
+    def knowing(self, colour_hist: Float[np.ndarray, "l a b"]) -> "WorkingClip":
+        """Return the working clip with a hand that is everything that passes, less the object.
 
         How much of what passes is object follows from the object's own colours (their weighted median ratio).
         """
-        if len(self.moving) < 300 or not look.any():
+        if len(self.moving) < 300 or not colour_hist.any():
             return self
         passing = histogram(self.moving)
-        cells = look > 0.02 * look.max()
-        ratio, weight = passing[cells] / look[cells], look[cells]
+        cells = colour_hist > 0.02 * colour_hist.max()
+        ratio, weight = passing[cells] / colour_hist[cells], colour_hist[cells]
         order = np.argsort(ratio)
         middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
-        hand = np.maximum(passing - 1.3 * float(ratio[order][middle]) * look, 0)
+        hand = np.maximum(passing - 1.3 * float(ratio[order][middle]) * colour_hist, 0)
         if hand.sum() < 0.05:
             return self
         return replace(self, hand_hist=hand / hand.sum(), skin_only=False)
 
 
-def footage_of(clip: Clip) -> Footage:
+def working_clip_of(clip: Clip) -> WorkingClip:
     """Return at most 150 evenly spaced frames of the clip at working size, with their stills."""
     n = len(clip.frames)
     frame_idx = np.unique(np.linspace(0, n - 1, min(n, MAX_FRAMES)).round().astype(int))
@@ -123,7 +123,7 @@ def footage_of(clip: Clip) -> Footage:
     always = still_of(rgb)
     moving = _passing(rgb, lab, always)
     skin = moving[skin_prior(moving[None])[0]] if len(moving) else moving
-    return Footage(
+    return WorkingClip(
         rgb=rgb,
         lab=lab,
         frame_idx=frame_idx,
@@ -162,20 +162,22 @@ def still_of(rgb: UInt8[np.ndarray, "time h w 3"]) -> UInt8[np.ndarray, "h w 3"]
     return still
 
 
-def camera_shift_px(footage: Footage, passed: Bool[np.ndarray, "h w"] | None = None) -> float:
+def camera_shift_px(
+    working: WorkingClip, passers_by: Bool[np.ndarray, "h w"] | None = None
+) -> float:
     """Return how far the picture moved as a whole, at working size: the largest over nine frames.
 
     Two measures look at it and the smaller one counts, since a camera that moves shows in both: corners fail where
-    most of them lie on what is moved, tiles where the picture is plain. `passed` is where things moved in front of the
+    most of them lie on what is moved, tiles where the picture is plain. `passers_by` is where things moved in front of the
     camera, as far as that is known: both measures look at the rest of the picture as well, which may be too little.
     """
-    grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in footage.rgb]
+    grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in working.rgb]
     pick = np.unique(np.linspace(0, len(grey) - 1, 9).astype(int))
     chosen = [grey[i] for i in pick]
-    everywhere = np.ones(footage.shape, bool)
+    everywhere = np.ones(working.shape, bool)
     shifts = [
         shift
-        for there in ([everywhere] if passed is None else [everywhere, ~passed])
+        for there in ([everywhere] if passers_by is None else [everywhere, ~passers_by])
         for shift in (_corner_shift(chosen, there), _tile_shift(chosen, there))
         if shift is not None
     ]

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from v2p_data.scene.backends.config import GroundConfig, SegmentConfig
-from v2p_data.scene.data_types import Sighting
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.data_types import ObjectTrack
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.hint_masks import Box
 from v2p_data.video.clip import Clip
 
@@ -20,10 +20,10 @@ DETECTORS = ("grounding_dino", "mm_grounding_dino", "owlv2", "worker")
 
 
 class _Frames(Sequence[UInt8[np.ndarray, "h w 3"]]):
-    """The clip's frames behind the footage's, read one at a time."""
+    """The clip's frames behind the working clip's, read one at a time."""
 
-    def __init__(self, clip: Clip, footage: Footage) -> None:
-        self._clip, self._idx = clip, footage.frame_idx
+    def __init__(self, clip: Clip, working: WorkingClip) -> None:
+        self._clip, self._idx = clip, working.frame_idx
 
     def __len__(self) -> int:
         return len(self._idx)
@@ -36,12 +36,12 @@ class _Frames(Sequence[UInt8[np.ndarray, "h w 3"]]):
 
 
 def detected(
-    clip: Clip, footage: Footage, phrases: Sequence[str], cfg: GroundConfig
+    clip: Clip, working: WorkingClip, phrases: Sequence[str], cfg: GroundConfig
 ) -> dict[str, Box]:
     """Return a box per phrase that the detector finds, in the first frame, or in the last where only that shows it."""
     from v2p_data.scene.backends.detect import detect  # imports transformers
 
-    ends = [int(footage.frame_idx[0]), int(footage.frame_idx[-1])]
+    ends = [int(working.frame_idx[0]), int(working.frame_idx[-1])]
     by_picture = detect([clip.frames[i] for i in ends], phrases, cfg)
     out: dict[str, Box] = {}
     for frame, by_phrase in zip(ends, by_picture, strict=True):
@@ -53,8 +53,8 @@ def detected(
 
 
 def segmented(
-    clip: Clip, footage: Footage, objects: Sequence[Sighting], cfg: SegmentConfig
-) -> tuple[Sighting, ...]:
+    clip: Clip, working: WorkingClip, objects: Sequence[ObjectTrack], cfg: SegmentConfig
+) -> tuple[ObjectTrack, ...]:
     """Return the objects with the masks that a video model makes of what was found of them in one frame."""
     from v2p_data.scene.backends.segment import Prompt, segment_video
 
@@ -63,8 +63,8 @@ def segmented(
     for s in objects:
         large = cv2.resize(s.first.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0
         prompts.append(Prompt(frame_idx=s.at, mask=large))
-    seen = segment_video(_Frames(clip, footage), prompts, cfg)
-    size = (footage.shape[1], footage.shape[0])
+    seen = segment_video(_Frames(clip, working), prompts, cfg)
+    size = (working.shape[1], working.shape[0])
     out = []
     for s, masks, scores in zip(objects, seen.masks, seen.scores, strict=True):
         small = np.stack(
@@ -76,5 +76,5 @@ def segmented(
         if not small[s.at].any():
             small[s.at] = s.first
         quality = np.where(small.any((1, 2)), scores, 0.0)
-        out.append(replace(s, masks=small, quality=quality, meets=float(scores.mean())))
+        out.append(replace(s, masks=small, quality=quality, agreement=float(scores.mean())))
     return tuple(out)

@@ -1,7 +1,7 @@
 """Which pixels are which object of the caption, in every frame: grounding, then segmentation, by the chosen backends.
 
 A user's box, points or a detector's box say where an object is in one frame; without them what moved and what stands
-there decides. Everything works at the footage's size.
+there decides. Everything works at working size.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,25 +12,29 @@ from jaxtyping import Bool
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS
-from v2p_data.scene.data_types import Sighting, Sights
+from v2p_data.scene.data_types import GroundedObjects, ObjectTrack
 from v2p_data.scene.frames.classes import HAND, MOVED, TABLE
 from v2p_data.scene.frames.colour import histogram
 from v2p_data.scene.frames.mask_ops import bounding_box, grow, largest
 from v2p_data.scene.frames.segmentation import (
     LEAST_SHARE,
-    Watched,
+    Segmentation,
     hand_at,
-    seen_at_first,
+    share_at_first,
     table_seen,
 )
 from v2p_data.scene.frames.table import Table, find_table
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.held_tool import HeldTool, find_tool
-from v2p_data.scene.grounding.hint_masks import Box, Mark, marks_of
-from v2p_data.scene.grounding.moved_by_change import Moved, find_moved, find_other
-from v2p_data.scene.grounding.moved_by_network import find_movers, rated
-from v2p_data.scene.grounding.outlines import apart, settled
-from v2p_data.scene.grounding.static_objects import Search, find_standing
+from v2p_data.scene.grounding.hint_masks import Box, HintMask, hint_masks_of
+from v2p_data.scene.grounding.moved_by_change import (
+    Moved,
+    find_moved_by_change,
+    find_static_by_change,
+)
+from v2p_data.scene.grounding.moved_by_network import find_moved_by_network, rated
+from v2p_data.scene.grounding.outlines import disjoint_ends, without_shadow
+from v2p_data.scene.grounding.static_objects import StaticSearch, find_static_object
 from v2p_data.scene.grounding.tracking import carried, track
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.schema import Role
@@ -58,76 +62,76 @@ _SETS_OUT, _WELL_SEEN = 0.05, 0.6
 """Share of its way that a thing has gone when it moves; and the share of its largest area that shows a tool well."""
 
 
-def sight(
+def ground_objects(
     clip: Clip,
-    footage: Footage,
+    working: WorkingClip,
     meaning: Meaning,
-    watched: Watched | None,
+    segmentation: Segmentation | None,
     min_found: float,
     boxes: Mapping[str, Box] | None = None,
-) -> Sights:
+) -> GroundedObjects:
     """Return the masks of all objects that the caption names.
 
-    `watched` is what the network sees, where it was asked; `boxes` are what a detector says, by phrase: a user's hint
+    `segmentation` is what the network sees, where it was asked; `boxes` are what a detector says, by phrase: a user's hint
     for the phrase goes before it.
 
     Raises:
         ItemRejectedError: `no_hand`, `not_there_at_first`, `object_not_found` or `reference_not_found`, with the number that decided.
     """
-    if watched is not None:
-        _check_hand(clip, watched)
-        footage = _knowing_hand(footage, watched)
-    table = find_table(footage.always, table_seen(watched) if watched else None)
-    marked = marks_of(clip, footage, watched, boxes or {})
+    if segmentation is not None:
+        _check_hand(clip, segmentation)
+        working = _knowing_hand(working, segmentation)
+    table = find_table(working.always, table_seen(segmentation) if segmentation else None)
+    marked = hint_masks_of(clip, working, segmentation, boxes or {})
     tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
     own = marked.get(meaning.manipulated)
-    if own is not None and own.at_end(footage):
-        _check_there_at_first(clip, meaning.manipulated, watched)
-    moved, held = _find_movers(clip, footage, table, watched, meaning, tool, marked)
-    sure, why = _sureness(moved, watched, own)
+    if own is not None and own.at_end(working):
+        _check_there_at_first(clip, meaning.manipulated, segmentation)
+    moved, tool_moved = _find_moved(clip, working, table, segmentation, meaning, tool, marked)
+    sure, why = _sureness(moved, segmentation, own)
     if sure < min_found:
-        _check_there_at_first(clip, meaning.manipulated, watched)
+        _check_there_at_first(clip, meaning.manipulated, segmentation)
         raise ItemRejectedError(
             "object_not_found",
             f"the best match for '{meaning.manipulated}' in {clip.item} is sure to {sure:.3f}, below {min_found:g} "
             f"({why}); mark it, and each other object of the caption, with a box in captions.json",
             round(sure, 3),
         )
-    if watched is None:
-        footage = footage.knowing(moved.look)
-    thing = _mover(
-        _sighting(clip, meaning.manipulated, "manipulated"), footage, watched, moved, own
+    if segmentation is None:
+        working = working.knowing(moved.colour_hist)
+    thing = _moved_object(
+        _unseen_object(clip, meaning.manipulated, "manipulated"), working, segmentation, moved, own
     )
     moved = replace(moved, last=thing.masks[-1])
-    scene = _Scene(clip, footage, table, watched, meaning, moved, thing, min_found)
+    scene = _Scene(clip, working, table, segmentation, meaning, moved, thing, min_found)
     objects, warnings = [thing], list[str]()
-    taken = np.zeros(footage.shape, bool)
+    taken = np.zeros(working.shape, bool)
     for phrase, role in meaning.others:
-        thing, mark = _sighting(clip, phrase, role), marked.get(phrase)
-        if role == "tool" and (watched is not None or mark is not None):
-            seen = _tool(scene, thing, mark, held)
+        thing, mark = _unseen_object(clip, phrase, role), marked.get(phrase)
+        if role == "tool" and (segmentation is not None or mark is not None):
+            seen = _tool(scene, thing, mark, tool_moved)
         else:
-            seen = _stander(scene, thing, mark, taken)
+            seen = _static_object(scene, thing, mark, taken)
         if seen is None:
             warnings.append(f"the '{phrase}' was not found and is left out")
             continue
         if not seen.moves:
             taken |= grow(seen.first, 2)
         objects.append(seen)
-    may_be_hidden = own is None or not own.at_end(footage)
-    if watched is not None and KINDS[meaning.kind].hides and may_be_hidden and objects[1:]:
-        objects[0] = swallowed(watched, objects[0], objects[1])
-    return Sights(
+    may_be_hidden = own is None or not own.at_end(working)
+    if segmentation is not None and KINDS[meaning.kind].hides and may_be_hidden and objects[1:]:
+        objects[0] = hidden_in_container(segmentation, objects[0], objects[1])
+    return GroundedObjects(
         objects=tuple(objects),
-        footage=footage,
+        working=working,
         table=table,
-        watched=watched,
+        segmentation=segmentation,
         warnings=tuple(warnings),
     )
 
 
 def without_asides(
-    sights: Sights, meaning: Meaning, clip: Clip
+    grounded: GroundedObjects, meaning: Meaning, clip: Clip
 ) -> tuple[list[int], tuple[str, ...]]:
     """Return the numbers of the objects without those of which the caption does not speak, and a warning for each of these.
 
@@ -135,13 +139,13 @@ def without_asides(
     """
     left_out = [
         k
-        for k, s in enumerate(sights.objects)
+        for k, s in enumerate(grounded.objects)
         if k
         and KINDS[meaning.kind].other == "ignored"
         and not (s.hinted or _is_said(s.phrase, clip))
     ]
-    return [k for k in range(len(sights.objects)) if k not in left_out], tuple(
-        f"the '{sights.objects[k].phrase}', of which the caption does not speak, was not found surely enough and is left out"
+    return [k for k in range(len(grounded.objects)) if k not in left_out], tuple(
+        f"the '{grounded.objects[k].phrase}', of which the caption does not speak, was not found surely enough and is left out"
         for k in left_out
     )
 
@@ -155,39 +159,39 @@ class _Scene:
     """What the search for the other objects goes by."""
 
     clip: Clip
-    footage: Footage
+    working: WorkingClip
     table: Table
-    watched: Watched | None
+    segmentation: Segmentation | None
     meaning: Meaning
     moved: Moved
-    mover: Sighting
+    mover: ObjectTrack
     """The manipulated object."""
     min_found: float
 
 
-def _mover(
-    thing: Sighting,
-    footage: Footage,
-    watched: Watched | None,
+def _moved_object(
+    thing: ObjectTrack,
+    working: WorkingClip,
+    segmentation: Segmentation | None,
     moved: Moved,
-    mark: Mark | None,
-) -> Sighting:
+    mark: HintMask | None,
+) -> ObjectTrack:
     """Return a thing that moves, followed from its first outline to its last."""
-    sure, why = _sureness(moved, watched, mark)
-    course = track(
-        footage,
+    sure, why = _sureness(moved, segmentation, mark)
+    tracked = track(
+        working,
         moved,
-        every=_every(footage),
-        moving=None if watched is None else lambda i: watched.at(i)[MOVED],
-        bare=None if watched is None else lambda i: watched.at(i)[TABLE],
+        every=_every(working),
+        moving=None if segmentation is None else lambda i: segmentation.at(i)[MOVED],
+        bare=None if segmentation is None else lambda i: segmentation.at(i)[TABLE],
     )
-    if mark is not None and mark.on_its_way(footage):
-        course.masks[mark.frame], course.quality[mark.frame] = mark.mask, 1.0
+    if mark is not None and mark.on_its_way(working):
+        tracked.masks[mark.frame], tracked.quality[mark.frame] = mark.mask, 1.0
     return replace(
         thing,
-        masks=course.masks,
-        quality=course.quality,
-        meets=course.meets,
+        masks=tracked.masks,
+        quality=tracked.quality,
+        agreement=tracked.agreement,
         moves=True,
         sure=sure,
         why=why,
@@ -195,37 +199,39 @@ def _mover(
     )
 
 
-def _every(footage: Footage) -> int:
+def _every(working: WorkingClip) -> int:
     """Return every how-manieth frame is tracked."""
-    return 1 if len(footage.rgb) < 80 else 2
+    return 1 if len(working.rgb) < 80 else 2
 
 
-def swallowed(watched: Watched, thing: Sighting, other: Sighting) -> Sighting:
+def hidden_in_container(
+    segmentation: Segmentation, thing: ObjectTrack, other: ObjectTrack
+) -> ObjectTrack:
     """Return the thing as last seen, where it goes into the other and nothing that moved is seen at the end: bins are deep.
 
     Where the user marked the other, only what is seen there counts: hands and legs uncover things elsewhere.
     """
     little = _LITTLE * float(thing.first.sum())
     goal = grow(other.first, _TOUCH_PX)
-    left = watched.at(len(thing.masks) - 1)[MOVED] > 0.5
+    left = segmentation.at(len(thing.masks) - 1)[MOVED] > 0.5
     if not other.noun.hollow or (left & goal if other.hinted else left).sum() > little:
         return thing
     entering = [
         (int(i), mask)
-        for i in watched.idx[len(watched.idx) // 3 :]
-        if (mask := (watched.at(int(i))[MOVED] > 0.5) & goal).sum() > little
+        for i in segmentation.idx[len(segmentation.idx) // 3 :]
+        if (mask := (segmentation.at(int(i))[MOVED] > 0.5) & goal).sum() > little
     ]
     if not entering:
         return thing
     i, mask = entering[-1]
     masks, quality = thing.masks.copy(), thing.quality.copy()
     masks[i:], quality[i + 1 :] = largest(mask), 0.0
-    return replace(thing, masks=masks, quality=quality, swallowed=True)
+    return replace(thing, masks=masks, quality=quality, hidden_in_container=True)
 
 
 def _tool(
-    scene: _Scene, thing: Sighting, mark: Mark | None, held: Moved | None
-) -> Sighting | None:
+    scene: _Scene, thing: ObjectTrack, mark: HintMask | None, tool_moved: Moved | None
+) -> ObjectTrack | None:
     """Return a tool: in a hand that brings it, else what moves as well, or what is marked, followed.
 
     None where it is not found and the caption can do without.
@@ -234,9 +240,9 @@ def _tool(
         ItemRejectedError: `reference_not_found`.
     """
     found, sure = None, 0.0
-    if scene.watched is not None:
+    if scene.segmentation is not None:
         box = None if mark is None else (mark.frame, mark.box)
-        found = find_tool(scene.footage, scene.watched, scene.mover.masks, thing.noun, box)
+        found = find_tool(scene.working, scene.segmentation, scene.mover.masks, thing.noun, box)
     if found is not None:
         sure = found.sure if mark is None else mark.sure
     if found is not None and sure >= scene.min_found:
@@ -253,16 +259,16 @@ def _tool(
         )
     seen = None
     if mark is not None:
-        seen = _held(scene, thing, mark)
-    elif held is not None:
-        seen = _mover(thing, scene.footage, scene.watched, held, mark)
+        seen = _marked_tool(scene, thing, mark)
+    elif tool_moved is not None:
+        seen = _moved_object(thing, scene.working, scene.segmentation, tool_moved, mark)
     if seen is None:
         _check_needed(scene, thing.phrase, sure)
     return seen
 
 
-def _first_pushing(tool: HeldTool, pushed: Sighting) -> int:
-    """Return the footage frame that shows a tool first and well while what it pushes moves, or shortly before or after."""
+def _first_pushing(tool: HeldTool, pushed: ObjectTrack) -> int:
+    """Return the working frame that shows a tool first and well while what it pushes moves, or shortly before or after."""
     spots = {i: np.argwhere(m).mean(0) for i, m in enumerate(pushed.masks) if m.any()}
     start = np.argwhere(pushed.first).mean(0)
     way = np.argwhere(pushed.last).mean(0) - start
@@ -276,24 +282,24 @@ def _first_pushing(tool: HeldTool, pushed: Sighting) -> int:
     return next((i for i in seen if area[i] > _WELL_SEEN * area[seen].max()), tool.at)
 
 
-def _held(scene: _Scene, thing: Sighting, mark: Mark) -> Sighting | None:
+def _marked_tool(scene: _Scene, thing: ObjectTrack, mark: HintMask) -> ObjectTrack | None:
     """Return a marked tool, followed from that frame on; None where the mark is empty."""
     if not mark.mask.any():
         return None
-    footage, watched = scene.footage, scene.watched
-    course = carried(
-        footage,
+    working, segmentation = scene.working, scene.segmentation
+    tracked = carried(
+        working,
         mark.mask,
         mark.frame,
-        every=_every(footage),
+        every=_every(working),
         moving=None
-        if watched is None
-        else lambda i: watched.at(i)[MOVED] + 0.5 * watched.at(i)[HAND],
+        if segmentation is None
+        else lambda i: segmentation.at(i)[MOVED] + 0.5 * segmentation.at(i)[HAND],
     )
     return replace(
         thing,
-        masks=course.masks,
-        quality=course.quality,
+        masks=tracked.masks,
+        quality=tracked.quality,
         moves=True,
         at=mark.frame,
         sure=mark.sure,
@@ -302,34 +308,36 @@ def _held(scene: _Scene, thing: Sighting, mark: Mark) -> Sighting | None:
     )
 
 
-def _stander(
-    scene: _Scene, thing: Sighting, mark: Mark | None, taken: Bool[np.ndarray, "h w"]
-) -> Sighting | None:
+def _static_object(
+    scene: _Scene, thing: ObjectTrack, mark: HintMask | None, taken: Bool[np.ndarray, "h w"]
+) -> ObjectTrack | None:
     """Return a thing that stands still; None where it is not found and the caption can do without.
 
     Raises:
         ItemRejectedError: `reference_not_found`.
     """
-    phrase, kind, watched = thing.phrase, scene.meaning.kind, scene.watched
+    phrase, kind, segmentation = thing.phrase, scene.meaning.kind, scene.segmentation
     late = kind == "uncover" if mark is None else mark.frame > 0
     if mark is not None:
         mask, sure = mark.mask, mark.sure
     else:
-        if watched is not None:
-            search = Search(
-                footage=scene.footage,
+        if segmentation is not None:
+            search = StaticSearch(
+                working=scene.working,
                 table=scene.table,
-                watched=watched,
+                segmentation=segmentation,
                 phrase=phrase,
                 moved=scene.mover.noun,
                 kind=kind,
                 ends=(scene.moved.first, scene.moved.last),
                 taken=taken,
             )
-            found = find_standing(search)
+            found = find_static_object(search)
             sure = found.score if found else 0.0
         else:
-            found = find_other(scene.footage, scene.table, phrase, kind, scene.moved, taken)
+            found = find_static_by_change(
+                scene.working, scene.table, phrase, kind, scene.moved, taken
+            )
             sure = _rise(found.score, 1.0, 0.5) if found else 0.0
         mask = found.mask if found else np.zeros_like(taken)
     if sure < scene.min_found or not mask.any():
@@ -360,11 +368,11 @@ def _check_needed(scene: _Scene, phrase: str, sure: float) -> None:
         )
 
 
-def _sighting(clip: Clip, phrase: str, role: Role) -> Sighting:
+def _unseen_object(clip: Clip, phrase: str, role: Role) -> ObjectTrack:
     """Return an object of which nothing is seen yet."""
     hint = clip.hints.get(phrase, {})
     size = hint.get("size_m")
-    return Sighting(
+    return ObjectTrack(
         phrase=phrase,
         role=role,
         noun=noun_for(hint.get("name") or phrase),
@@ -378,8 +386,8 @@ def _sighting(clip: Clip, phrase: str, role: Role) -> Sighting:
     )
 
 
-def _check_hand(clip: Clip, watched: Watched) -> None:
-    most = float((watched.shares[:, HAND] > 0.5).mean((1, 2)).max())
+def _check_hand(clip: Clip, segmentation: Segmentation) -> None:
+    most = float((segmentation.shares[:, HAND] > 0.5).mean((1, 2)).max())
     if most < _LEAST_HAND:
         raise ItemRejectedError(
             "no_hand",
@@ -389,8 +397,8 @@ def _check_hand(clip: Clip, watched: Watched) -> None:
         )
 
 
-def _check_there_at_first(clip: Clip, phrase: str, watched: Watched | None) -> None:
-    seen = None if watched is None else seen_at_first(watched)
+def _check_there_at_first(clip: Clip, phrase: str, segmentation: Segmentation | None) -> None:
+    seen = None if segmentation is None else share_at_first(segmentation)
     if seen is not None:
         raise ItemRejectedError(
             "not_there_at_first",
@@ -400,81 +408,89 @@ def _check_there_at_first(clip: Clip, phrase: str, watched: Watched | None) -> N
         )
 
 
-def _knowing_hand(footage: Footage, watched: Watched) -> Footage:
-    """Return the footage with the colours of the hand that the network saw."""
-    pixels = [footage.rgb[i][hand_at(watched, int(i))] for i in watched.idx]
+def _knowing_hand(working: WorkingClip, segmentation: Segmentation) -> WorkingClip:
+    """Return the working clip with the colours of the hand that the network saw."""
+    pixels = [working.rgb[i][hand_at(segmentation, int(i))] for i in segmentation.idx]
     hand = np.concatenate(pixels)
     if len(hand) < 300:
-        return footage
+        return working
     return replace(
-        footage, hand_hist=histogram(hand[:: max(1, len(hand) // 60000)]), skin_only=False
+        working, hand_hist=histogram(hand[:: max(1, len(hand) // 60000)]), skin_only=False
     )
 
 
-def _find_movers(
+def _find_moved(
     clip: Clip,
-    footage: Footage,
+    working: WorkingClip,
     table: Table,
-    watched: Watched | None,
+    segmentation: Segmentation | None,
     meaning: Meaning,
     tool: str,
-    marked: dict[str, Mark],
+    marked: dict[str, HintMask],
 ) -> tuple[Moved, Moved | None]:
     mark = marked.get(meaning.manipulated)
-    at_end = mark is not None and mark.at_end(footage)
+    at_end = mark is not None and mark.at_end(working)
     first = mark.mask if mark and not at_end else None
     last = mark.mask if mark and at_end else None
-    look = None
-    if mark is not None and watched is not None and mark.on_its_way(footage):
-        first, last, look = None, None, histogram(footage.rgb[mark.frame][mark.mask])
-    moved, held = None, None
-    if watched is not None:
+    colour_hist = None
+    if mark is not None and segmentation is not None and mark.on_its_way(working):
+        first, last, colour_hist = None, None, histogram(working.rgb[mark.frame][mark.mask])
+    moved, tool_moved = None, None
+    if segmentation is not None:
         goal = next(
             (marked[phrase].mask for phrase, _ in meaning.others if phrase in marked), None
         )
-        found = find_movers(
-            footage,
-            watched,
+        found = find_moved_by_network(
+            working,
+            segmentation,
             meaning.manipulated,
             meaning.kind,
             tool,
             first,
             last,
             goal,
-            look,
+            colour_hist,
         )
-        moved, held = found or (None, None)
+        moved, tool_moved = found or (None, None)
     if moved is None or (mark is None and not tool):
-        by_change = find_moved(
-            footage, table, meaning.manipulated, meaning.kind, first=first, last=last
+        by_change = find_moved_by_change(
+            working, table, meaning.manipulated, meaning.kind, first=first, last=last
         )
         moved = (
             by_change
-            if moved is None or watched is None
-            else _agreed(footage, watched, meaning, moved, by_change)
+            if moved is None or segmentation is None
+            else _agreed(working, segmentation, meaning, moved, by_change)
         )
     if moved is None:
-        _check_there_at_first(clip, meaning.manipulated, watched)
+        _check_there_at_first(clip, meaning.manipulated, segmentation)
         raise ItemRejectedError(
             "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
         )
     given = [end for end, mask in enumerate((first, last)) if mask is not None]
-    if watched is not None:
-        moved = _settled(footage, watched, moved, given)
-    return apart(footage, moved, given), held
+    if segmentation is not None:
+        moved = _without_shadows(working, segmentation, moved, given)
+    return disjoint_ends(working, moved, given), tool_moved
 
 
-def _settled(footage: Footage, watched: Watched, moved: Moved, keep: Sequence[int]) -> Moved:
+def _without_shadows(
+    working: WorkingClip, segmentation: Segmentation, moved: Moved, keep: Sequence[int]
+) -> Moved:
     """Return both outlines without what the network surely sees as table; those in `keep` are taken as they are."""
     first, last = (
-        mask if end in keep else settled(mask, watched.at(i))
-        for end, (mask, i) in enumerate(((moved.first, 0), (moved.last, int(watched.idx[-1]))))
+        mask if end in keep else without_shadow(mask, segmentation.at(i))
+        for end, (mask, i) in enumerate(
+            ((moved.first, 0), (moved.last, int(segmentation.idx[-1])))
+        )
     )
-    return replace(moved, first=first, last=last, look=histogram(footage.rgb[0][first]))
+    return replace(moved, first=first, last=last, colour_hist=histogram(working.rgb[0][first]))
 
 
 def _agreed(
-    footage: Footage, watched: Watched, meaning: Meaning, moved: Moved, by_change: Moved | None
+    working: WorkingClip,
+    segmentation: Segmentation,
+    meaning: Meaning,
+    moved: Moved,
+    by_change: Moved | None,
 ) -> Moved:
     """Return what the network found, weighed by what colours and vanishing edges say.
 
@@ -488,7 +504,7 @@ def _agreed(
             score=_NO_OPINION * moved.score,
         )
     if by_change.first.any() and by_change.last.any():
-        other = rated(footage, watched, meaning.manipulated, meaning.kind, by_change)
+        other = rated(working, segmentation, meaning.manipulated, meaning.kind, by_change)
         if other.score > _CLEARLY_BETTER * moved.score:
             rivalry = float(1 / (1 + (moved.score / other.score) ** 2))
             cues = {**other.cues, "no rival": rivalry}
@@ -509,10 +525,12 @@ def _agreed(
     return replace(moved, score=moved.score * opinion, cues=cues)
 
 
-def _sureness(moved: Moved, watched: Watched | None, mark: Mark | None) -> tuple[float, str]:
+def _sureness(
+    moved: Moved, segmentation: Segmentation | None, mark: HintMask | None
+) -> tuple[float, str]:
     if mark is not None:
         return mark.sure, ""
-    if watched is None or "no rival" not in moved.cues:
+    if segmentation is None or "no rival" not in moved.cues:
         return _rise(moved.score, 3.6, 0.8), f"its cues add up to {moved.score:.1f}"
     weakest = min(moved.cues, key=lambda cue: moved.cues[cue])
     sure = moved.score**0.5
@@ -525,14 +543,16 @@ def _less_what_passes(
     """Return a standing thing's mask over time, less what passes in front of it."""
     out = np.repeat(mask[None], len(scene.mover.masks), axis=0)
     for i, hidden in enumerate(scene.mover.masks):
-        if scene.watched is not None:
-            shares = scene.watched.at(i)
+        if scene.segmentation is not None:
+            shares = scene.segmentation.at(i)
             hidden = hidden | (shares[HAND] + shares[MOVED] > 0.5)
         out[i] &= ~hidden
     return out
 
 
-def stands_on(table: Table, mask: Bool[np.ndarray, "h w"], watched: Watched | None = None) -> bool:
+def rests_on_table(
+    table: Table, mask: Bool[np.ndarray, "h w"], segmentation: Segmentation | None = None
+) -> bool:
     """Return whether the mask's foot lies on the table's part of the picture, or the network sees table beneath it."""
     x, y, w, h = bounding_box(mask)
     foot = np.zeros_like(mask)
@@ -540,11 +560,11 @@ def stands_on(table: Table, mask: Bool[np.ndarray, "h w"], watched: Watched | No
     foot &= mask
     if float((foot & grow(table.hull, 6)).sum()) > 0.3 * float(foot.sum()):
         return True
-    if watched is None:
+    if segmentation is None:
         return False
     below = grow(foot, _BELOW_PX) & ~grow(mask, 1)
     below[: y + int(0.75 * h)] = False
-    return bool(below.any()) and float(watched.early[TABLE][below].mean()) > _SEEN_BELOW
+    return bool(below.any()) and float(segmentation.early[TABLE][below].mean()) > _SEEN_BELOW
 
 
 def _rise(x: float, middle: float, width: float) -> float:

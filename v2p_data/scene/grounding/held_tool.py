@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from v2p_data.scene.frames.classes import HAND, MOVED
 from v2p_data.scene.frames.colour import histogram, lab_of, likelihood, shadow, similarity
 from v2p_data.scene.frames.mask_ops import DRAWN_OFF_PX, bounding_box, grow, iou, is_cut, tidy
-from v2p_data.scene.frames.segmentation import Watched
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.segmentation import Segmentation
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.camera_height import px_per_m
 from v2p_data.scene.scale.nouns import Noun
 
@@ -58,7 +58,7 @@ class HeldTool:
     """A tool in the picture."""
 
     at: int
-    """Footage frame that shows it best."""
+    """Working frame that shows it best."""
     masks: Bool[np.ndarray, "time h w"] = field(repr=False)
     """Empty where it is not seen."""
     quality: Float[np.ndarray, "time"] = field(repr=False)
@@ -97,8 +97,8 @@ class _Piece:
 
 
 def find_tool(
-    footage: Footage,
-    watched: Watched,
+    working: WorkingClip,
+    segmentation: Segmentation,
     pushed: Bool[np.ndarray, "time h w"],
     noun: Noun,
     marked: tuple[int, Bool[np.ndarray, "h w"]] | None = None,
@@ -109,23 +109,23 @@ def find_tool(
     into one another (found as in Viterbi 1967).
 
     Args:
-        footage: frames and stills.
-        watched: what the network sees.
+        working: frames and stills.
+        segmentation: what the network sees.
         pushed: the manipulated object's visible pixels.
         noun: what the tool is.
-        marked: a footage frame and the box there, as a mask, in which a user says it is.
+        marked: a working frame and the box there, as a mask, in which a user says it is.
     """
-    background = lab_of(_background(footage, watched, pushed))
-    metre_px = px_per_m(watched.camera, footage.shape, float(np.nonzero(pushed[0])[0].mean()))
+    background = lab_of(_background(working, segmentation, pushed))
+    metre_px = px_per_m(segmentation.camera, working.shape, float(np.nonzero(pushed[0])[0].mean()))
     usual_px = tuple(side * metre_px for side in sorted(noun.size_m)[:0:-1])
-    picks = set(watched.idx[:: max(1, len(watched.idx) // _LOOKS)].tolist())
+    picks = set(segmentation.idx[:: max(1, len(segmentation.idx) // _LOOKS)].tolist())
     frames = sorted(picks | ({marked[0]} if marked else set()))
     pieces = []
     for i in frames:
-        frame = _frame(footage, watched, pushed, background, i)
+        frame = _frame(working, segmentation, pushed, background, i)
         box = marked[1] if marked is not None and i == marked[0] else None
         pieces.append(_best_pieces(frame, usual_px, box))
-    chain = _best_chain(footage, frames, pieces)
+    chain = _best_chain(working, frames, pieces)
     if not chain:
         return None
     at, best = max(chain.items(), key=lambda item: item[1].rating)
@@ -171,26 +171,26 @@ def _area_beside(piece: _Piece, best: _Piece) -> float:
 
 
 def _background(
-    footage: Footage, watched: Watched, pushed: Bool[np.ndarray, "time h w"]
+    working: WorkingClip, segmentation: Segmentation, pushed: Bool[np.ndarray, "time h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the picture without hand, tool and what is pushed: the late still, the early one where that shows any."""
     stood, stands = grow(pushed[0], 3), grow(pushed[-1], 3)
-    early, late = (w[HAND] + w[MOVED] for w in (watched.early, watched.late))
+    early, late = (w[HAND] + w[MOVED] for w in (segmentation.early, segmentation.late))
     use_early = (stands | ((late > 0.3) & (early < late))) & ~stood
-    return np.where(use_early[..., None], footage.early, footage.late)
+    return np.where(use_early[..., None], working.early, working.late)
 
 
 def _frame(
-    footage: Footage,
-    watched: Watched,
+    working: WorkingClip,
+    segmentation: Segmentation,
     pushed: Bool[np.ndarray, "time h w"],
     background: Float32[np.ndarray, "h w 3"],
     i: int,
 ) -> _Frame:
-    lab, shares = footage.lab[i], watched.at(i)
+    lab, shares = working.lab[i], segmentation.at(i)
     passing = np.linalg.norm(lab - background, axis=-1) > _PASSING_LAB
     return _Frame(
-        rgb=footage.rgb[i],
+        rgb=working.rgb[i],
         lab=lab,
         passing=passing & ~grow(pushed[i], 1),
         shaded=shadow(lab, background, darkest=_DARKEST_SHADOW, drift=_HUE_LOST),
@@ -261,10 +261,10 @@ def _along(
     half = max(1.5, float(np.percentile(off[mask], 95)))
     room = max(0.0, 1.1 * usual_px[0] - float(np.ptp(own)))
     line = (off <= half) & (ahead > own.min() - room) & (ahead < own.max() + room) & passing
-    look = histogram(frame.rgb[mask])
+    colour_hist = histogram(frame.rgb[mask])
     hand = passing & ~mask & ~line & (frame.hand > 0.5)
     others = histogram(frame.rgb[hand])
-    alike = likelihood(look, frame.rgb) > likelihood(others, frame.rgb) + 1e-5
+    alike = likelihood(colour_hist, frame.rgb) > likelihood(others, frame.rgb) + 1e-5
     return mask | tidy(line & alike, 1)
 
 
@@ -286,14 +286,14 @@ def _across(
 
 
 def _best_chain(
-    footage: Footage, frames: list[int], pieces: list[list[_Piece]]
+    working: WorkingClip, frames: list[int], pieces: list[list[_Piece]]
 ) -> dict[int, _Piece]:
-    """Return the pieces, by footage frame, that are together the best."""
+    """Return the pieces, by working frame, that are together the best."""
     total = [np.array([_worth(piece) for piece in here] + [0.0]) for here in pieces]
     came = [np.zeros(len(values), int) for values in total]
     for k in range(1, len(frames)):
         links = np.zeros((len(total[k - 1]), len(total[k])))
-        flow = _flow(footage, frames[k - 1], frames[k])
+        flow = _flow(working, frames[k - 1], frames[k])
         for a, before in enumerate(pieces[k - 1]):
             moved = _carried(before.mask, flow)
             for b, after in enumerate(pieces[k]):
@@ -403,10 +403,10 @@ def _likeness(before: _Piece, after: _Piece, moved: Bool[np.ndarray, "h w"]) -> 
     return similarity(before.hist, after.hist) * size * (0.2 + 0.8 * iou(after.mask, moved))
 
 
-def _flow(footage: Footage, before: int, now: int) -> Float32[np.ndarray, "h w 2"]:
+def _flow(working: WorkingClip, before: int, now: int) -> Float32[np.ndarray, "h w 2"]:
     """Return from where each pixel of the later frame came."""
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    grey = [cv2.cvtColor(footage.rgb[i], cv2.COLOR_RGB2GRAY) for i in (now, before)]
+    grey = [cv2.cvtColor(working.rgb[i], cv2.COLOR_RGB2GRAY) for i in (now, before)]
     back = method.calc(*grey, None)  # type: ignore[call-overload]
     y, x = np.mgrid[: back.shape[0], : back.shape[1]].astype(np.float32)
     return np.stack([x, y], -1) + back

@@ -17,9 +17,9 @@ from v2p_data.scene.frames.mask_ops import (
     refine,
     spans,
 )
-from v2p_data.scene.frames.segmentation import Watched
-from v2p_data.scene.frames.working_clip import Footage
-from v2p_data.scene.grounding.outlines import filled, less_table
+from v2p_data.scene.frames.segmentation import Segmentation
+from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.outlines import filled, without_table
 from v2p_data.video.clip import Clip
 
 _HINTED_SURE = 0.97
@@ -48,66 +48,70 @@ class Box:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mark:
+class HintMask:
     """A mask that a user or a detector stands for."""
 
     mask: Bool[np.ndarray, "h w"]
     frame: int
-    """Footage frame."""
+    """Working frame."""
     sure: float
     box: Bool[np.ndarray, "h w"]
     """What was drawn, or the box around the mask."""
 
-    def at_end(self, footage: Footage) -> bool:
-        return self.frame > 0.5 * (len(footage.rgb) - 1)
+    def at_end(self, working: WorkingClip) -> bool:
+        return self.frame > 0.5 * (len(working.rgb) - 1)
 
-    def on_its_way(self, footage: Footage) -> bool:
+    def on_its_way(self, working: WorkingClip) -> bool:
         """Return whether what is marked is elsewhere at the nearer end of the clip: then the mark shows how it looks, not where it ends."""
-        end = -1 if self.at_end(footage) else 0
-        off = np.linalg.norm(footage.lab[self.frame] - footage.lab[end], axis=-1)[self.mask]
+        end = -1 if self.at_end(working) else 0
+        off = np.linalg.norm(working.lab[self.frame] - working.lab[end], axis=-1)[self.mask]
         return bool(off.size and np.median(off) > _ELSEWHERE_LAB)
 
 
-def marks_of(
-    clip: Clip, footage: Footage, watched: Watched | None, boxes: Mapping[str, Box]
-) -> dict[str, Mark]:
+def hint_masks_of(
+    clip: Clip, working: WorkingClip, segmentation: Segmentation | None, boxes: Mapping[str, Box]
+) -> dict[str, HintMask]:
     """Return the masks that users' boxes and points mean, and detectors' boxes, by phrase."""
     out = {}
     for phrase, box in boxes.items():
-        i = int(np.abs(footage.frame_idx - box.frame).argmin())
-        out[phrase] = _boxed(footage, watched, i, box.box_xyxy, box.score)
+        i = int(np.abs(working.frame_idx - box.frame).argmin())
+        out[phrase] = _boxed(working, segmentation, i, box.box_xyxy, box.score)
     for phrase, hint in clip.hints.items():
-        i = int(np.abs(footage.frame_idx - hint.get("frame", 0)).argmin())
+        i = int(np.abs(working.frame_idx - hint.get("frame", 0)).argmin())
         if "box" in hint:
-            out[phrase] = _boxed(footage, watched, i, hint["box"], _HINTED_SURE)
+            out[phrase] = _boxed(working, segmentation, i, hint["box"], _HINTED_SURE)
         elif "points" in hint:
-            spots = [(x * footage.px_scale, y * footage.px_scale) for x, y in hint["points"]]
-            mask = from_points(footage.rgb[i], spots)
+            spots = [(x * working.px_scale, y * working.px_scale) for x, y in hint["points"]]
+            mask = from_points(working.rgb[i], spots)
             x, y, w, h = bounding_box(mask)
-            inside = _inside_of((x, y, x + w, y + h), footage.shape)
-            out[phrase] = Mark(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
+            inside = _inside_of((x, y, x + w, y + h), working.shape)
+            out[phrase] = HintMask(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
     return out
 
 
 def _boxed(
-    footage: Footage, watched: Watched | None, i: int, box_xyxy: Sequence[float], sure: float
-) -> Mark:
-    """Return what a box in the clip's pixels means at footage frame `i`."""
-    x0, y0, x1, y1 = (v * footage.px_scale for v in box_xyxy)
+    working: WorkingClip,
+    segmentation: Segmentation | None,
+    i: int,
+    box_xyxy: Sequence[float],
+    sure: float,
+) -> HintMask:
+    """Return what a box in the clip's pixels means at working frame `i`."""
+    x0, y0, x1, y1 = (v * working.px_scale for v in box_xyxy)
     box = (x0, y0, x1, y1)
-    mask = from_box(footage.rgb[i], box, _thing_at(watched, i))
-    inside = _inside_of(box, footage.shape)
+    mask = from_box(working.rgb[i], box, _thing_at(segmentation, i))
+    inside = _inside_of(box, working.shape)
     drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
-    if watched is not None:
+    if segmentation is not None:
         if mask.sum() < _SMALL_PX or spans(mask, drawn) < _FILLED:
-            mask = filled(mask, watched.at(i), grow(inside, DRAWN_OFF_PX))
-        mask = less_table(mask, watched.at(i))
-    beside = refine(footage.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
+            mask = filled(mask, segmentation.at(i), grow(inside, DRAWN_OFF_PX))
+        mask = without_table(mask, segmentation.at(i))
+    beside = refine(working.rgb[i], mask, never=~grow(inside, _BESIDE_PX))
     if spans(beside, drawn) > spans(mask, drawn) - _RAN_AWAY:
         mask = beside
-    if watched is not None and spans(mask, drawn) < _LEAST_SPAN:
-        mask = ellipse_in(drawn, footage.shape)
-    return Mark(mask=mask, frame=i, sure=sure, box=inside)
+    if segmentation is not None and spans(mask, drawn) < _LEAST_SPAN:
+        mask = ellipse_in(drawn, working.shape)
+    return HintMask(mask=mask, frame=i, sure=sure, box=inside)
 
 
 def _inside_of(
@@ -119,8 +123,8 @@ def _inside_of(
     return inside
 
 
-def _thing_at(watched: Watched | None, i: int) -> Float[np.ndarray, "h w"] | None:
-    if watched is None:
+def _thing_at(segmentation: Segmentation | None, i: int) -> Float[np.ndarray, "h w"] | None:
+    if segmentation is None:
         return None
-    shares = watched.at(i)
+    shares = segmentation.at(i)
     return shares[MOVED] + shares[OTHER]

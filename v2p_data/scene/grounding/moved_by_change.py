@@ -37,7 +37,7 @@ from v2p_data.scene.frames.mask_ops import (
     tidy,
 )
 from v2p_data.scene.frames.table import Table
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.working_clip import WorkingClip
 
 _MIN_SHARE, _MAX_SHARE = 0.0015, 0.16
 """An object's share of the picture; smaller is noise, larger is a person."""
@@ -62,7 +62,7 @@ class Moved:
     last: Bool[np.ndarray, "h w"]
     score: float
     """Sum of the cues, where above about 4.5 it was nearly always right; with the network their product."""
-    look: Float[np.ndarray, "l a b"] = field(repr=False)
+    colour_hist: Float[np.ndarray, "l a b"] = field(repr=False)
     """Colour histogram of the object."""
     cues: dict[str, float] = field(default_factory=dict)
 
@@ -88,8 +88,8 @@ class _Blob:
     """The mask with the rest of the object, once `_complete` has looked for it."""
 
 
-def find_moved(
-    footage: Footage,
+def find_moved_by_change(
+    working: WorkingClip,
     table: Table,
     phrase: str,
     kind: Kind,
@@ -102,24 +102,24 @@ def find_moved(
     A mask given by the user for either end is taken as it is.
     """
     words = colour_words(phrase)
-    pair = _best_pair(footage, table, words, kind, first, last)
+    pair = _best_pair(working, table, words, kind, first, last)
     if pair is None:
         return None
     # Now that the object's look is known, the hand is everything else that moves, sleeves and dark skin as well.
-    look = _look(footage, pair[1], words)
-    footage = footage.knowing(look)
-    pair = _best_pair(footage, table, words, kind, first, last, look) or pair
+    colour_hist = _colour_hist(working, pair[1], words)
+    working = working.knowing(colour_hist)
+    pair = _best_pair(working, table, words, kind, first, last, colour_hist) or pair
     score, a, b, cues = pair
-    look = _look(footage, a, words)
+    colour_hist = _colour_hist(working, a, words)
     return Moved(
         first=first
         if first is not None
-        else outline(footage, footage.rgb[0], _whole(a), words, look),
+        else outline(working, working.rgb[0], _whole(a), words, colour_hist),
         last=last
         if last is not None
-        else outline(footage, footage.rgb[-1], _whole(b), words, look),
+        else outline(working, working.rgb[-1], _whole(b), words, colour_hist),
         score=score,
-        look=look,
+        colour_hist=colour_hist,
         cues={
             **{f"first {k}": v for k, v in a.cues.items()},
             **{f"last {k}": 0.6 * v for k, v in b.cues.items()},
@@ -129,19 +129,19 @@ def find_moved(
 
 
 def outline(
-    footage: Footage,
+    working: WorkingClip,
     image: UInt8[np.ndarray, "h w 3"],
     blob: Bool[np.ndarray, "h w"],
     words: tuple[str, ...],
-    look: Float[np.ndarray, "l a b"],
+    colour_hist: Float[np.ndarray, "l a b"],
 ) -> Bool[np.ndarray, "h w"]:
     """Return the object's outline around a blob in any frame, the hand cut away.
 
-    Hand is what looks more like the moving hand than like the object (`look`).
+    Hand is what looks more like the moving hand than like the object (`colour_hist`).
     """
-    likelier = likelihood(footage.hand_hist, image) > likelihood(look, image)
-    never = tidy(footage.hand(image) & likelier)
-    shade = shadow(lab_of(image), footage.lit) & blob & ~_colour(image, words)
+    likelier = likelihood(working.hand_hist, image) > likelihood(colour_hist, image)
+    never = tidy(working.hand(image) & likelier)
+    shade = shadow(lab_of(image), working.lit) & blob & ~_colour(image, words)
     if shade.sum() < 0.4 * blob.sum():
         blob = blob & ~shade
     rest = blob & ~never
@@ -158,8 +158,8 @@ def outline(
     return refine(image, main_parts(tidy(rest)) if tidy(rest).any() else rest, never)
 
 
-def find_other(
-    footage: Footage,
+def find_static_by_change(
+    working: WorkingClip,
     table: Table,
     phrase: str,
     kind: Kind,
@@ -171,8 +171,8 @@ def find_other(
     For `uncover` the late still is searched, for all others the early one.
     """
     late = kind == "uncover"
-    still = footage.late if late else footage.early
-    h, w = footage.shape
+    still = working.late if late else working.early
+    h, w = working.shape
     words = colour_words(phrase)
     goal = moved.first if late else moved.last
     goal_zone = grow(goal, 6)
@@ -184,13 +184,13 @@ def find_other(
     ends = [np.argwhere(mask).mean(0) for mask in (moved.first, moved.last) if mask.any()]
     way = float(np.linalg.norm(ends[-1] - ends[0])) if ends else 0.0
     colour = _colour(still, words)
-    quarter = max(3, len(footage.lab) // 5)
-    stack = footage.lab[-quarter:] if late else footage.lab[:quarter]
+    quarter = max(3, len(working.lab) // 5)
+    stack = working.lab[-quarter:] if late else working.lab[:quarter]
     steps = np.linalg.norm(np.diff(stack[:: max(1, quarter // 8)], axis=0), axis=-1)
     restless = (steps > 12).mean(0) > 0.15
     inner_hull = shrink(table.hull, 1)
     stands_out = table.stands_out(still) & inner_hull & ~restless
-    hand = footage.hand(still) & ~colour
+    hand = working.hand(still) & ~colour
     sets = [stands_out, stands_out & ~hand] + ([colour & ~restless] if words else [])
     lab = lab_of(still)
     occupied = grow(moved.first, 3)
@@ -260,24 +260,24 @@ def pieces_of(mask: Bool[np.ndarray, "h w"], least_px: float) -> list[Bool[np.nd
 
 
 def _best_pair(
-    footage: Footage,
+    working: WorkingClip,
     table: Table,
     words: tuple[str, ...],
     kind: Kind,
     first: np.ndarray | None,
     last: np.ndarray | None,
-    look: np.ndarray | None = None,
+    colour_hist: np.ndarray | None = None,
 ) -> tuple[float, _Blob, _Blob, dict[str, float]] | None:
     def found(given: np.ndarray | None, at_end: bool) -> list[_Blob]:
         if given is not None:
-            return [_given(footage.rgb[-1 if at_end else 0], given)]
-        return _blobs(footage, table, words, kind, at_end=at_end, look=look)
+            return [_given(working.rgb[-1 if at_end else 0], given)]
+        return _blobs(working, table, words, kind, at_end=at_end, colour_hist=colour_hist)
 
     best = None
     ends = found(last, at_end=True)
     for a in found(first, at_end=False):
         for b in ends:
-            cues = _pair_cues(a, b, kind, footage.shape)
+            cues = _pair_cues(a, b, kind, working.shape)
             score = a.score + 0.6 * b.score + sum(cues.values())
             if best is None or score > best[0]:
                 best = score, a, b, cues
@@ -288,8 +288,8 @@ def _whole(blob: _Blob) -> np.ndarray:
     return blob.mask if blob.whole is None else blob.whole
 
 
-def _look(footage: Footage, blob: _Blob, words: tuple[str, ...]) -> np.ndarray:
-    return histogram(footage.rgb[0][_typical(footage, _whole(blob), words)])
+def _colour_hist(working: WorkingClip, blob: _Blob, words: tuple[str, ...]) -> np.ndarray:
+    return histogram(working.rgb[0][_typical(working, _whole(blob), words)])
 
 
 def _given(image: np.ndarray, mask: np.ndarray) -> _Blob:
@@ -298,17 +298,17 @@ def _given(image: np.ndarray, mask: np.ndarray) -> _Blob:
     )
 
 
-def _typical(footage: Footage, mask: np.ndarray, words: tuple[str, ...]) -> np.ndarray:
+def _typical(working: WorkingClip, mask: np.ndarray, words: tuple[str, ...]) -> np.ndarray:
     """Return the pixels of a blob that are surely the object: its named colour and what is printed between.
 
     Skin-coloured parts that hang together with something passing outside are fingers.
     """
-    image = footage.rgb[0]
+    image = working.rgb[0]
     named = mask & _colour(image, words)
     if named.sum() < 0.15 * mask.sum():
-        sure = mask & ~footage.hand(image)
+        sure = mask & ~working.hand(image)
         return sure if sure.sum() > 0.2 * mask.sum() else mask
-    passing = np.linalg.norm(lab_of(image) - lab_of(footage.late), axis=-1) > 12
+    passing = np.linalg.norm(lab_of(image) - lab_of(working.late), axis=-1) > 12
     outside, skin = tidy(passing & ~mask), skin_prior(image)
     sure = mask & convex_hull(tidy(named) | shrink(named, 1))
     count, parts = cv2.connectedComponents((sure & ~named).astype(np.uint8))
@@ -320,33 +320,33 @@ def _typical(footage: Footage, mask: np.ndarray, words: tuple[str, ...]) -> np.n
 
 
 def _blobs(
-    footage: Footage,
+    working: WorkingClip,
     table: Table,
     words: tuple[str, ...],
     kind: Kind,
     *,
     at_end: bool,
-    look: np.ndarray | None,
+    colour_hist: np.ndarray | None,
 ) -> list[_Blob]:
-    h, w = footage.shape
-    n = len(footage.rgb)
-    image = footage.rgb[-1 if at_end else 0]
-    gone = footage.early if at_end else footage.late
+    h, w = working.shape
+    n = len(working.rgb)
+    image = working.rgb[-1 if at_end else 0]
+    gone = working.early if at_end else working.late
     lab, gone_lab = lab_of(image), lab_of(gone)
     smooth = cv2.GaussianBlur(lab, (0, 0), 1.0)
     difference = np.linalg.norm(smooth - cv2.GaussianBlur(gone_lab, (0, 0), 1.0), axis=-1)
     changed = difference > max(7.0, 2.5 * float(np.median(difference)) + 3)
-    hand = footage.hand(image)
+    hand = working.hand(image)
     match = colour_match(balance(image), words) if words else np.full((h, w), 0.5, np.float32)
     # A colour that the table has as well says nothing ("white" on a white table).
     telling = 1 - float(match[table.seen].mean()) if table.seen.any() else 1.0
     colour = (match > 0.5) if words else np.zeros((h, w), bool)
-    shade = shadow(lab, footage.lit) & ~colour
-    skin = skin_prior(image) & grow(footage.arm(image), 2)
+    shade = shadow(lab, working.lit) & ~colour
+    skin = skin_prior(image) & grow(working.arm(image), 2)
     changed &= ~shade
     # How long a pixel keeps the look it has here: an arm leaves at once, an object when it is moved.
     # (Frame by frame: all at once are a fifth of a gigabyte.)
-    moved = np.stack([np.linalg.norm(frame - lab, axis=-1) > 11 for frame in footage.lab])
+    moved = np.stack([np.linalg.norm(frame - lab, axis=-1) > 11 for frame in working.lab])
     order = moved[::-1] if at_end else moved
     stays = np.where(order.any(0), order.argmax(0), n) / n
     fleeting = stays < 0.05
@@ -362,11 +362,11 @@ def _blobs(
         (tidy(stands_out & ~(hand & ~colour) & ~fleeting), 0.8),
         (tidy(stands_out & colour), 0.8),
     ]
-    if look is not None:
+    if colour_hist is not None:
         others = np.maximum(
-            likelihood(footage.hand_hist, image), likelihood(footage.rest_hist, image)
+            likelihood(working.hand_hist, image), likelihood(working.rest_hist, image)
         )
-        alike = changed & (likelihood(look, image) > others)
+        alike = changed & (likelihood(colour_hist, image) > others)
         views += [(tidy(alike), 0.0), (tidy(alike, 9), 0.0)]
 
     def vanishing(mask: np.ndarray) -> float:
@@ -408,11 +408,11 @@ def _blobs(
         blob.whole = _completed(
             blob, best, changed, hand, skin, colour if words else None, vanishing
         )
-        if look is None and not words and at_end:
+        if colour_hist is None and not words and at_end:
             blob.whole = blob.mask  # nothing tells the object from the arm yet
-        elif look is not None and (blob.whole & ~blob.mask).any():
+        elif colour_hist is not None and (blob.whole & ~blob.mask).any():
             surplus = histogram(image[blob.whole & ~blob.mask])
-            blob.whole = blob.whole if similarity(look, surplus) > 0.5 else blob.mask
+            blob.whole = blob.whole if similarity(colour_hist, surplus) > 0.5 else blob.mask
     return best
 
 

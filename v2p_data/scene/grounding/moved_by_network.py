@@ -31,8 +31,8 @@ from v2p_data.scene.frames.mask_ops import (
     refine,
     tidy,
 )
-from v2p_data.scene.frames.segmentation import LEAST_SHARE, Watched, hand_at
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.segmentation import LEAST_SHARE, Segmentation, hand_at
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.moved_by_change import Moved
 
 _LIKELY, _POSSIBLE = 0.5, 0.25
@@ -77,35 +77,35 @@ class _Pair:
         return self.first.rating * self.last.rating * float(np.prod(list(self.parts.values())))
 
 
-def find_movers(
-    footage: Footage,
-    watched: Watched,
+def find_moved_by_network(
+    working: WorkingClip,
+    segmentation: Segmentation,
     phrase: str,
     kind: Kind,
     tool: str = "",
     first: Bool[np.ndarray, "h w"] | None = None,
     last: Bool[np.ndarray, "h w"] | None = None,
     goal: Bool[np.ndarray, "h w"] | None = None,
-    look: Float[np.ndarray, "l a b"] | None = None,
+    colour_hist: Float[np.ndarray, "l a b"] | None = None,
 ) -> tuple[Moved, Moved | None] | None:
     """Return the manipulated object and, where the caption names one that a hand holds, the tool.
 
     A mask given by the user for either end is taken as it is; `goal` is what the user marked as that into, onto or over
-    which it goes; `look` its colours, where the user marked it on its way. None where nothing that moved was seen.
+    which it goes; `colour_hist` its colours, where the user marked it on its way. None where nothing that moved was seen.
     """
-    starts = _ends(footage, watched, phrase, 0, first)
-    stops = _ends(footage, watched, phrase, len(footage.rgb) - 1, last)
-    if look is not None:
-        starts, stops = ([_alike(blob, look) for blob in ends] for ends in (starts, stops))
+    starts = _ends(working, segmentation, phrase, 0, first)
+    stops = _ends(working, segmentation, phrase, len(working.rgb) - 1, last)
+    if colour_hist is not None:
+        starts, stops = ([_alike(blob, colour_hist) for blob in ends] for ends in (starts, stops))
     if starts and not stops and KINDS[kind].hides:
-        stops = _last_seen(footage, watched, phrase, starts[0].area)
+        stops = _last_seen(working, segmentation, phrase, starts[0].area)
     stops = [_hidden_end(blob, KINDS[kind].end_weight) for blob in stops]
     if goal is not None and KINDS[kind].touches:
         near = grow(goal, _GAP_PX)
         stops = [_at_goal(blob, near) for blob in stops]
     pairs = sorted(
         (
-            _Pair(a, b, _pair_parts(a, b, kind, footage.shape))
+            _Pair(a, b, _pair_parts(a, b, kind, working.shape))
             for a in starts
             for b in stops
         ),
@@ -121,40 +121,40 @@ def find_movers(
     if not rest:
         return _moved(pairs, best), None
     second = rest[0]
-    held = [_held(footage, watched, pair.first.hist) for pair in (best, second)]
+    in_hand = [_share_in_hand(working, segmentation, pair.first.hist) for pair in (best, second)]
     words = [colour_words(text) for text in (phrase, tool)]
     by_colour = [
-        _named(footage.rgb[0], best.first.mask, words[0]) * _named(footage.rgb[0], second.first.mask, words[1]),
-        _named(footage.rgb[0], second.first.mask, words[0]) * _named(footage.rgb[0], best.first.mask, words[1]),
+        _named(working.rgb[0], best.first.mask, words[0]) * _named(working.rgb[0], second.first.mask, words[1]),
+        _named(working.rgb[0], second.first.mask, words[0]) * _named(working.rgb[0], best.first.mask, words[1]),
     ]  # fmt: skip
-    if by_colour[1] * (0.3 + held[0]) > by_colour[0] * (0.3 + held[1]):
+    if by_colour[1] * (0.3 + in_hand[0]) > by_colour[0] * (0.3 + in_hand[1]):
         best, second = second, best
     return _moved(pairs, best), _moved(pairs, second)
 
 
 def mask_of_mover(
-    footage: Footage, watched: Watched, i: int, blob: Bool[np.ndarray, "h w"]
+    working: WorkingClip, segmentation: Segmentation, i: int, blob: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return a blob's outline at footage frame `i` at working size, the hand cut away."""
-    never = grow(hand_at(watched, i) & ~blob, 1) & ~blob
-    return refine(footage.rgb[i], blob, never)
+    """Return a blob's outline at working frame `i` at working size, the hand cut away."""
+    never = grow(hand_at(segmentation, i) & ~blob, 1) & ~blob
+    return refine(working.rgb[i], blob, never)
 
 
 def _ends(
-    footage: Footage,
-    watched: Watched,
+    working: WorkingClip,
+    segmentation: Segmentation,
     phrase: str,
     i: int,
     given: Bool[np.ndarray, "h w"] | None,
 ) -> list[_Blob]:
     if given is not None:
-        hist = histogram(footage.rgb[i][given])
+        hist = histogram(working.rgb[i][given])
         return [_Blob(mask=given, area=int(given.sum()), hist=hist, parts={"given": 1.0})]
-    moved = watched.at(i)[MOVED]
-    h, w = footage.shape
+    moved = segmentation.at(i)[MOVED]
+    h, w = working.shape
     cores: list[Bool[np.ndarray, "h w"]] = []
     masks: list[Bool[np.ndarray, "h w"]] = []
-    hand = hand_at(watched, i)
+    hand = hand_at(segmentation, i)
     for level in (_LIKELY, _POSSIBLE):
         # Print on a thing and what lies in it break it up: gaps are closed, but not over the hand.
         whole = tidy(moved > level, _GAP_PX) & ~(hand & (moved < _POSSIBLE))
@@ -166,13 +166,13 @@ def _ends(
             ):
                 continue
             cores.append(mask)
-            masks.append(mask_of_mover(footage, watched, i, largest(_grown_to(mask, moved))))
-    pieces = _of_named_colour(footage.rgb[i], phrase, cores)
-    blobs = _rated(footage, watched, phrase, i, masks, cores)
-    cut = [mask_of_mover(footage, watched, i, piece) for piece in pieces]
+            masks.append(mask_of_mover(working, segmentation, i, largest(_grown_to(mask, moved))))
+    pieces = _of_named_colour(working.rgb[i], phrase, cores)
+    blobs = _rated(working, segmentation, phrase, i, masks, cores)
+    cut = [mask_of_mover(working, segmentation, i, piece) for piece in pieces]
     blobs += [
         blob.weighed("cut by colour", _PIECE)
-        for blob in _rated(footage, watched, phrase, i, cut, pieces)
+        for blob in _rated(working, segmentation, phrase, i, cut, pieces)
     ]
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
 
@@ -197,21 +197,21 @@ def _of_named_colour(
 
 
 def _rated(
-    footage: Footage,
-    watched: Watched,
+    working: WorkingClip,
+    segmentation: Segmentation,
     phrase: str,
     i: int,
     masks: Sequence[Bool[np.ndarray, "h w"]],
     cores: Sequence[Bool[np.ndarray, "h w"]],
 ) -> list[_Blob]:
-    """Return what speaks for each mask being what the phrase names, at footage frame `i`, the first or one near the end.
+    """Return what speaks for each mask being what the phrase names, at working frame `i`, the first or one near the end.
 
     `cores` are what the network saw of each before its outline was refined: noise is small there.
     """
-    image, moved = footage.rgb[i], watched.at(i)[MOVED]
+    image, moved = working.rgb[i], segmentation.at(i)[MOVED]
     words = colour_words(phrase)
     match = colour_match(balance(image), words) if words else None
-    lab, gone = lab_of(image), lab_of(footage.late if i == 0 else footage.early)
+    lab, gone = lab_of(image), lab_of(working.late if i == 0 else working.early)
     return [
         _Blob(
             mask=mask,
@@ -229,22 +229,26 @@ def _rated(
     ]
 
 
-def rated(footage: Footage, watched: Watched, phrase: str, kind: Kind, moved: Moved) -> Moved:
+def rated(
+    working: WorkingClip, segmentation: Segmentation, phrase: str, kind: Kind, moved: Moved
+) -> Moved:
     """Return outlines found in another way, with the cues that the network's own are judged by."""
-    stop = len(footage.rgb) - 1
+    stop = len(working.rgb) - 1
     (a,), (b,) = (
-        _rated(footage, watched, phrase, i, [mask], [mask])
+        _rated(working, segmentation, phrase, i, [mask], [mask])
         for i, mask in ((0, moved.first), (stop, moved.last))
     )
     b = _hidden_end(b, KINDS[kind].end_weight)
-    pair = _Pair(a, b, _pair_parts(a, b, kind, footage.shape))
+    pair = _Pair(a, b, _pair_parts(a, b, kind, working.shape))
     return _moved([pair], pair)
 
 
-def _last_seen(footage: Footage, watched: Watched, phrase: str, area: int) -> list[_Blob]:
+def _last_seen(
+    working: WorkingClip, segmentation: Segmentation, phrase: str, area: int
+) -> list[_Blob]:
     """Return the blobs of the last frame that shows half of something this large, before all is hidden."""
-    for i in watched.idx[: len(watched.idx) // 3 : -1].tolist():
-        blobs = _ends(footage, watched, phrase, i, None)
+    for i in segmentation.idx[: len(segmentation.idx) // 3 : -1].tolist():
+        blobs = _ends(working, segmentation, phrase, i, None)
         if any(blob.area > area / 2 for blob in blobs):
             return blobs
     return []
@@ -255,9 +259,9 @@ def _hidden_end(blob: _Blob, weight: float) -> _Blob:
     return replace(blob, parts={name: part**weight for name, part in blob.parts.items()})
 
 
-def _alike(blob: _Blob, look: Float[np.ndarray, "l a b"]) -> _Blob:
+def _alike(blob: _Blob, colour_hist: Float[np.ndarray, "l a b"]) -> _Blob:
     """Return a blob that counts little where it has other colours than what the user marked."""
-    return blob.weighed("alike what is marked", 0.2 + 0.8 * similarity(blob.hist, look))
+    return blob.weighed("alike what is marked", 0.2 + 0.8 * similarity(blob.hist, colour_hist))
 
 
 def _at_goal(blob: _Blob, goal: Bool[np.ndarray, "h w"]) -> _Blob:
@@ -317,7 +321,7 @@ def _moved(pairs: list[_Pair], chosen: _Pair) -> Moved:
         "no rival": float(1 / (1 + (rival / max(chosen.rating, 1e-6)) ** 2)),
     }
     score = float(np.prod(list(cues.values())))
-    return Moved(first=a.mask, last=b.mask, score=score, look=a.hist, cues=cues)
+    return Moved(first=a.mask, last=b.mask, score=score, colour_hist=a.hist, cues=cues)
 
 
 def _is_another(pair: _Pair, chosen: _Pair) -> bool:
@@ -326,15 +330,15 @@ def _is_another(pair: _Pair, chosen: _Pair) -> bool:
     return all((a.mask & b.mask).sum() < _SAME_THING * min(a.area, b.area) for a, b in ends)
 
 
-def _held(footage: Footage, watched: Watched, hist: np.ndarray) -> float:
+def _share_in_hand(working: WorkingClip, segmentation: Segmentation, hist: np.ndarray) -> float:
     """Return how much of the time a hand adjoins what looks like this (0 to 1)."""
     touches = []
-    for i in watched.idx[len(watched.idx) // 4 : -(len(watched.idx) // 4) or None]:
-        shares = watched.at(int(i))
+    for i in segmentation.idx[len(segmentation.idx) // 4 : -(len(segmentation.idx) // 4) or None]:
+        shares = segmentation.at(int(i))
         hand = shares[HAND] > _LIKELY
         if hand.sum() < 30:
             continue
-        alike = (shares[MOVED] > _LIKELY) & (likelihood(hist, footage.rgb[i]) > 2e-4)
+        alike = (shares[MOVED] > _LIKELY) & (likelihood(hist, working.rgb[i]) > 2e-4)
         near = grow(hand, 5) & alike
         touches.append(min(1.0, near.sum() / max(1.0, 0.25 * alike.sum())))
     return float(np.mean(touches)) if touches else 0.0

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, UInt8
 from v2p_data.scene.frames.classes import MOVED, OTHER, TABLE
 from v2p_data.scene.frames.colour import histogram, likelihood
 from v2p_data.scene.frames.mask_ops import grow, largest, tidy
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.moved_by_change import Moved
 
 _AROUND_PX = 10
@@ -29,18 +29,18 @@ _LEAST_CHANGE = 0.05
 """Of an outline: what is not worth mending."""
 
 
-def apart(footage: Footage, moved: Moved, keep: Sequence[int] = ()) -> Moved:
+def disjoint_ends(working: WorkingClip, moved: Moved, keep: Sequence[int] = ()) -> Moved:
     """Return the two outlines without what each has of the other's place: both change, but only one shows the thing.
 
     A part that both have is bare in one of them where it looks there like what lies around the two, rather than like the rest
     of that outline; where there is hardly a rest, rather than in the other picture.
 
     Args:
-        footage: frames.
+        working: frames.
         moved: both outlines.
         keep: 0 for a first one, 1 for a last one that is taken as it is.
     """
-    masks, images = [moved.first, moved.last], [footage.rgb[0], footage.rgb[-1]]
+    masks, images = [moved.first, moved.last], [working.rgb[0], working.rgb[-1]]
     both, either = masks[0] & masks[1], masks[0] | masks[1]
     if not both.any():
         return moved
@@ -58,10 +58,10 @@ def apart(footage: Footage, moved: Moved, keep: Sequence[int] = ()) -> Moved:
         if wrong.sum() > _LEAST_WRONG * area and rest.sum() > _LEAST_LEFT * area:
             masks[k] = rest
     first, last = masks
-    return replace(moved, first=first, last=last, look=histogram(images[0][first]))
+    return replace(moved, first=first, last=last, colour_hist=histogram(images[0][first]))
 
 
-def settled(
+def without_shadow(
     mask: Bool[np.ndarray, "h w"], shares: Float32[np.ndarray, "5 h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Return a moved thing's outline without what to the network surely is bare table, shadows above all, and completed.
@@ -73,7 +73,7 @@ def settled(
     return _if_worth(completed(_off_sure_table(mask, shares), shares[MOVED]), mask)
 
 
-def less_table(
+def without_table(
     mask: Bool[np.ndarray, "h w"], shares: Float32[np.ndarray, "5 h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Return the outline without what to the network surely is bare table; `shares` is what it sees in the same picture.

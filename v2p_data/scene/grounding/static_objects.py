@@ -28,9 +28,9 @@ from v2p_data.scene.frames.mask_ops import (
     solidity,
     tidy,
 )
-from v2p_data.scene.frames.segmentation import Watched
+from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.table import Table
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.moved_by_change import (
     Found,
     pieces_of,
@@ -73,7 +73,7 @@ _LESS_HIDDEN = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Candidate:
+class StaticCandidate:
     """A thing that may be the one that is meant."""
 
     mask: Bool[np.ndarray, "h w"]
@@ -81,12 +81,12 @@ class Candidate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
+class StaticSearch:
     """What is looked for, and where."""
 
-    footage: Footage
+    working: WorkingClip
     table: Table
-    watched: Watched
+    segmentation: Segmentation
     phrase: str
     """What the caption calls it."""
     moved: Noun
@@ -104,9 +104,9 @@ class Search:
         return KINDS[self.kind].starts_over
 
     @cached_property
-    def stands(self) -> Float32[np.ndarray, "h w"]:
+    def static(self) -> Float32[np.ndarray, "h w"]:
         """How likely each pixel shows a thing that stands there."""
-        return seen_standing(self.watched, self.kind)
+        return static_share(self.segmentation, self.kind)
 
     @cached_property
     def log_scale(self) -> float:
@@ -114,11 +114,11 @@ class Search:
         mask = self.ends[0]
         if not (self.moved.known and mask.any()):
             return 0.0
-        off = larger_than_usual(self.moved, self.watched.camera, mask)
+        off = larger_than_usual(self.moved, self.segmentation.camera, mask)
         return float(np.sign(off) * max(0.0, abs(off) - _KINDS_VARY))
 
 
-def find_standing(search: Search) -> Found | None:
+def find_static_object(search: StaticSearch) -> Found | None:
     """Return the thing that the phrase means, its score being how likely it is the right one; None where nothing stands.
 
     It is the candidate from which most overlap with what is meant can be expected: a whole rather than its likelier half.
@@ -144,7 +144,7 @@ def find_standing(search: Search) -> Found | None:
     return Found(mask=mask, score=float(1 / (1 + np.exp(-odds))))
 
 
-def overlaps_of(found: list[Candidate]) -> Float[np.ndarray, "n n"]:
+def overlaps_of(found: list[StaticCandidate]) -> Float[np.ndarray, "n n"]:
     """Return how far each candidate overlaps each (IoU)."""
     masks = np.stack([one.mask.ravel() for one in found]).astype(np.float32)
     common, area = masks @ masks.T, masks.sum(1)
@@ -157,15 +157,15 @@ def odds_of(likely: Float[np.ndarray, "n"], alike: Float[np.ndarray, "n"]) -> fl
     return float(np.log(share / (1 - share)))
 
 
-def seen_standing(watched: Watched, kind: Kind) -> Float32[np.ndarray, "h w"]:
+def static_share(segmentation: Segmentation, kind: Kind) -> Float32[np.ndarray, "h w"]:
     """Return how likely each pixel shows a thing that stands there, over all frames in which nothing passes before it.
 
     What is uncovered is only seen at the end, and the network may say that it moved.
     """
     if kind == "uncover":
-        return watched.late[OTHER] + watched.late[MOVED]
-    free = 1 - watched.shares[:, HAND] - watched.shares[:, MOVED]
-    return watched.shares[:, OTHER].sum(0) / np.maximum(free.sum(0), _LEAST_FREE)
+        return segmentation.late[OTHER] + segmentation.late[MOVED]
+    free = 1 - segmentation.shares[:, HAND] - segmentation.shares[:, MOVED]
+    return segmentation.shares[:, OTHER].sum(0) / np.maximum(free.sum(0), _LEAST_FREE)
 
 
 def usual_area_px(noun: Noun, camera: SeenCamera, shape: tuple[int, int], row_px: float) -> float:
@@ -191,51 +191,58 @@ def larger_than_usual(noun: Noun, camera: SeenCamera, mask: Bool[np.ndarray, "h 
     """Return the logarithm of how much larger a mask's object seems than its kind usually is, of its forms the likelier."""
     y, tall = bounding_box(mask)[1::2]
     area, row_px = float(mask.sum()), y + _FOOT * tall
-    forms = [one for one in (noun, noun.other) if one is not None]
+    forms = [one for one in (noun, noun.variant) if one is not None]
     offs = [
         float(np.log(area / usual_area_px(one, camera, mask.shape, row_px))) / 2 for one in forms
     ]
     return min(offs, key=abs)
 
 
-def candidates(search: Search) -> list[Candidate]:
+def candidates(search: StaticSearch) -> list[StaticCandidate]:
     """Return all that may be meant by the phrase, with its cues."""
-    footage, table, watched, late = search.footage, search.table, search.watched, search.late
-    still, here = (footage.late, watched.late) if late else (footage.early, watched.early)
+    working, table, segmentation, late = (
+        search.working,
+        search.table,
+        search.segmentation,
+        search.late,
+    )
+    still, here = (
+        (working.late, segmentation.late) if late else (working.early, segmentation.early)
+    )
     words = colour_words(search.phrase)
     colour = colour_match(balance(still), words) if words else None
-    apart = table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5)
+    off_table = table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5)
     free = ~search.taken & ~grow(search.ends[1], 2) if late else ~search.taken
-    lab, way = lab_of(still), _Way.of(search)
+    lab, way = lab_of(still), _Approach.of(search)
     usual = float(colour[table.seen].mean()) if colour is not None and table.seen.any() else 0.0
     found = []
-    for mask, is_part in _masks(search.stands, apart, free, colour):
+    for mask, is_part in _masks(search.static, off_table, free, colour):
         own = _own_cues(search, mask, lab, colour, usual)
         if mask.mean() > _MOST_SHARE and own["larger than usual"] > _TOO_LARGE:
             continue
         cues = {"part": float(is_part), **own, **way.cues(mask, search.kind)}
-        found.append(Candidate(mask=mask, cues=cues))
+        found.append(StaticCandidate(mask=mask, cues=cues))
     return found
 
 
 def _own_cues(
-    search: Search,
+    search: StaticSearch,
     mask: Bool[np.ndarray, "h w"],
     lab: Float32[np.ndarray, "h w 3"],
     colour: Float32[np.ndarray, "h w"] | None,
     usual: float,
 ) -> dict[str, float]:
     """Return what a candidate looks like; `colour` is how well each pixel has the colour that the phrase names, `usual` the table's mean."""
-    stands, seen = search.stands, search.table.seen
+    static, seen = search.static, search.table.seen
     h, w = mask.shape
     x, y, bw, bh = bounding_box(mask)
     area = float(mask.sum())
     ring = grow(mask, 4) & ~grow(mask, 1)
     noun = noun_for(search.phrase)
-    off = larger_than_usual(noun, search.watched.camera, mask) - search.log_scale
+    off = larger_than_usual(noun, search.segmentation.camera, mask) - search.log_scale
     return {
-        "seen": float(stands[mask].mean()),
-        "seen around": float(stands[ring].mean()) if ring.any() else 0.0,
+        "seen": float(static[mask].mean()),
+        "seen around": float(static[ring].mean()) if ring.any() else 0.0,
         "sides cut": float(sum((x <= 1, x + bw >= w - 1, y <= 1, y + bh >= h - 1))),
         "larger than usual": max(0.0, off),
         "smaller than usual": max(0.0, -off),
@@ -249,7 +256,7 @@ def _own_cues(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Way:
+class _Approach:
     """From where to where something moved, as far as that tells which thing is meant."""
 
     own: Bool[np.ndarray, "h w"]
@@ -266,7 +273,7 @@ class _Way:
     length_px: float
 
     @classmethod
-    def of(cls, search: Search) -> "_Way":
+    def of(cls, search: StaticSearch) -> "_Approach":
         first, last = search.ends
         goal, own = (first, last) if search.late else (last, first)
         zone = grow(goal, 6)
@@ -331,19 +338,19 @@ def _sum(weights: dict[str, float], cues: dict[str, float]) -> float:
 
 
 def _masks(
-    stands: Float32[np.ndarray, "h w"],
-    apart: Bool[np.ndarray, "h w"],
+    static: Float32[np.ndarray, "h w"],
+    off_table: Bool[np.ndarray, "h w"],
     free: Bool[np.ndarray, "h w"],
     colour: Float32[np.ndarray, "h w"] | None,
 ) -> Iterator[tuple[Bool[np.ndarray, "h w"], bool]]:
     """Yield candidates, each with whether it is cut out of a larger one: by a neck, or by its colour."""
-    sets = [(tidy((stands > level) & free), False, _MOST_SEEN_SHARE) for level in _LEVELS]
-    sets.append((tidy(apart & free, 5), False, _MOST_SHARE))
+    sets = [(tidy((static > level) & free), False, _MOST_SEEN_SHARE) for level in _LEVELS]
+    sets.append((tidy(off_table & free, 5), False, _MOST_SHARE))
     if colour is not None:
         named = free & (colour > 0.5)
         sets += [
             (tidy(pixels & named, 5), True, _MOST_SHARE)
-            for pixels in (apart, *(stands > level for level in _LEVELS[1:]))
+            for pixels in (off_table, *(static > level for level in _LEVELS[1:]))
         ]
     known: list[Bool[np.ndarray, "h w"]] = []
     least = _LEAST_SHARE * free.size
@@ -359,19 +366,21 @@ def _masks(
                     yield mask, is_part or mask is not whole
 
 
-def _outlined(search: Search, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _outlined(search: StaticSearch, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Return the outline that follows the edges around a thing, as far as the network lets it."""
-    footage, watched, stands = search.footage, search.watched, search.stands
+    working, segmentation, static = search.working, search.segmentation, search.static
     late, never = search.late, search.ends[1]
     if not late:
-        passes = [shares[HAND] + shares[MOVED] for shares in (watched.early, watched.late)]
+        passes = [
+            shares[HAND] + shares[MOVED] for shares in (segmentation.early, segmentation.late)
+        ]
         hidden = [float(plane[mask].mean()) for plane in passes]
         late = hidden[1] + _LESS_HIDDEN < hidden[0]
         never = passes[int(late)] > 0.5
-    still: UInt8[np.ndarray, "h w 3"] = footage.late if late else footage.early
-    tells = stands[mask].mean() > _SEEN_AS_THING
-    none = (stands < _NO_THING) if tells else np.zeros_like(mask)
+    still: UInt8[np.ndarray, "h w 3"] = working.late if late else working.early
+    tells = static[mask].mean() > _SEEN_AS_THING
+    none = (static < _NO_THING) if tells else np.zeros_like(mask)
     fine = refine(still, mask, never | none)
     if not 0.5 <= fine.sum() / mask.sum() <= 1.8:
         fine = mask
-    return (fine & ~none) | (mask & (stands > _SURELY))
+    return (fine & ~none) | (mask & (static > _SURELY))

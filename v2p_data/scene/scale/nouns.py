@@ -66,7 +66,7 @@ class Noun:
     """Of a roll or a ring: the diameter of the hole through it, as a share of its own; 0 where there is none."""
     taper: float = 1.0
     """Base diameter over top diameter, for solids of revolution."""
-    other: "Noun | None" = None
+    variant: "Noun | None" = None
     """What things of that name may be as well: waste bins are round or square, tins tall or low."""
     spread: float = 0.2
     matter: Matter = "rigid"
@@ -212,9 +212,9 @@ def _noun(cells: list[str], others: Mapping[str, Noun]) -> tuple[Noun, list[str]
         raise ValueError(f"a {noun.form} cannot have the symmetry '{noun.symmetry}'")
     if second == "box":
         symmetry = "box" if noun.symmetry == "round" else noun.symmetry
-        noun = replace(noun, other=replace(noun, form="box", taper=1.0, symmetry=symmetry))
+        noun = replace(noun, variant=replace(noun, form="box", taper=1.0, symmetry=symmetry))
     elif second:
-        noun = replace(noun, other=replace(others[second], word=noun.word))
+        noun = replace(noun, variant=replace(others[second], word=noun.word))
     return noun, synonyms
 
 

@@ -5,13 +5,17 @@ import numpy as np
 import trimesh
 
 from v2p_data.scene.backends.config import MeshConfig
-from v2p_data.scene.data_types import Sighting
-from v2p_data.scene.frames.working_clip import Footage
+from v2p_data.scene.data_types import ObjectTrack
+from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.video.clip import Clip
 
 
 def mesh_by_worker(
-    clip: Clip, footage: Footage, s: Sighting, size_m: tuple[float, float, float], cfg: MeshConfig
+    clip: Clip,
+    working: WorkingClip,
+    s: ObjectTrack,
+    size_m: tuple[float, float, float],
+    cfg: MeshConfig,
 ) -> tuple[trimesh.Trimesh, str]:
     """Return the worker's mesh of an object and what had to be mended about it.
 
@@ -23,7 +27,7 @@ def mesh_by_worker(
     """
     from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
-    image = clip.frames[footage.frame_idx[s.at]]
+    image = clip.frames[working.frame_idx[s.at]]
     h, w = image.shape[:2]
     mask = cv2.resize(s.first.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0
     request = WorkerRequest(

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.frames.mask_ops import largest
-from v2p_data.scene.shapes.mesh_hypothesis import Candidate, Size, iou_of, turned
-from v2p_data.scene.shapes.silhouette_view import Crop, View
+from v2p_data.scene.shapes.mesh_hypothesis import MeshHypothesis, Size, iou_of, turned
+from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 
 _LOW = 0.6
 """Of its diameter: a lower vessel is a pan, with a stick for a handle; a higher one a mug."""
@@ -36,13 +36,15 @@ _PLATE = Handle(0.12, 0.6, 0.03, (0.0,))
 """Of a low vessel, and of a high one."""
 
 
-def handle_of_body(body: Candidate) -> Handle:
+def handle_of_body(body: MeshHypothesis) -> Handle:
     """Return which kind of handle a vessel may have."""
     low = float(body.mesh.extents[2]) < _LOW * float(body.mesh.extents[:2].mean())
     return _STICK if low else _PLATE
 
 
-def with_handle(body: Candidate, kind: Handle, view: View, crop: Crop) -> Candidate | None:
+def with_handle(
+    body: MeshHypothesis, kind: Handle, view: SilhouetteView, crop: SilhouetteCrop
+) -> MeshHypothesis | None:
     """Return the vessel with the handle that its outline shows; None where it shows none, or does not stand upright.
 
     Low vessels have a stick near the rim, tall ones a plate at half height, whose own height hides how far back it reaches:
@@ -69,7 +71,7 @@ def with_handle(body: Candidate, kind: Handle, view: View, crop: Crop) -> Candid
 
 
 def _tries(
-    spots: Float[np.ndarray, "n 2"], kind: Handle, body: Candidate, inner: float
+    spots: Float[np.ndarray, "n 2"], kind: Handle, body: MeshHypothesis, inner: float
 ) -> list[tuple[Float[np.ndarray, "2"], Size]]:
     """Return directions and extents of handles that may be what is seen at these spots beside the axis."""
     diameter, height = float(body.mesh.extents[:2].mean()), float(body.mesh.extents[2])
@@ -99,8 +101,8 @@ def _spots(
 
 
 def _joined(
-    body: Candidate, way: Float[np.ndarray, "2"], inner: float, extents: Size, z: float
-) -> Candidate:
+    body: MeshHypothesis, way: Float[np.ndarray, "2"], inner: float, extents: Size, z: float
+) -> MeshHypothesis:
     """Return a vessel with a block beside it, `inner` from its axis and at height `z`, towards `way`; x then points there.
 
     The block touches the wall and goes no further in: two closed surfaces side by side are one closed surface.
@@ -117,7 +119,7 @@ def _joined(
     middle = mesh.bounds.mean(axis=0)
     for solid in (mesh, *parts, handle):
         solid.vertices -= middle
-    return Candidate(
+    return MeshHypothesis(
         kind="revolution",
         mesh=mesh,
         parts=(*parts, handle),

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from v2p_data.geometry.pillow import inflated, pillow
 from v2p_data.geometry.pose import inverse, transform
 from v2p_data.scene.frames.mask_ops import bounding_box
-from v2p_data.scene.shapes.mesh_hypothesis import Candidate, Size, turned
-from v2p_data.scene.shapes.silhouette_view import Crop, View, middle_of
+from v2p_data.scene.shapes.mesh_hypothesis import MeshHypothesis, Size, turned
+from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView, middle_of
 
 _FLAT = 0.45
 """Things lower than this share of their length lie, and are seen in the plane of the table; others stand."""
@@ -22,7 +22,7 @@ _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turns (right, towards the back, up) to an upright plane's (right, up, towards the camera)."""
 
 
-def inflation(view: View, crop: Crop, size_m: Size) -> Candidate | None:
+def inflation(view: SilhouetteView, crop: SilhouetteCrop, size_m: Size) -> MeshHypothesis | None:
     """Return the outline, seen in a plane through the object and inflated to the fit's thickness.
 
     What lies is seen in a plane along the table, what stands in the upright plane that faces the camera.
@@ -78,12 +78,12 @@ def inflation(view: View, crop: Crop, size_m: Size) -> Candidate | None:
     solids = [turned(solid, turn.T) for solid in (mesh, *parts)]
     middle = _centred(solids)
     T_world_mesh = T_world_mesh @ transform(np.eye(3), middle)
-    grown, T_world_mesh = _settled(crop, solids[0], T_world_mesh)
+    grown, T_world_mesh = _without_shadows(crop, solids[0], T_world_mesh)
     for solid in solids:
         solid.vertices *= grown
     if not lies and abs(T[2, 2]) > _STANDS:
         solids, T_world_mesh = _along_fit(solids, T_world_mesh, T)
-    return Candidate(
+    return MeshHypothesis(
         kind="inflated",
         mesh=solids[0],
         parts=tuple(solids[1:]),
@@ -111,8 +111,8 @@ def _centred(solids: list[trimesh.Trimesh]) -> Float[np.ndarray, "3"]:
     return middle
 
 
-def _settled(
-    crop: Crop, mesh: trimesh.Trimesh, T_world_mesh: Float[np.ndarray, "4 4"]
+def _without_shadows(
+    crop: SilhouetteCrop, mesh: trimesh.Trimesh, T_world_mesh: Float[np.ndarray, "4 4"]
 ) -> tuple[float, Float[np.ndarray, "4 4"]]:
     """Return by how much to scale the mesh, and its pose on the table, so that its outline lies over the mask."""
     grown, T = 1.0, T_world_mesh.copy()
@@ -143,7 +143,7 @@ def _plane_points(
 
 
 def _ground_shift(
-    crop: Crop, drawn: Bool[np.ndarray, "i j"], forward: Float[np.ndarray, "3"]
+    crop: SilhouetteCrop, drawn: Bool[np.ndarray, "i j"], forward: Float[np.ndarray, "3"]
 ) -> float:
     """Return how much further along the table a thing stands whose foot is drawn too high or too low in the picture [m]."""
     onto = crop.matrix[:, [0, 1, 3]]

@@ -8,14 +8,14 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from v2p_data.scene.shapes.silhouette_view import Crop, View
+from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 
 Kind = Literal["primitive", "revolution", "inflated", "spoon"]
 Size = tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Candidate:
+class MeshHypothesis:
     """A mesh that an object may have."""
 
     kind: Kind
@@ -27,7 +27,9 @@ class Candidate:
     """From the mesh's frame to the fitted primitive's."""
 
 
-def iou_of(shape: Candidate, views: Sequence[View], crops: list[Crop]) -> float:
+def iou_of(
+    shape: MeshHypothesis, views: Sequence[SilhouetteView], crops: list[SilhouetteCrop]
+) -> float:
     """Return how well a shape covers the outlines where they can be seen, averaged over the views."""
     return float(
         np.mean(

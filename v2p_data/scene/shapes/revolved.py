@@ -8,8 +8,8 @@ from v2p_data.geometry.mesh import lathe, lathe_parts, wall_m
 from v2p_data.geometry.pose import transform
 from v2p_data.geometry.raster import fill, in_parts
 from v2p_data.scene.scale.nouns import Noun
-from v2p_data.scene.shapes.mesh_hypothesis import Candidate, Size
-from v2p_data.scene.shapes.silhouette_view import Crop, View
+from v2p_data.scene.shapes.mesh_hypothesis import MeshHypothesis, Size
+from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 
 _RINGS, _RADII, _AROUND = 48, 44, 30
 _MAX_RADIUS = 0.8
@@ -22,7 +22,9 @@ _RING_INSIDE = 0.94
 """Of a ring's points must lie in the mask: a disc half a percent too large has 6 % outside."""
 
 
-def revolution(view: View, crop: Crop, size_m: Size, noun: Noun) -> Candidate | None:
+def revolution(
+    view: SilhouetteView, crop: SilhouetteCrop, size_m: Size, noun: Noun
+) -> MeshHypothesis | None:
     """Return what the outline leaves of a body of revolution about the fit's z: at each height the largest disc in it.
 
     The silhouette of such a body is the union of its discs' silhouettes, so nothing larger can be right. Discs at the
@@ -62,7 +64,7 @@ def revolution(view: View, crop: Crop, size_m: Size, noun: Noun) -> Candidate | 
     wide, tall = 2 * float(radius.max()), float(z[-1] - z[0])
     wall = wall_m((wide, wide, 2 * tall)) if noun.hollow else 0.0
     move = transform(np.eye(3), shift * diameter * side + np.array([0.0, 0.0, middle]))
-    return Candidate(
+    return MeshHypothesis(
         kind="revolution",
         mesh=lathe(profile, wall),
         parts=lathe_parts(profile, wall),
@@ -71,7 +73,7 @@ def revolution(view: View, crop: Crop, size_m: Size, noun: Noun) -> Candidate | 
 
 
 def _carved(
-    crop: Crop,
+    crop: SilhouetteCrop,
     T_world_obj: Float[np.ndarray, "4 4"],
     z: Float[np.ndarray, "k"],
     radii: Float[np.ndarray, "j"],
@@ -103,7 +105,7 @@ def _with_rim(z: Float[np.ndarray, "k"], radius: Float[np.ndarray, "k"]) -> Floa
 
 
 def _needed(
-    crop: Crop,
+    crop: SilhouetteCrop,
     T_world_obj: Float[np.ndarray, "4 4"],
     centre: Float[np.ndarray, "3"],
     z: Float[np.ndarray, "k"],

@@ -18,9 +18,9 @@ from v2p_data.scene.frames.mask_ops import handle_of
 from v2p_data.scene.scale.nouns import Form, Noun
 from v2p_data.scene.shapes.handles import handle_of_body, with_handle
 from v2p_data.scene.shapes.inflation import inflation
-from v2p_data.scene.shapes.mesh_hypothesis import Candidate, Kind, Size, iou_of
+from v2p_data.scene.shapes.mesh_hypothesis import Kind, MeshHypothesis, Size, iou_of
 from v2p_data.scene.shapes.revolved import revolution
-from v2p_data.scene.shapes.silhouette_view import Crop, View
+from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 from v2p_data.scene.shapes.spoon import is_spoon, spoons
 
 _OTHER_END = 0.03
@@ -76,7 +76,7 @@ class ShapeChoice:
 
 
 def best_shape(
-    views: Sequence[View],
+    views: Sequence[SilhouetteView],
     camera: Camera,
     size_m: Size,
     noun: Noun,
@@ -92,7 +92,7 @@ def best_shape(
         cfg: how clearly the primitive must be beaten.
     """
     cfg = cfg or ShapeConfig()
-    crops = [Crop(view, camera) for view in views]
+    crops = [SilhouetteCrop(view, camera) for view in views]
     primitive = _primitive(size_m, noun)
     if is_spoon(noun):
         held, other = spoons(size_m, views[0].T_world_obj)
@@ -139,8 +139,8 @@ def best_shape(
     )
 
 
-def _primitive(size_m: Size, noun: Noun) -> Candidate:
-    return Candidate(
+def _primitive(size_m: Size, noun: Noun) -> MeshHypothesis:
+    return MeshHypothesis(
         kind="primitive",
         mesh=mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
         parts=parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
@@ -149,19 +149,21 @@ def _primitive(size_m: Size, noun: Noun) -> Candidate:
 
 
 def _others(
-    view: View, crop: Crop, size_m: Size, noun: Noun, cfg: ShapeConfig
-) -> list[tuple[Candidate, float]]:
+    view: SilhouetteView, crop: SilhouetteCrop, size_m: Size, noun: Noun, cfg: ShapeConfig
+) -> list[tuple[MeshHypothesis, float]]:
     """Return what else the object may be, with the margin by which each must win."""
     if noun.bore:
         return []
-    found: list[tuple[Candidate | None, float]] = []
+    found: list[tuple[MeshHypothesis | None, float]] = []
     if noun.form != "box":
         margin = cfg.revolution_margin if noun.form == "cylinder" else cfg.ball_margin
         body = crop
         if noun.handled:
             handle = handle_of(view.mask)
             unknown = handle if view.hidden is None else view.hidden | handle
-            body = Crop(replace(view, mask=view.mask & ~handle, hidden=unknown), crop.camera)
+            body = SilhouetteCrop(
+                replace(view, mask=view.mask & ~handle, hidden=unknown), crop.camera
+            )
         found.append((revolution(view, body, size_m, noun), margin))
     if not noun.hollow and noun.symmetry != "sphere" and not crop.at_border:
         irregular = noun.form == "box" and noun.symmetry == "none" and not is_spoon(noun)
@@ -170,7 +172,7 @@ def _others(
     return [(candidate, margin) for candidate, margin in found if candidate is not None]
 
 
-def _as_large(shape: Candidate, size_m: Size) -> bool:
+def _as_large(shape: MeshHypothesis, size_m: Size) -> bool:
     """Return whether its sides are about the fit's: seen aslant, what is flat can be inflated to any depth."""
     ratio = np.sort(shape.mesh.extents) / np.sort(size_m)
     return bool((np.maximum(ratio, 1 / ratio) < _OTHER_SIDES).all())

@@ -17,7 +17,7 @@ _CROP_PX = 160
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class SilhouetteView:
     """The object in one frame."""
 
     mask: Bool[np.ndarray, "h w"]
@@ -28,10 +28,10 @@ class View:
     """Pixels that say nothing, because something may stand in front."""
 
 
-class Crop:
+class SilhouetteCrop:
     """One view's mask, cropped and brought to one size."""
 
-    def __init__(self, view: View, camera: Camera) -> None:
+    def __init__(self, view: SilhouetteView, camera: Camera) -> None:
         x, y, w, h = bounding_box(view.mask)
         pad = int(0.3 * max(w, h)) + 3
         zoom = _CROP_PX / (max(w, h) + 2 * pad)

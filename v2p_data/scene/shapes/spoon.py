@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from v2p_data.geometry.mesh import lathe
 from v2p_data.scene.scale.nouns import Noun
-from v2p_data.scene.shapes.mesh_hypothesis import Candidate, Size, turned
+from v2p_data.scene.shapes.mesh_hypothesis import MeshHypothesis, Size, turned
 
 _BOWL_LENGTH, _BOWL_DEPTH, _WALL = 0.3, 0.42, 0.12
 """Of the spoon's length, and twice of its height."""
@@ -27,7 +27,9 @@ def is_spoon(noun: Noun) -> bool:
     return noun.word.endswith("spoon")
 
 
-def spoons(size_m: Size, T_world_obj: Float[np.ndarray, "4 4"]) -> tuple[Candidate, Candidate]:
+def spoons(
+    size_m: Size, T_world_obj: Float[np.ndarray, "4 4"]
+) -> tuple[MeshHypothesis, MeshHypothesis]:
     """Return the spoon that fills a fitted block, its bowl at the one end and at the other, open upwards.
 
     The bowl of the first is at the end that is lower: so a hand holds a spoon that it pushes with.
@@ -42,8 +44,8 @@ def spoons(size_m: Size, T_world_obj: Float[np.ndarray, "4 4"]) -> tuple[Candida
     axes[:, 1] = np.cross(axes[:, 2], axes[:, 0])
     mesh, parts = _spoon(size_m[long], size_m[across], size_m[up])
 
-    def lying(turn: Float[np.ndarray, "3 3"]) -> Candidate:
-        return Candidate(
+    def lying(turn: Float[np.ndarray, "3 3"]) -> MeshHypothesis:
+        return MeshHypothesis(
             kind="spoon",
             mesh=turned(mesh, turn),
             parts=tuple(turned(part, turn) for part in parts),
