@@ -32,7 +32,7 @@ from bench_reconstruction import (
     table,
 )
 from drawn_clips.clips import MotionKind, VideoSpec, random_spec
-from v2p_data.scene.reconstruct import SceneConfig
+from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.scale.shared_camera import FEWEST, Filmed, shared_camera
 from v2p_data.seeds import rng_for
 

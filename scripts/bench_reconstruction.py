@@ -60,8 +60,10 @@ from policies.evaluation.rate import wilson
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import apply, transform_from_pose
+from v2p_data.scene.config import SceneConfig
+from v2p_data.scene.data_types import Reconstruction
 from v2p_data.scene.frames.working_clip import WIDTH_PX
-from v2p_data.scene.reconstruct import Reconstruction, SceneConfig, reconstruct
+from v2p_data.scene.reconstruct import reconstruct
 from v2p_data.scene.scale.shared_camera import filmed
 from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos

@@ -27,7 +27,8 @@ from policies.evaluation.rate import wilson
 from v2p_data.cli import parse
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import between_centres
-from v2p_data.scene.reconstruct import Estimate, Reconstruction, reconstruct
+from v2p_data.scene.data_types import Estimate, Reconstruction
+from v2p_data.scene.reconstruct import reconstruct
 from v2p_data.seeds import rng_for
 from v2p_data.stages import EngineConfig
 from v2p_data.video.captions import VideoItem, find_videos

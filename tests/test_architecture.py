@@ -56,12 +56,16 @@ SCENE_BELOW: dict[str, set[str]] = {
     "scene": {"schema"},
     # Learned models know pictures and numbers, nothing of ours.
     "backends": set(),
+    "config": {"backends"},
     "scale": {"schema"},
     "frames": {"scale"},
     "data_types": {"frames", "scale", "schema"},
     "grounding": {"data_types", "frames", "scale", "backends", "schema"},
     "shapes": {"data_types", "frames", "scale", "backends"},
-    "fitting": {"shapes", "grounding", "data_types", "frames", "scale", "backends", "schema"},
+    "fitting": {
+        *("shapes", "grounding", "data_types", "frames", "scale"),
+        *("backends", "config", "schema"),
+    },
 }
 """The rooms of `scene`. What is not named here stands above them all: the order of the steps, and what is written."""
 TOP = {

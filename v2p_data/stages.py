@@ -45,7 +45,7 @@ from v2p_data.policy_training import (
     make_policy,
 )
 from v2p_data.reward.config import RewardConfig
-from v2p_data.scene.reconstruct import SceneConfig
+from v2p_data.scene.config import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
 from v2p_data.solved import find_solved, solved_digests

@@ -21,7 +21,7 @@ from scipy.spatial import QhullError
 from v2p_data.geometry.mesh import mesh_for
 from v2p_data.geometry.pose import angle_between, apply, inverse
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.scene.reconstruct import Reconstruction
+from v2p_data.scene.data_types import Reconstruction
 from v2p_data.scene.schema import Symmetry
 
 Stage = Literal["grounding", "segmentation", "mesh", "pose"]

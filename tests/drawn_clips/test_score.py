@@ -24,8 +24,8 @@ from drawn_clips.score import (
 )
 from v2p_data.geometry.mesh import mesh_for
 from v2p_data.geometry.pose import transform
+from v2p_data.scene.data_types import Estimate, Reconstruction
 from v2p_data.scene.fitting.silhouette import camera_above
-from v2p_data.scene.reconstruct import Estimate, Reconstruction
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.shapes.spoon import spoons
 from v2p_data.video.clip import Clip

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.confidence import Cue, by_stage, check_confidence
-from v2p_data.scene.reconstruct import SceneConfig, reconstruct
+from v2p_data.scene.confidence import by_stage, check_confidence
+from v2p_data.scene.config import SceneConfig
+from v2p_data.scene.data_types import Cue
+from v2p_data.scene.reconstruct import reconstruct
 
 CUES = (
     Cue(stage="grounding", what="finding 'cup'", value=0.8),

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from v2p_data.errors import V2PError
 from v2p_data.geometry.mesh import lathe, lathe_parts
 from v2p_data.geometry.pose import transform
+from v2p_data.scene.data_types import Estimate, Reconstruction
 from v2p_data.scene.export import write_scene
 from v2p_data.scene.fitting.silhouette import camera_above
-from v2p_data.scene.reconstruct import Estimate, Reconstruction
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.scene import Scene, SceneObject, least_turn, read_masks, write_masks
 from v2p_data.video.clip import Clip

@@ -9,10 +9,10 @@ import pytest
 
 from v2p_data.geometry.mesh import outline_points, revolution
 from v2p_data.geometry.pose import transform
+from v2p_data.scene.data_types import Estimate, Reconstruction
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.overlay import draw as draw_over
 from v2p_data.scene.overlay import write_overlay
-from v2p_data.scene.reconstruct import Estimate, Reconstruction
 from v2p_data.scene.scale.nouns import noun_for
 
 SIZE = (640, 480)

@@ -8,8 +8,9 @@ import pytest
 import trimesh
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.export import write_scene
-from v2p_data.scene.reconstruct import SceneConfig, reconstruct
+from v2p_data.scene.reconstruct import reconstruct
 from v2p_data.scene.scene import Scene
 from v2p_data.video.captions import find_videos
 from v2p_data.video.decode import VideoConfig, read_clip

@@ -10,6 +10,7 @@ network. Each step can ask a learned model instead (`backends/`, `docs/backends.
 
 Rooms, each of which imports only those above it:
     backends        learned models and workers
+    config          the settings
     scale           usual sizes turn camera heights into metres
     frames          working frames, colours, the table, and the network's classes for every pixel
     data_types      what the rooms below hand to each other
@@ -17,8 +18,10 @@ Rooms, each of which imports only those above it:
     shapes          an outline and a noun become a mesh
     fitting         masks become a camera, sizes and poses
 Above them all:
-    reconstruct     the steps, in order; `SceneConfig`
+    reconstruct     START HERE: the steps, in order
+    meshes          every object gets its mesh
     confidence      how sure each step is; does the motion fit the caption?
+    estimates       one named object in metres; remarks are the warnings
     export, overlay what is written
 The artefact itself, which the rest of the engine reads: scene, schema, files.
 

@@ -3,14 +3,12 @@
 A scene's confidence is the product of its cues; each cue belongs to one stage, whose confidence is the product of its own.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.scene.data_types import GroundedObjects, Placement
+from v2p_data.scene.data_types import Cue, GroundedObjects, Placement
 from v2p_data.scene.fitting.placement import vote_of
 from v2p_data.scene.fitting.trajectory import TOUCH_PX
 from v2p_data.scene.frames.colour import balance, colour_match, named_colours
@@ -26,16 +24,6 @@ _OUT_OF_SIGHT = 0.8
 """What went into a bin lies in it, and what a fist lifts goes with it, but nobody sees where."""
 _GROWN = 0.2
 """Logarithm: of twelve drawn things that a hand touches at first where they rest, none seems so much larger there than at the end."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cue:
-    """One reason to trust a scene or not."""
-
-    stage: str
-    what: str
-    value: float
-    """0 to 1."""
 
 
 def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tuple[Cue, ...]:

@@ -6,15 +6,18 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float
 
 from v2p_data.geometry.camera import Camera
+from v2p_data.kinds import Kind
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.table import Table
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.camera_height import table_width_m
 from v2p_data.scene.scale.nouns import Noun
-from v2p_data.scene.schema import Observed, Role
+from v2p_data.scene.schema import Observed, Role, Symmetry
+from v2p_data.video.clip import Clip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,3 +160,65 @@ class Placement:
     """Standard deviation of the logarithm of `height_m`."""
     upright_cost: float
     """What standing as at first would have cost the manipulated object at the end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cue:
+    """One reason to trust a scene or not."""
+
+    stage: str
+    what: str
+    value: float
+    """0 to 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """One object as far as it was understood, in the scene frame and in metres."""
+
+    name: str
+    label: str
+    role: Role
+    noun: Noun
+    size_m: tuple[float, float, float]
+    rgba: tuple[float, float, float, float]
+    frames: tuple[int, ...]
+    """Clip frames with a pose."""
+    T_world_objs: Float[np.ndarray, "pose 4 4"]
+    confidences: tuple[float, ...]
+    masks: dict[int, Bool[np.ndarray, "h w"]] = field(repr=False)
+    """Its visible pixels by clip frame, at working size."""
+    source: dict[str, str]
+    """Where size, mass and friction come from, in words."""
+    mass_kg: float
+    mesh: trimesh.Trimesh | None = field(default=None, repr=False)
+    """Best mesh, own frame, centred on its bounding box [m]; None means the noun's primitive of this size."""
+    parts: tuple[trimesh.Trimesh, ...] = field(default=(), repr=False)
+    """Convex solids that collide for `mesh`, in the same frame; empty where only the hull is known."""
+    symmetry: Symmetry = "none"
+    observed: tuple[Observed, ...] = ()
+    """Per pose whether one view shows its depth; empty means that all are fully observed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction:
+    """A scene before it is written; `clip` is kept for the overlay."""
+
+    clip: Clip = field(repr=False)
+    kind: Kind
+    objects: tuple[Estimate, ...]
+    """The manipulated one first."""
+    camera: Camera
+    """For the clip's frames, in the scene frame."""
+    confidence: float
+    warnings: tuple[str, ...]
+    stages: dict[str, tuple[float, str]]
+    """Per stage how sure it is, 0 to 1, and why it is not surer."""
+    cues: tuple[Cue, ...] = ()
+    """All that the confidence is the product of."""
+    scale_spread: float = 0.0
+    """Standard deviation of the logarithm of all lengths together: one view does not show scale."""
+    least_found: float = 1.0
+    """How sure the least sure finding is, 0 to 1."""
+    contradiction: str | None = None
+    """How the motion contradicts the caption, where nothing is rejected for it."""

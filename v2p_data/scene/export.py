@@ -17,8 +17,8 @@ from jaxtyping import Float
 from v2p_data.geometry.camera import mujoco_xyaxes
 from v2p_data.geometry.mesh import mass_properties, mesh_for, parts_for, write_obj, write_ply
 from v2p_data.geometry.pose import pose_from_transform
+from v2p_data.scene.data_types import Estimate, Reconstruction
 from v2p_data.scene.overlay import write_overlay
-from v2p_data.scene.reconstruct import Estimate, Reconstruction
 from v2p_data.scene.scene import Scene, SceneObject, StageConfidence, write_masks
 from v2p_data.scene.schema import Shape
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import outline_points
-from v2p_data.scene.reconstruct import Estimate, Reconstruction
+from v2p_data.scene.data_types import Estimate, Reconstruction
 
 LONG_SIDE_PX = 640
 """Of the picture; smaller videos are enlarged, or the words would not fit."""

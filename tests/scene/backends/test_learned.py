@@ -14,11 +14,12 @@ from v2p_data.scene.backends.config import (
     MeshConfig,
     SegmentConfig,
 )
+from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import CameraGuess, ObjectTrack
 from v2p_data.scene.fitting.by_model import camera_from_depth
 from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.scene.grounding.by_model import detected, segmented
-from v2p_data.scene.reconstruct import SceneConfig, reconstruct
+from v2p_data.scene.reconstruct import reconstruct
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.shapes.by_worker import mesh_by_worker
 

@@ -6,14 +6,15 @@ import pytest
 
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.scene.confidence import held_at_first
+from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import CameraGuess, GroundedObjects, ObjectTrack
+from v2p_data.scene.fitting.camera_guess import with_measured_camera
 from v2p_data.scene.fitting.placement import _body, _hidden, place, with_noun_variants
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.classes import CLASSES, HAND
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.table import find_table
 from v2p_data.scene.frames.working_clip import working_clip_of
-from v2p_data.scene.reconstruct import SceneConfig, with_measured_camera
 from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.video.clip import Clip
@@ -164,11 +165,9 @@ def test_lids_of_jars_and_of_pots_are_told_by_their_size(across_m: float, word: 
 
     lid = resting("lid", "manipulated", np.stack([mask] * 12))
 
-    (with_measured_camera,) = with_noun_variants(
-        working_clip_of(filmed(frames)), (lid,), guess, "lift_up"
-    )
+    (told,) = with_noun_variants(working_clip_of(filmed(frames)), (lid,), guess, "lift_up")
 
-    assert with_measured_camera.noun.size_m == noun_for(word).size_m
+    assert told.noun.size_m == noun_for(word).size_m
 
 
 @pytest.mark.parametrize(("vessel", "word"), [("jar", "lid"), ("pot", "pot lid")])
@@ -186,11 +185,9 @@ def test_a_lid_is_about_as_wide_as_what_it_covers(vessel: str, word: str):
     )
     guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=0.5)
 
-    with_measured_camera, _ = with_noun_variants(
-        working_clip_of(filmed(frames)), objects, guess, "cover"
-    )
+    told, _ = with_noun_variants(working_clip_of(filmed(frames)), objects, guess, "cover")
 
-    assert with_measured_camera.noun.size_m == noun_for(word).size_m
+    assert told.noun.size_m == noun_for(word).size_m
 
 
 def test_a_lid_that_is_taken_off_lay_on_what_it_covered():

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from v2p_data.errors import V2PError
+from v2p_data.scene.estimates import slug_for
 from v2p_data.scene.frames.colour import colour_words
-from v2p_data.scene.reconstruct import slug_for
 from v2p_data.scene.scale.nouns import (
     COLUMNS,
     FALLBACK,
