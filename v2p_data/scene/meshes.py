@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import GroundedObjects, Placement
+from v2p_data.scene.fitting.end_poses import UNSEEN_IOU
 from v2p_data.scene.fitting.metric import metric_camera, scene_origin
-from v2p_data.scene.fitting.placement import UNSEEN_IOU
 from v2p_data.scene.fitting.refine_pose import refine_pose, warped_trajectory
 from v2p_data.scene.shapes.shape import ShapeChoice, ShapeConfig, best_shape
 from v2p_data.scene.shapes.silhouette_view import SilhouetteView

@@ -21,7 +21,8 @@ from v2p_data.scene.estimates import estimates_of
 from v2p_data.scene.fitting.by_model import camera_from_depth
 from v2p_data.scene.fitting.camera_guess import camera_guess
 from v2p_data.scene.fitting.metric import clip_camera
-from v2p_data.scene.fitting.placement import place, with_noun_variants
+from v2p_data.scene.fitting.noun_variants import with_noun_variants
+from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.frames.checks import check_change, check_still
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
 from v2p_data.scene.frames.stabilise import stabilised

@@ -9,7 +9,9 @@ from v2p_data.scene.confidence import held_at_first
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import CameraGuess, GroundedObjects, ObjectTrack
 from v2p_data.scene.fitting.camera_guess import with_measured_camera
-from v2p_data.scene.fitting.placement import _body, _hidden, place, with_noun_variants
+from v2p_data.scene.fitting.noun_variants import with_noun_variants
+from v2p_data.scene.fitting.object_view import hidden_around, round_body
+from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.classes import CLASSES, HAND
 from v2p_data.scene.frames.segmentation import Segmentation
@@ -67,7 +69,7 @@ def test_what_comes_later_hides_nothing_now_but_an_arm_does():
         **common,
     )  # fmt: skip
 
-    hidden = _hidden(working_clip_of(clip), (pushed, other), stands, 0)
+    hidden = hidden_around(working_clip_of(clip), (pushed, other), stands, 0)
 
     assert hidden[arm].mean() > 0.2
     assert not hidden[block(160, 100)].any()
@@ -142,8 +144,8 @@ def test_a_pan_is_fitted_without_its_handle():
     handle[middle - 3 : middle + 4, columns.max() - 4 : columns.max() + 60] = True
     hidden = np.zeros_like(body)
 
-    kept, unknown = _body(body | handle, hidden, pan)
-    bowl, nothing = _body(body | handle, hidden, noun_for("bowl"))
+    kept, unknown = round_body(body | handle, hidden, pan)
+    bowl, nothing = round_body(body | handle, hidden, noun_for("bowl"))
 
     assert (kept & body).sum() > 0.97 * body.sum()
     assert unknown[handle & ~body].mean() > 0.9

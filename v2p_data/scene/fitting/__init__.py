@@ -1,8 +1,18 @@
 """Mask tracks become a camera, sizes and poses, in camera heights: the camera stands 1 above the table.
 
-Comes in: a `ObjectTrack` per object. Goes out: a `Placement` with the camera and a `PlacedObject` per object.
+Comes in: an `ObjectTrack` per object, and a guess of the camera. Goes out: a `Placement` with the camera and a `PlacedObject` per object.
 
-Reading order: placement (the order of the steps), silhouette (one outline, one shape), cuboid_network (how a box is turned),
-trajectory (poses between first and last), tool_pose (a tool in a hand), hand_scale (the hand as a ruler), refine_pose (the last
-pose once more, with the mesh), ring_mask (the hole of a ring), by_model (learned models).
+Reading order:
+    placement       the order of the steps
+    plans           one plan per kind of task: where the object starts, how it moves, where it ends
+    camera_guess, pitch             the camera
+    object_view, noun_variants      what is seen of an object at both ends, and which form its noun has
+    silhouette, cuboid_network      one shape under one outline; how a box is turned
+    end_poses, trajectory           poses at both ends, and between
+    tool_pose, place_tool           a tool in a hand
+    hand_scale      the hand as a ruler
+    refine_pose     the last pose once more, with the mesh
+    ring_mask       the hole of a ring
+    metric          camera heights become metres
+    by_model        learned models
 """

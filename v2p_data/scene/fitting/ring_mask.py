@@ -1,4 +1,4 @@
-"""What one sees through a ring is no part of it: outlines are fitted whole, and lose their hole once it is known where the ring lies."""
+"""The hole of a ring is cut out of its masks. Outlines are fitted whole; the hole follows once the ring's pose is known."""
 
 import cv2
 import numpy as np
@@ -10,9 +10,9 @@ from v2p_data.geometry.raster import fill, in_parts
 from v2p_data.scene.frames.mask_ops import iou
 
 _AROUND = 32
-"""Points on a rim."""
+"""Number of points on a rim."""
 _LIES_THERE = 0.6
-"""Overlap of the posed ring with the mask, below which the pose does not tell where the hole is: in a hand a ring is tilted."""
+"""IoU of the posed ring with the mask, below which the pose does not tell where the hole is: in a hand a ring is tilted."""
 
 
 def without_hole(

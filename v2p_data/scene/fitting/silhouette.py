@@ -29,12 +29,15 @@ if TYPE_CHECKING:
 _WORK_PX = 110
 """Longer side of the crop in which silhouettes are compared."""
 _HIDDEN_WEIGHT = 0.15
-_LOOK_WEIGHT, _MOST_BY_LOOK = 0.01, 0.15
-"""Outlines hardly tell a cube's yaw. What a box costs per nat that the box network finds it less likely, and at most, in units of IoU."""
+"""Weight, 0 to 1, of pixels that may be hidden: without it a shape grows behind the hand."""
+_LOOK_WEIGHT = 0.01
+"""Cost in units of IoU of each nat by which the cuboid network finds a box less likely: outlines hardly tell a cube's yaw."""
+_MOST_BY_LOOK = 0.15
+"""Greatest cost by the cuboid network, in units of IoU: real boxes look different from the drawn ones it learned from."""
 _LEAST_FACE_PX = 10
-"""Smaller boxes show nothing of how they are turned."""
+"""Side of the outline's bounding box below which a box shows nothing of its turn."""
 _PRIOR_WEIGHT = 0.03
-"""Cost of proportions one sigma off the noun's, in units of IoU."""
+"""Cost of proportions one standard deviation off the noun's, in units of IoU."""
 
 
 @dataclass(frozen=True, kw_only=True)

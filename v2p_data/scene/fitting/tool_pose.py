@@ -1,8 +1,8 @@
-"""How a hand holds what it pushes with, from all frames in which it pushes.
+"""The pose of a tool in a hand, from all frames in which the tool pushes.
 
-One outline of something thin does not show how steep it is, nor whether it leans towards the camera or away. But its tip is
-behind what it pushes and goes with that, a hand holds it as high as a fist, and it points back to where the arm comes from
-rather than ahead of where it pushes.
+One outline of a thin tool does not show its tilt, nor whether it leans towards the camera or away. Three habits tell more. The tip is
+behind the pushed object and moves with it. The hand holds the tool as high as a fist. The tool points back to where the arm
+comes from.
 """
 
 from collections.abc import Sequence
@@ -21,31 +21,57 @@ from v2p_data.scene.frames.hand import hand_end
 from v2p_data.scene.frames.segmentation import Segmentation, hand_at
 from v2p_data.scene.scale.nouns import Noun
 
-_HIDDEN_WEIGHT = 0.15
-"""Of pixels that may be hidden, in the overlap."""
-_GRIP_AT = 0.7
-"""From its tip, as a share of its length: where a hand holds it."""
-_GRIP_HEIGHT_M, _LOWEST_GRIP_M = 0.08, 0.04
-"""Over the table, of a hand that pushes with something, and at least: the fist must clear the table."""
-_STEEPEST, _LEAST_USUAL_TILT_RAD = 0.81, 0.35
-"""Sine: steeper nobody holds a short pen; and a long stick is seldom laid flatter."""
-_TILT_SD_RAD = 0.25
-_ARM_SD_RAD, _BEHIND_SD_RAD = 0.5, 1.0
-"""How far the tool's heading is from the arm's, and from straight back."""
-_GAP_SD_M, _ASIDE_SD_M = 0.01, 0.015
-"""How far its tip is from what it pushes, and aside of the middle."""
-_AWAY_SD_M, _FARTHEST_AWAY = 0.1, 3.0
-"""The same before and after it pushes; and how many of its lengths away it is searched then."""
-_PRIOR_WEIGHT = 0.03
-"""Cost of what is one standard deviation off, in units of IoU."""
-_TIP_AT, _HIGHEST_TIP_M = 0.35, 0.03
-"""Of the pushed thing's height, and at most: where the tip touches it."""
-_ELBOW_HEIGHT_M, _FARTHEST_M = 0.15, 2.0
-"""Over the table, of an arm where it comes into the picture; and how far away that is, at most."""
+
+@dataclass(frozen=True, kw_only=True)
+class ToolPrior:
+    """How hands hold what they push with, and what a deviation costs.
+
+    All were set by hand. Drawn hands hold tools at 70 % of their length, 8.5 cm above the table; real ones were not measured.
+    """
+
+    grip_at: float = 0.7
+    """Where a hand holds the tool: share of its length from the tip, 0 to 1."""
+    grip_height_m: float = 0.08
+    """Height of the grip over the table, of a hand that pushes."""
+    lowest_grip_m: float = 0.04
+    """Least height of the grip: a fist must clear the table."""
+    steepest_sin: float = 0.81
+    """Sine of the steepest tilt at which somebody holds a short pen."""
+    least_usual_tilt_rad: float = 0.35
+    """Least usual tilt: a long stick is seldom laid flatter."""
+    tilt_sd_rad: float = 0.25
+    """Standard deviation of the tilt from the usual one."""
+    arm_sd_rad: float = 0.5
+    """Standard deviation of the tool's heading from the arm's."""
+    behind_sd_rad: float = 1.0
+    """Standard deviation of the tool's heading from straight back along the push."""
+    gap_sd_m: float = 0.01
+    """Standard deviation of the tip from the pushed object, along the push."""
+    aside_sd_m: float = 0.015
+    """Standard deviation of the tip from the pushed object's middle, across the push."""
+    away_sd_m: float = 0.1
+    """Standard deviation of both before and after the push, when the tool need not touch."""
+    farthest_away: float = 3.0
+    """Farthest place of the tip before and after the push at which the search begins [tool lengths]."""
+    weight: float = 0.03
+    """Cost of one squared standard deviation, in units of IoU."""
+    hidden_weight: float = 0.15
+    """Weight, 0 to 1, of pixels that may be hidden, in the overlap."""
+
+
+PRIOR = ToolPrior()
+_TIP_AT = 0.35
+"""Height at which the tip touches the pushed object, as a share of that object's height."""
+_HIGHEST_TIP_M = 0.03
+"""Greatest height of the tip over the table."""
+_ELBOW_HEIGHT_M = 0.15
+"""Height over the table of an arm where it comes into the picture."""
+_FARTHEST_M = 2.0
+"""Greatest distance of that place from the camera's foot."""
 _SETS_OUT = 0.05
-"""Share of its way that a thing has gone when it is pushed, and that is left when it no longer is."""
+"""Share of an object's way that it has gone when the push begins, and that is left when the push ends."""
 _LEAST_TRAVEL = 0.2
-"""Of its extent: what goes less far tells no direction."""
+"""Travel in extents of the pushed object, below which it tells no direction."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +176,7 @@ class ToolPose:
     """A tool in a hand."""
 
     fit: Fit
-    """Where it is when what it pushes is where it was at first."""
+    """Where it is when the pushed object is where it was at first."""
     T_world_seen: Float[np.ndarray, "4 4"]
     """Where the first of the views shows it: elsewhere, if it does not push there."""
 
@@ -164,103 +190,163 @@ def fit_tool_pose(
 ) -> ToolPose:
     """Return where something long is that a hand pushes with.
 
-    It keeps its turn, and goes where that goes. How steep it is follows from the height of a fist, from which the outlines
-    may pull it a little.
+    The tool keeps its turn and goes with the pushed object. Its tilt follows from the height of a fist; the outlines may pull it a little.
 
     Args:
-        views: working frames, and its outlines there.
-        push: what it pushes, and whence.
-        noun: its shape.
-        size: its usual one, along its own axes, in camera heights like all lengths here.
+        views: working frames, and the tool's outlines there.
+        push: the pushed object's motion.
+        noun: the tool's shape.
+        size: its usual size, along its own axes [camera heights].
         spread: standard deviation of the logarithm of its length. It may be longer than usual; where it seems shorter, the
             hand or the picture's edge hides the rest.
     """
-    away = not all(push.frames[0] <= i <= push.frames[1] for i, _ in views)
-    loose = _AWAY_SD_M if away else 0.0
-    unit = outline_points(noun.form, (1.0, 1.0, 1.0), noun.taper)
-    order = np.argsort(size)[::-1]
-    shifts = [np.array([*(push.spots[i] - push.spots[0]), 0.0]) for i, _ in views]
-    aside = np.array([-push.way[1], push.way[0]])
-    back = float(np.arctan2(*(-push.way[::-1])))
-    start = push.spots[0] + push.behind
+    model = _ToolModel(views, push, noun, size, spread)
+    turns = np.radians(range(0, 360, 20))
+    tip = model.first_tip()
+    level = _Parameters(0.0, 0.0, 0.0, 0.0, 0.0)
+    starts = [np.array([*tip, turn, model.usual_tilt(level), 0.0]) for turn in turns]
+    best = search(model.cost, starts, np.array([0.1, 0.1, 0.3, 0.1, 0.1]))
+    found = _Parameters.of(best)
+    points = model.outline(found)
+    covers = [
+        (silhouette.iou(points + shift), silhouette.visible(points + shift))
+        for shift, silhouette in model.shifted_views
+    ]
+    iou, visible = np.mean(covers, axis=0).tolist()
+    pushing = _Parameters.of(best * [0, 0, 1, 1, 1]) if model.away else found
+    fit = Fit(
+        size=three(model.size_of(found)),
+        T_world_obj=model.pose(pushing),
+        iou=iou,
+        visible=visible,
+        cost=model.cost(best),
+    )
+    seen = model.pose(found)
+    seen[:3, 3] += model.shifted_views[0][0]
+    return ToolPose(fit=fit, T_world_seen=seen)
 
-    def size_of(v: np.ndarray) -> np.ndarray:
-        out = np.array(size)
-        out[order[0]] *= np.exp(abs(v[4]))
+
+@dataclass(frozen=True)
+class _Parameters:
+    """What is searched for, in this order."""
+
+    along: float
+    """Of the tip from where it pushes, along the push [tool lengths]."""
+    aside: float
+    """The same across the push."""
+    heading_rad: float
+    """From the tip to the grip, counterclockwise from +x."""
+    tilt_rad: float
+    """Over the table."""
+    log_length: float
+    """Logarithm of the length over the usual one; its sign does not count."""
+
+    @classmethod
+    def of(cls, v: Float[np.ndarray, "5"]) -> "_Parameters":
+        return cls(*v)
+
+
+class _ToolModel:
+    """A tool's shape, where its parameters place it, and what they cost."""
+
+    def __init__(
+        self,
+        views: Sequence[tuple[int, Silhouette]],
+        push: PushMotion,
+        noun: Noun,
+        size: tuple[float, float, float],
+        spread: float,
+    ) -> None:
+        self.away = not all(push.frames[0] <= i <= push.frames[1] for i, _ in views)
+        """Whether a view shows the tool before or after it pushes: then its tip is farther off."""
+        self.shifted_views = [
+            (np.array([*(push.spots[i] - push.spots[0]), 0.0]), silhouette)
+            for i, silhouette in views
+        ]
+        """How far the pushed object had gone in each view, with the outline there."""
+        self._views, self._push, self._size, self._spread = views, push, size, spread
+        self._unit = outline_points(noun.form, (1.0, 1.0, 1.0), noun.taper)
+        self._order = np.argsort(size)[::-1]
+        self._aside = np.array([-push.way[1], push.way[0]])
+        self._back_rad = float(np.arctan2(*(-push.way[::-1])))
+        self._start = push.spots[0] + push.behind
+
+    def size_of(self, p: _Parameters) -> Float[np.ndarray, "3"]:
+        """Return the extents along the tool's own axes [camera heights]."""
+        out = np.array(self._size)
+        out[self._order[0]] *= np.exp(abs(p.log_length))
         return out
 
-    def tilt_for(grip_m: float, v: np.ndarray) -> float:
-        high = grip_m / push.height_m / (_GRIP_AT * size_of(v).max())
-        return float(np.arcsin(min(high, _STEEPEST)))
+    def usual_tilt(self, p: _Parameters) -> float:
+        """Return the tilt at which a hand usually holds a tool of this length."""
+        return max(self._tilt_for(PRIOR.grip_height_m, p), PRIOR.least_usual_tilt_rad)
 
-    def place(v: np.ndarray) -> np.ndarray:
-        tilt = max(v[3], tilt_for(_LOWEST_GRIP_M, v))
-        level = np.array([np.cos(v[2]), np.sin(v[2]), 0.0])
+    def _tilt_for(self, grip_m: float, p: _Parameters) -> float:
+        high = grip_m / self._push.height_m / (PRIOR.grip_at * self.size_of(p).max())
+        return float(np.arcsin(min(high, PRIOR.steepest_sin)))
+
+    def pose(self, p: _Parameters) -> Float[np.ndarray, "4 4"]:
+        """Return the tool's pose while the pushed object is where it was at first."""
+        order, push = self._order, self._push
+        tilt = max(p.tilt_rad, self._tilt_for(PRIOR.lowest_grip_m, p))
+        level = np.array([np.cos(p.heading_rad), np.sin(p.heading_rad), 0.0])
         along = np.cos(tilt) * level + np.array([0.0, 0.0, np.sin(tilt)])
         rotation = np.empty((3, 3))
         rotation[:, order[0]] = along
         rotation[:, order[1]] = (-level[1], level[0], 0.0)
         rotation[:, order[2]] = np.cross(along, rotation[:, order[1]])
         rotation[:, order[2]] *= np.sign(np.linalg.det(rotation))
-        tip = np.array([*(start + max(size) * (v[0] * push.way + v[1] * aside)), push.tip_height])
-        return transform(rotation, tip + along * size_of(v).max() / 2)
+        off = max(self._size) * (p.along * push.way + p.aside * self._aside)
+        tip = np.array([*(self._start + off), push.tip_height])
+        return transform(rotation, tip + along * self.size_of(p).max() / 2)
 
-    def outline(v: np.ndarray) -> np.ndarray:
-        T = place(v)
-        return (unit * size_of(v)) @ T[:3, :3].T + T[:3, 3]
+    def outline(self, p: _Parameters) -> Float[np.ndarray, "n 3"]:
+        """Return points whose convex hull is the tool."""
+        T = self.pose(p)
+        return (self._unit * self.size_of(p)) @ T[:3, :3].T + T[:3, 3]
 
-    def usual_tilt(v: np.ndarray) -> float:
-        return max(tilt_for(_GRIP_HEIGHT_M, v), _LEAST_USUAL_TILT_RAD)
+    def cost(self, v: Float[np.ndarray, "5"]) -> float:
+        """Return how badly the outlines are covered, plus how unusually the tool is held, in units of IoU."""
+        p = _Parameters.of(v)
+        prior = self._prior(p)
+        points = self.outline(p)
+        ious = [
+            silhouette.iou(points + shift, PRIOR.hidden_weight)
+            for shift, silhouette in self.shifted_views
+        ]
+        return 1 - float(np.mean(ious)) + PRIOR.weight * float(prior)
 
-    def cost(v: np.ndarray) -> float:
-        metres = max(size) * push.height_m
+    def _prior(self, p: _Parameters) -> float:
+        """Return squared standard deviations; what is far off counts by its logarithm only."""
+        push = self._push
+        metres = max(self._size) * push.height_m
+        loose = PRIOR.away_sd_m if self.away else 0.0
         turned = [
-            (v[3] - usual_tilt(v)) / _TILT_SD_RAD,
-            _between(v[2], back) / _BEHIND_SD_RAD,
+            (p.tilt_rad - self.usual_tilt(p)) / PRIOR.tilt_sd_rad,
+            _between(p.heading_rad, self._back_rad) / PRIOR.behind_sd_rad,
         ]
         off = [
-            v[4] / spread,
-            v[0] * metres / np.hypot(_GAP_SD_M, loose),
-            v[1] * metres / np.hypot(_ASIDE_SD_M, loose),
+            p.log_length / self._spread,
+            p.along * metres / np.hypot(PRIOR.gap_sd_m, loose),
+            p.aside * metres / np.hypot(PRIOR.aside_sd_m, loose),
         ]
         if push.arm_rad is not None:
-            off.append(_between(v[2], push.arm_rad) / _ARM_SD_RAD)
-        prior = np.square(turned).sum() + np.log1p(np.square(off)).sum()
-        points = outline(v)
-        ious = [
-            silhouette.iou(points + shift, _HIDDEN_WEIGHT)
-            for shift, (_, silhouette) in zip(shifts, views, strict=True)
-        ]
-        return 1 - float(np.mean(ious)) + _PRIOR_WEIGHT * float(prior)
+            off.append(_between(p.heading_rad, push.arm_rad) / PRIOR.arm_sd_rad)
+        return np.square(turned).sum() + np.log1p(np.square(off)).sum()
 
-    tip = np.zeros(2)
-    if away:  # the view's point nearest to where the tip would push
-        i, silhouette = views[0]
+    def first_tip(self) -> Float[np.ndarray, "2"]:
+        """Return where the search for the tip begins, along and aside: at the push, or at the first view's nearest point."""
+        tip = np.zeros(2)
+        if not self.away:
+            return tip
+        push = self._push
+        i, silhouette = self._views[0]
         here = np.array([*(push.spots[i] + push.behind), push.tip_height])
         pixel = silhouette.nearest_to(silhouette.camera.project(here[None])[0])
         off_xy = (silhouette.camera.on_plane(pixel[None], push.tip_height)[0] - here)[:2]
-        if np.linalg.norm(off_xy) < _FARTHEST_AWAY * max(size):
-            tip = np.array([off_xy @ push.way, off_xy @ aside]) / max(size)
-    turns = np.radians(range(0, 360, 20))
-    starts = [np.array([*tip, turn, usual_tilt(np.zeros(5)), 0.0]) for turn in turns]
-    best = search(cost, starts, np.array([0.1, 0.1, 0.3, 0.1, 0.1]))
-    points = outline(best)
-    covers = [
-        (silhouette.iou(points + shift), silhouette.visible(points + shift))
-        for shift, (_, silhouette) in zip(shifts, views, strict=True)
-    ]
-    iou, visible = np.mean(covers, axis=0).tolist()
-    pushing = best * [0, 0, 1, 1, 1] if away else best
-    fit = Fit(
-        size=three(size_of(best)),
-        T_world_obj=place(pushing),
-        iou=iou,
-        visible=visible,
-        cost=cost(best),
-    )
-    seen = place(best)
-    seen[:3, 3] += shifts[0]
-    return ToolPose(fit=fit, T_world_seen=seen)
+        if np.linalg.norm(off_xy) < PRIOR.farthest_away * max(self._size):
+            tip = np.array([off_xy @ push.way, off_xy @ self._aside]) / max(self._size)
+        return tip
 
 
 def _between(a: float, b: float) -> float:

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
-from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.data_types import Fit, ObjectTrack
+from v2p_data.scene.fitting.plans import FitPlan
 from v2p_data.scene.fitting.silhouette import on_wall
 from v2p_data.scene.frames.classes import MOVED
 from v2p_data.scene.frames.hand import hand_end
@@ -19,16 +19,17 @@ from v2p_data.scene.frames.segmentation import Segmentation, hand_at
 from v2p_data.scene.schema import Observed
 
 TOUCH_PX = 5
-"""What is so near to a thing's outline touches it."""
+"""Distance from an outline, in a picture 320 px wide, within which a hand touches the object."""
 _SEEN_RISING = 0.5
-"""Of its height in the picture: a thing that is seen to rise less than this is hidden by the hand that lifts it."""
+"""Rise over the object's height in the picture; an object seen to rise less is hidden by the hand that lifts it."""
 _LEFT_IN_SIGHT = 0.3
-"""Of its area: where so much that moved is in sight, no hand hides it."""
-_TIPS_BESIDE, _JUMP = 7, 0.1
-"""In so many frames beside each other a hand's end is compared; it jumps where it is farther from their median than this share of
-the picture's width."""
+"""Share of the object's area; where more of what moved is in sight at the end, no hand hides the object."""
+_TIPS_BESIDE = 7
+"""Frames over which the median of a hand's end is taken."""
+_JUMP = 0.1
+"""Distance from that median, over the picture's width, from which a hand's end is a false one."""
 _GOES_WITH_HAND = 0.5
-"""How sure a pose is of what a hand hides."""
+"""Confidence, 0 to 1, of a pose that goes with a hand."""
 
 
 @dataclass
@@ -56,7 +57,7 @@ class Trajectory:
 
 def trajectory_between(
     s: ObjectTrack,
-    kind: Kind,
+    plan: FitPlan,
     first_fit: Fit,
     last_fit: Fit,
     end: tuple[int, Bool[np.ndarray, "h w"]],
@@ -71,7 +72,7 @@ def trajectory_between(
     trajectory = Trajectory([s.at], [first], [float(np.clip(first_fit.iou, 0, 1))], [depth])
     count = min(max_poses, last_i - s.at + 1)
     spots = np.unique(np.linspace(s.at, last_i, count).round().astype(int))
-    on_table = KINDS[kind].slides
+    on_table = plan.slides
     turn = Rotation.from_matrix(last[:3, :3] @ first[:3, :3].T).as_rotvec()
     ends = [_centre(s.first), _centre(last_mask)]
     bias = [
@@ -102,7 +103,7 @@ def trajectory_between(
             0.7 * float(s.quality[i]),
             "no_depth" if free else depth,
         )
-    in_air = kind == "lift_up" or s.in_hand
+    in_air = plan.end == "in_air" or s.in_hand
     return trajectory.append(last_i, last, last_fit.iou, "no_depth" if in_air else "full")
 
 

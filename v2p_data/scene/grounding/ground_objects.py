@@ -42,24 +42,31 @@ from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
 
 _CHANGE_TELLS = 4.0
-"""Score of the hand-written cues from which their finding is an opinion."""
+"""Score from which the heuristics (`moved_by_change`) count as a second opinion; below about 4.5 most findings were wrong."""
 _CLEARLY_BETTER = 1.6
-"""What those cues found is preferred where the network's own measures rate it so many times as high."""
+"""Ratio of ratings by the network's own cues, from which the heuristics' finding is preferred to the network's."""
 _LIES_WITHIN = 0.8
-"""Share of the one outline in the other from which both see the same thing, one of them with something beside it."""
-_AS_A_PART, _AS_A_PIECE = 0.5, 0.35
-"""What overlap such a finding counts as at least: the network's within that of those cues, and theirs within the network's."""
+"""Share of one outline in the other, from which both show the same object, one of them with something beside it."""
+_AS_A_PART = 0.5
+"""Least overlap that counts where the network's outline lies within the heuristics' one."""
+_AS_A_PIECE = 0.35
+"""Least overlap that counts where the heuristics' outline lies within the network's: it is the most colourful piece."""
 _NO_OPINION = 0.75
-"""What the finding of the network alone counts where those cues have none."""
+"""Factor on the network's score where the heuristics have no opinion."""
 _LEAST_HAND = 0.002
-"""Share of the picture that a hand covers when it is seen best."""
+"""Least share of the picture that a hand covers in the frame that shows most of it."""
 _LITTLE = 0.2
-"""Of a thing's first outline: when no more than this is seen of it, it is hidden."""
+"""Share of an object's first outline; when no more than this is seen, the object is hidden."""
 _TOUCH_PX = 6
-_BELOW_PX, _SEEN_BELOW = 5, 0.5
-"""How far below a thing the network must see table, and how surely in the mean."""
-_SETS_OUT, _WELL_SEEN = 0.05, 0.6
-"""Share of its way that a thing has gone when it moves; and the share of its largest area that shows a tool well."""
+"""Distance in a picture 320 px wide, within which an object reaches the one it goes into."""
+_BELOW_PX = 5
+"""Depth of the strip below an object in which the network must see table."""
+_SEEN_BELOW = 0.5
+"""Mean probability of table in that strip, from which the object stands on the table."""
+_SETS_OUT = 0.05
+"""Share of its way that a pushed object has gone when it moves."""
+_WELL_SEEN = 0.6
+"""Share of a tool's largest area, from which a frame shows the tool well."""
 
 
 def ground_objects(

@@ -1,4 +1,4 @@
-"""An outline is corrected by what the scene network sees: without bare table, completed, without the other end's place."""
+"""Outlines are corrected by what the scene network sees: table is cut off, missing parts are added, the two ends are made disjoint."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,26 +14,32 @@ from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.moved_by_change import Moved
 
 _AROUND_PX = 10
-_LEAST_OWN, _LEAST_WRONG, _LEAST_LEFT = 0.25, 0.1, 0.3
-"""Shares of an outline: what must not lie in the other's place to tell how the thing looks, what is worth cutting off, and
-what must be left."""
+"""Width of the ring around both outlines whose colours stand for the background, in a picture 320 px wide."""
+_LEAST_OWN = 0.25
+"""Share of an outline outside the other outline, from which its colours tell how the object looks."""
+_LEAST_WRONG = 0.1
+"""Share of an outline below which a wrong part is not cut off."""
+_LEAST_LEFT = 0.3
+"""Share of an outline that must remain after a cut."""
 _BARE_RATIO = 1.0
-"""Logarithm of how much better what lies around explains a pixel than the thing does."""
-_SURELY, _SURELY_TABLE = 0.9, 0.8
-"""From this on the network's word goes before the edges that an outline follows: they may be those of a shadow or of print."""
+"""Log likelihood ratio of background over object colours, from which a pixel is background."""
+_SURELY = 0.9
+"""Probability from which the network adds a pixel to an outline, whatever the edges say: they may belong to print."""
+_SURELY_TABLE = 0.8
+"""Probability from which the network cuts a pixel off as table, whatever the edges say: they may belong to a shadow."""
 _BESIDE_PX = 12
-"""Of a picture 320 px wide: as far the network's word completes an outline."""
+"""Reach beside an outline within which the network completes it, in a picture 320 px wide."""
 _MOST_CUT = 0.6
-"""Of an outline: where the network sees more of it as table, it does not know the thing."""
+"""Share of an outline that may be cut off as table; where more seems table, the network does not know the object."""
 _LEAST_CHANGE = 0.05
-"""Of an outline: what is not worth mending."""
+"""Share of an outline below which a change is noise of the edge."""
 
 
 def disjoint_ends(working: WorkingClip, moved: Moved, keep: Sequence[int] = ()) -> Moved:
-    """Return the two outlines without what each has of the other's place: both change, but only one shows the thing.
+    """Return both outlines, each without the other's place: the picture changes at both, but each shows the object at one only.
 
-    A part that both have is bare in one of them where it looks there like what lies around the two, rather than like the rest
-    of that outline; where there is hardly a rest, rather than in the other picture.
+    A pixel in both outlines is background in a picture where it has the colours of the ring around both outlines. The rest of the
+    outline is compared; where hardly anything is left of it, the other picture.
 
     Args:
         working: frames.
