@@ -51,12 +51,15 @@ class Truth:
     fps: float
     num_frames: int
     camera: Camera
+    """At the first frame."""
+    cameras: tuple[Camera, ...] = field(repr=False)
+    """At every frame, where a hand moved it; nothing where it was on a stand."""
     hand_in_view: Bool[np.ndarray, "time"] = field(repr=False)
     things: tuple[TrueThing, ...]
     mask_idx: Int[np.ndarray, "some_time"]
     """The frames that have masks, the first and the last among them."""
     masks: UInt8[np.ndarray, "some_time h w"] = field(repr=False)
-    """0 background, 1 hand and arm, 2 and on the things in their order, 255 the bare table."""
+    """0 background, 1 hand and arm, 2 and on the things in their order, 255 the bare table; seen from the first frame's camera."""
 
 
 def write(video: SyntheticVideo, folder: Path) -> Path:
@@ -110,12 +113,8 @@ def write(video: SyntheticVideo, folder: Path) -> Path:
         "kind": spec.kind,
         "fps": spec.fps,
         "num_frames": len(video.frames),
-        "camera": {
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "K": camera.K.round(6).tolist(),
-            "T_world_cam": camera.T_world_cam.round(9).tolist(),
-        },
+        "camera": _said(camera),
+        **({"cameras": [_said(c) for c in video.cameras]} if video.cameras else {}),
         "table": {"normal": [0.0, 0.0, 1.0], "height_m": 0.0},
         "hand_in_view": video.hand_in_view.tolist(),
         "masks": f"{spec.name}_masks.npz",
@@ -139,7 +138,6 @@ def load_truth(folder: Path, name: str) -> Truth:
     said = json.loads(path.read_text())
     with np.load(path.parent / said["masks"]) as saved:
         masks, mask_idx = saved["masks"], saved["frame_idx"]
-    camera = said["camera"]
     things = tuple(
         TrueThing(
             mask_label=t["mask_label"],
@@ -162,14 +160,28 @@ def load_truth(folder: Path, name: str) -> Truth:
         kind=said["kind"],
         fps=float(said["fps"]),
         num_frames=said["num_frames"],
-        camera=Camera(
-            width_px=camera["width_px"],
-            height_px=camera["height_px"],
-            K=np.array(camera["K"]),
-            T_world_cam=np.array(camera["T_world_cam"]),
-        ),
+        camera=_camera(said["camera"]),
+        cameras=tuple(_camera(one) for one in said.get("cameras", ())),
         hand_in_view=np.array(said["hand_in_view"]),
         things=things,
         mask_idx=mask_idx,
         masks=masks,
+    )
+
+
+def _said(camera: Camera) -> dict[str, Any]:
+    return {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "K": camera.K.round(6).tolist(),
+        "T_world_cam": camera.T_world_cam.round(9).tolist(),
+    }
+
+
+def _camera(said: dict[str, Any]) -> Camera:
+    return Camera(
+        width_px=said["width_px"],
+        height_px=said["height_px"],
+        K=np.array(said["K"]),
+        T_world_cam=np.array(said["T_world_cam"]),
     )

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import between_centres
 from v2p_data.scene.frames.stabilise import stabilised
 from v2p_data.scene.frames.working_clip import camera_shift_px, working_clip_of
@@ -65,10 +66,23 @@ def test_a_clip_from_a_stand_stays_as_it_is(draw):
     assert stabilised(clip, working_clip_of(clip)) is clip
 
 
-def test_a_camera_that_travels_is_left_to_be_turned_away(draw):
-    clip, _ = swaying(draw(), 50.0)
+def test_a_camera_that_travels_is_turned_away_with_how_far(draw):
+    clip, _ = swaying(draw(), 60.0)
 
-    assert stabilised(clip, working_clip_of(clip)) is clip
+    with pytest.raises(ItemRejectedError, match="at most 42 px") as caught:
+        stabilised(clip, working_clip_of(clip))
+
+    assert caught.value.reason == "camera_moves"
+    assert caught.value.value == pytest.approx(66, abs=6)  # 60 px right, 30 px down
+
+
+def test_what_an_aligned_frame_no_longer_shows_comes_from_another_one(draw):
+    clip, _ = swaying(draw(), 12.0)
+
+    steady = stabilised(clip, working_clip_of(clip))
+
+    rim = steady.frames[:, :, :4].astype(int)
+    assert np.median(np.abs(rim - rim[0])) < 6
 
 
 def test_a_picture_without_anything_to_follow_is_left_alone(draw):

@@ -1,62 +1,58 @@
 """Clips filmed from the hand: every frame is brought to where the first one was taken from.
 
-What does not move in the scene fills most of a picture, and a camera that sways by a few centimetres changes it by about one
-homography. It is measured from corners that are followed from the first frame into every other one. What stands high above
-the table keeps a little of the sway: that is why a camera that travels is still turned away.
+The table fills most of a picture, and a camera that sways, pans or walks by a few centimetres changes how it looks by one
+homography per frame (`camera_motion.py`). What stands high above the table keeps a little of the sway: that is
+why a camera that travels far is turned away.
 """
 
-import itertools
 from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 
+from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import between_centres
-from v2p_data.scene.frames.working_clip import WIDTH_PX, WorkingClip, camera_shift_px, followed
+from v2p_data.scene.frames.camera_motion import STANDS_PX, camera_motion
+from v2p_data.scene.frames.working_clip import WIDTH_PX, WorkingClip, camera_shift_px
 from v2p_data.video.clip import Clip, Hint
 
-MAX_SWAY = 0.1
-"""Of the picture's width: where its corners went farther, the camera travelled, and things hide each other anew."""
-_CORNERS = 400
-_FEWEST = 20
-"""Corners in agreement; with fewer, a frame goes as the one before went."""
-_MOST_LOST = 0.1
-"""Share of the frames that may go so: blurred ones."""
-_AGREES_PX = 1.0
-"""At working size."""
-_CLEARLY_MORE = 1.5
-"""So many times more corners must agree with a camera that moves than with one that stands, in the mean over the frames that move."""
-_SPREAD = 0.35
-"""Of the picture's width and height: corners in agreement that lie closer together may all be on one moving thing,"""
-_ALL_AGREE = 0.95
-"""unless hardly any corner moves otherwise."""
-_STANDS_PX = 1.0
-"""A camera whose picture moves less than this at working size stands still."""
+MAX_TRAVEL = 0.13
+"""Of the picture's width: where its middle went farther, the camera travelled, and things hide each other anew."""
+MAX_ZOOM = 0.12
+"""Lengths in the picture may grow or shrink by so much."""
+_BACK = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+_FILL_FRAMES = 15
+"""Of so many frames the nearest in time fills what a frame no longer shows."""
 
 
 def stabilised(clip: Clip, working: WorkingClip) -> Clip:
     """Return the clip with its frames aligned with the first one; as it is where the camera stood still or no way is found.
 
-    What the aligned frames no longer show at their edges is filled with the first frame's pixels; hints go along.
+    What the aligned frames no longer show at their edges is filled from the nearest frame that shows it; hints go along.
+
+    Raises:
+        ItemRejectedError: `camera_moves`: it clearly moved, and farther than can be undone.
     """
-    if camera_shift_px(working) < _STANDS_PX:
+    if camera_shift_px(working) < STANDS_PX:
         return clip
     h, w = clip.frames.shape[1:3]
     small_h, small_w = working.shape
-    small = _moves(_greys(clip.frames, (small_w, small_h)))
-    if small is None:
+    motion = camera_motion(_greys(clip.frames, (small_w, small_h)))
+    if motion is None:
         return clip
+    travel, zoom = motion.travel(small_w, small_h), motion.zoom(small_w, small_h)
+    if travel > MAX_TRAVEL or zoom > MAX_ZOOM:
+        raise ItemRejectedError(
+            "camera_moves",
+            f"the camera travels by {travel * WIDTH_PX:.0f} px of {WIDTH_PX} and zooms by {zoom:.0%}; at most "
+            f"{MAX_TRAVEL * WIDTH_PX:.0f} px and {MAX_ZOOM:.0%} can be undone: hold it stiller, or film from a stand",
+            round(travel * WIDTH_PX, 2),
+        )
     to_small = np.diag([small_w / w, small_h / h, 1.0])
-    to_filmed = np.linalg.inv(to_small) @ small @ to_small
-    edges = np.array([[[0, 0], [w, 0], [w, h], [0, h]]], np.float64)
-    sway = (
-        max(float(np.abs(cv2.perspectiveTransform(edges, H) - edges).max()) for H in to_filmed) / w
-    )
-    if sway > MAX_SWAY:
-        return clip
+    to_filmed = np.linalg.inv(to_small) @ motion.to_frames @ to_small
     note = (
-        f"the camera swayed by up to {sway * WIDTH_PX:.0f} px of {WIDTH_PX}: all frames were aligned with the first, and "
+        f"the camera swayed by up to {travel * WIDTH_PX:.0f} px of {WIDTH_PX}: all frames were aligned with the first, and "
         "masks and overlays belong to the aligned ones"
     )
     return replace(
@@ -78,67 +74,28 @@ def _greys(
     ]
 
 
-def _moves(grey: list[UInt8[np.ndarray, "h w"]]) -> Float[np.ndarray, "time 3 3"] | None:
-    """Return per frame the homography that takes the first frame's pixels there; None where that is not clear."""
-    corners = cv2.goodFeaturesToTrack(grey[0], _CORNERS, 0.005, 5)
-    if corners is None or len(corners) < _FEWEST:
-        return None
-    moves, tellings = [np.eye(3)], []
-    for image in grey[1:]:
-        start = cv2.perspectiveTransform(corners, moves[-1]).astype(np.float32)
-        there, sure = followed(grey[0], image, corners, start)
-        here, there = corners[sure, 0] + 0.5, there[sure, 0] + 0.5
-        found = _motion(here, there, image.shape)
-        if found is None:
-            moves.append(moves[-1])
-            continue
-        H, agree = found
-        moves.append(H)
-        went = np.linalg.norm(there - here, axis=-1)
-        if went[agree].max() > _STANDS_PX:
-            tellings.append((agree.sum(), (went < _AGREES_PX).sum()))
-    lost = sum(one is other for one, other in itertools.pairwise(moves)) / len(moves)
-    if not tellings or lost > _MOST_LOST:
-        return None
-    moved, stayed = np.mean(tellings, axis=0)
-    return np.stack(moves) if moved > _CLEARLY_MORE * stayed else None
-
-
-def _motion(
-    here: Float32[np.ndarray, "n 2"], there: Float32[np.ndarray, "n 2"], shape: tuple[int, ...]
-) -> tuple[Float[np.ndarray, "3 3"], Bool[np.ndarray, "n"]] | None:
-    """Return how the picture moved and which corners agree; None where too few do, or perhaps all on one thing."""
-    if len(here) < _FEWEST:
-        return None
-    H, agree = cv2.findHomography(here, there, cv2.USAC_MAGSAC, _AGREES_PX)
-    if H is None:
-        return None
-    inside = agree[:, 0] > 0
-    wide = inside.any() and _extent(here[inside], shape) >= _SPREAD
-    return (
-        (H, inside) if inside.sum() >= _FEWEST and (wide or inside.mean() > _ALL_AGREE) else None
-    )
-
-
-def _extent(points: Float32[np.ndarray, "n 2"], shape: tuple[int, ...]) -> float:
-    return float((np.ptp(points, axis=0) / shape[1::-1]).min())
-
-
 def _aligned(
     frames: UInt8[np.ndarray, "time h w 3"], to_filmed: Float[np.ndarray, "time 3 3"]
 ) -> UInt8[np.ndarray, "time h w 3"]:
-    h, w = frames.shape[1:3]
+    """Return the frames as the first one's camera would show them."""
+    n, h, w = frames.shape[:3]
     out = np.empty_like(frames)
-    for own, frame, H in zip(out, frames, to_filmed, strict=True):
-        own[:] = frames[0]
-        cv2.warpPerspective(
-            frame,
-            between_centres(H),
-            (w, h),
-            dst=own,
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_TRANSPARENT,
-        )
+    beyond = np.empty((n, h, w), bool)
+    whole = np.full((h, w), 255, np.uint8)
+    for own, gone, frame, H in zip(out, beyond, frames, to_filmed, strict=True):
+        there = between_centres(H)
+        own[:] = cv2.warpPerspective(frame, there, (w, h), flags=_BACK)
+        gone[:] = cv2.warpPerspective(whole, there, (w, h), flags=_BACK) < 255
+    picks = np.unique(np.linspace(0, n - 1, min(_FILL_FRAMES, n)).round().astype(int))
+    shown = out[picks].copy()
+    for t in range(n):
+        left = beyond[t].copy()
+        for k in np.argsort(np.abs(picks - t), kind="stable"):
+            fills = left & ~beyond[picks[k]]
+            out[t][fills] = shown[k][fills]
+            left &= ~fills
+            if not left.any():
+                break
     return out
 
 
