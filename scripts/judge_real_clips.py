@@ -2,6 +2,12 @@
 
 Each clip is decoded and rebuilt as `v2p scene` does it, without hints, with `--boxes` with one box per object, or with
 `--boxes manipulated` with a box around what is moved and nothing else, as a person in a hurry marks it.
+The boxes are those of `CLIPS/boxes.json` where there is one, drawn by whoever keeps the clips, else those of the clips that we
+have looked at while building (`docs/real_clip_boxes.json`). Only clips that nobody tuned on say what to expect of others.
+
+    {"clip1.mp4": {"rating": 4, "objects": {"red box": {"first": [210, 140, 290, 230], "last": null}}}}
+
+Boxes are `[x0, y0, x1, y1]` in the file's pixels, null where nothing of the object is seen; the rating may be left out.
 A clip is right when every outline's box overlaps the drawn one by half or more (intersection over union), at the
 first and at the last frame. Whatever follows the options goes to the engine's settings, e.g. `--scene.min-confidence 0.6`.
 
@@ -19,6 +25,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import av
 import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -57,6 +64,7 @@ class Verdict:
 
     clip: str
     rating: int
+    """How well suited a person found it, 1 to 5; 0 where nobody said."""
     reason: str = ""
     """Slug of the rejection; empty where it was accepted."""
     number: float | None = None
@@ -91,13 +99,17 @@ def main() -> None:
     parser.add_argument("--no-gate", action="store_true", help="reject nothing for low confidence")
     parser.add_argument("--out", type=Path, help="folder for judged.json and the pictures")
     parser.add_argument("--jobs", type=int, default=1, help="clips at a time")
-    parser.add_argument("--drawn", type=Path, default=DRAWN, help="the boxes drawn by hand")
+    parser.add_argument(
+        "--drawn", type=Path, help="the boxes drawn by hand; CLIPS/boxes.json where there is one"
+    )
     parser.add_argument("--only", default="", help="clips whose file name has this in it")
     args, rest = parser.parse_known_args()
     logging.basicConfig(level=logging.ERROR)
     cfg = parse(EngineConfig, rest, "scene")
     if args.no_gate:
         cfg = replace(cfg, scene=cfg.scene.without_gate())
+    beside = (args.videos if args.videos.is_dir() else args.videos.parent) / "boxes.json"
+    args.drawn = args.drawn or (beside if beside.is_file() else DRAWN)
     drawn: dict[str, Any] = json.loads(args.drawn.read_text())
     videos = [
         v for v in find_videos(args.videos) if v.path.name in drawn and args.only in v.path.name
@@ -126,14 +138,14 @@ def judge(
     video: VideoItem, drawn: dict[str, Any], cfg: EngineConfig, boxes: Hinted
 ) -> tuple[Verdict, UInt8[np.ndarray, "h w 3"]]:
     """Rebuild one clip and compare it with what was drawn; return the verdict and its picture."""
-    hints = {phrase: Hint(**thing["hint"]) for phrase, thing in drawn["objects"].items()}
-    if boxes == "none":
-        hints = {}
-    elif boxes == "manipulated":
-        manipulated = parse_caption(video.caption, video.objects).manipulated.lower()
-        hints = {phrase: hint for phrase, hint in hints.items() if phrase.lower() == manipulated}
+    manipulated = parse_caption(video.caption, video.objects).manipulated.lower()
+    hints = {
+        phrase: hint_of(thing, video.path)
+        for phrase, thing in drawn["objects"].items()
+        if boxes == "all" or (boxes == "manipulated" and phrase.lower() == manipulated)
+    }
     video = replace(video, hints=hints)
-    verdict = Verdict(clip=video.path.stem, rating=drawn["rating"])
+    verdict = Verdict(clip=video.path.stem, rating=drawn.get("rating", 0))
     start, clip, scene = time.monotonic(), None, None
     try:
         clip = read_clip(video, cfg.video)
@@ -146,6 +158,17 @@ def judge(
         verdict.kind, verdict.confidence = scene.kind, round(scene.confidence, 3)
         _compare(verdict, clip, scene, drawn)
     return verdict, _picture(verdict, clip, scene, drawn)
+
+
+def hint_of(thing: dict[str, Any], path: Path) -> Hint:
+    """Return the hint that was drawn for an object: its own, else its box at the first frame, else that at the last."""
+    if "hint" in thing:
+        return Hint(**thing["hint"])
+    if thing["first"] is not None:
+        return Hint(frame=0, box=thing["first"])
+    with av.open(str(path)) as file:
+        frames = sum(1 for _ in file.decode(video=0))
+    return Hint(frame=frames - 1, box=thing["last"])
 
 
 def _compare(verdict: Verdict, clip: Clip, scene: Reconstruction, drawn: dict[str, Any]) -> None:
