@@ -150,3 +150,32 @@ def test_clicks_are_read_as_they_are_typed():
     assert clicks_from(["120,80", "3.5,7"]) == ((120.0, 80.0), (3.5, 7.0))
     with pytest.raises(V2PError, match="'120;80'"):
         clicks_from(["120;80"])
+
+
+def table_with_box(
+    shadow_at: int, box_at: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a grained grey table with a dark red box, and a hard shadow over 80 columns; and the box's mask."""
+    grain = np.add.outer(np.arange(256) // 9 % 3, np.arange(256) // 40 % 2)
+    picture = 110.0 + 8 * grain[..., None] + np.zeros(3)
+    mask = np.zeros((256, 256), bool)
+    mask[120:156, box_at : box_at + 28] = True
+    picture[mask] = (120, 45, 40)
+    picture[130:156, box_at : box_at + 9] = (70, 28, 26)  # its side is darker
+    picture[40:240, shadow_at : shadow_at + 80] *= 0.45
+    noisy = picture + rng.normal(0, 2.0, picture.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8), mask
+
+
+def test_a_hard_shadow_that_passes_over_the_object_is_not_taken_for_it():
+    rng = np.random.default_rng(0)
+    nobody = np.zeros((256, 256), bool)
+    frames = [table_with_box(10 + 4 * k, 110 + k // 2, rng) for k in range(50)]
+    tracker = ColourTracker()
+    picture, mask = frames[0]
+    tracker.start(picture, middle(mask), nobody)
+
+    overlaps = [iou(tracker.track(p, nobody).mask, m) for p, m in frames[1:]]
+
+    assert np.min(overlaps) > 0.7
+    assert np.mean(overlaps) > 0.85
