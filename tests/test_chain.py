@@ -73,6 +73,7 @@ def content(out: Path) -> dict[str, str]:
     return hashes | described
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.e2e
 @pytest.mark.timeout(900)

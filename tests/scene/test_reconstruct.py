@@ -137,6 +137,7 @@ def test_an_object_that_is_not_there_is_not_found(draw):
     assert caught.value.reason == "reference_not_found"
 
 
+@pytest.mark.long
 def test_what_the_caption_does_not_speak_of_is_left_out_rather_than_the_whole_scene(draw):
     clip = draw(objects=("blue box", "bowl"))
     clip.frames[:, 150:190, 40:80] = 30, 120, 40

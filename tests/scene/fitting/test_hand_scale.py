@@ -76,6 +76,7 @@ def seen(item: str):
     return working, segment_clip(clip, working), masks, [(mask, foot)], camera, pitch, height
 
 
+@pytest.mark.long
 def test_the_height_of_a_sample_clip_s_camera_is_told_by_its_hand_from_a_wrong_guess():
     *given, true = seen("push_blue_box_left")
 
@@ -87,6 +88,7 @@ def test_the_height_of_a_sample_clip_s_camera_is_told_by_its_hand_from_a_wrong_g
         assert 0.03 < found[1] < 0.3
 
 
+@pytest.mark.long
 def test_a_hand_that_touches_nothing_says_nothing():
     working, segmentation, masks, stands, camera, pitch, height = seen("push_blue_box_left")
     gone = replace(segmentation, shares=segmentation.shares.copy())
