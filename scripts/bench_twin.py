@@ -45,6 +45,8 @@ class BenchConfig:
     """Names and values of the twin's parameters."""
     allow_for_camera: bool = True
     """Labels are carried over to the training camera by the calibrated pose, as `v2p deploy` does."""
+    wait_for_gripper: bool = True
+    """The arm of a policy waits while the gripper travels, as in `v2p deploy`."""
     out: Path | None = None
     """JSON file with every episode's outcome."""
 
@@ -85,6 +87,7 @@ def main(cfg: BenchConfig) -> None:
     twin = judge_in_twin(
         cfg.task, load, seeds=seeds, cfg=how, parameters=parameters, workers=cfg.workers,
         look=allowing_for_place if cfg.allow_for_camera else true_labels,
+        waits=cfg.wait_for_gripper and who.kind == "policy",
     )  # fmt: skip
     _tell("twin", twin.successes, twin.at_end if cfg.at_end else None, time.perf_counter() - start)
     print(f"failures in the twin: {_counts(twin)}")

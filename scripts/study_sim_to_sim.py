@@ -32,8 +32,9 @@ from v2p_data.task.task import TaskBundle
 from v2p_data.twin.judge import TwinJudged, judge_in_twin, true_labels
 from v2p_data.twin.parameters import nominal
 
-PLACES = ("training", "twin", "twin_raw", "tracked")
-"""Training simulator; twin with true masks carried over to the training camera, and not carried over; tracked masks."""
+PLACES = ("training", "twin", "twin_hasty", "twin_raw", "tracked")
+"""Training simulator; twin with true masks, through all of `v2p deploy`; without waiting for the gripper; without carrying
+masks over to the training camera either; masks tracked in the twin's pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,15 +140,15 @@ def _played(asked: Asked, place: str, value: float | None) -> Row:
             look = FaultyLook(place, value, asked.first_seed)
     found = judge_in_twin(
         asked.task, play_of(contestant(asked.policy), asked.first_seed, "cpu"), seeds=asked.seeds,
-        cfg=EvaluationConfig(episodes=asked.episodes, at_end=place == "twin"),
-        parameters=parameters, look=look,
+        cfg=EvaluationConfig(episodes=asked.episodes, at_end=place.startswith("twin")),
+        parameters=parameters, look=look, waits=place not in ("twin_raw", "twin_hasty"),
     )  # fmt: skip
     row = {
         "once": _letters(found.successes),
         "failures": _failures(found),
         "twin": parameters.digest()[:12],
     }
-    if place == "twin":
+    if place.startswith("twin"):
         row["at_end"] = _letters(found.at_end)
     if isinstance(look, FaultyLook):
         row["iou"] = round(float(np.mean(look.overlaps)), 4)

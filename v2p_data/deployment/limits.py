@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.deployment.robot import ActionScale, Reading
 from v2p_data.errors import V2PError
 from v2p_data.sim.batch_env import SimConfig
+from v2p_data.sim.gripper_wait import GripperWait
 from v2p_data.sim.robot import QUAT_DOWN, TARGET_HIGH_M, TARGET_LOW_M
 
 STEP_S = 0.05
@@ -50,6 +51,8 @@ class LimitsConfig:
     max_force_n: float = 60.0
     """Contact force at the tool that stops the run, on robots that report it, when it lasts for two readings: the peak of
     a touch is shorter."""
+    wait_for_gripper: bool = True
+    """The arm waits while the gripper travels: real ones are slower than that of the training."""
     max_silence_ms: float = 300.0
     """Without a reading for so long the robot is told to hold and the run ends."""
 
@@ -70,7 +73,7 @@ class Limited:
 
     action: Float[np.ndarray, "7"]
     acted: tuple[str, ...]
-    """Which limits changed it: `range`, `speed`, `turn`, `lead`, `workspace`, `tilt`."""
+    """Which limits changed it: `range`, `gripper`, `speed`, `turn`, `lead`, `workspace`, `tilt`."""
 
 
 class LimitStop(V2PError):  # noqa: N818 - it is no error of the program's
@@ -101,6 +104,7 @@ class Guard:
         self._last: np.ndarray | None = None
         self._is_pressing = False
         self._turns: deque[np.ndarray] = deque(maxlen=PENDING)
+        self._wait = GripperWait() if cfg.wait_for_gripper else None
 
     def check_start(self, reading: Reading) -> None:
         """Refuse to begin where the arm is.
@@ -170,6 +174,11 @@ class Guard:
         allowed = np.clip(action, -1.0, 1.0)
         if np.abs(action - allowed).max() > 1e-6:
             acted.append("range")
+        if self._wait is not None and self._wait.is_waiting(
+            float(reading.state[6]), float(reading.state[10])
+        ):
+            allowed[:6] = 0.0
+            acted.append("gripper")
         shift = allowed[:3] * self.scale.position_step_m
         turn = allowed[3:6] * self.scale.rotation_step_rad
         # One factor for both: the arm goes the same way, later.

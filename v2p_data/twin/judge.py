@@ -21,6 +21,7 @@ from v2p_data.evaluation.actors import Actor, WorldActor
 from v2p_data.evaluation.batch import NEVER
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import failure_kinds
+from v2p_data.sim.gripper_wait import GripperWait
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.arm import TwinArm
 from v2p_data.twin.parameters import TwinParameters
@@ -82,6 +83,7 @@ def play(
     *,
     at_end: bool,
     labels: Callable[[], UInt8[np.ndarray, "h w"]] | None = None,
+    waits: bool = False,
 ) -> Played:
     """Play one episode of at most `steps` control steps; without `at_end` it is over with its first success.
 
@@ -92,6 +94,7 @@ def play(
         steps: the most.
         at_end: go on after a success.
         labels: what a policy sees; by default the true labels of the twin's camera.
+        waits: the arm waits while the gripper travels.
 
     Raises:
         V2PError: an action is not finite or has another shape.
@@ -104,9 +107,13 @@ def play(
         actor.reset(1)
     else:
         actor.begin(arm.mirror.env)
+    wait = GripperWait() if waits else None
     success_step, last, broke = NEVER, False, False
     for t in range(steps):
-        outcome = arm.act(_action(actor, arm, labels))
+        action = _action(actor, arm, labels)
+        if wait is not None:
+            action = wait.held(action, arm.tool.opening, arm.target.opening)
+        outcome = arm.act(action)
         broke = outcome.is_broken
         if broke:
             break
@@ -137,6 +144,7 @@ def judge_in_twin(
     parameters: TwinParameters | None = None,
     workers: int = 1,
     look: Look = true_labels,
+    waits: bool = False,
 ) -> TwinJudged:
     """Play one episode per seed.
 
@@ -148,11 +156,12 @@ def judge_in_twin(
         parameters: of the twin; by default the nominal one.
         workers: processes that share out the episodes; changes no result.
         look: how a policy sees the twin; picklable.
+        waits: the arm waits while the gripper travels, as in `v2p deploy`.
 
     Raises:
         V2PError: the folder holds no task, or the actor does not suit the twin.
     """
-    settings = (task_folder, load, cfg, parameters, look)
+    settings = (task_folder, load, cfg, parameters, look, waits)
     if workers == 1:
         table = _Table(*settings)
         try:
@@ -175,6 +184,7 @@ class _Table:
         cfg: EvaluationConfig,
         parameters: TwinParameters | None,
         look: Look,
+        waits: bool,
     ) -> None:
         bundle = TaskBundle.load(task_folder)
         self.actor, size_px = load(bundle)
@@ -187,11 +197,13 @@ class _Table:
         self.steps = bundle.policy_steps(cfg.horizon_scale)
         self.arm = TwinArm(bundle, parameters, height)
         self.labels = look(self.arm)
+        self.waits = waits
 
     def play(self, seed: int) -> Played:
         return play(
-            self.arm, self.actor, seed, self.steps, at_end=self.cfg.at_end, labels=self.labels
-        )
+            self.arm, self.actor, seed, self.steps, at_end=self.cfg.at_end, labels=self.labels,
+            waits=self.waits,
+        )  # fmt: skip
 
 
 _table: _Table | None = None
