@@ -39,14 +39,14 @@ from policies.ppo.policy import Expert
 from policies.ppo.train import train_expert
 from v2p_data.episodes.collect import judge_expert
 from v2p_data.errors import V2PError
-from v2p_data.learning import success_of
+from v2p_data.experts.bank import Bank, BankConfig, record_bank, use_bank
+from v2p_data.experts.learning import success_of
+from v2p_data.experts.teacher import Teacher
 from v2p_data.seeds import seed_for
-from v2p_data.sim.bank import Bank, BankConfig, record_bank, use_bank
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.teacher import Teacher
 from v2p_data.sim.torchrl_env import TorchRLEnv
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
-from v2p_data.task.nearest import Solved, rank_solved
+from v2p_data.task.likeness import Solved, rank_solved
 
 Way = Literal[
     "scratch", "bank", "bank+reverse", "other", "imitation", "imitation+ppo", "imitation+ppo+bank"

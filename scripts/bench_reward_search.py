@@ -22,13 +22,13 @@ import tyro
 
 from policies.evaluation.rate import Rate, wilson
 from policies.ppo.policy import Expert
+from v2p_data.experts.teacher import play
 from v2p_data.reward.candidate import Candidate, load_candidates
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.jobs import REQUEST_FILE, Job, Jobs
 from v2p_data.reward.search import How, search_reward
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.teacher import play
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 

@@ -21,8 +21,8 @@ import numpy as np
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
 from v2p_data.episodes.collect import judge_expert
-from v2p_data.expert_config import ExpertConfig
-from v2p_data.learning import learn
+from v2p_data.experts.config import ExpertConfig
+from v2p_data.experts.learning import Worlds, learn
 from v2p_data.report.sheet import write_contact_sheet
 from v2p_data.seeds import seed_for
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
@@ -62,9 +62,10 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
         ppo=replace(base.ppo, total_steps=args.total_steps, max_seconds=args.max_seconds),
     )
     started, cpu = time.monotonic(), time.process_time()
-    learned = learn(
-        bundle, cfg, folder, seed=seed_for(seed, "benchmark", task), num_threads=args.threads
+    worlds = Worlds(
+        bundle=bundle, seed=seed_for(seed, "benchmark", task), num_threads=args.threads
     )
+    learned = learn(worlds, cfg, folder)
     wall, cpu = time.monotonic() - started, time.process_time() - cpu
     judged = judge_expert(
         bundle,

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from v2p_data import kinds
+from v2p_data.experts import teacher
+from v2p_data.experts.primitives import Moment
 from v2p_data.kinds import TaskKind
-from v2p_data.sim import teacher
 from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.primitives import Moment
 from v2p_data.sim.verdict import Witness
 from v2p_data.task import referee
 from v2p_data.task.benchmark import load_benchmark

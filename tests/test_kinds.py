@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from v2p_data.errors import V2PError
+from v2p_data.experts import teacher
 from v2p_data.kinds import KINDS, TaskKind, check_every_kind, kind_named
-from v2p_data.sim import teacher
 from v2p_data.task import referee
 from v2p_data.task.templates import recipes
 from v2p_data.video import meaning

@@ -24,7 +24,8 @@ from v2p_data.episodes.about import CARRIED_TASKS
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.expert_config import ExpertConfig
+from v2p_data.experts.config import ExpertConfig
+from v2p_data.experts.solved import find_solved, solved_digests
 from v2p_data.judging import PROGRAMS, Contestant, judge_task, play_of, row_of
 from v2p_data.pipeline.artifact import (
     Record,
@@ -48,7 +49,6 @@ from v2p_data.reward.config import RewardConfig
 from v2p_data.scene.config import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
-from v2p_data.solved import find_solved, solved_digests
 from v2p_data.task.generate import TaskConfig
 from v2p_data.task.task import CODE_FILE, TASK_FILE
 from v2p_data.task.vlm_config import VlmConfig
@@ -316,7 +316,7 @@ def make_expert(
     """Find a teacher, imitate it, go on with PPO, all at the coarse time step; judge at the fine one with the independent referee."""
     from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import judge_expert
-    from v2p_data.learning import learn
+    from v2p_data.experts.learning import Worlds, learn
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.task_check import check_task
     from v2p_data.task.pool import add_solved
@@ -325,15 +325,18 @@ def make_expert(
     expert_cfg: ExpertConfig = cfg.config
     bundle = TaskBundle.load(inputs["task"])
     check_task(bundle, num_threads=runtime.num_threads)
-    learned = learn(
-        bundle,
-        expert_cfg,
-        out,
+    worlds = Worlds(
+        bundle=bundle,
         seed=seed_for(cfg.seed, "expert", bundle.title),
         num_threads=runtime.num_threads,
+        success_bonus=success_bonus,
+    )
+    learned = learn(
+        worlds,
+        expert_cfg,
+        out,
         device=runtime.device,
         solved=find_solved(warm_start) if warm_start else (),
-        success_bonus=success_bonus,
         on_progress=lambda share, words: runtime.progress(0.95 * share, words),
     )
     expert = Expert.load(out)

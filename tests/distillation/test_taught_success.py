@@ -11,14 +11,14 @@ import toy_run
 
 from policies.ppo.config import ImitationConfig
 from policies.ppo.policy import Expert
-from v2p_data import candidate_worker
-from v2p_data.candidate_worker import teach
-from v2p_data.learning import success_of
+from v2p_data.experts.learning import success_of
+from v2p_data.experts.teacher import play
+from v2p_data.reward import worker
 from v2p_data.reward.candidate import DONE_FILE, TRAIN_FOLDER
 from v2p_data.reward.jobs import HEARTBEAT_FILE
+from v2p_data.reward.worker import teach
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.teacher import play
 from v2p_data.task.benchmark import load_benchmark
 
 PASSING = toy_run.CODE.replace(
@@ -49,7 +49,7 @@ def test_a_reward_search_measures_as_an_experts_training_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     quick = partial(ImitationConfig, least_rounds=1, round_steps=30, epochs=2, minibatch=256)
-    monkeypatch.setattr(candidate_worker, "ImitationConfig", quick)
+    monkeypatch.setattr(worker, "ImitationConfig", quick)
     bundle = load_benchmark("lift_up")
     scene = replace(bundle.scene, folder=tmp_path / "made")
     scene.folder.mkdir()

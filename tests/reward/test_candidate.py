@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from policies.ppo.train import NotFiniteError
-from v2p_data.candidate_worker import closeness, fault_of
 from v2p_data.errors import V2PError
 from v2p_data.reward.candidate import Candidate, Evaluation, Fault, Training, load_candidates
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.methods import load_candidate, prepare, reward_text, save_bundle
+from v2p_data.reward.worker import closeness, fault_of
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.splice import rest_part, reward_part
 from v2p_data.task.task import TaskBundle

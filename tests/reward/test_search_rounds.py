@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from v2p_data.candidate_worker import run_job
 from v2p_data.cli import parse
 from v2p_data.pipeline.runner import Runtime, Stage, make_stage
 from v2p_data.report.page import NO_BREAK, write_page
@@ -25,6 +24,7 @@ from v2p_data.reward.jobs import HEARTBEAT_FILE, Jobs
 from v2p_data.reward.methods import in_place_of_reward, save_bundle
 from v2p_data.reward.reflect import proposals
 from v2p_data.reward.search import search_reward
+from v2p_data.reward.worker import run_job
 from v2p_data.stages import REWARD_SEARCH_FOLDER, EngineConfig, chain
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.splice import rest_part, reward_part, with_reward

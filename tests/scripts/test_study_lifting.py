@@ -15,7 +15,7 @@ from policies.ppo.config import ImitationConfig, PPOConfig
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import V2PError
-from v2p_data.expert_config import ExpertConfig
+from v2p_data.experts.config import ExpertConfig
 from v2p_data.pipeline.runner import (
     Outcome,
     Runtime,

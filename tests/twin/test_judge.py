@@ -9,7 +9,7 @@ from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import NEVER
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import NEVER_REACHED
-from v2p_data.sim.teacher import Teacher
+from v2p_data.experts.teacher import Teacher
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.twin.judge import judge_in_twin
 

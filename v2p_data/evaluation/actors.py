@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from v2p_data.errors import V2PError
+from v2p_data.experts.teacher import Teacher
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.observation import PROGRESS_COLUMN
-from v2p_data.sim.teacher import Teacher
 
 TRIAL_WORLDS = 64
 """Episodes in which each scripted program is tried before one is chosen."""

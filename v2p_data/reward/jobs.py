@@ -1,7 +1,7 @@
 """Candidates' trainings as processes of their own: what goes wrong in one is its own result.
 
 One process loads the libraries (seconds, and most of a small training's memory) and forks for every job; it runs
-`v2p_data.candidate_worker`. A job is a folder with a `request.json`; what it makes lies in the same folder. Between the
+`v2p_data.reward.worker`. A job is a folder with a `request.json`; what it makes lies in the same folder. Between the
 processes go lines of JSON and files, nothing else. All of them end when their parent does, however it went.
 """
 
@@ -24,7 +24,7 @@ from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.reward.candidate import DONE_FILE, FAULT_FILE, Fault, read_json
 from v2p_data.reward.config import Limits
 
-WORKER = "v2p_data.candidate_worker"
+WORKER = "v2p_data.reward.worker"
 REQUEST_FILE = "request.json"
 HEARTBEAT_FILE = "heartbeat"
 LOG_FILE = "worker.log"

@@ -1,7 +1,7 @@
 """Code-as-Policies with our primitives: a scripted program per world, chosen anew every 50 control steps.
 
 A language model would write the program from the caption and the states; offline, the choice is between the programs
-that a scene offers (`sim.teacher`). Those that the caption names come first. At each choice a world keeps its program
+that a scene offers (`experts.teacher`). Those that the caption names come first. At each choice a world keeps its program
 where the object has moved since the last one or the task's success holds, and takes the next program otherwise. In
 between the program sees the robot and the objects at every step, as the paper's closed-loop baseline does.
 """
@@ -9,9 +9,9 @@ between the program sees the robot and the objects at every step, as the paper's
 import numpy as np
 from jaxtyping import Float
 
+from v2p_data.experts.teacher import Teacher
 from v2p_data.kinds import KINDS
 from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.teacher import Teacher
 
 EVERY_STEPS = 50
 """The paper's number."""

@@ -14,7 +14,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -48,9 +48,6 @@ from v2p_data.sim.start_check import check_start
 from v2p_data.sim.states import Observed, StateBlock
 from v2p_data.sim.world import CAMERA, World, build_world
 from v2p_data.task.task import Task, TaskBundle
-
-if TYPE_CHECKING:
-    from v2p_data.sim.bank import Starts
 
 ACT_DIM = 7
 HELD_STEPS = 5
@@ -179,6 +176,30 @@ class Followed:
     target_finger: Float[np.ndarray, "env"]
 
 
+class ResetSource(Protocol):
+    """Saved moments from which some episodes begin, and how they ended. A row is the number of a moment."""
+
+    def draw(self, ids: Int[np.ndarray, "n"], rng: np.random.Generator) -> Int[np.ndarray, "n"]:
+        """Return the row that each of the worlds `ids` starts from; -1 for a plain start."""
+        ...
+
+    def take(self, index: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
+        """Return the moments of some rows, for `BatchEnv.restore`."""
+        ...
+
+    def note(self, rows: Int[np.ndarray, "n"], succeeded: Bool[np.ndarray, "n"]) -> None:
+        """Take in how episodes that began at some rows ended."""
+        ...
+
+    def state(self) -> str:
+        """Return its own state as text, for a checkpoint."""
+        ...
+
+    def load_state(self, text: str) -> None:
+        """Go on from what `state` gave."""
+        ...
+
+
 class BatchEnv:
     """Worlds of one task.
 
@@ -218,8 +239,8 @@ class BatchEnv:
         self.object_names = [o.name for o in self.world.objects]
         self.broken_count = 0
         """Worlds whose simulation broke down since the environment was made."""
-        self.starts: Starts | None = None
-        """Where some episodes begin in the middle; set by `bank.use_bank`, for training only."""
+        self.starts: ResetSource | None = None
+        """Where some episodes begin in the middle; for training only."""
         self._bind(num_threads)
         self.randomizer = Randomizer(
             self.world, self._batch, self.cfg.randomization, rng_for(seed, "start-poses")
@@ -335,7 +356,7 @@ class BatchEnv:
         row = self.starts.draw(ids, self._rng)
         is_banked = row >= 0
         if is_banked.any():
-            self.restore(ids[is_banked], self.starts.bank.take(row[is_banked]))
+            self.restore(ids[is_banked], self.starts.take(row[is_banked]))
         self._bank_row[ids] = row
         return ids[~is_banked]
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from v2p_data.errors import V2PError
 from v2p_data.scene.scene import Scene
 from v2p_data.task.example_tasks import BASIC_EXAMPLES, Example
-from v2p_data.task.nearest import likeness
+from v2p_data.task.likeness import likeness
 from v2p_data.task.task import TaskBundle
 
 SOLVED_FILE = "solved.json"

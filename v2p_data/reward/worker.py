@@ -29,11 +29,12 @@ from jaxtyping import Float
 from tensordict import TensorDict
 
 from policies.ppo.config import ImitationConfig, PPOConfig
-from policies.ppo.imitate import imitate
 from policies.ppo.policy import Expert
 from policies.ppo.train import NotFiniteError, train_expert
 from v2p_data.errors import V2PError
-from v2p_data.learning import success_of
+from v2p_data.experts.config import ExpertConfig
+from v2p_data.experts.learning import Worlds, success_of
+from v2p_data.experts.learning import teach as teach_policy
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.reward.candidate import (
     DONE_FILE,
@@ -55,7 +56,6 @@ from v2p_data.reward.trajectories import Trajectories
 from v2p_data.scene.scene import SceneObject
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.teacher import Teacher
 from v2p_data.sim.torchrl_env import TorchRLEnv
 from v2p_data.task.confine import confine, leave_the_network
 
@@ -64,6 +64,8 @@ POLL_S = 0.05
 FILE_BYTES = 2 * 1024**3
 OPEN_FILES = 256
 THREADS = 64
+ANY_SUCCESS = 1e-6
+"""A program that succeeds in any world is imitated: candidates start from it, however poor it is."""
 LEAST_WAY_M = 0.01
 """The video's displacement says nothing below this."""
 
@@ -293,45 +295,34 @@ def teach(request: dict[str, Any], folder: Path) -> None:
     bundle = load_candidate(Path(request["bundle"]), Path(request["code"]))
     seed, threads = int(request["seed"]), int(request["num_threads"])
 
-    def worlds(count: int, what: str, *, fine: bool = False) -> BatchEnv:
-        return BatchEnv(
-            bundle,
-            SimConfig(fine=fine),
-            num_envs=count,
-            seed=seed_for(seed, what),
-            num_threads=threads,
-        )
-
-    began = time.monotonic()
-    trial, env = (
-        worlds(int(request["eval_worlds"]), "trials"),
-        worlds(request["num_envs"], "taught"),
+    worlds = Worlds(bundle=bundle, seed=seed, num_threads=threads)
+    num_trials, num_envs = int(request["eval_worlds"]), int(request["num_envs"])
+    cfg = ExpertConfig(
+        trial_worlds=num_trials,
+        num_envs=num_envs,
+        least_teacher_success=ANY_SUCCESS,
+        imitation=ImitationConfig(rounds=int(request["rounds"]), num_threads=threads),
     )
-    teacher = Teacher(env)
-    best = teacher.choose(trial)
-    steps = len(teacher.trials) * trial.num_envs * bundle.horizon_steps
-    _beat(folder)
-    success = 0.0
-    if best.success > 0:
-        rounds = int(request["rounds"])
-        imitated = imitate(
-            TorchRLEnv(env),
-            teacher.act,
-            ImitationConfig(rounds=rounds, num_threads=threads),
-            folder / TRAIN_FOLDER,
-            seed=seed_for(seed, "imitation") % 2**63,
-            on_progress=lambda _: _beat(folder),
-        )
-        steps += imitated.steps
-        exam = worlds(int(request["eval_worlds"]), "exam", fine=True)
-        success = success_of(exam, Expert.load(imitated.folder))
+    began = time.monotonic()
+    taught = teach_policy(
+        worlds,
+        worlds.make(num_trials, "trials"),
+        cfg,
+        folder / TRAIN_FOLDER,
+        has_exams=False,
+        on_progress=lambda *_: _beat(folder),
+    )
+    steps, success = taught.steps, 0.0
+    if taught.folder is not None:
+        exam = worlds.make(num_trials, "exam", fine=True)
+        success = success_of(exam, Expert.load(taught.folder))
         steps += exam.num_envs * bundle.horizon_steps
     write_json_atomically(
         folder / DONE_FILE,
         {
             "mark": 0,
-            "teacher": best.name if best.success > 0 else "",
-            "program_success": best.success,
+            "teacher": taught.program if taught.folder is not None else "",
+            "program_success": taught.program_success,
             "taught_success": success,
             "control_steps": steps,
             "seconds": time.monotonic() - began,

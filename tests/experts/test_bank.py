@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from v2p_data.errors import V2PError
+from v2p_data.experts.bank import UNKNOWN, Bank, BankConfig, Starts, record_bank, use_bank
 from v2p_data.sim import randomize
-from v2p_data.sim.bank import UNKNOWN, Bank, BankConfig, Starts, record_bank, use_bank
 from v2p_data.sim.batch_env import HELD_STEPS, BatchEnv, SimConfig, without_randomization
 from v2p_data.task.task import Task, TaskBundle
 

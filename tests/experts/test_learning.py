@@ -8,8 +8,8 @@ import torch
 
 from policies.ppo.config import ImitationConfig, PPOConfig
 from policies.ppo.policy import Expert, weights_of
-from v2p_data.expert_config import ExpertConfig
-from v2p_data.learning import TAUGHT_FOLDER, Learned, learn, success_of
+from v2p_data.experts.config import ExpertConfig
+from v2p_data.experts.learning import TAUGHT_FOLDER, Learned, Worlds, learn, success_of
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
@@ -37,7 +37,7 @@ def bundle() -> TaskBundle:
 @pytest.fixture(scope="module")
 def learned(bundle: TaskBundle, tmp_path_factory) -> tuple[Learned, Path]:
     out = tmp_path_factory.mktemp("learned")
-    return learn(bundle, TINY, out, seed=3, num_threads=1), out
+    return learn(Worlds(bundle=bundle, seed=3, num_threads=1), TINY, out), out
 
 
 def weights_in(folder: Path) -> dict[str, torch.Tensor]:
@@ -82,8 +82,8 @@ def test_the_same_seed_learns_the_same_weights_and_another_seed_others(
 ):
     first, out = learned
 
-    again = learn(bundle, TINY, tmp_path / "again", seed=3, num_threads=2)
-    learn(bundle, TINY, tmp_path / "other", seed=4, num_threads=1)
+    again = learn(Worlds(bundle=bundle, seed=3, num_threads=2), TINY, tmp_path / "again")
+    learn(Worlds(bundle=bundle, seed=4, num_threads=1), TINY, tmp_path / "other")
 
     assert are_equal(weights_in(out / "last"), weights_in(tmp_path / "again" / "last"))
     assert not are_equal(weights_in(out / "last"), weights_in(tmp_path / "other" / "last"))
@@ -94,10 +94,9 @@ def test_without_a_teacher_ppo_learns_from_nothing(bundle: TaskBundle, tmp_path:
     told: list[float] = []
 
     result = learn(
-        bundle,
+        Worlds(bundle=bundle, seed=3),
         replace(TINY, teacher="none"),
         tmp_path,
-        seed=3,
         on_progress=lambda share, words: told.append(share),
     )
 
@@ -111,7 +110,7 @@ def test_without_a_teacher_ppo_learns_from_nothing(bundle: TaskBundle, tmp_path:
 def test_a_program_that_hardly_succeeds_teaches_nothing(bundle: TaskBundle, tmp_path: Path):
     unreachable = replace(TINY, least_teacher_success=1.01)
 
-    result = learn(bundle, unreachable, tmp_path, seed=3)
+    result = learn(Worlds(bundle=bundle, seed=3), unreachable, tmp_path)
 
     assert result.teacher == ""
     assert len(result.trials) >= 1
@@ -128,7 +127,7 @@ def test_a_taught_expert_lifts_the_box_at_the_fine_time_step(bundle: TaskBundle,
         ppo=replace(TINY.ppo, total_steps=0),
     )
 
-    learn(bundle, cfg, tmp_path, seed=3)
+    learn(Worlds(bundle=bundle, seed=3), cfg, tmp_path)
 
     worlds = BatchEnv(bundle, SimConfig(fine=True), num_envs=32, seed=99, num_threads=1)
     assert success_of(worlds, Expert.load(tmp_path)) >= 0.7

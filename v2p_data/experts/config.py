@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from policies.ppo.config import ImitationConfig, PPOConfig
+from v2p_data.experts.bank import BankConfig
 from v2p_data.sim.backends import Backend
-from v2p_data.sim.bank import BankConfig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,8 @@ A folder of runs holds `expert/<item>-<fingerprint>` with a record that names it
 """
 
 import json
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from policies.ppo.policy import EXPERT_FILE, WEIGHTS_FILE
@@ -12,8 +14,18 @@ from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import demand_whole, read_record
 from v2p_data.pipeline.contents import damaged
 from v2p_data.pipeline.fingerprint import file_digest
-from v2p_data.task.nearest import Solved
+from v2p_data.task.likeness import likeness
 from v2p_data.task.task import TaskBundle
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solved:
+    """An expert that exists, and its task."""
+
+    bundle: TaskBundle
+    folder: Path
+    obs_dim: int
+    """Length of the observation it was trained on."""
 
 
 def find_solved(runs: Path) -> list[Solved]:
@@ -53,3 +65,20 @@ def solved_digests(runs: Path | None) -> dict[str, str]:
     return {
         f"solved {s.folder.name}": file_digest(s.folder / WEIGHTS_FILE) for s in find_solved(runs)
     }
+
+
+def rank_solved(bundle: TaskBundle, obs_dim: int, solved: Iterable[Solved]) -> list[Solved]:
+    """Return the experts whose weights fit a task, the most alike first; equals in the order of their folders' names.
+
+    Experts for another arm, with another observation or another size of motion do not fit: in them the same
+    number means something else.
+    """
+    arm = bundle.arm
+    fitting = [
+        s
+        for s in solved
+        if s.obs_dim == obs_dim
+        and s.bundle.arm == arm
+        and s.bundle.motion_scale == bundle.motion_scale
+    ]
+    return sorted(fitting, key=lambda s: (-likeness(bundle, s.bundle), s.folder.name))

@@ -13,9 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from v2p_data.kinds import KINDS
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.primitives import (
+from v2p_data.experts.primitives import (
     CLOSE,
     Actions,
     Body,
@@ -28,6 +26,8 @@ from v2p_data.sim.primitives import (
     release,
     swing,
 )
+from v2p_data.kinds import KINDS
+from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.task.probes import first_pose
 
 logger = logging.getLogger(__name__)
@@ -330,7 +330,7 @@ def _check_preferred_programs() -> None:
         for start in kind.programs:
             if not any(name.startswith(start) for name in known):
                 raise ValueError(
-                    f"task kind '{kind.name}' prefers the scripted policy '{start}'; add it to v2p_data/sim/teacher.py "
+                    f"task kind '{kind.name}' prefers the scripted policy '{start}'; add it to v2p_data/experts/teacher.py "
                     f"or name one of: {', '.join(known)}"
                 )
 

@@ -7,8 +7,8 @@ import torch
 from policies.ppo.config import ActorConfig
 from policies.ppo.policy import ActorCritic, Expert
 from v2p_data.errors import V2PError
+from v2p_data.experts.solved import find_solved, solved_digests
 from v2p_data.pipeline.artifact import Record, write_record
-from v2p_data.solved import find_solved, solved_digests
 from v2p_data.task.benchmark import load_benchmark
 
 

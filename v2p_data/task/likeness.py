@@ -1,13 +1,10 @@
-"""Which solved task is most like a new one: where PPO may start from another expert's weights.
+"""How alike two tasks are. Experts start from the most similar task's expert; a model is shown similar tasks.
 
 Likeness is counted in points, by what decides how the arm moves: the family of the kind (carrying, pushing,
 tipping, throwing), the kind itself, the number of objects, and their shapes and sizes.
 """
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from pathlib import Path
 
 from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene, SceneObject
@@ -17,33 +14,6 @@ FAMILY_POINTS = 4.0
 KIND_POINTS = 2.0
 COUNT_POINTS = 1.0
 """For the same number of objects: then their observations lie in the same places."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Solved:
-    """An expert that exists, and its task."""
-
-    bundle: TaskBundle
-    folder: Path
-    obs_dim: int
-    """Length of the observation it was trained on."""
-
-
-def rank_solved(bundle: TaskBundle, obs_dim: int, solved: Iterable[Solved]) -> list[Solved]:
-    """Return the experts whose weights fit a task, the most alike first; equals in the order of their folders' names.
-
-    Experts for another arm, with another observation or another size of motion do not fit: in them the same
-    number means something else.
-    """
-    arm = bundle.arm
-    fitting = [
-        s
-        for s in solved
-        if s.obs_dim == obs_dim
-        and s.bundle.arm == arm
-        and s.bundle.motion_scale == bundle.motion_scale
-    ]
-    return sorted(fitting, key=lambda s: (-likeness(bundle, s.bundle), s.folder.name))
 
 
 def likeness(a: TaskBundle, b: TaskBundle) -> float:

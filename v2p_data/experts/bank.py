@@ -179,7 +179,7 @@ def use_bank(env: BatchEnv, bank: Bank, cfg: BankConfig) -> "Starts":
 
 
 class Starts:
-    """Draws from a bank for one environment, and remembers how far the curriculum is.
+    """Draws from a bank for one environment, and remembers how far the curriculum is: a `batch_env.ResetSource`.
 
     Args:
         bank: the moments.
@@ -205,6 +205,10 @@ class Starts:
         """Return the bank's row that each of the worlds starts from; -1 for a plain start."""
         is_banked = (rng.random(len(ids)) < self.cfg.share) & (ids >= self.cfg.num_plain)
         return np.where(is_banked, rng.integers(0, self.num_open, len(ids)), PLAIN)
+
+    def take(self, index: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
+        """Return the moments of some rows, for `BatchEnv.restore`."""
+        return self.bank.take(index)
 
     def note(self, rows: Int[np.ndarray, "n"], succeeded: Bool[np.ndarray, "n"]) -> None:
         """Take in how episodes that began at some rows ended."""

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from v2p_data.experts.solved import Solved, rank_solved
 from v2p_data.kinds import KINDS, Kind
 from v2p_data.task.benchmark import benchmark_names
 from v2p_data.task.benchmark import load_benchmark as load
-from v2p_data.task.nearest import Solved, likeness, rank_solved
+from v2p_data.task.likeness import likeness
 
 load_benchmark = functools.cache(load)
 

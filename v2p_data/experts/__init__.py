@@ -1,0 +1,11 @@
+"""A task becomes an expert: a neural network that solves it, from the simulator's states.
+
+Comes in: a `TaskBundle` and the settings of `config`. Goes out: a folder with the expert's weights, the curve of its
+training, and `taught/`, the policy that imitation gave. Reading order:
+
+    primitives   scripted motions: reach, grasp, carry, push, throw
+    teacher      scripted policies made of them, and the search for the best one
+    bank         saved moments from which some episodes of a training begin
+    solved       experts of other tasks as starting points
+    learning     the four steps: teach, record resets, improve by PPO, keep the better one
+"""
