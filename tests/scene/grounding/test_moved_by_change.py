@@ -8,7 +8,8 @@ import pytest
 from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.frames.table import find_table
 from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
-from v2p_data.scene.grounding.moved_by_change import Moved, find_static_by_change
+from v2p_data.scene.grounding.moved_by_change import Moved
+from v2p_data.scene.grounding.static_by_change import find_static_by_change
 from v2p_data.video.clip import Clip
 
 H, W = 240, 320

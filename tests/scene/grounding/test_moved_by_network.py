@@ -8,9 +8,10 @@ import pytest
 from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.colour import histogram
-from v2p_data.scene.grounding.ground_objects import ground_objects, hidden_in_container
+from v2p_data.scene.grounding.ground_objects import ground_objects
 from v2p_data.scene.grounding.moved_by_change import Moved
-from v2p_data.scene.grounding.moved_by_network import find_moved_by_network, rated
+from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network, rated
+from v2p_data.scene.grounding.moved_object import hidden_in_container
 from v2p_data.scene.grounding.outlines import (
     completed,
     disjoint_ends,
@@ -113,7 +114,9 @@ def test_a_mask_given_by_hand_is_taken_as_it_is(segmentation_of):
     given = np.zeros(working.shape, bool)
     given[60:100, 50:90] = True
 
-    found, _ = find_moved_by_network(working, segmentation, "box", "push_right", first=given)
+    found, _ = find_moved_by_network(
+        working, segmentation, "box", "push_right", marked=Marked(first=given)
+    )
 
     np.testing.assert_array_equal(found.first, given)
 
@@ -396,9 +399,9 @@ def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(se
     first, goals = large(start, working), [large(goal, working) for goal in (near, far)]
 
     ends = [
-        find_moved_by_network(working, segmentation, "red box", "insert", first=first, goal=goal)[
-            0
-        ].last
+        find_moved_by_network(
+            working, segmentation, "red box", "insert", marked=Marked(first=first, goal=goal)
+        )[0].last
         for goal in goals
     ]
 
@@ -413,7 +416,11 @@ def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(segment
     there = large(square(15 + 3 * 6, 60), working)
 
     moved, _ = find_moved_by_network(
-        working, segmentation, "thing", "push_right", colour_hist=histogram(working.rgb[6][there])
+        working,
+        segmentation,
+        "thing",
+        "push_right",
+        marked=Marked(colour_hist=histogram(working.rgb[6][there])),
     )
 
     assert iou(moved.first, square(15, 60)) > 0.8

@@ -77,31 +77,44 @@ class _Pair:
         return self.first.rating * self.last.rating * float(np.prod(list(self.parts.values())))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Marked:
+    """What a person marked, at working size."""
+
+    first: Bool[np.ndarray, "h w"] | None = None
+    """The moved object's first outline, which is taken as it is."""
+    last: Bool[np.ndarray, "h w"] | None = None
+    """Its last outline, which is taken as it is."""
+    goal: Bool[np.ndarray, "h w"] | None = None
+    """The object into, onto or over which it goes."""
+    colour_hist: Float[np.ndarray, "l a b"] | None = None
+    """Its colours, where it was marked on its way."""
+
+
 def find_moved_by_network(
     working: WorkingClip,
     segmentation: Segmentation,
     phrase: str,
     kind: Kind,
     tool: str = "",
-    first: Bool[np.ndarray, "h w"] | None = None,
-    last: Bool[np.ndarray, "h w"] | None = None,
-    goal: Bool[np.ndarray, "h w"] | None = None,
-    colour_hist: Float[np.ndarray, "l a b"] | None = None,
+    marked: Marked | None = None,
 ) -> tuple[Moved, Moved | None] | None:
     """Return the manipulated object and, where the caption names one that a hand holds, the tool.
 
-    A mask given by the user for either end is taken as it is; `goal` is what the user marked as that into, onto or over
-    which it goes; `colour_hist` its colours, where the user marked it on its way. None where nothing that moved was seen.
+    None where nothing that moved was seen.
     """
-    starts = _ends(working, segmentation, phrase, 0, first)
-    stops = _ends(working, segmentation, phrase, len(working.rgb) - 1, last)
-    if colour_hist is not None:
-        starts, stops = ([_alike(blob, colour_hist) for blob in ends] for ends in (starts, stops))
+    given = marked or Marked()
+    starts = _ends(working, segmentation, phrase, 0, given.first)
+    stops = _ends(working, segmentation, phrase, len(working.rgb) - 1, given.last)
+    if given.colour_hist is not None:
+        starts, stops = (
+            [_alike(blob, given.colour_hist) for blob in ends] for ends in (starts, stops)
+        )
     if starts and not stops and KINDS[kind].hides:
         stops = _last_seen(working, segmentation, phrase, starts[0].area)
     stops = [_hidden_end(blob, KINDS[kind].end_weight) for blob in stops]
-    if goal is not None and KINDS[kind].touches:
-        near = grow(goal, _GAP_PX)
+    if given.goal is not None and KINDS[kind].touches:
+        near = grow(given.goal, _GAP_PX)
         stops = [_at_goal(blob, near) for blob in stops]
     pairs = sorted(
         (

@@ -31,10 +31,7 @@ from v2p_data.scene.frames.mask_ops import (
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.table import Table
 from v2p_data.scene.frames.working_clip import WorkingClip
-from v2p_data.scene.grounding.moved_by_change import (
-    Found,
-    pieces_of,
-)
+from v2p_data.scene.grounding.static_by_change import Found, pieces_of
 from v2p_data.scene.scale.camera_height import SeenCamera, px_per_m
 from v2p_data.scene.scale.nouns import Noun, noun_for
 
