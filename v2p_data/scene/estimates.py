@@ -22,7 +22,7 @@ from v2p_data.scene.data_types import (
 from v2p_data.scene.fitting.by_model import poses_by_worker
 from v2p_data.scene.fitting.metric import clip_camera, metric_camera, scene_origin
 from v2p_data.scene.fitting.ring_mask import without_hole
-from v2p_data.scene.fitting.silhouette import three
+from v2p_data.scene.fitting.shape_fit import three
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.meshes import MeshedObject
 from v2p_data.scene.scale.nouns import Noun

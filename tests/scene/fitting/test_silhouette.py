@@ -7,9 +7,7 @@ import pytest
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import quat_from_yaw, transform, transform_from_pose
 from v2p_data.scene.data_types import ObjectTrack
-from v2p_data.scene.fitting.silhouette import (
-    Silhouette,
-    camera_above,
+from v2p_data.scene.fitting.shape_fit import (
     fit_lifted,
     fit_pose,
     fit_shape,
@@ -17,6 +15,7 @@ from v2p_data.scene.fitting.silhouette import (
     on_wall,
     orientations,
 )
+from v2p_data.scene.fitting.silhouette import Silhouette, camera_above
 from v2p_data.scene.fitting.trajectory import Trajectory, carried_by_hand, peak, trajectory_in_hand
 from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED
 from v2p_data.scene.frames.segmentation import Segmentation

@@ -9,8 +9,9 @@ import pytest
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Fit
-from v2p_data.scene.fitting.silhouette import Silhouette, camera_above, three
-from v2p_data.scene.fitting.tool_pose import PushMotion, fit_tool_pose, push_motion
+from v2p_data.scene.fitting.shape_fit import three
+from v2p_data.scene.fitting.silhouette import Silhouette, camera_above
+from v2p_data.scene.fitting.tool_pose import Pushed, PushMotion, fit_tool_pose, push_motion
 from v2p_data.scene.fitting.trajectory import Trajectory
 from v2p_data.scene.frames.classes import CLASSES, HAND
 from v2p_data.scene.frames.segmentation import Segmentation
@@ -52,7 +53,14 @@ def arm_from(spot: np.ndarray) -> Segmentation:
 
 def pushed(segmentation: Segmentation | None = None) -> PushMotion:
     trajectory, fit = block()
-    return push_motion(trajectory, fit, "box", FRAMES, np.zeros(2), CAMERA, HEIGHT_M, segmentation)
+    return push_motion(
+        Pushed(trajectory=trajectory, fit=fit, form="box"),
+        FRAMES,
+        np.zeros(2),
+        CAMERA,
+        HEIGHT_M,
+        segmentation,
+    )
 
 
 def stick(
@@ -94,7 +102,14 @@ def test_what_goes_nowhere_is_pushed_from_where_the_tool_is():
     trajectory, fit = block()
     still = replace(trajectory, poses=[trajectory.poses[0]] * FRAMES)
 
-    push = push_motion(still, fit, "box", FRAMES, FROM - [0.4, 0], CAMERA, HEIGHT_M, None)
+    push = push_motion(
+        Pushed(trajectory=still, fit=fit, form="box"),
+        FRAMES,
+        FROM - [0.4, 0],
+        CAMERA,
+        HEIGHT_M,
+        None,
+    )
 
     assert push.frames == (0, FRAMES - 1)
     np.testing.assert_allclose(push.way, [1, 0], atol=1e-6)

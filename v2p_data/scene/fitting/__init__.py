@@ -7,7 +7,7 @@ Reading order:
     plans           one plan per kind of task: where the object starts, how it moves, where it ends
     camera_guess, pitch             the camera
     object_view, noun_variants      what is seen of an object at both ends, and which form its noun has
-    silhouette, cuboid_network      one shape under one outline; how a box is turned
+    silhouette, shape_fit, cuboid_network   one shape under one outline; how a box is turned
     end_poses, trajectory           poses at both ends, and between
     tool_pose, place_tool           a tool in a hand
     hand_scale      the hand as a ruler

@@ -11,15 +11,8 @@ from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Fit, ObjectTrack
 from v2p_data.scene.fitting.object_view import MOUTH_DOWN, ObjectView, round_body
 from v2p_data.scene.fitting.plans import FitPlan
-from v2p_data.scene.fitting.silhouette import (
-    Silhouette,
-    Within,
-    fit_lifted,
-    fit_pose,
-    fit_shape,
-    three,
-    yaw_of,
-)
+from v2p_data.scene.fitting.shape_fit import Within, fit_lifted, fit_pose, fit_shape, three, yaw_of
+from v2p_data.scene.fitting.silhouette import Silhouette
 from v2p_data.scene.scale.nouns import Noun
 
 UNSEEN_IOU = 0.35

@@ -9,11 +9,8 @@ from v2p_data.scene.data_types import CameraGuess, Fit, ObjectTrack
 from v2p_data.scene.fitting.end_poses import is_lid
 from v2p_data.scene.fitting.object_view import other_objects
 from v2p_data.scene.fitting.plans import plan_of
-from v2p_data.scene.fitting.silhouette import (
-    Silhouette,
-    camera_above,
-    fit_shape,
-)
+from v2p_data.scene.fitting.shape_fit import fit_shape
+from v2p_data.scene.fitting.silhouette import Silhouette, camera_above
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.nouns import Noun
 

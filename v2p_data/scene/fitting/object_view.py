@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.fitting.plans import STATIC, FitPlan
-from v2p_data.scene.fitting.silhouette import orientations
+from v2p_data.scene.fitting.shape_fit import orientations
 from v2p_data.scene.fitting.trajectory import peak
 from v2p_data.scene.frames.colour import lab_of
 from v2p_data.scene.frames.mask_ops import bounding_box, grow, handle_of, tidy

@@ -7,9 +7,7 @@ import numpy as np
 from v2p_data.scene.data_types import CameraGuess, Fit
 from v2p_data.scene.fitting.end_poses import fits_at_first
 from v2p_data.scene.fitting.object_view import ObjectView
-from v2p_data.scene.fitting.silhouette import (
-    camera_above,
-)
+from v2p_data.scene.fitting.silhouette import camera_above
 
 _TURN_COST = 0.007
 """Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""

@@ -9,8 +9,9 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.scene.data_types import ObjectTrack, PlacedObject
 from v2p_data.scene.fitting.end_poses import EndPoses
 from v2p_data.scene.fitting.object_view import ObjectView, unknown_around
-from v2p_data.scene.fitting.silhouette import Silhouette, three
-from v2p_data.scene.fitting.tool_pose import fit_tool_pose, push_motion
+from v2p_data.scene.fitting.shape_fit import three
+from v2p_data.scene.fitting.silhouette import Silhouette
+from v2p_data.scene.fitting.tool_pose import Pushed, fit_tool_pose, push_motion
 from v2p_data.scene.fitting.trajectory import Trajectory
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.working_clip import WorkingClip
@@ -48,9 +49,11 @@ def place_tool(
     s = see.s
     ground = camera.on_plane(np.argwhere(s.first).mean(0)[None, ::-1])[0][:2]
     push = push_motion(
-        Trajectory(list(pushed.frames), list(pushed.T_world_objs), [], []),
-        pushed.first,
-        thing.noun.form,
+        Pushed(
+            trajectory=Trajectory(list(pushed.frames), list(pushed.T_world_objs), [], []),
+            fit=pushed.first,
+            form=thing.noun.form,
+        ),
         len(s.masks),
         ground if np.isfinite(ground).all() else np.zeros(2),
         camera,

@@ -15,7 +15,8 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Fit
-from v2p_data.scene.fitting.silhouette import Silhouette, search, three
+from v2p_data.scene.fitting.shape_fit import search, three
+from v2p_data.scene.fitting.silhouette import Silhouette
 from v2p_data.scene.fitting.trajectory import Trajectory
 from v2p_data.scene.frames.hand import hand_end
 from v2p_data.scene.frames.segmentation import Segmentation, hand_at
@@ -93,10 +94,19 @@ class PushMotion:
     """Metres per camera height."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Pushed:
+    """What a tool pushes."""
+
+    trajectory: Trajectory
+    fit: Fit
+    """The object at first."""
+    form: str
+    """Its noun's shape: `box`, `cylinder` or `sphere`."""
+
+
 def push_motion(
-    trajectory: Trajectory,
-    fit: Fit,
-    form: str,
+    pushed: Pushed,
     num_frames: int,
     tool_xy: Float[np.ndarray, "2"],
     camera: Camera,
@@ -106,28 +116,28 @@ def push_motion(
     """Return how a thing is pushed.
 
     Args:
-        trajectory: its poses.
-        fit: it at first.
-        form: its shape.
+        pushed: the object, and its poses.
         num_frames: of the working clip.
         tool_xy: where the tool is seen, roughly: from there a thing is pushed that hardly moves.
         camera: one camera height above the table.
         height_m: metres per camera height.
         segmentation: what the network sees, where it was asked.
     """
-    known = np.array([T[:2, 3] for T in trajectory.poses])
+    known = np.array([T[:2, 3] for T in pushed.trajectory.poses])
     times = np.arange(num_frames)
-    spots = np.stack([np.interp(times, trajectory.frames, known[:, k]) for k in range(2)], 1)
+    spots = np.stack(
+        [np.interp(times, pushed.trajectory.frames, known[:, k]) for k in range(2)], 1
+    )
     whole = spots[-1] - spots[0]
     begins, ends = 0, num_frames - 1
-    if np.linalg.norm(whole) < _LEAST_TRAVEL * max(fit.size):
+    if np.linalg.norm(whole) < _LEAST_TRAVEL * max(pushed.fit.size):
         whole = spots[0] - tool_xy
     else:
         gone = (spots - spots[0]) @ whole / float(whole @ whole)
         begins = max(0, int((gone > _SETS_OUT).argmax()) - 1)
         ends = min(ends, int(np.flatnonzero(gone < 1 - _SETS_OUT)[-1]) + 1)
     way = whole / max(1e-9, float(np.linalg.norm(whole)))
-    points = outline_points(form, fit.size) @ fit.T_world_obj[:3, :3].T
+    points = outline_points(pushed.form, pushed.fit.size) @ pushed.fit.T_world_obj[:3, :3].T
     behind = float((points[:, :2] @ way).min()) * way
     tall = float(np.ptp(points[:, 2]))
     arm = None

@@ -11,7 +11,7 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Fit, ObjectTrack
 from v2p_data.scene.fitting.plans import FitPlan
-from v2p_data.scene.fitting.silhouette import on_wall
+from v2p_data.scene.fitting.shape_fit import on_wall
 from v2p_data.scene.frames.classes import MOVED
 from v2p_data.scene.frames.hand import hand_end
 from v2p_data.scene.frames.mask_ops import bounding_box, grow

@@ -1,7 +1,7 @@
 """The largest body of revolution that an outline leaves room for: the neck of a bottle, the bulge of a bowl."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from v2p_data.geometry.mesh import lathe, lathe_parts, wall_m
@@ -50,9 +50,11 @@ def revolution(
     if len(rows) < 4 or radius.max() <= 0:
         return None
     centre = T[:3, 3] + T[:3, :3] @ (shift * diameter * side)
+    discs = _discs(crop, transform(T[:3, :3], centre), z[rows], radius[rows])
     first, last = _needed(
-        crop, T, centre, z, radius, rows, fitted=height / 2, bottom=up <= 0.9, top=up >= -0.9
+        crop, discs, z[rows], fitted=height / 2, bottom=up <= 0.9, top=up >= -0.9
     )
+    first, last = int(rows[first]), int(rows[last])
     if last - first < 3:
         return None
     z, radius = z[first : last + 1], radius[first : last + 1]
@@ -104,13 +106,30 @@ def _with_rim(z: Float[np.ndarray, "k"], radius: Float[np.ndarray, "k"]) -> Floa
     return out
 
 
-def _needed(
+def _discs(
     crop: SilhouetteCrop,
     T_world_obj: Float[np.ndarray, "4 4"],
-    centre: Float[np.ndarray, "3"],
     z: Float[np.ndarray, "k"],
     radius: Float[np.ndarray, "k"],
-    rows: np.ndarray,
+) -> Bool[np.ndarray, "k i j"]:
+    """Return the silhouette of each disc, at its height and of its radius along the axis of a pose."""
+    angles = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
+    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(_AROUND)], axis=1)
+    discs = []
+    for height, wide in zip(z, radius, strict=True):
+        points = wide * ring + np.array([0.0, 0.0, height])
+        pixels = crop.pixels(points @ T_world_obj[:3, :3].T + T_world_obj[:3, 3])
+        picture = np.zeros(crop.mask.shape, np.uint8)
+        if np.isfinite(pixels).all():
+            fill(picture, in_parts(pixels))
+        discs.append(picture > 0)
+    return np.array(discs)
+
+
+def _needed(
+    crop: SilhouetteCrop,
+    stack: Bool[np.ndarray, "k i j"],
+    z: Float[np.ndarray, "k"],
     *,
     fitted: float,
     bottom: bool,
@@ -120,25 +139,14 @@ def _needed(
 
     `fitted` is half that height: the base of a bowl that lies on its mouth is seen within the outline, which does not need it.
     """
-    angles = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
-    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(_AROUND)], axis=1)
-    discs = []
-    for k in rows.tolist():
-        points = radius[k] * ring + np.array([0.0, 0.0, z[k]])
-        pixels = crop.pixels(points @ T_world_obj[:3, :3].T + centre)
-        picture = np.zeros(crop.mask.shape, np.uint8)
-        if np.isfinite(pixels).all():
-            fill(picture, in_parts(pixels))
-        discs.append(picture > 0)
-    stack = np.array(discs)
     covers = stack.sum(axis=0)
     allowed = 0.006 * float(crop.mask.sum())
-    first, last = 0, len(rows) - 1
+    first, last = 0, len(z) - 1
     for end, step in ((last, -1), (first, 1)):
         if not (top if step < 0 else bottom):
             continue
         k, lost, left = end, 0.0, covers.copy()
-        while 0 <= k < len(rows) and abs(z[rows[k]]) > fitted:
+        while 0 <= k < len(z) and abs(z[k]) > fitted:
             left = left - stack[k]
             lost = float(((left == 0) & (covers > 0) & crop.mask).sum())
             if lost > allowed:
@@ -147,5 +155,5 @@ def _needed(
         if step < 0:
             last = max(k, 0)
         else:
-            first = min(k, len(rows) - 1)
-    return int(rows[first]), int(rows[max(last, first)])
+            first = min(k, len(z) - 1)
+    return first, max(last, first)
