@@ -124,14 +124,7 @@ def table_from_depth(
     rays = np.stack([u + 0.5, v + 0.5, np.ones(len(u))], axis=1) @ np.linalg.inv(K).T
     inverse = 1 / depth_m.ravel()[spots]
     # On the plane n . X = -height with X = depth * ray, the inverse depth is linear in the ray: ray . (n / -height).
-    triples = rng.integers(0, len(spots), (_HYPOTHESES, 3))
-    solvable = np.abs(np.linalg.det(rays[triples])) > 1e-9
-    if not solvable.any():
-        return None
-    slopes = np.linalg.solve(rays[triples][solvable], inverse[triples][solvable][..., None])[
-        ..., 0
-    ]
-    slopes = slopes[[_may_be_table(s, max_roll_rad) for s in slopes]]
+    slopes = _hypotheses(rays, inverse, max_roll_rad, rng)
     if not len(slopes):
         return None
     # |depth - plane's depth| / depth = |1 - inverse / plane's inverse|
@@ -159,6 +152,22 @@ def table_from_depth(
         pitch_rad=float(np.arcsin(np.clip(-normal[2], -1, 1))),
         roll_rad=float(np.arctan2(-normal[0], -normal[1])),
     )
+
+
+def _hypotheses(
+    rays: Float[np.ndarray, "n 3"],
+    inverse: Float[np.ndarray, "n"],
+    max_roll_rad: float,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "k 3"]:
+    """Return the planes through three pixels each that a table can be, as inverse depth per ray."""
+    triples = rng.integers(0, len(rays), (_HYPOTHESES, 3))
+    solvable = np.abs(np.linalg.det(rays[triples])) > 1e-9
+    if not solvable.any():
+        return np.zeros((0, 3))
+    slopes = np.linalg.solve(rays[triples][solvable], inverse[triples][solvable][..., None])
+    slopes = slopes[..., 0]
+    return slopes[[_may_be_table(slope, max_roll_rad) for slope in slopes]]
 
 
 def _may_be_table(slope: Float[np.ndarray, "3"], max_roll_rad: float) -> bool:

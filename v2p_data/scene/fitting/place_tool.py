@@ -67,11 +67,10 @@ def place_tool(
         if s.masks[i].any() and s.quality[i] > _LEAST_QUALITY
     ] or [s.at]
     few = np.unique(np.linspace(0, len(seen) - 1, _MOST_VIEWS).round().astype(int))
-    views = []
-    for i in (seen[k] for k in few):
-        views.append(
-            (i, Silhouette(s.masks[i], unknown_around(seen_in.working, thing, s, i), camera))
-        )
+    views = [
+        (i, Silhouette(s.masks[i], unknown_around(seen_in.working, thing, s, i), camera))
+        for i in (seen[k] for k in few)
+    ]
     size, spread = (s.known_m, _NO_SPREAD) if s.known_m else (s.noun.size_m, s.noun.spread)
     held = fit_tool_pose(views, push, s.noun, three(np.array(size) / height_m), spread)
     fit = held.fit

@@ -17,6 +17,14 @@ from v2p_data.scene.frames.colour import histogram, lab_of, likelihood, shadow, 
 from v2p_data.scene.frames.mask_ops import DRAWN_OFF_PX, bounding_box, grow, iou, is_cut, tidy
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.tool_pieces import (
+    LEAST_PX,
+    ToolFrame,
+    ToolPiece,
+    connected_pieces,
+    pieces_in,
+    ratings_of,
+)
 from v2p_data.scene.scale.camera_height import px_per_m
 from v2p_data.scene.scale.nouns import Noun
 
@@ -26,25 +34,24 @@ _DARKEST_SHADOW = 0.38
 """Of the bare table's lightness: what a room reflects lights even shadows; dark tools are darker."""
 _HUE_LOST = 0.1
 """Lab per step of lightness: overexposed tables have lost the hue that their shadows show."""
-_HALF_WIDTHS_PX = (2, 3, 5, 8, 12)
-"""Of what is cut off what passes, so that thinner things are left, at working size."""
-_COLOURS = (2, 3, 4)
-"""Into so many kinds of colour what passes is split."""
-_LEAST_PX = 40
 _MOST_SHARE = 0.15
-"""Of the picture."""
+"""Greatest share of the picture that a tool covers."""
 _LOOKS = 24
-"""Frames in which the tool is searched."""
-_KEPT, _EXTENDED = 8, 5
-"""Pieces of a frame that are kept, and that are prolonged along their line."""
+"""Number of frames in which the tool is searched."""
+_KEPT = 8
+"""Number of a frame's pieces that are kept."""
+_EXTENDED = 5
+"""Number of a frame's pieces that are prolonged along their line."""
 _LEAST_ALIKE = 0.4
-"""Pieces of a chain that look less like its best one are something else."""
-_LEAST_IN_BOX, _AS_GOOD_AS_FILLED = 0.3, 0.85
-"""Overlap with a drawn box that a piece must have, and from which on more says nothing: people draw a little off."""
+"""Likeness to the best piece of a chain, 0 to 1, below which another piece is something else."""
+_LEAST_IN_BOX = 0.3
+"""Overlap with a drawn box that a piece must have."""
+_AS_GOOD_AS_FILLED = 0.85
+"""Overlap with a drawn box from which more says nothing: people draw a little off."""
 _BESIDE_BOX = 0.3
-"""Where a user drew a box, all else counts by this exponent."""
+"""Exponent of all other ratings where a user drew a box."""
 _MOSTLY_PASSES = 0.7
-"""Of a strip across the box, for it to be what passes there."""
+"""Share of a strip across the box that must pass, for the strip to be the tool."""
 _MARKED_WORTH = 10.0
 """What a piece of the frame that a user marked adds to a chain beside its rating: the chain goes through there."""
 _FILLS_WORTH = 3.0
@@ -66,34 +73,6 @@ class HeldTool:
     sure: float
     why: str
     """What speaks most against it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Frame:
-    """What passes in one frame, and what is known there."""
-
-    rgb: UInt8[np.ndarray, "h w 3"]
-    lab: Float32[np.ndarray, "h w 3"]
-    passing: Bool[np.ndarray, "h w"]
-    shaded: Bool[np.ndarray, "h w"]
-    hand: Float32[np.ndarray, "h w"]
-    """Probability."""
-    moved: Float32[np.ndarray, "h w"]
-    pushed: Bool[np.ndarray, "h w"]
-    away_px: Float32[np.ndarray, "h w"]
-    """From what is pushed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Piece:
-    mask: Bool[np.ndarray, "h w"]
-    parts: dict[str, float]
-    """What its rating is the product of, each 0 to 1."""
-    hist: Float[np.ndarray, "l a b"]
-
-    @property
-    def rating(self) -> float:
-        return float(np.prod(list(self.parts.values())))
 
 
 def find_tool(
@@ -157,14 +136,14 @@ def _sureness(ratings: list[float]) -> float:
     return float(np.clip(seen * 1.4 * np.sqrt(np.median(ratings)), 0, 1))
 
 
-def _alike(piece: _Piece, best: _Piece) -> float:
+def _alike(piece: ToolPiece, best: ToolPiece) -> float:
     """Return how much a piece looks like the best one, 0 to 1: the picture's edge may cut it, and a hand hide some."""
     ratio = abs(float(np.log(_area_beside(piece, best) / best.mask.sum())))
     ratio = max(0.0, ratio - 0.3)
     return similarity(piece.hist, best.hist) * float(np.exp(-0.5 * (ratio / 0.6) ** 2))
 
 
-def _area_beside(piece: _Piece, best: _Piece) -> float:
+def _area_beside(piece: ToolPiece, best: ToolPiece) -> float:
     """Return a piece's area, as the best one's where the picture's edge cuts it: nobody knows how large it is."""
     own, other = float(piece.mask.sum()), float(best.mask.sum())
     return max(own, other) if is_cut(piece.mask) else own
@@ -186,10 +165,10 @@ def _frame(
     pushed: Bool[np.ndarray, "time h w"],
     background: Float32[np.ndarray, "h w 3"],
     i: int,
-) -> _Frame:
+) -> ToolFrame:
     lab, shares = working.lab[i], segmentation.at(i)
     passing = np.linalg.norm(lab - background, axis=-1) > _PASSING_LAB
-    return _Frame(
+    return ToolFrame(
         rgb=working.rgb[i],
         lab=lab,
         passing=passing & ~grow(pushed[i], 1),
@@ -202,12 +181,12 @@ def _frame(
 
 
 def _best_pieces(
-    frame: _Frame, usual_px: tuple[float, ...], box: Bool[np.ndarray, "h w"] | None
-) -> list[_Piece]:
+    frame: ToolFrame, usual_px: tuple[float, ...], box: Bool[np.ndarray, "h w"] | None
+) -> list[ToolPiece]:
     """Return the best of what passes that may be a thing of its own; `usual_px` is (length, width) [px]."""
-    pieces: list[_Piece] = []
+    pieces: list[ToolPiece] = []
     for passing in (frame.passing & ~frame.shaded, frame.passing):
-        for mask in _cut(passing, frame):
+        for mask in pieces_in(passing, frame):
             _add(pieces, frame, passing, mask, usual_px, box)
         best = sorted(pieces, key=lambda piece: -piece.rating)[:_EXTENDED]
         for piece in best:
@@ -218,14 +197,14 @@ def _best_pieces(
             _add(pieces, frame, frame.passing, mask, usual_px, box)
         inside = grow(box, DRAWN_OFF_PX)
         for piece in sorted(pieces, key=lambda piece: -piece.rating)[:_EXTENDED]:
-            for part in _connected(piece.mask & inside):
+            for part in connected_pieces(piece.mask & inside):
                 _add(pieces, frame, frame.passing, part, usual_px, box)
     return sorted(pieces, key=lambda piece: -piece.rating)[:_KEPT]
 
 
 def _add(
-    pieces: list[_Piece],
-    frame: _Frame,
+    pieces: list[ToolPiece],
+    frame: ToolFrame,
     passing: Bool[np.ndarray, "h w"],
     mask: Bool[np.ndarray, "h w"],
     usual_px: tuple[float, ...],
@@ -236,15 +215,15 @@ def _add(
         (mask & other.mask).sum() > 0.93 * (mask | other.mask).sum() for other in pieces
     ):
         return
-    parts = _parts(frame, passing, mask, usual_px)
+    parts = ratings_of(frame, passing, mask, usual_px)
     if box is not None:
         parts |= {name: part**_BESIDE_BOX for name, part in parts.items()}
         parts["in the box"] = min(1.0, _fills(mask, box) / _AS_GOOD_AS_FILLED)
-    pieces.append(_Piece(mask=mask, parts=parts, hist=histogram(frame.rgb[mask])))
+    pieces.append(ToolPiece(mask=mask, parts=parts, hist=histogram(frame.rgb[mask])))
 
 
 def _along(
-    frame: _Frame,
+    frame: ToolFrame,
     passing: Bool[np.ndarray, "h w"],
     mask: Bool[np.ndarray, "h w"],
     usual_px: tuple[float, ...],
@@ -269,7 +248,7 @@ def _along(
 
 
 def _across(
-    frame: _Frame, box: Bool[np.ndarray, "h w"], usual_px: tuple[float, ...]
+    frame: ToolFrame, box: Bool[np.ndarray, "h w"], usual_px: tuple[float, ...]
 ) -> Iterator[Bool[np.ndarray, "h w"]]:
     """Yield what passes along the two diagonals of the box: something straight and thin that fills it lies along one of them."""
     x, y, w, h = bounding_box(box)
@@ -281,13 +260,13 @@ def _across(
         strip = np.zeros(box.shape, np.uint8)
         cv2.line(strip, *ends, 1, wide)
         passes = (strip > 0) & passing
-        if passes.sum() >= max(_LEAST_PX / 2, _MOSTLY_PASSES * strip.sum()):
+        if passes.sum() >= max(LEAST_PX / 2, _MOSTLY_PASSES * strip.sum()):
             yield passes
 
 
 def _best_chain(
-    working: WorkingClip, frames: list[int], pieces: list[list[_Piece]]
-) -> dict[int, _Piece]:
+    working: WorkingClip, frames: list[int], pieces: list[list[ToolPiece]]
+) -> dict[int, ToolPiece]:
     """Return the pieces, by working frame, that are together the best."""
     total = [np.array([_worth(piece) for piece in here] + [0.0]) for here in pieces]
     came = [np.zeros(len(values), int) for values in total]
@@ -309,92 +288,14 @@ def _best_chain(
     return chain
 
 
-def _worth(piece: _Piece) -> float:
+def _worth(piece: ToolPiece) -> float:
     """Return what a piece adds to a chain: less than nothing where it is rated low."""
     marked = piece.parts.get("in the box")
     said = 0.0 if marked is None else _MARKED_WORTH + _FILLS_WORTH * marked
     return piece.rating**0.5 - _LEAST_WORTH + said
 
 
-def _cut(passing: Bool[np.ndarray, "h w"], frame: _Frame) -> Iterator[Bool[np.ndarray, "h w"]]:
-    """Yield what passes, its thin parts, what the network says is moved of it, and its parts of one colour."""
-    yield from _connected(passing)
-    for half_width in _HALF_WIDTHS_PX:
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * half_width + 1,) * 2)
-        thick = cv2.morphologyEx(passing.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0
-        thin = passing & ~grow(thick, 1)
-        yield from _connected(tidy(thin) if half_width > 2 else thin)
-    yield from _connected(tidy((frame.moved > 0.5) & grow(passing, 1)))
-    pixels = frame.lab[passing]
-    if len(pixels) < _LEAST_PX:
-        return
-    cv2.setRNGSeed(3)
-    for count in _COLOURS:
-        sample = np.ascontiguousarray(pixels[:: max(1, len(pixels) // 2000)])
-        if len(sample) < count:
-            return
-        _, _, centres = cv2.kmeans(
-            sample, count, np.empty(0), (3, 12, 1.0), 1, cv2.KMEANS_PP_CENTERS
-        )
-        nearest = np.linalg.norm(pixels[:, None] - centres[None], axis=-1).argmin(1)
-        for k in range(count):
-            alike = np.zeros_like(passing)
-            alike[passing] = nearest == k
-            yield from _connected(tidy(alike, 5))
-
-
-def _connected(mask: Bool[np.ndarray, "h w"]) -> Iterator[Bool[np.ndarray, "h w"]]:
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    for k in range(1, count):
-        if stats[k, cv2.CC_STAT_AREA] >= _LEAST_PX:
-            yield parts == k
-
-
-def _parts(
-    frame: _Frame,
-    passing: Bool[np.ndarray, "h w"],
-    mask: Bool[np.ndarray, "h w"],
-    usual_px: tuple[float, ...],
-) -> dict[str, float]:
-    """Return what speaks for a piece being the tool, each 0 to 1."""
-    area = float(mask.sum())
-    y, x = np.nonzero(mask)
-    sides = cv2.minAreaRect(np.stack([x, y], 1).astype(np.float32))[1]
-    length, across = max(sides) + 1, min(sides) + 1
-    width = area / length
-    usual_length, usual_width = usual_px[0], max(usual_px[1], 2.0)
-    # A spoon is as wide as its noun says at its bowl only.
-    mean_width = usual_width if usual_length > 6 * usual_width else 0.45 * usual_width
-    x0, y0, w, h = bounding_box(mask)
-    inner = np.pad(mask[y0 : y0 + h, x0 : x0 + w].astype(np.uint8), 1)
-    thickest = 2 * float(cv2.distanceTransform(inner, cv2.DIST_L2, 5).max()) - 1
-    ring = grow(mask, 2) & ~mask & ~frame.pushed
-    around = passing & ~mask & (frame.hand > 0.5)
-    near = around & grow(mask, 20)
-    hand = near if near.sum() > 100 else around
-    unlike = 0.6
-    if hand.sum() > 100:
-        alike = similarity(histogram(frame.rgb[mask]), histogram(frame.rgb[hand]))
-        unlike = float(np.clip(1.15 - alike, 0.15, 1))
-    reach = 0.25 * np.sqrt(float(frame.pushed.sum())) + 3
-    return {
-        "long": float(np.clip((length / width - 1.5) / 4, 0.02, 1)),
-        "straight": min(1.0, area / (length * across) / 0.5),
-        "at the thing": float(np.exp(-max(0.0, float(frame.away_px[mask].min()) - 3) / reach)),
-        "end on": float(np.clip(1.4 - 1.6 * (frame.away_px[mask] <= 5).mean(), 0.05, 1)),
-        "usual width": _within(width / mean_width, 0.4, 0.4),
-        "not thick": _within(max(1.0, thickest / usual_width), 0.4, 0.5),
-        "usual length": _within(length / (0.7 * usual_length), 0.5, 0.5),
-        "stands out": float(np.clip(1 - 1.2 * passing[ring].mean(), 0.1, 1))
-        if ring.any()
-        else 0.5,
-        "no shadow": float(1 - 0.9 * frame.shaded[mask].mean()),
-        "no hand": float(1 - 0.45 * frame.hand[mask].mean()),
-        "unlike the hand": unlike,
-    }
-
-
-def _likeness(before: _Piece, after: _Piece, moved: Bool[np.ndarray, "h w"]) -> float:
+def _likeness(before: ToolPiece, after: ToolPiece, moved: Bool[np.ndarray, "h w"]) -> float:
     """Return how much two frames' pieces look like one thing, 0 to 1; `moved` is the first where flow takes it."""
     ratio = float(np.log(after.mask.sum() / before.mask.sum()))
     if is_cut(before.mask) or is_cut(after.mask):
@@ -424,8 +325,3 @@ def _fills(mask: Bool[np.ndarray, "h w"], box: Bool[np.ndarray, "h w"]) -> float
     x, y, w, h = bounding_box(mask)
     own[y : y + h, x : x + w] = True
     return iou(own, box)
-
-
-def _within(ratio: float, free: float, sd: float) -> float:
-    """Return 1 for a ratio near one, less beyond exp(`free`) either way."""
-    return float(np.exp(-0.5 * (max(0.0, abs(float(np.log(ratio))) - free) / sd) ** 2))

@@ -33,15 +33,12 @@ def inflation(view: SilhouetteView, crop: SilhouetteCrop, size_m: Size) -> MeshH
     lengths = [s for s, up in zip(size_m, np.abs(T[2, :3]), strict=True) if up < 0.7]
     lies = tall < _FLAT * max(lengths, default=tall)
     thin = tall if lies else min([*lengths, tall])
-    eye = crop.camera.T_world_cam[:3, 3]
-    ahead = T[:3, 3] - eye
-    tilt = float(np.arctan2(-ahead[2], np.hypot(ahead[0], ahead[1])))
-    forward = np.array([ahead[0], ahead[1], 0.0]) / max(float(np.hypot(*ahead[:2])), 1e-9)
-    up = np.array([0.0, 0.0, 1.0])
+    tilt, forward = _line_of_sight(crop, T[:3, 3])
     if not 0.1 < tilt < 1.45:
         lies = lies or tilt >= 1.45
-    right = np.cross(forward, up)
     slant = 1 / np.tan(max(tilt, 0.1)) if lies else np.tan(min(tilt, 1.45))
+    up = np.array([0.0, 0.0, 1.0])
+    right = np.cross(forward, up)
     axes = np.stack([right, forward, up] if lies else [right, up, -forward], axis=1)
     cap, px = thin / 2, 1.6 * float(np.linalg.norm(size_m)) / _PLANE_PX
     origin = np.array([T[0, 3], T[1, 3], cap if lies else 0.0])
@@ -66,13 +63,7 @@ def inflation(view: SilhouetteView, crop: SilhouetteCrop, size_m: Size) -> MeshH
             break
         if not lies:
             origin += _ground_shift(crop, drawn, forward) * forward
-        # Where the silhouette is too large the outline shrinks by as much, and the other way round.
-        spots = np.nan_to_num(crop.pixels(plane), nan=0.0).astype(np.float32) - 0.5
-        wrong = cv2.remap(
-            goal - _signed(drawn), spots[..., 0], spots[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )  # fmt: skip
-        scale = float(np.abs(np.diff(spots[_PLANE_PX // 2, :, 0])).mean())
-        field = field + 0.8 * np.clip(wrong / max(scale, 0.2), -8, 8)
+        field = field + _correction(crop, drawn, goal, plane)
     turn = _along(mesh) if lies else _UPRIGHT
     T_world_mesh = T_world_plane @ transform(turn, np.zeros(3))
     solids = [turned(solid, turn.T) for solid in (mesh, *parts)]
@@ -89,6 +80,30 @@ def inflation(view: SilhouetteView, crop: SilhouetteCrop, size_m: Size) -> MeshH
         parts=tuple(solids[1:]),
         T_obj_shape=inverse(T) @ T_world_mesh,
     )
+
+
+def _correction(
+    crop: SilhouetteCrop,
+    drawn: Bool[np.ndarray, "i j"],
+    goal: Float[np.ndarray, "i j"],
+    plane: Float[np.ndarray, "p q 3"],
+) -> Float[np.ndarray, "p q"]:
+    """Return by how much the outline in the plane grows or shrinks, where the silhouette is too small or too large."""
+    spots = np.nan_to_num(crop.pixels(plane), nan=0.0).astype(np.float32) - 0.5
+    wrong = cv2.remap(
+        goal - _signed(drawn), spots[..., 0], spots[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )  # fmt: skip
+    scale = float(np.abs(np.diff(spots[_PLANE_PX // 2, :, 0])).mean())
+    return 0.8 * np.clip(wrong / max(scale, 0.2), -8, 8)
+
+
+def _line_of_sight(
+    crop: SilhouetteCrop, spot: Float[np.ndarray, "3"]
+) -> tuple[float, Float[np.ndarray, "3"]]:
+    """Return how far below the horizon the camera sees a place [rad], and the level direction there."""
+    ahead = spot - crop.camera.T_world_cam[:3, 3]
+    tilt = float(np.arctan2(-ahead[2], np.hypot(ahead[0], ahead[1])))
+    return tilt, np.array([ahead[0], ahead[1], 0.0]) / max(float(np.hypot(*ahead[:2])), 1e-9)
 
 
 def _along_fit(

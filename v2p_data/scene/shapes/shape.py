@@ -93,11 +93,7 @@ def best_shape(
     """
     cfg = cfg or ShapeConfig()
     crops = [SilhouetteCrop(view, camera) for view in views]
-    primitive = _primitive(size_m, noun)
-    if is_spoon(noun):
-        held, other = spoons(size_m, views[0].T_world_obj)
-        gain = iou_of(other, views, crops) - iou_of(held, views, crops)
-        primitive = other if gain > _OTHER_END else held
+    primitive = _spoon(views, crops, size_m) if is_spoon(noun) else _primitive(size_m, noun)
     plain = iou_of(primitive, views, crops)
     hidden = crops[0].hidden_share(crops[0].drawn(primitive.mesh, views[0].T_world_obj))
     best, best_iou, best_gain = primitive, plain, 0.0
@@ -146,6 +142,15 @@ def _primitive(size_m: Size, noun: Noun) -> MeshHypothesis:
         parts=parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
         T_obj_shape=np.eye(4),
     )
+
+
+def _spoon(
+    views: Sequence[SilhouetteView], crops: list[SilhouetteCrop], size_m: Size
+) -> MeshHypothesis:
+    """Return the spoon with its bowl at the end that covers the outlines better."""
+    held, other = spoons(size_m, views[0].T_world_obj)
+    gain = iou_of(other, views, crops) - iou_of(held, views, crops)
+    return other if gain > _OTHER_END else held
 
 
 def _others(
