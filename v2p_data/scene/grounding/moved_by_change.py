@@ -1,8 +1,7 @@
-"""Which pixels are the thing that moved, where it was first and last, and which are the other thing in the caption.
+"""Which pixels are the moved object at the start and at the end, from what changed between the two.
 
-What moved leaves two marks in a static picture: at its origin, edges that vanish; at its destination, edges that
-appear. Candidate blobs come from several views of that change and are scored by hand-set weights; colour words are the
-strongest cue, the vanishing edge second. The best score is also the gate: below about 4.5 most findings were wrong.
+A moved object leaves two marks in a still picture: edges that vanish where it was, and edges that appear where it goes. Candidates of both
+ends (`change_blobs`) are rated by weights set by hand, and the best pair is taken. Below a score of about 4.5 most findings were wrong.
 """
 
 from dataclasses import dataclass, field

@@ -1,7 +1,7 @@
-"""Which pixels are the thing that moved and which are the others, from the scene network: the default way.
+"""Which pixels are the moved object at the start and at the end, from what the scene network sees: the default way.
 
-The network says of every pixel what it is; this module cuts that into things, takes those that fit the caption, and
-says from 0 to 1 how sure that is and why not surer.
+The network's class `moved` is cut into blobs at both ends. Pairs of blobs are rated by how well they fit the caption and each other; the
+product of the cues, 0 to 1, is the score, and the weakest cue is its reason.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""Which of the things that stand there is the one that the caption names, from what the scene network sees.
+"""Which static object the caption means, from what the scene network sees.
 
-The network says of every pixel in every frame whether it shows a thing that never moved. That is cut into candidates, and
-cues - how large each is, of which colour, where - say which of them is meant. How much each cue counts was learned from
-drawn clips (`scripts/train_standing.py`); the weights lie beside this file.
+The network says of every pixel in every frame whether it shows an object that never moved. That is cut into candidates. Cues, such as
+size, colour and place, say which candidate is meant. What each cue counts was learned from drawn clips
+(`scripts/train_standing.py`); the weights are `standing.json` beside this file.
 """
 
 import json
