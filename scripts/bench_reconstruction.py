@@ -44,17 +44,8 @@ import trimesh
 from jaxtyping import Bool, UInt8
 
 from drawn_clips.clips import MotionKind, VideoSpec, drawing_code, random_spec, render
-from drawn_clips.score import (
-    STAGES,
-    FoundClip,
-    Symmetry,
-    TrueClip,
-    TrueThing,
-    found_of,
-    rejected,
-    score_clip,
-    shown_at,
-)
+from drawn_clips.score import found_of, rejected, score_clip, shown_at
+from drawn_clips.score_types import STAGES, FoundClip, TrueClip, TrueThing
 from drawn_clips.truth import Truth, load_truth, write
 from policies.evaluation.rate import wilson
 from v2p_data.errors import ItemRejectedError
@@ -65,6 +56,7 @@ from v2p_data.scene.data_types import Reconstruction
 from v2p_data.scene.frames.working_clip import WIDTH_PX
 from v2p_data.scene.reconstruct import reconstruct
 from v2p_data.scene.scale.shared_camera import filmed
+from v2p_data.scene.schema import Symmetry
 from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos
 from v2p_data.video.clip import Clip

@@ -36,7 +36,7 @@ from v2p_data.seeds import rng_for
 
 NUM_MASKS = 16
 """Evenly spaced frames whose masks are kept."""
-_NOT_DRAWING = ("__init__.py", "score.py")
+_NOT_DRAWING = ("__init__.py", "score.py", "score_types.py", "shape_overlap.py")
 """Files of this package that change no clip."""
 
 

@@ -8,20 +8,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from drawn_clips.score import (
-    FoundClip,
-    FoundThing,
-    TrueClip,
-    TrueThing,
-    found_of,
-    opening,
-    rejected,
-    score_clip,
-    shape_ious,
-    shown_at,
-    size_sides,
-    turn_between,
-)
+from drawn_clips.score import found_of, rejected, score_clip, shown_at, size_sides, turn_between
+from drawn_clips.score_types import FoundClip, FoundThing, TrueClip, TrueThing
+from drawn_clips.shape_overlap import opening, shape_ious
 from v2p_data.geometry.mesh import mesh_for
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Estimate, Reconstruction

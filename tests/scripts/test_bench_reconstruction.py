@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from drawn_clips.camera import View
-from drawn_clips.score import TrueClip, TrueThing
+from drawn_clips.score_types import TrueClip, TrueThing
 from v2p_data.geometry.camera import Camera, intrinsics
 
 
