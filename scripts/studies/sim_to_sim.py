@@ -39,11 +39,8 @@ def flags(row: Row, key: str = "once") -> np.ndarray:
 
 def rates_table(rows: list[Row]) -> str:
     """Return success once (and at the end) by policy, task and place."""
-    places = [
-        p
-        for p in ("training", "twin", "twin_raw", "tracked")
-        if any(r["place"] == p for r in rows)
-    ]
+    order = ("training", "twin", "twin_hasty", "twin_raw", "tracked")
+    places = [p for p in order if any(r["place"] == p for r in rows)]
     lines = [
         "**Sim-to-sim: success once [95 %], at the end in brackets**",
         "",
