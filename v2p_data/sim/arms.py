@@ -199,7 +199,7 @@ def read_arm(cfg: RobotConfig, physics: PhysicsConfig, servo: ServoConfig) -> Ar
     _prepare(spec, cfg, names, servo)
     _prepare_geoms(spec, cfg, [model.body(b).name for b in chain], kind, physics)
     base = np.eye(4)
-    base[:3, :3] = Rotation.from_euler("z", cfg.base_yaw_rad).asmatrix_from_quat()
+    base[:3, :3] = Rotation.from_euler("z", cfg.base_yaw_rad).as_matrix()
     base[:3, 3] = cfg.base_pos_m
     return ArmFile(
         cfg=cfg,
@@ -249,7 +249,7 @@ class Kinematics:
         """Return the tool's state from joint angles and speeds."""
         R, pos, jacobian = self._forward(qpos)
         twist = np.einsum("njk,nk->nj", jacobian, qvel)
-        quat = Rotation.frommatrix_from_quat(np.nan_to_num(R)).as_quat(scalar_first=True)
+        quat = Rotation.from_matrix(np.nan_to_num(R)).as_quat(scalar_first=True)
         return ToolState(
             pos=pos,
             rotation=R,
@@ -276,7 +276,7 @@ class Kinematics:
         error = np.full((len(pos), 6), np.inf)
         for _ in range(IK_STEPS):
             R, at, jacobian = self._forward(qpos)
-            turn = (wanted * Rotation.frommatrix_from_quat(R).inv()).as_rotvec()
+            turn = (wanted * Rotation.from_matrix(R).inv()).as_rotvec()
             error = np.concatenate([pos - at, turn], axis=1)
             if np.abs(error).max() < 1e-9:
                 break
@@ -460,7 +460,7 @@ def _turns(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _quat(R: np.ndarray) -> np.ndarray:
-    return Rotation.frommatrix_from_quat(R).as_quat(scalar_first=True)
+    return Rotation.from_matrix(R).as_quat(scalar_first=True)
 
 
 def sensor_ends(arm: ArmFile | None, pads: Iterable[str]) -> list[str]:
