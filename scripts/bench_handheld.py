@@ -181,7 +181,7 @@ def _outcome(row: Row) -> str:
 
 
 def _table_spots(truth: Truth) -> Float[np.ndarray, "n 2"]:
-    """Return a grid of the first picture's pixels that show bare table or what stands on it."""
+    """Return a grid of the first picture's pixels that show the bare table or objects on it."""
     w, h = truth.camera.width_px, truth.camera.height_px
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 24), np.linspace(0, h - 1, 18)), -1)
     spots = grid.reshape(-1, 2)

@@ -136,7 +136,7 @@ class PlacedObject:
     hidden_in_hand: bool = False
     """Whether a hand hides it from the camera: then its poses go with the hand."""
     unseen: bool = False
-    """Whether nothing shows where it ends: then it lies in the middle of what swallowed it."""
+    """Whether nothing shows where it ends: then it is put in the middle of its container."""
     log_growth: float = 0.0
     """Logarithm of how much larger it seems where it starts than where it ends, if it lies on the table at both: what is held
     in the air is nearer to the camera, and seems larger."""

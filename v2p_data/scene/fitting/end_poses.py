@@ -176,7 +176,7 @@ def _top_of(own: Float[np.ndarray, "3"], other_fit: Fit) -> tuple[float, Within]
 
 
 def _inside(fit: Fit, support: float, within: Within) -> Fit:
-    """Return a pose in the middle of what swallowed it: deep bins hide what lies in them."""
+    """Return a pose in the middle of the container: deep bins hide their content."""
     rest = rest_of(fit.T_world_obj[:3, :3])
     height = support + float(np.abs(rest[2]) @ np.array(fit.size) / 2)
     return replace(fit, T_world_obj=transform(rest, np.array([*within.xy, height])))

@@ -36,7 +36,7 @@ class FitPlan:
 TOOL = FitPlan(slides=True)
 """For what a hand moves beside the manipulated object."""
 STATIC = FitPlan()
-"""For what stands still."""
+"""For static objects."""
 
 
 def plan_of(kind: Kind) -> FitPlan:

@@ -54,7 +54,7 @@ _CLEARLY_BETTER = 1.3
 _LEAST_LINKED = 0.6
 """Share of the frames that must be linked to the first one itself."""
 _MOST_LOST = 0.15
-"""Share of the frames that may have no link at all: blurred ones, whose motion is what lies between their neighbours'."""
+"""Share of the frames that may have no link at all: blurred ones, whose motion is interpolated."""
 _MOST_IN_A_ROW = 4
 """Frames without a link, one after the other."""
 
