@@ -15,5 +15,5 @@ def in_parts(pixels: Float[np.ndarray, "*n 2"]) -> Int32[np.ndarray, "*n 2"]:
 
 
 def fill(picture: UInt8[np.ndarray, "h w"], polygon: Int32[np.ndarray, "*n 2"]) -> None:
-    """Set what lies in a convex polygon, given as by `in_parts`, to one."""
+    """Set the pixels in a convex polygon, given as by `in_parts`, to one."""
     cv2.fillConvexPoly(picture, polygon, 1, cv2.LINE_8, _BITS)

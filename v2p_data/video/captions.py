@@ -7,7 +7,7 @@ same folder (`labels.py`), else from the file's own name:
      "push.mp4": {"caption": "Pushing blue box next to can", "objects": ["blue box", "can"],
                   "hints": {"can": {"frame": 0, "box": [310, 120, 380, 240], "size_m": [0.066, 0.066, 0.12]}}}}
 
-A hint marks one object: `box` and `points` in one `frame`, `size_m`, or the `name` of what is meant where the
+A hint marks one object: `box` and `points` in one `frame`, `size_m`, or the `name` of the object where the
 caption's words do not say it.
 """
 

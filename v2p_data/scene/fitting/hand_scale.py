@@ -1,4 +1,4 @@
-"""A hand as a ruler: how large it looks where it touches what stands on the table says how high the camera stands.
+"""A hand as a ruler: how large it looks where it touches an object on the table says how high the camera stands.
 
 Hands differ by a few percent, household things by far more. How far away a hand is, one view does not show, but it shows
 where a hand touches a thing at rest: as far as the thing's foot. There a small network looks at the hand alone, in a window
@@ -33,7 +33,7 @@ REACH_M = 0.25
 """The end of a hand that touches a thing is no farther than this from the thing's foot."""
 WINDOW_M, _WINDOW_PX = 0.28, 112
 TOWARDS_ARM = 0.25
-"""Of the window: it shows more of the hand than of what lies beyond its end."""
+"""Of the window: it shows more of the hand than of its surroundings."""
 _WIDTHS = (16, 32, 56, 96)
 TOUCHING_M = 0.02
 _IN_PLACE = 0.4
@@ -49,7 +49,7 @@ class HandView:
     """A hand that touches a thing at rest."""
 
     planes: Float32[np.ndarray, "4 112 112"]
-    """Its colours, nothing of what lies around it, and its outline."""
+    """Its colours, nothing of its surroundings, and its outline."""
     known: Float32[np.ndarray, "4"]
     """Camera's pitch [rad], how far the thing's foot lies under the picture's middle [picture widths], and where the foot is
     from the hand's end, (right, down) [windows]."""

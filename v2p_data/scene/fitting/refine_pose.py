@@ -54,7 +54,7 @@ def refine_pose(
 
     Args:
         view: the outline and the mesh's pose by the primitive [m].
-        T_first: the mesh's pose at first: what lies as it lay then mostly keeps its yaw.
+        T_first: the mesh's pose at first: an object that lies as it lay then mostly keeps its yaw.
         mesh: in its own frame [m].
         camera: of the mask.
         in_air: whether the object does not rest on anything.

@@ -47,7 +47,7 @@ class Segmentation:
 def segment_clip(clip: Clip, working: WorkingClip) -> Segmentation:
     """Return what the network sees in the clip's frames and in its two stills.
 
-    Where what moves is small, the network looks at it a second time, enlarged.
+    Where the moving objects are small, the network looks at it a second time, enlarged.
     """
     from v2p_data.scene.frames.network import classify  # torch takes a second to import
 
@@ -76,7 +76,7 @@ def _classify_enlarged(
     shares: Float32[np.ndarray, "n+2 5 h w"],
     camera: SeenCamera,
 ) -> SeenCamera:
-    """Replace the shares around what moves by what the network sees there at the clip's own resolution.
+    """Replace the shares around moving objects by those that the network sees there at the clip's own resolution.
 
     The window keeps its size and goes along. The last two shares are those of the stills, of the beginning and the end.
     Both looks say how much of the table the picture shows; the camera comes back with both in it.
@@ -145,7 +145,7 @@ class _Windows:
 
 
 def _windows(moved: Float32[np.ndarray, "n h w"]) -> _Windows | None:
-    """Return a part of each picture around what moves in it; None where that is most of it, or nothing."""
+    """Return a part of each picture around the moving objects; None where that is most of it, or nothing."""
     h, w = moved.shape[1:]
     boxes = np.full((len(moved), 4), np.nan)
     for k, plane in enumerate(moved):
@@ -171,7 +171,7 @@ def _windows(moved: Float32[np.ndarray, "n h w"]) -> _Windows | None:
 
 
 def share_at_first(segmentation: Segmentation) -> float | None:
-    """Return how much of the picture what moves covers at the beginning, where it only comes into the picture later.
+    """Return how much of the picture the moving object covers at the beginning, where it only comes into the picture later.
 
     None where it is there from the beginning, or not seen at the end.
     """

@@ -21,7 +21,7 @@ class Table:
     seen: Bool[np.ndarray, "h w"]
     """Pixels of the bare table."""
     hull: Bool[np.ndarray, "h w"]
-    """Convex hull of those: the table with what stands on it."""
+    """Convex hull of those: the table with the objects on it."""
     lab: Float32[np.ndarray, "h w 3"]
     """Colour the bare table has, or would have, at each pixel."""
     noise: float

@@ -53,7 +53,7 @@ class WorkingClip:
 
     @cached_property
     def lit(self) -> Float32[np.ndarray, "h w 3"]:
-        """Lab of the brightest that stands still at each pixel: what lies there when no shadow falls on it."""
+        """Lab of the brightest still colour at each pixel: the surface without a shadow."""
         stills = np.stack([lab_of(image) for image in self._stills])
         brightest = stills[..., 0].argmax(0)
         return np.take_along_axis(stills, brightest[None, ..., None], 0)[0]
@@ -67,7 +67,7 @@ class WorkingClip:
         return self.rgb.shape[1], self.rgb.shape[2]
 
     def hand(self, image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-        """Return pixels that look like the moving hand and not like what stands still here."""
+        """Return pixels that look like the moving hand and not like static objects here."""
         moving, still = likelihood(self.hand_hist, image), likelihood(self.rest_hist, image)
         hand = (moving > 2 * still + 1e-7) & self.arm(image)
         return hand & skin_prior(image) if self.skin_only else hand

@@ -180,7 +180,7 @@ def _is_said(phrase: str, clip: Clip) -> bool:
 def _tool(
     scene: _Scene, thing: ObjectTrack, mark: HintMask | None, tool_moved: Moved | None
 ) -> ObjectTrack | None:
-    """Return a tool: in a hand that brings it, else what moves as well, or what is marked, followed.
+    """Return a tool: in a hand that brings it, else the second moving object, or the marked one, followed.
 
     None where it is not found and the caption can do without.
 

@@ -169,7 +169,7 @@ def _ends(
     masks: list[Bool[np.ndarray, "h w"]] = []
     hand = hand_at(segmentation, i)
     for level in (_LIKELY, _POSSIBLE):
-        # Print on a thing and what lies in it break it up: gaps are closed, but not over the hand.
+        # Print on an object and its content break it up: gaps are closed, but not over the hand.
         whole = tidy(moved > level, _GAP_PX) & ~(hand & (moved < _POSSIBLE))
         count, parts, stats, _ = cv2.connectedComponentsWithStats(whole.astype(np.uint8))
         for k in range(1, count):

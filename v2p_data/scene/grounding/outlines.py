@@ -119,7 +119,7 @@ def filled(
 ) -> Bool[np.ndarray, "h w"]:
     """Return an outline completed `inside` of the box that somebody drew around it.
 
-    Only by what is seen as the same kind, moved or not: what moves may stand before something that does not.
+    Only by what is seen as the same kind, moved or not: a moving object may hide a static one.
     """
     own = max((MOVED, OTHER), key=lambda what: float(shares[what][mask].mean()))
     return completed(mask, np.where(inside, shares[own], 0))

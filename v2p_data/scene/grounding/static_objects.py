@@ -102,7 +102,7 @@ class StaticSearch:
 
     @property
     def late(self) -> bool:
-        """Whether what is meant is seen at the end only."""
+        """Whether the named object is seen at the end only."""
         return KINDS[self.kind].starts_over
 
     @cached_property
@@ -112,7 +112,7 @@ class StaticSearch:
 
     @cached_property
     def log_scale(self) -> float:
-        """By how much all seems larger than it is, as far as what moves seems too large for its kind by more than kinds vary."""
+        """By how much all seems larger than it is, as far as the moving object seems too large for its kind by more than kinds vary."""
         mask = self.ends[0]
         if not (self.moved.known and mask.any()):
             return 0.0
@@ -123,7 +123,7 @@ class StaticSearch:
 def find_static_object(search: StaticSearch) -> Found | None:
     """Return the thing that the phrase means, its score being how likely it is the right one; None where nothing stands.
 
-    It is the candidate from which most overlap with what is meant can be expected: a whole rather than its likelier half.
+    It is the candidate from which most overlap with the named object can be expected: a whole rather than its likelier half.
     """
     found = candidates(search)
     if not found:

@@ -25,7 +25,7 @@ _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 def inflation(view: SilhouetteView, crop: SilhouetteCrop, size_m: Size) -> MeshHypothesis | None:
     """Return the outline, seen in a plane through the object and inflated to the fit's thickness.
 
-    What lies is seen in a plane along the table, what stands in the upright plane that faces the camera.
+    A lying object is seen in a plane along the table, a standing one in the upright plane that faces the camera.
     """
     T = view.T_world_obj
     extents = np.abs(T[:3, :3]) @ np.array(size_m)
@@ -182,7 +182,7 @@ def _signed(picture: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 def _blown(
     outline: Bool[np.ndarray, "h w"], px: float, cap: float, *, stands: bool
 ) -> tuple[trimesh.Trimesh, tuple[trimesh.Trimesh, ...]] | None:
-    """Return the inflated outline; what stands ends at the picture's middle row, where the table is."""
+    """Return the inflated outline; a standing object ends at the picture's middle row, where the table is."""
     if outline.sum() < 60:
         return None
     if stands:

@@ -1,4 +1,4 @@
-"""The frame of a program: what stands at module level, imports, the one class, the heads of functions."""
+"""The frame of a program: statements at module level, imports, the one class, the heads of functions."""
 
 import ast
 
@@ -19,7 +19,7 @@ def read_program(tree: ast.Module) -> None:
 
 
 class _Program:
-    """Reads what stands outside the bodies of functions."""
+    """Reads the statements outside the bodies of functions."""
 
     def __init__(self, tree: ast.Module) -> None:
         self.tree = tree
