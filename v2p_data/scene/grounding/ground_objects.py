@@ -300,7 +300,7 @@ def _static_object(
         quality=masks.sum((1, 2)) / max(1, mask.sum()),
         at=at,
         sure=sure,
-        why="" if mark else "what stands there fits the words only so far",
+        why="" if mark else "the object there fits the words only so far",
         hinted=mark is not None,
     )
 
@@ -339,7 +339,7 @@ def _check_hand(clip: Clip, segmentation: Segmentation) -> None:
     if most < _LEAST_HAND:
         raise ItemRejectedError(
             "no_hand",
-            f"no hand is seen in {clip.item}: it covers {most:.2%} of the picture at most; what moves by itself shows no "
+            f"no hand is seen in {clip.item}: it covers {most:.2%} of the picture at most; motion without a hand shows no "
             "manipulation",
             round(most, 5),
         )

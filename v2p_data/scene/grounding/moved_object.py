@@ -219,7 +219,7 @@ def check_there_at_first(clip: Clip, phrase: str, segmentation: Segmentation | N
     if seen is not None:
         raise ItemRejectedError(
             "not_there_at_first",
-            f"what moves in {clip.item} is not in the picture when it begins (it covers {seen:.2%} of it, at least {LEAST_SHARE:.2%} "
+            f"the moving object of {clip.item} is not in the picture when it begins (it covers {seen:.2%} of it, at least {LEAST_SHARE:.2%} "
             f"needed): let the clip begin where '{phrase}' lies on the table",
             round(seen, 5),
         )
