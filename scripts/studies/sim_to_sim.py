@@ -125,7 +125,8 @@ def sweeps_table(rows: list[Row]) -> str:
         mine = [r for r in swept if (r["place"], r["policy"], r["task"]) == (sweep, policy, task)]
         cells = ", ".join(_swept(r) for r in mine)
         quantity = SWEEPS[sweep]
-        lines.append(f"| {quantity.title} [{quantity.unit}] | {policy}, {task} | {cells} |")
+        title = " ".join(quantity.title.split())
+        lines.append(f"| {title} [{quantity.unit}] | {policy}, {task} | {cells} |")
     return "\n".join(lines)
 
 

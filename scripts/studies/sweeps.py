@@ -87,6 +87,17 @@ def _single(name: str) -> Callable[[float], TwinParameters]:
     return lambda value: changed({name: value})
 
 
+def _slippery(scale: float) -> TwinParameters:
+    """Return the twin with other friction; of two surfaces in contact the rougher one counts."""
+    twin = nominal()
+    return changed(
+        {
+            "pad_friction": scale * twin.pad_friction,
+            "object_friction_scale": scale * twin.object_friction_scale,
+        }
+    )
+
+
 SWEEPS: dict[str, Sweep] = {
     "erosion": Sweep(title="mask erosion", unit="px", values=(0, 1, 2, 4, 6, 8), fault=eroded),
     "dilation": Sweep(
@@ -106,13 +117,13 @@ SWEEPS: dict[str, Sweep] = {
         parameters=_single("command_latency_s"),
     ),
     "placement": Sweep(
-        title="camera placement (times 11 mm and 19 mrad, known by calibration)",
+        title="camera placement, known\n(times 11 mm and 19 mrad)",
         unit="times",
         values=(0, 1, 4, 8, 12, 16),
         parameters=_scaled("placement_m", "placement_rad"),
     ),
     "calibration": Sweep(
-        title="camera calibration error (times 1.7 mm and 4.1 mrad)",
+        title="calibration error\n(times 1.7 mm and 4.1 mrad)",
         unit="times",
         values=(0, 1, 2, 4, 8, 12),
         parameters=_scaled("calibration_m", "calibration_rad"),
@@ -124,10 +135,10 @@ SWEEPS: dict[str, Sweep] = {
         parameters=_single("reference_gain_hz"),
     ),
     "friction": Sweep(
-        title="friction of objects",
+        title="friction of pads and objects",
         unit="times",
-        values=(1.2, 0.8, 0.4, 0.2, 0.1, 0.05),
-        parameters=_single("object_friction_scale"),
+        values=(1, 0.8, 0.6, 0.4, 0.2, 0.1),
+        parameters=_slippery,
     ),
 }
 
