@@ -1,0 +1,73 @@
+"""The README's table of results, made from `docs/results.json`: counts stand there, rates and intervals are computed.
+
+python scripts/results_table.py            # prints the table
+python scripts/results_table.py --write    # puts it into README.md
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from policies.evaluation.rate import wilson
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "results.json"
+README = ROOT / "README.md"
+BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """Return the results as a Markdown table, a row each, with Wilson 95 % intervals.
+
+    Args:
+        results: `about`, `what`, `successes`, `trials`, `unit`, `seeds`, `hardware` and `command` (empty: judged by others) of each.
+    """
+    rows = [
+        "| | what | result, 95 % interval | of | seeds | command |",
+        "|---|---|---|---|---|---|",
+    ]
+    before = ""
+    for result in results:
+        rate = wilson(result["successes"], result["trials"])
+        shown = f"{100 * rate.value:.0f} % ({100 * rate.low:.0f}-{100 * rate.high:.0f})"
+        about = "" if result["about"] == before else f"**{result['about']}**"
+        before = result["about"]
+        command = f"`{result['command']}`" if result["command"] else "judged by others"
+        rows.append(
+            f"| {about} | {result['what']} | {shown} | {result['trials']} {result['unit']} | {result['seeds']} | {command} |"
+        )
+    return "\n".join(rows)
+
+
+def with_table(page: str, rows: str) -> str:
+    """Return the page with these rows between its two marks.
+
+    Raises:
+        ValueError: a mark is missing.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"the page has no {BEGIN} followed by {END}")
+    return f"{before}{BEGIN}\n{rows}\n{END}{after}"
+
+
+def main() -> None:
+    """Print the table, or write it into the README."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--write", action="store_true", help="put it into README.md")
+    rows = table(json.loads(RESULTS.read_text())["results"])
+    if not parser.parse_args().write:
+        print(rows)
+        return
+    try:
+        README.write_text(with_table(README.read_text(), rows))
+    except ValueError as error:
+        print(f"error: {README.name}: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
