@@ -12,6 +12,7 @@ A clip is right when every outline's box overlaps the drawn one by half or more 
 first and at the last frame. Whatever follows the options goes to the engine's settings, e.g. `--scene.min-confidence 0.6`.
 
     python scripts/judge_real_clips.py CLIPS --out outputs/judged
+    python scripts/judge_real_clips.py CLIPS --scene.preset learned --out outputs/judged_learned
     python scripts/judge_real_clips.py CLIPS --boxes --no-gate --out outputs/judged_boxes
 """
 

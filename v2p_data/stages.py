@@ -105,10 +105,12 @@ class Seeded:
 
 
 def scene_stage(video: VideoItem, cfg: EngineConfig) -> Stage:
-    """Return the stage that understands one video."""
+    """Return the stage that understands one video; a preset's choice is part of its recipe."""
+    from v2p_data.scene.preset import with_preset
+
     recipe = {
         "video": cfg.video,
-        "scene": cfg.scene,
+        "scene": with_preset(cfg.scene),
         "seed": cfg.seed,
         "caption": video.caption,
         "objects": video.objects,

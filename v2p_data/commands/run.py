@@ -267,6 +267,7 @@ def generate(
     videos: Path, root: Path, repo_id: str, cfg: EngineConfig, runtime: Runtime
 ) -> Path | None:
     """Run the chain on every video and pack what came through; return the dataset, if there is one."""
+    _fetch_learned(cfg)
     chains = [chain(video, cfg) for video in _videos(videos)]
     outcomes = _run(chains, runtime)
     good = [c for c in chains if outcomes[(c.name, c.folder_name)].is_usable]
@@ -454,6 +455,7 @@ def _up_to(
 ) -> int:
     args = _with_config(FromVideos, argv, name)
     root = _run_folder(args.out)
+    _fetch_learned(args.engine)
     with only_run_in(root):
         stages = [stage_of(video, args.engine) for video in _videos(args.videos)]
         outcomes = _run(stages, args.how.runtime(root))
@@ -487,6 +489,22 @@ def _settings_in(argv: Sequence[str], source: Path) -> list[str]:
                 del words[k : k + (1 if "=" in word else 2)]
                 break
     return words
+
+
+def _fetch_learned(cfg: EngineConfig) -> None:
+    """Download the models of the preset `learned` before any work begins, and say so first.
+
+    Raises:
+        V2PError: one cannot be downloaded.
+    """
+    if cfg.scene.preset != "learned":
+        return
+    from v2p_data.commands.models import fetch_learned
+    from v2p_data.scene.preset import checkpoints_of, missing, with_preset
+
+    absent = missing(checkpoints_of(with_preset(cfg.scene)))
+    if absent:
+        fetch_learned(absent)
 
 
 def _videos(folder: Path) -> list[VideoItem]:

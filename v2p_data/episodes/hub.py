@@ -167,6 +167,26 @@ def fetch_policy(repo_id: str, *, waits_s: Sequence[float] = WAITS_S) -> Path:
     Raises:
         V2PError: there is no such policy, or the Hub cannot be reached.
     """
+    folder = fetch_model(repo_id, ignore=("*.ckpt", "*.bin"), waits_s=waits_s)
+    missing = [name for name in POLICY_FILES if not (folder / name).is_file()]
+    if missing:
+        raise V2PError(f"'{repo_id}' is no LeRobot policy: it holds no {' and no '.join(missing)}")
+    return folder
+
+
+def fetch_model(
+    repo_id: str, *, ignore: Sequence[str], waits_s: Sequence[float] = WAITS_S
+) -> Path:
+    """Return the folder of any model on the Hub, fetched once and kept in the library's own cache.
+
+    Args:
+        repo_id: its name.
+        ignore: patterns of files that are not fetched.
+        waits_s: pauses before further tries.
+
+    Raises:
+        V2PError: there is no such model, or the Hub cannot be reached.
+    """
     check_repo_id(repo_id)
     endpoint = _endpoint()
     token = next((t for name in TOKEN_VARIABLES if (t := os.environ.get(name, "").strip())), "")
@@ -185,18 +205,11 @@ def fetch_policy(repo_id: str, *, waits_s: Sequence[float] = WAITS_S) -> Path:
     def once() -> Path:
         return Path(
             snapshot_download(
-                repo_id,
-                endpoint=endpoint,
-                token=token or False,
-                ignore_patterns=["*.ckpt", "*.bin"],
+                repo_id, endpoint=endpoint, token=token or False, ignore_patterns=list(ignore)
             )
         )
 
-    folder = _explained(lambda: _patiently(fetch, waits_s), f"fetch '{repo_id}'", endpoint, token)
-    missing = [name for name in POLICY_FILES if not (folder / name).is_file()]
-    if missing:
-        raise V2PError(f"'{repo_id}' is no LeRobot policy: it holds no {' and no '.join(missing)}")
-    return folder
+    return _explained(lambda: _patiently(fetch, waits_s), f"fetch '{repo_id}'", endpoint, token)
 
 
 def push_envhub(

@@ -1,6 +1,7 @@
 """The settings of a reconstruction."""
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from v2p_data.scene.backends.config import (
     DepthConfig,
@@ -10,11 +11,16 @@ from v2p_data.scene.backends.config import (
     SegmentConfig,
 )
 
+type Preset = Literal["builtin", "learned"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class SceneConfig:
     """How a scene is rebuilt, and how sure we must be."""
 
+    preset: Preset = "builtin"
+    """`builtin` downloads nothing. `learned` takes Grounding DINO, SAM 2 and a metric depth model in sizes that fit this machine,
+    for each stage whose backend is not set; 'v2p scene models' lists them."""
     min_confidence: float = 0.55
     """Scenes below are rejected."""
     min_found: float = 0.5

@@ -30,6 +30,7 @@ from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
 from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
 from v2p_data.scene.grounding.ground_objects import ground_objects, without_asides
 from v2p_data.scene.meshes import with_meshes
+from v2p_data.scene.preset import with_preset
 from v2p_data.scene.remarks import remarks_on
 from v2p_data.video.captions import parse_caption
 from v2p_data.video.clip import Clip
@@ -43,6 +44,7 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
         ItemRejectedError: `camera_moves`, `nothing_moves`, `no_hand`, `not_there_at_first`, `object_not_found`, `reference_not_found`,
             `motion_contradicts_caption` or `low_confidence`, with the number that decided.
     """
+    cfg = with_preset(cfg)
     meaning = parse_caption(clip.caption, clip.objects)
     clip, working, segmentation = _frames(clip, cfg)
     grounded = _grounded(clip, working, segmentation, meaning, cfg)

@@ -1,0 +1,130 @@
+"""The preset of learned models: which checkpoint does which stage on this machine, and what of it must be downloaded.
+
+Only checkpoints whose weights allow commercial use are chosen (`docs/backends.md`). A stage that was set by hand stays
+as it was set. torch and huggingface_hub are imported only where they are asked.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from v2p_data.scene.backends.config import DEFAULT_MODELS
+from v2p_data.scene.config import SceneConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """What decides which sizes are taken."""
+
+    gpu_memory_gb: float = 0.0
+    """Memory of the first CUDA device [GB]; 0 without one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """Checkpoints for machines with at least so much GPU memory."""
+
+    least_gpu_gb: float
+    ground: str
+    segment: str
+    depth: str
+    ground_batch: int
+    """Pictures per pass of the detector."""
+    depth_batch: int
+    """Pictures per pass of the depth model."""
+
+
+_DEPTH = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
+SIZES = (
+    Size(least_gpu_gb=16.0, ground="IDEA-Research/grounding-dino-base", segment="facebook/sam2.1-hiera-large",
+         depth=_DEPTH, ground_batch=8, depth_batch=8),
+    Size(least_gpu_gb=8.0, ground="IDEA-Research/grounding-dino-base", segment="facebook/sam2.1-hiera-base-plus",
+         depth=_DEPTH, ground_batch=4, depth_batch=4),
+    Size(least_gpu_gb=0.0, ground="IDEA-Research/grounding-dino-tiny", segment="facebook/sam2.1-hiera-tiny",
+         depth=_DEPTH, ground_batch=1, depth_batch=1),
+)  # fmt: skip
+"""The largest first. Weights in float32 take 2.0, 1.4 and 0.95 GB; the rest of the memory is for activations."""
+
+WEIGHTS_GB = {
+    "IDEA-Research/grounding-dino-tiny": 0.69,
+    "IDEA-Research/grounding-dino-base": 0.93,
+    "facebook/sam2.1-hiera-tiny": 0.16,
+    "facebook/sam2.1-hiera-small": 0.18,
+    "facebook/sam2.1-hiera-base-plus": 0.32,
+    "facebook/sam2.1-hiera-large": 0.90,
+    "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf": 0.10,
+    "openmmlab-community/mm_grounding_dino_tiny_o365v1_goldg_v3det": 0.69,
+    "google/owlv2-base-patch16-ensemble": 0.62,
+    "apple/DepthPro-hf": 3.8,
+}
+"""Size of the weights [GB], from their number of parameters in float32."""
+NEEDED_FILES = ("config.json", "model.safetensors")
+"""A checkpoint whose cache holds these counts as downloaded."""
+UNWANTED_FILES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.msgpack", "*.h5", "*.onnx")
+"""The same weights in other formats."""
+
+
+def this_machine() -> Machine:
+    """Return what this machine has."""
+    import torch
+
+    if not torch.cuda.is_available():
+        return Machine()
+    return Machine(gpu_memory_gb=torch.cuda.get_device_properties(0).total_memory / 1e9)
+
+
+def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machine) -> SceneConfig:
+    """Return the settings with what the preset chooses written out; without a preset as they are.
+
+    Args:
+        cfg: settings; a stage with a backend of its own keeps it.
+        machine_of: asked only where the preset is `learned`.
+    """
+    if cfg.preset != "learned":
+        return cfg
+    machine = machine_of()
+    size = next(s for s in SIZES if machine.gpu_memory_gb >= s.least_gpu_gb)
+    ground, segment, depth = cfg.ground, cfg.segment, cfg.depth
+    if ground.backend == "network":
+        ground = replace(
+            ground, backend="grounding_dino", model=ground.model or size.ground, batch_size=size.ground_batch
+        )  # fmt: skip
+    if segment.backend == "flow":
+        segment = replace(segment, backend="sam2", model=segment.model or size.segment)
+    if depth.backend == "none":
+        depth = replace(
+            depth, backend="depth_anything", model=depth.model or size.depth, batch_size=size.depth_batch
+        )  # fmt: skip
+    return replace(cfg, preset="builtin", ground=ground, segment=segment, depth=depth)
+
+
+def checkpoints_of(cfg: SceneConfig) -> tuple[str, ...]:
+    """Return the Hub ids and folders of all checkpoints that these settings load."""
+    named = (cfg.ground, cfg.segment, cfg.depth)
+    return tuple(
+        stage.model or DEFAULT_MODELS[stage.backend]
+        for stage in named
+        if stage.backend in DEFAULT_MODELS and not stage.worker
+    )
+
+
+def missing(models: Iterable[str]) -> tuple[str, ...]:
+    """Return those of the checkpoints that are neither a folder here nor in the Hub's cache."""
+    from huggingface_hub import try_to_load_from_cache
+
+    return tuple(
+        model
+        for model in models
+        if not Path(model).is_dir()
+        and not all(isinstance(try_to_load_from_cache(model, f), str) for f in NEEDED_FILES)
+    )
+
+
+def told(models: Iterable[str]) -> str:
+    """Return a line that names checkpoints with their sizes [GB], for a person who waits for a download."""
+    sizes = {model: WEIGHTS_GB.get(model) for model in models}
+    words = ", ".join(
+        f"{model} ({f'{gb:.2g} GB' if gb else 'size unknown'})" for model, gb in sizes.items()
+    )
+    known = sum(gb for gb in sizes.values() if gb)
+    return f"{words}; {known:.2g} GB together" if len(sizes) > 1 else words
