@@ -1,5 +1,7 @@
 """Laws of the pinhole camera; OpenCV projects and resizes, MuJoCo frames its cameras, as oracles."""
 
+from dataclasses import replace
+
 import cv2
 import mujoco
 import numpy as np
@@ -12,8 +14,9 @@ from v2p_data.geometry.camera import (
     intrinsics,
     look_at,
     mujoco_xyaxes,
+    poses_over_table,
 )
-from v2p_data.geometry.pose import apply
+from v2p_data.geometry.pose import apply, transform
 
 WIDTH_PX, HEIGHT_PX, FOVY_RAD = 64, 48, 0.9
 
@@ -206,3 +209,44 @@ def test_homographies_between_centres_chain_and_keep_whole_pixels(rng):
     seen = between_centres(A) @ [*(corner - 0.5), 1]
     expected = A @ [*corner, 1]
     np.testing.assert_allclose(seen[:2] / seen[2] + 0.5, expected[:2] / expected[2])
+
+
+@pytest.fixture
+def over_table() -> Camera:
+    """Over a table, as people film."""
+    pose = look_at(np.array([-0.6, 0.1, 0.5]), np.array([0.1, 0.0, 0.0]))
+    return Camera(width_px=640, height_px=480, K=intrinsics(640, 480, 0.8), T_world_cam=pose)
+
+
+def moved(camera: Camera, rng: np.random.Generator, zoom: float = 1.0) -> Camera:
+    """Return the camera after a small motion in a hand."""
+    turn, _ = cv2.Rodrigues(rng.normal(0, 0.05, 3))
+    K = camera.K * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
+    pose = camera.T_world_cam @ transform(turn, rng.normal(0, 0.03, 3))
+    return replace(camera, K=K, T_world_cam=pose)
+
+
+def table_homography(first: Camera, other: Camera) -> np.ndarray:
+    """Return the map of the table's pixels from one camera to another, by four of its points and OpenCV."""
+    corners = np.array([[-0.2, -0.2, 0], [0.4, -0.2, 0], [0.4, 0.2, 0], [-0.2, 0.2, 0]])
+    return cv2.findHomography(first.project(corners), other.project(corners))[0]
+
+
+def test_the_poses_of_a_moving_camera_follow_from_what_it_sees_of_the_table(rng, over_table):
+    others = [over_table, *(moved(over_table, rng) for _ in range(5))]
+    maps = np.stack([-3.0 * table_homography(over_table, other) for other in others])
+
+    poses = poses_over_table(over_table, maps)
+
+    np.testing.assert_allclose(poses, [other.T_world_cam for other in others], atol=1e-6)
+
+
+def test_a_zoom_costs_little_of_the_pose(rng, over_table):
+    other = moved(over_table, rng, zoom=1.05)
+
+    (pose,) = poses_over_table(over_table, table_homography(over_table, other)[None])
+
+    turn = pose[:3, :3].T @ other.T_world_cam[:3, :3]
+    assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 2.0
+    assert np.linalg.norm(pose[:3, 3] - other.T_world_cam[:3, 3]) < 0.06
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)

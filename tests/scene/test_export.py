@@ -311,3 +311,30 @@ def test_an_object_that_was_made_by_hand_has_a_motion_but_no_masks(scene):
     assert cube.first_to_last.translation_m == (0.1, 0.0, 0.0)
     with pytest.raises(V2PError, match="not made from a video"):
         replace(scene, objects=(cube,)).masks("cube")
+
+
+def test_a_moving_camera_has_a_pose_per_frame_and_a_still_one_does_not_say_it(
+    folder, scene, tmp_path
+):
+    assert "T_world_cams" not in json.loads((folder / "scene.json").read_text())["camera"]
+    made = reconstruction()
+    shift = np.eye(3)[None].repeat(len(made.clip.frames), 0)
+    shift[1:, 0, 2] = 4.0  # pixels to the right, as when the camera turns to the left
+
+    moved = replace(made, clip=replace(made.clip, to_filmed=shift))
+    (tmp_path / "moved").mkdir()
+    write_scene(moved, tmp_path / "moved")
+    read = Scene.load(tmp_path / "moved")
+
+    assert read.T_world_cams is not None
+    np.testing.assert_allclose(read.T_world_cams[0], scene.camera.T_world_cam, atol=2e-6)
+    assert not np.allclose(read.T_world_cams[1], scene.camera.T_world_cam, atol=1e-3)
+
+
+def test_a_pose_per_frame_is_demanded_for_all_frames(folder, tmp_path):
+    data = json.loads((folder / "scene.json").read_text())
+    data["camera"]["T_world_cams"] = [data["camera"]["T_world_cam"]]
+    (tmp_path / "scene.json").write_text(json.dumps(data))
+
+    with pytest.raises(V2PError, match="has 1 poses, but the clip has"):
+        Scene.load(tmp_path)

@@ -44,6 +44,33 @@ class Camera:
             return np.where(distance > 0, origin + distance * rays, np.nan)
 
 
+def poses_over_table(
+    camera: Camera, to_filmed: Float[np.ndarray, "time 3 3"]
+) -> Float[np.ndarray, "time 4 4"]:
+    """Return `T_world_cam` of each frame of a moving camera.
+
+    Args:
+        camera: of the first frame; the table is its plane z = 0.
+        to_filmed: per frame the homography from the first frame's pixels on the table to the frame's own.
+
+    The intrinsics are taken to stay. What a homography says beyond a rigid motion, such as zoom, is spread over the pose.
+
+    Source: Zhang 2000, "A flexible new technique for camera calibration", section 3.1, with the nearest rotation by SVD.
+    """
+    world_to_cam = inverse(camera.T_world_cam)
+    plane_to_first = camera.K @ world_to_cam[:3, [0, 1, 3]]
+    B = np.linalg.inv(camera.K) @ to_filmed @ plane_to_first
+    B = B / B[:, 2:, 2:]  # the origin's depth is positive; its scale follows
+    B = B / np.linalg.norm(B[:, :, :2], axis=1).mean(1)[:, None, None]
+    U, _, Vt = np.linalg.svd(
+        np.stack([B[:, :, 0], B[:, :, 1], np.cross(B[:, :, 0], B[:, :, 1])], axis=2)
+    )
+    T_cam_worlds = np.tile(np.eye(4), (len(B), 1, 1))
+    T_cam_worlds[:, :3, :3] = U @ Vt
+    T_cam_worlds[:, :3, 3] = B[:, :, 2]
+    return np.linalg.inv(T_cam_worlds)
+
+
 def intrinsics(width_px: int, height_px: int, fovy_rad: float) -> Float[np.ndarray, "3 3"]:
     """Return K of a camera with square pixels, the principal point in the middle."""
     f = 0.5 * height_px / np.tan(fovy_rad / 2)

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from v2p_data.geometry.camera import mujoco_xyaxes
+from v2p_data.geometry.camera import mujoco_xyaxes, poses_over_table
 from v2p_data.geometry.mesh import mass_properties, mesh_for, parts_for, write_obj, write_ply
 from v2p_data.geometry.pose import pose_from_transform
 from v2p_data.scene.data_types import Estimate, Reconstruction
@@ -56,6 +56,9 @@ def write_scene(reconstruction: Reconstruction, folder: Path) -> Scene:
             for stage, (value, reason) in reconstruction.stages.items()
         },
         scale_spread=round(reconstruction.scale_spread, 4),
+        T_world_cams=None
+        if clip.to_filmed is None
+        else poses_over_table(reconstruction.camera, clip.to_filmed),
         warnings=(*clip.warnings, *reconstruction.warnings),
         folder=folder,
     )

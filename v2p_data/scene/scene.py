@@ -205,6 +205,7 @@ class Scene:
     objects: tuple[SceneObject, ...]
     """The manipulated object first."""
     camera: Camera
+    """Of the aligned frames, which is the first frame's where the camera moved."""
     fps: float
     num_frames: int
     confidence: float
@@ -213,6 +214,8 @@ class Scene:
     """Per stage of the reconstruction."""
     scale_spread: float = 0.0
     """Standard deviation of the logarithm of all lengths together: one view does not show scale."""
+    T_world_cams: Float[np.ndarray, "time 4 4"] | None = None
+    """Pose of the camera in each frame as it was filmed; None where the camera stood still."""
     table: Plane = Plane()
     """The table's top."""
     gravity_m_s2: tuple[float, float, float] = GRAVITY_M_S2
@@ -256,13 +259,15 @@ class Scene:
     def save(self, folder: Path) -> None:
         """Write `scene.json`; meshes, masks and URDFs are written by their makers."""
         data = asdict(replace(self, folder=Path()))
-        del data["folder"]
+        del data["folder"], data["T_world_cams"]
         data["camera"] = {
             "width_px": self.camera.width_px,
             "height_px": self.camera.height_px,
             "K": self.camera.K.tolist(),
             "T_world_cam": self.camera.T_world_cam.tolist(),
         }
+        if self.T_world_cams is not None:
+            data["camera"]["T_world_cams"] = np.round(self.T_world_cams, 6).tolist()
         for written, thing in zip(data["objects"], self.objects, strict=True):
             if thing.poses_world:  # for readers of the file; here it follows from the poses
                 written["first_to_last"] = asdict(thing.first_to_last)
@@ -300,12 +305,15 @@ class Scene:
                 K=np.array(read.camera.K, float),
                 T_world_cam=np.array(read.camera.T_world_cam, float),
             ),
+            T_world_cams=np.array(read.camera.T_world_cams, float)
+            if read.camera.T_world_cams
+            else None,
             folder=folder,
         )
 
 
 _AS_WRITTEN = {f.name for f in fields(Scene)} - {
-    *("kind", "objects", "confidences", "table", "camera", "folder")
+    *("kind", "objects", "confidences", "table", "camera", "T_world_cams", "folder")
 }
 """Fields that stand in the file as they are."""
 

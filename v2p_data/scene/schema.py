@@ -152,6 +152,7 @@ class CameraEntry(FileModel):
     height_px: Annotated[int, Gt(0), Le(16_384)]
     K: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]]
     T_world_cam: tuple[Row4, Row4, Row4, Row4]
+    T_world_cams: Annotated[tuple[tuple[Row4, Row4, Row4, Row4], ...], Len(0, MAX_FRAMES)] = ()
 
 
 class PlaneEntry(FileModel):
@@ -195,6 +196,10 @@ def read_scene_file(folder: Path, name: str) -> SceneFile:
     data = read_own(folder, name, MAX_SCENE_BYTES)
     path = folder / name
     found = parsed(data, SceneFile, path, "remake it with 'v2p scene'", version_field="schema")
+    if len(found.camera.T_world_cams) not in (0, found.num_frames):
+        raise V2PError(
+            f"{path}: camera.T_world_cams has {len(found.camera.T_world_cams)} poses, but the clip has {found.num_frames} frames"
+        )
     if len({o.name for o in found.objects}) < len(found.objects):
         names = ", ".join(o.name for o in found.objects)
         raise V2PError(f"{path}: two objects have one name ({names}); each needs its own")
