@@ -296,7 +296,7 @@ def _apart_from_surroundings(picture: np.ndarray, robot: np.ndarray) -> np.ndarr
 
 
 _BINS = np.array([12, 24, 24])
-"""As `scene.colour.histogram` counts."""
+"""As `scene.frames.colour.histogram` counts."""
 _FLOOR = -4.0
 
 

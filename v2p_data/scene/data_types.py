@@ -3,6 +3,7 @@
 `frames` and `scale` lie below this file, `grounding`, `shapes` and `fitting` above it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -144,6 +145,20 @@ class PlacedObject:
     """Whether it lies on something at first: then its last outline, on the table, shows its shape."""
     T_world_seen: Float[np.ndarray, "4 4"] | None = None
     """Where the object tracks's first outline shows it, if that is not its first pose."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RestingObject:
+    """An object that a hand moves, where it rests on the table, and the camera that sees both."""
+
+    masks: Bool[np.ndarray, "time h w"]
+    """Its masks in every working frame."""
+    rests: Sequence[tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "3"]]]
+    """Its outline and its position [camera heights] where it rests: at first, and at last where the table carries it there."""
+    camera: Camera
+    """One camera height above the table."""
+    pitch_rad: float
+    """How far the camera looks below the horizon."""
 
 
 @dataclass(frozen=True, kw_only=True)

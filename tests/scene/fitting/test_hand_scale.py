@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
+from v2p_data.scene.data_types import RestingObject
 from v2p_data.scene.fitting import hand_scale
 from v2p_data.scene.fitting.hand_scale import (
     hand_scale_network,
@@ -73,14 +74,18 @@ def seen(item: str):
     masks = np.repeat(mask[None], len(working.rgb), 0)
     first = np.array(truth["object"]["poses_world"][0][:3])
     foot = (first - [T[0, 3], T[1, 3], 0]) / height
-    return working, segment_clip(clip, working), masks, [(mask, foot)], camera, pitch, height
+    resting = RestingObject(masks=masks, rests=[(mask, foot)], camera=camera, pitch_rad=pitch)
+    return working, segment_clip(clip, working), resting, height
 
 
 @pytest.mark.long
 def test_the_height_of_a_sample_clip_s_camera_is_told_by_its_hand_from_a_wrong_guess():
-    *given, true = seen("push_blue_box_left")
+    working, segmentation, resting, true = seen("push_blue_box_left")
 
-    high, low = (height_from_hand(*given, guess) for guess in (1.25 * true, true / 1.25))
+    high, low = (
+        height_from_hand(working, segmentation, resting, guess)
+        for guess in (1.25 * true, true / 1.25)
+    )
 
     for found in (high, low):
         assert found is not None
@@ -90,15 +95,15 @@ def test_the_height_of_a_sample_clip_s_camera_is_told_by_its_hand_from_a_wrong_g
 
 @pytest.mark.long
 def test_a_hand_that_touches_nothing_says_nothing():
-    working, segmentation, masks, stands, camera, pitch, height = seen("push_blue_box_left")
+    working, segmentation, resting, height = seen("push_blue_box_left")
     gone = replace(segmentation, shares=segmentation.shares.copy())
     gone.shares[:, HAND] = 0
 
-    assert height_from_hand(working, gone, masks, stands, camera, pitch, height) is None
-    away = np.zeros_like(masks)
+    assert height_from_hand(working, gone, resting, height) is None
+    away = np.zeros_like(resting.masks)
     away[:, 5:20, 5:20] = True  # where no hand comes
-    far = [(away[0], stands[0][1])]
-    assert height_from_hand(working, segmentation, away, far, camera, pitch, height) is None
+    far = replace(resting, masks=away, rests=[(away[0], resting.rests[0][1])])
+    assert height_from_hand(working, segmentation, far, height) is None
 
 
 def test_missing_weights_are_one_clear_sentence(tmp_path, monkeypatch):

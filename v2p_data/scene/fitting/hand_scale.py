@@ -6,7 +6,6 @@ that is 28 cm wide if the camera stands as high as guessed, and says how much to
 was trained on rendered hands only (`scripts/train_hand_ruler.py`); its weights lie beside this file.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,10 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import nn
 
-from v2p_data.geometry.camera import Camera
+from v2p_data.scene.data_types import RestingObject
 from v2p_data.scene.frames.classes import HAND
 from v2p_data.scene.frames.hand import HandEnd, gap_px, hand_end
 from v2p_data.scene.frames.mask_ops import iou
@@ -131,29 +130,20 @@ def planes_of(
 
 
 def height_from_hand(
-    working: WorkingClip,
-    segmentation: Segmentation,
-    masks: Bool[np.ndarray, "time h w"],
-    stands: Sequence[tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "3"]]],
-    camera: Camera,
-    pitch_rad: float,
-    height_m: float,
+    working: WorkingClip, segmentation: Segmentation, resting: RestingObject, height_m: float
 ) -> tuple[float, float] | None:
-    """Return the camera's height [m] by the hand that moves a thing, and the standard deviation of its logarithm.
+    """Return the camera's height [m] by the hand that moves an object, and the standard deviation of its logarithm.
 
     Args:
         working: frames.
         segmentation: what the network sees in them.
-        masks: of the thing, in every working frame.
-        stands: its outlines where it rests, at first and at last, and its positions there [camera heights].
-        camera: one camera height above the table.
-        pitch_rad: how far it looks below the horizon.
-        height_m: guess.
+        resting: the object that the hand touches.
+        height_m: a guess of the camera's height.
 
     Returns:
-        None where no hand is seen that touches the thing at rest.
+        None where no hand is seen that touches the object at rest.
     """
-    views = _views(working, segmentation, masks, stands, camera, pitch_rad, height_m)
+    views = _views(working, segmentation, resting, height_m)
     if not views:
         return None
     off, stated = _said(views)
@@ -161,24 +151,19 @@ def height_from_hand(
 
 
 def _views(
-    working: WorkingClip,
-    segmentation: Segmentation,
-    masks: Bool[np.ndarray, "time h w"],
-    stands: Sequence[tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "3"]]],
-    camera: Camera,
-    pitch_rad: float,
-    height_m: float,
+    working: WorkingClip, segmentation: Segmentation, resting: RestingObject, height_m: float
 ) -> list[HandView]:
     h, w = working.shape
+    masks, camera, pitch_rad = resting.masks, resting.camera, resting.pitch_rad
     feet = []
-    for _, position in stands:
+    for _, position in resting.rests:
         foot = camera.project((position * [1, 1, 0])[None])[0]
         below = (foot[1] - h / 2) / w
         px_per_m = w / table_width_m(pitch_rad, float(camera.K[0, 0]) / w, height_m, below)
         feet.append((foot, below, px_per_m))
     out = []
     for k, i in enumerate(segmentation.idx):
-        overlaps = [iou(masks[i], mask) for mask, _ in stands]
+        overlaps = [iou(masks[i], mask) for mask, _ in resting.rests]
         best = int(np.argmax(overlaps))
         foot, below, px_per_m = feet[best]
         if overlaps[best] < _IN_PLACE or not px_per_m > _LEAST_PX_PER_M:

@@ -11,7 +11,14 @@ from jaxtyping import Float
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.kinds import Kind
-from v2p_data.scene.data_types import CameraGuess, Fit, ObjectTrack, PlacedObject, Placement
+from v2p_data.scene.data_types import (
+    CameraGuess,
+    Fit,
+    ObjectTrack,
+    PlacedObject,
+    Placement,
+    RestingObject,
+)
 from v2p_data.scene.fitting.end_poses import (
     EndPoses,
     fit_both_ends,
@@ -66,8 +73,12 @@ def place(
     known = guess.heights(pitch_rad)
     height_m, spread = camera_height_m(votes, known)
     if segmentation is not None and len(resting) == len(objects):
-        hand = (working, segmentation)
-        by_hand = _height_from_hand(hand, views[0], fits[0], plan, camera, (pitch_rad, height_m))
+        from v2p_data.scene.fitting.hand_scale import (
+            height_from_hand,  # torch takes a second to import
+        )
+
+        resting_object = _resting_object(views[0], fits[0], plan, camera, pitch_rad)
+        by_hand = height_from_hand(working, segmentation, resting_object, height_m)
         if by_hand is not None:
             height_m, spread = camera_height_m(votes, [*known, by_hand])
     seen_in = SeenIn(working=working, segmentation=segmentation)
@@ -109,23 +120,14 @@ def _manipulated(
     return out
 
 
-def _height_from_hand(
-    hand: tuple[WorkingClip, Segmentation],
-    see: ObjectView,
-    fits: EndPoses,
-    plan: FitPlan,
-    camera: Camera,
-    known: tuple[float, float],
-) -> tuple[float, float] | None:
-    """Return the camera's height by the hand that moves the object, as `hand_scale.height_from_hand` does; `known` is pitch and height."""
-    from v2p_data.scene.fitting.hand_scale import (
-        height_from_hand,  # torch takes a second to import
-    )
-
-    stands = [(see.s.first, fits.first.T_world_obj[:3, 3])]
-    if plan.end != "in_air":  # in mid-air it stands on nothing
-        stands.append((see.last_mask, fits.last.T_world_obj[:3, 3]))
-    return height_from_hand(*hand, see.s.masks, stands, camera, *known)
+def _resting_object(
+    see: ObjectView, fits: EndPoses, plan: FitPlan, camera: Camera, pitch_rad: float
+) -> RestingObject:
+    """Return the object where the hand takes it and, unless that is in mid-air, where the hand leaves it."""
+    rests = [(see.s.first, fits.first.T_world_obj[:3, 3])]
+    if plan.end != "in_air":
+        rests.append((see.last_mask, fits.last.T_world_obj[:3, 3]))
+    return RestingObject(masks=see.s.masks, rests=rests, camera=camera, pitch_rad=pitch_rad)
 
 
 def _trajectory(
