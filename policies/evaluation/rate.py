@@ -1,10 +1,6 @@
 """A success rate and how far it can be trusted."""
 
-import math
 from dataclasses import dataclass
-
-Z_95 = 1.959963984540054
-"""Two-sided 95 % quantile of the normal distribution."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,10 +46,9 @@ def wilson(successes: int, trials: int) -> Rate:
         raise ValueError(
             f"need trials >= 1 and 0 <= successes <= trials, got {successes} of {trials}"
         )
-    p, z2 = successes / trials, Z_95**2
-    centre = (p + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = Z_95 * math.sqrt(p * (1 - p) / trials + z2 / (4 * trials**2)) / (1 + z2 / trials)
-    # At the ends the formula gives 0 and 1 up to rounding.
-    low = 0.0 if successes == 0 else centre - half
-    high = 1.0 if successes == trials else centre + half
-    return Rate(successes=successes, trials=trials, low=low, high=high)
+    from scipy.stats import binomtest  # takes a second to import
+
+    interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="wilson")
+    return Rate(
+        successes=successes, trials=trials, low=float(interval.low), high=float(interval.high)
+    )

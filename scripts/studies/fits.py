@@ -8,12 +8,15 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
+from scipy.special import ndtri
 
-from policies.evaluation.rate import Z_95, Rate, wilson
+from policies.evaluation.rate import Rate, wilson
 
 Row = dict[str, Any]
 When = Literal["once", "at_end"]
 Group = Literal["all", "shape", "category"]
+Z_95 = float(ndtri(0.975))
+"""Two-sided 95 % quantile of the normal distribution."""
 PARAMETERS = 2
 """Of either law; a fit of as many points says nothing."""
 

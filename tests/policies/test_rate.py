@@ -4,7 +4,10 @@ import math
 
 import pytest
 
-from policies.evaluation.rate import Z_95, wilson
+from policies.evaluation.rate import wilson
+
+Z_95 = 1.959964
+"""Two-sided 95 % quantile of the normal distribution, from a table."""
 
 
 def test_nine_of_ten_has_the_interval_computed_by_hand():

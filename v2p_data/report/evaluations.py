@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from policies.evaluation.rate import Rate
 from v2p_data.report.films import FAILURE, SUCCESS
 from v2p_data.report.media import MediaBudget, Medium, PageConfig, film_uri, picture_uri
-from v2p_data.report.reading import Rate, Run, as_dict, number, rate_of, read_json
+from v2p_data.report.reading import Run, as_dict, number, rate_of, read_json
 
 FILM_SUFFIXES = (".mp4", ".webm", ".mkv", ".avi", ".mov", ".gif")
 VIDEOS_FOLDER, SHEET_FILE = "videos", "sheet.png"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from policies.evaluation.rate import Rate
 from v2p_data.episodes.features import ACTION_NAMES, FPS
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError
@@ -25,7 +26,6 @@ from v2p_data.report.media import (
 )
 from v2p_data.report.reading import (
     ITEM_STAGES,
-    Rate,
     Result,
     Run,
     as_dict,

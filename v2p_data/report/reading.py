@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from policies.evaluation.rate import Rate
 from v2p_data.errors import UnusableError
 from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record, read_rejects
 from v2p_data.pipeline.contents import damages
@@ -190,20 +191,6 @@ def model_use(run: Run) -> dict[str, int]:
             elif name == "tokens" or name.endswith("_tokens"):
                 use["tokens"] += int(value)
     return use
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rate:
-    """A success rate as the records keep it."""
-
-    successes: int
-    trials: int
-    low: float
-    high: float
-
-    @property
-    def value(self) -> float:
-        return self.successes / self.trials
 
 
 def rate_of(data: Any) -> Rate | None:
