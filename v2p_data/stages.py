@@ -26,6 +26,7 @@ from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.solved import find_solved, solved_digests
+from v2p_data.json_files import read_object
 from v2p_data.judging import PROGRAMS, Contestant, judge_task, play_of, row_of
 from v2p_data.pipeline.artifact import (
     Record,
@@ -508,7 +509,7 @@ def copy_tasks(tasks: Mapping[str, Path], dataset: Path) -> None:
             ),
         )
         described = dataset / ROOT_OF_TASKS / item / TASK_FILE
-        task = json.loads(described.read_text())
+        task = read_object(described, "make the task anew")
         if (shareable := without_places(task)) != task:
             described.write_text(json.dumps(shareable, indent=1))
 

@@ -63,7 +63,8 @@ def test_a_truncated_checkpoint(policy):
 
 def test_a_missing_or_garbled_checkpoint(policy):
     (policy / "policy_preprocessor.json").write_text('{"steps": [')
-    assert "policy_preprocessor.json is damaged" in told(policy)
+    assert "policy_preprocessor.json, line 1" in (said := told(policy))
+    assert "not valid JSON; copy the policy anew" in said
     (policy / "model.safetensors").unlink()
     assert "holds no model.safetensors" in told(policy)
     (policy / "config.json").unlink()

@@ -20,10 +20,10 @@ from v2p_data.episodes.episode_stats import rgb_stats
 from v2p_data.episodes.features import features
 from v2p_data.episodes.staging import Episode, Heading
 from v2p_data.episodes.stream import encode_rgb
-from v2p_data.episodes.tables import read_json
 from v2p_data.episodes.verify import verify
 from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.sim.masks import PALETTE, labels_to_rgb
 
 pytestmark = pytest.mark.slow
@@ -138,7 +138,7 @@ def test_tables_and_metadata_are_what_lerobots_writer_makes(
     assert (
         pq.ParquetFile(packed / data).num_row_groups == pq.ParquetFile(root / data).num_row_groups
     )
-    assert read_json(packed / "meta/info.json") == read_json(root / "meta/info.json")
+    assert json_or_none(packed / "meta/info.json") == json_or_none(root / "meta/info.json")
     ours, theirs = (
         pq.read_table(r / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
         for r in (packed, root)
@@ -382,7 +382,7 @@ def test_the_card_tells_tasks_palette_and_ranges(packed: Path, tmp_path: Path):
 
 
 def test_the_card_of_an_older_dataset_names_its_seven_numbers(packed: Path):
-    about, info = (read_json(packed / "meta" / name) for name in ("v2p.json", "info.json"))
+    about, info = (json_or_none(packed / "meta" / name) for name in ("v2p.json", "info.json"))
     state = info["features"]["observation.state"]
     assert (state["shape"], len(state["names"])) == ([11], 11)
 

@@ -259,12 +259,21 @@ def test_the_summary_gives_the_share_of_right_scenes_with_its_interval(tmp_path)
     assert "accepted bad, wrong: took the <hand>" in words
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"clips": 3}', '{"clips": [3]}'])
+@pytest.mark.parametrize("text", ["[]", "{}", '{"clips": 3}', '{"clips": [3]}'])
 def test_a_file_that_is_no_review_is_named(tmp_path, text):
     path = tmp_path / "review.json"
     path.write_text(text)
 
     with pytest.raises(V2PError, match=r"is no review\.json"):
+        summary_of(path)
+
+
+@pytest.mark.parametrize("text", ["", "[" * 100_000])
+def test_a_review_that_is_no_json_is_one_sentence(tmp_path, text):
+    path = tmp_path / "review.json"
+    path.write_text(text)
+
+    with pytest.raises(V2PError, match=r"review\.json.*; download it anew from the review page"):
         summary_of(path)
     with pytest.raises(V2PError, match="cannot be read"):
         summary_of(tmp_path / "nowhere.json")

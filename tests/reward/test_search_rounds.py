@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from v2p_data.cli import parse
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.runner import Runtime, Stage, make_stage
 from v2p_data.report.page import NO_BREAK, write_page
 from v2p_data.report.reading import read_curve
-from v2p_data.reward.candidate import Candidate, Fault, load_candidates, read_json
+from v2p_data.reward.candidate import Candidate, Fault, load_candidates
 from v2p_data.reward.feedback import Feedback
 from v2p_data.reward.jobs import HEARTBEAT_FILE, Jobs
 from v2p_data.reward.methods import in_place_of_reward, save_bundle
@@ -196,7 +197,7 @@ def test_a_round_is_full_also_where_its_parents_first_ideas_were_tried(
     cfg = parse(EngineConfig, [*flags, "--reward.target-success=2.0"], "reward").reward
     bundle = bundle_with(BY_CHANCE)
     told = Feedback.from_dict(
-        read_json(folder(two_rounds, two_rounds.elites[0]) / "feedback.json")
+        json_or_none(folder(two_rounds, two_rounds.elites[0]) / "feedback.json")
     )
     parent = two_rounds.candidates[1].code
     offered = proposals(bundle, parent, told, np.random.default_rng(0))

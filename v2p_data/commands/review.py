@@ -1,7 +1,6 @@
 """`v2p scene review`: a page to judge a run's scenes on, and what comes back from it."""
 
 import hashlib
-import json
 import os
 import shlex
 from collections import Counter
@@ -15,6 +14,7 @@ import tyro
 from policies.evaluation.rate import wilson
 from v2p_data.cli import command_of, parse
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.json_files import read_json
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.report.reading import Result, number, read_run
 from v2p_data.report.review_page import ReviewClip, Stills, stills_of, write_review
@@ -248,12 +248,7 @@ def _made_by(args: Review, folder: Path, results: Sequence[Result]) -> list[str]
 
 
 def _read_review(path: Path) -> list[dict[str, Any]]:
-    try:
-        data = json.loads(path.read_text("utf-8-sig"))
-    except OSError as error:
-        raise V2PError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise V2PError(f"{path} is no review.json: {error}") from error
+    data = read_json(path, "download it anew from the review page")
     clips = data.get("clips") if isinstance(data, dict) else None
     if not isinstance(clips, list) or not all(isinstance(c, dict) for c in clips):
         raise V2PError(

@@ -12,6 +12,7 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import demand_whole
 from v2p_data.reward.candidate import (
     CANDIDATE_FILE,
@@ -19,7 +20,6 @@ from v2p_data.reward.candidate import (
     TRAIN_FOLDER,
     Candidate,
     load_candidates,
-    read_json,
 )
 from v2p_data.reward.config import Limits, RewardConfig
 from v2p_data.reward.feedback import Feedback
@@ -126,7 +126,7 @@ def searches_in(run: Path) -> list[Path]:
 
 
 def _search(search: Path, number: int | None) -> str:
-    table: dict[str, Any] = read_json(search / SEARCH_FILE) or {}
+    table: dict[str, Any] = json_or_none(search / SEARCH_FILE) or {}
     found = table.get("found") or {}
     parts = [f"{table.get('title', '')}: {table.get('method', '')}, {search}", *_table(table)]
     if found:
@@ -181,7 +181,7 @@ def _candidate(candidate: Candidate, parent: Candidate | None) -> list[str]:
     curves = curve_lines(training.folder / TRAIN_FOLDER / "curve.csv")
     if curves:
         lines += ["", "curves of training:", *curves]
-    data = read_json(training.folder / FEEDBACK_FILE)
+    data = json_or_none(training.folder / FEEDBACK_FILE)
     if isinstance(data, dict):
         lines += ["", "what its policy did:", *_indented(Feedback.from_dict(data).text())]
     if parent is not None:

@@ -9,9 +9,10 @@ import tyro
 from v2p_data.cli import parse
 from v2p_data.commands.display import STAGE_ORDER
 from v2p_data.errors import UnusableError, V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import RECORD_FILE, read_record
 from v2p_data.pipeline.contents import damaged, damages, demand_no
-from v2p_data.report.reading import PARTIAL_SUFFIX, RUN_FILE, read_json
+from v2p_data.report.reading import PARTIAL_SUFFIX, RUN_FILE
 
 Row = tuple[str, str, str, str]
 """Stage, item, what became of it, more."""
@@ -84,7 +85,7 @@ def _failures(run: Path) -> Iterator[Row]:
     path = run / RUN_FILE
     if not path.exists(follow_symlinks=False):
         return
-    outcomes = read_json(path)
+    outcomes = json_or_none(path)
     if not isinstance(outcomes, list) or not all(isinstance(o, dict) for o in outcomes):
         yield "run", RUN_FILE, "damaged", f"{path} cannot be read; the next command writes it anew"
         return

@@ -3,7 +3,6 @@
 Files first (whole, with statistics), then what the policy sees and does (features, size, palette, names, scale, rate).
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from v2p_data.episodes.features import (
     STATE_NAMES,
 )
 from v2p_data.errors import V2PError
+from v2p_data.json_files import read_object
 from v2p_data.sim.masks import PALETTE
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
@@ -56,7 +56,7 @@ def check_policy(folder: Path, offer: Offer, task: str = "") -> Facts:
     Raises:
         V2PError: it does not, or its checkpoint is damaged.
     """
-    config = _read_json(folder, CONFIG_FILE, "it is no LeRobot policy")
+    config = _policy_file(folder, CONFIG_FILE, "it is no LeRobot policy")
     _check_whole(folder / WEIGHTS_FILE)
     facts = read_facts(folder)
     _check_features(folder, config, offer)
@@ -151,7 +151,9 @@ def _check_palette(folder: Path, config: dict[str, Any], facts: Facts) -> None:
 def _check_statistics(folder: Path, config: dict[str, Any]) -> None:
     modes: dict[str, str] = config.get("normalization_mapping") or {}
     for name in PROCESSOR_FILES:
-        said = _read_json(folder, name, "LeRobot's processors are part of a policy; copy it anew")
+        said = _policy_file(
+            folder, name, "LeRobot's processors are part of a policy; copy it anew"
+        )
         for step in said.get("steps", []):
             if "normalizer" not in str(step.get("registry_name", "")):
                 continue
@@ -262,14 +264,8 @@ def _shapes(folder: Path, config: dict[str, Any], name: str) -> dict[str, tuple[
         ) from error
 
 
-def _read_json(folder: Path, name: str, otherwise: str) -> dict[str, Any]:
+def _policy_file(folder: Path, name: str, otherwise: str) -> dict[str, Any]:
     path = folder / name
     if not path.is_file():
         raise V2PError(f"{folder} holds no {name}: {otherwise}")
-    try:
-        said = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise V2PError(f"{path} is damaged or cut off ({error}); copy the policy anew") from error
-    if not isinstance(said, dict):
-        raise V2PError(f"{path} holds no JSON object; copy the policy anew")
-    return said
+    return read_object(path, "copy the policy anew")

@@ -4,13 +4,13 @@
 of the run or LeRobot's `train_config.json`, as long as it is there.
 """
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from v2p_data.episodes.features import ACTION_KEY, METADATA_FILE, STATE_KEY
 from v2p_data.errors import V2PError
+from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import read_record, write_json_atomically
 from v2p_data.sim.batch_env import SimConfig
 from v2p_data.task.task import TASK_FILE
@@ -41,12 +41,12 @@ def facts_of_dataset(dataset: Path) -> Facts:
     Raises:
         V2PError: a file of it cannot be read.
     """
-    info, ours = _json(dataset / "meta/info.json"), _json(dataset / METADATA_FILE)
+    info, ours = _told(dataset / "meta/info.json"), _told(dataset / METADATA_FILE)
     try:
         features: dict[str, Any] = info.get("features", {})
         palette = {int(k): int(grey) for k, grey in ours.get("palette", {}).items()}
         tasks = [
-            _json(path) for path in sorted((dataset / TASKS_IN_DATASET).glob(f"*/{TASK_FILE}"))
+            _told(path) for path in sorted((dataset / TASKS_IN_DATASET).glob(f"*/{TASK_FILE}"))
         ]
         return Facts(
             fps=float(info["fps"]) if "fps" in info else None,
@@ -81,7 +81,7 @@ def read_facts(policy: Path) -> Facts:
     """
     path = policy / FACTS_FILE
     if path.is_file():
-        said = _json(path)
+        said = read_object(path, "delete it, or train anew")
         lists = ("state", "action", "palette")
         try:
             fields: dict[str, Any] = {
@@ -105,7 +105,7 @@ def _dataset_of(policy: Path) -> Path | None:
         if name and found.is_dir():
             return found
     config = policy / "train_config.json"
-    root = ((_json(config).get("dataset") or {}) if config.is_file() else {}).get("root")
+    root = (_told(config).get("dataset") or {}).get("root")
     return Path(root) if root and Path(root).is_dir() else None
 
 
@@ -114,13 +114,6 @@ def _names(feature: Any) -> tuple[str, ...]:
     return tuple(map(str, names)) if isinstance(names, list) else ()
 
 
-def _json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    try:
-        said = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise V2PError(f"{path} cannot be read ({error}); make it anew") from error
-    if not isinstance(said, dict):
-        raise V2PError(f"{path} holds no JSON object; make it anew")
-    return said
+def _told(path: Path) -> dict[str, Any]:
+    """Return the object in a file, an empty one where there is no file."""
+    return read_object(path, "make it anew") if path.is_file() else {}

@@ -5,7 +5,6 @@ ledger once it is staged, and students are kept until the next one exists, so a 
 again makes the same files as an undisturbed one.
 """
 
-import json
 import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +21,7 @@ from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
 from v2p_data.episodes.staging import Episode, refusals_told, staged_episodes
 from v2p_data.errors import V2PError
+from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.task.task import TaskBundle
@@ -258,7 +258,7 @@ def _collect(
             write_json_atomically(
                 path, _stage(lesson.bundle, handovers, episodes, folder, number, first)
             )
-        batches.append(json.loads(path.read_text()))
+        batches.append(read_object(path, "delete it; its batch is made again"))
     return batches
 
 

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.episodes.features import METADATA_FILE, METADATA_SCHEMA
-from v2p_data.episodes.tables import Found, read_json
+from v2p_data.episodes.tables import Found
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 
 CARRIED_TASKS = Path("v2p/tasks")
 """Of a dataset: the tasks that its episodes were made in, a folder each."""
@@ -28,7 +29,7 @@ def read_about(root: Path) -> dict[str, Any] | None:
     path = root / METADATA_FILE
     if not path.exists(follow_symlinks=False):
         return None
-    about = read_json(path)
+    about = json_or_none(path, max_bytes=None)
     if not isinstance(about, dict):
         raise V2PError(f"{path} is damaged: it is no JSON object; {_remedy(root)}")
     schema = about.get("schema", METADATA_SCHEMA)

@@ -30,6 +30,7 @@ from v2p_data.episodes.staging import (
     staged_episodes,
 )
 from v2p_data.errors import ItemRejectedError
+from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import REJECTS_FILE, write_json_atomically, write_rejects
 from v2p_data.seeds import seed_for
 from v2p_data.sim import randomize
@@ -180,7 +181,7 @@ def _collect(
             )
             entry = _stage(bundle, rollouts, cfg, out, number, have, num_threads, on_progress)
             write_json_atomically(ledger, entry)
-        batches.append(json.loads(ledger.read_text()))
+        batches.append(read_object(ledger, "delete it; its batch is made again"))
     return _finish(bundle, cfg, out, batches)
 
 

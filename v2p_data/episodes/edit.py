@@ -34,11 +34,11 @@ from v2p_data.episodes.tables import (
     episodes_of,
     layout_problems,
     read_info,
-    read_json,
     row_spans,
 )
 from v2p_data.episodes.verify import frames_differ
 from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.scene.files import copy_folder, is_plain_path
 
@@ -157,7 +157,7 @@ def _read(root: Path) -> _Source:
             f"{root} is not sound ({first.where}: {first.detail}); 'v2p verify {root}' tells everything"
         )
     episodes = episodes_of(root)
-    about = read_json(root / METADATA_FILE)
+    about = json_or_none(root / METADATA_FILE, max_bytes=None)
     lengths = [int(n) for n in column(episodes, "length")]
     if about is not None and len(about["episodes"]) != len(lengths):
         raise V2PError(

@@ -20,9 +20,9 @@ from v2p_data.episodes.tables import (
     damage_told,
     episodes_of,
     read_info,
-    read_json,
 )
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import RECORD_FILE, read_record
 from v2p_data.pipeline.contents import damaged
 
@@ -147,7 +147,7 @@ def _task(
             f"{acted.taken_over_frames}; the expert alone in {acted.num_demonstrations} demonstrations"
         )
     carried = root / CARRIED_TASKS / item
-    scene = read_json(carried / "scene/scene.json") or {}
+    scene = json_or_none(carried / "scene/scene.json") or {}
     if scene:
         objects = ", ".join(f"{o['label']} ({o['shape']})" for o in scene.get("objects", []))
         yield f"  video     {scene.get('video', '?')}: {objects}"

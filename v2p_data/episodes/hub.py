@@ -22,8 +22,8 @@ from v2p_data.episodes.about import CARRIED_TASKS
 from v2p_data.episodes.card import CARD_FILE, LICENSE, write_card, write_text
 from v2p_data.episodes.features import METADATA_FILE
 from v2p_data.episodes.repo_id import check_repo_id
-from v2p_data.episodes.tables import read_json
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.pipeline.shareable import without_places
 
@@ -105,7 +105,7 @@ def push_dataset(
     info_path = root / "meta/info.json"
     if not info_path.is_file():
         raise V2PError(f"{root} holds no LeRobot dataset (no meta/info.json); nothing was pushed")
-    info = read_json(info_path)
+    info = json_or_none(info_path)
     if not isinstance(info, dict):
         raise V2PError(f"{info_path} is damaged: it is no JSON object; nothing was pushed")
     version = str(info.get("codebase_version", ""))
@@ -389,19 +389,19 @@ def _first_line(text: str, token: str) -> str:
 def _remove_places(root: Path) -> None:
     """Take places of this machine out of what earlier versions wrote; today's names none."""
     for path in (root / METADATA_FILE, *root.glob(f"{CARRIED_TASKS}/*/task.json")):
-        data = read_json(path)
+        data = json_or_none(path, max_bytes=None)
         if data is not None and (shareable := without_places(data)) != data:
             write_json_atomically(path, shareable)
 
 
 def _policy_card(folder: Path, repo_id: str) -> str:
-    config = read_json(folder / "config.json")
+    config = json_or_none(folder / "config.json")
     if not isinstance(config, dict):
         raise V2PError(
             f"{folder / 'config.json'} is damaged: it is no JSON object; nothing was pushed"
         )
     kind = str(config.get("type", "unknown"))
-    trained = read_json(folder / "train_config.json")
+    trained = json_or_none(folder / "train_config.json")
     source = trained.get("dataset") if isinstance(trained, dict) else None
     dataset = str(source.get("repo_id", "")) if isinstance(source, dict) else ""
     fetched = (

@@ -24,6 +24,7 @@ from v2p_data.episodes import stream
 from v2p_data.episodes.episode_stats import Stats, mask_stats, rgb_stats
 from v2p_data.episodes.staging import MASK_CAMERA, Episode, Heading
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
 
 SHARD_FRAMES = 4096
@@ -109,9 +110,8 @@ def make_shards(
 
 def stats_of(shard: Shard, folder: Path) -> list[dict[str, Stats]] | None:
     """Return the pictures' statistics per episode and camera of a finished shard; None where it is not finished."""
-    try:
-        note = json.loads(shard.note(folder).read_text())
-    except (FileNotFoundError, json.JSONDecodeError):
+    note = json_or_none(shard.note(folder), max_bytes=None)
+    if not isinstance(note, dict):
         return None
     files = [shard.file(folder, camera) for camera in shard.episodes[0].cameras]
     if note.get("fingerprint") != shard.fingerprint or not all(f.is_file() for f in files):

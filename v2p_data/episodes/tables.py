@@ -5,7 +5,6 @@ read here first, and what does not fit together is named by file.
 """
 
 import itertools
-import json
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 
 INFO_FILE = "meta/info.json"
 STATS_FILE = "meta/stats.json"
@@ -45,7 +45,7 @@ def read_info(root: Path) -> dict[str, Any]:
     Raises:
         V2PError: there is no LeRobot v3 dataset at `root`.
     """
-    info = read_json(root / INFO_FILE)
+    info = json_or_none(root / INFO_FILE)
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
         raise V2PError(
             f"{root} holds no LeRobot dataset: there is no readable {INFO_FILE} in it; "
@@ -58,14 +58,6 @@ def read_info(root: Path) -> dict[str, Any]:
             "convert it with LeRobot's own converter"
         )
     return info
-
-
-def read_json(path: Path) -> Any:
-    """Return what the file holds, or None where there is none or it is no JSON."""
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        return None
 
 
 def camera_keys(info: dict[str, Any], *dtypes: str) -> list[str]:
@@ -167,7 +159,7 @@ def _unreadable(root: Path) -> Iterator[Found]:
                 check="unreadable_file", where=_name(root, path),
                 detail=f"is no whole parquet file ({words}); its writer was killed or the copy was cut",
             )  # fmt: skip
-    if read_json(root / STATS_FILE) is None:
+    if json_or_none(root / STATS_FILE) is None:
         yield Found(check="unreadable_file", where=STATS_FILE, detail="is no JSON")
 
 

@@ -4,13 +4,13 @@ A folder of runs holds `expert/<item>-<fingerprint>` with a record that names it
 `task/`, or in `reward/` where its reward was searched. What is there is part of the recipe of an expert that may start from it: see `solved_digests`.
 """
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from policies.ppo.policy import EXPERT_FILE, WEIGHTS_FILE
 from v2p_data.errors import V2PError
+from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import demand_whole, read_record
 from v2p_data.pipeline.contents import damaged
 from v2p_data.pipeline.fingerprint import file_digest
@@ -46,8 +46,8 @@ def find_solved(runs: Path) -> list[Solved]:
         demand_whole(folder, runs)
         demand_whole(task, runs)
         try:
-            obs_dim = int(json.loads((folder / EXPERT_FILE).read_text())["obs_dim"])
-        except (OSError, ValueError, LookupError, TypeError) as error:
+            obs_dim = int(read_object(folder / EXPERT_FILE, "train it anew")["obs_dim"])
+        except (V2PError, ValueError, LookupError, TypeError) as error:
             raise damaged(folder, f"{folder / EXPERT_FILE} cannot be read") from error
         found.append(Solved(bundle=TaskBundle.load(task), folder=folder, obs_dim=obs_dim))
     if not found:

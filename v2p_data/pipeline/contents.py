@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from v2p_data.errors import UnusableError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.fingerprint import file_digest
 
 MEMORY_FOLDER = ".checked"
@@ -146,10 +147,7 @@ def _remembered(memory: Path | None) -> dict[str, Any]:
     """Return stamp and digest of files that were as listed; nothing where that cannot be read."""
     if memory is None:
         return {}
-    try:
-        known = json.loads(memory.read_text())
-    except (OSError, ValueError, RecursionError):
-        return {}
+    known = json_or_none(memory, max_bytes=None)
     return cast(dict[str, Any], known) if isinstance(known, dict) else {}
 
 

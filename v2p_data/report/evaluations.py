@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from policies.evaluation.rate import Rate
+from v2p_data.json_files import json_or_none
 from v2p_data.report.films import FAILURE, SUCCESS
 from v2p_data.report.media import MediaBudget, Medium, PageConfig, film_uri, picture_uri
-from v2p_data.report.reading import Run, as_dict, number, rate_of, read_json
+from v2p_data.report.reading import Run, as_dict, number, rate_of
 
 FILM_SUFFIXES = (".mp4", ".webm", ".mkv", ".avi", ".mov", ".gif")
 VIDEOS_FOLDER, SHEET_FILE = "videos", "sheet.png"
@@ -42,7 +43,7 @@ def evaluation_rows(run: Run, cfg: PageConfig, budget: MediaBudget) -> list[Eval
     """Return all judged tasks: the policy's first, those it was trained on before the others."""
     rows: list[EvaluationRow] = []
     for result in run.made("evaluation"):
-        data = result.counts.get("rows") or read_json(result.folder / "evaluation.json")
+        data = result.counts.get("rows") or json_or_none(result.folder / "evaluation.json")
         for row in data if isinstance(data, list) else []:
             rate = rate_of(row)
             if rate is None:

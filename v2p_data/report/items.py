@@ -12,6 +12,7 @@ from policies.evaluation.rate import Rate
 from v2p_data.episodes.features import ACTION_NAMES, FPS
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.report.audits import AuditView, audit_view
 from v2p_data.report.chart import Line, line_chart
 from v2p_data.report.media import (
@@ -33,7 +34,6 @@ from v2p_data.report.reading import (
     number,
     rate_of,
     read_curve,
-    read_json,
 )
 from v2p_data.report.rewards import RewardView, reward_view
 from v2p_data.report.searches import SEARCH_FOLDER
@@ -196,10 +196,10 @@ def _mesh_picture(folder: Path, obj: SceneObject, size_px: int) -> str | None:
 def _add_task(view: ItemView, result: Result) -> None:
     code = result.folder / "task.py"
     view.code = code.read_text(errors="replace") if code.is_file() else ""
-    view.task = as_dict(read_json(result.folder / "task.json"))
+    view.task = as_dict(json_or_none(result.folder / "task.json"))
     view.kind = str(view.task.get("kind") or view.kind)
     view.audit = audit_view(view.task.get("audit"))
-    table = as_dict(read_json(result.folder / "audit.json"))
+    table = as_dict(json_or_none(result.folder / "audit.json"))
     view.samples = [
         _sample_view(sample, k == table.get("picked"))
         for k, sample in enumerate(as_dicts(table.get("samples")))
@@ -208,7 +208,7 @@ def _add_task(view: ItemView, result: Result) -> None:
 
 
 def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
-    counts = as_dict(result.counts or read_json(result.folder / "evaluation.json"))
+    counts = as_dict(result.counts or json_or_none(result.folder / "evaluation.json"))
     view.rate = rate_of(counts.get("success"))
     view.charts = training_charts(read_curve(result.folder / "curve.csv"))
     uri = budget.admit(

@@ -4,7 +4,6 @@ Nothing here trusts a file to be whole: a run may be young, killed or edited. Wh
 """
 
 import csv
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ import numpy as np
 
 from policies.evaluation.rate import Rate
 from v2p_data.errors import UnusableError
+from v2p_data.json_files import MAX_BYTES, json_or_none
 from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record, read_rejects
 from v2p_data.pipeline.contents import damages
 
@@ -24,8 +24,6 @@ JOINT_STAGES = ("dataset", "distillation", "policy", "evaluation")
 STAGES = ITEM_STAGES + JOINT_STAGES
 RUN_FILE = "run.json"
 PARTIAL_SUFFIX = ".partial"
-MAX_READ_BYTES = 20_000_000
-"""Nothing that a stage writes for a page is larger; some of it comes from processes that ran generated code."""
 MAX_SIZE = 1e30
 """Numbers beyond it are treated as not finite: charts subtract them from each other."""
 
@@ -206,22 +204,12 @@ def rate_of(data: Any) -> Rate | None:
 
 def read_curve(path: Path) -> dict[str, np.ndarray]:
     """Return a CSV's columns; what is no number is NaN, and a last line that a kill cut short is left out."""
-    if not path.is_file() or path.stat().st_size > MAX_READ_BYTES:
+    if not path.is_file() or path.stat().st_size > MAX_BYTES:
         return {}
     with path.open(newline="", errors="replace") as stream:
         head, *rows = [*csv.reader(stream)] or [[]]
     whole = [row for row in rows if len(row) == len(head)]
     return {name: np.array([_float(row[k]) for row in whole]) for k, name in enumerate(head)}
-
-
-def read_json(path: Path) -> Any:
-    """Return a JSON file's content, None if there is none that can be read."""
-    try:
-        if not path.is_file() or path.stat().st_size > MAX_READ_BYTES:
-            return None
-        return json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        return None
 
 
 def number(value: Any) -> float | None:
@@ -272,7 +260,7 @@ def _outcomes(root: Path) -> tuple[list[dict[str, Any]], bool]:
     """Return what became of each result that the last command asked for, and whether all of it can be read."""
     if not (root / RUN_FILE).exists(follow_symlinks=False):
         return [], True
-    found = read_json(root / RUN_FILE)
+    found = json_or_none(root / RUN_FILE)
     outcomes = as_dicts(found)
     is_whole = isinstance(found, list) and len(outcomes) == len(found)
     return [o for o in outcomes if o.get("stage") in STAGES and "item" in o], is_whole

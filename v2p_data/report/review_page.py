@@ -8,7 +8,6 @@ script than the page's own from running.
 
 import base64
 import hashlib
-import json
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -23,6 +22,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.scene.scene import SCENE_FILE
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.clip import Hint
@@ -201,10 +201,7 @@ def _scene_json(folder: Path | None) -> dict[str, Any]:
     """Return what `scene.json` says, `{}` where it cannot be read: a page for people shows what there is."""
     if folder is None:
         return {}
-    try:
-        data = json.loads((folder / SCENE_FILE).read_text())
-    except (OSError, ValueError):
-        return {}
+    data = json_or_none(folder / SCENE_FILE)
     return data if isinstance(data, dict) else {}
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from v2p_data.report.reading import as_dict, as_dicts, as_list, number, read_json
+from v2p_data.json_files import json_or_none
+from v2p_data.report.reading import as_dict, as_dicts, as_list, number
 
 SEARCH_FOLDER = "search"
 """In the result of the stage `reward`."""
@@ -195,7 +196,7 @@ def _choice(found: dict[str, Any]) -> Choice | None:
 
 def _json(path: Path, inside: Path) -> Any:
     own = _own_file(path, inside)
-    return None if own is None else read_json(own)
+    return None if own is None else json_or_none(own)
 
 
 def _text(path: Path, inside: Path) -> str:

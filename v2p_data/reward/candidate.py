@@ -8,7 +8,6 @@
 What a training wrote was written by a process that ran generated code: it is read as data.
 """
 
-import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
 
 CODE_FILE = "code.py"
@@ -28,7 +28,6 @@ FEEDBACK_FILE = "feedback.json"
 TRAJECTORIES_FILE = "trajectories.npz"
 TRAIN_FOLDER = "train"
 LAST_POLICY = "last"
-MAX_JSON_BYTES = 10_000_000
 MAX_WORDS = 500
 
 Kind = Literal[
@@ -61,7 +60,7 @@ class Fault:
         """Return what a file says, None where there is no such file."""
         if not path.is_file():
             return None
-        data = read_json(path)
+        data = json_or_none(path)
         said = data.get("kind") if isinstance(data, dict) else None
         kind: Kind
         for kind in KINDS:
@@ -138,8 +137,8 @@ class Training:
         """Read how far a training came; an empty one where there is nothing."""
         fault = Fault.read(folder / FAULT_FILE)
         try:
-            entries = read_json(folder / EVALUATIONS_FILE) or []
-            done = read_json(folder / DONE_FILE) or {}
+            entries = json_or_none(folder / EVALUATIONS_FILE) or []
+            done = json_or_none(folder / DONE_FILE) or {}
             evaluations = tuple(Evaluation.of(e) for e in entries)
             mark, reached = int(done.get("mark", 0)), bool(done.get("reached", False))
             seconds = float(done.get("seconds", 0.0))
@@ -197,7 +196,7 @@ class Candidate:
         Raises:
             V2PError: there is no candidate.
         """
-        data = read_json(folder / CANDIDATE_FILE)
+        data = json_or_none(folder / CANDIDATE_FILE)
         if not isinstance(data, dict):
             raise V2PError(f"{folder} holds no candidate of a reward search")
         return Candidate(
@@ -235,16 +234,6 @@ def load_candidates(search: Path) -> list[Candidate]:
         Candidate.load(path.parent)
         for path in sorted((search / "candidates").glob(f"*/{CANDIDATE_FILE}"))
     ]
-
-
-def read_json(path: Path) -> Any:
-    """Return a file's JSON, None where there is no such file or nothing that can be read."""
-    try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            return None
-        return json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        return None
 
 
 def _mean(values: list[float]) -> float:

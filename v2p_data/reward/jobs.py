@@ -20,8 +20,9 @@ from typing import Any
 
 import v2p_data
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
-from v2p_data.reward.candidate import DONE_FILE, FAULT_FILE, Fault, read_json
+from v2p_data.reward.candidate import DONE_FILE, FAULT_FILE, Fault
 from v2p_data.reward.config import Limits
 
 WORKER = "v2p_data.reward.worker"
@@ -47,7 +48,7 @@ class Job:
 
     @property
     def is_done(self) -> bool:
-        done = read_json(self.folder / DONE_FILE)
+        done = json_or_none(self.folder / DONE_FILE)
         if not isinstance(done, dict):
             return False
         return done.get("mark", -1) >= self.mark or bool(done.get("reached"))
@@ -169,7 +170,6 @@ class Jobs:
         environment = {
             "PATH": "/usr/bin:/bin",
             **{f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS")},
-            "V2P_PARENT": str(os.getpid()),
         }
         process = subprocess.Popen(
             [sys.executable, "-I", "-c", starter],

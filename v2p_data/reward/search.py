@@ -12,7 +12,6 @@ goes on from its checkpoint. A search that is killed and started again ends with
 """
 
 import fcntl
-import json
 import logging
 import shutil
 from collections.abc import Callable, Generator, Sequence
@@ -24,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none, read_object
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.pipeline.fingerprint import canonical
 from v2p_data.reward import redesign
@@ -36,7 +36,6 @@ from v2p_data.reward.candidate import (
     Fault,
     Training,
     load_candidates,
-    read_json,
 )
 from v2p_data.reward.config import Limits, RewardConfig
 from v2p_data.reward.feedback import Feedback
@@ -226,7 +225,7 @@ class _Search:
         """Return a round's candidates: those that were written before, or new ones."""
         path = self.out / "rounds" / f"{iteration}.json"
         folder = self.out / "candidates"
-        numbers = read_json(path)
+        numbers = json_or_none(path)
         if isinstance(numbers, list):
             return [Candidate.load(folder / f"{n:03d}") for n in numbers]
         self._tell(f"round {iteration + 1}: writing rewards")
@@ -295,7 +294,9 @@ class _Search:
         for standing in self._elites():
             parent = standing.candidate
             try:
-                feedback = Feedback.from_dict(read_json(standing.training.folder / FEEDBACK_FILE))
+                feedback = Feedback.from_dict(
+                    json_or_none(standing.training.folder / FEEDBACK_FILE)
+                )
             except V2PError:  # its process ran generated code
                 logger.warning("candidate %d left no readable feedback", parent.number)
                 continue
@@ -473,7 +474,7 @@ class _Search:
         fault = Fault.read(folder / "fault.json")
         if fault is not None:
             raise V2PError(f"no policy to start from could be taught: {fault.reason}")
-        done = read_json(folder / DONE_FILE) or {}
+        done = json_or_none(folder / DONE_FILE) or {}
         if done.get("teacher"):
             self.warm_start = folder / TRAIN_FOLDER
 
@@ -519,7 +520,7 @@ class _Search:
                 faults[fault.kind] = faults.get(fault.kind, 0) + 1
         marks = self.cfg.marks[-1]
         worth = [c for c in candidates if not _is_screened(c.training())]
-        taught = read_json(self.out / TAUGHT_FOLDER / DONE_FILE) or {}
+        taught = json_or_none(self.out / TAUGHT_FOLDER / DONE_FILE) or {}
         return Found(
             chosen=best.number,
             code=best.code,
@@ -602,7 +603,7 @@ def candidate_row(candidate: Candidate, cfg: RewardConfig) -> dict[str, Any]:
 
 def chosen_candidate(search: Path) -> Candidate | None:
     """Return the candidate that a finished search chose."""
-    table = read_json(search / SEARCH_FILE)
+    table = json_or_none(search / SEARCH_FILE)
     found = table.get("found") if isinstance(table, dict) else None
     if not found:
         return None
@@ -635,7 +636,7 @@ def _check_recipe(bundle: TaskBundle, cfg: RewardConfig, seed: int, out: Path) -
     if not path.is_file():
         write_json_atomically(path, recipe)
         return
-    saved = json.loads(path.read_text())
+    saved = read_object(path, f"clear {out} away, or choose another folder")
     if saved == recipe:
         return
     changed = [k for k in recipe if saved.get(k) != recipe[k]]

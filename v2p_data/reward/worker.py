@@ -35,6 +35,7 @@ from v2p_data.errors import V2PError
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import Worlds, success_of
 from v2p_data.experts.learning import teach as teach_policy
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.reward.candidate import (
     DONE_FILE,
@@ -46,7 +47,6 @@ from v2p_data.reward.candidate import (
     TRAJECTORIES_FILE,
     Fault,
     Kind,
-    read_json,
 )
 from v2p_data.reward.feedback import feedback_of
 from v2p_data.reward.jobs import HEARTBEAT_FILE, LOG_FILE, REQUEST_FILE
@@ -193,8 +193,8 @@ def train(request: dict[str, Any], folder: Path) -> None:
         num_threads=threads,
     )
     warm_start = Path(request["warm_start"]) if request["warm_start"] else None
-    evaluations: list[dict[str, Any]] = read_json(folder / EVALUATIONS_FILE) or []
-    done: dict[str, Any] = read_json(folder / DONE_FILE) or {}
+    evaluations: list[dict[str, Any]] = json_or_none(folder / EVALUATIONS_FILE) or []
+    done: dict[str, Any] = json_or_none(folder / DONE_FILE) or {}
     began, before = time.monotonic(), float(done.get("seconds", 0.0))
     mark, target = len(evaluations), int(request["mark"])
     reached, trajectories = False, None

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError
+from v2p_data.json_files import read_json
 
 IMAGES_FOLDER = "images"
 LEDGER_FILE = "ledger.jsonl"
@@ -142,8 +143,8 @@ class CallStore:
         if path is None:
             return None
         try:
-            return Call.from_dict(json.loads(path.read_text()))
-        except (OSError, ValueError, TypeError, KeyError) as error:
+            return Call.from_dict(read_json(path))
+        except (V2PError, ValueError, TypeError, KeyError) as error:
             raise V2PError(
                 f"{path} holds no stored call ({type(error).__name__}); delete it, and it is asked again"
             ) from error

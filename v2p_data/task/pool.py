@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from v2p_data.errors import V2PError
+from v2p_data.json_files import read_object
 from v2p_data.scene.scene import Scene
 from v2p_data.task.example_tasks import BASIC_EXAMPLES, Example
 from v2p_data.task.likeness import likeness
@@ -99,4 +100,4 @@ def _example(bundle: TaskBundle) -> Example:
 
 
 def _success(folder: Path) -> float:
-    return float(json.loads((folder / SOLVED_FILE).read_text())["success"])
+    return float(read_object(folder / SOLVED_FILE, "remove its folder from the pool")["success"])

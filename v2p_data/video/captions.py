@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError, did_you_mean
-from v2p_data.video.checked import check_keys, listed, read_json, same_name, type_of, words
+from v2p_data.json_files import read_json
+from v2p_data.video.checked import check_keys, listed, same_name, type_of, words
 from v2p_data.video.clip import Hint
 from v2p_data.video.hints import MARK_KEYS, boxes_as_read, read_hint
 from v2p_data.video.labels import Labels, read_labels

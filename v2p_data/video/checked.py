@@ -1,52 +1,14 @@
-"""JSON that people wrote, read and checked: what is wrong with it is said with its place in the file."""
+"""Checks of JSON that people wrote: the sentence names the place of what is wrong."""
 
 import json
 import unicodedata
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError, did_you_mean
 
 MAX_WORDS = 2000
 """Letters; what is longer is no caption and no name."""
-
-
-def read_json(path: Path) -> Any:
-    """Return what a JSON file holds.
-
-    Raises:
-        V2PError: it is no JSON, or has two entries of one name.
-    """
-    try:
-        return json.loads(path.read_text("utf-8-sig"), object_pairs_hook=_no_duplicates)
-    except json.JSONDecodeError as error:
-        raise V2PError(
-            f"{path}, line {error.lineno}, column {error.colno}: {error.msg}; this is not valid JSON"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise V2PError(f"{path} is not UTF-8 text; save it as UTF-8") from error
-    except RecursionError as error:
-        raise V2PError(f"{path} is nested too deeply; this is no caption file") from error
-    except _DuplicateKeyError as error:
-        raise V2PError(f"{path} has two entries for '{error}'; remove one") from error
-    except ValueError as error:  # a number of thousands of digits
-        raise V2PError(f"{path} holds a number that cannot be read: {error}") from error
-    except OSError as error:
-        raise V2PError(f"{path} cannot be read: {error.strerror}") from error
-
-
-class _DuplicateKeyError(Exception):
-    pass
-
-
-def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    seen: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in seen:
-            raise _DuplicateKeyError(key)
-        seen[key] = value
-    return seen
 
 
 def check_keys(data: dict[str, Any], known: tuple[str, ...], where: str) -> None:

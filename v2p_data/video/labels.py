@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError
-from v2p_data.video.checked import listed, read_json, shortened, type_of, words
+from v2p_data.json_files import read_json
+from v2p_data.video.checked import listed, shortened, type_of, words
 
 _SAYING = ("label", "template", "placeholders")
 _SLOT = re.compile(r"\[([^\]]*)\]")
