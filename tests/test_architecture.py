@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LEAVES = {"errors", "json_files"}
+LEAVES = {"errors", "json_files", "processes"}
 """Every room may use them; they know nothing but each other."""
 BELOW: dict[str, set[str]] = {
     "errors": set(),
     "json_files": set(),
+    "processes": set(),
     "seeds": set(),
     "kinds": set(),
     "pipeline": set(),

@@ -10,7 +10,6 @@ import logging
 import multiprocessing
 import os
 import signal
-import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -29,9 +28,11 @@ from v2p_data.pipeline.runner import (
     make_stage,
     stored_outcome,
 )
+from v2p_data.processes import end_with_parent
 
-PARENT_POLL_S = 0.5
 PROGRESS_EVERY_S = 0.2
+WORKERS_END_S = 5.0
+"""The workers of a killed run are gone by then."""
 RUN_LOCK = ".lock"
 WORKER_LOCK = ".workers.lock"
 """Shared by the workers: as long as one lives, no new run begins."""
@@ -66,7 +67,7 @@ def only_run_in(root: Path) -> Generator[None]:
     with stream:
         _lock(stream, root, wait_s=0.0)
         with (root / WORKER_LOCK).open("a") as workers:
-            _lock(workers, root, wait_s=10 * PARENT_POLL_S)
+            _lock(workers, root, wait_s=WORKERS_END_S)
         yield
 
 
@@ -226,7 +227,7 @@ def _no_progress(share: float, words: str) -> None:
 
 def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends us
-    threading.Thread(target=_end_with_parent, args=(parent_pid,), daemon=True).start()
+    end_with_parent(parent_pid)
     log.parent.mkdir(parents=True, exist_ok=True)
     stream = log.open("a")
     os.dup2(stream.fileno(), 1)
@@ -254,9 +255,3 @@ def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) 
 def _limit_threads(num_threads: int) -> None:
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = str(num_threads)
-
-
-def _end_with_parent(parent_pid: int) -> None:
-    while os.getppid() == parent_pid:
-        time.sleep(PARENT_POLL_S)
-    os.kill(os.getpid(), signal.SIGKILL)

@@ -10,7 +10,6 @@ import os
 import selectors
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -18,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import v2p_data
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.processes import own_python
 from v2p_data.reward.candidate import DONE_FILE, FAULT_FILE, Fault
 from v2p_data.reward.config import Limits
 
@@ -165,14 +164,12 @@ class Jobs:
             process.stdin.flush()
 
     def _launch(self) -> subprocess.Popen[bytes]:
-        root = str(Path(v2p_data.__file__).parents[1])
-        starter = f"import sys; sys.path.insert(0, {root!r}); from {WORKER} import main; main()"
         environment = {
             "PATH": "/usr/bin:/bin",
             **{f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS")},
         }
         process = subprocess.Popen(
-            [sys.executable, "-I", "-c", starter],
+            own_python(WORKER),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=environment,

@@ -10,7 +10,6 @@ before it loads any generated code; time limits are the parent's business. What 
 """
 
 import csv
-import ctypes
 import json
 import os
 import re
@@ -19,7 +18,6 @@ import signal
 import sys
 import time
 import traceback
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +35,7 @@ from v2p_data.experts.learning import Worlds, success_of
 from v2p_data.experts.learning import teach as teach_policy
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.processes import end_with_parent
 from v2p_data.reward.candidate import (
     DONE_FILE,
     EVALUATIONS_FILE,
@@ -59,7 +58,6 @@ from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.torchrl_env import TorchRLEnv
 from v2p_data.task.confine import confine, leave_the_network
 
-PR_SET_PDEATHSIG = 1
 POLL_S = 0.05
 FILE_BYTES = 2 * 1024**3
 OPEN_FILES = 256
@@ -75,7 +73,7 @@ LEAST_WAY_M = 0.01
 
 def main() -> None:
     """Answer requests until the input ends or the parent does."""
-    _die_with_parent()
+    end_with_parent(os.getppid())  # a parent that ended before this closed the input
     leave_the_network()
     torch.set_num_threads(1)
     # Loads what tensordict loads late, once for all jobs: three seconds.
@@ -109,18 +107,18 @@ def _obey(message: dict[str, Any], children: dict[int, int]) -> None:
             if number == message["kill"]:
                 os.kill(pid, signal.SIGKILL)
         return
-    pid = os.fork()
+    parent_pid, pid = os.getpid(), os.fork()
     if pid == 0:
         code = 1
         try:
-            code = _in_child(Path(message["job"]))
+            code = _in_child(Path(message["job"]), parent_pid)
         finally:
             os._exit(code)
     children[pid] = message["number"]
 
 
-def _in_child(folder: Path) -> int:
-    _die_with_parent()
+def _in_child(folder: Path, parent_pid: int) -> int:
+    end_with_parent(parent_pid)
     with (folder / LOG_FILE).open("a") as log, Path(os.devnull).open() as nothing:
         os.dup2(nothing.fileno(), 0)
         os.dup2(log.fileno(), 1)
@@ -165,12 +163,6 @@ def fault_of(error: Exception) -> Fault:
 
 def _say(message: dict[str, Any]) -> None:
     os.write(1, json.dumps(message).encode() + b"\n")
-
-
-def _die_with_parent() -> None:
-    """Have the kernel end this process with its parent, also where that is killed."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 # --- what a job does -----------------------------------------------------------------------------------------

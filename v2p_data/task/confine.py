@@ -13,6 +13,7 @@ import resource
 from contextlib import suppress
 from pathlib import Path
 
+from v2p_data.processes import end_with_parent
 from v2p_data.task import kernel_rules
 
 NOBODY = 65534
@@ -44,7 +45,7 @@ def confine(
 ) -> tuple[str, ...]:
     """Give up, for the rest of this process's life, everything that untrusted code should not have.
 
-    No socket can be opened and no program started afterwards, whatever the arguments are.
+    No socket can be opened and no program started afterwards, whatever the arguments are. The process ends with its parent.
 
     Args:
         seconds: of computing from now on, over all threads; None: no limit. The wall clock is the parent's business.
@@ -90,6 +91,7 @@ def confine(
         held.append("nobody")
     if kernel_rules.drop_capabilities():
         held.append("capabilities")
+    end_with_parent(os.getppid())  # becoming nobody made the kernel forget it
     if kernel_rules.refuse_calls(may_start_processes=processes > 0):
         held.append("seccomp")
     return tuple(held)

@@ -7,20 +7,15 @@ or a memory bomb in one sample is that sample's own result. See `sandbox` for wh
 import hashlib
 import json
 import math
-import os
-import signal
 import subprocess
-import sys
 import tempfile
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import v2p_data
 from v2p_data.errors import V2PError
+from v2p_data.processes import end_group, own_python
 from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
 from v2p_data.task.guarded import COMPONENT_NAME
@@ -150,12 +145,10 @@ def _ask_child(
 ) -> list[SmokeResult]:
     num_probes = len(next(iter(probes.values()))) if probes else 0
     request = trial_request(sources, scene, probes, seconds_each)
-    root = str(Path(v2p_data.__file__).parents[1])
-    module = f"v2p_data.task.{CHILD.removesuffix('.py')}"
-    starter = f"import sys; sys.path.insert(0, {root!r}); from {module} import main; main()"
-    with tempfile.TemporaryDirectory(prefix="v2p-task-") as folder:
-        child = subprocess.Popen(
-            [sys.executable, "-I", "-c", starter],
+    with (
+        tempfile.TemporaryDirectory(prefix="v2p-task-") as folder,
+        subprocess.Popen(
+            own_python(f"v2p_data.task.{CHILD.removesuffix('.py')}"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -167,16 +160,16 @@ def _ask_child(
                 "PATH": "/usr/bin:/bin",
             },
             start_new_session=True,
-        )
+        ) as child,
+    ):
         try:
             answer, complaint = child.communicate(json.dumps(request).encode(), timeout_s)
         except subprocess.TimeoutExpired:
-            _end(child)
             return [
                 SmokeResult(runnable=False, error=f"the trial run took more than {timeout_s:g} s")
             ] * len(sources)
         finally:
-            _end(child)
+            end_group(child)
     return _read(answer, complaint, len(sources), num_probes)
 
 
@@ -221,11 +214,3 @@ def _edge_states(scene: Scene) -> States:
 
 def _as_lists(states: States) -> dict[str, Any]:
     return {k: np.asarray(v, float).tolist() for k, v in states.items()}
-
-
-def _end(child: subprocess.Popen[bytes]) -> None:
-    """End the child and everything it started; they share a process group of their own."""
-    if child.poll() is None:
-        with suppress(ProcessLookupError):
-            os.killpg(child.pid, signal.SIGKILL)
-        child.communicate()

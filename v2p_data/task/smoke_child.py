@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from v2p_data.processes import end_with_parent
 from v2p_data.task.confine import confine, leave_the_network
 from v2p_data.task.guarded import Answers, GuardedTask, TaskOutputError, demand_equal
 from v2p_data.task.reader.refusal import TaskCodeError
@@ -68,6 +69,7 @@ class FakePlacer:
 
 def main() -> None:
     """Answer one request from stdin on stdout."""
+    end_with_parent(os.getppid())
     request: dict[str, Any] = json.load(sys.stdin)
     leave_the_network()
     torch.set_num_threads(1)

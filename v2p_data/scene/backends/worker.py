@@ -10,7 +10,7 @@ a worker is a program you chose to run.
 import json
 import os
 import shlex
-import signal
+import shutil
 import stat
 import subprocess
 import tempfile
@@ -28,6 +28,7 @@ from jaxtyping import Shaped
 from trimesh.exchange.obj import load_obj
 
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.processes import end_group, ending_with_us
 
 SCHEMA, VERSION = "v2p-worker", 1
 EXIT_REFUSED = 3
@@ -204,16 +205,15 @@ def run_worker(
 def _run(words: list[str], answer: Path, log: Path, timeout_s: float, max_bytes: int) -> int:
     # Our own interpreter's settings would lead another environment's Python astray.
     env = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
+    if shutil.which(words[0]) is None:
+        raise V2PError(
+            f"worker '{words[0]}' cannot be started: there is no such program; check its command line"
+        )
     with log.open("wb") as out:
-        try:
-            process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, env=env,
-                start_new_session=True,
-            )  # fmt: skip
-        except OSError as error:
-            raise V2PError(
-                f"worker '{words[0]}' cannot be started ({error.strerror}); check its command line"
-            ) from error
+        process = subprocess.Popen(
+            ending_with_us(words), stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, env=env,
+            start_new_session=True,
+        )  # fmt: skip
         try:
             end = time.monotonic() + timeout_s
             while True:
@@ -231,23 +231,7 @@ def _run(words: list[str], answer: Path, log: Path, timeout_s: float, max_bytes:
                         f"worker '{shlex.join(words[:-4])}' was stopped: it wrote more than {max_bytes} bytes"
                     )
         finally:
-            _kill_group(process)
-
-
-def _kill_group(process: subprocess.Popen[bytes]) -> None:
-    """End the worker and all that it started, whether or not it has already exited itself."""
-    for sign, grace_s in ((signal.SIGTERM, 1.0), (signal.SIGKILL, 10.0)):
-        if process.poll() is not None:
-            sign = signal.SIGKILL
-        try:
-            os.killpg(process.pid, sign)
-        except (ProcessLookupError, PermissionError):
-            break
-        try:
-            process.wait(timeout=grace_s)
-        except subprocess.TimeoutExpired:
-            continue
-    process.wait()
+            end_group(process, grace_s=1.0)
 
 
 def _write_request(request: WorkerRequest, folder: Path) -> None:
