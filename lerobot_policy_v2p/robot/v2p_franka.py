@@ -12,8 +12,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
-from lerobot.robots import Robot
 
+from lerobot_policy_v2p.robot.arm_robot import ArmRobot, action_of, named_action, named_state
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
 from lerobot_policy_v2p.robot.franky import FrankyArm
 from lerobot_policy_v2p.robot.network import NetworkArm
@@ -21,7 +21,6 @@ from lerobot_policy_v2p.robot.simulated import SimulatedArm
 from v2p_data.deployment.limits import Guard
 from v2p_data.deployment.robot import MASK_NAME, ActionScale, Rig
 from v2p_data.deployment.sight import LOST_AFTER, Sight, clicks_from
-from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.sim.masks import labels_to_rgb
@@ -76,7 +75,7 @@ ARMS: dict[str, Callable[[V2PFrankaConfig], Arm]] = {
 }
 
 
-class V2PFranka(Robot):
+class V2PFranka(ArmRobot[Arm]):
     """A Franka arm as LeRobot sees it, and as `v2p deploy` does."""
 
     config_class = V2PFrankaConfig
@@ -84,39 +83,17 @@ class V2PFranka(Robot):
 
     def __init__(self, config: V2PFrankaConfig) -> None:
         super().__init__(config)
-        del self.calibration  # LeRobot's dict of motors, which would hide the method
         self.config = config
-        self.arm: Arm | None = None
+        sees = config.pictures == "rgb"
+        self.picture_name, self.picture_px = (RGB_NAME, RGB_PX) if sees else (MASK_NAME, MASK_PX)
         self._sight: Sight | None = None
         self._is_started = False
         self._guard: Guard | None = None
         self._state: np.ndarray | None = None
 
     @property
-    def observation_features(self) -> dict[str, Any]:
-        size, name = (RGB_PX, RGB_NAME) if self.config.pictures == "rgb" else (MASK_PX, MASK_NAME)
-        return {**dict.fromkeys(STATE_NAMES, float), name: (size, size, 3)}
-
-    @property
-    def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(ACTION_NAMES, float)
-
-    @property
-    def cameras(self) -> dict[str, Any]:
-        """Return nothing: pictures come from the arm's backend, no camera of LeRobot's is opened."""
-        return {}
-
-    @property
     def action_scale(self) -> ActionScale:
         return self._connected().action_scale
-
-    @property
-    def is_connected(self) -> bool:
-        return self.arm is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
 
     def connect(self, calibrate: bool = True) -> None:
         """Start the simulation, or reach the arm; there is nothing to calibrate."""
@@ -129,10 +106,6 @@ class V2PFranka(Robot):
             if self.config.backend != "sim":
                 self._guard = Guard(self.config.limits, self.arm.action_scale)
 
-    def calibrate(self) -> None: ...
-
-    def configure(self) -> None: ...
-
     def get_observation(self) -> dict[str, Any]:
         """Return the state's entries by name, and `mask` or `rgb`.
 
@@ -141,7 +114,7 @@ class V2PFranka(Robot):
         """
         arm = self._connected()
         self._state = arm.state()
-        state: dict[str, Any] = dict(zip(STATE_NAMES, self._state.tolist(), strict=True))
+        state = named_state(self._state)
         if self.config.pictures == "rgb":
             return {**state, RGB_NAME: self._seeing().picture()}
         if self._sight is None:
@@ -155,17 +128,10 @@ class V2PFranka(Robot):
             V2PError: a limit ends the run, and the arm holds its position; or it does not answer.
         """
         arm = self._connected()
-        wanted = np.array([float(action[name]) for name in ACTION_NAMES])
+        wanted = action_of(action)
         if self._guard is not None and self.config.pictures == "mask":
-            reading = Rig(self).reading_of(
-                dict(
-                    zip(
-                        STATE_NAMES,
-                        self._state if self._state is not None else arm.state(),
-                        strict=True,
-                    )
-                )
-            )
+            state = self._state if self._state is not None else arm.state()
+            reading = Rig(self).reading_of(named_state(state))
             try:
                 self._guard.look(reading)
                 wanted = self._guard.limit(wanted, reading).action
@@ -173,7 +139,7 @@ class V2PFranka(Robot):
                 arm.hold()
                 raise
         done = arm.act(np.clip(wanted, -1.0, 1.0))
-        return dict(zip(ACTION_NAMES, done.tolist(), strict=True))
+        return named_action(done)
 
     def calibration(self) -> Camera:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Return the camera of `rgb`."""
@@ -206,11 +172,6 @@ class V2PFranka(Robot):
         """The simulated task in words."""
         return self.arm.env.task_description if isinstance(self.arm, SimulatedArm) else ""
 
-    def disconnect(self) -> None:
-        if self.arm is not None:
-            self.arm.close()
-            self.arm = None
-
     def _tracked(self, sight: Sight, state: dict[str, Any]) -> np.ndarray:
         reading = Rig(self).reading_of({**state, RGB_NAME: self._seeing().picture()})
         try:
@@ -233,8 +194,3 @@ class V2PFranka(Robot):
                 f"the backend '{self.config.backend}' gives no pictures; use 'sim' or 'network'"
             )
         return arm
-
-    def _connected(self) -> Arm:
-        if self.arm is None:
-            raise V2PError("the robot is not connected; call connect() first")
-        return self.arm

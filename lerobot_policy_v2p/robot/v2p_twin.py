@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from lerobot.robots import Robot
 
+from lerobot_policy_v2p.robot.arm_robot import ArmRobot, action_of, named_action, named_state
 from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
-from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
-from v2p_data.errors import V2PError
+from v2p_data.deployment.robot import ActionScale
 from v2p_data.geometry.camera import Camera
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.arm import TwinArm
@@ -24,40 +23,18 @@ from v2p_data.twin.parameters import changed
 logger = logging.getLogger(__name__)
 
 
-class V2PTwin(Robot):
+class V2PTwin(ArmRobot[TwinArm]):
     """The twin as LeRobot sees it."""
 
     config_class = V2PTwinConfig
     name = "v2p_twin"
+    picture_name, picture_px = RGB_NAME, RGB_PX
 
     def __init__(self, config: V2PTwinConfig) -> None:
         super().__init__(config)
-        del self.calibration  # LeRobot's dict of motors, which would hide the method
         self.config = config
-        self.arm: TwinArm | None = None
         self._steps = 0
         self._has_succeeded = False
-
-    @property
-    def observation_features(self) -> dict[str, Any]:
-        return {**dict.fromkeys(STATE_NAMES, float), RGB_NAME: (RGB_PX, RGB_PX, 3)}
-
-    @property
-    def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(ACTION_NAMES, float)
-
-    @property
-    def cameras(self) -> dict[str, Any]:
-        """Return nothing: the picture comes from the twin, no camera of LeRobot's is opened."""
-        return {}
-
-    @property
-    def is_connected(self) -> bool:
-        return self.arm is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
 
     def connect(self, calibrate: bool = True) -> None:
         """Start the episode; the camera is calibrated already."""
@@ -66,9 +43,15 @@ class V2PTwin(Robot):
             self.arm = TwinArm(bundle, changed(self.config.change))
             self.restart(self.config.seed)
 
-    def calibrate(self) -> None: ...
-
-    def configure(self) -> None: ...
+    @property
+    def action_scale(self) -> ActionScale:
+        """What an action of 1 means in this task: some tasks, such as throwing, take larger steps."""
+        cfg = self._connected().cfg
+        return ActionScale(
+            position_step_m=cfg.position_step_m,
+            rotation_step_rad=cfg.rotation_step_rad,
+            finger_step_m=cfg.finger_step_m,
+        )
 
     def restart(self, seed: int) -> None:
         """Start the episode of another seed."""
@@ -82,20 +65,19 @@ class V2PTwin(Robot):
             V2PError: there is no OpenGL.
         """
         arm = self._connected()
-        state = dict(zip(STATE_NAMES, arm.state().tolist(), strict=True))
-        return {**state, RGB_NAME: arm.picture()}
+        return {**named_state(arm.state()), RGB_NAME: arm.picture()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Carry out an action for 50 ms and return it as it was carried out: clipped to [-1, 1]."""
         arm = self._connected()
-        clipped = np.clip([float(action[name]) for name in ACTION_NAMES], -1.0, 1.0)
+        clipped = np.clip(action_of(action), -1.0, 1.0)
         outcome = arm.act(clipped)
         self._steps += 1
         if outcome.is_held and not self._has_succeeded and arm.mirror.verdict():
             self._has_succeeded = True
             title = arm.mirror.bundle.title
             logger.info("task '%s' succeeded in the twin after %d steps", title, self._steps)
-        return dict(zip(ACTION_NAMES, clipped.tolist(), strict=True))
+        return named_action(clipped)
 
     def calibration(self) -> Camera:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Return the camera of `rgb` as calibrated, in the arm's base frame."""
@@ -118,13 +100,3 @@ class V2PTwin(Robot):
     def task_description(self) -> str:
         """The task in words."""
         return self._connected().mirror.bundle.description
-
-    def disconnect(self) -> None:
-        if self.arm is not None:
-            self.arm.close()
-            self.arm = None
-
-    def _connected(self) -> TwinArm:
-        if self.arm is None:
-            raise V2PError("the twin is not connected; call connect() first")
-        return self.arm

@@ -1,17 +1,41 @@
 """The loop in the twin: another simulator, whose pictures and readings are as late and as wrong as a real arm's."""
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 
 from v2p_data.deployment.limits import Guard, LimitsConfig
 from v2p_data.deployment.loop import LoopConfig, Run
-from v2p_data.deployment.robot import Rig
+from v2p_data.deployment.robot import ActionScale, Rig
 from v2p_data.deployment.sight import Sight
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.segment import points_inside
 from v2p_data.scene.frames.mask_ops import iou
+from v2p_data.task.task import TASK_FILE
 
 pytestmark = pytest.mark.slow
+
+
+def test_the_twin_says_the_action_scale_of_its_task(task_folder, tmp_path):
+    from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
+    from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
+
+    far = shutil.copytree(task_folder, tmp_path / "far")
+    task = json.loads((far / TASK_FILE).read_text())
+    (far / TASK_FILE).write_text(json.dumps({**task, "motion_scale": 2.0}))
+    robot = V2PTwin(V2PTwinConfig(task_folder=str(far), calibration_dir=tmp_path))
+    robot.connect()
+
+    scale = Rig(robot).scale
+    before = robot.arm.target.pos[2]
+    robot.arm.act(np.array([0, 0, 1.0, 0, 0, 0, 0]))
+    moved = robot.arm.target.pos[2] - before
+    robot.disconnect()
+
+    assert scale == ActionScale(position_step_m=2 * ActionScale.position_step_m)
+    assert moved == pytest.approx(scale.position_step_m)
 
 
 def test_the_twin_is_seen_from_one_click_and_kept_within_limits(task_folder, steady, tmp_path):
