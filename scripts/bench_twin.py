@@ -90,7 +90,7 @@ def main(cfg: BenchConfig) -> None:
         waits=cfg.wait_for_gripper and who.kind == "policy",
     )  # fmt: skip
     _tell("twin", twin.successes, twin.at_end if cfg.at_end else None, time.perf_counter() - start)
-    print(f"failures in the twin: {_counts(twin)}")
+    print(f"failures in the twin: {twin.failure_counts()}")
     here, there = twin.successes, trained_in.successes
     print(
         f"paired: both {(here & there).sum()}, twin only {(here & ~there).sum()}, "
@@ -107,11 +107,6 @@ def _tell(where: str, once, at_end, seconds: float) -> None:  # noqa: ANN001 - a
 
     rates = f"once {rate(once)}" + ("" if at_end is None else f", at end {rate(at_end)}")
     print(f"{where}: {rates}; {seconds:.0f} s")
-
-
-def _counts(twin: TwinJudged) -> dict[str, int]:
-    kinds = [e.failure for e in twin.episodes if e.failure]
-    return {kind: kinds.count(kind) for kind in sorted(set(kinds))}
 
 
 def _write(

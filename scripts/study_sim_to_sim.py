@@ -13,12 +13,11 @@ import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bench_deploy import PATIENCE_MS, Measured, TimedPolicy, episode, robot_in
-from studies.results import Row, append_result, results_in
+from studies.results import Row, append_result, letters_of, results_in
 from studies.sim_to_sim import table
 from studies.sweeps import SWEEPS, FaultyLook
 from v2p_data.commands.deploy import loaded_policy
@@ -29,7 +28,7 @@ from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.judging import contestant, play_of
 from v2p_data.task.task import TaskBundle
-from v2p_data.twin.judge import TwinJudged, judge_in_twin, true_labels
+from v2p_data.twin.judge import judge_in_twin, true_labels
 from v2p_data.twin.parameters import nominal
 
 PLACES = ("training", "twin", "twin_hasty", "twin_raw", "tracked")
@@ -123,8 +122,8 @@ def _played(asked: Asked, place: str, value: float | None) -> Row:
         )  # fmt: skip
         assert judged.at_end is not None
         return {
-            "once": _letters(judged.successes),
-            "at_end": _letters(judged.at_end),
+            "once": letters_of(judged.successes),
+            "at_end": letters_of(judged.at_end),
             "failures": judged.failure_counts(),
         }
     if place == "tracked":
@@ -144,12 +143,12 @@ def _played(asked: Asked, place: str, value: float | None) -> Row:
         parameters=parameters, look=look, waits=place not in ("twin_raw", "twin_hasty"),
     )  # fmt: skip
     row = {
-        "once": _letters(found.successes),
-        "failures": _failures(found),
+        "once": letters_of(found.successes),
+        "failures": found.failure_counts(),
         "twin": parameters.digest()[:12],
     }
     if place.startswith("twin"):
-        row["at_end"] = _letters(found.at_end)
+        row["at_end"] = letters_of(found.at_end)
     if isinstance(look, FaultyLook):
         row["iou"] = round(float(np.mean(look.overlaps)), 4)
     return row
@@ -169,20 +168,11 @@ def _tracked(asked: Asked) -> Row:
             robot.disconnect()
     endings = [e for e in measured.endings if e != "done"]
     return {
-        "once": _letters(measured.tracked),
+        "once": letters_of(np.array(measured.tracked)),
         "failures": {e: endings.count(e) for e in sorted(set(endings))},
         "iou": round(float(np.mean(measured.object_iou)), 4),
         "iou_5th": round(float(np.percentile(measured.object_iou, 5)), 4),
     }
-
-
-def _failures(found: TwinJudged) -> dict[str, int]:
-    kinds = [e.failure for e in found.episodes if e.failure]
-    return {kind: kinds.count(kind) for kind in sorted(set(kinds))}
-
-
-def _letters(true: Any) -> str:
-    return "".join("1" if t else "0" for t in true)
 
 
 def _arguments() -> argparse.Namespace:

@@ -52,7 +52,7 @@ from .objects import (
     unseen_meshes,
     unseen_stage,
 )
-from .results import Row
+from .results import Row, letters_of
 
 FILMS_FOLDER = "films"
 Key = tuple[Arm, int, int]
@@ -397,15 +397,11 @@ def judged_row(judged: Judged) -> Row:
     at_end = judged.at_end
     assert at_end is not None
     return {
-        "once": _letters(judged.successes),
-        "at_end": _letters(at_end),
+        "once": letters_of(judged.successes),
+        "at_end": letters_of(at_end),
         "failures": judged.failure_counts(),
         "median_success_s": judged.median_success_s,
     }
-
-
-def _letters(true: np.ndarray) -> str:
-    return "".join("1" if t else "0" for t in true)
 
 
 def record_of(folder: Path) -> Record:

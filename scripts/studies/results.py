@@ -5,6 +5,9 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Bool
+
 RESULTS = "results.jsonl"
 Row = dict[str, Any]
 
@@ -31,3 +34,8 @@ def append_result(out: Path, row: Row) -> None:
     cut = path.is_file() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
     with path.open("a") as stream:
         stream.write(("\n" if cut else "") + json.dumps(row) + "\n")
+
+
+def letters_of(successes: Bool[np.ndarray, "episode"]) -> str:
+    """Return the episodes in order, one letter each: `1` for a success."""
+    return "".join("1" if success else "0" for success in successes)

@@ -6,6 +6,7 @@ see the twin's truth. All of it is sim-to-sim: no real arm was asked.
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -73,6 +74,11 @@ class TwinJudged:
     def at_end(self) -> Bool[np.ndarray, "episode"]:
         """Which episodes were a success at their last step."""
         return np.array([e.at_end for e in self.episodes])
+
+    def failure_counts(self) -> dict[str, int]:
+        """Return how many episodes failed in which way, in the order of the names."""
+        counts = Counter(e.failure for e in self.episodes if e.failure)
+        return dict(sorted(counts.items()))
 
 
 def play(
