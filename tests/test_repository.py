@@ -52,14 +52,14 @@ def test_every_v2p_command_in_the_readme_exists():
 )
 def test_every_v2p_command_in_readme_and_docs_parses(page):
     from v2p_data.cli import parse
-    from v2p_data.commands import camera, deploy, edit, models, review, reward, run, share, show, task
+    from v2p_data.commands import camera, deploy, edit, hands, models, review, reward, run, share, show, task
 
     kinds = {
         "generate": run.Generate, "train": run.Train, "eval": run.Evaluate, "demo": run.Demo,
         "distill": run.Distill, "deploy": deploy.Deploy,
         "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
         "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify,
-        "status": show.Status, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.Review, "scene models": models.Models,
+        "status": show.Status, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.Review, "scene models": models.Models, "scene hands": hands.Hands,
         "reward": run.FromVideos, "task show": task.ShowTask, "reward search": reward.Search,
         "reward show": reward.ShowReward, "explain": share.Explain, "merge": edit.Merge, "drop": edit.Drop,
     }  # fmt: skip

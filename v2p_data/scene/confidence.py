@@ -12,6 +12,7 @@ from v2p_data.scene.data_types import Cue, GroundedObjects, Placement
 from v2p_data.scene.fitting.placement import vote_of
 from v2p_data.scene.fitting.trajectory import TOUCH_PX
 from v2p_data.scene.frames.colour import balance, colour_match, named_colours
+from v2p_data.scene.frames.hand_track import contact_share
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
 from v2p_data.scene.frames.segmentation import hand_at
 from v2p_data.scene.grounding.ground_objects import rests_on_table
@@ -20,6 +21,8 @@ from v2p_data.scene.scale.nouns import is_clear
 
 _COLOURED = 0.25
 """Share of a thing's pixels that need its colour: few things are one colour all over."""
+_AWAY_PX = 4.0
+"""Of a picture 320 px wide: an object so far from both its ends moves."""
 _OUT_OF_SIGHT = 0.8
 """What went into a bin lies in it, and what a fist lifts goes with it, but nobody sees where."""
 _GROWN = 0.2
@@ -42,6 +45,9 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
             add("grounding", f"colour of {which}", 0.4 + 0.6 * match / _COLOURED)
         if s.moves:
             add("segmentation", f"track of {which} from start to end", 0.8 + 0.7 * s.agreement)
+        touched = _touched_share(grounded) if s is grounded.objects[0] else None
+        if touched is not None:
+            add("grounding", f"a hand at {which} while it moves", 0.4 + 2 * touched)
         off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
         add("size", f"size of {which}", np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2))
         covers = placed.first.iou / attainable_iou(s.first)
@@ -69,6 +75,22 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
     if kind == "generic":
         add("grounding", "understanding the caption", 0.85)
     return tuple(cues)
+
+
+def _touched_share(grounded: GroundedObjects) -> float | None:
+    """Return in which share of its moving frames a fingertip is at the manipulated object; None where nobody knows, or a tool moves it."""
+    thing, segmentation = grounded.objects[0], grounded.segmentation
+    by_tool = any(s.role == "tool" for s in grounded.objects)
+    if segmentation is None or segmentation.hands is None or by_tool or thing.hinted:
+        return None
+    spots = {i: np.argwhere(mask).mean(0) for i, mask in enumerate(thing.masks) if mask.any()}
+    ends = [np.argwhere(mask).mean(0) for mask in (thing.first, thing.last) if mask.any()]
+    moving = [
+        i
+        for i, spot in spots.items()
+        if all(np.linalg.norm(spot - end) > _AWAY_PX for end in ends)
+    ]
+    return contact_share(segmentation.hands, thing.masks, np.array(moving, int))
 
 
 def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:

@@ -6,6 +6,7 @@ from typing import Literal
 from v2p_data.scene.backends.config import (
     DepthConfig,
     GroundConfig,
+    HandsConfig,
     MeshConfig,
     PoseConfig,
     SegmentConfig,
@@ -44,6 +45,7 @@ class SceneConfig:
     """Poses kept per object, the first and last among them."""
     ground: GroundConfig = field(default_factory=GroundConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
+    hands: HandsConfig = field(default_factory=HandsConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)

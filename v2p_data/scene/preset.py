@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from v2p_data.scene.backends.config import DEFAULT_MODELS
+from v2p_data.scene.backends.hands_setup import installed_worker
 from v2p_data.scene.config import SceneConfig
 
 
@@ -74,12 +75,15 @@ def this_machine() -> Machine:
 
 
 def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machine) -> SceneConfig:
-    """Return the settings with what the preset chooses written out; without a preset as they are.
+    """Return the settings with what the preset and this machine choose written out.
 
     Args:
         cfg: settings; a stage with a backend of its own keeps it.
         machine_of: asked only where the preset is `learned`.
     """
+    if cfg.hands.backend == "auto":
+        found = "mediapipe" if installed_worker() else "none"
+        cfg = replace(cfg, hands=replace(cfg.hands, backend=found))
     if cfg.preset != "learned":
         return cfg
     machine = machine_of()

@@ -29,6 +29,7 @@ from v2p_data.scene.frames.stabilise import stabilised
 from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
 from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
 from v2p_data.scene.grounding.ground_objects import ground_objects, without_asides
+from v2p_data.scene.grounding.hands_by_model import track_hands
 from v2p_data.scene.meshes import with_meshes
 from v2p_data.scene.preset import with_preset
 from v2p_data.scene.remarks import remarks_on
@@ -91,6 +92,8 @@ def _frames(clip: Clip, cfg: SceneConfig) -> tuple[Clip, WorkingClip, Segmentati
         clip, working = steady, working_clip_of(steady)
     segmentation = segment_clip(clip, working) if cfg.ground.backend == "network" else None
     check_still(working, segmentation, cfg.max_camera_shift_px)
+    if segmentation is not None:
+        segmentation = replace(segmentation, hands=track_hands(clip, working, cfg.hands))
     return clip, working, segmentation
 
 

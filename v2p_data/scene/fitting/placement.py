@@ -76,11 +76,15 @@ def place(
         from v2p_data.scene.fitting.hand_scale import (
             height_from_hand,  # torch takes a second to import
         )
+        from v2p_data.scene.fitting.landmark_scale import height_from_landmarks
 
         resting_object = _resting_object(views[0], fits[0], plan, camera, pitch_rad)
-        by_hand = height_from_hand(working, segmentation, resting_object, height_m)
-        if by_hand is not None:
-            height_m, spread = camera_height_m(votes, [*known, by_hand])
+        by_hand = [height_from_hand(working, segmentation, resting_object, height_m)]
+        if segmentation.hands is not None:
+            by_hand.append(height_from_landmarks(segmentation.hands, resting_object, height_m))
+        told = [vote for vote in by_hand if vote is not None]
+        if told:
+            height_m, spread = camera_height_m(votes, [*known, *told])
     seen_in = SeenIn(working=working, segmentation=segmentation)
     placed: list[PlacedObject] = []
     for k, see in enumerate(views):

@@ -1,0 +1,208 @@
+"""Hands from a worker: the contract, the environment of MediaPipe, and what the track of fingertips says."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from v2p_data.cli import run
+from v2p_data.errors import V2PError
+from v2p_data.geometry.camera import Camera, intrinsics
+from v2p_data.scene.backends import hands_setup
+from v2p_data.scene.backends.config import HandsConfig
+from v2p_data.scene.backends.worker import WorkerRequest, run_worker
+from v2p_data.scene.config import SceneConfig
+from v2p_data.scene.fitting.hand_scale import RestingObject
+from v2p_data.scene.fitting.landmark_scale import height_from_landmarks, px_per_m
+from v2p_data.scene.fitting.silhouette import camera_above
+from v2p_data.scene.frames.hand_track import HandTrack, contact_share
+from v2p_data.scene.frames.working_clip import working_clip_of
+from v2p_data.scene.grounding.hands_by_model import track_hands
+from v2p_data.scene.preset import with_preset
+
+HAND_M = np.random.default_rng(3).normal(0, 0.03, (21, 3))
+"""Any 21 points of the size of a hand will do: [m], axes right, down, forward."""
+
+
+def worker_of(body: str, folder: Path) -> str:
+    """Return the command line of a worker with this body."""
+    path = folder / "worker.py"
+    path.write_text(
+        "import json, sys\nfrom pathlib import Path\nimport numpy as np\n"
+        "given, out = Path(sys.argv[2]), Path(sys.argv[4])\n"
+        "images = np.load(given / 'arrays.npz')['images']\n"
+        f"{body}\n"
+        "np.savez(out / 'result.npz', **answer)\n"
+        "(out / 'result.json').write_text(json.dumps({'schema': 'v2p-worker', 'version': 1, 'kind': 'hands', 'fields': {}}))\n"
+    )
+    return shlex.join([sys.executable, str(path)])
+
+
+ONE_HAND = """
+n = len(images)
+answer = dict(image_idx=np.arange(n), landmarks_px=np.full((n, 21, 2), 20.0), landmarks_m=np.zeros((n, 21, 3)),
+              scores=np.full(n, 0.9), is_right=np.ones(n, bool))
+"""
+
+
+def track(num: int, px: np.ndarray, sampled: int | None = None) -> HandTrack:
+    """Return one hand per frame."""
+    return HandTrack(
+        at=np.arange(num),
+        px=px,
+        metres=np.repeat(HAND_M[None], num, 0),
+        num_sampled=sampled or num,
+    )
+
+
+def test_a_worker_s_hands_belong_to_working_frames_and_pixels(tmp_path, draw):
+    clip = draw(num_frames=12)
+    working = working_clip_of(clip)
+    cfg = HandsConfig(backend="worker", worker=worker_of(ONE_HAND, tmp_path))
+
+    hands = track_hands(clip, working, cfg)
+
+    assert hands is not None
+    assert hands.is_known
+    np.testing.assert_array_equal(hands.at, np.arange(len(working.rgb)))
+    np.testing.assert_allclose(hands.px, 20.0 * working.px_scale)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ("answer['image_idx'] += len(images)", "'image_idx' of result.npz must"),
+        ("answer['scores'] += 1", "'scores' of result.npz must lie in 0..1"),
+        ("answer['landmarks_m'] += 2", "'landmarks_m' of result.npz must lie in -1..1"),
+        ("answer['landmarks_px'] = answer['landmarks_px'][:, :20]", "'landmarks_px' of result.npz must be float"),
+        ("del answer['is_right']", "lacks the array 'is_right'"),
+    ],
+)  # fmt: skip
+def test_a_result_that_breaks_the_contract_is_one_sentence(tmp_path, wrong: str, sentence: str):
+    command = worker_of(ONE_HAND + wrong, tmp_path)
+    images = np.zeros((2, 24, 32, 3), np.uint8)
+
+    with pytest.raises(V2PError, match=sentence.replace(".", r"\.")):
+        run_worker(command, WorkerRequest(kind="hands", arrays={"images": images}), 60.0)
+
+
+def test_a_picture_without_hands_is_an_answer(tmp_path, draw):
+    body = ONE_HAND + "answer = {name: array[:0] for name, array in answer.items()}"
+    clip = draw(num_frames=12)
+
+    hands = track_hands(
+        clip,
+        working_clip_of(clip),
+        HandsConfig(backend="worker", worker=worker_of(body, tmp_path)),
+    )
+
+    assert hands is not None
+    assert len(hands.at) == 0
+    assert not hands.is_known
+
+
+def test_without_an_installation_auto_asks_nobody_and_mediapipe_says_what_to_do(
+    tmp_path, monkeypatch: pytest.MonkeyPatch, draw, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    clip = draw(num_frames=12)
+    working = working_clip_of(clip)
+
+    assert with_preset(SceneConfig()).hands.backend == "none"
+    assert track_hands(clip, working, HandsConfig()) is None
+    with pytest.raises(V2PError, match="run 'v2p scene hands --setup'"):
+        track_hands(clip, working, HandsConfig(backend="mediapipe"))
+    assert run(["scene", "hands"]) == 0
+    assert "v2p scene hands --setup" in capsys.readouterr().out
+
+
+def test_a_half_made_environment_is_not_used(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    hands_setup.hands_folder().mkdir(parents=True)
+
+    assert hands_setup.installed_worker() == ""
+
+
+def test_an_installation_that_fails_is_one_sentence_and_leaves_nothing_in_use(
+    tmp_path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    lock = tmp_path / "requirements.lock"
+    lock.write_text("no-such-package==1 --hash=sha256:" + 64 * "0" + "\n")
+    monkeypatch.setattr(hands_setup, "REQUIREMENTS", lock)
+    monkeypatch.setenv("UV_OFFLINE", "1")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+
+    with pytest.raises(V2PError, match="without the worker everything works as before"):
+        hands_setup.set_up_hands(lambda words: None)
+
+    assert hands_setup.installed_worker() == ""
+
+
+def test_every_pinned_package_has_a_hash():
+    lines = hands_setup.REQUIREMENTS.read_text().splitlines()
+    pins = [line for line in lines if "==" in line]
+
+    assert any(pin.startswith("mediapipe==") for pin in pins)
+    assert all(pin.endswith("\\") for pin in pins)
+    assert not any("http" in line for line in lines)
+
+
+def test_the_real_worker_finds_no_hand_in_an_empty_picture():
+    command = hands_setup.installed_worker()
+    if not command:
+        pytest.skip("MediaPipe is not set up here: v2p scene hands --setup")
+    images = np.full((3, 120, 160, 3), 127, np.uint8)
+
+    answer = run_worker(command, WorkerRequest(kind="hands", arrays={"images": images}), 120.0)
+
+    assert answer.arrays["landmarks_px"].shape == (0, 21, 2)
+
+
+def test_a_hand_that_goes_along_touches_and_one_that_stays_away_does_not():
+    masks = np.zeros((10, 60, 80), bool)
+    for i in range(10):
+        masks[i, 30:40, 5 * i : 5 * i + 10] = True
+    moving = np.arange(2, 8)
+    beside = np.stack([np.tile([5.0 * i + 12, 35.0], (21, 1)) for i in range(10)])
+    beside[:, 0] += [0, -15]  # the wrist, so that a palm is 15 px long
+    away = np.tile([70.0, 5.0], (10, 21, 1))
+    away[:, 0] += [0, 15]
+
+    assert contact_share(track(10, beside), masks, moving) == 1.0
+    assert contact_share(track(10, away), masks, moving) == 0.0
+    assert contact_share(track(10, away, sampled=30), masks, moving) is None
+    assert contact_share(None, masks, moving) is None
+
+
+@pytest.mark.parametrize("height_m", [0.4, 0.7])
+def test_landmarks_at_a_resting_object_give_the_camera_s_height(height_m: float):
+    shape, pitch = (240, 320), 0.6
+    camera = camera_above(shape, pitch, 0.9)
+    foot = np.array([1.4, 0.1, 0.0])  # camera heights
+    grip = foot + np.array([0, 0, 0.05 / height_m])
+    landmarks = grip + (HAND_M / height_m) @ camera.T_world_cam[:3, :3].T
+    px = np.repeat(camera.project(landmarks)[None], 6, 0)
+    u, v = camera.project(grip[None])[0].astype(int)
+    masks = np.zeros((6, *shape), bool)
+    masks[:, v - 12 : v + 12, u - 12 : u + 12] = True
+    resting = RestingObject(masks=masks, rests=[(masks[0], foot)], camera=camera, pitch_rad=pitch)
+
+    told = height_from_landmarks(track(6, px), resting, 0.5)
+
+    assert told is not None
+    assert told[0] == pytest.approx(height_m, rel=0.05)
+    assert told[1] == pytest.approx(0.22, abs=0.01)
+    assert height_from_landmarks(track(2, px[:2]), resting, 0.5) is None
+
+
+def test_the_scale_of_landmarks_is_that_of_the_picture():
+    camera = Camera(
+        width_px=640, height_px=480, K=intrinsics(640, 480, 0.8), T_world_cam=np.eye(4)
+    )
+
+    shown = px_per_m(camera.project(HAND_M + np.array([0.05, 0, 0.8])), HAND_M)
+
+    assert shown == pytest.approx(camera.K[0, 0] / 0.8, rel=0.05)
