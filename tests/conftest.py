@@ -1,6 +1,12 @@
 """What holds for all tests."""
 
+import os
+from pathlib import Path
+
 import pytest
+
+# What a user has set up on this machine, such as the model that finds hands, changes no test.
+os.environ["V2P_CACHE"] = str(Path(__file__).parent / "no_cache")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -52,7 +52,19 @@ def test_every_v2p_command_in_the_readme_exists():
 )
 def test_every_v2p_command_in_readme_and_docs_parses(page):
     from v2p_data.cli import parse
-    from v2p_data.commands import camera, deploy, edit, hands, models, review, reward, run, share, show, task
+    from v2p_data.commands import (
+        camera,
+        deploy,
+        edit,
+        hands,
+        models,
+        review,
+        reward,
+        run,
+        share,
+        show,
+        task,
+    )
 
     kinds = {
         "generate": run.Generate, "train": run.Train, "eval": run.Evaluate, "demo": run.Demo,

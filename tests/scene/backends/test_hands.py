@@ -106,7 +106,7 @@ def test_a_picture_without_hands_is_an_answer(tmp_path, draw):
 def test_without_an_installation_auto_asks_nobody_and_mediapipe_says_what_to_do(
     tmp_path, monkeypatch: pytest.MonkeyPatch, draw, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("V2P_CACHE", str(tmp_path))
     clip = draw(num_frames=12)
     working = working_clip_of(clip)
 
@@ -119,7 +119,7 @@ def test_without_an_installation_auto_asks_nobody_and_mediapipe_says_what_to_do(
 
 
 def test_a_half_made_environment_is_not_used(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("V2P_CACHE", str(tmp_path))
     hands_setup.hands_folder().mkdir(parents=True)
 
     assert hands_setup.installed_worker() == ""
@@ -128,7 +128,7 @@ def test_a_half_made_environment_is_not_used(tmp_path, monkeypatch: pytest.Monke
 def test_an_installation_that_fails_is_one_sentence_and_leaves_nothing_in_use(
     tmp_path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("V2P_CACHE", str(tmp_path))
     lock = tmp_path / "requirements.lock"
     lock.write_text("no-such-package==1 --hash=sha256:" + 64 * "0" + "\n")
     monkeypatch.setattr(hands_setup, "REQUIREMENTS", lock)
@@ -150,7 +150,8 @@ def test_every_pinned_package_has_a_hash():
     assert not any("http" in line for line in lines)
 
 
-def test_the_real_worker_finds_no_hand_in_an_empty_picture():
+def test_the_real_worker_finds_no_hand_in_an_empty_picture(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("V2P_CACHE")
     command = hands_setup.installed_worker()
     if not command:
         pytest.skip("MediaPipe is not set up here: v2p scene hands --setup")

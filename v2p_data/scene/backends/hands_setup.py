@@ -25,10 +25,11 @@ _TIMEOUT_S = 1200
 
 
 def hands_folder() -> Path:
-    """Return where the environment of these pinned packages is, or would be."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    """Return where the environment of these pinned packages is, or would be; `V2P_CACHE` names another cache folder."""
+    shared = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    cache = Path(os.environ.get("V2P_CACHE") or shared / "v2p")
     digest = hashlib.sha256(REQUIREMENTS.read_bytes()).hexdigest()[:8]
-    return cache / "v2p" / f"hands-{digest}"
+    return cache / f"hands-{digest}"
 
 
 def installed_worker() -> str:
@@ -57,7 +58,7 @@ def set_up_hands(tell: Callable[[str], None]) -> Path:
     uv = shutil.which("uv") or next(
         (str(p) for p in Path(sys.prefix).parent.glob("*/bin/uv") if os.access(p, os.X_OK)), None
     )
-    base = sys._base_executable or sys.executable
+    base = getattr(sys, "_base_executable", sys.executable)
     packages = ["--no-deps", "--require-hashes", "-r", str(REQUIREMENTS)]
     if uv:
         _call([uv, "venv", "--quiet", "--python", base, str(folder)])
