@@ -28,6 +28,7 @@ test-fast: $(STAMP)
 check: $(STAMP)
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/ruff format --check .
+	@$(VENV)/bin/codespell $$(git ls-files '*.py' '*.md' '*.toml' '*.yaml')
 	@$(VENV)/bin/pyright --pythonpath $(PY)
 
 format: $(STAMP)

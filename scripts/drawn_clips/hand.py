@@ -27,8 +27,6 @@ _THUMB = (0.048, 0.060)
 _THUMB_R = 0.0100
 _STEP_M = 0.0038
 
-Gesture = Literal["palm", "fingers", "grip"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Hand:

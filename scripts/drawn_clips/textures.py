@@ -29,7 +29,6 @@ _HSV: dict[str, tuple[float, float, float, float, float, float]] = {
     "grey": (0.0, 1.0, 0.0, 0.10, 0.35, 0.65),
 }
 """Colour word -> hue, saturation and value from and to; hue in turns."""
-COLOUR_WORDS = tuple(_HSV)
 
 
 def colour_called(word: str, rng: np.random.Generator) -> Rgb:

@@ -1,7 +1,6 @@
 """Settings of the study of lifting: arms, numbers of tasks, and sizes."""
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Literal
 
 from v2p_data.policy_config import PolicyConfig
@@ -146,6 +145,3 @@ class LiftingConfig:
 def source_of(arm: Arm) -> Source:
     """Return where an arm's training objects come from."""
     return "toys" if arm == "toys" else "videos"
-
-
-CONFIGS = Path(__file__).parents[2] / "configs"

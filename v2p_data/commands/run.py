@@ -296,7 +296,8 @@ def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Pat
         and cfg.policy.encoder == "resnet18"
     ):
         print(  # noqa: T201
-            "ResNet18 trains for hours to days on a CPU; --config configs/small.yaml takes minutes",
+            "ResNet18 trains for hours to days on a CPU; --policy.preset=small --policy.steps=4000 --policy.batch-size=256 "
+            "takes minutes",
             file=sys.stderr,
         )
     stage = policy_stage(dataset.resolve(), record, cfg, sources)

@@ -23,7 +23,6 @@ from v2p_data.geometry.camera import Camera
 VERSION = 1
 LONGEST_LINE = 2**21
 """Bytes: a picture of 256 x 256 as PNG is at most a tenth of that."""
-REQUESTS = ("hello", "read", "target", "hold")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,6 @@ from v2p_data.reward.candidate import (
     Candidate,
     Fault,
     Training,
-    load_candidates,
 )
 from v2p_data.reward.config import Limits, RewardConfig
 from v2p_data.reward.feedback import Feedback
@@ -58,7 +57,6 @@ SEARCH_FILE = "search.json"
 RECIPE_FILE = "recipe.json"
 BUNDLE_FOLDER = "bundle"
 TAUGHT_FOLDER = "taught"
-BEATS_PER_RUNG = 20
 
 Progress = Callable[[float, str], None]
 ModelWriter = Callable[[TaskBundle, str, str, int], list[str]]
@@ -599,15 +597,6 @@ def candidate_row(candidate: Candidate, cfg: RewardConfig) -> dict[str, Any]:
         "successes": [e.success for e in training.evaluations],
         "seconds": round(training.seconds, 1),
     }
-
-
-def chosen_candidate(search: Path) -> Candidate | None:
-    """Return the candidate that a finished search chose."""
-    table = json_or_none(search / SEARCH_FILE)
-    found = table.get("found") if isinstance(table, dict) else None
-    if not found:
-        return None
-    return next(c for c in load_candidates(search) if c.number == found["chosen"])
 
 
 def _is_screened(training: Training) -> bool:

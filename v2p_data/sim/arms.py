@@ -77,28 +77,6 @@ def robot_from_json(data: dict[str, Any]) -> RobotConfig:
     return RobotConfig(**{**fields, "path": Path(data["path"])}) if data else RobotConfig()
 
 
-def menagerie_panda() -> RobotConfig:
-    """Return the Panda with its own hand, from MuJoCo Menagerie through the package `robot_descriptions`.
-
-    Raises:
-        V2PError: the package is not installed.
-    """
-    try:
-        from robot_descriptions import panda_mj_description  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise V2PError(
-            "menagerie's Panda needs the package robot_descriptions; install it, or give the path of an MJCF file"
-        ) from error
-    return RobotConfig(
-        path=Path(panda_mj_description.MJCF_PATH),
-        eef_site="hand",
-        eef_offset_m=(0.0, 0.0, 0.097),
-        fingers=("finger_joint1", "finger_joint2"),
-        pads=("left_finger", "right_finger"),
-        home_qpos=(0.0, 0.1, 0.0, -2.15, 0.0, 2.25, 0.7853981633974483),
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class Robot:
     """Where an arm is in the model's state, and its kinematics."""
