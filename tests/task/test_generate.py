@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.task.audit import audit, build_probes
+from v2p_data.task.audit import audit
+from v2p_data.task.audit_probes import build_probes
 from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.probes import rest_height
 from v2p_data.task.smoke import SmokeResult, smoke_run_all

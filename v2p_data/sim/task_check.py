@@ -11,7 +11,7 @@ import torch
 from v2p_data.errors import ItemRejectedError
 from v2p_data.seeds import rng_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.task.audit import build_probes
+from v2p_data.task.audit_probes import build_probes
 from v2p_data.task.guarded import GuardedTask, Show
 from v2p_data.task.task import Task, TaskBundle
 

@@ -15,7 +15,8 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
-from v2p_data.task.audit import Audit, audit, build_probes
+from v2p_data.task.audit import Audit, audit
+from v2p_data.task.audit_probes import build_probes
 from v2p_data.task.calls import Call
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
