@@ -10,6 +10,7 @@ import tyro
 from v2p_data.cli import parse
 from v2p_data.episodes.hub import fetch_model
 from v2p_data.errors import V2PError
+from v2p_data.scene.backends.hands_setup import installed_worker, set_up_hands
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import (
     UNWANTED_FILES,
@@ -31,7 +32,7 @@ class Models:
 
 
 def models_command(argv: list[str]) -> int:
-    """List the checkpoints with their sizes; with --fetch download them."""
+    """List the checkpoints with their sizes; with --fetch download them, and set up the model that finds hands."""
     args = parse(Models, argv, "scene models")
     cfg = with_preset(args.scene)
     models = checkpoints_of(cfg)
@@ -39,8 +40,15 @@ def models_command(argv: list[str]) -> int:
     memory = this_machine().gpu_memory_gb
     where = f"a GPU with {memory:.0f} GB" if memory else "a machine without CUDA"
     print(f"for {where}: {told(models) or 'no learned model'}")  # noqa: T201
-    if absent and args.fetch:
-        fetch_learned(absent)
+    wants_hands = args.scene.hands.backend in ("auto", "mediapipe") and not installed_worker()
+    if args.fetch:
+        if absent:
+            fetch_learned(absent)
+        if wants_hands:
+            set_up_hands(lambda words: print(words, file=sys.stderr, flush=True))  # noqa: T201
+    elif wants_hands and not absent:
+        print("hands: not set up; next: v2p scene models --fetch")  # noqa: T201
+        return 0
     elif absent:
         print(f"not here yet: {told(absent)}\nnext: v2p scene models --fetch")  # noqa: T201
         return 0

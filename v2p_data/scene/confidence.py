@@ -79,9 +79,9 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
 
 def _touched_share(grounded: GroundedObjects) -> float | None:
     """Return in which share of its moving frames a fingertip is at the manipulated object; None where nobody knows, or a tool moves it."""
-    thing, segmentation = grounded.objects[0], grounded.segmentation
+    thing, hands = grounded.objects[0], grounded.working.hands
     by_tool = any(s.role == "tool" for s in grounded.objects)
-    if segmentation is None or segmentation.hands is None or by_tool or thing.hinted:
+    if hands is None or by_tool or thing.hinted:
         return None
     spots = {i: np.argwhere(mask).mean(0) for i, mask in enumerate(thing.masks) if mask.any()}
     ends = [np.argwhere(mask).mean(0) for mask in (thing.first, thing.last) if mask.any()]
@@ -90,7 +90,7 @@ def _touched_share(grounded: GroundedObjects) -> float | None:
         for i, spot in spots.items()
         if all(np.linalg.norm(spot - end) > _AWAY_PX for end in ends)
     ]
-    return contact_share(segmentation.hands, thing.masks, np.array(moving, int))
+    return contact_share(hands, thing.masks, np.array(moving, int))
 
 
 def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:

@@ -92,8 +92,7 @@ def _frames(clip: Clip, cfg: SceneConfig) -> tuple[Clip, WorkingClip, Segmentati
         clip, working = steady, working_clip_of(steady)
     segmentation = segment_clip(clip, working) if cfg.ground.backend == "network" else None
     check_still(working, segmentation, cfg.max_camera_shift_px)
-    if segmentation is not None:
-        segmentation = replace(segmentation, hands=track_hands(clip, working, cfg.hands))
+    working = replace(working, hands=track_hands(clip, working, cfg.hands))
     return clip, working, segmentation
 
 

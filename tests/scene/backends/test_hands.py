@@ -14,7 +14,7 @@ from v2p_data.scene.backends import hands_setup
 from v2p_data.scene.backends.config import HandsConfig
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 from v2p_data.scene.config import SceneConfig
-from v2p_data.scene.fitting.hand_scale import RestingObject
+from v2p_data.scene.data_types import RestingObject
 from v2p_data.scene.fitting.landmark_scale import height_from_landmarks, px_per_m
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.hand_track import HandTrack, contact_share

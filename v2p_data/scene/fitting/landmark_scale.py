@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import apply, inverse
-from v2p_data.scene.fitting.hand_scale import RestingObject
+from v2p_data.scene.data_types import RestingObject
 from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.mask_ops import iou
 

@@ -27,6 +27,7 @@ from v2p_data.scene.fitting.end_poses import (
     is_lid,
     log_growth,
 )
+from v2p_data.scene.fitting.landmark_scale import height_from_landmarks
 from v2p_data.scene.fitting.object_view import ObjectView, object_view
 from v2p_data.scene.fitting.pitch import best_pitch
 from v2p_data.scene.fitting.place_tool import SeenIn, place_tool, placed_along
@@ -72,18 +73,9 @@ def place(
     votes = [vote_of(objects[k], fits[k].first) for k in resting]
     known = guess.heights(pitch_rad)
     height_m, spread = camera_height_m(votes, known)
-    if segmentation is not None and len(resting) == len(objects):
-        from v2p_data.scene.fitting.hand_scale import (
-            height_from_hand,  # torch takes a second to import
-        )
-        from v2p_data.scene.fitting.landmark_scale import height_from_landmarks
-
+    if len(resting) == len(objects):
         resting_object = _resting_object(views[0], fits[0], plan, camera, pitch_rad)
-        by_hand = [height_from_hand(working, segmentation, resting_object, height_m)]
-        if segmentation.hands is not None:
-            by_hand.append(height_from_landmarks(segmentation.hands, resting_object, height_m))
-        told = [vote for vote in by_hand if vote is not None]
-        if told:
+        if told := _told_by_hand(working, segmentation, resting_object, height_m):
             height_m, spread = camera_height_m(votes, [*known, *told])
     seen_in = SeenIn(working=working, segmentation=segmentation)
     placed: list[PlacedObject] = []
@@ -103,6 +95,25 @@ def place(
         scale_spread=spread,
         upright_cost=fits[0].as_before,
     )
+
+
+def _told_by_hand(
+    working: WorkingClip,
+    segmentation: Segmentation | None,
+    resting: RestingObject,
+    height_m: float,
+) -> list[tuple[float, float]]:
+    """Return what a hand that touches the object at rest says of the camera's height, with spreads: by its look and by its landmarks."""
+    told = []
+    if segmentation is not None:
+        from v2p_data.scene.fitting.hand_scale import (
+            height_from_hand,  # torch takes a second to import
+        )
+
+        told.append(height_from_hand(working, segmentation, resting, height_m))
+    if working.hands is not None:
+        told.append(height_from_landmarks(working.hands, resting, height_m))
+    return [vote for vote in told if vote is not None]
 
 
 def _manipulated(

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.ndimage import median_filter
 
 from v2p_data.scene.frames.classes import HAND, LONG_SIDE_PX, MOVED, TABLE
-from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.mask_ops import bounding_box, grow, tidy
 from v2p_data.scene.frames.working_clip import WorkingClip, end_quarters, still_of
 from v2p_data.scene.scale.camera_height import SeenCamera, table_width_m
@@ -39,8 +38,6 @@ class Segmentation:
     late: Float32[np.ndarray, "5 h w"]
     """In the still of the end."""
     camera: SeenCamera
-    hands: HandTrack | None = None
-    """Where a model that knows hands was asked."""
 
     def at(self, i: int) -> Float32[np.ndarray, "5 h w"]:
         """Return the probabilities at the working frame nearest to `i`."""

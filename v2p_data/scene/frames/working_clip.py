@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from v2p_data.scene.frames.colour import histogram, lab_of, likelihood, skin_prior
+from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.video.clip import Clip
 
 WIDTH_PX = 320
@@ -50,6 +51,8 @@ class WorkingClip:
     """Colour histogram of what does not move."""
     skin_only: bool = True
     """Whether only skin-like pixels can be hand: so until the object's look is known."""
+    hands: HandTrack | None = None
+    """Where a model that knows hands was asked."""
 
     @cached_property
     def lit(self) -> Float32[np.ndarray, "h w 3"]:
