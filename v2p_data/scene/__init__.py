@@ -10,7 +10,7 @@ network. Each step can ask a learned model instead (`backends/`, `docs/backends.
 
 Rooms, each of which imports only those above it:
     backends        learned models and workers
-    config          the settings
+    config          the settings; preset: what a preset and this machine choose
     scale           usual sizes turn camera heights into metres
     frames          working frames, colours, the table, and the network's classes for every pixel
     data_types      what the rooms below hand to each other

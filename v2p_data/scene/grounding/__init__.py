@@ -15,4 +15,5 @@ Reading order:
     outlines            an outline is corrected
     tracking, mask_follower             a mask is carried through the clip
     by_model            learned models
+    hands_by_model      a model that knows hands
 """
