@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from policies.evaluation.rate import Rate, wilson
+from studies.results import append_result, results_in
 from v2p_data.judging import contestant
 from v2p_data.pipeline.artifact import Record, read_record
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
@@ -33,7 +34,6 @@ from v2p_data.stages import (
 )
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 
-RESULTS = "results.jsonl"
 SETTINGS = Path(__file__).parents[1] / "configs" / "demo.yaml"
 
 
@@ -53,9 +53,9 @@ def main() -> None:
     if not args.table:
         for seed in args.seeds:
             for task in args.tasks:
-                if (task, seed) not in {(r["task"], r["seed"]) for r in _results(args.out)}:
+                if (task, seed) not in {(r["task"], r["seed"]) for r in results_in(args.out)}:
                     _one(task, seed, args)
-    print(table(_results(args.out)))
+    print(table(results_in(args.out)))
 
 
 def make_benchmark_task(
@@ -101,8 +101,7 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
                 for stage in (expert, dataset, *policy.inputs.values(), policy, evaluation)
             },
         }
-    with (args.out / RESULTS).open("a") as stream:
-        stream.write(json.dumps(result) + "\n")
+    append_result(args.out, result)
     print(json.dumps(result), flush=True)
 
 
@@ -151,11 +150,6 @@ def _rate(rate: Rate) -> str:
 
 def _percent(share: float) -> str:
     return f"{share:.0%}"
-
-
-def _results(out: Path) -> list[dict[str, Any]]:
-    path = out / RESULTS
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
 if __name__ == "__main__":

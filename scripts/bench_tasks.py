@@ -20,14 +20,13 @@ import numpy as np
 
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
+from studies.results import append_result, results_in
 from v2p_data.episodes.collect import judge_expert
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import Worlds, learn
 from v2p_data.report.sheet import write_contact_sheet
 from v2p_data.seeds import seed_for
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
-
-RESULTS = "results.jsonl"
 
 
 def main() -> None:
@@ -48,9 +47,9 @@ def main() -> None:
     if not args.table:
         for seed in args.seeds:
             for task in args.tasks:
-                if (task, seed, args.teacher) not in {_key(r) for r in _results(args.out)}:
+                if (task, seed, args.teacher) not in {_key(r) for r in results_in(args.out)}:
                     _one(task, seed, args)
-    print(table(_results(args.out)))
+    print(table(results_in(args.out)))
 
 
 def _one(task: str, seed: int, args: argparse.Namespace) -> None:
@@ -87,14 +86,8 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
         "load": round(os.getloadavg()[0], 2),
         "learned": learned.as_dict(),
     }
-    with (args.out / RESULTS).open("a") as file:
-        file.write(json.dumps(result) + "\n")
+    append_result(args.out, result)
     print(json.dumps({k: v for k, v in result.items() if k != "learned"}), flush=True)
-
-
-def _results(out: Path) -> list[dict]:
-    path = out / RESULTS
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
 def _key(result: dict) -> tuple[str, int, str]:

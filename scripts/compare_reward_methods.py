@@ -22,6 +22,7 @@ import numpy as np
 
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
+from studies.results import append_result, results_in
 from v2p_data.reward.candidate import DONE_FILE
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.jobs import Jobs
@@ -37,7 +38,6 @@ from v2p_data.task.task import TaskBundle
 METHODS = ("v2p", "eureka", "robogen", "code_as_policy")
 TAUGHT_ROUNDS = {"lift_up": 2, "uncover": 2, "throw_into": 8}
 """Rounds of imitation that leave something to be learned."""
-RESULTS = "results.jsonl"
 Act = Callable[[np.ndarray], np.ndarray]
 
 
@@ -63,9 +63,9 @@ def main() -> None:
             for seed in args.seeds:
                 for task in args.tasks:
                     for method in args.methods:
-                        if (task, method, seed) not in {_key(r) for r in _results(args.out)}:
+                        if (task, method, seed) not in {_key(r) for r in results_in(args.out)}:
                             _one(task, method, seed, args, jobs)
-    print(table(_results(args.out)))
+    print(table(results_in(args.out)))
 
 
 def _one(task: str, method: str, seed: int, args: argparse.Namespace, jobs: Jobs) -> None:
@@ -113,8 +113,7 @@ def _one(task: str, method: str, seed: int, args: argparse.Namespace, jobs: Jobs
         "seconds": round(time.monotonic() - began, 1),
         "found": found,
     }
-    with (args.out / RESULTS).open("a") as stream:
-        stream.write(json.dumps(row) + "\n")
+    append_result(args.out, row)
     print(json.dumps({k: v for k, v in row.items() if k != "found"}), flush=True)
 
 
@@ -135,11 +134,6 @@ def judge(bundle: TaskBundle, act: Act | None, episodes: int, seed: int) -> int:
         obs = env.step(programs.act() if act is None else act(obs)).obs
         witness.note()
     return int(witness.verdict().sum())
-
-
-def _results(out: Path) -> list[dict[str, Any]]:
-    path = out / RESULTS
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
 def _key(result: dict[str, Any]) -> tuple[str, str, int]:

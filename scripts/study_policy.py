@@ -24,6 +24,7 @@ from policies.bc.student import Student
 from policies.bc.trainer import TrainerConfig
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
+from studies.results import append_result, results_in
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.rounds import Lesson, distill
 from v2p_data.evaluation.batch import judge
@@ -33,7 +34,6 @@ from v2p_data.policy_training import ACTION_LIMIT, StudentActor, recorded_under,
 from v2p_data.seeds import seed_for
 from v2p_data.task.task import TaskBundle
 
-RESULTS = "results.jsonl"
 SHARES = (0.15, 0.2)
 """Of the training time: before the first round, before each further one; the rest is the last training."""
 CALIBRATION_STEPS = 10
@@ -98,11 +98,11 @@ def main() -> None:
         for seed in args.seeds:
             for name in args.variants:
                 done = {
-                    (r["variant"], r["seed"], tuple(r["trained_on"])) for r in _results(args.out)
+                    (r["variant"], r["seed"], tuple(r["trained_on"])) for r in results_in(args.out)
                 }
                 if (name, seed, tuple(args.tasks)) not in done:
                     _one(name, seed, args)
-    print(table(_results(args.out)))
+    print(table(results_in(args.out)))
 
 
 def _one(name: str, seed: int, args: argparse.Namespace) -> None:
@@ -167,8 +167,7 @@ def _one(name: str, seed: int, args: argparse.Namespace) -> None:
         "wall_s": round(made_s, 1),
         "tasks": rows,
     }
-    with (args.out / RESULTS).open("a") as stream:
-        stream.write(json.dumps(result) + "\n")
+    append_result(args.out, result)
     print(json.dumps(result), flush=True)
 
 
@@ -229,11 +228,6 @@ def table(results: list[dict[str, Any]]) -> str:
             f" | {end:.3f} | {mean['samples']:,.0f} | {mean['train_s']:.0f} | {mean['wall_s']:.0f} |"
         )
     return "\n".join(lines)
-
-
-def _results(out: Path) -> list[dict[str, Any]]:
-    path = out / RESULTS
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
 if __name__ == "__main__":
