@@ -38,14 +38,14 @@ class HandTrack:
         """Whether hands were found often enough to say where no hand was."""
         return len(np.unique(self.at)) >= max(_FEWEST, _KNOWN_SHARE * self.num_sampled)
 
-    def touches(self, k: int, mask: Bool[np.ndarray, "h w"]) -> bool:
+    def touches(self, k: int, mask: Bool[np.ndarray, "h w"], reach: float = _REACH) -> bool:
         """Return whether a fingertip of hand `k` is at the mask, which is not empty."""
         h, w = mask.shape
         x, y = np.floor(self.px[k][_TIPS]).astype(int).T
         inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
         palm = float(np.linalg.norm(self.px[k][_WRIST] - self.px[k][_MIDDLE_KNUCKLE]))
         away = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
-        return bool(inside.any()) and float(away[y[inside], x[inside]].min()) <= _REACH * palm
+        return bool(inside.any()) and float(away[y[inside], x[inside]].min()) <= reach * palm
 
 
 def contact_share(

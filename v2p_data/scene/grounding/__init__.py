@@ -16,4 +16,5 @@ Reading order:
     tracking, mask_follower             a mask is carried through the clip
     by_model            learned models
     hands_by_model      a model that knows hands
+    handled             where a hand takes an object and puts it down
 """
