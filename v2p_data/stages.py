@@ -11,11 +11,11 @@ where they are used, so that listing stages costs little.
 import json
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from policies.evaluation.rate import wilson
 from v2p_data.craft_data import scene_data, task_data
@@ -55,6 +55,9 @@ from v2p_data.task.task import CODE_FILE, TASK_FILE
 from v2p_data.task.vlm_config import VlmConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
+
+if TYPE_CHECKING:
+    from v2p_data.scene.frames.prepare import PreparedClip
 
 logger = logging.getLogger(__name__)
 
@@ -134,20 +137,25 @@ def make_scene(
     runtime: Runtime,
     *,
     video: VideoItem,
+    prepared: Callable[[], "PreparedClip"] | None = None,
 ) -> dict[str, Any]:
-    """Decode the video and rebuild its objects."""
+    """Decode the video and rebuild its objects; `prepared` gives the decoded clip where it is at hand."""
     from v2p_data.scene.export import write_scene
-    from v2p_data.scene.reconstruct import reconstruct
+    from v2p_data.scene.reconstruct import prepared_for, reconstruct_prepared
     from v2p_data.video.decode import read_clip
 
     del inputs
-    runtime.progress(0.0, "decoding")
-    clip = read_clip(video, cfg["video"])
-    runtime.progress(0.2, "finding objects")
-    reconstruction = reconstruct(clip, cfg["scene"], rng_for(cfg["seed"], "scene", video.item))
-    scene = write_scene(reconstruction, out)
+    if prepared is None:
+        runtime.progress(0.0, "decoding")
+        clip = read_clip(video, cfg["video"])
+        runtime.progress(0.2, "finding objects")
+        ready = prepared_for(clip, cfg["scene"])
+    else:
+        ready = prepared()
+    rng = rng_for(cfg["seed"], "scene", video.item)
+    scene = write_scene(reconstruct_prepared(ready, cfg["scene"], rng), out)
     return {
-        "frames": len(clip.frames),
+        "frames": len(ready.clip.frames),
         "objects": len(scene.objects),
         "kind": scene.kind,
         "confidence": round(scene.confidence, 3),

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from v2p_data.deployment.click_page import ClickPage
-from v2p_data.deployment.segmentation import TrackerConfig, clicked_mask
 from v2p_data.errors import V2PError
+from v2p_data.scene.frames.one_click import ClickConfig, clicked_mask
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def page():
     picture[60:80, 50:75] = (20, 40, 190)
     nothing = np.zeros((96, 96), bool)
     with ClickPage(
-        picture, ["red <box>", "brick"], lambda click: clicked_mask(picture, click, nothing, TrackerConfig())
+        picture, ["red <box>", "brick"], lambda click: clicked_mask(picture, click, nothing, ClickConfig())
     ) as page:  # fmt: skip
         yield page
 

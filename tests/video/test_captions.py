@@ -8,12 +8,11 @@ import pytest
 from v2p_data.errors import V2PError
 from v2p_data.video.captions import (
     find_videos,
-    merge_captions,
     read_footage,
     unique_items,
-    write_captions,
 )
 from v2p_data.video.hints import check_hints
+from v2p_data.video.save_hints import merge_captions, write_captions
 
 
 @pytest.fixture

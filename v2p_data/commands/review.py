@@ -1,8 +1,10 @@
 """`v2p scene review`: a page to judge a run's scenes on, and what comes back from it."""
 
+import contextlib
 import hashlib
 import os
 import shlex
+import threading
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,16 +18,12 @@ from v2p_data.cli import command_of, parse
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.json_files import read_json
 from v2p_data.pipeline.fingerprint import file_digest
+from v2p_data.pipeline.workers import only_run_in
 from v2p_data.report.reading import Result, number, read_run
 from v2p_data.report.review_page import ReviewClip, Stills, stills_of, write_review
-from v2p_data.video.captions import (
-    VideoItem,
-    find_videos,
-    merge_captions,
-    write_captions,
-    written_captions,
-)
+from v2p_data.video.captions import VideoItem, find_videos, written_captions
 from v2p_data.video.hints import check_hints
+from v2p_data.video.save_hints import merge_captions, write_captions
 
 PAGE_FILE = "review.html"
 
@@ -42,6 +40,10 @@ class Review:
     """A captions.json or review.json from the page: its hints go into the captions.json beside the videos."""
     summary: Path | None = None
     """A review.json from the page: print how many of the accepted scenes are right."""
+    serve: bool = False
+    """Serve a page on this machine instead: marks are saved at once, and each marked clip is rebuilt while you look."""
+    port: int = 0
+    """Where --serve listens, on 127.0.0.1; 0 takes a free port."""
 
 
 def review_command(argv: list[str]) -> int:
@@ -50,6 +52,9 @@ def review_command(argv: list[str]) -> int:
         raise V2PError("give either --apply or --summary, not both")
     if args.summary is not None:
         print(summary_of(args.summary))  # noqa: T201
+        return 0
+    if args.serve:
+        _serve(args)
         return 0
     if not (args.run / "scene").is_dir():
         raise V2PError(f"{args.run} holds no scenes; make some with 'v2p scene VIDEOS --out RUN'")
@@ -76,6 +81,30 @@ def review_command(argv: list[str]) -> int:
         print(f"{blind} without their video, so without stills; name its folder with --videos")  # noqa: T201
     print("Next: open it in a browser; press ? there")  # noqa: T201
     return 0
+
+
+def _serve(args: Review) -> None:
+    """Serve the page until Ctrl-C."""
+    from v2p_data.commands.live_review import REVIEW_FILE, LiveReview
+    from v2p_data.report.review_server import ReviewServer
+
+    results = read_run(args.run).of_stage("scene") if args.run.is_dir() else []
+    folder = args.videos or video_folder(results)
+    if folder is None:
+        raise V2PError(
+            f"where the videos of {args.run} are is not known here; name it with --videos"
+        )
+    with (
+        only_run_in(args.run),
+        contextlib.closing(LiveReview(args.run, folder)) as session,
+        ReviewServer(session, args.run.resolve().name, args.port) as server,
+    ):
+        print(f"Open {server.address} in a browser of this machine; Ctrl-C ends it", flush=True)  # noqa: T201
+        print(f"Marks go into {session.captions}, judgements into {args.run / REVIEW_FILE}")  # noqa: T201
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+    again = shlex.join(_made_by(args, session.home, results))
+    print(f"\nNext: {again}   (the clips that were rebuilt are kept)")  # noqa: T201
 
 
 def review_clips(results: Sequence[Result], folder: Path | None) -> list[ReviewClip]:

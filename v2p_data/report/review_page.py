@@ -1,7 +1,7 @@
 """A page on which a person judges a run's scenes and marks what was not found.
 
 One HTML file: stills lie in it, overlay videos beside it in the run. Judgements and hints stay in the browser until they
-are downloaded as `review.json` and `captions.json`; `v2p_data.video.captions.merge_captions` reads both.
+are downloaded as `review.json` and `captions.json`; `v2p_data.video.save_hints.merge_captions` reads both.
 Text from users reaches the page only as JSON and through the template's escaping, and a content policy keeps any other
 script than the page's own from running.
 """
@@ -139,7 +139,7 @@ def write_review(
         "store": store,
         "captions": dict(captions),
         "commands": dict(commands),
-        "clips": [_clip_json(clip, out.parent) for clip in clips],
+        "clips": [clip_json(clip, out.parent) for clip in clips],
     }
     source = (Path(__file__).parent / "review.html").read_text()
     script = re.search(r'<script id="app">(.*?)</script>', source, re.S)
@@ -159,7 +159,8 @@ def write_review(
     return out
 
 
-def _clip_json(clip: ReviewClip, home: Path) -> dict[str, Any]:
+def clip_json(clip: ReviewClip, home: Path) -> dict[str, Any]:
+    """Return what a page in the folder `home` shows of a clip."""
     scene = _scene_json(clip.folder)
     stills = clip.stills
     return {

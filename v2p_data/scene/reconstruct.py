@@ -23,10 +23,7 @@ from v2p_data.scene.fitting.camera_guess import camera_guess
 from v2p_data.scene.fitting.metric import clip_camera
 from v2p_data.scene.fitting.noun_variants import with_noun_variants
 from v2p_data.scene.fitting.placement import place
-from v2p_data.scene.frames.checks import check_change, check_still
-from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
-from v2p_data.scene.frames.stabilise import stabilised
-from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
+from v2p_data.scene.frames.prepare import PreparedClip, prepare
 from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
 from v2p_data.scene.grounding.ground_objects import ground_objects, without_asides
 from v2p_data.scene.grounding.hands_by_model import track_hands
@@ -43,12 +40,32 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
 
     Raises:
         ItemRejectedError: `camera_moves`, `nothing_moves`, `no_hand`, `not_there_at_first`, `object_not_found`, `reference_not_found`,
-            `motion_contradicts_caption` or `low_confidence`, with the number that decided.
+            `bad_hint`, `motion_contradicts_caption` or `low_confidence`, with the number that decided.
     """
+    return reconstruct_prepared(prepared_for(clip, cfg), cfg, rng)
+
+
+def prepared_for(clip: Clip, cfg: SceneConfig) -> PreparedClip:
+    """Return the clip prepared for a reconstruction with these settings."""
     cfg = with_preset(cfg)
+    prepared = prepare(
+        clip,
+        with_network=cfg.ground.backend == "network",
+        max_camera_shift_px=cfg.max_camera_shift_px,
+    )
+    hands = track_hands(prepared.clip, prepared.working, cfg.hands)
+    return replace(prepared, working=replace(prepared.working, hands=hands))
+
+
+def reconstruct_prepared(
+    prepared: PreparedClip, cfg: SceneConfig, rng: np.random.Generator
+) -> Reconstruction:
+    """Return the scene that a prepared clip shows, as `reconstruct` does of the clip."""
+    cfg = with_preset(cfg)
+    clip = prepared.clip
     meaning = parse_caption(clip.caption, clip.objects)
-    clip, working, segmentation = _frames(clip, cfg)
-    grounded = _grounded(clip, working, segmentation, meaning, cfg)
+    grounded = _grounded(prepared, meaning, cfg)
+    segmentation = grounded.segmentation
 
     guess = camera_guess(None if segmentation is None else segmentation.camera, cfg)
     tracks = with_noun_variants(grounded.working, grounded.objects, guess, meaning.kind)
@@ -83,27 +100,9 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     )
 
 
-def _frames(clip: Clip, cfg: SceneConfig) -> tuple[Clip, WorkingClip, Segmentation | None]:
-    """Return the clip, stabilised where its camera sways, its working frames, and what the network sees, where it is asked."""
-    working = working_clip_of(clip)
-    check_change(working)
-    steady = stabilised(clip, working)
-    if steady is not clip:
-        clip, working = steady, working_clip_of(steady)
-    segmentation = segment_clip(clip, working) if cfg.ground.backend == "network" else None
-    check_still(working, segmentation, cfg.max_camera_shift_px)
-    working = replace(working, hands=track_hands(clip, working, cfg.hands))
-    return clip, working, segmentation
-
-
-def _grounded(
-    clip: Clip,
-    working: WorkingClip,
-    segmentation: Segmentation | None,
-    meaning: Meaning,
-    cfg: SceneConfig,
-) -> GroundedObjects:
+def _grounded(prepared: PreparedClip, meaning: Meaning, cfg: SceneConfig) -> GroundedObjects:
     """Return the caption's objects with their mask tracks."""
+    clip, working, segmentation = prepared.clip, prepared.working, prepared.segmentation
     boxes = None
     if cfg.ground.backend in DETECTORS:
         boxes = detected(clip, working, meaning.phrases, cfg.ground)

@@ -7,14 +7,11 @@ same folder (`labels.py`), else from the file's own name:
      "push.mp4": {"caption": "Pushing blue box next to can", "objects": ["blue box", "can"],
                   "hints": {"can": {"frame": 0, "box": [310, 120, 380, 240], "size_m": [0.066, 0.066, 0.12]}}}}
 
-A hint marks one object: `box` and `points` in one `frame`, `size_m`, or the `name` of the object where the
-caption's words do not say it.
+A hint marks one object: `box`, `click`, `stroke` or `points` in one `frame`, `size_m`, or the `name` of the object where the
+caption's words do not say it. A hint called `table` marks the table itself.
 """
 
-import json
-import os
 import re
-import shutil
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +22,7 @@ from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.json_files import read_json
 from v2p_data.video.checked import check_keys, listed, same_name, type_of, words
 from v2p_data.video.clip import Hint
-from v2p_data.video.hints import MARK_KEYS, boxes_as_read, read_hint
+from v2p_data.video.hints import TABLE, boxes_as_read, read_hint
 from v2p_data.video.labels import Labels, read_labels
 from v2p_data.video.meaning import Meaning as Meaning
 from v2p_data.video.meaning import parse_caption as parse_caption
@@ -40,7 +37,7 @@ CAPTIONS_FILE = "captions.json"
 NO_CAPTION = "moving object"
 """What stands for a caption where nobody gave one and the file's name tells nothing."""
 
-_ENTRY_KEYS = ("caption", "hints", "objects")
+ENTRY_KEYS = ("caption", "hints", "objects")
 _NO_WORDS = r"\d+|img|vid|video|videos|clip|mov|pxl|dsc|gopr|rec|screen|untitled|new|final|copy"
 
 
@@ -150,109 +147,6 @@ def written_captions(folder: Path, names: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-@dataclass(frozen=True, kw_only=True)
-class Merged:
-    """A caption file with hints added, not yet written."""
-
-    path: Path
-    captions: dict[str, Any]
-    """All that the file is to hold: entries that got no hint are as they were, to the letter."""
-    hints: dict[str, dict[str, Hint]]
-    """By file name, all hints of each video that got one; their marks are not yet checked against the picture."""
-    added: tuple[str, ...]
-    """One line for each object whose hint changed."""
-    kept: tuple[str, ...]
-    """One sentence for each caption or list of objects that differs and stays as it is in the folder."""
-
-
-def merge_captions(folder: Path, addition: Path) -> Merged:
-    """Return a folder's captions with the hints of another caption file, or of a review, added.
-
-    Nothing is taken away: hints for other objects and videos stay. For one object a new box or new points replace the
-    old marks together, because they belong to one frame; a size or a name replaces only itself.
-
-    Args:
-        folder: the folder of the videos.
-        addition: a `captions.json`, or a `review.json` (`{"clips": [{"video", "hints"}]}`).
-
-    Raises:
-        V2PError: no such file, the folder's own captions, a clip or an object that is not known, or a hint that
-            cannot be used.
-    """
-    items = {video.path.name: video for video in find_videos(folder)}
-    path = folder / CAPTIONS_FILE
-    if addition.resolve() == path.resolve():
-        raise V2PError(
-            f"{addition} is the very file that the hints go into; give the one that was downloaded from the review page"
-        )
-    captions = written_captions(folder, list(items))
-    changed: dict[str, dict[str, Hint]] = {}
-    added: list[str] = []
-    kept: list[str] = []
-    for said_name, entry in _entries_of(addition).items():
-        where = f"{addition}, entry '{said_name}'"
-        name = same_name(said_name, items)
-        if name is None:
-            raise V2PError(
-                f"{where}: there is no such video in {folder}.{did_you_mean(said_name, items)}"
-            )
-        video = items[name]
-        hints = entry.get("hints") or {}
-        for key, here in (("caption", video.caption), ("objects", list(video.objects))):
-            if entry.get(key, here) != here:
-                kept.append(f"{name}: {key} stays {here!r}; the other file has {entry[key]!r}")
-        if not hints:
-            continue
-        entry_here = captions.get(name)
-        old: dict[str, Any] = (
-            entry_here if isinstance(entry_here, dict) else {"caption": video.caption}
-        )
-        both: dict[str, Any] = dict(old.get("hints", {}))
-        hints = {same_name(phrase, both) or phrase: hint for phrase, hint in hints.items()}
-        for phrase, hint in hints.items():
-            both[phrase] = _merged_hint(both.get(phrase), hint)
-        if both == old.get("hints", {}):
-            continue
-        new = {"objects": list(video.objects), **old, "hints": both}
-        new = {key: new[key] for key in ("caption", "objects", "hints")}
-        _, _, checked = _entry(new, where)
-        changed[name] = checked
-        added += [
-            f"{name}, '{phrase}': {', '.join(k for k in sorted(both[phrase]) if k != 'frame')}"
-            for phrase in hints
-            if both[phrase] != old.get("hints", {}).get(phrase)
-        ]
-        captions[name] = new
-    return Merged(
-        path=path, captions=captions, hints=changed, added=tuple(added), kept=tuple(kept)
-    )
-
-
-def write_captions(merged: Merged) -> Path | None:
-    """Write the caption file so that it is either whole or as it was; return the copy of the old one, if there was one.
-
-    Raises:
-        V2PError: the folder cannot be written.
-    """
-    path, backup = merged.path, None
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        if path.is_file():
-            backup = _free_name(path)
-            shutil.copyfile(path, backup)
-        with temporary.open("w", encoding="utf-8") as stream:
-            json.dump(merged.captions, stream, indent=1, ensure_ascii=False)
-            stream.write("\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        raise V2PError(
-            f"{path} cannot be written: {error.strerror}; nothing was changed"
-        ) from error
-    return backup
-
-
 def unique_items(stems: list[str]) -> list[str]:
     """Return an identifier for each file name; where two would be the same, the later gets a number."""
     taken: set[str] = set()
@@ -268,49 +162,6 @@ def unique_items(stems: list[str]) -> list[str]:
     return items
 
 
-def _entries_of(path: Path) -> dict[str, dict[str, Any]]:
-    """Return caption, objects and hints by file name, from either kind of file."""
-    data = read_json(path)
-    if not isinstance(data, dict):
-        raise V2PError(
-            f"{path} is neither a caption file nor a review: both are objects, not a {type_of(data)}"
-        )
-    if isinstance(data.get("clips"), list):
-        clips = [c for c in data["clips"] if isinstance(c, dict) and c.get("hints")]
-        data = {str(c.get("video", "")): {"hints": c["hints"]} for c in clips}
-    entries: dict[str, dict[str, Any]] = {}
-    for name, entry in data.items():
-        where = f"{path}, entry '{name}'"
-        entry = {"caption": entry} if isinstance(entry, str) else entry
-        if not isinstance(entry, dict):
-            raise V2PError(
-                f"{where}: give a caption, or an object with caption, objects and hints, not a {type_of(entry)}"
-            )
-        check_keys(entry, _ENTRY_KEYS, where)
-        if not isinstance(entry.get("hints", {}), dict):
-            raise V2PError(
-                f"{where}: 'hints' must be an object, name -> hint, not a {type_of(entry['hints'])}"
-            )
-        entries[name] = entry
-    return entries
-
-
-def _merged_hint(old: Any, new: Any) -> Any:
-    if not (isinstance(old, dict) and isinstance(new, dict)):
-        return new
-    if "box" in new or "points" in new:
-        old = {k: v for k, v in old.items() if k not in MARK_KEYS}
-        return {**old, **new}
-    return {**old, **{k: v for k, v in new.items() if k != "frame"}}
-
-
-def _free_name(path: Path) -> Path:
-    backup, number = path.with_name(f"{path.name}.bak"), 2
-    while backup.exists():
-        backup, number = path.with_name(f"{path.name}.bak{number}"), number + 1
-    return backup
-
-
 _Said = tuple[str, tuple[str, ...], dict[str, Hint]]
 """Caption, objects, hints."""
 
@@ -324,17 +175,24 @@ def _item(item: str, path: Path, said: _Said) -> VideoItem:
     caption, objects, hints = said
     if not objects:
         found = parse_caption(caption).phrases
-        objects = tuple(dict.fromkeys([*found, *hints]))
+        objects = tuple(dict.fromkeys([*found, *(name for name in hints if name != TABLE)]))
     return VideoItem(item=item, path=path, caption=caption, objects=objects, hints=hints)
 
 
 def _read_captions(folder: Path, names: list[str]) -> dict[str, _Said]:
     where = folder / CAPTIONS_FILE
     written = written_captions(folder, names)
-    return {name: _entry(entry, f"{where}, entry '{name}'") for name, entry in written.items()}
+    return {
+        name: checked_entry(entry, f"{where}, entry '{name}'") for name, entry in written.items()
+    }
 
 
-def _entry(entry: Any, where: str) -> _Said:
+def checked_entry(entry: Any, where: str) -> _Said:
+    """Return caption, objects and hints of an entry of a caption file.
+
+    Raises:
+        V2PError: it cannot be used; the sentence begins with `where`.
+    """
     if isinstance(entry, str):
         entry = {"caption": entry}
     if not isinstance(entry, dict):
@@ -342,7 +200,7 @@ def _entry(entry: Any, where: str) -> _Said:
             f"{where}: give a caption, or an object with caption, objects and hints, "
             f"not a {type_of(entry)}"
         )
-    check_keys(entry, _ENTRY_KEYS, where)
+    check_keys(entry, ENTRY_KEYS, where)
     caption = words(entry.get("caption"), f"{where}: 'caption'")
     objects = entry.get("objects", [])
     if not isinstance(objects, list):
@@ -353,7 +211,7 @@ def _entry(entry: Any, where: str) -> _Said:
     hints = entry.get("hints", {})
     if not isinstance(hints, dict):
         raise V2PError(f"{where}: 'hints' must be an object, name -> hint, not a {type_of(hints)}")
-    known = objects or parse_caption(caption).phrases
+    known = (*(objects or parse_caption(caption).phrases), TABLE)
     checked: dict[str, Hint] = {}
     for said_name, hint in hints.items():
         name = same_name(said_name, known)

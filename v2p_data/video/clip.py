@@ -18,6 +18,10 @@ class Hint(TypedDict, total=False):
     """`[x0, y0, x1, y1]` [px], right and down."""
     points: list[list[float]]
     """Points on the object, `[x, y]` [px]."""
+    click: list[float]
+    """One pixel of the object, `[x, y]` [px]: the program finds the outline around it."""
+    stroke: list[list[float]]
+    """A line drawn over the object, `[x, y]` [px] each: all of it is object."""
     size_m: list[float]
     """Length, width, height [m]."""
     name: str

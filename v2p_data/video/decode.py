@@ -7,7 +7,7 @@ an `ItemRejectedError`, never in a crash or an endless loop.
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -24,8 +24,8 @@ from jaxtyping import Int, UInt8
 
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.video.captions import VideoItem
-from v2p_data.video.clip import Clip, Hint
-from v2p_data.video.hints import check_hints
+from v2p_data.video.clip import Clip
+from v2p_data.video.hints import check_hints, hints_in_clip
 from v2p_data.video.tracks import (
     Orientation,
     Promise,
@@ -136,7 +136,9 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
         path=item.path,
         caption=item.caption,
         objects=item.objects,
-        hints=_hints_in_clip(item.hints, frames, film.shown_px, source_frame),
+        hints=hints_in_clip(
+            item.hints, (frames.shape[2], frames.shape[1]), film.shown_px, source_frame
+        ),
         frames=frames,
         fps=fps,
         total_frames=total,
@@ -395,31 +397,6 @@ def _even(
     # a player shows a picture until the next one is due
     chosen = np.searchsorted(times, due + usual / 2, side="right") - 1
     return chosen.clip(0, len(times) - 1), (count - 1) / end
-
-
-def _hints_in_clip(
-    hints: Mapping[str, Hint],
-    frames: UInt8[np.ndarray, "time h w 3"],
-    shown_px: tuple[int, int],
-    source_frame: Int[np.ndarray, "time"],
-) -> dict[str, Hint]:
-    """Return the hints with the clip's frame numbers and pixels."""
-    sx, sy = frames.shape[2] / shown_px[0], frames.shape[1] / shown_px[1]
-    moved: dict[str, Hint] = {}
-    for name, hint in hints.items():
-        nearest = int(np.abs(source_frame - hint.get("frame", 0)).argmin())
-        there = Hint(frame=nearest)
-        if "box" in hint:
-            x0, y0, x1, y1 = hint["box"]
-            there["box"] = [x0 * sx, y0 * sy, x1 * sx, y1 * sy]
-        if "points" in hint:
-            there["points"] = [[x * sx, y * sy] for x, y in hint["points"]]
-        if "size_m" in hint:
-            there["size_m"] = hint["size_m"]
-        if "name" in hint:
-            there["name"] = hint["name"]
-        moved[name] = there
-    return moved
 
 
 def _check_size(path: Path, width: int, height: int, cfg: VideoConfig, low: bool = True) -> None:

@@ -4,6 +4,9 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+from jaxtyping import Int
+
 from v2p_data.errors import V2PError
 from v2p_data.video.checked import check_keys, numbers, type_of, words
 from v2p_data.video.clip import Hint
@@ -14,10 +17,12 @@ MAX_SIZE_M = 1.5
 """No object on a table is longer."""
 MAX_NAME = 60
 """Letters; a longer name is a sentence."""
-MARK_KEYS = ("box", "frame", "points")
+MARK_KEYS = ("box", "click", "frame", "points", "stroke")
 """What belongs to one frame and is replaced together."""
+TABLE = "table"
+"""The name under which a person marks the table itself, where no object is called so."""
 
-_KEYS = ("box", "frame", "name", "points", "size_m")
+_KEYS = ("box", "click", "frame", "name", "points", "size_m", "stroke")
 _LARGEST_FRACTION = 1.5
 """Pixels; marks that all lie this near to the corner are shares of the picture."""
 
@@ -38,16 +43,11 @@ def read_hint(hint: Any, where: str) -> Hint:
     if "box" in hint:
         checked["box"] = _box(hint["box"], where)
     if "points" in hint:
-        points = hint["points"]
-        if not isinstance(points, list) or not points:
-            raise V2PError(f"{where}: 'points' must be a list of [x, y], not {json.dumps(points)}")
-        checked["points"] = [numbers(p, 2, f"{where}: a point must be [x, y]") for p in points]
-        flat = [v for point in checked["points"] for v in point]
-        if max(flat) <= _LARGEST_FRACTION and any(v % 1 for v in flat):
-            raise V2PError(
-                f"{where}: 'points' look like fractions of the picture, got {points}; "
-                "a point is [x, y] in pixels"
-            )
+        checked["points"] = _spots(hint["points"], "points", 1, where)
+    if "click" in hint:
+        checked["click"] = _spots([hint["click"]], "click", 1, where)[0]
+    if "stroke" in hint:
+        checked["stroke"] = _spots(hint["stroke"], "stroke", 2, where)
     if "size_m" in hint:
         size = numbers(hint["size_m"], 3, f"{where}: 'size_m' must be [length, width, height]")
         if not all(MIN_SIZE_M <= side <= MAX_SIZE_M for side in size):
@@ -64,7 +64,9 @@ def read_hint(hint: Any, where: str) -> Hint:
             )
         checked["name"] = name
     if len(checked) == 1:
-        raise V2PError(f"{where}: says nothing; give a box, points, size_m or name")
+        raise V2PError(
+            f"{where}: says nothing; give a box, a click, points, a stroke, size_m or name"
+        )
     return checked
 
 
@@ -97,12 +99,50 @@ def check_hints(
                 f"which is {width} x {height} px; a box is x0, y0, x1, y1 in pixels of the video as a player shows it: "
                 "neither x, y, width, height nor thousandths of the picture"
             )
-        for x, y in hint.get("points", []):
+        for x, y in marked_spots(hint):
             if not (0 <= x <= width and 0 <= y <= height):
                 raise V2PError(
                     f"{where}, hint '{name}': the point {[x, y]} lies outside of the picture, "
                     f"which is {width} x {height} px"
                 )
+
+
+def marked_spots(hint: Hint) -> list[list[float]]:
+    """Return all single pixels that a hint marks: points, click and stroke, `[x, y]` [px]."""
+    click = [hint["click"]] if "click" in hint else []
+    return [*hint.get("points", []), *click, *hint.get("stroke", [])]
+
+
+def hints_in_clip(
+    hints: Mapping[str, Hint],
+    clip_px: tuple[int, int],
+    shown_px: tuple[int, int],
+    source_frame: Int[np.ndarray, "time"],
+) -> dict[str, Hint]:
+    """Return a file's hints with the clip's frame numbers and pixels.
+
+    Args:
+        hints: by object phrase, in the file's pixels and frame numbers.
+        clip_px: width and height of the clip's frames.
+        shown_px: width and height of the file's picture as a player shows it.
+        source_frame: the file's frame number behind each of the clip's.
+    """
+    sx, sy = clip_px[0] / shown_px[0], clip_px[1] / shown_px[1]
+    moved: dict[str, Hint] = {}
+    for name, hint in hints.items():
+        there = hint.copy()
+        there["frame"] = int(np.abs(source_frame - hint.get("frame", 0)).argmin())
+        if "box" in hint:
+            x0, y0, x1, y1 = hint["box"]
+            there["box"] = [x0 * sx, y0 * sy, x1 * sx, y1 * sy]
+        if "points" in hint:
+            there["points"] = [[x * sx, y * sy] for x, y in hint["points"]]
+        if "click" in hint:
+            there["click"] = [hint["click"][0] * sx, hint["click"][1] * sy]
+        if "stroke" in hint:
+            there["stroke"] = [[x * sx, y * sy] for x, y in hint["stroke"]]
+        moved[name] = there
+    return moved
 
 
 def boxes_as_read(hints: Mapping[str, Hint], where: str) -> list[str]:
@@ -113,6 +153,20 @@ def boxes_as_read(hints: Mapping[str, Hint], where: str) -> list[str]:
         if "box" in hint
         for x0, y0, x1, y1 in [hint["box"]]
     ]
+
+
+def _spots(value: Any, key: str, least: int, where: str) -> list[list[float]]:
+    if not isinstance(value, list) or len(value) < least:
+        some = "a list of [x, y]" if least == 1 else f"a list of {least} or more [x, y]"
+        raise V2PError(f"{where}: '{key}' must be {some}, not {json.dumps(value)}")
+    spots = [numbers(p, 2, f"{where}: a point must be [x, y]") for p in value]
+    flat = [v for spot in spots for v in spot]
+    if max(flat) <= _LARGEST_FRACTION and any(v % 1 for v in flat):
+        raise V2PError(
+            f"{where}: '{key}' look like fractions of the picture, got {value}; "
+            "a point is [x, y] in pixels"
+        )
+    return spots
 
 
 def _box(value: Any, where: str) -> list[float]:

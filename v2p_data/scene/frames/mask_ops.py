@@ -108,9 +108,9 @@ def attainable_iou(mask: Bool[np.ndarray, "h w"]) -> float:
 
 
 def from_points(
-    image: UInt8[np.ndarray, "h w 3"], points: list[tuple[float, float]]
+    image: UInt8[np.ndarray, "h w 3"], points: list[tuple[float, float]], alike_lab: float = 9.0
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the region around the points (x, y in pixels of this image) that has their colours."""
+    """Return the region around the points (x, y in pixels of this image) that has their colours, up to a distance in Lab."""
     lab = lab_of(cv2.GaussianBlur(image, (0, 0), 1.0))
     h, w = lab.shape[:2]
     seed = np.zeros((h, w), np.uint8)
@@ -118,7 +118,7 @@ def from_points(
         cv2.circle(seed, (round(x), round(y)), 4, 1, -1)
     colours = lab[seed > 0][::3]
     nearest = np.min(np.linalg.norm(lab[:, :, None] - colours[None, None, :24], axis=-1), axis=-1)
-    alike = tidy(nearest < 9) | (seed > 0)
+    alike = tidy(nearest < alike_lab) | (seed > 0)
     _, parts = cv2.connectedComponents(alike.astype(np.uint8))
     wanted = {int(parts[min(h - 1, round(y)), min(w - 1, round(x))]) for x, y in points} - {0}
     return refine(image, np.isin(parts, list(wanted)))
@@ -217,6 +217,20 @@ def _local_mean(lab: np.ndarray, where: np.ndarray) -> np.ndarray:
     weight = cv2.boxFilter(where.astype(np.float32), -1, (11, 11))
     total = cv2.boxFilter(lab * where[..., None].astype(np.float32), -1, (11, 11))
     return total / np.maximum(weight, 1e-6)[..., None]
+
+
+def from_core(
+    image: UInt8[np.ndarray, "h w 3"],
+    core: Bool[np.ndarray, "h w"],
+    likely: Bool[np.ndarray, "h w"],
+    possible: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"] | None:
+    """Return what GrabCut makes of three nested regions: all of the first is object, nothing outside of the last; None where it finds nothing."""
+    labels = np.full(core.shape, cv2.GC_BGD, np.uint8)
+    labels[possible] = cv2.GC_PR_BGD
+    labels[likely] = cv2.GC_PR_FGD
+    labels[core] = cv2.GC_FGD
+    return _grab_cut(image, labels)
 
 
 def _grab_cut(image: np.ndarray, labels: np.ndarray) -> np.ndarray | None:

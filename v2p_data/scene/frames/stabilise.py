@@ -65,7 +65,9 @@ def stabilised(clip: Clip, working: WorkingClip) -> Clip:
         clip,
         frames=_aligned(clip.frames, to_filmed),
         to_filmed=to_filmed,
-        hints={phrase: _moved(hint, to_filmed, (h, w)) for phrase, hint in clip.hints.items()},
+        hints={
+            phrase: hint_in_aligned(hint, to_filmed, (w, h)) for phrase, hint in clip.hints.items()
+        },
         warnings=(*clip.warnings, note),
     )
 
@@ -105,10 +107,18 @@ def _aligned(
     return out
 
 
-def _moved(hint: Hint, to_filmed: Float[np.ndarray, "time 3 3"], shape: tuple[int, int]) -> Hint:
-    """Return a hint where the thing is in the aligned frame."""
+def hint_in_aligned(
+    hint: Hint, to_filmed: Float[np.ndarray, "time 3 3"], size_px: tuple[int, int]
+) -> Hint:
+    """Return a hint where the object is in the aligned frame.
+
+    Args:
+        hint: in the pixels and frame numbers of the clip as it was filmed.
+        to_filmed: by frame, the homography from aligned pixels to filmed ones.
+        size_px: width and height of the clip's frames.
+    """
     out = hint.copy()
-    h, w = shape
+    w, h = size_px
     to_aligned = np.linalg.inv(to_filmed[hint.get("frame", 0)])
     if "box" in hint:
         x0, y0, x1, y1 = hint["box"]
@@ -119,6 +129,17 @@ def _moved(hint: Hint, to_filmed: Float[np.ndarray, "time 3 3"], shape: tuple[in
         if (high - low).min() >= 1:
             out["box"] = [float(v) for v in (*low, *high)]
     if "points" in hint:
-        points = cv2.perspectiveTransform(np.array([hint["points"]], np.float64), to_aligned)[0]
-        out["points"] = points.clip(0, (w - 1, h - 1)).tolist()
+        out["points"] = _aligned_spots(hint["points"], to_aligned, size_px)
+    if "click" in hint:
+        out["click"] = _aligned_spots([hint["click"]], to_aligned, size_px)[0]
+    if "stroke" in hint:
+        out["stroke"] = _aligned_spots(hint["stroke"], to_aligned, size_px)
     return out
+
+
+def _aligned_spots(
+    spots: list[list[float]], to_aligned: Float[np.ndarray, "3 3"], size_px: tuple[int, int]
+) -> list[list[float]]:
+    w, h = size_px
+    there = cv2.perspectiveTransform(np.array([spots], np.float64), to_aligned)[0]
+    return there.clip(0, (w - 1, h - 1)).tolist()

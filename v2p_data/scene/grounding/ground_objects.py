@@ -25,6 +25,7 @@ from v2p_data.scene.frames.table import Table, find_table
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.held_tool import HeldTool, find_tool
 from v2p_data.scene.grounding.hint_masks import Box, HintMask, hint_masks_of
+from v2p_data.scene.grounding.marked_table import with_marked_table
 from v2p_data.scene.grounding.moved_by_change import Moved
 from v2p_data.scene.grounding.moved_object import (
     check_there_at_first,
@@ -84,10 +85,12 @@ def ground_objects(
     for the phrase goes before it.
 
     Raises:
-        ItemRejectedError: `no_hand`, `not_there_at_first`, `object_not_found` or `reference_not_found`, with the number that decided.
+        ItemRejectedError: `no_hand`, `not_there_at_first`, `bad_hint`, `object_not_found` or `reference_not_found`, with the number that
+            decided.
     """
     if segmentation is not None:
         _check_hand(clip, segmentation)
+        segmentation = with_marked_table(clip, working, segmentation)
         working = _knowing_hand(working, segmentation)
     table = find_table(working.always, table_seen(segmentation) if segmentation else None)
     marked = hint_masks_of(clip, working, segmentation, boxes or {})

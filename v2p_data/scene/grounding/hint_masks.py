@@ -1,4 +1,4 @@
-"""What somebody marked in one frame - a box or points of a user's, a detector's box - becomes an outline there."""
+"""What somebody marked in one frame - a box, a click, a stroke or points, a detector's box - becomes an outline there."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.frames.classes import MOVED, OTHER
 from v2p_data.scene.frames.mask_ops import (
     DRAWN_OFF_PX,
@@ -20,7 +21,9 @@ from v2p_data.scene.frames.mask_ops import (
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.outlines import filled, without_table
+from v2p_data.scene.grounding.spot_masks import mask_at_spots
 from v2p_data.video.clip import Clip
+from v2p_data.video.hints import TABLE
 
 _HINTED_SURE = 0.97
 _ELSEWHERE_LAB = 12.0
@@ -71,22 +74,48 @@ class HintMask:
 def hint_masks_of(
     clip: Clip, working: WorkingClip, segmentation: Segmentation | None, boxes: Mapping[str, Box]
 ) -> dict[str, HintMask]:
-    """Return the masks that users' boxes and points mean, and detectors' boxes, by phrase."""
+    """Return the masks that users' boxes, clicks, strokes and points mean, and detectors' boxes, by phrase.
+
+    Raises:
+        ItemRejectedError: `bad_hint`: a click or a stroke is on no object.
+    """
     out = {}
     for phrase, box in boxes.items():
         i = int(np.abs(working.frame_idx - box.frame).argmin())
         out[phrase] = _boxed(working, segmentation, i, box.box_xyxy, box.score)
     for phrase, hint in clip.hints.items():
+        if phrase == TABLE and phrase not in clip.objects:
+            continue  # no object: `marked_table` reads it
         i = int(np.abs(working.frame_idx - hint.get("frame", 0)).argmin())
         if "box" in hint:
             out[phrase] = _boxed(working, segmentation, i, hint["box"], _HINTED_SURE)
+        elif "stroke" in hint or "click" in hint:
+            spots = (
+                hint["stroke"] if "stroke" in hint else [hint["click"]] if "click" in hint else []
+            )
+            shares = None if segmentation is None else segmentation.at(i)
+            try:
+                mask = mask_at_spots(working.rgb[i], _scaled(spots, working), shares)
+            except V2PError as error:
+                detail = f"{clip.path.name}, hint '{phrase}': {error}"
+                raise ItemRejectedError("bad_hint", detail) from error
+            out[phrase] = _outlined(mask, i)
         elif "points" in hint:
-            spots = [(x * working.px_scale, y * working.px_scale) for x, y in hint["points"]]
-            mask = from_points(working.rgb[i], spots)
-            x, y, w, h = bounding_box(mask)
-            inside = _inside_of((x, y, x + w, y + h), working.shape)
-            out[phrase] = HintMask(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
+            out[phrase] = _outlined(
+                from_points(working.rgb[i], _scaled(hint["points"], working)), i
+            )
     return out
+
+
+def _scaled(spots: list[list[float]], working: WorkingClip) -> list[tuple[float, float]]:
+    """Return spots in the clip's pixels at working size."""
+    return [(x * working.px_scale, y * working.px_scale) for x, y in spots]
+
+
+def _outlined(mask: Bool[np.ndarray, "h w"], i: int) -> HintMask:
+    x, y, w, h = bounding_box(mask)
+    inside = _inside_of((x, y, x + w, y + h), mask.shape)
+    return HintMask(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
 
 
 def _boxed(

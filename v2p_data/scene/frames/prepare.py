@@ -1,0 +1,57 @@
+"""What a reconstruction needs of a clip before it asks which pixels are which object: nothing here depends on hints."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from v2p_data.scene.frames.checks import check_change, check_still
+from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
+from v2p_data.scene.frames.stabilise import hint_in_aligned, stabilised
+from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
+from v2p_data.video.clip import Clip, Hint
+from v2p_data.video.hints import check_hints, hints_in_clip
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedClip:
+    """A clip whose camera stands still, with its working frames and what the network sees in them."""
+
+    clip: Clip
+    """Aligned, where the camera swayed."""
+    working: WorkingClip
+    segmentation: Segmentation | None
+    """None where another backend than the network grounds."""
+
+    def with_hints(self, hints: Mapping[str, Hint]) -> "PreparedClip":
+        """Return the same with these hints, given in the file's pixels and frames, in place of the clip's own.
+
+        Raises:
+            V2PError: a mark lies outside of the picture, or in a frame that there is not.
+        """
+        clip = self.clip
+        check_hints(hints, clip.source_size_px, clip.total_frames, clip.path.name)
+        size_px = clip.width_px, clip.height_px
+        own = hints_in_clip(hints, size_px, clip.source_size_px, clip.source_frame)
+        if clip.to_filmed is not None:
+            own = {
+                phrase: hint_in_aligned(hint, clip.to_filmed, size_px)
+                for phrase, hint in own.items()
+            }
+        return replace(self, clip=replace(clip, hints=own))
+
+
+def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> PreparedClip:
+    """Return the clip, stabilised where its camera sways, its working frames, and what the network sees, where it is asked.
+
+    `max_camera_shift_px` is of a picture 320 px wide.
+
+    Raises:
+        ItemRejectedError: `nothing_moves` or `camera_moves`, with the number that decided.
+    """
+    working = working_clip_of(clip)
+    check_change(working)
+    steady = stabilised(clip, working)
+    if steady is not clip:
+        clip, working = steady, working_clip_of(steady)
+    segmentation = segment_clip(clip, working) if with_network else None
+    check_still(working, segmentation, max_camera_shift_px)
+    return PreparedClip(clip=clip, working=working, segmentation=segmentation)
