@@ -69,6 +69,9 @@ class Browser:
 
     def open(self, address: str) -> None:
         self.call("Page.navigate", url=address)
+        self.wait_for(
+            f"location.href === {json.dumps(address)} && document.readyState === 'complete'"
+        )
 
     def value(self, script: str) -> Any:
         """Return what a script in the page evaluates to."""

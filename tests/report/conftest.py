@@ -1,6 +1,7 @@
 """A run folder as the stages leave it, small and made by hand."""
 
 import json
+import sys
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,8 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.pipeline.artifact import Record, write_record, write_rejects
 from v2p_data.report.media import frames_uri
 from v2p_data.scene.scene import Scene, SceneObject
+
+sys.path.insert(0, str(Path(__file__).parent))  # browser.py beside the tests
 
 
 class FakeRun:

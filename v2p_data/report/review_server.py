@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 from urllib.parse import unquote, urlsplit
 
 import jinja2
@@ -28,6 +28,7 @@ LONGEST_BODY = 200_000
 _CHUNK = 1 << 16
 
 
+@runtime_checkable
 class Session(Protocol):
     """What the page shows and changes; all calls may come from several threads."""
 

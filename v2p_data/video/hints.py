@@ -1,7 +1,7 @@
 """Hints: what a person marked about an object, checked alone and against the picture that it was marked in."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -107,10 +107,12 @@ def check_hints(
                 )
 
 
-def marked_spots(hint: Hint) -> list[list[float]]:
-    """Return all single pixels that a hint marks: points, click and stroke, `[x, y]` [px]."""
-    click = [hint["click"]] if "click" in hint else []
-    return [*hint.get("points", []), *click, *hint.get("stroke", [])]
+def marked_spots(hint: Hint) -> Iterator[list[float]]:
+    """Yield all single pixels that a hint marks: points, click and stroke, `[x, y]` [px]."""
+    yield from hint.get("points", [])
+    if "click" in hint:
+        yield hint["click"]
+    yield from hint.get("stroke", [])
 
 
 def hints_in_clip(

@@ -114,7 +114,8 @@ def _scaled(spots: list[list[float]], working: WorkingClip) -> list[tuple[float,
 
 def _outlined(mask: Bool[np.ndarray, "h w"], i: int) -> HintMask:
     x, y, w, h = bounding_box(mask)
-    inside = _inside_of((x, y, x + w, y + h), mask.shape)
+    inside = np.zeros(mask.shape, bool)
+    inside[y : y + h, x : x + w] = True
     return HintMask(mask=mask, frame=i, sure=_HINTED_SURE, box=inside)
 
 
