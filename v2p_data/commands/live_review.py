@@ -4,7 +4,6 @@ A mark is saved in the caption file beside the videos before anything else happe
 folder and with its settings, as `v2p scene` would do it: that command finds the result there and keeps it.
 """
 
-import json
 import threading
 import time
 from collections.abc import Iterable, Mapping
@@ -17,11 +16,12 @@ from typing import Any
 from v2p_data.commands.display import outcomes_json
 from v2p_data.commands.prepared_clips import PreparedClips, outlines_of
 from v2p_data.commands.run import RUN_FILE
+from v2p_data.commands.scene_settings import settings_of, usual_settings
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import read_record, write_json_atomically
 from v2p_data.pipeline.runner import Outcome, Runtime, make_stage, stored_outcome
-from v2p_data.pipeline.settings import from_values
-from v2p_data.report.reading import Result, as_dicts, read_json, read_run
+from v2p_data.report.reading import Result, as_dict, as_dicts, read_run
 from v2p_data.report.review_page import SCHEMA, ReviewClip, clip_json
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.frames.prepare import PreparedClip
@@ -86,12 +86,12 @@ class LiveReview:
         self._at_work: dict[str, threading.Lock] = {}
         """By result folder: two marks that mean the same are not rebuilt at once."""
         results = {r.item: r for r in read_run(root).of_stage("scene")}
-        usual = _usual_settings(results.values())
+        usual = usual_settings(results.values())
         self._desks = {
             video.item: _Desk(
                 video=video,
                 result=results.get(video.item),
-                cfg=_settings_of(results.get(video.item)) or usual,
+                cfg=settings_of(results.get(video.item)) or usual,
             )
             for video in _in_order(find_videos(videos), results)
         }
@@ -278,7 +278,7 @@ class LiveReview:
     def _remember(self, outcome: Outcome) -> None:
         """Put the outcome into the run's list of what its last command made: pages read there which result counts."""
         path = self.root / RUN_FILE
-        rows = as_dicts(read_json(path)) if path.is_file() else []
+        rows = as_dicts(json_or_none(path))
         others = [r for r in rows if (r.get("stage"), r.get("item")) != ("scene", outcome.item)]
         write_json_atomically(path, [*others, *outcomes_json({0: outcome}, [])])
 
@@ -382,36 +382,7 @@ def _in_order(videos: Iterable[VideoItem], results: Mapping[str, Result]) -> lis
     return sorted(videos, key=lambda video: (video.item not in made, video.item))
 
 
-def _settings_of(result: Result | None) -> EngineConfig | None:
-    """Return the settings that a scene was made with; None where they are not known to this version."""
-    recipe = result.record.recipe.get("config") if result is not None and result.record else None
-    if not isinstance(recipe, dict):
-        return None
-    try:
-        return EngineConfig(
-            video=from_values(VideoConfig, recipe.get("video"), "the record's video"),
-            scene=from_values(SceneConfig, recipe.get("scene"), "the record's scene"),
-            seed=int(recipe.get("seed", 0)),
-        )
-    except (V2PError, TypeError, ValueError):
-        return None
-
-
-def _usual_settings(results: Iterable[Result]) -> EngineConfig:
-    """Return the settings of the run's newest scene, the usual ones where there is none."""
-    dated = [
-        (str((r.record.provenance or {}).get("time", "")), cfg)
-        for r in results
-        if r.record is not None and (cfg := _settings_of(r)) is not None
-    ]
-    return max(dated, key=lambda pair: pair[0])[1] if dated else EngineConfig()
-
-
 def _judgements(path: Path) -> dict[str, str | None]:
     """Return what was said earlier, by the results' keys; what cannot be read is not counted."""
-    try:
-        data = json.loads(path.read_text())
-        rows = as_dicts(data.get("clips"))
-    except (OSError, ValueError, AttributeError):
-        return {}
+    rows = as_dicts(as_dict(json_or_none(path)).get("clips"))
     return {str(r.get("key")): r["judgement"] for r in rows if r.get("judgement") in _JUDGEMENTS}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.json_files import read_json
 from v2p_data.video.captions import (
     CAPTIONS_FILE,
     ENTRY_KEYS,
@@ -17,7 +18,7 @@ from v2p_data.video.captions import (
     find_videos,
     written_captions,
 )
-from v2p_data.video.checked import check_keys, read_json, same_name, type_of
+from v2p_data.video.checked import check_keys, same_name, type_of
 from v2p_data.video.clip import Hint
 from v2p_data.video.hints import MARK_KEYS
 
