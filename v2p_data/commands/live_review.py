@@ -337,9 +337,11 @@ class LiveReview:
 def _prepared(future: Future[PreparedClip], video: VideoItem) -> PreparedClip | V2PError:
     """Return the clip with its hints, or why it cannot be used."""
     try:
-        return future.result().with_hints(video.hints)
-    except ItemRejectedError as error:
+        ready = future.result()
+    except V2PError as error:
         return error
+    try:
+        return ready.with_hints(video.hints)
     except V2PError as error:
         return ItemRejectedError("bad_hint", str(error))
 
