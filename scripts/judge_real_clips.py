@@ -207,8 +207,10 @@ def _box_at(clip: Clip, scene: Reconstruction, thing: Estimate, end: str) -> Box
     if not mask.any():
         return None
     y, x = np.nonzero(mask)
-    sx, sy = clip.source_size_px[0] / mask.shape[1], clip.source_size_px[1] / mask.shape[0]
-    x0, y0, x1, y1 = x.min() * sx, y.min() * sy, (x.max() + 1) * sx, (y.max() + 1) * sy
+    left, top, right, bottom = scene.clip.in_file_px
+    sx, sy = (right - left) / mask.shape[1], (bottom - top) / mask.shape[0]
+    x0, x1 = left + x.min() * sx, left + (x.max() + 1) * sx
+    y0, y1 = top + y.min() * sy, top + (y.max() + 1) * sy
     return [float(x0), float(y0), float(x1), float(y1)]
 
 

@@ -20,7 +20,7 @@ from v2p_data.scene.export import write_scene
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.scene import Scene, SceneObject, least_turn, read_masks, write_masks
-from v2p_data.video.clip import Clip
+from v2p_data.video.clip import Clip, Crop
 
 FRAMES = (0, 3, 5)
 BOTTLE = np.array([(0.03, -0.1), (0.035, -0.09), (0.035, 0.03), (0.014, 0.07), (0.014, 0.1)])
@@ -338,3 +338,20 @@ def test_a_pose_per_frame_is_demanded_for_all_frames(folder, tmp_path):
 
     with pytest.raises(V2PError, match="has 1 poses, but the clip has"):
         Scene.load(tmp_path)
+
+
+def test_a_scene_without_its_black_bars_says_what_part_of_the_file_it_shows(scene, tmp_path):
+    made = reconstruction()
+    h, w = made.clip.frames.shape[1:3]
+    crop = Crop(box_px=(0, 10, w, h + 10), full_px=(w, h + 20))
+    (tmp_path / "cut").mkdir()
+    write_scene(replace(made, clip=replace(made.clip, crop=crop)), tmp_path / "cut")
+
+    read = Scene.load(tmp_path / "cut")
+
+    assert scene.crop_px is None
+    assert read.crop_px is not None
+    sw, sh = made.clip.source_size_px
+    np.testing.assert_allclose(
+        read.crop_px, (0, 10 * sh / (h + 20), sw, (h + 10) * sh / (h + 20)), atol=0.01
+    )

@@ -216,7 +216,9 @@ def test_the_files_have_the_fields_of_what_they_become():
         return {f.name for f in fields(kind)}
 
     assert set(ObjectEntry.model_fields) == names(SceneObject) | {"first_to_last"}
-    assert set(SceneFile.model_fields) == (names(Scene) - {"folder", "T_world_cams"}) | {"version"}
+    assert set(SceneFile.model_fields) == (
+        names(Scene) - {"folder", "T_world_cams", "crop_px"}
+    ) | {"version"}
     assert set(TaskFile.model_fields) == names(TaskBundle) - {"scene", "code", "folder"}
     assert set(RobotEntry.model_fields) == names(RobotConfig)
     assert set(AuditEntry.model_fields) == names(Audit) | {"acceptable"}

@@ -114,7 +114,8 @@ def outlines_of(prepared: PreparedClip) -> dict[str, list[list[list[float]]]]:
     """
     clip, working = prepared.clip, prepared.working
     to_clip = 1 / working.px_scale
-    to_file = clip.source_size_px[0] / clip.width_px
+    x0, y0, x1, _ = clip.in_file_px
+    to_file = (x1 - x0) / clip.width_px
     out: dict[str, list[list[list[float]]]] = {}
     for phrase, marked in hint_masks_of(clip, working, prepared.segmentation, {}).items():
         found, _ = cv2.findContours(
@@ -126,7 +127,7 @@ def outlines_of(prepared: PreparedClip) -> dict[str, list[list[list[float]]]]:
             if clip.to_filmed is not None:
                 H = clip.to_filmed[clip.hints[phrase].get("frame", 0)]
                 spots = cv2.perspectiveTransform(spots[None], H)[0]
-            out[phrase].append((spots * to_file).round(1).tolist())
+            out[phrase].append((spots * to_file + (x0, y0)).round(1).tolist())
     return out
 
 

@@ -59,6 +59,7 @@ def write_scene(reconstruction: Reconstruction, folder: Path) -> Scene:
         T_world_cams=None
         if clip.to_filmed is None
         else poses_over_table(reconstruction.camera, clip.to_filmed),
+        crop_px=None if clip.crop is None else clip.crop.in_file(clip.source_size_px),
         warnings=(*clip.warnings, *reconstruction.warnings),
         folder=folder,
     )

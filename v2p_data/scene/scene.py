@@ -216,6 +216,8 @@ class Scene:
     """Standard deviation of the logarithm of all lengths together: one view does not show scale."""
     T_world_cams: Float[np.ndarray, "time 4 4"] | None = None
     """Pose of the camera in each frame as it was filmed; None where the camera stood still."""
+    crop_px: tuple[float, float, float, float] | None = None
+    """x0, y0, x1, y1 in the file's pixels of what the camera's pictures show, where black bars were cut off."""
     table: Plane = Plane()
     """The table's top."""
     gravity_m_s2: tuple[float, float, float] = GRAVITY_M_S2
@@ -259,7 +261,7 @@ class Scene:
     def save(self, folder: Path) -> None:
         """Write `scene.json`; meshes, masks and URDFs are written by their makers."""
         data = asdict(replace(self, folder=Path()))
-        del data["folder"], data["T_world_cams"]
+        del data["folder"], data["T_world_cams"], data["crop_px"]
         data["camera"] = {
             "width_px": self.camera.width_px,
             "height_px": self.camera.height_px,
@@ -268,6 +270,8 @@ class Scene:
         }
         if self.T_world_cams is not None:
             data["camera"]["T_world_cams"] = np.round(self.T_world_cams, 6).tolist()
+        if self.crop_px is not None:
+            data["camera"]["crop_px"] = [round(v, 2) for v in self.crop_px]
         for written, thing in zip(data["objects"], self.objects, strict=True):
             if thing.poses_world:  # for readers of the file; here it follows from the poses
                 written["first_to_last"] = asdict(thing.first_to_last)
@@ -308,12 +312,13 @@ class Scene:
             T_world_cams=np.array(read.camera.T_world_cams, float)
             if read.camera.T_world_cams
             else None,
+            crop_px=read.camera.crop_px,
             folder=folder,
         )
 
 
 _AS_WRITTEN = {f.name for f in fields(Scene)} - {
-    *("kind", "objects", "confidences", "table", "camera", "T_world_cams", "folder")
+    *("kind", "objects", "confidences", "table", "camera", "T_world_cams", "crop_px", "folder")
 }
 """Fields that stand in the file as they are."""
 

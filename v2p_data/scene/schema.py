@@ -153,6 +153,7 @@ class CameraEntry(FileModel):
     K: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]]
     T_world_cam: tuple[Row4, Row4, Row4, Row4]
     T_world_cams: Annotated[tuple[tuple[Row4, Row4, Row4, Row4], ...], Len(0, MAX_FRAMES)] = ()
+    crop_px: tuple[Entry, Entry, Entry, Entry] | None = None
 
 
 class PlaneEntry(FileModel):

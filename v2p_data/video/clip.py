@@ -29,6 +29,22 @@ class Hint(TypedDict, total=False):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Crop:
+    """Which part of the decoded pictures a clip's frames are."""
+
+    box_px: tuple[int, int, int, int]
+    """x0, y0, x1, y1 in the decoded pictures."""
+    full_px: tuple[int, int]
+    """Width and height of the decoded pictures."""
+
+    def in_file(self, source_size_px: tuple[int, int]) -> tuple[float, float, float, float]:
+        """Return the box in the file's pixels."""
+        sx, sy = source_size_px[0] / self.full_px[0], source_size_px[1] / self.full_px[1]
+        x0, y0, x1, y1 = self.box_px
+        return x0 * sx, y0 * sy, x1 * sx, y1 * sy
+
+
+@dataclass(frozen=True, kw_only=True)
 class Clip:
     """One decoded video: upright RGB frames at an even spacing in time."""
 
@@ -55,8 +71,17 @@ class Clip:
     """Width and height as shown, before scaling."""
     to_filmed: Float[ndarray, "time 3 3"] | None = field(default=None, repr=False)
     """By frame: homography from its pixels to those that were filmed, where a swaying camera's frames were aligned."""
+    crop: Crop | None = None
+    """What is left of the pictures where black bars were cut off."""
     warnings: tuple[str, ...] = ()
     """Sentences for a person: what was odd about the file though it could be used."""
+
+    @property
+    def in_file_px(self) -> tuple[float, float, float, float]:
+        """What the frames show: x0, y0, x1, y1 in the file's pixels."""
+        if self.crop is None:
+            return 0.0, 0.0, float(self.source_size_px[0]), float(self.source_size_px[1])
+        return self.crop.in_file(self.source_size_px)
 
     @property
     def width_px(self) -> int:

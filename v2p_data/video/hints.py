@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from v2p_data.errors import V2PError
 from v2p_data.video.checked import check_keys, numbers, type_of, words
-from v2p_data.video.clip import Hint
+from v2p_data.video.clip import Crop, Hint
 
 MIN_SIZE_M = 0.002
 """Thinner than a coin is a slip of the unit, and nothing a simulator can hold."""
@@ -145,6 +145,26 @@ def hints_in_clip(
             there["stroke"] = [[x * sx, y * sy] for x, y in hint["stroke"]]
         moved[name] = there
     return moved
+
+
+def hint_in_crop(hint: Hint, crop: Crop) -> Hint:
+    """Return a hint in the pixels of a cropped picture; what lies outside of it is moved to its edge."""
+    x0, y0, x1, y1 = crop.box_px
+
+    def inside(x: float, y: float) -> list[float]:
+        return [min(max(x - x0, 0.0), x1 - x0 - 1.0), min(max(y - y0, 0.0), y1 - y0 - 1.0)]
+
+    out = hint.copy()
+    if "box" in hint:
+        a, b, c, d = hint["box"]
+        out["box"] = [*inside(a, b), *(v + 1.0 for v in inside(c - 1, d - 1))]
+    if "points" in hint:
+        out["points"] = [inside(x, y) for x, y in hint["points"]]
+    if "click" in hint:
+        out["click"] = inside(*hint["click"])
+    if "stroke" in hint:
+        out["stroke"] = [inside(x, y) for x, y in hint["stroke"]]
+    return out
 
 
 def boxes_as_read(hints: Mapping[str, Hint], where: str) -> list[str]:

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from v2p_data.scene.frames.checks import check_change, check_still
+from v2p_data.scene.frames.footage import check_footage, without_bars
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
 from v2p_data.scene.frames.stabilise import hint_in_aligned, stabilised
 from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
 from v2p_data.video.clip import Clip, Hint
-from v2p_data.video.hints import check_hints, hints_in_clip
+from v2p_data.video.hints import check_hints, hint_in_crop, hints_in_clip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +31,10 @@ class PreparedClip:
         clip = self.clip
         check_hints(hints, clip.source_size_px, clip.total_frames, clip.path.name)
         size_px = clip.width_px, clip.height_px
-        own = hints_in_clip(hints, size_px, clip.source_size_px, clip.source_frame)
+        decoded_px = size_px if clip.crop is None else clip.crop.full_px
+        own = hints_in_clip(hints, decoded_px, clip.source_size_px, clip.source_frame)
+        if clip.crop is not None:
+            own = {phrase: hint_in_crop(hint, clip.crop) for phrase, hint in own.items()}
         if clip.to_filmed is not None:
             own = {
                 phrase: hint_in_aligned(hint, clip.to_filmed, size_px)
@@ -40,15 +44,17 @@ class PreparedClip:
 
 
 def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> PreparedClip:
-    """Return the clip, stabilised where its camera sways, its working frames, and what the network sees, where it is asked.
+    """Return the clip without black bars, stabilised where its camera sways, its working frames, and what the network sees, where it is asked.
 
     `max_camera_shift_px` is of a picture 320 px wide.
 
     Raises:
-        ItemRejectedError: `nothing_moves` or `camera_moves`, with the number that decided.
+        ItemRejectedError: `nothing_moves`, `split_screen`, `cut` or `camera_moves`, with the number that decided.
     """
+    clip = without_bars(clip)
     working = working_clip_of(clip)
     check_change(working)
+    check_footage(clip, working)
     steady = stabilised(clip, working)
     if steady is not clip:
         clip, working = steady, working_clip_of(steady)
