@@ -148,7 +148,7 @@ def hints_in_clip(
 
 
 def hint_in_crop(hint: Hint, crop: Crop) -> Hint:
-    """Return a hint in the pixels of a cropped picture; what lies outside of it is moved to its edge."""
+    """Return a hint in the pixels of a cropped picture; marks outside of it are moved to its edge."""
     x0, y0, x1, y1 = crop.box_px
 
     def inside(x: float, y: float) -> list[float]:
