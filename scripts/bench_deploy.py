@@ -134,7 +134,7 @@ def robot_in(kind: str, folder: Path, seed: int) -> Any:
     robot = (
         V2PFranka(V2PFrankaConfig(task_folder=str(folder), seed=seed, pictures="rgb"))
         if kind == "sim"
-        else V2PTwin(V2PTwinConfig(task_folder=str(folder), seed=seed))
+        else V2PTwin(V2PTwinConfig(task_folder=str(folder), seed=seed, pictures="rgb"))
     )
     robot.connect()
     return robot

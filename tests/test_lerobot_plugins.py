@@ -287,7 +287,7 @@ def test_lerobots_act_trains_on_the_same_dataset(run_tool, dataset, tmp_path):
     assert (checkpoint / "model.safetensors").is_file()
 
 
-def test_lerobot_rolls_the_policy_out_on_the_simulated_robot(
+def test_lerobot_rolls_the_policy_out_on_the_simulated_robot_and_on_the_twin(
     run_tool, dataset, task_folder, tmp_path, caplog
 ):
     from lerobot.scripts.lerobot_rollout import main
@@ -303,28 +303,29 @@ def test_lerobot_rolls_the_policy_out_on_the_simulated_robot(
     )
 
     # LeRobot replaces the root logger's handlers, so the robot's own logger is listened to.
-    log = logging.getLogger("lerobot_policy_v2p.robot.v2p_franka")
-    log.addHandler(caplog.handler)
-    try:
-        run_tool(
-            main,
-            "--strategy.type=base",
-            f"--policy.path={checkpoint}",
-            "--robot.type=v2p_franka",
-            "--robot.backend=sim",
-            f"--robot.task_folder={task_folder}",
-            f"--robot.calibration_dir={tmp_path}",
-            "--task=leaving the cube alone",
-            "--duration=2",
-            "--fps=20",
-            "--device=cpu",
-            "--play_sounds=false",
-            "--return_to_initial_position=false",
-        )
-    finally:
-        log.removeHandler(caplog.handler)
+    for robot in ("v2p_franka", "v2p_twin"):
+        log = logging.getLogger(f"lerobot_policy_v2p.robot.{robot}")
+        log.addHandler(caplog.handler)
+        try:
+            run_tool(
+                main,
+                "--strategy.type=base",
+                f"--policy.path={checkpoint}",
+                f"--robot.type={robot}",
+                f"--robot.task_folder={task_folder}",
+                f"--robot.calibration_dir={tmp_path}",
+                "--task=leaving the cube alone",
+                "--duration=4",
+                "--fps=20",
+                "--device=cpu",
+                "--play_sounds=false",
+                "--return_to_initial_position=false",
+            )
+        finally:
+            log.removeHandler(caplog.handler)
 
     assert "task 'rest' succeeded after 5 steps" in caplog.text
+    assert "task 'rest' succeeded in the twin after 5 steps" in caplog.text
 
 
 def test_the_robots_entries_are_the_datasets_in_the_same_order(task_folder, tmp_path):
@@ -370,7 +371,7 @@ def test_the_twin_is_a_lerobot_robot_that_gives_what_a_real_arm_gives(task_folde
     from v2p_data.twin.interface import RobotWithCamera
 
     robot = make_robot_from_config(
-        V2PTwinConfig(task_folder=str(task_folder), calibration_dir=tmp_path)
+        V2PTwinConfig(task_folder=str(task_folder), pictures="rgb", calibration_dir=tmp_path)
     )
     assert isinstance(robot, RobotWithCamera)
     with pytest.raises(V2PError, match="connect"):

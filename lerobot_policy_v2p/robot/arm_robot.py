@@ -1,13 +1,20 @@
 """What the robot types of this plugin share: the dataset's names, and one arm that needs no calibration by LeRobot."""
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
-from lerobot.robots import Robot, RobotConfig
+from lerobot.robots import Robot
 
+from lerobot_policy_v2p.robot.config_arm import ArmRobotConfig
+from v2p_data.deployment.robot import MASK_NAME
 from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
+from v2p_data.twin.interface import RGB_NAME, RGB_PX
+
+MASK_PX = 256
 
 
 class Closable(Protocol):
@@ -24,8 +31,10 @@ class ArmRobot[Arm: Closable](Robot):
     picture_px: int
     """Its width and height."""
 
-    def __init__(self, config: RobotConfig) -> None:
+    def __init__(self, config: ArmRobotConfig) -> None:
         super().__init__(config)
+        sees = config.pictures == "rgb"
+        self.picture_name, self.picture_px = (RGB_NAME, RGB_PX) if sees else (MASK_NAME, MASK_PX)
         del self.calibration  # LeRobot's dict of motors, which would hide the method
         self.arm: Arm | None = None
 
@@ -59,6 +68,15 @@ class ArmRobot[Arm: Closable](Robot):
         if self.arm is not None:
             self.arm.close()
             self.arm = None
+
+    @contextmanager
+    def closed_on_error(self) -> Generator[None]:
+        """Leave no arm connected where what is done with it fails."""
+        try:
+            yield
+        except BaseException:
+            self.disconnect()
+            raise
 
     def _connected(self) -> Arm:
         if self.arm is None:

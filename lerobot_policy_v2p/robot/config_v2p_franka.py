@@ -1,31 +1,23 @@
 """Settings of the robot type `v2p_franka`. LeRobot parses this config, hence it is not frozen."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from lerobot.robots import RobotConfig
 
-from v2p_data.deployment.limits import LimitsConfig
+from lerobot_policy_v2p.robot.config_arm import ArmRobotConfig
 
 Backend = Literal["sim", "network", "franky"]
-Pictures = Literal["mask", "rgb"]
 
 
 @RobotConfig.register_subclass("v2p_franka")
 @dataclass(kw_only=True)
-class V2PFrankaConfig(RobotConfig):
+class V2PFrankaConfig(ArmRobotConfig):
     """A Franka arm with a parallel gripper, real or simulated."""
 
     backend: Backend = "sim"
     """`sim` simulates a task; `network` talks to a driver of yours by the protocol of docs/deploy.md; `franky` drives a
-    real arm through the library franky and has never been run by us."""
-    pictures: Pictures = "mask"
-    """What an observation holds: `mask` for policies, `rgb` for `v2p deploy`, which makes the masks itself."""
-    clicks: str = ""
-    """`mask` only: pixels of the objects in order, `120,80 60,200`. The masks are then tracked in the colour pictures from
-    these pixels on. Needed by `network`; without clicks `sim` and `franky` give masks of their own."""
-    limits: LimitsConfig = field(default_factory=LimitsConfig)
-    """`network` and `franky`: what `send_action` lets through. `v2p deploy` has limits of its own instead."""
+    real arm through the library franky and has never been run by us. `network` needs `clicks`, or `pictures` to be `rgb`."""
 
     task_folder: str = ""
     """`sim`: the task to simulate, as `v2p task` writes it."""

@@ -4,11 +4,13 @@ from dataclasses import dataclass, field
 
 from lerobot.robots import RobotConfig
 
+from lerobot_policy_v2p.robot.config_arm import ArmRobotConfig
+
 
 @RobotConfig.register_subclass("v2p_twin")
 @dataclass(kw_only=True)
-class V2PTwinConfig(RobotConfig):
-    """The twin of a Franka arm with a parallel gripper and a camera: pictures and joint readings, no masks."""
+class V2PTwinConfig(ArmRobotConfig):
+    """The twin of a Franka arm with a parallel gripper and a camera: another simulator."""
 
     task_folder: str = ""
     """The task that stands on the twin's table, as `v2p task` writes it."""

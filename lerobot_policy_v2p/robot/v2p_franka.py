@@ -18,15 +18,10 @@ from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
 from lerobot_policy_v2p.robot.franky import FrankyArm
 from lerobot_policy_v2p.robot.network import NetworkArm
 from lerobot_policy_v2p.robot.simulated import SimulatedArm
-from v2p_data.deployment.limits import Guard
-from v2p_data.deployment.robot import MASK_NAME, ActionScale, Rig
-from v2p_data.deployment.sight import LOST_AFTER, Sight, clicks_from
+from lerobot_policy_v2p.robot.unattended import Unattended, check_policy_of
+from v2p_data.deployment.robot import ActionScale
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
-from v2p_data.sim.masks import labels_to_rgb
-from v2p_data.twin.interface import RGB_NAME, RGB_PX
-
-MASK_PX = 256
 
 
 class Arm(Protocol):
@@ -84,12 +79,8 @@ class V2PFranka(ArmRobot[Arm]):
     def __init__(self, config: V2PFrankaConfig) -> None:
         super().__init__(config)
         self.config = config
-        sees = config.pictures == "rgb"
-        self.picture_name, self.picture_px = (RGB_NAME, RGB_PX) if sees else (MASK_NAME, MASK_PX)
-        self._sight: Sight | None = None
-        self._is_started = False
-        self._guard: Guard | None = None
-        self._state: np.ndarray | None = None
+        self._unattended: Unattended | None = None
+        self._state: dict[str, Any] | None = None
 
     @property
     def action_scale(self) -> ActionScale:
@@ -97,14 +88,17 @@ class V2PFranka(ArmRobot[Arm]):
 
     def connect(self, calibrate: bool = True) -> None:
         """Start the simulation, or reach the arm; there is nothing to calibrate."""
-        if self.arm is None:
-            self.arm = ARMS[self.config.backend](self.config)
-            self._is_started = False
-            self._sight = None
-            if self.config.clicks and self.config.pictures == "mask":
-                self._sight = Sight(self.calibration(), clicks_from(self.config.clicks.split()))
-            if self.config.backend != "sim":
-                self._guard = Guard(self.config.limits, self.arm.action_scale)
+        if self.arm is not None:
+            return
+        self.arm = ARMS[self.config.backend](self.config)
+        self._state = self._unattended = None
+        with self.closed_on_error():
+            check_policy_of(self.config, self.action_scale, self.task_description)
+            if self.config.pictures == "mask":
+                self._unattended = Unattended(
+                    self, self.config, self.arm.mask, lambda: self._seeing().picture(),
+                    is_limited=self.config.backend != "sim",
+                )  # fmt: skip
 
     def get_observation(self) -> dict[str, Any]:
         """Return the state's entries by name, and `mask` or `rgb`.
@@ -112,14 +106,10 @@ class V2PFranka(ArmRobot[Arm]):
         Raises:
             V2PError: the arm does not answer, or what was clicked is lost; the arm then holds its position.
         """
-        arm = self._connected()
-        self._state = arm.state()
-        state = named_state(self._state)
-        if self.config.pictures == "rgb":
-            return {**state, RGB_NAME: self._seeing().picture()}
-        if self._sight is None:
-            return {**state, MASK_NAME: arm.mask()}
-        return {**state, MASK_NAME: self._tracked(self._sight, state)}
+        self._state = named_state(self._connected().state())
+        if self._unattended is None:
+            return {**self._state, self.picture_name: self._seeing().picture()}
+        return {**self._state, self.picture_name: self._unattended.mask(self._state)}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Carry out an action and return it as it was carried out: clipped to [-1, 1] and, on real arms, to the limits.
@@ -129,17 +119,9 @@ class V2PFranka(ArmRobot[Arm]):
         """
         arm = self._connected()
         wanted = action_of(action)
-        if self._guard is not None and self.config.pictures == "mask":
-            state = self._state if self._state is not None else arm.state()
-            reading = Rig(self).reading_of(named_state(state))
-            try:
-                self._guard.look(reading)
-                wanted = self._guard.limit(wanted, reading).action
-            except V2PError:
-                arm.hold()
-                raise
-        done = arm.act(np.clip(wanted, -1.0, 1.0))
-        return named_action(done)
+        if self._unattended is not None:
+            wanted = self._unattended.allowed(wanted, self._state or named_state(arm.state()))
+        return named_action(arm.act(np.clip(wanted, -1.0, 1.0)))
 
     def calibration(self) -> Camera:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Return the camera of `rgb`."""
@@ -171,21 +153,6 @@ class V2PFranka(ArmRobot[Arm]):
     def task_description(self) -> str:
         """The simulated task in words."""
         return self.arm.env.task_description if isinstance(self.arm, SimulatedArm) else ""
-
-    def _tracked(self, sight: Sight, state: dict[str, Any]) -> np.ndarray:
-        reading = Rig(self).reading_of({**state, RGB_NAME: self._seeing().picture()})
-        try:
-            seen = sight.see(reading) if self._is_started else sight.start(reading)
-        except V2PError:
-            self._connected().hold()
-            raise
-        self._is_started = True
-        if max(seen.missed) >= LOST_AFTER:
-            self._connected().hold()
-            raise V2PError(
-                f"object {int(np.argmax(seen.missed)) + 1} is no longer seen; the robot holds its position"
-            )
-        return labels_to_rgb(seen.labels)
 
     def _seeing(self) -> SeeingArm:
         arm = self._connected()

@@ -1,7 +1,7 @@
-"""The robot type `v2p_twin`: the dataset's state and action names, and an RGB picture, on the twin of a Franka arm.
+"""The robot type `v2p_twin`: the dataset's state and action names, and masks or a picture, on the twin of a Franka arm.
 
-It is a `v2p_data.twin.interface.RobotWithCamera`: what it gives is what a real arm with a calibrated camera gives.
-Everything done with it is sim-to-sim. How the episode went is logged, and asked of `arm.mirror` by judges.
+It is a `v2p_data.twin.interface.RobotWithCamera`: with `pictures=rgb` it gives what a real arm with a calibrated camera
+gives. Everything done with it is sim-to-sim. How the episode went is logged, and asked of `arm.mirror` by judges.
 """
 
 import logging
@@ -13,11 +13,14 @@ from jaxtyping import Float
 
 from lerobot_policy_v2p.robot.arm_robot import ArmRobot, action_of, named_action, named_state
 from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
+from lerobot_policy_v2p.robot.unattended import Unattended, check_policy_of
 from v2p_data.deployment.robot import ActionScale
+from v2p_data.deployment.view import allowing_for_place
 from v2p_data.geometry.camera import Camera
+from v2p_data.sim.masks import labels_to_rgb
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.arm import TwinArm
-from v2p_data.twin.interface import RGB_NAME, RGB_PX
+from v2p_data.twin.judge import true_labels
 from v2p_data.twin.parameters import changed
 
 logger = logging.getLogger(__name__)
@@ -28,19 +31,22 @@ class V2PTwin(ArmRobot[TwinArm]):
 
     config_class = V2PTwinConfig
     name = "v2p_twin"
-    picture_name, picture_px = RGB_NAME, RGB_PX
 
     def __init__(self, config: V2PTwinConfig) -> None:
         super().__init__(config)
         self.config = config
         self._steps = 0
         self._has_succeeded = False
+        self._unattended: Unattended | None = None
 
     def connect(self, calibrate: bool = True) -> None:
         """Start the episode; the camera is calibrated already."""
-        if self.arm is None:
-            bundle = TaskBundle.load(Path(self.config.task_folder))
-            self.arm = TwinArm(bundle, changed(self.config.change))
+        if self.arm is not None:
+            return
+        bundle = TaskBundle.load(Path(self.config.task_folder))
+        self.arm = TwinArm(bundle, changed(self.config.change))
+        with self.closed_on_error():
+            check_policy_of(self.config, self.action_scale, self.task_description)
             self.restart(self.config.seed)
 
     @property
@@ -55,22 +61,39 @@ class V2PTwin(ArmRobot[TwinArm]):
 
     def restart(self, seed: int) -> None:
         """Start the episode of another seed."""
-        self._connected().reset(seed)
+        arm = self._connected()
+        arm.reset(seed)
         self._steps, self._has_succeeded = 0, False
+        self._unattended = None
+        if self.config.pictures == "mask":
+            labels = (allowing_for_place if self.config.training_view else true_labels)(arm)
+            self._unattended = Unattended(
+                self, self.config, lambda: labels_to_rgb(labels()), arm.picture
+            )
 
     def get_observation(self) -> dict[str, Any]:
-        """Return the state's entries by name, and `rgb`.
+        """Return the state's entries by name, and `mask` or `rgb`.
 
         Raises:
-            V2PError: there is no OpenGL.
+            V2PError: there is no OpenGL for pictures, or what was clicked is lost.
         """
         arm = self._connected()
-        return {**named_state(arm.state()), RGB_NAME: arm.picture()}
+        state = named_state(arm.state())
+        if self._unattended is None:
+            return {**state, self.picture_name: arm.picture()}
+        return {**state, self.picture_name: self._unattended.mask(state)}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Carry out an action for 50 ms and return it as it was carried out: clipped to [-1, 1]."""
+        """Carry out an action for 50 ms; return it as carried out: clipped to [-1, 1] and, with masks, to the limits.
+
+        Raises:
+            V2PError: a limit ends the run.
+        """
         arm = self._connected()
-        clipped = np.clip(action_of(action), -1.0, 1.0)
+        wanted = action_of(action)
+        if self._unattended is not None:
+            wanted = self._unattended.allowed(wanted, named_state(arm.state()))
+        clipped = np.clip(wanted, -1.0, 1.0)
         outcome = arm.act(clipped)
         self._steps += 1
         if outcome.is_held and not self._has_succeeded and arm.mirror.verdict():
@@ -90,6 +113,9 @@ class V2PTwin(ArmRobot[TwinArm]):
     def opening(self) -> float:
         """Return the gripper's opening of the last observation, 0 closed, 1 open."""
         return self._connected().measured.opening
+
+    def hold(self) -> None:
+        """Do nothing: time stands still."""
 
     @property
     def has_succeeded(self) -> bool:

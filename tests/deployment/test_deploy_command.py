@@ -138,7 +138,7 @@ def test_lerobots_own_rollout_sees_by_tracking_from_a_click(
         [
             "lerobot-rollout", "--strategy.type=base", f"--policy.path={policy_folder}", "--robot.type=v2p_franka",
             f"--robot.task_folder={task_folder}", f"--robot.clicks={click[1]}", f"--robot.calibration_dir={tmp_path}",
-            "--task=lifting the red box", "--duration=1", "--fps=20", "--device=cpu", "--play_sounds=false",
+            "--task=lifting the red box", "--duration=3", "--fps=20", "--device=cpu", "--play_sounds=false",
             "--return_to_initial_position=false",
         ],
     )  # fmt: skip

@@ -42,7 +42,9 @@ def test_the_twin_is_seen_from_one_click_and_kept_within_limits(task_folder, ste
     from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
     from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
 
-    robot = V2PTwin(V2PTwinConfig(task_folder=str(task_folder), calibration_dir=tmp_path))
+    robot = V2PTwin(
+        V2PTwinConfig(task_folder=str(task_folder), pictures="rgb", calibration_dir=tmp_path)
+    )
     robot.connect()
     rig, places, seen_labels, true = Rig(robot), [], [], []
     try:

@@ -19,7 +19,8 @@ from v2p_data.errors import V2PError
 
 ROBOT_PREFIX = "--robot."
 CLICK_WAIT_S = 300.0
-OURS = "v2p_franka"
+OURS = ("v2p_franka", "v2p_twin")
+"""Robots that give masks unless they are asked for pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +176,7 @@ def connected(words: Sequence[str]) -> Iterator[Any]:
     named = {
         word.partition("=")[0].removeprefix(ROBOT_PREFIX): word.partition("=")[2] for word in words
     }
-    gives_pictures = named.get("type") == OURS and named.get("backend") != "franky"
+    gives_pictures = named.get("type") in OURS and named.get("backend") != "franky"
     if gives_pictures and not {"pictures", "clicks"} & set(named):
         words = [*words, f"{ROBOT_PREFIX}pictures=rgb"]
     config = robot_config(words)

@@ -58,12 +58,29 @@ def check_policy(folder: Path, offer: Offer, task: str = "") -> Facts:
     """
     config = _policy_file(folder, CONFIG_FILE, "it is no LeRobot policy")
     _check_whole(folder / WEIGHTS_FILE)
-    facts = read_facts(folder)
     _check_features(folder, config, offer)
+    return check_meaning(folder, offer.scale, task)
+
+
+def check_meaning(folder: Path, scale: ActionScale, task: str = "") -> Facts:
+    """Demand that a policy's masks, states and actions mean what a robot's do; return what is known of its training.
+
+    LeRobot's own tools compare shapes, and no more.
+
+    Args:
+        folder: the policy.
+        scale: what an action of 1 means on the robot.
+        task: in words; decides where the policy knows several scales.
+
+    Raises:
+        V2PError: they do not, or the policy's files are damaged.
+    """
+    config = _policy_file(folder, CONFIG_FILE, "it is no LeRobot policy")
+    facts = read_facts(folder)
     _check_palette(folder, config, facts)
     _check_statistics(folder, config)
     _check_names(folder, facts)
-    _check_scale(folder, facts, offer.scale, task)
+    _check_scale(folder, facts, scale, task)
     if facts.fps is not None and abs(facts.fps - HZ) > 0.01:
         raise V2PError(
             f"the policy in {folder} was trained at {facts.fps:g} frames per second, and the loop runs at {HZ} Hz: its"

@@ -49,6 +49,7 @@ class Sight:
         camera: of the pictures, calibrated. It may stand elsewhere than the camera of training.
         clicks_px: a pixel (u right, v down) on each object, the manipulated one first.
         new_tracker: makes what follows one object.
+        training_view: labels are carried over to the camera of training.
 
     Raises:
         V2PError: no click, or more than there are greys; the camera sees too little of the table.
@@ -59,6 +60,8 @@ class Sight:
         camera: Camera,
         clicks_px: Sequence[tuple[float, float]],
         new_tracker: Callable[[], StreamTracker] = ColourTracker,
+        *,
+        training_view: bool = True,
     ) -> None:
         if not 1 <= len(clicks_px) <= MAX_OBJECTS:
             raise V2PError(
@@ -68,7 +71,7 @@ class Sight:
         self.clicks_px = tuple(clicks_px)
         self._new_tracker = new_tracker
         self._silhouette = Silhouette(camera)
-        self._view = view_for(camera)
+        self._view = view_for(camera) if training_view else None
         self._trackers: list[StreamTracker] = []
         self._missed: list[int] = []
 
