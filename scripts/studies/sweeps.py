@@ -59,8 +59,10 @@ def dropped(labels: Labels, share: float, rng: np.random.Generator) -> Labels:
 
 
 def swapped(labels: Labels, radius_px: float, rng: np.random.Generator) -> Labels:
-    """Return labels with round parts of each object [px at 256] that go by the robot's label."""
+    """Return labels with round parts of each object [px at 256] that go by the robot's label; none of radius 0."""
     out = labels.copy()
+    if not radius_px:
+        return out
     for label in np.unique(labels[labels >= FIRST_OBJECT]):
         rows, columns = np.nonzero(labels == label)
         for k in rng.integers(len(rows), size=SWAPPED_BLOBS):

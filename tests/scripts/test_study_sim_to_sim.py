@@ -115,7 +115,7 @@ def test_a_dropped_mask_is_background_and_a_swapped_one_partly_robot(parts):
 
 def test_no_fault_is_no_change(parts):
     rng = np.random.default_rng(0)
-    for fault in ("eroded", "dilated", "dropped"):
+    for fault in ("eroded", "dilated", "dropped", "swapped"):
         np.testing.assert_array_equal(getattr(parts.sweeps, fault)(labels(), 0, rng), labels())
 
 
