@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 
 from v2p_data.scene.frames.checks import check_change, check_still
 from v2p_data.scene.frames.footage import check_footage, without_bars
+from v2p_data.scene.frames.paint_over import without_graphics
+from v2p_data.scene.frames.repeats import without_repeats
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
 from v2p_data.scene.frames.stabilise import hint_in_aligned, stabilised
 from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
@@ -44,17 +46,22 @@ class PreparedClip:
 
 
 def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> PreparedClip:
-    """Return the clip without black bars, stabilised where its camera sways, its working frames, and what the network sees, where it is asked.
+    """Return the clip ready to be searched, with its working frames and what the network sees, where it is asked.
 
+    Black bars are cut off, repeated frames dropped, captions painted over, and frames aligned where the camera sways.
     `max_camera_shift_px` is of a picture 320 px wide.
 
     Raises:
-        ItemRejectedError: `nothing_moves`, `split_screen`, `cut` or `camera_moves`, with the number that decided.
+        ItemRejectedError: `nothing_moves`, `split_screen`, `cut`, `overlay` or `camera_moves`, with the number that decided.
     """
-    clip = without_bars(clip)
+    clip = without_repeats(without_bars(clip))
     working = working_clip_of(clip)
     check_change(working)
     check_footage(clip, working)
+    painted = without_graphics(clip)
+    if painted is not clip:
+        clip, working = painted, working_clip_of(painted)
+        check_change(working)
     steady = stabilised(clip, working)
     if steady is not clip:
         clip, working = steady, working_clip_of(steady)
