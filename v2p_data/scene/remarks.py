@@ -5,6 +5,7 @@ import numpy as np
 from v2p_data.kinds import Kind
 from v2p_data.scene.confidence import held_at_first
 from v2p_data.scene.data_types import GroundedObjects, Placement
+from v2p_data.scene.frames.hand_track import people_face
 
 _CLOSE_RIVAL = 0.02
 """IoU: where the next best face down covers the outlines no worse than this, the choice was as good as drawn by lot."""
@@ -13,7 +14,7 @@ _CLOSE_RIVAL = 0.02
 def remarks_on(
     kind: Kind, grounded: GroundedObjects, placement: Placement, num_frames: int
 ) -> list[str]:
-    """Return what is assumed or hardly seen: scale, unknown nouns, close rivals, hidden ends, lifts."""
+    """Return what is assumed or hardly seen: scale, unknown nouns, close rivals, hidden ends, two people, lifts."""
     spread = placement.scale_spread
     by_network = " and from what the network makes of the picture" if grounded.segmentation else ""
     out = [
@@ -39,6 +40,11 @@ def remarks_on(
         out.append(
             f"'{grounded.objects[0].phrase}' seems {np.expm1(thing.log_growth):.0%} larger at first than at the end, as if a hand held it in the "
             "air: its first pose is where it would stand on the table"
+        )
+    if people_face(grounded.working.hands):
+        out.append(
+            "hands reach in from opposite sides at once, as of two people: only one object's motion is understood, and another person's hand may "
+            "have moved it; film one person"
         )
     last_frame = int(grounded.working.frame_idx[thing.last_i])
     if kind == "lift_up":

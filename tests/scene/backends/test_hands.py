@@ -17,7 +17,7 @@ from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import RestingObject
 from v2p_data.scene.fitting.landmark_scale import height_from_landmarks, px_per_m
 from v2p_data.scene.fitting.silhouette import camera_above
-from v2p_data.scene.frames.hand_track import HandTrack, contact_share
+from v2p_data.scene.frames.hand_track import HandTrack, contact_share, people_face
 from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.scene.grounding.hands_by_model import track_hands
 from v2p_data.scene.preset import with_preset
@@ -207,3 +207,37 @@ def test_the_scale_of_landmarks_is_that_of_the_picture():
     shown = px_per_m(camera.project(HAND_M + np.array([0.05, 0, 0.8])), HAND_M)
 
     assert shown == pytest.approx(camera.K[0, 0] / 0.8, rel=0.05)
+
+
+def pointing(way: tuple[float, float], at: tuple[float, float]) -> np.ndarray:
+    """Return a hand's landmarks [px] with its wrist at a spot and its palm along a way."""
+    reach = np.linspace(0, 1, 21)[:, None]
+    px = np.array(at) + 60 * reach * way
+    px[9] = np.array(at) + 30 * np.array(way)
+    return px
+
+
+@pytest.mark.parametrize(
+    ("other", "at", "frames", "two"),
+    [
+        ((0.0, 1.0), (200.0, 20.0), 20, True),  # from the far side of the table
+        ((-0.2, -1.0), (250.0, 200.0), 20, False),  # the same person's other hand
+        ((-1.0, 0.1), (300.0, 120.0), 20, False),  # the other hand, from the side
+        ((0.0, 1.0), (100.0, 150.0), 20, False),  # at the same place: found twice
+        ((0.0, 1.0), (200.0, 20.0), 4, False),  # hardly ever
+    ],
+)
+def test_hands_that_face_each_other_are_two_people_s(other, at, frames, two):
+    own = np.repeat(pointing((0.1, -1.0), (100.0, 200.0))[None], 40, 0)
+    second = np.repeat(pointing(other, at)[None], frames, 0)
+    px, when = np.concatenate([own, second]), np.concatenate([np.arange(40), np.arange(frames)])
+    order = np.argsort(when, kind="stable")
+    hands = HandTrack(
+        at=when[order], px=px[order], metres=np.repeat(HAND_M[None], len(px), 0), num_sampled=40
+    )
+
+    assert people_face(hands) is two
+
+
+def test_nothing_is_said_of_two_people_where_no_model_knows_hands():
+    assert people_face(None) is False

@@ -16,6 +16,12 @@ _REACH = 0.3
 the frames in which they move, and wrong ones in 0 to 16 %."""
 _KNOWN_SHARE = 0.5
 """Share of the sampled frames in which a hand must be found, so that its absence elsewhere means something."""
+_APART = 1.0
+"""In palm lengths: two hands at one place are one hand, found twice."""
+_UPRIGHT = 0.4
+"""Sine of the angle at which a hand points up or down in the picture."""
+_FACING_SHARE = 0.1
+"""Of the sampled frames. In 32 real clips two hands face each other in one of 75 frames at most."""
 _FEWEST = 5
 """Frames with a hand and a moving object, from which their share says something."""
 
@@ -69,3 +75,26 @@ def contact_share(
     return len({int(hands.at[k]) for k in seen if hands.touches(k, masks[hands.at[k]])}) / len(
         frames
     )
+
+
+def people_face(hands: HandTrack | None) -> bool:
+    """Return whether hands reach in from opposite sides, one up and one down in the picture, in many frames at once: two people's.
+
+    One person's two hands point the same way, up or down. False where hands are not known.
+    """
+    if hands is None:
+        return False
+    facing = 0
+    for i in np.unique(hands.at):
+        here = np.flatnonzero(hands.at == i)
+        ways = hands.px[here, _MIDDLE_KNUCKLE] - hands.px[here, _WRIST]
+        palms = np.maximum(np.linalg.norm(ways, axis=1), 1e-6)
+        rise, middle = ways[:, 1] / palms, hands.px[here].mean(1)
+        facing += any(
+            rise[a] < -_UPRIGHT
+            and rise[b] > _UPRIGHT
+            and np.linalg.norm(middle[a] - middle[b]) > _APART * max(palms[a], palms[b])
+            for a in range(len(here))
+            for b in range(len(here))
+        )
+    return facing >= max(_FEWEST, _FACING_SHARE * hands.num_sampled)
