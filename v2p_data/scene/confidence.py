@@ -15,7 +15,7 @@ from v2p_data.scene.frames.colour import balance, colour_match, named_colours
 from v2p_data.scene.frames.hand_track import contact_share
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
 from v2p_data.scene.frames.segmentation import hand_at
-from v2p_data.scene.grounding.ground_objects import rests_on_table
+from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, rests_on_table
 from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
 from v2p_data.scene.scale.nouns import is_clear
 
@@ -65,7 +65,7 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
         add("pose", f"{which} seen at the end", max(0.1, least + seen))
     thing = grounded.objects[0]
     add("camera", "camera height", height_plausibility(placement.height_m))
-    if not rests_on_table(grounded.table, thing.first, grounded.segmentation):
+    if not _rests_on_table(grounded):
         add("grounding", "standing on the table at first", 0.6)
     if not (thing.noun.known or thing.known_m):
         add("size", f"knowing what '{thing.phrase}' is", 0.9)
@@ -93,6 +93,14 @@ def _touched_share(grounded: GroundedObjects) -> float | None:
     return contact_share(hands, thing.masks, np.array(moving, int))
 
 
+def _rests_on_table(grounded: GroundedObjects) -> bool:
+    """Return whether the manipulated object rests on the table at first."""
+    gap_px = {} if grounded.working.outliner is None else {"gap_px": EXACT_GAP_PX}
+    return rests_on_table(
+        grounded.table, grounded.objects[0].first, grounded.segmentation, **gap_px
+    )
+
+
 def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:
     """Return whether a hand seems to hold the manipulated object in the air when the clip begins.
 
@@ -101,7 +109,7 @@ def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:
     thing = grounded.objects[0]
     if placement.objects[0].log_growth < _GROWN:
         return False
-    if not rests_on_table(grounded.table, thing.first, grounded.segmentation):
+    if not _rests_on_table(grounded):
         return True
     hand = None if grounded.segmentation is None else hand_at(grounded.segmentation, thing.at)
     return hand is not None and bool((hand & grow(thing.first, TOUCH_PX)).any())

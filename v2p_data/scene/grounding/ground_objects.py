@@ -46,8 +46,8 @@ from v2p_data.video.meaning import Meaning
 
 _LEAST_HAND = 0.002
 """Least share of the picture that a hand covers in the frame that shows most of it."""
-_BELOW_PX = 5
-"""Depth of the strip below an object in which the network must see table."""
+_BELOW_PX, _GAP_PX, EXACT_GAP_PX = 5, 1, 3
+"""Depth of the strip below an object in which the network must see table, and where it begins; below a model's exact outline later."""
 _SEEN_BELOW = 0.5
 """Mean probability of table in that strip, from which the object stands on the table."""
 _SETS_OUT = 0.05
@@ -373,9 +373,19 @@ def _less_what_passes(
 
 
 def rests_on_table(
-    table: Table, mask: Bool[np.ndarray, "h w"], segmentation: Segmentation | None = None
+    table: Table,
+    mask: Bool[np.ndarray, "h w"],
+    segmentation: Segmentation | None = None,
+    gap_px: int = _GAP_PX,
 ) -> bool:
-    """Return whether the mask's foot lies on the table's part of the picture, or the network sees table beneath it."""
+    """Return whether the mask's foot is on the table's part of the picture, or the network sees table beneath it.
+
+    Args:
+        table: the table's part of the picture.
+        mask: the object at the beginning.
+        segmentation: what the network sees.
+        gap_px: between the mask and the strip beneath it; what the network sees as object goes on a little beside an exact outline.
+    """
     x, y, w, h = bounding_box(mask)
     foot = np.zeros_like(mask)
     foot[y + int(0.75 * h) : y + h, x : x + w] = True
@@ -384,6 +394,6 @@ def rests_on_table(
         return True
     if segmentation is None:
         return False
-    below = grow(foot, _BELOW_PX) & ~grow(mask, 1)
+    below = grow(foot, gap_px + _BELOW_PX - _GAP_PX) & ~grow(mask, gap_px)
     below[: y + int(0.75 * h)] = False
     return bool(below.any()) and float(segmentation.early[TABLE][below].mean()) > _SEEN_BELOW

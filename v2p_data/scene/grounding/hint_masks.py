@@ -20,6 +20,7 @@ from v2p_data.scene.frames.mask_ops import (
 )
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.model_outlines import outline_at_spots, outline_in_box
 from v2p_data.scene.grounding.outlines import filled, without_table
 from v2p_data.scene.grounding.spot_masks import mask_at_spots
 from v2p_data.video.clip import Clip
@@ -94,8 +95,10 @@ def hint_masks_of(
                 hint["stroke"] if "stroke" in hint else [hint["click"]] if "click" in hint else []
             )
             shares = None if segmentation is None else segmentation.at(i)
+            scaled = _scaled(spots, working)
+            outlines = outline_at_spots(working, i, scaled)
             try:
-                mask = mask_at_spots(working.rgb[i], _scaled(spots, working), shares)
+                mask = mask_at_spots(working.rgb[i], scaled, shares, outlines)
             except V2PError as error:
                 detail = f"{clip.path.name}, hint '{phrase}': {error}"
                 raise ItemRejectedError("bad_hint", detail) from error
@@ -129,6 +132,9 @@ def _boxed(
     """Return what a box in the clip's pixels means at working frame `i`."""
     x0, y0, x1, y1 = (v * working.px_scale for v in box_xyxy)
     box = (x0, y0, x1, y1)
+    outlined = outline_in_box(working, i, box)
+    if outlined is not None:
+        return HintMask(mask=outlined, frame=i, sure=sure, box=_inside_of(box, working.shape))
     mask = from_box(working.rgb[i], box, _thing_at(segmentation, i))
     inside = _inside_of(box, working.shape)
     drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))

@@ -45,6 +45,8 @@ class Moved:
     colour_hist: Float[np.ndarray, "l a b"] = field(repr=False)
     """Colour histogram of the object."""
     cues: dict[str, float] = field(default_factory=dict)
+    outlined: tuple[int, ...] = ()
+    """0 where a model that knows edges of objects drew the first outline, 1 where it drew the last: these are final."""
 
 
 def find_moved_by_change(

@@ -26,6 +26,7 @@ from v2p_data.scene.frames.colour import (
 from v2p_data.scene.frames.mask_ops import (
     edge_contrast,
     grow,
+    iou,
     is_cut,
     largest,
     refine,
@@ -34,6 +35,7 @@ from v2p_data.scene.frames.mask_ops import (
 from v2p_data.scene.frames.segmentation import LEAST_SHARE, Segmentation, hand_at
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.handled import handling_in
+from v2p_data.scene.grounding.model_outlines import outlines_around
 from v2p_data.scene.grounding.moved_by_change import Moved
 
 _LIKELY, _POSSIBLE = 0.5, 0.25
@@ -47,6 +49,16 @@ _MOSTLY_OTHER = 0.5
 """Share of an outline: with less of the named colour it is taken along with something else."""
 
 
+_ASKED = 3
+"""Of the best blobs, so many are outlined anew by a model, where one was asked for."""
+_ONE_OUTLINE = 0.9
+"""IoU from which two outlines are one."""
+_WHOLE = 8.0
+"""Exponent of the overlap that the model expects: 0.99 for most whole objects, 0.9 for their parts."""
+_NOT_OUTLINED = 0.4
+"""What a blob counts beside the model's outlines."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Blob:
     mask: Bool[np.ndarray, "h w"]
@@ -54,10 +66,14 @@ class _Blob:
     hist: np.ndarray
     parts: dict[str, float]
     """What its rating is the product of, each 0 to 1."""
+    preference: float = 1.0
+    """What its outline adds to the rating, not to the confidence."""
+    outlined: bool = False
+    """Whether a model that knows edges of objects drew it."""
 
     @property
     def rating(self) -> float:
-        return float(np.prod(list(self.parts.values())))
+        return self.preference * float(np.prod(list(self.parts.values())))
 
     def weighed(self, what: str, part: float) -> "_Blob":
         """Return the blob with one factor more in its rating."""
@@ -195,7 +211,37 @@ def _ends(
         blob.weighed("cut by colour", _PIECE)
         for blob in _rated(working, segmentation, phrase, i, cut, pieces)
     ]
+    if working.outliner is not None:
+        blobs = _with_outlines(working, segmentation, phrase, i, blobs)
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
+
+
+def _with_outlines(
+    working: WorkingClip, segmentation: Segmentation, phrase: str, i: int, blobs: list[_Blob]
+) -> list[_Blob]:
+    """Return the blobs with the outlines that a model draws at the best of them.
+
+    A blob may hold an arm or the screen behind the object; the model draws each by itself. It is surer of whole objects than of parts.
+    """
+    moved, hand = segmentation.at(i)[MOVED], hand_at(segmentation, i)
+    best = sorted(blobs, key=lambda blob: -blob.rating)[:_ASKED]
+    found: list[_Blob] = []
+    for blob in best:
+        outlines = [
+            one
+            for one in outlines_around(working, i, blob.mask, hand)
+            if (one.mask & blob.mask).sum() > _SAME_THING * min(one.mask.sum(), blob.area)
+            and all(iou(one.mask, other.mask) < _ONE_OUTLINE for other in found)
+        ]
+        masks = [one.mask for one in outlines]
+        held = float(moved[blob.mask].sum())
+        for one, rated in zip(
+            outlines, _rated(working, segmentation, phrase, i, masks, masks), strict=True
+        ):
+            share = float(np.clip(moved[one.mask & blob.mask].sum() / held, 0.0, 1.0))
+            whole = float(np.clip(one.iou, 0.0, 1.0)) ** _WHOLE
+            found.append(replace(rated, preference=whole * share**0.5, outlined=True))
+    return [*found, *(replace(blob, preference=_NOT_OUTLINED) for blob in blobs)]
 
 
 def _of_named_colour(
@@ -268,10 +314,10 @@ def _last_seen(
     working: WorkingClip, segmentation: Segmentation, phrase: str, area: int
 ) -> list[_Blob]:
     """Return the blobs of the last frame that shows half of something this large, before all is hidden."""
+    quick = replace(working, outliner=None)
     for i in segmentation.idx[: len(segmentation.idx) // 3 : -1].tolist():
-        blobs = _ends(working, segmentation, phrase, i, None)
-        if any(blob.area > area / 2 for blob in blobs):
-            return blobs
+        if any(blob.area > area / 2 for blob in _ends(quick, segmentation, phrase, i, None)):
+            return _ends(working, segmentation, phrase, i, None)
     return []
 
 
@@ -352,7 +398,10 @@ def _moved(pairs: list[_Pair], chosen: _Pair) -> Moved:
         "no rival": float(1 / (1 + (rival / max(chosen.rating, 1e-6)) ** 2)),
     }
     score = float(np.prod(list(cues.values())))
-    return Moved(first=a.mask, last=b.mask, score=score, colour_hist=a.hist, cues=cues)
+    outlined = tuple(end for end, blob in enumerate((a, b)) if blob.outlined)
+    return Moved(
+        first=a.mask, last=b.mask, score=score, colour_hist=a.hist, cues=cues, outlined=outlined
+    )
 
 
 def _is_another(pair: _Pair, chosen: _Pair) -> bool:

@@ -33,6 +33,8 @@ _AS_A_PIECE = 0.35
 """Least overlap that counts where the heuristics' outline lies within the network's: it is the most colourful piece."""
 _NO_OPINION = 0.75
 """Factor on the network's score where the heuristics have no opinion."""
+_NO_OPINION_OF_WHOLE = 0.85
+"""The same where a model that knows edges of objects drew both outlines: nothing else was taken along."""
 _LITTLE = 0.2
 """Share of an object's first outline; when no more than this is seen, the object is hidden."""
 _TOUCH_PX = 6
@@ -83,7 +85,9 @@ def find_moved_object(
         raise ItemRejectedError(
             "object_not_found", f"nothing that moved looks like '{meaning.manipulated}'", None
         )
-    given = [end for end, mask in enumerate((first, last)) if mask is not None]
+    given = [
+        end for end, mask in enumerate((first, last)) if mask is not None or end in moved.outlined
+    ]
     if segmentation is not None:
         moved = _without_shadows(working, segmentation, moved, given)
     return disjoint_ends(working, moved, given), tool_moved
@@ -114,11 +118,11 @@ def _agreed(
     The two ways err differently: the network takes people who move for things; the other takes shadows and hands along.
     What the other found is preferred where it is clearly better by the network's own cues.
     """
+    whole = moved.outlined == (0, 1)
     if by_change is None or by_change.score < _CHANGE_TELLS:
+        opinion = _NO_OPINION_OF_WHOLE if whole else _NO_OPINION
         return replace(
-            moved,
-            cues={**moved.cues, "second opinion": _NO_OPINION},
-            score=_NO_OPINION * moved.score,
+            moved, cues={**moved.cues, "second opinion": opinion}, score=opinion * moved.score
         )
     if by_change.first.any() and by_change.last.any():
         other = rated(working, segmentation, meaning.manipulated, meaning.kind, by_change)
@@ -138,6 +142,8 @@ def _agreed(
     opinion = float(np.clip(0.55 + 0.75 * max(0.0, overlaps[0]), 0, 1)) * float(
         np.clip(0.75 + 0.5 * overlaps[1], 0, 1)
     )
+    if whole:
+        opinion = max(opinion, _NO_OPINION)
     cues = {**moved.cues, "second opinion": opinion}
     return replace(moved, score=moved.score * opinion, cues=cues)
 

@@ -7,7 +7,7 @@ size, colour and place, say which candidate is meant. What each cue counts was l
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -31,6 +31,7 @@ from v2p_data.scene.frames.mask_ops import (
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.table import Table
 from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.model_outlines import outlines_around
 from v2p_data.scene.grounding.static_by_change import Found, pieces_of
 from v2p_data.scene.scale.camera_height import SeenCamera, px_per_m
 from v2p_data.scene.scale.nouns import Noun, noun_for
@@ -70,6 +71,16 @@ _SURELY = 0.9
 """Probability from which a pixel belongs to the outline, whatever the edges say."""
 _NO_THING = 0.08
 """Probability below which a pixel does not belong to the outline of an object that the network knows."""
+_ASKED = 5
+"""Of the best candidates, so many are outlined anew by a model, where one was asked for."""
+_ASKED_APART = 0.7
+"""IoU below which two candidates are asked for both."""
+_WHOLE = 30.0
+"""Weight on the logarithm of the overlap that such a model expects: 0.99 for most whole objects, 0.9 for their parts."""
+_NOT_OUTLINED = -2.0
+"""What other candidates' outlines add to their rating beside those."""
+_MOST_TAKEN = 0.3
+"""Share of an outline that other objects may hold."""
 _LESS_HIDDEN = 0.1
 """Share of an object by which less must be hidden in the late still for its outline to be taken there."""
 
@@ -80,6 +91,15 @@ class StaticCandidate:
 
     mask: Bool[np.ndarray, "h w"]
     cues: dict[str, float]
+    preference: float = 0.0
+    """What its outline adds to its rating."""
+    outlined: bool = False
+    """Whether a model that knows edges of objects drew it."""
+
+    @property
+    def rating(self) -> float:
+        """Log odds, up to a constant, of being the object that is meant."""
+        return _sum(_learned()["choice"], self.cues) + self.preference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +148,10 @@ def find_static_object(search: StaticSearch) -> Found | None:
     found = candidates(search)
     if not found:
         return None
+    if search.working.outliner is not None:
+        found = _with_outlines(search, found)
     learned = _learned()
-    rating = np.array([_sum(learned["choice"], one.cues) for one in found])
+    rating = np.array([one.rating for one in found])
     likely = softmax(rating)
     overlaps = overlaps_of(found)
     k = int((overlaps @ softmax(_SOFTER * rating)).argmax())
@@ -141,8 +163,10 @@ def find_static_object(search: StaticSearch) -> Found | None:
     else:
         odds = _sum(learned["aside"], said)
     if noun_for(search.phrase).handled:
-        mask = max((c.mask for c in found if _is_with_handle(c.mask, mask)), key=np.sum)
-    mask = _outlined(search, mask)
+        alike = [c.mask for c in found if c.outlined == best.outlined]
+        mask = max((m for m in alike if _is_with_handle(m, mask)), key=np.sum)
+    if not best.outlined:
+        mask = _outlined(search, mask)
     return Found(mask=mask, score=float(1 / (1 + np.exp(-odds))))
 
 
@@ -202,29 +226,86 @@ def larger_than_usual(noun: Noun, camera: SeenCamera, mask: Bool[np.ndarray, "h 
 
 def candidates(search: StaticSearch) -> list[StaticCandidate]:
     """Return all that may be meant by the phrase, with its cues."""
-    working, table, segmentation, late = (
-        search.working,
-        search.table,
-        search.segmentation,
-        search.late,
-    )
-    still, here = (
-        (working.late, segmentation.late) if late else (working.early, segmentation.early)
-    )
-    words = colour_words(search.phrase)
-    colour = colour_match(balance(still), words) if words else None
-    off_table = table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5)
-    free = ~search.taken & ~grow(search.ends[1], 2) if late else ~search.taken
-    lab, way = lab_of(still), _Approach.of(search)
-    usual = float(colour[table.seen].mean()) if colour is not None and table.seen.any() else 0.0
+    cues = _Cues.of(search)
     found = []
-    for mask, is_part in _masks(search.static, off_table, free, colour):
-        own = _own_cues(search, mask, lab, colour, usual)
+    for mask, is_part in _masks(search.static, cues.off_table, cues.free, cues.colour):
+        own = cues.own(mask)
         if mask.mean() > _MOST_SHARE and own["larger than usual"] > _TOO_LARGE:
             continue
-        cues = {"part": float(is_part), **own, **way.cues(mask, search.kind)}
-        found.append(StaticCandidate(mask=mask, cues=cues))
+        all_cues = {"part": float(is_part), **own, **cues.way.cues(mask, search.kind)}
+        found.append(StaticCandidate(mask=mask, cues=all_cues))
     return found
+
+
+def _with_outlines(search: StaticSearch, found: list[StaticCandidate]) -> list[StaticCandidate]:
+    """Return the candidates with the outlines that a model draws at the best of them."""
+    working, segmentation = search.working, search.segmentation
+    cues = _Cues.of(search)
+    best: list[StaticCandidate] = []
+    for one in sorted(found, key=lambda one: -one.rating):
+        if len(best) < _ASKED and all(iou(one.mask, other.mask) < _ASKED_APART for other in best):
+            best.append(one)
+    passes = [shares[HAND] + shares[MOVED] for shares in (segmentation.at(0), segmentation.at(-1))]
+    out: list[StaticCandidate] = []
+    for one in best:
+        hidden = [float(plane[one.mask].mean()) for plane in passes]
+        late = search.late or hidden[1] + _LESS_HIDDEN < hidden[0]
+        for outline in outlines_around(working, -1 if late else 0, one.mask):
+            mask = outline.mask
+            if (mask & cues.free).sum() < (1 - _MOST_TAKEN) * mask.sum() or any(
+                iou(mask, other.mask) >= _SAME for other in out
+            ):
+                continue
+            own = cues.own(mask)
+            if mask.mean() > _MOST_SHARE and own["larger than usual"] > _TOO_LARGE:
+                continue
+            all_cues = {"part": 0.0, **own, **cues.way.cues(mask, search.kind)}
+            whole = _WHOLE * float(np.log(np.clip(outline.iou, 0.1, 1.0)))
+            out.append(StaticCandidate(mask=mask, cues=all_cues, preference=whole, outlined=True))
+    return [*out, *(replace(one, preference=_NOT_OUTLINED) for one in found)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cues:
+    """What the candidates' cues are computed from."""
+
+    search: StaticSearch
+    lab: Float32[np.ndarray, "h w 3"]
+    """Colours of the still in which the object is searched."""
+    colour: Float32[np.ndarray, "h w"] | None
+    """How well each pixel has the colour that the phrase names."""
+    usual: float
+    """Its mean over the table."""
+    off_table: Bool[np.ndarray, "h w"]
+    """What stands out from the table, and is neither hand nor moving."""
+    free: Bool[np.ndarray, "h w"]
+    """What other objects do not take."""
+    way: "_Approach"
+
+    @classmethod
+    def of(cls, search: StaticSearch) -> "_Cues":
+        working, table, segmentation = search.working, search.table, search.segmentation
+        late = search.late
+        still, here = (
+            (working.late, segmentation.late) if late else (working.early, segmentation.early)
+        )
+        words = colour_words(search.phrase)
+        colour = colour_match(balance(still), words) if words else None
+        return cls(
+            search=search,
+            lab=lab_of(still),
+            colour=colour,
+            usual=float(colour[table.seen].mean())
+            if colour is not None and table.seen.any()
+            else 0.0,
+            off_table=table.stands_out(still) & (here[HAND] + (0 if late else here[MOVED]) < 0.5),
+            free=~search.taken & ~grow(search.ends[1], 2) if late else ~search.taken,
+            way=_Approach.of(search),
+        )
+
+    def own(self, mask: Bool[np.ndarray, "h w"]) -> dict[str, float]:
+        """Return what a candidate looks like."""
+        return _own_cues(self.search, mask, self.lab, self.colour, self.usual)
 
 
 def _own_cues(
