@@ -1,7 +1,7 @@
 """A model that outlines objects, asked about the frames of one clip; what it made of a frame is kept."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -9,6 +9,7 @@ from jaxtyping import Int, UInt8
 from v2p_data.scene.backends.outlines import EncodedPicture, Outlines, Spots
 
 
+@runtime_checkable
 class OutlineModel(Protocol):
     """What `backends/mobile_sam.py` offers."""
 

@@ -35,6 +35,8 @@ _NO_OPINION = 0.75
 """Factor on the network's score where the heuristics have no opinion."""
 _NO_OPINION_OF_WHOLE = 0.85
 """The same where a model that knows edges of objects drew both outlines: nothing else was taken along."""
+_SURE_OF_WHOLE = 0.35
+"""Exponent of the rating where a model drew both outlines, 0.5 otherwise: then what else lowers the rating says less about them."""
 _LITTLE = 0.2
 """Share of an object's first outline; when no more than this is seen, the object is hidden."""
 _TOUCH_PX = 6
@@ -156,7 +158,7 @@ def sureness_of(
     if segmentation is None or "no rival" not in moved.cues:
         return rise(moved.score, 3.6, 0.8), f"its cues add up to {moved.score:.1f}"
     weakest = min(moved.cues, key=lambda cue: moved.cues[cue])
-    sure = moved.score**0.5
+    sure = moved.score ** (_SURE_OF_WHOLE if moved.outlined == (0, 1) else 0.5)
     return sure, f"weakest is '{weakest}' with {moved.cues[weakest]:.2f}"
 
 
