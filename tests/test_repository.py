@@ -58,6 +58,7 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
         edit,
         hands,
         models,
+        outlines,
         review,
         reward,
         run,
@@ -72,6 +73,7 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
         "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
         "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify,
         "status": show.Status, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.Review, "scene models": models.Models, "scene hands": hands.Hands,
+        "scene outlines": outlines.Outlines,
         "reward": run.FromVideos, "task show": task.ShowTask, "reward search": reward.Search,
         "reward show": reward.ShowReward, "explain": share.Explain, "merge": edit.Merge, "drop": edit.Drop,
     }  # fmt: skip

@@ -44,6 +44,10 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "scene camera": ("camera", "what all scenes of a run say of the one camera that filmed them"),
     "scene hands": ("hands", "whether hands are found by a model here, and its installation"),
     "scene models": ("models", "which learned models a preset takes here, and their download"),
+    "scene outlines": (
+        "outlines",
+        "whether objects are outlined by a model here, and its download",
+    ),
     "scene review": ("review", "a page to judge a run's scenes on and to mark what was not found"),
     "task show": ("task", "a task's code, and the audit's answers"),
     "reward search": ("reward", "search for one task's reward"),

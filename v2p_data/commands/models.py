@@ -1,7 +1,7 @@
 """`v2p scene models`: which learned models the settings take, and their download."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -10,7 +10,7 @@ import tyro
 from v2p_data.cli import parse
 from v2p_data.episodes.hub import fetch_model
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.hands_setup import installed_worker, set_up_hands
+from v2p_data.scene.backends import hands_setup, mobile_sam_setup
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import (
     UNWANTED_FILES,
@@ -32,7 +32,7 @@ class Models:
 
 
 def models_command(argv: list[str]) -> int:
-    """List the checkpoints with their sizes; with --fetch download them, and set up the model that finds hands."""
+    """List the checkpoints with their sizes; with --fetch download them, and set up the models of hands and outlines."""
     args = parse(Models, argv, "scene models")
     cfg = with_preset(args.scene)
     models = checkpoints_of(cfg)
@@ -40,20 +40,41 @@ def models_command(argv: list[str]) -> int:
     memory = this_machine().gpu_memory_gb
     where = f"a GPU with {memory:.0f} GB" if memory else "a machine without CUDA"
     print(f"for {where}: {told(models) or 'no learned model'}")  # noqa: T201
-    wants_hands = args.scene.hands.backend in ("auto", "mediapipe") and not installed_worker()
+    to_set_up = not_set_up(args.scene)
     if args.fetch:
         if absent:
             fetch_learned(absent)
-        if wants_hands:
-            set_up_hands(lambda words: print(words, file=sys.stderr, flush=True))  # noqa: T201
-    elif wants_hands and not absent:
-        print("hands: not set up; next: v2p scene models --fetch")  # noqa: T201
-        return 0
-    elif absent:
-        print(f"not here yet: {told(absent)}\nnext: v2p scene models --fetch")  # noqa: T201
+        for set_up in to_set_up.values():
+            set_up(lambda words: print(words, file=sys.stderr, flush=True))  # noqa: T201
+    elif absent or to_set_up:
+        if absent:
+            print(f"not here yet: {told(absent)}")  # noqa: T201
+        if to_set_up:
+            print(f"not set up: {', '.join(to_set_up)}")  # noqa: T201
+        print("next: v2p scene models --fetch")  # noqa: T201
         return 0
     print("all are here; next: v2p scene VIDEOS --out DIR --scene.preset=learned")  # noqa: T201
     return 0
+
+
+type Tell = Callable[[str], None]
+
+
+def not_set_up(cfg: SceneConfig) -> dict[str, Callable[[Tell], object]]:
+    """Return how the models beside the preset are set up, by name and download, of those that are wanted and missing.
+
+    Args:
+        cfg: settings before the preset is written out.
+    """
+    named: dict[str, Callable[[Tell], object]] = {}
+    if cfg.hands.backend in ("auto", "mediapipe") and not hands_setup.installed_worker():
+        megabytes = hands_setup.DOWNLOAD_MB
+        named[f"MediaPipe for hands ({megabytes} MB)"] = hands_setup.set_up_hands
+    wants_outlines = cfg.outline.backend in ("auto", "mobile_sam") and cfg.outline.weights is None
+    if wants_outlines and mobile_sam_setup.installed_weights() is None:
+        megabytes = mobile_sam_setup.DOWNLOAD_MB
+        named[f"MobileSAM for outlines ({megabytes} MB)"] = mobile_sam_setup.set_up_mobile_sam
+    return named
 
 
 def fetch_learned(models: Sequence[str]) -> None:

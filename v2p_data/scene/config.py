@@ -8,6 +8,7 @@ from v2p_data.scene.backends.config import (
     GroundConfig,
     HandsConfig,
     MeshConfig,
+    OutlineConfig,
     PoseConfig,
     SegmentConfig,
 )
@@ -46,6 +47,7 @@ class SceneConfig:
     ground: GroundConfig = field(default_factory=GroundConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
     hands: HandsConfig = field(default_factory=HandsConfig)
+    outline: OutlineConfig = field(default_factory=OutlineConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)

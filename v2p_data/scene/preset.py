@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from v2p_data.scene.backends.config import DEFAULT_MODELS
+from v2p_data.scene.backends.config import DEFAULT_MODELS, OutlineConfig
 from v2p_data.scene.backends.hands_setup import installed_worker
+from v2p_data.scene.backends.mobile_sam_setup import installed_weights, transformers_is_there
 from v2p_data.scene.config import SceneConfig
 
 
@@ -84,6 +85,9 @@ def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machi
     if cfg.hands.backend == "auto":
         found = "mediapipe" if installed_worker() else "none"
         cfg = replace(cfg, hands=replace(cfg.hands, backend=found))
+    if cfg.outline.backend == "auto":
+        found = "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none"
+        cfg = replace(cfg, outline=replace(cfg.outline, backend=found))
     if cfg.preset != "learned":
         return cfg
     machine = machine_of()
@@ -100,6 +104,12 @@ def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machi
             depth, backend="depth_anything", model=depth.model or size.depth, batch_size=size.depth_batch
         )  # fmt: skip
     return replace(cfg, preset="builtin", ground=ground, segment=segment, depth=depth)
+
+
+def mobile_sam_is_here(cfg: OutlineConfig) -> bool:
+    """Return whether MobileSAM can be used: its weights were named or set up, and transformers is installed."""
+    weights = cfg.weights or installed_weights()
+    return weights is not None and transformers_is_there()
 
 
 def checkpoints_of(cfg: SceneConfig) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from v2p_data.scene.frames.prepare import PreparedClip, prepare
 from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
 from v2p_data.scene.grounding.ground_objects import ground_objects, without_asides
 from v2p_data.scene.grounding.hands_by_model import track_hands
+from v2p_data.scene.grounding.outliner_by_model import outliner_of
 from v2p_data.scene.meshes import with_meshes
 from v2p_data.scene.preset import with_preset
 from v2p_data.scene.remarks import remarks_on
@@ -54,7 +55,8 @@ def prepared_for(clip: Clip, cfg: SceneConfig) -> PreparedClip:
         max_camera_shift_px=cfg.max_camera_shift_px,
     )
     hands = track_hands(prepared.clip, prepared.working, cfg.hands)
-    return replace(prepared, working=replace(prepared.working, hands=hands))
+    outliner = outliner_of(prepared.clip, prepared.working, cfg.outline)
+    return replace(prepared, working=replace(prepared.working, hands=hands, outliner=outliner))
 
 
 def reconstruct_prepared(

@@ -135,7 +135,7 @@ def test_an_installation_that_fails_is_one_sentence_and_leaves_nothing_in_use(
     monkeypatch.setenv("UV_OFFLINE", "1")
     monkeypatch.setenv("PIP_NO_INDEX", "1")
 
-    with pytest.raises(V2PError, match="without the worker everything works as before"):
+    with pytest.raises(V2PError, match="without the hands worker everything works as before"):
         hands_setup.set_up_hands(lambda words: None)
 
     assert hands_setup.installed_worker() == ""

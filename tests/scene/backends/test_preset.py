@@ -14,7 +14,13 @@ from hub_server import TOKEN, Repo, running_hub
 from v2p_data.cli import run
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.backends.checkpoint import load_checkpoint
-from v2p_data.scene.backends.config import DepthConfig, GroundConfig, HandsConfig, SegmentConfig
+from v2p_data.scene.backends.config import (
+    DepthConfig,
+    GroundConfig,
+    HandsConfig,
+    OutlineConfig,
+    SegmentConfig,
+)
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import SIZES, WEIGHTS_GB, Machine, checkpoints_of, missing, with_preset
 from v2p_data.scene.reconstruct import reconstruct
@@ -66,8 +72,10 @@ def test_without_the_preset_nothing_changes_and_the_machine_is_not_asked():
     def machine() -> Machine:
         raise AssertionError
 
-    without_hands = SceneConfig(hands=HandsConfig(backend="none"))
-    assert with_preset(SceneConfig(), machine) == without_hands
+    without_models = SceneConfig(
+        hands=HandsConfig(backend="none"), outline=OutlineConfig(backend="none")
+    )
+    assert with_preset(SceneConfig(), machine) == without_models
     assert checkpoints_of(SceneConfig()) == ()
     assert with_preset(on(0.0), machine) == on(0.0)
 
@@ -89,7 +97,7 @@ def test_what_is_missing_is_named_and_downloaded_once(
     cfg = tiny(checkpoint)
     options = [
         "--scene.ground.model", cfg.ground.model, "--scene.depth.model", cfg.depth.model,
-        "--scene.segment.model", "user/tiny", "--scene.hands.backend", "none",
+        "--scene.segment.model", "user/tiny", "--scene.hands.backend", "none", "--scene.outline.backend", "none",
     ]  # fmt: skip
     with running_hub() as hub:
         files = {p.name: p.read_bytes() for p in folder.iterdir()}

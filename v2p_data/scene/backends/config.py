@@ -2,6 +2,7 @@
 
 import shlex
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 type DType = Literal["float32", "float16", "bfloat16"]
@@ -10,6 +11,7 @@ type GroundBackend = Literal[
 ]
 type SegmentBackend = Literal["flow", "sam2", "worker"]
 type HandsBackend = Literal["auto", "none", "mediapipe", "worker"]
+type OutlineBackend = Literal["auto", "none", "mobile_sam"]
 type DepthBackend = Literal["none", "depth_anything", "depth_pro", "moge", "worker"]
 
 DEFAULT_MODELS: dict[str, str] = {
@@ -124,6 +126,16 @@ class HandsConfig:
 
     def __post_init__(self) -> None:
         _check_worker(self.worker, self.worker_timeout_s, needed=self.backend == "worker")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutlineConfig:
+    """Who outlines an object from points on it or a box around it."""
+
+    backend: OutlineBackend = "auto"
+    """`mobile_sam` needs 'v2p scene outlines --setup' once, or `weights`; `auto` takes it where it can be used."""
+    weights: Path | None = None
+    """File with MobileSAM's weights (`mobile_sam.pt` as published, or safetensors); without one, what setup fetched."""
 
 
 @dataclass(frozen=True, kw_only=True)

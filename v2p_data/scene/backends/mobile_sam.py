@@ -8,12 +8,14 @@ Source: Zhang et al. 2023, arXiv:2306.14289; Kirillov et al. 2023 (Segment Anyth
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import nn
 
@@ -23,15 +25,19 @@ from v2p_data.scene.backends.tiny_vit import SIDE_PX, TinyViT
 
 _MEAN, _SD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 """Of the pictures that the checkpoint was trained on, red, green, blue."""
-_ON, _OFF, _NO_POINT = 1, 0, -10
-"""The decoder's labels of points; the last fills up shorter prompts."""
+_UNREADABLE = (
+    OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, RuntimeError, UnpicklingError, SafetensorError,
+)  # fmt: skip
+"""What files that are cut off or hold something else end with."""
+_ON, _OFF = 1, 0
+"""The decoder's labels of points."""
 
 
 class MobileSam:
     """The model on the CPU.
 
     Args:
-        weights: file that `mobile_sam_setup.py` wrote.
+        weights: file that `mobile_sam_setup.py` wrote, or a published `mobile_sam.pt`.
 
     Raises:
         V2PError: transformers is missing, or the weights are not MobileSAM's.
@@ -49,13 +55,13 @@ class MobileSam:
         decoder.vision_encoder = nn.Identity()
         encoder = TinyViT()
         try:
-            tensors = load_file(weights)
-            own, theirs = _split(tensors)
+            own, theirs = _split(_tensors_of(weights))
             encoder.load_state_dict(own)
             decoder.load_state_dict(theirs)
-        except (OSError, ValueError, KeyError, RuntimeError) as error:
+        except _UNREADABLE as error:
             raise V2PError(
-                f"{weights} does not hold MobileSAM's weights ({type(error).__name__}); delete its folder and run 'v2p scene outlines --setup'"
+                f"{weights} does not hold MobileSAM's weights ({type(error).__name__}); if setup wrote it, delete it and run "
+                "'v2p scene outlines --setup', else name another file with --scene.outline.weights"
             ) from error
         self._encoder = encoder.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._decoder = decoder.eval()
@@ -77,7 +83,7 @@ class MobileSam:
     def outlines(
         self, picture: EncodedPicture, prompts: Sequence[Spots], size_px: tuple[int, int]
     ) -> Outlines:
-        """Return three masks for each prompt; the prompts have all a box or none.
+        """Return three masks for each prompt.
 
         Args:
             picture: what `encode` returned.
@@ -86,35 +92,20 @@ class MobileSam:
         """
         h, w = size_px
         scale = SIDE_PX / max(h, w)
-        most = max(len(p.on) + len(p.off) for p in prompts)
-        inputs: dict[str, torch.Tensor] = {}
-        if most:
-            points = np.zeros((1, len(prompts), most, 2), np.float32)
-            labels = np.full((1, len(prompts), most), _NO_POINT, np.int64)
-            for k, p in enumerate(prompts):
-                for j, (spot, label) in enumerate(
-                    [*((s, _ON) for s in p.on), *((s, _OFF) for s in p.off)]
-                ):
-                    # The decoder counts pixels from their middle.
-                    points[0, k, j] = np.array(spot) * scale - 0.5
-                    labels[0, k, j] = label
-            inputs |= {
-                "input_points": torch.from_numpy(points),
-                "input_labels": torch.from_numpy(labels),
-            }
-        if prompts[0].box_xyxy is not None:
-            boxes = np.array([[p.box_xyxy for p in prompts]], np.float32) * scale - 0.5
-            inputs["input_boxes"] = torch.from_numpy(boxes)
-        out = self._decoder(image_embeddings=picture.features, multimask_output=True, **inputs)
-        small = out.pred_masks[0].numpy()
-        side = small.shape[-1]
-        rows, columns = round(h * scale * side / SIDE_PX), round(w * scale * side / SIDE_PX)
-        logits = np.empty((*small.shape[:2], h, w), np.float32)
-        for full, plane in zip(
-            logits.reshape(-1, h, w), small.reshape(-1, side, side), strict=True
-        ):
-            cv2.resize(plane[:rows, :columns], (w, h), dst=full, interpolation=cv2.INTER_LINEAR)
-        return Outlines(logits=logits, ious=out.iou_scores[0].numpy())
+        logits = np.empty((len(prompts), 3, h, w), np.float32)
+        ious = np.empty((len(prompts), 3), np.float32)
+        # Points that fill up shorter prompts would change the answer: the decoder does not leave them out of its attention.
+        for alike in _alike(prompts):
+            inputs = _inputs([prompts[k] for k in alike], scale)
+            out = self._decoder(image_embeddings=picture.features, multimask_output=True, **inputs)
+            ious[alike] = out.iou_scores[0].numpy()
+            planes = out.pred_masks[0].numpy()
+            side = planes.shape[-1]
+            rows, columns = round(h * scale * side / SIDE_PX), round(w * scale * side / SIDE_PX)
+            for k, three in zip(alike, planes[..., :rows, :columns], strict=True):
+                for full, plane in zip(logits[k], three, strict=True):
+                    cv2.resize(plane, (w, h), dst=full, interpolation=cv2.INTER_LINEAR)
+        return Outlines(logits=logits, ious=ious)
 
 
 @lru_cache(maxsize=1)
@@ -125,6 +116,36 @@ def mobile_sam(weights: Path) -> MobileSam:
         V2PError: as `MobileSam`.
     """
     return MobileSam(weights)
+
+
+def _alike(prompts: Sequence[Spots]) -> list[list[int]]:
+    """Return the numbers of prompts that have as many points as each other, and all a box or none."""
+    groups: dict[tuple[int, bool], list[int]] = {}
+    for k, prompt in enumerate(prompts):
+        key = len(prompt.on) + len(prompt.off), prompt.box_xyxy is not None
+        groups.setdefault(key, []).append(k)
+    return list(groups.values())
+
+
+def _inputs(prompts: Sequence[Spots], scale: float) -> dict[str, torch.Tensor]:
+    """Return what the decoder is given for prompts that are alike; `scale` is of its pixels per pixel."""
+    inputs: dict[str, torch.Tensor] = {}
+    # The decoder counts pixels from their middle.
+    if prompts[0].on or prompts[0].off:
+        points = np.array([[[*p.on, *p.off] for p in prompts]], np.float32)
+        labels = [[[_ON] * len(p.on) + [_OFF] * len(p.off) for p in prompts]]
+        inputs["input_points"] = torch.from_numpy(points * scale - 0.5)
+        inputs["input_labels"] = torch.tensor(labels)
+    if prompts[0].box_xyxy is not None:
+        boxes = np.array([[p.box_xyxy for p in prompts]], np.float32)
+        inputs["input_boxes"] = torch.from_numpy(boxes * scale - 0.5)
+    return inputs
+
+
+def _tensors_of(weights: Path) -> dict[str, torch.Tensor]:
+    if weights.suffix == ".safetensors":
+        return load_file(weights)
+    return torch.load(weights, map_location="cpu", weights_only=True)
 
 
 def _split(

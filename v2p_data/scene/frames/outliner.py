@@ -45,7 +45,7 @@ class Outliner:
         self._encoded: dict[int, EncodedPicture] = {}
 
     def at(self, i: int, prompts: Sequence[Spots]) -> Outlines:
-        """Return three masks for each prompt at working frame `i`, all in working pixels; the prompts have all a box or none."""
+        """Return three masks for each prompt at working frame `i`, all in working pixels."""
         i %= len(self._idx)
         if i not in self._encoded:
             self._encoded[i] = self._model.encode(self._frames[self._idx[i]])

