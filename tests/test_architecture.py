@@ -72,7 +72,8 @@ SCENE_BELOW: dict[str, set[str]] = {
     "backends": set(),
     "config": {"backends"},
     "scale": {"schema"},
-    "frames": {"scale"},
+    # A working clip holds the model that is asked about its frames.
+    "frames": {"scale", "backends"},
     "data_types": {"frames", "scale", "schema"},
     "grounding": {"data_types", "frames", "scale", "backends", "schema"},
     "shapes": {"data_types", "frames", "scale", "backends"},
