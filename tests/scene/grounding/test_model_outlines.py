@@ -214,8 +214,8 @@ def test_without_a_model_nothing_is_outlined(segmentation_of):
 
 def test_beneath_an_exact_outline_the_table_is_looked_for_a_little_lower(segmentation_of):
     """The network's object goes on for some pixels below the exact outline."""
-    working, segmentation = segmentation_of([[(square(40, 40, 20, 23), RED, OTHER)]] * 12)
-    seen = large(square(40, 40, 20, 23), working.shape)
+    working, segmentation = segmentation_of([[(square(20, 40, 80, 23), RED, OTHER)]] * 12)
+    seen = large(square(20, 40, 80, 23), working.shape)
     exact = seen.copy()
     exact[np.flatnonzero(seen.any(1))[-4:]] = False
     table = replace(find_table(working.always), hull=np.zeros(working.shape, bool))
