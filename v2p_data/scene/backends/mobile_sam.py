@@ -51,7 +51,9 @@ class MobileSam:
                 "MobileSAM needs transformers, which is not installed; install it with 'pip install lerobot_policy_v2p[learned]' "
                 "or give --scene.outline.backend=none"
             ) from None
-        decoder: Any = SamModel(SamConfig(vision_config={"num_hidden_layers": 0}))
+        config: Any = SamConfig()
+        config.vision_config.num_hidden_layers = 0  # the encoder is ours
+        decoder: Any = SamModel(config)
         decoder.vision_encoder = nn.Identity()
         encoder = TinyViT()
         try:
