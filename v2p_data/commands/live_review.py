@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.commands.display import outcomes_json
-from v2p_data.commands.prepared_clips import PreparedClips, outlines_of
+from v2p_data.commands.prepared_clips import PreparedClips, outlines_of, prepared_ahead
 from v2p_data.commands.run import RUN_FILE
 from v2p_data.commands.scene_settings import settings_of, usual_settings
 from v2p_data.errors import ItemRejectedError, V2PError
@@ -25,7 +25,6 @@ from v2p_data.report.reading import Result, as_dict, as_dicts, read_run
 from v2p_data.report.review_page import SCHEMA, ReviewClip, clip_json
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.frames.prepare import PreparedClip
-from v2p_data.scene.reconstruct import prepared_for
 from v2p_data.stages import EngineConfig, make_scene, scene_stage
 from v2p_data.video.captions import CAPTIONS_FILE, VideoItem, find_videos
 from v2p_data.video.decode import VideoConfig
@@ -80,7 +79,7 @@ class LiveReview:
         self._lock = threading.RLock()
         self._marking = threading.Lock()
         """Marks are saved one after the other; what is shown meanwhile need not wait."""
-        self._ready = PreparedClips(prepared_for)
+        self._ready = PreparedClips(prepared_ahead)
         self._worker = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="rebuild")
         self._jobs = 0
         self._at_work: dict[str, threading.Lock] = {}

@@ -16,6 +16,7 @@ from v2p_data.report.review_page import STILL_SIDE_PX, Stills
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.frames.prepare import PreparedClip
 from v2p_data.scene.grounding.hint_masks import hint_masks_of
+from v2p_data.scene.reconstruct import prepared_for
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.clip import Clip
 from v2p_data.video.decode import VideoConfig, read_clip
@@ -104,6 +105,14 @@ class PreparedClips:
                 stills.set_exception(error)
             raise
         return self._prepare(clip, scene_cfg)
+
+
+def prepared_ahead(clip: Clip, cfg: SceneConfig) -> PreparedClip:
+    """Return the clip prepared, with its ends encoded where a model outlines objects: no mark changes that."""
+    prepared = prepared_for(clip, cfg)
+    if prepared.working.outliner is not None:
+        prepared.working.outliner.encode_ends()
+    return prepared
 
 
 def outlines_of(prepared: PreparedClip) -> dict[str, list[list[list[float]]]]:

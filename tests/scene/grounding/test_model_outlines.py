@@ -139,6 +139,16 @@ def test_each_frame_is_encoded_once(segmentation_of):
     assert len(model.encoded) == 2
 
 
+def test_the_ends_can_be_encoded_before_anybody_asks(segmentation_of):
+    frames = pushed_with_sleeve()
+    knowing, model = with_model(segmentation_of(frames)[0], frames)
+
+    knowing.outliner.encode_ends()
+    outlines_around(knowing, 0, large(square(14, 44), knowing.shape))
+
+    assert [int(picture[0, 0, 0]) for picture in model.encoded] == [0, 11]
+
+
 def test_a_static_object_is_cut_out_of_the_things_around_it(segmentation_of):
     box, clutter = square(70, 40), square(62, 20, 30, 20)
     frames = [

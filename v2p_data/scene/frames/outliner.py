@@ -46,7 +46,15 @@ class Outliner:
 
     def at(self, i: int, prompts: Sequence[Spots]) -> Outlines:
         """Return three masks for each prompt at working frame `i`, all in working pixels."""
+        return self._model.outlines(self._features(i), prompts, self._size_px)
+
+    def encode_ends(self) -> None:
+        """Encode the first and the last frame, which every reconstruction asks about, before anybody waits for them."""
+        for i in (0, -1):
+            self._features(i)
+
+    def _features(self, i: int) -> EncodedPicture:
         i %= len(self._idx)
         if i not in self._encoded:
             self._encoded[i] = self._model.encode(self._frames[self._idx[i]])
-        return self._model.outlines(self._encoded[i], prompts, self._size_px)
+        return self._encoded[i]
