@@ -25,7 +25,7 @@ _STILLS = 15
 def without_graphics(clip: Clip) -> Clip:
     """Return the clip without captions and stickers that appear, change or vanish; as it is where none does.
 
-    Strokes as thin as letters are filled in from around them, frame by frame. Larger graphics are replaced by what stands there in frames without
+    Strokes as thin as letters are filled in from around them, frame by frame. Larger graphics are replaced by the pixels of frames without
     them; where no frame is without them, they no longer change.
 
     Raises:
