@@ -16,7 +16,7 @@ from pathlib import Path
 
 from studies.cells import Key, Study, cells_of, key_of
 from studies.config import ARMS, LiftingConfig
-from studies.results import append_result, results_in
+from studies.results import append_result, results_in, results_to_show
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import load_settings
@@ -105,9 +105,7 @@ def show(args: argparse.Namespace) -> None:
     """
     from studies.table import table
 
-    rows = results_in(args.out)
-    if not rows:
-        raise V2PError(f"{args.out} holds no results yet; run the study first")
+    rows = results_to_show(args.out)
     print(table(rows))
     if args.figure:
         from studies.figure import write_figure

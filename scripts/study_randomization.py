@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from studies.randomization import SETTINGS, RandomizationStudy, RandomizationStudyConfig, key_of
-from studies.results import append_result, results_in
+from studies.results import append_result, results_in, results_to_show
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import load_settings
@@ -89,9 +89,7 @@ def show(args: argparse.Namespace) -> None:
     """
     from studies.randomization_table import table, write_figure
 
-    rows = results_in(args.out)
-    if not rows:
-        raise V2PError(f"{args.out} holds no results yet; run the study first")
+    rows = results_to_show(args.out)
     print(table(rows))
     if args.figure:
         write_figure(rows, args.figure)

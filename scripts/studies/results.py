@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from v2p_data.errors import V2PError
+
 RESULTS = "results.jsonl"
 Row = dict[str, Any]
 
@@ -25,6 +27,18 @@ def results_in(out: Path) -> list[Row]:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
             logger.warning("a line of %s is cut short and left out", path)
+    return rows
+
+
+def results_to_show(out: Path) -> list[Row]:
+    """Return the lines of a study.
+
+    Raises:
+        V2PError: there is none yet.
+    """
+    rows = results_in(out)
+    if not rows:
+        raise V2PError(f"{out} holds no results yet; run the study first")
     return rows
 
 

@@ -69,6 +69,16 @@ def from_box(
     return max(masks, key=lambda mask: _plausibility(image, mask, (x0, y0, x1, y1)))
 
 
+def inside_box(
+    box_xyxy: tuple[float, float, float, float], shape: tuple[int, int]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels of a picture of this shape inside of a box [px]."""
+    x0, y0, x1, y1 = (max(0, round(v)) for v in box_xyxy)
+    inside = np.zeros(shape, bool)
+    inside[y0:y1, x0:x1] = True
+    return inside
+
+
 def ellipse_in(
     box: tuple[int, int, int, int], shape: tuple[int, int], share: float = 1.0
 ) -> Bool[np.ndarray, "h w"]:

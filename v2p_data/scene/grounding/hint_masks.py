@@ -15,6 +15,7 @@ from v2p_data.scene.frames.mask_ops import (
     from_box,
     from_points,
     grow,
+    inside_box,
     refine,
     spans,
 )
@@ -134,9 +135,9 @@ def _boxed(
     box = (x0, y0, x1, y1)
     outlined = outline_in_box(working, i, box)
     if outlined is not None:
-        return HintMask(mask=outlined, frame=i, sure=sure, box=_inside_of(box, working.shape))
+        return HintMask(mask=outlined, frame=i, sure=sure, box=inside_box(box, working.shape))
     mask = from_box(working.rgb[i], box, _thing_at(segmentation, i))
-    inside = _inside_of(box, working.shape)
+    inside = inside_box(box, working.shape)
     drawn = (max(0, round(x0)), max(0, round(y0)), round(x1), round(y1))
     if segmentation is not None:
         if mask.sum() < _SMALL_PX or spans(mask, drawn) < _FILLED:
@@ -148,15 +149,6 @@ def _boxed(
     if segmentation is not None and spans(mask, drawn) < _LEAST_SPAN:
         mask = ellipse_in(drawn, working.shape)
     return HintMask(mask=mask, frame=i, sure=sure, box=inside)
-
-
-def _inside_of(
-    box_xyxy: tuple[float, float, float, float], shape: tuple[int, int]
-) -> Bool[np.ndarray, "h w"]:
-    x0, y0, x1, y1 = (max(0, round(v)) for v in box_xyxy)
-    inside = np.zeros(shape, bool)
-    inside[y0:y1, x0:x1] = True
-    return inside
 
 
 def _thing_at(segmentation: Segmentation | None, i: int) -> Float[np.ndarray, "h w"] | None:

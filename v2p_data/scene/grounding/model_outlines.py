@@ -11,7 +11,7 @@ from jaxtyping import Bool
 
 from v2p_data.scene.backends.outlines import Spots
 from v2p_data.scene.backends.segment import points_inside
-from v2p_data.scene.frames.mask_ops import bounding_box, iou, largest
+from v2p_data.scene.frames.mask_ops import bounding_box, inside_box, iou, largest
 from v2p_data.scene.frames.working_clip import WorkingClip
 
 _LEAST_IOU = 0.7
@@ -84,7 +84,7 @@ def outline_in_box(
     seen = working.outliner.at(i, [Spots(box_xyxy=box_xyxy)])
     best = int(seen.ious[0].argmax())
     mask = seen.masks[0, best]
-    inside = _box_mask(box_xyxy, working.shape)
+    inside = inside_box(box_xyxy, working.shape)
     on_it = mask.any() and (mask & inside).sum() >= _IN_BOX * mask.sum()
     if not on_it or (mask & inside).sum() < _FILLS * inside.sum():
         return None
@@ -104,12 +104,3 @@ def outline_at_spots(
         if mask.any()
     ]
     return sorted(found, key=lambda one: -one.iou)
-
-
-def _box_mask(
-    box_xyxy: tuple[float, float, float, float], shape: tuple[int, int]
-) -> Bool[np.ndarray, "h w"]:
-    x0, y0, x1, y1 = (max(0, round(v)) for v in box_xyxy)
-    inside = np.zeros(shape, bool)
-    inside[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)] = True
-    return inside

@@ -131,6 +131,11 @@ class StaticSearch:
         return static_share(self.segmentation, self.kind)
 
     @cached_property
+    def cues(self) -> "_Cues":
+        """What every candidate's cues are computed from."""
+        return _Cues.of(self)
+
+    @cached_property
     def log_scale(self) -> float:
         """By how much all seems larger than it is, as far as the moving object seems too large for its kind by more than kinds vary."""
         mask = self.ends[0]
@@ -145,11 +150,9 @@ def find_static_object(search: StaticSearch) -> Found | None:
 
     It is the candidate from which most overlap with the named object can be expected: a whole rather than its likelier half.
     """
-    found = candidates(search)
+    found = _with_outlines(search, candidates(search))
     if not found:
         return None
-    if search.working.outliner is not None:
-        found = _with_outlines(search, found)
     learned = _learned()
     rating = np.array([one.rating for one in found])
     likely = softmax(rating)
@@ -226,42 +229,31 @@ def larger_than_usual(noun: Noun, camera: SeenCamera, mask: Bool[np.ndarray, "h 
 
 def candidates(search: StaticSearch) -> list[StaticCandidate]:
     """Return all that may be meant by the phrase, with its cues."""
-    cues = _Cues.of(search)
-    found = []
-    for mask, is_part in _masks(search.static, cues.off_table, cues.free, cues.colour):
-        own = cues.own(mask)
-        if mask.mean() > _MOST_SHARE and own["larger than usual"] > _TOO_LARGE:
-            continue
-        all_cues = {"part": float(is_part), **own, **cues.way.cues(mask, search.kind)}
-        found.append(StaticCandidate(mask=mask, cues=all_cues))
-    return found
+    cues = search.cues
+    masks = _masks(search.static, cues.off_table, cues.free, cues.colour)
+    rated = (cues.candidate(mask, is_part=is_part) for mask, is_part in masks)
+    return [one for one in rated if one is not None]
 
 
 def _with_outlines(search: StaticSearch, found: list[StaticCandidate]) -> list[StaticCandidate]:
-    """Return the candidates with the outlines that a model draws at the best of them."""
-    working, segmentation = search.working, search.segmentation
-    cues = _Cues.of(search)
+    """Return the candidates with the outlines that a model draws at the best of them, where one was asked for."""
+    if search.working.outliner is None:
+        return found
+    cues = search.cues
     best: list[StaticCandidate] = []
     for one in sorted(found, key=lambda one: -one.rating):
         if len(best) < _ASKED and all(iou(one.mask, other.mask) < _ASKED_APART for other in best):
             best.append(one)
-    passes = [shares[HAND] + shares[MOVED] for shares in (segmentation.at(0), segmentation.at(-1))]
     out: list[StaticCandidate] = []
     for one in best:
-        hidden = [float(plane[one.mask].mean()) for plane in passes]
-        late = search.late or hidden[1] + _LESS_HIDDEN < hidden[0]
-        for outline in outlines_around(working, -1 if late else 0, one.mask):
+        for outline in outlines_around(search.working, -1 if search.late else 0, one.mask):
             mask = outline.mask
-            if (mask & cues.free).sum() < (1 - _MOST_TAKEN) * mask.sum() or any(
-                iou(mask, other.mask) >= _SAME for other in out
-            ):
-                continue
-            own = cues.own(mask)
-            if mask.mean() > _MOST_SHARE and own["larger than usual"] > _TOO_LARGE:
-                continue
-            all_cues = {"part": 0.0, **own, **cues.way.cues(mask, search.kind)}
-            whole = _WHOLE * float(np.log(np.clip(outline.iou, 0.1, 1.0)))
-            out.append(StaticCandidate(mask=mask, cues=all_cues, preference=whole, outlined=True))
+            is_free = (mask & cues.free).sum() >= (1 - _MOST_TAKEN) * mask.sum()
+            is_known = any(iou(mask, other.mask) >= _SAME for other in out)
+            seen = cues.candidate(mask, is_part=False) if is_free and not is_known else None
+            if seen is not None:
+                whole = _WHOLE * float(np.log(np.clip(outline.iou, 0.1, 1.0)))
+                out.append(replace(seen, preference=whole, outlined=True))
     return [*out, *(replace(one, preference=_NOT_OUTLINED) for one in found)]
 
 
@@ -303,9 +295,18 @@ class _Cues:
             way=_Approach.of(search),
         )
 
-    def own(self, mask: Bool[np.ndarray, "h w"]) -> dict[str, float]:
-        """Return what a candidate looks like."""
-        return _own_cues(self.search, mask, self.lab, self.colour, self.usual)
+    def candidate(self, mask: Bool[np.ndarray, "h w"], *, is_part: bool) -> StaticCandidate | None:
+        """Return a mask with its cues; None where it is as large as the table.
+
+        Args:
+            mask: its pixels.
+            is_part: it was cut out of a larger one.
+        """
+        own = _own_cues(self.search, mask, self.lab, self.colour, self.usual)
+        if mask.mean() > _MOST_SHARE and own["larger than usual"] > _TOO_LARGE:
+            return None
+        cues = {"part": float(is_part), **own, **self.way.cues(mask, self.search.kind)}
+        return StaticCandidate(mask=mask, cues=cues)
 
 
 def _own_cues(
