@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.scene.frames.classes import HAND, MOVED
 from v2p_data.scene.frames.colour import histogram, lab_of, likelihood, shadow, similarity
+from v2p_data.scene.frames.flow import flow_to
 from v2p_data.scene.frames.mask_ops import DRAWN_OFF_PX, bounding_box, grow, iou, is_cut, tidy
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.working_clip import WorkingClip
@@ -306,9 +307,8 @@ def _likeness(before: ToolPiece, after: ToolPiece, moved: Bool[np.ndarray, "h w"
 
 def _flow(working: WorkingClip, before: int, now: int) -> Float32[np.ndarray, "h w 2"]:
     """Return from where each pixel of the later frame came."""
-    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     grey = [cv2.cvtColor(working.rgb[i], cv2.COLOR_RGB2GRAY) for i in (now, before)]
-    back = method.calc(*grey, None)  # type: ignore[call-overload]
+    back = flow_to(*grey)
     y, x = np.mgrid[: back.shape[0], : back.shape[1]].astype(np.float32)
     return np.stack([x, y], -1) + back
 

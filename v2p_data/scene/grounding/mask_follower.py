@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.scene.frames.colour import histogram, likelihood, similarity
+from v2p_data.scene.frames.flow import flow_to
 from v2p_data.scene.frames.mask_ops import bounding_box, convex_hull, grow, tidy
 from v2p_data.scene.frames.working_clip import WorkingClip
 
@@ -92,7 +93,6 @@ class _Follower:
         h, w = working.shape
         self._working, self._start, self._hist, self._moving = working, start, colour_hist, moving
         self._may_rest = may_rest
-        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._y, self._x = np.mgrid[:h, :w].astype(np.float32)
         self._before = smoothed(working.lab[anchor])
         self._home, self._area = grow(start, 2), int(start.sum())
@@ -128,10 +128,8 @@ class _Follower:
         self, now: UInt8[np.ndarray, "h w"], window: tuple[slice, slice]
     ) -> Float32[np.ndarray, "i j"]:
         """Return the last mask as optical flow carries it on, blurred: how likely each pixel is the object by its place."""
-        crop_now = np.ascontiguousarray(now[window])
-        crop_old = np.ascontiguousarray(self._grey[window])
-        back = self._flow.calc(crop_now, crop_old, None)  # type: ignore[call-overload]
-        ch, cw = crop_now.shape
+        back = flow_to(now[window], self._grey[window])
+        ch, cw = back.shape[:2]
         carried = cv2.remap(
             self._mask[window].astype(np.float32),
             self._x[:ch, :cw] + back[..., 0],
