@@ -15,7 +15,7 @@ from v2p_data.scene.frames.colour import balance, colour_match, named_colours
 from v2p_data.scene.frames.hand_track import contact_share
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
 from v2p_data.scene.frames.segmentation import hand_at
-from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, rests_on_table
+from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, seen_on_table
 from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
 from v2p_data.scene.scale.nouns import is_clear
 
@@ -25,6 +25,8 @@ _AWAY_PX = 4.0
 """Of a picture 320 px wide: an object so far from both its ends moves."""
 _OUT_OF_SIGHT = 0.8
 """What went into a bin lies in it, and what a fist lifts goes with it, but nobody sees where."""
+_IN_THE_AIR = 0.6
+"""Confidence in an object that does not rest on the table at first; it falls from 1 where half of what that needs is seen."""
 _GROWN = 0.2
 """Logarithm: of twelve drawn things that a hand touches at first where they rest, none seems so much larger there than at the end."""
 
@@ -65,8 +67,14 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
         add("pose", f"{which} seen at the end", max(0.1, least + seen))
     thing = grounded.objects[0]
     add("camera", "camera height", height_plausibility(placement.height_m))
-    if not _rests_on_table(grounded):
-        add("grounding", "standing on the table at first", 0.6)
+    on_table = _seen_on_table(grounded)
+    if on_table < 1:
+        on_table = max(0.0, 2 * on_table - 1)
+        add(
+            "grounding",
+            "standing on the table at first",
+            _IN_THE_AIR + (1 - _IN_THE_AIR) * on_table,
+        )
     if not (thing.noun.known or thing.known_m):
         add("size", f"knowing what '{thing.phrase}' is", 0.9)
     matter = "clear" if is_clear(thing.phrase) else thing.noun.matter
@@ -93,10 +101,10 @@ def _touched_share(grounded: GroundedObjects) -> float | None:
     return contact_share(hands, thing.masks, np.array(moving, int))
 
 
-def _rests_on_table(grounded: GroundedObjects) -> bool:
-    """Return whether the manipulated object rests on the table at first."""
+def _seen_on_table(grounded: GroundedObjects) -> float:
+    """Return how far the manipulated object is seen to rest on the table at first, 0 to 1."""
     gap_px = {} if grounded.working.outliner is None else {"gap_px": EXACT_GAP_PX}
-    return rests_on_table(
+    return seen_on_table(
         grounded.table, grounded.objects[0].first, grounded.segmentation, **gap_px
     )
 
@@ -109,7 +117,7 @@ def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:
     thing = grounded.objects[0]
     if placement.objects[0].log_growth < _GROWN:
         return False
-    if not _rests_on_table(grounded):
+    if _seen_on_table(grounded) < 1:
         return True
     hand = None if grounded.segmentation is None else hand_at(grounded.segmentation, thing.at)
     return hand is not None and bool((hand & grow(thing.first, TOUCH_PX)).any())

@@ -12,7 +12,7 @@ from v2p_data.scene.frames.classes import HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.scene.frames.table import find_table
-from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, rests_on_table
+from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, seen_on_table
 from v2p_data.scene.grounding.hint_masks import Box, hint_masks_of
 from v2p_data.scene.grounding.model_outlines import (
     outline_at_spots,
@@ -230,5 +230,5 @@ def test_beneath_an_exact_outline_the_table_is_looked_for_a_little_lower(segment
     exact[np.flatnonzero(seen.any(1))[-4:]] = False
     table = replace(find_table(working.always), hull=np.zeros(working.shape, bool))
 
-    assert not rests_on_table(table, exact, segmentation)
-    assert rests_on_table(table, exact, segmentation, gap_px=EXACT_GAP_PX)
+    assert seen_on_table(table, exact, segmentation) < 1
+    assert seen_on_table(table, exact, segmentation, gap_px=EXACT_GAP_PX) == 1

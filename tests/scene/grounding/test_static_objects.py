@@ -9,7 +9,7 @@ import pytest
 from v2p_data.scene.frames.classes import BACKGROUND, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.frames.table import find_table
-from v2p_data.scene.grounding.ground_objects import rests_on_table
+from v2p_data.scene.grounding.ground_objects import seen_on_table
 from v2p_data.scene.grounding.static_objects import (
     WEIGHTS,
     StaticCandidate,
@@ -243,9 +243,9 @@ def test_what_has_table_beneath_it_stands_on_the_table_whatever_its_colours_say(
     working, segmentation = segmentation_of([parts for _ in range(12)])
     nowhere = replace(find_table(working.always), hull=np.zeros(working.shape, bool))
 
-    assert not rests_on_table(nowhere, large(on, working))
-    assert rests_on_table(nowhere, large(on, working), segmentation)
-    assert not rests_on_table(nowhere, large(off, working), segmentation)
+    assert seen_on_table(nowhere, large(on, working)) < 1
+    assert seen_on_table(nowhere, large(on, working), segmentation) == 1
+    assert seen_on_table(nowhere, large(off, working), segmentation) < 1
 
 
 @pytest.mark.parametrize(("phrase", "far"), [("ball", False), ("plate", False), ("box", True)])

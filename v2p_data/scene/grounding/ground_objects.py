@@ -48,8 +48,8 @@ _LEAST_HAND = 0.002
 """Least share of the picture that a hand covers in the frame that shows most of it."""
 _BELOW_PX, _GAP_PX, EXACT_GAP_PX = 5, 1, 3
 """Depth of the strip below an object in which the network must see table, and where it begins; below a model's exact outline later."""
-_SEEN_BELOW = 0.5
-"""Mean probability of table in that strip, from which the object stands on the table."""
+_SEEN_BELOW, _FOOT_ON_TABLE = 0.5, 0.3
+"""Mean probability of table in that strip, and share of the foot within the table's part, from which the object rests on the table."""
 _SETS_OUT = 0.05
 """Share of its way that a pushed object has gone when it moves."""
 _WELL_SEEN = 0.6
@@ -372,13 +372,13 @@ def _less_what_passes(
     return out
 
 
-def rests_on_table(
+def seen_on_table(
     table: Table,
     mask: Bool[np.ndarray, "h w"],
     segmentation: Segmentation | None = None,
     gap_px: int = _GAP_PX,
-) -> bool:
-    """Return whether the mask's foot is on the table's part of the picture, or the network sees table beneath it.
+) -> float:
+    """Return how far the mask's foot is on the table's part of the picture, or the network sees table beneath it: 1 where it rests.
 
     Args:
         table: the table's part of the picture.
@@ -390,10 +390,10 @@ def rests_on_table(
     foot = np.zeros_like(mask)
     foot[y + int(0.75 * h) : y + h, x : x + w] = True
     foot &= mask
-    if float((foot & grow(table.hull, 6)).sum()) > 0.3 * float(foot.sum()):
-        return True
+    on_table = float((foot & grow(table.hull, 6)).sum() / max(1, foot.sum())) / _FOOT_ON_TABLE
     if segmentation is None:
-        return False
+        return min(1.0, on_table)
     below = grow(foot, gap_px + _BELOW_PX - _GAP_PX) & ~grow(mask, gap_px)
     below[: y + int(0.75 * h)] = False
-    return bool(below.any()) and float(segmentation.early[TABLE][below].mean()) > _SEEN_BELOW
+    beneath = float(segmentation.early[TABLE][below].mean()) if below.any() else 0.0
+    return min(1.0, max(on_table, beneath / _SEEN_BELOW))

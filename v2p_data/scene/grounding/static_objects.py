@@ -235,7 +235,9 @@ def candidates(search: StaticSearch) -> list[StaticCandidate]:
     return [one for one in rated if one is not None]
 
 
-def with_model_outlines(search: StaticSearch, found: list[StaticCandidate]) -> list[StaticCandidate]:
+def with_model_outlines(
+    search: StaticSearch, found: list[StaticCandidate]
+) -> list[StaticCandidate]:
     """Return the candidates with the outlines that a model draws at the best of them, where one was asked for."""
     if search.working.outliner is None:
         return found
