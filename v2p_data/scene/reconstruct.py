@@ -1,6 +1,7 @@
 """The order of steps from a clip to a scene.
 
-Frames, then grounding, then camera and poses in camera heights, then meshes in metres, then how sure all of it is.
+Frames, then grounding, then camera and poses in camera heights, then meshes in metres, then how sure all of it is. Where that is
+not sure, the objects are searched once more in the clip's mirror image, and the surer scene is kept.
 """
 
 from dataclasses import replace
@@ -27,6 +28,12 @@ from v2p_data.scene.frames.prepare import PreparedClip, prepare
 from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
 from v2p_data.scene.grounding.ground_objects import ground_objects, without_asides
 from v2p_data.scene.grounding.hands_by_model import track_hands
+from v2p_data.scene.grounding.mirror_image import (
+    as_filmed,
+    has_marks,
+    mirrored_clip,
+    mirrored_meaning,
+)
 from v2p_data.scene.grounding.outliner_by_model import outliner_of
 from v2p_data.scene.meshes import with_meshes
 from v2p_data.scene.preset import with_preset
@@ -34,6 +41,11 @@ from v2p_data.scene.remarks import remarks_on
 from v2p_data.video.captions import parse_caption
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
+
+_NOT_FOUND = ("object_not_found", "reference_not_found", "motion_contradicts_caption")
+"""Rejections that a search in the mirror image may mend: the object is there, but something else was taken for it."""
+_SURE_AT_ONCE = 0.65
+"""Confidence from which the first search is taken as it is."""
 
 
 def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Reconstruction:
@@ -64,11 +76,59 @@ def reconstruct_prepared(
 ) -> Reconstruction:
     """Return the scene that a prepared clip shows, as `reconstruct` does of the clip."""
     cfg = with_preset(cfg)
-    clip = prepared.clip
-    meaning = parse_caption(clip.caption, clip.objects)
-    grounded = _grounded(prepared, meaning, cfg)
-    segmentation = grounded.segmentation
+    meaning = parse_caption(prepared.clip.caption, prepared.clip.objects)
+    scene, error = None, None
+    try:
+        scene = _rebuilt(prepared, meaning, _grounded(prepared, meaning, cfg), cfg, rng)
+    except ItemRejectedError as rejected:
+        if rejected.reason not in _NOT_FOUND:
+            raise
+        error = rejected
+    if _may_search_again(prepared, cfg) and (scene is None or _is_unsure(scene, cfg)):
+        try:
+            found = _grounded_in_mirror_image(prepared, meaning, cfg)
+            again = _rebuilt(prepared, meaning, found, cfg, rng)
+        except ItemRejectedError:
+            again = None
+        if again is not None and (scene is None or _rank(again) > _rank(scene)):
+            scene = again
+    if scene is None:
+        assert error is not None
+        raise error
+    check_confidence(scene.cues, cfg.min_confidence)
+    return scene
 
+
+def _may_search_again(prepared: PreparedClip, cfg: SceneConfig) -> bool:
+    """Return whether a search in the mirror image can find something else: with our network, and where nobody marked anything."""
+    ours = cfg.ground.backend == "network" and cfg.segment.backend == "flow"
+    return ours and not has_marks(prepared.clip)
+
+
+def _is_unsure(scene: Reconstruction, cfg: SceneConfig) -> bool:
+    return scene.contradiction is not None or scene.confidence < max(
+        cfg.min_confidence, _SURE_AT_ONCE
+    )
+
+
+def _rank(scene: Reconstruction) -> tuple[bool, float]:
+    """Return what orders scenes of one clip: those that move as their caption says first, then the surest."""
+    return scene.contradiction is None, scene.confidence
+
+
+def _rebuilt(
+    prepared: PreparedClip,
+    meaning: Meaning,
+    grounded: GroundedObjects,
+    cfg: SceneConfig,
+    rng: np.random.Generator,
+) -> Reconstruction:
+    """Return the scene of the objects that were found, however sure it is.
+
+    Raises:
+        ItemRejectedError: `motion_contradicts_caption`.
+    """
+    clip, segmentation = prepared.clip, grounded.segmentation
     guess = camera_guess(None if segmentation is None else segmentation.camera, cfg)
     tracks = with_noun_variants(grounded.working, grounded.objects, guess, meaning.kind)
     grounded = replace(grounded, objects=tracks)
@@ -92,7 +152,7 @@ def reconstruct_prepared(
         kind=meaning.kind,
         objects=tuple(objects),
         camera=clip_camera(clip, placement),
-        confidence=check_confidence(cues, cfg.min_confidence),
+        confidence=confidence_of(cues),
         stages=by_stage(cues),
         cues=cues,
         scale_spread=placement.scale_spread,
@@ -100,6 +160,17 @@ def reconstruct_prepared(
         contradiction=contradiction,
         warnings=(*grounded.warnings, *remarks),
     )
+
+
+def _grounded_in_mirror_image(
+    prepared: PreparedClip, meaning: Meaning, cfg: SceneConfig
+) -> GroundedObjects:
+    """Return the caption's objects as they are found in the clip's mirror image."""
+    mirrored = mirrored_clip(prepared)
+    outliner = outliner_of(mirrored.clip, mirrored.working, cfg.outline)
+    mirrored = replace(mirrored, working=replace(mirrored.working, outliner=outliner))
+    found = _grounded(mirrored, mirrored_meaning(meaning), cfg)
+    return as_filmed(found, prepared.working)
 
 
 def _grounded(prepared: PreparedClip, meaning: Meaning, cfg: SceneConfig) -> GroundedObjects:

@@ -210,19 +210,14 @@ def classify(
             )
             for images in (frames, early, late)
         ]
-        # A mirrored picture shows the same things and the same camera; what is guessed otherwise there is chance.
-        both = [
-            inputs_of(*pictures).contiguous(memory_format=torch.channels_last)
-            for pictures in (three, [images.flip(-1) for images in three])
-        ]
-        own, mirrored = (net.classes_of(x).softmax(1) for x in both)
-        seen = (0.5 * (own + mirrored.flip(-1))).numpy()
-        for full, small in zip(shares[part], seen, strict=True):
-            for plane, share in zip(full, small, strict=True):
-                cv2.resize(share, (w, h), dst=plane, interpolation=cv2.INTER_LINEAR)
-        for x in both:
-            some = x[::_CAMERA_EVERY].contiguous(memory_format=torch.channels_last)
-            cameras.append(eye.camera_of(some))
+        x = inputs_of(*three).contiguous(memory_format=torch.channels_last)
+        for full, small in zip(shares[part], net.classes_of(x).softmax(1).numpy(), strict=True):
+            for plane, own in zip(full, small, strict=True):
+                cv2.resize(own, (w, h), dst=plane, interpolation=cv2.INTER_LINEAR)
+        # A mirrored picture shows the same camera; what is guessed otherwise there is chance.
+        flipped = inputs_of(*(y[::_CAMERA_EVERY].flip(-1) for y in three))
+        for some in (x[::_CAMERA_EVERY], flipped):
+            cameras.append(eye.camera_of(some.contiguous(memory_format=torch.channels_last)))
     camera = torch.cat(cameras).numpy().mean(0)
     return Seen(
         shares=shares,
