@@ -13,6 +13,7 @@ from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.grounding.ground_objects import ground_objects
 from v2p_data.scene.grounding.mirror_image import (
     as_filmed,
+    has_marks,
     mirrored_clip,
     mirrored_meaning,
 )
@@ -103,11 +104,11 @@ def test_what_somebody_clicked_is_searched_once(prepared, searches):
     assert len(searches) == 1
 
 
-def test_a_size_is_no_mark(prepared, searches):
-    hints = {"blue box": {"size_m": [0.09, 0.07, 0.05]}}
-    rebuilt(replace(prepared, clip=replace(prepared.clip, hints=hints)))
-
-    assert len(searches) == 2
+@pytest.mark.parametrize(
+    ("hint", "is_mark"), [({"stroke": [[1.0, 2.0]]}, True), ({"size_m": [0.1, 0.1, 0.1]}, False)]
+)
+def test_only_what_tells_a_place_is_a_mark(prepared, hint, is_mark):
+    assert has_marks(replace(prepared.clip, hints={"blue box": hint})) == is_mark
 
 
 def test_a_sure_scene_is_searched_once(prepared, monkeypatch):
@@ -120,9 +121,8 @@ def test_a_sure_scene_is_searched_once(prepared, monkeypatch):
     assert len(searched) == 1
 
 
-@pytest.mark.parametrize("of_searches", [(0.4, 0.6), (0.6, 0.4)])
-def test_the_surer_scene_of_both_is_kept(prepared, monkeypatch, of_searches):
-    values = iter(np.repeat(of_searches, 2))
-    monkeypatch.setattr(steps, "confidence_of", lambda _cues: float(next(values)))
+def test_the_surer_scene_of_both_is_kept(prepared, monkeypatch):
+    values = iter([0.4, 0.4, 0.6, 0.6])
+    monkeypatch.setattr(steps, "confidence_of", lambda _cues: next(values))
 
-    assert rebuilt(prepared).confidence == max(of_searches)
+    assert rebuilt(prepared).confidence == 0.6
