@@ -29,10 +29,7 @@ from drawn_clips.truth import load_truth, write
 from training import draw_all
 from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS as TASK_KINDS
-from v2p_data.scene.backends.mobile_sam import mobile_sam
-from v2p_data.scene.backends.mobile_sam_setup import installed_weights
 from v2p_data.scene.frames.mask_ops import iou
-from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.scene.frames.segmentation import segment_clip
 from v2p_data.scene.frames.stabilise import stabilised
 from v2p_data.scene.frames.working_clip import working_clip_of
@@ -43,7 +40,6 @@ from v2p_data.scene.grounding.static_objects import (
     candidates,
     odds_of,
     overlaps_of,
-    with_model_outlines,
 )
 from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos, parse_caption
@@ -101,8 +97,6 @@ def make_clip(job: tuple[int, Path]) -> str:
         path,
         names=list(found[0].cues),
         cues=cues,
-        outlined=[one.outlined for one in found],
-        preference=[one.preference for one in found],
         right=[iou(one.mask, shown) for one in found],
         alike=overlaps_of(found),
     )
@@ -112,14 +106,10 @@ def make_clip(job: tuple[int, Path]) -> str:
 def candidates_in(clip: Clip, phrase: str) -> list[StaticCandidate]:
     """Return the candidates for a phrase of a clip's caption."""
     meaning = parse_caption(clip.caption, clip.objects)
-    weights = installed_weights()
     working = working_clip_of(clip)
     steady = stabilised(clip, working)
     if steady is not clip:
         clip, working = steady, working_clip_of(steady)
-    if weights is not None:
-        outliner = Outliner(mobile_sam(weights), clip.frames, working.frame_idx, working.shape)
-        working = replace(working, outliner=outliner)
     seen = ground_objects(clip, working, meaning, segment_clip(clip, working), min_found=0.0)
     assert seen.segmentation is not None
     search = StaticSearch(
@@ -132,7 +122,7 @@ def candidates_in(clip: Clip, phrase: str) -> list[StaticCandidate]:
         ends=(seen.objects[0].first, seen.objects[0].last),
         taken=np.zeros(working.shape, bool),
     )
-    return with_model_outlines(search, candidates(search))
+    return candidates(search)
 
 
 def main() -> None:

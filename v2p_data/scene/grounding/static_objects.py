@@ -150,7 +150,7 @@ def find_static_object(search: StaticSearch) -> Found | None:
 
     It is the candidate from which most overlap with the named object can be expected: a whole rather than its likelier half.
     """
-    found = with_model_outlines(search, candidates(search))
+    found = _with_outlines(search, candidates(search))
     if not found:
         return None
     learned = _learned()
@@ -235,9 +235,7 @@ def candidates(search: StaticSearch) -> list[StaticCandidate]:
     return [one for one in rated if one is not None]
 
 
-def with_model_outlines(
-    search: StaticSearch, found: list[StaticCandidate]
-) -> list[StaticCandidate]:
+def _with_outlines(search: StaticSearch, found: list[StaticCandidate]) -> list[StaticCandidate]:
     """Return the candidates with the outlines that a model draws at the best of them, where one was asked for."""
     if search.working.outliner is None:
         return found
