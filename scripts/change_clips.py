@@ -45,8 +45,8 @@ _WIDTH_PX = 320
 class Change:
     """What is done to every frame."""
 
-    warp: Callable[[float, np.random.Generator], Callable[[float, tuple[int, int]], Homography]]
-    """From the clip's length [s] and randomness, the homography by second and (width, height)."""
+    warp: Callable[[np.random.Generator], Callable[[float, tuple[int, int]], Homography]]
+    """From randomness, the homography by second and (width, height)."""
     paint: Callable[[Image], Image] = lambda image: image
     width_px: int | None = None
     crf: int = _CRF
@@ -61,16 +61,14 @@ def _about(size: tuple[int, int], turn_rad: float, by: float) -> Homography:
 
 
 def _still(warp: Callable[[tuple[int, int]], Homography]):  # noqa: ANN202
-    return lambda _length_s, _rng: lambda _second, size: warp(size)
+    return lambda _rng: lambda _second, size: warp(size)
 
 
 def _mirrored(size: tuple[int, int]) -> Homography:
     return np.array([[-1.0, 0.0, size[0] - 1], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _shaken(
-    _length_s: float, rng: np.random.Generator
-) -> Callable[[float, tuple[int, int]], Homography]:
+def _shaken(rng: np.random.Generator) -> Callable[[float, tuple[int, int]], Homography]:
     """Return the sway of a hand-held camera: its power falls with the square of the frequency."""
     hz = np.geomspace(*SWAY_HZ, _WAVES)
     gain = rng.normal(1, 0.3, (2, _WAVES)) / np.sqrt(hz)
@@ -161,7 +159,7 @@ def rewrite(
         rate = file.streams.video[0].average_rate or Fraction(30)
         frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
     h, w = frames[0].shape[:2]
-    way = change.warp(len(frames) / float(rate), rng)
+    way = change.warp(rng)
     out_w = min(w, change.width_px or w)
     out_size = (2 * (out_w // 2), 2 * (round(h * out_w / w) // 2))
     warps = [way(k / float(rate), (w, h)) for k in range(len(frames))]
