@@ -76,8 +76,11 @@ def label_shares(
 ) -> UInt8[Tensor, "batch label h2 w2"]:
     """Return one channel per label: its share of each pixel of the smaller image, 0 to 255."""
     highest = min(int(labels.max()), num_labels - 1)
+    is_shrunk = longer_side_px < max(labels.shape[-2:])
     seen = [  # labels beyond the largest in the batch need no work
         as_uint8(shrink((labels == k).to(torch.float32)[:, None], longer_side_px)[:, 0])
+        if is_shrunk
+        else (labels == k).to(torch.uint8) * 255
         for k in range(highest + 1)
     ]
     return F.pad(torch.stack(seen, 1), (0, 0, 0, 0, 0, num_labels - len(seen)))

@@ -12,7 +12,7 @@ import json
 import logging
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +77,24 @@ class FrameTable:
             last=torch.cat([self.last, other.last + len(self)]),
         )
 
+    @property
+    def num_bytes(self) -> int:
+        """Memory of pictures, states and actions [bytes]."""
+        pictures = [value for prepared in self.pictures.values() for value in prepared.values()]
+        return sum(value.nbytes for value in [*pictures, *self.vectors.values(), self.action])
+
+    def on(self, device: torch.device) -> "FrameTable":
+        """Return this table with pictures, states and actions on a device; indices stay on the CPU."""
+        return replace(
+            self,
+            pictures={
+                key: {name: value.to(device) for name, value in prepared.items()}
+                for key, prepared in self.pictures.items()
+            },
+            vectors={key: value.to(device) for key, value in self.vectors.items()},
+            action=self.action.to(device),
+        )
+
     def of_tasks(self, words: Sequence[str]) -> "FrameTable":
         """Return the frames of some tasks, named in words."""
         wanted = torch.tensor([task in words for task in self.tasks])[self.task]
@@ -107,13 +125,15 @@ class FrameTable:
         first, last = self.first[rows][:, None], self.last[rows][:, None]
         seen = torch.minimum(torch.maximum(rows[:, None] + torch.tensor(observed), first), last)
         wanted = rows[:, None] + torch.tensor(acted)
+        taken = torch.minimum(wanted, last).to(self.action.device)
+        seen = seen.to(self.action.device)
         return {
             **{
                 key: {name: value[seen] for name, value in prepared.items()}
                 for key, prepared in self.pictures.items()
             },
             **{key: value[seen] for key, value in self.vectors.items()},
-            ACTION: self.action[torch.minimum(wanted, last)],
+            ACTION: self.action[taken],
             "action_is_pad": wanted > last,
             "task": [self.tasks[k] for k in self.task[rows].tolist()],
         }

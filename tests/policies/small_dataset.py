@@ -79,7 +79,7 @@ def config(
     return cfg
 
 
-def policy(cfg: V2PBCConfig | None = None, *, seed: int = 0):
+def policy(cfg: V2PBCConfig | None = None, *, seed: int = 0, device: str = "cpu"):
     """Return a policy and its processors, with statistics made up."""
     stats: dict[str, dict[str, Any]] = {
         STATE: {"mean": np.full(3, 0.5), "std": np.full(3, 2.0)},
@@ -90,7 +90,7 @@ def policy(cfg: V2PBCConfig | None = None, *, seed: int = 0):
             "std": np.ones(2),
         },
     }
-    return make_policy(cfg or config(num_labels=3), stats, seed=seed)
+    return make_policy(cfg or config(num_labels=3), stats, seed=seed, device=device)
 
 
 def table(net, *, lengths: tuple[int, ...] = LENGTHS, seed: int = 0) -> FrameTable:

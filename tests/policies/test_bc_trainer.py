@@ -384,3 +384,37 @@ def test_lerobot_loads_the_saved_folder_and_acts_the_same(dataset: Path, tmp_pat
     assert torch.equal(after(theirs.select_action(before(dict(seen)))), expected)
     again = our_processors.after(ours.select_action(our_processors.before(dict(seen))))
     assert torch.equal(again, expected)
+
+
+def test_frames_move_to_a_device_whole_and_give_the_same_batches():
+    net_, _ = policy(small(), seed=0)
+    there = table(net_.net)
+    rows = torch.tensor([3, 0, 11, 17])
+    moved = there.on(torch.device("cpu"))
+    one, other = (t.batch(rows, [-1, 0], [0, 1]) for t in (there, moved))
+    assert torch.equal(one["action"], other["action"])
+    assert torch.equal(one[MASK]["moments"], other[MASK]["moments"])
+    values = (*there.pictures[MASK].values(), *there.vectors.values(), there.action)
+    assert there.num_bytes == sum(v.numel() * v.element_size() for v in values)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("encoder", ["none", "conv"])
+def test_a_gpu_that_holds_all_frames_learns_what_one_that_fetches_them_does(
+    tmp_path: Path, monkeypatch, encoder: str
+):
+    def trained_on(device: str, share: float) -> dict[str, torch.Tensor]:
+        monkeypatch.setattr(trainer, "GPU_SHARE_FOR_FRAMES", share)
+        net_, processors = policy(small(encoder=encoder), device=device)
+        # Frames are prepared on the CPU, as a dataset's are.
+        frames = table(policy(small(encoder=encoder))[0].net)
+        train(net_, processors, frames, recipe(), tmp_path / f"{device}{share}", seed=5)
+        return {name: value.cpu() for name, value in weights(net_).items()}
+
+    held, fetched, on_cpu = (
+        trained_on(d, s) for d, s in (("cuda", 0.5), ("cuda", 0.0), ("cpu", 0.0))
+    )
+    for name in held:
+        torch.testing.assert_close(held[name], fetched[name], atol=1e-6, rtol=1e-4)
+        torch.testing.assert_close(held[name], on_cpu[name], atol=1e-3, rtol=1e-2)
