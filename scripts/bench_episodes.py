@@ -26,6 +26,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -226,7 +227,8 @@ def lerobots_way(
                             "task": bundle.description,
                         }
                     )
-                dataset.save_episode()
+                with ThreadPoolExecutor(1) as own:  # as root, SVT-AV1 makes its caller real-time
+                    own.submit(dataset.save_episode).result()
                 made.append(rollouts.action[:length, k])
         if len(made) == len(wanted):
             break

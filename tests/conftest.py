@@ -1,6 +1,7 @@
 """What holds for all tests."""
 
 import os
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -12,3 +13,25 @@ os.environ["V2P_CACHE"] = str(Path(__file__).parent / "no_cache")
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the longest first, so that two processes end at about the same time."""
     items.sort(key=lambda item: item.get_closest_marker("e2e") is None)
+
+
+if hasattr(os, "sched_getscheduler"):  # Linux
+    ORDINARY = (os.sched_getscheduler(0), os.sched_getparam(0))
+    """The scheduling class and priority in which the tests were started."""
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_teardown(item: pytest.Item) -> Generator[None]:
+        """Fail a test that leaves its process in another scheduling class, and restore the class.
+
+        A real-time process takes the cores from the tests that run beside it, which then reach their time limit.
+        """
+        yield
+        found = os.sched_getscheduler(0)
+        if found != ORDINARY[0]:
+            os.sched_setscheduler(0, *ORDINARY)
+            pytest.fail(
+                f"{item.name} left the process in scheduling class {found} instead of {ORDINARY[0]}. LeRobot's default"
+                " codec does that as root: its encoder SVT-AV1 makes the calling thread real-time. Encode in a thread"
+                " of its own, or with another codec.",
+                pytrace=False,
+            )
