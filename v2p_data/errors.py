@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
-from typing import Literal
+from typing import Any, Literal
 
 
 class V2PError(Exception):
@@ -24,6 +24,9 @@ class ItemRejectedError(V2PError):
         self.detail = detail
         self.value = value
 
+    def __reduce__(self) -> tuple[Any, ...]:  # a worker process raises it too
+        return type(self), (self.reason, self.detail, self.value)
+
 
 class UnusableError(V2PError):
     """A result that the engine made earlier cannot be used as it lies there; others can.
@@ -37,6 +40,9 @@ class UnusableError(V2PError):
         super().__init__(detail)
         self.reason = reason
         self.detail = detail
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.reason, self.detail)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -417,4 +417,5 @@ def test_a_gpu_that_holds_all_frames_learns_what_one_that_fetches_them_does(
     )
     for name in held:
         torch.testing.assert_close(held[name], fetched[name], atol=1e-6, rtol=1e-4)
-        torch.testing.assert_close(held[name], on_cpu[name], atol=1e-3, rtol=1e-2)
+        # Adam turns rounding of a gradient near zero into a whole step of the learning rate.
+        assert (held[name] - on_cpu[name]).float().abs().mean() < 1e-4
