@@ -1,4 +1,4 @@
-"""Edited videos: sample clips with bars, cuts and a second picture beside them, each put together here."""
+"""Edited videos: sample clips with bars and cuts, each put together here."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.frames.footage import check_footage, without_bars
+from v2p_data.scene.frames.footage import check_cuts, without_bars
 from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.video.captions import find_videos
 from v2p_data.video.clip import Clip
@@ -41,7 +41,7 @@ def another_scene(clip: Clip) -> np.ndarray:
 
 
 def checked(clip: Clip) -> None:
-    check_footage(clip, working_clip_of(clip))
+    check_cuts(clip, working_clip_of(clip))
 
 
 def test_a_clip_that_nobody_edited_is_left_as_it_is(clips):
@@ -108,16 +108,3 @@ def test_a_jump_of_exposure_and_a_swaying_camera_are_no_cuts(clips):
 
     checked(brighter)
     checked(made(clips[0], swaying))
-
-
-def test_two_pictures_beside_each_other_are_told_and_a_crop_is_advised(clips):
-    n = min(len(clips[0].frames), len(clips[1].frames))
-    other = (
-        another_scene(clips[1])[:n] // 2
-    )  # a seam between pictures of one brightness is not seen
-    both = np.concatenate([clips[0].frames[:n], other], axis=2)
-
-    with pytest.raises(ItemRejectedError, match=r"-vf crop=\d+:\d+:\d+:\d+") as error:
-        checked(made(clips[0], both))
-
-    assert error.value.reason == "split_screen"

@@ -1,4 +1,4 @@
-"""How a clip was edited: black bars are cut off; clips with cuts and split screens are rejected with advice.
+"""How a clip was edited: black bars are cut off; clips with cuts are rejected with advice.
 
 Cross-fades are not told from fast hands and moving cameras, and are not looked for.
 """
@@ -34,13 +34,6 @@ _OTHER, _SAME = 0.33, 0.55
 """Correlation of edges: below the first, two pictures show different scenes; above the second, the same one. In 35 uncut clips neighbours
 agree to 0.57 or more, but where a hand covers a nearly empty picture (0.26)."""
 
-_SEAM_STEP, _SEAM_SHARE, _BESIDE_SHARE = 10.0, 0.72, 0.45
-"""Luma step across a seam, the share of its length that has one, and the largest share 6 px beside it."""
-_SEAM_AT = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4)
-_SEAM_OFF = 0.02
-_SEAM_CORRELATION = 0.35
-_MOVES_LAB, _LEAST_MOVING = 15.0, 0.002
-
 
 def without_bars(clip: Clip) -> Clip:
     """Return the clip without black bars at its edges; as it is where it has none.
@@ -64,16 +57,6 @@ def without_bars(clip: Clip) -> Clip:
         hints={phrase: hint_in_crop(hint, crop) for phrase, hint in clip.hints.items()},
         warnings=(*clip.warnings, note),
     )
-
-
-def check_footage(clip: Clip, working: WorkingClip) -> None:
-    """Turn away a clip that shows more than one shot, or several pictures at once.
-
-    Raises:
-        ItemRejectedError: `split_screen`, `cut`, with the number that decided.
-    """
-    _check_split(clip, working)
-    _check_cuts(clip, working)
 
 
 # --- bars ----------------------------------------------------------------------------------------------------
@@ -113,7 +96,12 @@ def _bar(brightest: UInt8[np.ndarray, "h w"]) -> int:
 # --- cuts ----------------------------------------------------------------------------------------------------
 
 
-def _check_cuts(clip: Clip, working: WorkingClip) -> None:
+def check_cuts(clip: Clip, working: WorkingClip) -> None:
+    """Reject a clip that shows more than one shot.
+
+    Raises:
+        ItemRejectedError: `cut`, with the number that decided.
+    """
     edges = _edge_spectra(working.rgb)
     cuts = cuts_of(edges)
     if not cuts:
@@ -192,69 +180,3 @@ def _agreement(a: _Edges, b: _Edges) -> float:
         return straight
     best = cv2.matchTemplate(b, inner, cv2.TM_CCOEFF_NORMED)
     return max(straight, float(best.max()))
-
-
-# --- split screens -------------------------------------------------------------------------------------------
-
-
-def _check_split(clip: Clip, working: WorkingClip) -> None:
-    at, share = seam_of(clip.frames, working)
-    if not at:
-        return
-    w, h = clip.source_size_px
-    cut = round(at * w)
-    left, right = _moving_sides(working, at)
-    begin, length = (0, cut) if left >= right else (cut, w - cut)
-    raise ItemRejectedError(
-        "split_screen",
-        f"the picture is put together of several: a straight seam runs down it at {cut} of {w} px, along {share:.0%} of its "
-        f"length; keep one of them: ffmpeg -i {clip.path.name} -vf crop={length - length % 2}:{h - h % 2}:{begin}:0 one.mp4",
-        round(share, 3),
-    )
-
-
-def seam_of(frames: UInt8[np.ndarray, "time h w 3"], working: WorkingClip) -> tuple[float, float]:
-    """Return where a seam runs from top to bottom, as a share of the width, and the share of its length that shows a step.
-
-    Zeros where none does. Seams from left to right are not looked for: a table's far edge looks like one.
-    """
-    n = len(frames)
-    pick = np.unique(np.linspace(0, n - 1, min(n, 9)).round().astype(int))
-    grey = [cv2.cvtColor(frames[i], cv2.COLOR_RGB2GRAY).astype(np.float32) for i in pick]
-    w = frames.shape[2]
-    # A seam is there in every frame; the edge of something that moves is not.
-    shares = np.min([(np.abs(g[:, 3:] - g[:, :-3]) > _SEAM_STEP).mean(0) for g in grey], axis=0)
-    best = (0.0, 0.0)
-    for wanted in _SEAM_AT:
-        low, high = round((wanted - _SEAM_OFF) * w), round((wanted + _SEAM_OFF) * w)
-        at = low + int(shares[low:high].argmax())
-        share = float(shares[at])
-        beside = max(
-            float(shares[max(0, at - 8) : at - 5].max()), float(shares[at + 6 : at + 9].max())
-        )
-        if share < max(_SEAM_SHARE, best[1]) or beside > _BESIDE_SHARE:
-            continue
-        place = (at + 1.5) / w
-        moving = min(_moving_sides(working, place))
-        if moving >= _LEAST_MOVING and _continues(grey, at) < _SEAM_CORRELATION:
-            best = (place, share)
-    return best
-
-
-def _continues(grey: list[Float32[np.ndarray, "h w"]], at: int) -> float:
-    """Return how much the edges along the left side of a column go on along its right side, as a correlation."""
-    left = np.concatenate([np.diff(g[:, max(0, at - 2)]) for g in grey])
-    right = np.concatenate([np.diff(g[:, min(g.shape[1] - 1, at + 5)]) for g in grey])
-    if min(left.std(), right.std()) < 1e-3:
-        return 0.0
-    return float(np.corrcoef(left, right)[0, 1])
-
-
-def _moving_sides(working: WorkingClip, place: float) -> tuple[float, float]:
-    """Return the share of the picture that changes at some time, left and right of a seam."""
-    change = np.zeros(working.shape, np.float32)
-    for lab in working.lab[1:]:
-        np.maximum(change, np.linalg.norm(lab - working.lab[0], axis=-1), out=change)
-    moving = change > _MOVES_LAB
-    cut = round(place * moving.shape[1])
-    return float(moving[:, :cut].mean()), float(moving[:, cut:].mean())

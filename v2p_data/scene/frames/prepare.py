@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from v2p_data.scene.frames.checks import check_change, check_still
-from v2p_data.scene.frames.footage import check_footage, without_bars
+from v2p_data.scene.frames.footage import check_cuts, without_bars
 from v2p_data.scene.frames.paint_over import without_graphics
 from v2p_data.scene.frames.repeats import without_repeats
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
+from v2p_data.scene.frames.split_screen import check_split
 from v2p_data.scene.frames.stabilise import hint_in_aligned, stabilised
 from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
 from v2p_data.video.clip import Clip, Hint
@@ -57,7 +58,8 @@ def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> Pr
     clip = without_repeats(without_bars(clip))
     working = working_clip_of(clip)
     check_change(working)
-    check_footage(clip, working)
+    check_split(clip, working)
+    check_cuts(clip, working)
     painted = without_graphics(clip)
     if painted is not clip:
         clip, working = painted, working_clip_of(painted)
