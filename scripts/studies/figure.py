@@ -123,8 +123,8 @@ def _objects(axes: Axes, rows: list[Row]) -> None:
         f"{name}{'' if rows[0]['objects'][name]['group'] == 'shape' else ' *'}" for name in names
     ]
     axes.set_xticks(np.arange(len(names)), labels, rotation=40, ha="right", fontsize=8)
-    axes.set(title="Per object, largest N (* new category)", ylabel="success once", ylim=(0, 1.02))
-    axes.legend(fontsize=7)
+    axes.set(title="Per object, largest N (* new category)", ylabel="success once", ylim=(0, 1.18))
+    axes.legend(fontsize=7, ncols=5, loc="upper center")
 
 
 def _kinds(axes: Axes, rows: list[Row]) -> None:
