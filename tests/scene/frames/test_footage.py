@@ -1,38 +1,15 @@
 """Edited videos: sample clips with bars and cuts, each put together here."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from sample_clips import with_frames
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.footage import check_cuts, without_bars
 from v2p_data.scene.frames.working_clip import working_clip_of
-from v2p_data.video.captions import find_videos
 from v2p_data.video.clip import Clip
-from v2p_data.video.decode import read_clip
-
-SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
-
-
-@pytest.fixture(scope="module")
-def clips() -> list[Clip]:
-    return [read_clip(video) for video in find_videos(SAMPLES)]
-
-
-def made(clip: Clip, frames: np.ndarray) -> Clip:
-    """Return a clip with other frames, as if its file had held them."""
-    n, h, w = frames.shape[:3]
-    return replace(
-        clip,
-        frames=frames,
-        source_size_px=(2 * w, 2 * h),
-        source_frame=np.arange(n),
-        times_s=np.arange(n) / clip.fps,
-        total_frames=n,
-        source_fps=clip.fps,
-    )
 
 
 def another_scene(clip: Clip) -> np.ndarray:
@@ -59,7 +36,7 @@ def test_black_bars_are_cut_off_and_hints_go_along(clips, above, below, left, ri
     frames = np.pad(clip.frames, ((0, 0), (above, below), (left, right), (0, 0)))
     frames = np.maximum(frames, noise)  # bars of a real file are not quite black
     box = [left + 100.0, above + 50.0, left + 160.0, above + 90.0]
-    padded = replace(made(clip, frames), hints={"red box": {"frame": 0, "box": box}})
+    padded = replace(with_frames(clip, frames), hints={"red box": {"frame": 0, "box": box}})
 
     cut = without_bars(padded)
 
@@ -79,12 +56,12 @@ def test_a_dark_table_edge_is_no_bar(clips):
     shade = np.linspace(0, 1, 120)[:, None, None]
     frames[:, -120:] = (frames[:, -120:] * shade[::-1]).astype(np.uint8)  # fades to black
 
-    assert without_bars(made(clips[0], frames)).crop is None
+    assert without_bars(with_frames(clips[0], frames)).crop is None
 
 
 def test_a_cut_is_found_where_it_is_and_the_longest_part_is_advised(clips):
     a, b = clips[0].frames[:30], another_scene(clips[1])[:50]
-    clip = made(clips[0], np.concatenate([a, b]))
+    clip = with_frames(clips[0], np.concatenate([a, b]))
 
     with pytest.raises(ItemRejectedError, match=r"ffmpeg -ss \d+\.\d\d -to \d+\.\d\d -i") as error:
         checked(clip)
@@ -100,11 +77,11 @@ def test_a_jump_of_exposure_and_a_swaying_camera_are_no_cuts(clips):
     frames = clips[0].frames.astype(float)
     half = len(frames) // 2
     frames[half:] = (frames[half:] * 1.5 + 12).clip(0, 255)
-    brighter = made(clips[0], frames.astype(np.uint8))
+    brighter = with_frames(clips[0], frames.astype(np.uint8))
     shifts = (10 * np.sin(np.arange(len(frames)) / 3)).astype(int)
     swaying = np.stack(
         [np.roll(f, (s, 2 * s), (0, 1)) for f, s in zip(clips[0].frames, shifts, strict=True)]
     )
 
     checked(brighter)
-    checked(made(clips[0], swaying))
+    checked(with_frames(clips[0], swaying))

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,17 +9,9 @@ import pytest
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.paint_over import without_graphics
-from v2p_data.video.captions import find_videos
 from v2p_data.video.clip import Clip
-from v2p_data.video.decode import read_clip
 
-SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
 WHITE, BLACK, YELLOW = (255, 255, 255), (0, 0, 0), (255, 210, 30)
-
-
-@pytest.fixture(scope="module")
-def clips() -> list[Clip]:
-    return [read_clip(video) for video in find_videos(SAMPLES)]
 
 
 @pytest.fixture(scope="module")

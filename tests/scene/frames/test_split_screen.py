@@ -1,40 +1,18 @@
 """Split screens: sample clips put beside and above each other, and scenes with lines that look like seams, drawn here."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from sample_clips import with_frames
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.split_screen import Seam, check_split, seam_of
 from v2p_data.scene.frames.working_clip import working_clip_of
-from v2p_data.video.captions import find_videos
 from v2p_data.video.clip import Clip, Crop
-from v2p_data.video.decode import read_clip
 
-SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
 W, H = 320, 240
-
-
-@pytest.fixture(scope="module")
-def clips() -> list[Clip]:
-    return [read_clip(video) for video in find_videos(SAMPLES)]
-
-
-def with_frames(clip: Clip, frames: np.ndarray) -> Clip:
-    """Return a clip with other frames, as if its file had held them at twice the size."""
-    n, h, w = frames.shape[:3]
-    return replace(
-        clip,
-        frames=frames,
-        source_size_px=(2 * w, 2 * h),
-        source_frame=np.arange(n),
-        times_s=np.arange(n) / clip.fps,
-        total_frames=n,
-        source_fps=clip.fps,
-    )
 
 
 def found(clip: Clip, frames: np.ndarray) -> Seam | None:
