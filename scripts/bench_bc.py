@@ -20,8 +20,9 @@ import torch
 
 from policies.bc import trainer
 from policies.bc.configuration_v2p_bc import V2PBCConfig
+from policies.bc.frames import moved
 from policies.bc.student import Student
-from policies.bc.trainer import TrainerConfig, autocast_for, moved, normalised
+from policies.bc.trainer import TrainerConfig, autocast_for, normalised
 from v2p_data.pipeline.artifact import read_record
 
 NETWORKS: dict[str, tuple[int, dict[str, Any]]] = {

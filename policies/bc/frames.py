@@ -87,12 +87,9 @@ class FrameTable:
         """Return this table with pictures, states and actions on a device; indices stay on the CPU."""
         return replace(
             self,
-            pictures={
-                key: {name: value.to(device) for name, value in prepared.items()}
-                for key, prepared in self.pictures.items()
-            },
-            vectors={key: value.to(device) for key, value in self.vectors.items()},
-            action=self.action.to(device),
+            pictures=moved(self.pictures, device),
+            vectors=moved(self.vectors, device),
+            action=moved(self.action, device),
         )
 
     def of_tasks(self, words: Sequence[str]) -> "FrameTable":
@@ -137,6 +134,15 @@ class FrameTable:
             "action_is_pad": wanted > last,
             "task": [self.tasks[k] for k in self.task[rows].tolist()],
         }
+
+
+def moved(value: Any, device: torch.device) -> Any:
+    """Return a tensor, or a nested dict with all its tensors, on a device."""
+    if isinstance(value, Tensor):
+        return value.to(device, non_blocking=True)
+    if isinstance(value, dict):
+        return {key: moved(v, device) for key, v in value.items()}
+    return value
 
 
 def frames_of(

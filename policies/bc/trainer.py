@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from policies.bc.configuration_v2p_bc import V2PBCConfig
-from policies.bc.frames import ACTION, DatasetError, FrameTable
+from policies.bc.frames import ACTION, DatasetError, FrameTable, moved
 from policies.bc.modeling_v2p_bc import V2PBCPolicy
 from policies.threads import torch_threads
 
@@ -458,15 +458,6 @@ def _optimizer(policy: V2PBCPolicy) -> torch.optim.Optimizer:
         weight_decay=preset.weight_decay,
         fused=True,
     )
-
-
-def moved(value: Any, device: torch.device) -> Any:
-    """Return a batch with all its tensors on a device."""
-    if isinstance(value, Tensor):
-        return value.to(device, non_blocking=True)
-    if isinstance(value, dict):
-        return {key: moved(v, device) for key, v in value.items()}
-    return value
 
 
 def _tensorboard(folder: Path) -> Any:

@@ -84,6 +84,8 @@ def seam_of(frames: UInt8[np.ndarray, "time h w 3"], working: WorkingClip) -> Se
         np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
     )
     grey = np.stack([cv2.cvtColor(frames[i], cv2.COLOR_RGB2GRAY) for i in pick]).astype(np.float32)
+    if not any(_peaks(_step_shares(one)) for one in (grey, grey.swapaxes(1, 2))):
+        return None  # ordinary clips need no changes
     first = working.lab[0]
     changes = np.stack([np.linalg.norm(lab - first, axis=-1) > _CHANGE_LAB for lab in working.lab])
     seams = [
@@ -102,7 +104,7 @@ def _seam_along(
 ) -> Seam | None:
     """Return the longest seam along the second axis."""
     w = grey.shape[2]
-    if min(w, changes.shape[2]) < _LEAST_PX:
+    if changes.shape[2] < _LEAST_PX:
         return None
     shares = _step_shares(grey)
     moving = np.any(changes, axis=0)
@@ -130,6 +132,8 @@ def _step_shares(grey: _Greys) -> Float32[np.ndarray, "columns"]:
 def _peaks(shares: Float32[np.ndarray, "columns"]) -> list[int]:
     """Return the columns that may be seams, those with the longest step first."""
     w = len(shares) + _REACH
+    if w < _LEAST_PX:
+        return []
     columns = np.arange(len(shares))
     inside = (columns >= _MARGIN * w) & (columns <= (1 - _MARGIN) * w)
     found = list[int]()
