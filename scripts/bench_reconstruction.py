@@ -25,7 +25,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -48,6 +47,7 @@ from drawn_clips.score import found_of, rejected, score_clip, shown_at
 from drawn_clips.score_types import STAGES, FoundClip, TrueClip, TrueThing
 from drawn_clips.truth import Truth, load_truth, write
 from policies.evaluation.rate import wilson
+from studies.results import commit
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import apply, transform_from_pose
@@ -62,7 +62,6 @@ from v2p_data.video.captions import find_videos
 from v2p_data.video.clip import Clip
 from v2p_data.video.decode import read_clip
 
-ROOT = Path(__file__).parents[1]
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 FINAL_RUNS = "final_runs.jsonl"
 _IMPORTED_ONCE = (
@@ -429,20 +428,6 @@ def _note_final_run(args: argparse.Namespace) -> list[dict[str, Any]]:
         flush=True,
     )
     return runs
-
-
-def commit() -> str:
-    """Return the commit, with a plus where the working tree differs from it."""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", *words], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        return done.stdout.strip()
-
-    return (git("rev-parse", "--short=12", "HEAD") or "unknown") + (
-        "+" if git("status", "--porcelain", "--", "v2p_data", "scripts") else ""
-    )
 
 
 def each(jobs: int, function: Any, tasks: list[tuple[Any, ...]], done: str) -> Iterator[Any]:

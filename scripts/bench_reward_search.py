@@ -144,7 +144,7 @@ def _to_the_end(candidate: Candidate, mark: int) -> Job:
 
 def _rate(worlds: BatchEnv, candidate: Candidate) -> Rate:
     worlds.seed(0)
-    at_end, _ = play(worlds, Expert.load(candidate.policy_folder()).act)
+    at_end = play(worlds, Expert.load(candidate.policy_folder()).act).at_end
     return wilson(int(at_end.sum()), len(at_end))
 
 

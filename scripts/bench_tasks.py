@@ -1,31 +1,35 @@
-"""Learn the benchmark tasks and judge the experts: the table of `docs/experts.md`.
+"""Learn the benchmark tasks and judge the experts: the tables of `docs/experts.md`.
 
-Each task of `v2p_data/task/paper_tasks` is learned with the engine's defaults, once per seed, and judged by the
-independent referee on fresh episodes at the fine time step. Results are appended to a JSON-lines file, so that a
-stopped run goes on where it was; `--table` prints what is there.
+Each task of `v2p_data/task/paper_tasks` is learned with the engine's defaults, once per seed. The scripted program, the
+taught policy, PPO's and the expert play the same fresh episodes at the fine time step; the independent referee judges
+them. Results are appended to a JSON-lines file, so that a stopped run goes on where it was; `--table` prints what is there.
 
     python scripts/bench_tasks.py --out outputs/bench_tasks --tasks lift_up insert --seeds 0 1 2
 """
 
 import argparse
-import json
 import logging
 import os
 import time
 from collections import defaultdict
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
-from studies.results import append_result, results_in
+from studies.results import append_result, commit, results_in
 from v2p_data.episodes.collect import judge_expert
+from v2p_data.episodes.rollouts import Act, InWorlds, Rollouts
 from v2p_data.experts.config import ExpertConfig
-from v2p_data.experts.learning import Worlds, learn
+from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, learn
+from v2p_data.experts.teacher import Teacher
 from v2p_data.report.sheet import write_contact_sheet
 from v2p_data.seeds import seed_for
+from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 
 
@@ -36,8 +40,8 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="*", default=benchmark_names())
     parser.add_argument("--seeds", nargs="*", type=int, default=[0, 1, 2])
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--total-steps", type=int, default=600_000, help="of PPO")
-    parser.add_argument("--max-seconds", type=float, default=300.0, help="of PPO")
+    parser.add_argument("--total-steps", type=int, default=400_000, help="of PPO")
+    parser.add_argument("--max-seconds", type=float, default=36_000.0, help="of PPO")
     parser.add_argument("--teacher", choices=["programs", "none"], default="programs")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print the results so far and stop")
@@ -66,20 +70,27 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
     )
     learned = learn(worlds, cfg, folder)
     wall, cpu = time.monotonic() - started, time.process_time() - cpu
-    judged = judge_expert(
-        bundle,
-        Expert.load(folder).act,
-        episodes=args.episodes,
-        seed=seed_for(seed, "benchmark-judge", task),
-        num_threads=args.threads,
-    )
-    write_contact_sheet(bundle, judged, folder / "sheet.png")
+    actors: dict[str, Act | InWorlds] = {"expert": Expert.load(folder).act}
+    if learned.teacher:
+        actors["taught"] = Expert.load(folder / TAUGHT_FOLDER).act
+        actors["program"] = InWorlds(partial(_program, learned.teacher))
+    judged = {
+        who: judge_expert(
+            bundle,
+            act,
+            episodes=args.episodes,
+            seed=seed_for(seed, "benchmark-judge", task),
+            num_threads=args.threads,
+        )
+        for who, act in actors.items()
+    }
+    write_contact_sheet(bundle, judged["expert"], folder / "sheet.png")
     result = {
         "task": task,
         "seed": seed,
         "teacher": args.teacher,
-        "successes": int(judged.successes.sum()),
-        "task_successes": int(judged.task_successes.sum()),
+        "commit": commit(),
+        "judged": {who: _judged(rollouts) for who, rollouts in judged.items()},
         "episodes": args.episodes,
         "wall_seconds": round(wall, 1),
         "cpu_seconds": round(cpu, 1),
@@ -87,7 +98,22 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
         "learned": learned.as_dict(),
     }
     append_result(args.out, result)
-    print(json.dumps({k: v for k, v in result.items() if k != "learned"}), flush=True)
+    rates = {who: f"{r.successes.mean():.2f}" for who, r in judged.items()}
+    print(task, seed, rates, learned.made_by, f"{cpu:.0f} CPU s", flush=True)
+
+
+def _program(name: str, env: BatchEnv) -> Act:
+    teacher = Teacher(env)
+    teacher.name = name
+    return lambda obs: teacher.act()
+
+
+def _judged(rollouts: Rollouts) -> dict[str, Any]:
+    """Return the referee's verdicts, a letter per episode, and the control steps until the task's success was held."""
+    return {
+        "success": "".join("1" if s else "0" for s in rollouts.successes),
+        "steps": (rollouts.held_at + 1).tolist(),
+    }
 
 
 def _key(result: dict) -> tuple[str, int, str]:

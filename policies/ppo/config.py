@@ -67,7 +67,11 @@ class PPOConfig:
     max_seconds: float = 600.0
     """Wall-clock safety net, added up over resumptions; a run it stops depends on the machine."""
     target_success: float = 0.95
-    """Training stops once the deterministic worlds reach this."""
+    """From nothing, training goes on to this success of the deterministic worlds before a plateau may end it."""
+    plateau_steps: int = 100_000
+    """Training stops once so many control steps brought no better success or time to success."""
+    plateau_gain: float = 0.005
+    """What counts as better: so much more success, or a time to success that is shorter by ten times this share of an episode."""
     window_episodes: int = 128
     """The success rates are taken over this many last episodes (two rounds of the deterministic worlds)."""
     min_window_episodes: int = 64
@@ -99,7 +103,7 @@ class PPOConfig:
     """Exploration of a policy that starts from another expert's weights."""
     warm_start_learning_rate: float = 2e-4
     """At the start of such a training."""
-    warm_start_critic_batches: int = 6
+    warm_start_critic_batches: int = 2
     """So many batches teach only the value after a warm start: a value that knows nothing spoils a good policy."""
     checkpoint_seconds: float = 10.0
     """A kill loses at most about this much work."""
@@ -114,6 +118,11 @@ class PPOConfig:
             raise ValueError(
                 "need 0 < min_window_episodes <= window_episodes, "
                 f"got {self.min_window_episodes} and {self.window_episodes}"
+            )
+        if self.plateau_steps < 1 or self.plateau_gain < 0:
+            raise ValueError(
+                "need plateau_steps >= 1 and plateau_gain >= 0, "
+                f"got {self.plateau_steps} and {self.plateau_gain}"
             )
         if not self.min_learning_rate <= self.learning_rate <= self.max_learning_rate:
             raise ValueError(

@@ -41,7 +41,7 @@ from policies.ppo.curve import (
     cut_after,
     plot_curve,
 )
-from policies.ppo.evaluate import evaluate, outcome
+from policies.ppo.evaluate import evaluate, outcome, score
 from policies.ppo.policy import ActorCritic, Expert, load_weights, weights_of
 from policies.threads import torch_threads
 
@@ -54,6 +54,9 @@ FINITE_KEYS = (("next", "observation"), ("next", "reward"), "observation", "acti
 COMPONENTS_KEY = ("next", "components")
 
 
+StoppedBy = Literal["plateau", "steps", "seconds", "decline"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ExpertResult:
     """What training ended with."""
@@ -62,9 +65,13 @@ class ExpertResult:
     """The best expert."""
     success: float
     """Deterministic success of the best window in training: chosen as the best of many, hence a little flattering."""
+    actor_updates: int
+    """Gradient steps that the best expert's actor took; 0 for an actor that is still as it was at the start."""
+    last_actor_updates: int
+    """The same of the expert in `last/`."""
     steps: int
     seconds: float
-    stopped_by: Literal["target", "steps", "seconds", "decline"]
+    stopped_by: StoppedBy
     evaluation: Rate | None = None
     """Fresh episodes of the best expert in `eval_env`."""
 
@@ -87,10 +94,22 @@ class _Progress:
     """Discounted reward so far, per world."""
     episode_return: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
     """Plain sum of rewards so far, per world."""
+    age: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
+    """Steps of the episode so far, per world."""
+    waited: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
+    """Steps of the episode before success was first held, per world."""
     deterministic: list[float] = field(default_factory=list[float])
+    scores: list[float] = field(default_factory=list[float])
+    """Of the same episodes, see `policies.ppo.evaluate.score`."""
     exploring: list[float] = field(default_factory=list[float])
     returns: list[float] = field(default_factory=list[float])
+    actor_updates: int = 0
     best_success: float = -1.0
+    best_score: float = -1.0
+    best_actor_updates: int = 0
+    plateau_score: float = -1.0
+    """The score that must be beaten by `plateau_gain`, and when it was reached."""
+    plateau_since: int = 0
 
     def success(self, cfg: PPOConfig, *, deterministic: bool = True) -> float:
         """Return the rate over the window, or NaN while there are too few episodes."""
@@ -143,6 +162,10 @@ def train_expert(
     return ExpertResult(
         folder=out,
         success=max(progress.best_success, 0.0),
+        actor_updates=(
+            progress.best_actor_updates if progress.best_success >= 0 else progress.actor_updates
+        ),
+        last_actor_updates=progress.actor_updates,
         steps=progress.steps,
         seconds=progress.seconds,
         stopped_by=stopped_by,
@@ -175,7 +198,10 @@ class _Learner:
             learning_rate=cfg.learning_rate,
             discounted=torch.zeros(self.num_envs, device=device),
             episode_return=torch.zeros(self.num_envs, device=device),
+            age=torch.zeros(self.num_envs, device=device),
+            waited=torch.zeros(self.num_envs, device=device),
         )
+        self.is_warm = warm_start is not None
         self.critic_batches = 0
         if warm_start is not None:
             _start_from(self.model, Expert.load(warm_start), cfg)
@@ -198,9 +224,7 @@ class _Learner:
         self.best_weights = weights_of(self.model)
         self._resume()
 
-    def run(
-        self, on_progress: Callable[[int, int, float], None] | None
-    ) -> Literal["target", "steps", "seconds", "decline"]:
+    def run(self, on_progress: Callable[[int, int, float], None] | None) -> StoppedBy:
         """Go on until something stops it, and leave everything on disk."""
         cfg, progress = self.cfg, self.progress
         before, started = progress.seconds, time.monotonic()
@@ -227,14 +251,15 @@ class _Learner:
             plot_curve(self.out / CURVE_FILE, self.out / PICTURE_FILE)
         return reason
 
-    def _reason_to_stop(self) -> Literal["target", "steps", "seconds", "decline"] | None:
+    def _reason_to_stop(self) -> StoppedBy | None:
         cfg, progress = self.cfg, self.progress
-        if progress.best_success >= cfg.target_success:
-            return "target"
         if progress.steps >= cfg.total_steps:
             return "steps"
-        if self.critic_batches and progress.success(cfg) < progress.best_success - cfg.decline:
+        if self.is_warm and progress.success(cfg) < progress.best_success - cfg.decline:
             return "decline"
+        may_end = self.is_warm or progress.best_success >= cfg.target_success
+        if may_end and progress.steps - progress.plateau_since >= cfg.plateau_steps:
+            return "plateau"
         if progress.seconds >= cfg.max_seconds:
             return "seconds"
         return None
@@ -245,18 +270,14 @@ class _Learner:
         self._check_finite(batch)
         self._follow_episodes(batch)
         success = progress.success(cfg)
-        if success >= max(progress.best_success, 0.0):
-            progress.best_success = success
-            self.best_weights = weights_of(self.model)
+        self._compare_with_best(success)
         learning = batch[cfg.num_deterministic :]
         kl = 0.0
         # An untouched normaliser: the first batch only shows what observations look like.
         is_first = float(self.model.normaliser.count) == 0
         if not is_first:
             kl = self._update(learning)
-        if (
-            self.critic_batches == 0
-        ):  # a policy that can do something already keeps the eyes it has
+        if not self.is_warm:  # a policy that can do something already keeps the eyes it has
             self.model.normaliser.update(batch["observation"].flatten(0, 1))
         progress.iteration += 1
         progress.steps += batch.numel()
@@ -280,6 +301,20 @@ class _Learner:
             **{f"reward_{name}": mean for name, mean in sorted(means.items())},
         }
 
+    def _compare_with_best(self, success: float) -> None:
+        """Keep the weights whose deterministic episodes are the best so far, and note when they got clearly better."""
+        progress = self.progress
+        if math.isnan(success):
+            return
+        progress.best_success = max(progress.best_success, success)
+        now = float(np.mean(progress.scores))
+        if now >= max(progress.best_score, 0.0):
+            progress.best_score = now
+            progress.best_actor_updates = progress.actor_updates
+            self.best_weights = weights_of(self.model)
+        if now >= progress.plateau_score + self.cfg.plateau_gain:
+            progress.plateau_score, progress.plateau_since = now, progress.steps
+
     def _follow_episodes(self, batch: TensorDictBase) -> None:
         """Take note of finished episodes and of the scale of the returns."""
         cfg, progress = self.cfg, self.progress
@@ -289,6 +324,9 @@ class _Learner:
         for t in range(cfg.batch_time):
             progress.discounted = cfg.gamma * progress.discounted + reward[:, t]
             progress.episode_return = progress.episode_return + reward[:, t]
+            progress.age = progress.age + 1
+            is_first = (progress.waited == 0) & success[:, t]
+            progress.waited = torch.where(is_first, progress.age, progress.waited)
             squares = squares + progress.discounted.square().mean() / cfg.batch_time
             ended = done[:, t].nonzero()[:, 0]
             for world in ended.tolist():
@@ -296,10 +334,18 @@ class _Learner:
                     progress.deterministic if world < cfg.num_deterministic else progress.exploring
                 )
                 outcomes.append(float(success[world, t]))
+                if world < cfg.num_deterministic:
+                    waited = float(progress.waited[world] / progress.age[world])
+                    progress.scores.append(score(outcomes[-1], waited))
                 progress.returns.append(float(progress.episode_return[world]))
-            progress.discounted[ended] = 0.0
-            progress.episode_return[ended] = 0.0
-        for outcomes in (progress.deterministic, progress.exploring, progress.returns):
+            for name in ("discounted", "episode_return", "age", "waited"):
+                getattr(progress, name)[ended] = 0.0
+        for outcomes in (
+            progress.deterministic,
+            progress.scores,
+            progress.exploring,
+            progress.returns,
+        ):
             del outcomes[: -cfg.window_episodes]
         keep = 0.95 if progress.iteration else 0.0
         progress.mean_square_return = keep * progress.mean_square_return + (1 - keep) * float(
@@ -354,6 +400,8 @@ class _Learner:
         # Apart, so that a large value error does not silence the actor.
         if self.progress.iteration < self.critic_batches:
             self.model.actor.zero_grad(set_to_none=True)
+        else:
+            self.progress.actor_updates += 1
         norms = [
             nn.utils.clip_grad_norm_(part.parameters(), self.cfg.max_grad_norm)
             for part in (self.model.actor, self.model.critic)
@@ -435,8 +483,8 @@ class _Learner:
             self.env.load_state_dict(saved["env"])
             self.collector._carrier.update(TensorDict(saved["carrier"], self.env.batch_size))
         else:
-            self.progress.discounted.zero_()
-            self.progress.episode_return.zero_()
+            for name in ("discounted", "episode_return", "age", "waited"):
+                getattr(self.progress, name).zero_()
             log.info(
                 "the environment keeps no state: its worlds start new episodes at this resumption"
             )
@@ -517,6 +565,8 @@ def _recipe(cfg: PPOConfig, seed: int) -> dict[str, Any]:
         "total_steps",
         "max_seconds",
         "target_success",
+        "plateau_steps",
+        "plateau_gain",
         "checkpoint_seconds",
         "num_threads",
         "eval_episodes",

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from jaxtyping import Bool
 from v2p_data.errors import V2PError
 
 RESULTS = "results.jsonl"
+ROOT = Path(__file__).parents[2]
 Row = dict[str, Any]
 
 logger = logging.getLogger(__name__)
@@ -53,3 +55,17 @@ def append_result(out: Path, row: Row) -> None:
 def letters_of(successes: Bool[np.ndarray, "episode"]) -> str:
     """Return the episodes in order, one letter each: `1` for a success."""
     return "".join("1" if success else "0" for success in successes)
+
+
+def commit() -> str:
+    """Return the commit, with a plus where the working tree differs from it."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(
+            ["git", *words], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        return done.stdout.strip()
+
+    return (git("rev-parse", "--short=12", "HEAD") or "unknown") + (
+        "+" if git("status", "--porcelain", "--", "v2p_data", "policies", "scripts") else ""
+    )

@@ -37,10 +37,10 @@ def test_a_success_that_is_lost_again_counts():
     )
     expert = toy_run.expert()
 
-    at_end, ever = play(env, expert.act)
+    played = play(env, expert.act)
 
-    assert ever.all()
-    assert not at_end.any()
+    assert played.once.all()
+    assert not played.at_end.any()
     assert success_of(env, expert) == pytest.approx(1.0)
 
 

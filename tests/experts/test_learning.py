@@ -6,16 +6,20 @@ from pathlib import Path
 import pytest
 import torch
 
-from policies.ppo.config import ImitationConfig, PPOConfig
-from policies.ppo.policy import Expert, weights_of
+from policies.ppo.config import ActorConfig, ImitationConfig, PPOConfig
+from policies.ppo.policy import ActorCritic, Expert, weights_of
+from policies.ppo.train import ExpertResult
+from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
-from v2p_data.experts.learning import TAUGHT_FOLDER, Learned, Worlds, learn, success_of
+from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, keep_better, learn, success_of
+from v2p_data.experts.record import Learned
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 
 TINY = ExpertConfig(
     trial_worlds=8,
+    compare_worlds=16,
     num_envs=48,
     imitation=ImitationConfig(rounds=2, least_rounds=2, round_steps=30, epochs=2, minibatch=256),
     ppo=PPOConfig(
@@ -44,6 +48,10 @@ def weights_in(folder: Path) -> dict[str, torch.Tensor]:
     return weights_of(Expert.load(folder).model)
 
 
+def actor_in(folder: Path) -> dict[str, torch.Tensor]:
+    return {k: v for k, v in weights_in(folder).items() if k.startswith("actor.net")}
+
+
 def are_equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
@@ -66,14 +74,66 @@ def test_every_step_of_every_world_is_counted(learned: tuple[Learned, Path]):
     assert result.stopped_by == "steps"
 
 
-def test_the_better_one_of_pupil_and_ppo_is_kept(learned: tuple[Learned, Path]):
+def test_the_better_one_of_pupil_and_ppo_is_kept_and_called_by_its_maker(
+    learned: tuple[Learned, Path],
+):
     result, out = learned
 
-    assert result.taught_success is not None
-    assert result.ppo_success is not None
-    is_taught_better = result.taught_success > result.ppo_success
-    assert result.kept == ("taught" if is_taught_better else "ppo")
-    assert are_equal(weights_in(out), weights_in(out / TAUGHT_FOLDER)) or result.kept == "ppo"
+    assert result.comparison is not None
+    is_ppo_better = result.comparison.ppo.score > result.comparison.taught.score
+    assert result.kept == ("ppo" if is_ppo_better else "taught")
+    assert are_equal(actor_in(out), actor_in(out / TAUGHT_FOLDER)) == (not is_ppo_better)
+    assert (result.actor_updates > 0) == is_ppo_better
+    assert ("PPO" in result.made_by) == is_ppo_better
+
+
+def test_without_a_gradient_step_of_the_actor_the_expert_is_the_taught_one(
+    bundle: TaskBundle, tmp_path: Path
+):
+    only_the_value = replace(TINY.ppo, warm_start_critic_batches=9)
+
+    result = learn(Worlds(bundle=bundle, seed=3), replace(TINY, ppo=only_the_value), tmp_path)
+
+    assert (result.kept, result.actor_updates, result.comparison) == ("taught", 0, None)
+    assert result.made_by == "taught: imitation of the program 'lift'"
+    assert are_equal(actor_in(tmp_path), actor_in(tmp_path / TAUGHT_FOLDER))
+
+
+def test_a_budget_that_ends_before_the_first_gradient_step_makes_no_expert(
+    bundle: TaskBundle, tmp_path: Path
+):
+    nothing = replace(TINY, teacher="none", ppo=replace(TINY.ppo, total_steps=0))
+
+    with pytest.raises(ItemRejectedError, match=r"before the best policy of 'lift_up' had"):
+        learn(Worlds(bundle=bundle, seed=3), nothing, tmp_path)
+
+
+def test_a_policy_that_meets_itself_on_the_same_episodes_is_exactly_as_good(
+    bundle: TaskBundle, tmp_path: Path
+):
+    cfg = replace(TINY, compare_worlds=16)
+    worlds = Worlds(bundle=bundle, seed=3)
+    for name in ("taught", "ppo", "ppo/last"):
+        model = ActorCritic(
+            worlds.make(1, "shape").obs_dim, 7, ActorConfig(), torch.Generator().manual_seed(1)
+        )
+        Expert(model).save(tmp_path / name)
+
+    improved = ExpertResult(
+        folder=tmp_path / "ppo",
+        success=1.0,
+        actor_updates=7,
+        last_actor_updates=9,
+        steps=1,
+        seconds=1.0,
+        stopped_by="steps",
+    )
+
+    compared, updates = keep_better(worlds, cfg, tmp_path / "taught", tmp_path / "ppo", improved)
+
+    assert updates == 0
+    assert compared.taught == compared.ppo
+    assert (compared.success_gain.value, compared.moved) == (0.0, 0.0)
 
 
 @pytest.mark.slow
@@ -101,7 +161,8 @@ def test_without_a_teacher_ppo_learns_from_nothing(bundle: TaskBundle, tmp_path:
     )
 
     assert (result.teacher, result.trials, result.kept) == ("", (), "ppo")
-    assert result.taught_success is None
+    assert result.comparison is None
+    assert result.made_by == f"{result.actor_updates} gradient steps of PPO"
     assert result.steps == 2 * 16 * 48
     assert not (tmp_path / TAUGHT_FOLDER).exists()
     assert told == [0.5, 1.0]

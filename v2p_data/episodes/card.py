@@ -227,8 +227,8 @@ def _results(about: dict[str, Any], episodes: list[dict[str, Any]]) -> str:
     """Return per task how often its expert succeeded, and what became of the episodes."""
     items: dict[str, Any] = about.get("provenance", {}).get("items", {})
     lines = [
-        "| made from | expert succeeds | episodes tried | succeeded | left out, by reason |",
-        "|---|---|---|---|---|",
+        "| made from | expert made by | expert succeeds | episodes tried | succeeded | left out, by reason |",
+        "|---|---|---|---|---|---|",
     ]
     known = len(lines)
     for key in dict.fromkeys(e.get("history", e["item"]) for e in episodes):
@@ -242,12 +242,15 @@ def _results(about: dict[str, Any], episodes: list[dict[str, Any]]) -> str:
         )
         if not counts and not expert:
             continue
+        made_by = _cell((expert.get("learning") or {}).get("made_by") or "not recorded")
         rejected = ", ".join(
             f"{n} {reason}" for reason, n in (counts.get("rejected") or {}).items()
         )
         tried, share = counts.get("rollouts", "-"), counts.get("success")
         won = f"{share:.1%}" if isinstance(share, float | int) else "-"
-        lines.append(f"| {_cell(key)} | {shown} | {tried} | {won} | {_cell(rejected) or 'none'} |")
+        lines.append(
+            f"| {_cell(key)} | {made_by} | {shown} | {tried} | {won} | {_cell(rejected) or 'none'} |"
+        )
     if len(lines) == known:
         return "No rates were recorded with this dataset."
     lines.append("")
@@ -262,7 +265,7 @@ def _making(about: dict[str, Any]) -> str:
     provenance = about["provenance"]
     packages = ", ".join(f"{k} {v}" for k, v in sorted(provenance.get("packages", {}).items()))
     lines = [
-        "`v2p generate VIDEOS`: video, scene, task code, expert (PPO), episodes, dataset. Recipes, seeds and "
+        "`v2p generate VIDEOS`: video, scene, task code, expert, episodes, dataset. Recipes, seeds and "
         "counts of every stage are in `meta/v2p.json`.",
     ]
     for edit in provenance.get("edits", []):

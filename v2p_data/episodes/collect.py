@@ -187,7 +187,7 @@ def _collect(
 
 def judge_expert(
     bundle: TaskBundle,
-    act: Act,
+    act: Act | InWorlds,
     *,
     episodes: int,
     seed: int,

@@ -31,6 +31,8 @@ class ExpertConfig:
     backend: Backend = "cpu"
     """Where PPO's worlds are simulated: `warp` is for the GPU of `--device` and 8192 worlds; all else stays on
     the CPU."""
+    compare_worlds: int = 256
+    """Episodes at the fine time step that the taught policy and PPO's both play; the better one becomes the expert."""
     eval_episodes: int = 64
     """Episodes at the fine time step that judge the finished expert, on seeds of their own."""
     min_success: float = 0.3

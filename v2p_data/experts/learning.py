@@ -4,27 +4,30 @@
 
 * `teach`: scripted programs are tried; the one that the task's own success function likes best is imitated (DAgger);
 * `record_resets`: moments of the program's episodes, from which PPO may start;
-* `improve_by_ppo`: PPO goes on from the taught policy, from another task's expert, or from nothing;
-* `keep_better`: of the taught policy and PPO's the better one is kept, by episodes at the fine time step.
+* `improve_by_ppo`: PPO goes on from the taught policy, from another task's expert, or from nothing. After a taught
+  policy it trains at the fine time step, at which episodes are recorded;
+* `keep_better`: the taught policy and PPO's play the same episodes at the fine time step, and the better one is kept.
 
-The result is a neural network in any case; scripts never make a dataset.
+The result is a neural network in any case; scripts never make a dataset. It is called PPO's only if PPO changed it.
 """
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
+from policies.evaluation.paired import median_difference, success_difference
 from policies.ppo.imitate import imitate
 from policies.ppo.policy import Expert
-from policies.ppo.train import train_expert
+from policies.ppo.train import LAST_FOLDER, ExpertResult, train_expert
+from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.bank import Bank, record_bank, use_bank
 from v2p_data.experts.config import ExpertConfig
+from v2p_data.experts.record import Comparison, Judged, Learned
 from v2p_data.experts.solved import Solved, rank_solved
-from v2p_data.experts.teacher import Teacher, Trial, play
+from v2p_data.experts.teacher import Played, Teacher, Trial, play
 from v2p_data.seeds import seed_for
 from v2p_data.sim.backends import make_batch_env
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
@@ -83,47 +86,6 @@ class Taught:
     """Of imitation."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Improved:
-    """What came of PPO; the policy is in the folder that it was given."""
-
-    steps: int
-    seconds: float
-    stopped_by: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Kept:
-    """Which policy is kept, and how both did: shares of worlds in which success held at some time."""
-
-    kept: Literal["taught", "ppo"]
-    taught_success: float | None = None
-    ppo_success: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Learned:
-    """The sum of all steps; the expert itself is in the folder."""
-
-    steps: int
-    """Control steps in all, trials of programs included."""
-    seconds: float
-    kept: Literal["taught", "ppo"]
-    teacher: str
-    """The program's name, or nothing."""
-    trials: tuple[Trial, ...]
-    taught_success: float | None
-    """At the fine step, on worlds that decide which policy is kept; so is `ppo_success`."""
-    ppo_success: float | None
-    stopped_by: str
-    started_from: str = ""
-    """Folder of another task's expert, if PPO started from one."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
-        return asdict(self)
-
-
 def learn(
     worlds: Worlds,
     cfg: ExpertConfig,
@@ -157,7 +119,7 @@ def learn(
             steps += cfg.trial_worlds * worlds.bundle.horizon_steps
         del trial_env
     pupil = taught.folder if taught else None
-    env = _training_worlds(worlds, cfg, bank, device)
+    env = _training_worlds(worlds, cfg, bank, device, fine=pupil is not None and bank is None)
     ranked = rank_solved(worlds.bundle, env.worlds.obs_dim, solved) if pupil is None else []
     other = ranked[0].folder if ranked else None
     if other is not None:
@@ -171,15 +133,19 @@ def learn(
         start=pupil or other,
         on_progress=lambda share, words: on_progress(begun + (1 - begun) * share, words),
     )
-    better = keep_better(worlds, cfg, pupil, out)
+    del env
+    comparison, updates = None, improved.actor_updates
+    if improved.last_actor_updates == 0:
+        _say_unchanged(worlds.bundle.title, improved, pupil)
+    elif pupil is not None:
+        comparison, updates = keep_better(worlds, cfg, pupil, out, improved)
     return Learned(
         steps=steps + improved.steps,
         seconds=seconds + improved.seconds,
-        kept=better.kept,
+        actor_updates=updates,
         teacher=taught.program if taught and pupil else "",
         trials=taught.trials if taught else (),
-        taught_success=better.taught_success,
-        ppo_success=better.ppo_success,
+        comparison=comparison,
         stopped_by=improved.stopped_by,
         started_from=other.name if other is not None else "",
     )
@@ -251,9 +217,9 @@ def improve_by_ppo(
     seed: int,
     start: Path | None,
     on_progress: Progress = lambda share, words: None,
-) -> Improved:
+) -> ExpertResult:
     """Train by PPO in some worlds, from the policy in the folder `start` where there is one; write into `out`."""
-    result = train_expert(
+    return train_expert(
         env,
         cfg.ppo,
         out,
@@ -263,31 +229,76 @@ def improve_by_ppo(
             min(done / total, 1), "PPO" if np.isnan(success) else f"PPO, success {success:.0%}"
         ),
     )
-    return Improved(steps=result.steps, seconds=result.seconds, stopped_by=result.stopped_by)
 
 
-def keep_better(worlds: Worlds, cfg: ExpertConfig, taught: Path | None, out: Path) -> Kept:
-    """Leave the better of the taught policy and of PPO's in `out`, by episodes at the fine time step."""
-    if taught is None:
-        return Kept(kept="ppo")
-    judge_env = worlds.make(2 * cfg.trial_worlds, "which is better", fine=True)
-    of_taught = success_of(judge_env, Expert.load(taught))
-    of_ppo = success_of(judge_env, Expert.load(out))
-    is_taught_better = of_taught > of_ppo
-    if is_taught_better:
-        Expert.load(taught).save(out)
-    return Kept(
-        kept="taught" if is_taught_better else "ppo", taught_success=of_taught, ppo_success=of_ppo
+def keep_better(
+    worlds: Worlds, cfg: ExpertConfig, taught: Path, out: Path, improved: ExpertResult
+) -> tuple[Comparison, int]:
+    """Leave the better one of the taught policy and PPO's in `out`; also return how many gradient steps it took.
+
+    Both of PPO's policies, the best in training and the last one, and the taught one play the same episodes at the fine
+    time step. Of PPO's two the one with the higher score is compared with the taught one.
+    """
+    env = worlds.make(cfg.compare_worlds, "which is better", fine=True)
+    dt_s, seed = env.physics.control_dt_s, worlds.seed_of("episodes that compare")
+    before = Expert.load(taught)
+    seen: list[np.ndarray] = []
+
+    def watched(obs: np.ndarray) -> np.ndarray:
+        seen.append(obs.copy())
+        return before.act(obs)
+
+    def judged(expert: Expert) -> tuple[Judged, Played, Expert]:
+        played = play(env, watched if expert is before else expert.act, seed)
+        return Judged.of(played, dt_s), played, expert
+
+    of_taught = judged(before)
+    best, last = (judged(Expert.load(folder)) for folder in (out, out / LAST_FOLDER))
+    of_ppo = last if last[0].score > best[0].score else best
+    updates = improved.last_actor_updates if of_ppo is last else improved.actor_updates
+    (taught_judged, taught_played, _), (ppo_judged, ppo_played, after) = of_taught, of_ppo
+    both = taught_played.once & ppo_played.once
+    states = np.concatenate(seen)
+    comparison = Comparison(
+        taught=taught_judged,
+        ppo=ppo_judged,
+        success_gain=success_difference(ppo_played.once, taught_played.once),
+        time_saved_s=median_difference(
+            dt_s * taught_played.steps[both], dt_s * ppo_played.steps[both]
+        ),
+        moved=float(np.abs(after.act(states) - before.act(states)).mean()),
     )
+    is_kept = ppo_judged.score > taught_judged.score
+    (after if is_kept else before).save(out)
+    return comparison, updates if is_kept else 0
+
+
+def _say_unchanged(title: str, improved: ExpertResult, pupil: Path | None) -> None:
+    """Warn that PPO changed nothing of a taught policy.
+
+    Raises:
+        ItemRejectedError: `ppo_changed_nothing`: there is no taught policy either.
+    """
+    words = (
+        f"PPO ended ({improved.stopped_by}) after {improved.steps} steps, before the best policy of '{title}' had "
+        "taken a gradient step"
+    )
+    if pupil is None:
+        raise ItemRejectedError(
+            "ppo_changed_nothing",
+            f"{words}; give it more with --expert.ppo.total-steps or --expert.ppo.max-seconds",
+            improved.steps,
+        )
+    logger.warning("%s: the expert is the taught policy", words)
 
 
 def _training_worlds(
-    worlds: Worlds, cfg: ExpertConfig, bank: Bank | None, device: str
+    worlds: Worlds, cfg: ExpertConfig, bank: Bank | None, device: str, *, fine: bool
 ) -> TorchRLEnv:
     """Return the worlds of PPO, some of whose episodes begin from the bank where there is one."""
     env = make_batch_env(
         worlds.bundle,
-        SimConfig(success_bonus=worlds.success_bonus),
+        SimConfig(fine=fine, success_bonus=worlds.success_bonus),
         num_envs=cfg.num_envs,
         seed=seed_for(worlds.seed, "worlds"),
         num_threads=worlds.num_threads,
@@ -302,6 +313,6 @@ def _training_worlds(
 def success_of(env: BatchEnv, expert: Expert) -> float:
     """Play one episode in every world and return the share that the task's success held at some time.
 
-    That is what episodes are recorded for, and what `taught_success` and `ppo_success` mean wherever they are kept.
+    That is what episodes are recorded for, and what success means wherever two policies are compared.
     """
-    return float(play(env, expert.act)[1].mean())
+    return float(play(env, expert.act).once.mean())

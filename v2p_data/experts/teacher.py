@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from v2p_data.experts.primitives import (
     CLOSE,
@@ -33,6 +33,7 @@ from v2p_data.task.probes import first_pose
 logger = logging.getLogger(__name__)
 
 Program = Callable[[Moment], Actions]
+Act = Callable[[Float[np.ndarray, "env obs"]], Float[np.ndarray, "env 7"]]
 
 LIFT, PUSH_AS, CARRY_AS, TIP = "lift", "push as in the video", "carry as in the video", "tip over"
 """Names of the programs that need no second object."""
@@ -102,21 +103,37 @@ class Teacher:
 
     def play(self) -> float:
         """Play one episode in every world and return the share whose success was held at the end."""
-        return float(play(self.env, lambda _: self.act())[0].mean())
+        return float(play(self.env, lambda _: self.act()).at_end.mean())
 
 
-def play(
-    env: BatchEnv, act: Callable[[Float[np.ndarray, "env obs"]], Float[np.ndarray, "env 7"]]
-) -> tuple[Bool[np.ndarray, "env"], Bool[np.ndarray, "env"]]:
-    """Play one episode in every world; return where success was held at the end, and where at any time."""
+@dataclass(frozen=True, kw_only=True)
+class Played:
+    """One episode in every world, judged by the task's own success."""
+
+    at_end: Bool[np.ndarray, "env"]
+    """Success was held at the end."""
+    steps: Int[np.ndarray, "env"]
+    """Control steps until success was first held; one more than the horizon where it never was."""
+    horizon: int
+
+    @property
+    def once(self) -> Bool[np.ndarray, "env"]:
+        """Success was held at some time, which is what episodes are recorded for."""
+        return self.steps <= self.horizon
+
+
+def play(env: BatchEnv, act: Act, seed: int | None = None) -> Played:
+    """Play one episode in every world; policies that are given the same seed play the same episodes."""
+    if seed is not None:
+        env.seed(seed)
     env.reset(np.arange(env.num_envs))
     obs, at_end = env.observe(), np.zeros(env.num_envs, bool)
-    ever = at_end
-    for _ in range(env.horizon):
+    steps = np.full(env.num_envs, env.horizon + 1)
+    for step in range(1, env.horizon + 1):
         result = env.step(act(obs))
         obs, at_end = result.obs, result.held
-        ever = ever | at_end
-    return at_end, ever
+        steps = np.where(at_end, np.minimum(steps, step), steps)
+    return Played(at_end=at_end, steps=steps, horizon=env.horizon)
 
 
 def programs_for(env: BatchEnv) -> dict[str, Program]:

@@ -101,6 +101,8 @@ class ItemView:
     """What picking one of the samples was good for, in a sentence."""
     reward: RewardView | None = None
     rate: Rate | None = None
+    made_by: str = ""
+    """Who made the expert, and what PPO changed, in a sentence or two."""
     charts: list[Markup] = field(default_factory=list[Markup])
     sheet: Medium | None = None
     episodes: list[EpisodeView] = field(default_factory=list[EpisodeView])
@@ -210,6 +212,7 @@ def _add_task(view: ItemView, result: Result) -> None:
 def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
     counts = as_dict(result.counts or json_or_none(result.folder / "evaluation.json"))
     view.rate = rate_of(counts.get("success"))
+    view.made_by = _made_by(as_dict(counts.get("learning")))
     view.charts = training_charts(read_curve(result.folder / "curve.csv"))
     uri = budget.admit(
         picture_uri(result.folder / "sheet.png", cfg.sheet_width_px),
@@ -305,6 +308,26 @@ def _sample_view(sample: Mapping[str, Any], is_picked: bool) -> SampleView:
         runnable=sample.get("runnable") is True,
         score=number(sample.get("score")),
         trouble=str(sample.get("error") or audit.get("vetoed") or " ".join(failed)),
+    )
+
+
+def _made_by(learning: Mapping[str, Any]) -> str:
+    """Return who made the expert and what PPO changed; nothing where the record does not say."""
+    made_by = str(learning.get("made_by") or "")
+    compared = as_dict(learning.get("comparison"))
+    before, after = (as_dict(compared.get(who)) for who in ("taught", "ppo"))
+    rates = [rate_of(judged.get("success")) for judged in (before, after)]
+    times = [number(judged.get("median_s")) for judged in (before, after)]
+    if not made_by or None in rates or None in times:
+        return f"Made by {made_by}." if made_by else ""
+    words = [
+        f"{rate.value:.0%} after {time:.2f} s"
+        for rate, time in zip(rates, times, strict=True)
+        if rate
+    ]
+    return (
+        f"Made by {made_by}. On the same {compared['success_gain']['pairs']} episodes the taught policy succeeded in "
+        f"{words[0]}, PPO's in {words[1]} (median)."
     )
 
 

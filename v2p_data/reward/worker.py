@@ -241,6 +241,7 @@ def ppo_config(num_envs: int, total_steps: int, *, num_threads: int = 1) -> PPOC
         max_seconds=float("inf"),
         target_success=2.0,
         decline=2.0,
+        plateau_steps=total_steps,
         num_deterministic=max(1, num_envs // 8),
         window_episodes=max(64, num_envs // 4),
         min_window_episodes=max(1, num_envs // 8),

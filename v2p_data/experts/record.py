@@ -1,0 +1,86 @@
+"""What an expert's record says of how it was learned: who made it, and what PPO changed."""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from policies.evaluation.paired import Difference
+from policies.evaluation.rate import Rate, wilson
+from policies.ppo.evaluate import score
+from v2p_data.experts.teacher import Played, Trial
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """How one policy did on the episodes that decide which policy is kept."""
+
+    success: Rate
+    """The task's own success was held at some time."""
+    median_s: float | None
+    """Time to success of the successful episodes [s]; None where none is."""
+    score: float
+    """Mean of `policies.ppo.evaluate.score`."""
+
+    @staticmethod
+    def of(played: Played, dt_s: float) -> "Judged":
+        """Return it from episodes with control steps of `dt_s` seconds."""
+        once, steps = played.once, played.steps
+        return Judged(
+            success=wilson(int(once.sum()), len(once)),
+            median_s=dt_s * float(np.median(steps[once])) if once.any() else None,
+            score=float(
+                np.mean([score(s, w) for s, w in zip(once, steps / played.horizon, strict=True)])
+            ),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """The taught policy and PPO's on the same episodes."""
+
+    taught: Judged
+    ppo: Judged
+    success_gain: Difference
+    """PPO's success minus the taught policy's."""
+    time_saved_s: Difference | None
+    """Median over the episodes in which both succeed: the taught policy's time to success minus PPO's."""
+    moved: float
+    """Mean absolute difference of their actions in the states that the taught policy visits; actions lie in [-1, 1]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learned:
+    """The sum of all steps; the expert itself is in the folder."""
+
+    steps: int
+    """Control steps in all, trials of programs included."""
+    seconds: float
+    actor_updates: int
+    """Gradient steps of PPO that the expert's actor took; 0 for one that imitation alone made."""
+    teacher: str
+    """The program's name, or nothing."""
+    trials: tuple[Trial, ...]
+    comparison: Comparison | None
+    """Of the taught policy and PPO's; None where nobody taught or PPO changed nothing."""
+    stopped_by: str
+    started_from: str = ""
+    """Folder of another task's expert, if PPO started from one."""
+
+    @property
+    def kept(self) -> Literal["taught", "ppo"]:
+        """Who made the expert: imitation alone, or PPO."""
+        return "ppo" if self.actor_updates else "taught"
+
+    @property
+    def made_by(self) -> str:
+        """Say who made the expert, in a few words."""
+        taught = f"imitation of the program '{self.teacher}'" if self.teacher else ""
+        if self.kept == "taught":
+            return f"taught: {taught}"
+        ppo = f"{self.actor_updates:,} gradient steps of PPO"
+        return f"{taught}, then {ppo}" if taught else ppo
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return {"kept": self.kept, "made_by": self.made_by, **asdict(self)}
