@@ -11,7 +11,6 @@ import argparse
 import logging
 import os
 import time
-from collections import defaultdict
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from policies.evaluation.paired import median_difference, success_difference
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
 from studies.results import append_result, commit, results_in
@@ -30,7 +30,10 @@ from v2p_data.experts.teacher import Teacher
 from v2p_data.report.sheet import write_contact_sheet
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.robot import FINE
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
+
+CONTROL_DT_S = FINE.control_dt_s
 
 
 def main() -> None:
@@ -120,35 +123,75 @@ def _key(result: dict) -> tuple[str, int, str]:
     return result["task"], result["seed"], result["teacher"]
 
 
-def table(results: list[dict]) -> str:
-    """Return one Markdown row per task: success over all seeds with its interval, cost per seed."""
-    groups: dict[tuple[str, str], list[dict]] = defaultdict(list)
-    for result in results:
-        groups[result["task"], result["teacher"]].append(result)
+def table(results: list[dict[str, Any]]) -> str:
+    """Return one Markdown row per task: how often each actor succeeds over all seeds, what PPO gained, what it took."""
     lines = [
-        "| task | teacher | success (referee, fine step) | per seed | program alone | steps (M) | wall s | CPU s |",
-        "|---|---|---|---|---|---|---|---|",
+        "| task | program | taught | taught + PPO | PPO gains | PPO saves (s) | PPO kept | gradient steps | moved | steps (M) | CPU s "
+        "| reward alone | its steps (M) |",
+        "|" + "---|" * 13,
     ]
-    for (task, teacher), group in sorted(groups.items()):
-        rate = wilson(sum(r["successes"] for r in group), sum(r["episodes"] for r in group))
-        trials = [t["success"] for r in group for t in r["learned"]["trials"]
-                  if t["name"] == r["learned"]["teacher"]]  # fmt: skip
+    tasks = sorted({r["task"] for r in results}, key=benchmark_names().index)
+    for task in tasks:
+        by_teacher = {
+            teacher: [r for r in results if (r["task"], r["teacher"]) == (task, teacher)]
+            for teacher in ("programs", "none")
+        }
         lines.append(
-            f"| {task} | {teacher} | {rate} | "
-            + " ".join(f"{r['successes'] / r['episodes']:.2f}" for r in group)
-            + f" | {np.mean(trials):.2f} | " * bool(trials)
-            + " | - | " * (not trials)
-            + " | ".join(
-                _range([scale * f(r) for r in group], form)
-                for f, scale, form in (
-                    (lambda r: r["learned"]["steps"], 1e-6, ".2f"),
-                    (lambda r: r["wall_seconds"], 1, ".0f"),
-                    (lambda r: r["cpu_seconds"], 1, ".0f"),
-                )
-            )
-            + " |"
+            f"| {task} | {_taught_cells(by_teacher['programs'])} | {_alone_cells(by_teacher['none'])} |"
         )
     return "\n".join(lines)
+
+
+def _taught_cells(group: list[dict[str, Any]]) -> str:
+    """Return the cells from `program` to `CPU s`."""
+    if not group:
+        return " | ".join("-" * 10)
+    learned = [r["learned"] for r in group]
+    expert, taught = (_successes(group, who) for who in ("expert", "taught"))
+    both = expert & taught
+    gain = success_difference(expert, taught)
+    saved = median_difference(
+        CONTROL_DT_S * _steps(group, "taught")[both], CONTROL_DT_S * _steps(group, "expert")[both]
+    )
+    return " | ".join(
+        (
+            *(_rate(group, who) for who in ("program", "taught", "expert")),
+            f"{gain.value:+.3f} ({gain.low:+.3f} to {gain.high:+.3f})",
+            f"{saved.value:+.2f} ({saved.low:+.2f} to {saved.high:+.2f})" if saved else "-",
+            f"{sum(one['kept'] == 'ppo' for one in learned)} of {len(group)}",
+            _range([one["actor_updates"] for one in learned], ",.0f"),
+            _range([(one["comparison"] or {"moved": 0.0})["moved"] for one in learned], ".3f"),
+            _range([1e-6 * one["steps"] for one in learned], ".2f"),
+            _range([r["cpu_seconds"] for r in group], ".0f"),
+        )
+    )
+
+
+def _alone_cells(group: list[dict[str, Any]]) -> str:
+    """Return the cells of PPO from nothing."""
+    if not group:
+        return "- | -"
+    return f"{_rate(group, 'expert')} | {_range([1e-6 * r['learned']['steps'] for r in group], '.2f')}"
+
+
+def _rate(group: list[dict[str, Any]], who: str) -> str:
+    """Return a success rate over all seeds with its interval, and each seed's."""
+    if any(who not in r["judged"] for r in group):
+        return "-"
+    successes = _successes(group, who)
+    rate = wilson(int(successes.sum()), len(successes))
+    seeds = " ".join(
+        f"{r['judged'][who]['success'].count('1') / r['episodes']:.2f}" for r in group
+    )
+    return f"{rate.value:.3f} ({rate.low:.3f}-{rate.high:.3f}; {seeds})"
+
+
+def _successes(group: list[dict[str, Any]], who: str) -> np.ndarray:
+    return np.array([letter == "1" for r in group for letter in r["judged"][who]["success"]])
+
+
+def _steps(group: list[dict[str, Any]], who: str) -> np.ndarray:
+    return np.concatenate([r["judged"][who]["steps"] for r in group])
 
 
 def _range(values: list[float], form: str) -> str:

@@ -304,7 +304,7 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
         config=Seeded(config=replace(cfg.expert, warm_start=None), seed=cfg.seed),
         inputs={"task": task},
         sources=solved_digests(cfg.expert.warm_start) | named,
-        version=2,
+        version=3,
         make=partial(
             make_expert,
             warm_start=cfg.expert.warm_start,
@@ -324,7 +324,7 @@ def make_expert(
     teaches_model: bool,
     success_bonus: float,
 ) -> dict[str, Any]:
-    """Find a teacher, imitate it, go on with PPO, all at the coarse time step; judge at the fine one with the independent referee."""
+    """Find a teacher, imitate it, go on with PPO; judge with the independent referee."""
     from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.experts.learning import Worlds, learn
