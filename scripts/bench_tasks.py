@@ -20,6 +20,8 @@ import numpy as np
 
 from policies.evaluation.paired import median_difference, success_difference
 from policies.evaluation.rate import wilson
+from policies.ppo.config import PPOConfig
+from policies.ppo.curve import CURVE_FILE, read_rows
 from policies.ppo.policy import Expert
 from studies.results import append_result, commit, results_in
 from v2p_data.episodes.collect import judge_expert
@@ -45,6 +47,9 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--total-steps", type=int, default=400_000, help="of PPO")
     parser.add_argument("--max-seconds", type=float, default=36_000.0, help="of PPO")
+    parser.add_argument(
+        "--target-success", type=float, default=PPOConfig().target_success, help="see PPOConfig"
+    )
     parser.add_argument("--teacher", choices=["programs", "none"], default="programs")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print the results so far and stop")
@@ -65,7 +70,12 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
     base = ExpertConfig(teacher=args.teacher)
     cfg = replace(
         base,
-        ppo=replace(base.ppo, total_steps=args.total_steps, max_seconds=args.max_seconds),
+        ppo=replace(
+            base.ppo,
+            total_steps=args.total_steps,
+            max_seconds=args.max_seconds,
+            target_success=args.target_success,
+        ),
     )
     started, cpu = time.monotonic(), time.process_time()
     worlds = Worlds(
@@ -99,6 +109,7 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
         "cpu_seconds": round(cpu, 1),
         "load": round(os.getloadavg()[0], 2),
         "learned": learned.as_dict(),
+        "curve": _curve(folder),
     }
     append_result(args.out, result)
     rates = {who: f"{r.successes.mean():.2f}" for who, r in judged.items()}
@@ -117,6 +128,20 @@ def _judged(rollouts: Rollouts) -> dict[str, Any]:
         "success": "".join("1" if s else "0" for s in rollouts.successes),
         "steps": (rollouts.held_at + 1).tolist(),
     }
+
+
+def _curve(folder: Path, points: int = 12) -> list[list[float | None]]:
+    """Return evenly spread moments of a training: million steps, deterministic and exploring success."""
+    rows = read_rows(folder / CURVE_FILE)
+    at = np.linspace(0, len(rows) - 1, points).astype(int) if rows else []
+    keys = ("success_deterministic", "success_stochastic")
+    return [
+        [
+            rows[k]["steps"] / 1e6,
+            *(None if np.isnan(rows[k][key]) else rows[k][key] for key in keys),
+        ]
+        for k in at
+    ]
 
 
 def _key(result: dict) -> tuple[str, int, str]:

@@ -53,9 +53,7 @@ class Draft:
     contact: str = "near"
     """Float expression: 1 while the gripper has the object."""
     pays_contact: bool = False
-    """Whether contact is worth something by itself: where the object must be grasped."""
-    turn: bool = True
-    """Whether grasping pays for turning the gripper to the manipulated object's narrow side."""
+    """Whether contact is worth something by itself: where something must be grasped, see `grasp_setup`."""
     progress: str = "obj_pos[:, 2] * 0"
     """Float expression, 0 at the start and 1 when done."""
     remaining: str = "obj_pos[:, 2] * 0"

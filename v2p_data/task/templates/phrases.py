@@ -12,22 +12,34 @@ _LEAN_SETUP = [
     "vertical[:, 2] = 1",
     "lean = torch.norm(in_world_frame(eef_quat, vertical)[:, :2], dim=-1)",
 ]
-GRASP_SETUP = [
-    *_LEAN_SETUP,
-    "grasp_point = obj_pos.clone()",
-    "grasp_point[:, 2] = obj_pos[:, 2] + (half_height - 0.035).clamp(min=0.0)",
-    # The pads close along the gripper's own y axis.
-    "closing = torch.zeros_like(eef_pos)",
-    "closing[:, 1] = 1",
-    "closing = in_world_frame(eef_quat, closing)",
-    "pads_apart = 2 * obj_half(obj_quat, obj_size, closing)",
-]
 STILL_UPRIGHT = "(upright(obj_quat, obj_start_quat) > 0.9)"
 # Withholds what pushing earns once the object topples. A penalty instead teaches not to touch tall objects at all:
 # 0 % for a 5 x 8 cm cylinder.
 STANDING = "upright(obj_quat, obj_start_quat).clamp(0.0, 1.0)"
 # A leaning finger pushes at the object's upper edge and rolls it over: 4 cm cubes in one episode out of seven.
 LEVEL = ("level", "-0.4 * lean")
+
+
+def grasp_setup(name: str = "obj") -> list[str]:
+    """Lines for the point at which the gripper holds an object, `obj` or `ref`, and for the side that it spans.
+
+    While the gripper is beside a tall object the point is above that object: whoever comes straight at it presses on
+    its rim and never gets the open fingers over it.
+    """
+    return [
+        *_LEAN_SETUP,
+        f"grasp_point = {name}_pos.clone()",
+        f"tall = {name}_start[:, 2] - table_height",
+        f"beside = torch.norm(({name}_pos - eef_pos)[:, :2], dim=-1)",
+        f"grasp_point[:, 2] = {name}_pos[:, 2] + (tall - 0.035).clamp(min=0.0)"
+        " + torch.minimum(1.5 * (beside - 0.01).clamp(min=0.0), 2 * tall)",
+        # The pads close along the gripper's own y axis.
+        "closing = torch.zeros_like(eef_pos)",
+        "closing[:, 1] = 1",
+        "closing = in_world_frame(eef_quat, closing)",
+        f"pads_apart = 2 * {name}_half({name}_quat, {name}_size, closing)",
+        f"diagonal = torch.norm({name}_size[:, :2], dim=-1)",
+    ]
 
 
 def is_still(v: Variant) -> tuple[str, str]:

@@ -7,7 +7,7 @@ import numpy as np
 from v2p_data.kinds import KINDS, Kind, check_every_kind
 from v2p_data.task.templates import carrying, pushing
 from v2p_data.task.templates.draft import Draft, Measured
-from v2p_data.task.templates.phrases import GRASP_SETUP, is_still, push_point_setup, shifted
+from v2p_data.task.templates.phrases import grasp_setup, is_still, push_point_setup, shifted
 from v2p_data.task.templates.variants import Variant
 
 Recipe = Callable[[Measured, Variant], Draft]
@@ -49,7 +49,7 @@ def _generic(m: Measured, v: Variant) -> Draft:
             "remaining = torch.norm(goal_point - obj_pos, dim=-1)",
         ],
         success=success,
-        reward_setup=GRASP_SETUP if lifts else push_point_setup(clearance_m=0.02),
+        reward_setup=grasp_setup() if lifts else push_point_setup(clearance_m=0.02),
         target="grasp_point" if lifts else "push_point",
         contact="obj_grasped * near" if lifts else "near",
         pays_contact=bool(lifts),

@@ -5,11 +5,18 @@ from v2p_data.task.templates.variants import Variant
 
 _TURN = (
     "turn",
-    "0.15 * reach * (1 - (pads_apart - 0.07) / (torch.norm(obj_size[:, :2], dim=-1) - 0.07).clamp(min=0.03)).clamp(0.0, 1.0)",
+    "0.15 * reach * (1 - (pads_apart - 0.07) / (diagonal - 0.07).clamp(min=0.03)).clamp(0.0, 1.0)",
 )
 """Without it, open fingers get wedged over the diagonal of a wide box, and closing them achieves nothing. It counts near
 the object only: paid everywhere, turning is learned instead of reaching, and after 0.1 million steps the object is in
 the gripper a tenth as often."""
+_CLOSE = (
+    "close",
+    "0.1 * (distance < 0.025).float() * (gripper_width > pads_apart - 0.004).float()"
+    " * (1 - (gripper_width - pads_apart) / 0.085).clamp(0.0, 1.0)",
+)
+"""Closing takes four steps, and only the last one makes contact. It counts where the object is between the pads: fingers
+that have closed above it are narrower than it."""
 
 
 def docstring_lines(v: Variant, d: Draft) -> list[str]:
@@ -64,7 +71,7 @@ def _components(v: Variant, d: Draft) -> list[tuple[str, str]]:
         progress = f"{v.progress} * progress * (0.3 + 0.7 * reach)"
     parts.append(("reach", reach))
     if v.contact and d.pays_contact:
-        parts += [_TURN] if d.turn else []
+        parts += [_TURN, _CLOSE]
         parts.append(("contact", f"{v.contact} * contact"))
     parts.append(("progress", progress))
     if v.speed:
