@@ -34,6 +34,7 @@ from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.sim.robot import FINE
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
+from v2p_data.task.task import TaskBundle
 
 CONTROL_DT_S = FINE.control_dt_s
 
@@ -42,7 +43,12 @@ def main() -> None:
     """Read the command line, learn, judge, print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/bench_tasks"))
-    parser.add_argument("--tasks", nargs="*", default=benchmark_names())
+    parser.add_argument(
+        "--tasks",
+        nargs="*",
+        default=benchmark_names(),
+        help="of the benchmark, or folders of tasks",
+    )
     parser.add_argument("--seeds", nargs="*", type=int, default=[0, 1, 2])
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--total-steps", type=int, default=400_000, help="of PPO")
@@ -59,13 +65,16 @@ def main() -> None:
     if not args.table:
         for seed in args.seeds:
             for task in args.tasks:
-                if (task, seed, args.teacher) not in {_key(r) for r in results_in(args.out)}:
+                if (Path(task).name, seed, args.teacher) not in {
+                    _key(r) for r in results_in(args.out)
+                }:
                     _one(task, seed, args)
     print(table(results_in(args.out)))
 
 
 def _one(task: str, seed: int, args: argparse.Namespace) -> None:
-    bundle = load_benchmark(task)
+    bundle = TaskBundle.load(Path(task)) if Path(task).is_dir() else load_benchmark(task)
+    task = Path(task).name
     folder = args.out / f"{task}-{args.teacher}-{seed}"
     base = ExpertConfig(teacher=args.teacher)
     cfg = replace(
@@ -155,7 +164,11 @@ def table(results: list[dict[str, Any]]) -> str:
         "| reward alone | its steps (M) |",
         "|" + "---|" * 13,
     ]
-    tasks = sorted({r["task"] for r in results}, key=benchmark_names().index)
+    names = benchmark_names()
+    tasks = sorted(
+        {r["task"] for r in results},
+        key=lambda t: (names.index(t) if t in names else len(names), t),
+    )
     for task in tasks:
         by_teacher = {
             teacher: [r for r in results if (r["task"], r["teacher"]) == (task, teacher)]
