@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from paper_tables import success
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
 from studies.results import append_result, results_in
@@ -100,8 +101,8 @@ def table(results: list[dict]) -> str:
     for result in results:
         groups[result["task"], result["teacher"]].append(result)
     lines = [
-        "| task | teacher | success (referee, fine step) | per seed | program alone | steps (M) | wall s | CPU s |",
-        "|---|---|---|---|---|---|---|---|",
+        "| task | teacher | success (referee, fine step) | per seed | program alone | steps (M) | wall s | CPU s | paper |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for (task, teacher), group in sorted(groups.items()):
         rate = wilson(sum(r["successes"] for r in group), sum(r["episodes"] for r in group))
@@ -120,7 +121,7 @@ def table(results: list[dict]) -> str:
                     (lambda r: r["cpu_seconds"], 1, ".0f"),
                 )
             )
-            + " |"
+            + f" | {success(task)} |"
         )
     return "\n".join(lines)
 
