@@ -205,7 +205,7 @@ def _versions(*packages: str) -> dict[str, str]:
 def main() -> int:
     """Run the checks, print a line for each, write the JSON."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--device", default="cuda:0", help="cuda:0, or cpu to try the checks")
+    parser.add_argument("--device", default="cuda", help="cuda, or cpu to try the checks")
     parser.add_argument("--quick", action="store_true", help="small sizes; the figures mean nothing")  # fmt: skip
     parser.add_argument("--checks", nargs="*", choices=[*CHECKS], default=[*CHECKS])
     parser.add_argument("--out", type=Path, default=Path("outputs/check_gpu.json"))
