@@ -43,6 +43,15 @@ LIKE_THE_PAPER = {
     "recipe/delay": list(randomize.recording().delay_s),
 }
 """Settings that say they are the paper's."""
+QUOTES = [
+    ("v2p_data/reward/config.py", "the paper takes {recipe/iterations}, and {recipe/iterations self-collected} for hard"),
+    ("v2p_data/task/task.py", "the paper gives {recipe/horizon} steps"),
+    ("v2p_data/task/schema.py", "the paper's episodes have {recipe/horizon} steps"),
+    ("v2p_data/episodes/collect.py", "the paper's policies learn from {recipe/trajectories}"),
+    ("v2p_data/policy_config.py", "{recipe/epochs} epochs of batch {recipe/batch}"),
+    ("configs/paper.yaml", "{recipe/epochs} epochs of batch {recipe/batch}"),
+]  # fmt: skip
+"""Sentences of code and settings that quote the paper."""
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -68,6 +77,26 @@ def test_a_marked_figure_is_the_paper_s():
 @pytest.mark.parametrize("where", LIKE_THE_PAPER)
 def test_a_setting_that_says_it_is_the_paper_s_is(where: str):
     assert LIKE_THE_PAPER[where] == papers_value(where)
+
+
+@pytest.mark.parametrize(("file", "sentence"), QUOTES)
+def test_a_sentence_in_the_code_quotes_the_paper(file: str, sentence: str):
+    quoted = re.sub(r"{(.+?)}", lambda found: str(papers_value(found[1])), sentence)
+
+    assert quoted in (ROOT / file).read_text()
+
+
+def test_the_average_that_table_1_prints_is_not_that_of_its_rows_as_the_note_says():
+    told = map(float, re.findall(r"0\.\d+", DATA["tables"]["table 1"]["note"]))
+
+    for method, mean in zip(
+        ("Code-as-Policy", "RoboGen", "Eureka", "Video2Policy"), told, strict=True
+    ):
+        rows = [
+            row[method]["mean"] for task, row in TABLES["table 1"].items() if task != "average"
+        ]
+        assert mean == pytest.approx(np.mean(rows), abs=0.0051)
+        assert mean != TABLES["table 1"]["average"][method]
 
 
 def test_table_1_has_a_row_for_each_task_of_the_benchmark():
