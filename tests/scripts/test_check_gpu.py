@@ -42,7 +42,7 @@ def test_without_a_gpu_one_sentence_says_so():
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_checks_run_on_the_cpu_and_one_file_says_what_came_of_each(tmp_path: Path):
-    checks = ["trainers_like_cpu", "bc_speed", "backends"]
+    checks = ["trainers_like_cpu", "bc_speed"]
 
     done = started(
         "--device=cpu", "--quick", f"--out={tmp_path / 'told.json'}", "--checks", *checks
@@ -54,12 +54,11 @@ def test_the_checks_run_on_the_cpu_and_one_file_says_what_came_of_each(tmp_path:
     assert [*found] == checks
     assert all(c["ran"] and c["passed"] and not c["error"] for c in found.values())
     assert found["trainers_like_cpu"]["figures"]["passed"] >= 3
-    assert found["backends"]["figures"]["failed"] == 0
     (row,) = found["bc_speed"]["figures"]["rows"]
     assert row["loop"] > 0
     assert told["quick"]
     assert told["device"] == "cpu"
-    assert told["packages"]["torch"] == torch.__version__
+    assert torch.__version__.startswith(told["packages"]["torch"])
 
 
 def test_a_check_s_figures_are_the_numbers_that_it_prints_by_name():
