@@ -4,25 +4,28 @@ The ratio of the first two says how much the loader costs; it is measured in one
 On a GPU a second loop takes every batch from the computer's memory, although the GPU could hold all frames.
 
     python scripts/bench_bc.py --dataset outputs/demo/dataset/demo-1a2b3c4d --threads 2
-    python scripts/bench_bc.py --dataset outputs/demo/dataset/demo-1a2b3c4d --device cuda
+    python scripts/bench_bc.py --frames 8192 --device cuda     # random frames, no dataset needed
 """
 
 import argparse
 import json
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
 import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
 
 from policies.bc import trainer
 from policies.bc.configuration_v2p_bc import V2PBCConfig
-from policies.bc.frames import moved
+from policies.bc.frames import frames_of, moved
 from policies.bc.student import Student
-from policies.bc.trainer import TrainerConfig, autocast_for, normalised
+from policies.bc.trainer import TrainerConfig, autocast_for, make_policy, normalised
 from v2p_data.pipeline.artifact import read_record
 
 NETWORKS: dict[str, tuple[int, dict[str, Any]]] = {
@@ -35,39 +38,59 @@ GPU_NETWORKS: dict[str, tuple[int, dict[str, Any]]] = {
     "small (moments)": NETWORKS["small (moments)"],
     "ResNet18 at 256 px (paper)": (1024, {"preset": "paper", "pretrained_backbone_weights": None}),
 }  # fmt: skip
-TURNS = 5
-"""Loop and bare network take turns, so that a noisy moment meets both."""
-SECONDS_A_TURN = 4.0
+MASK, STATE, ACTION = "observation.images.mask", "observation.state", "action"
+SIZE_PX, STATE_DIM, ACT_DIM = 256, 11, 7
+"""Of random frames: those of our datasets."""
+NUM_LABELS = 3
+EPISODE = 64
+"""Frames of a random episode."""
 
 
 def main() -> None:
     """Read the command line, measure, print a table and JSON."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--dataset", type=Path, required=True, help="of v2p generate")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--dataset", type=Path, help="of v2p generate")
+    source.add_argument("--frames", type=int, help="so many random ones")
+    parser.add_argument(
+        "--networks", nargs="*", help="some of them, by the first word of their names"
+    )
+    parser.add_argument(
+        "--turns",
+        type=int,
+        default=5,
+        help="loop and bare network take turns, so that a noisy moment meets both",
+    )
+    parser.add_argument("--seconds", type=float, default=4.0, help="a turn")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--cache", type=Path, default=Path("outputs/bench_bc"))
     parser.add_argument("--lerobot", action="store_true", help="LeRobot's loader as well; slow")
     args = parser.parse_args()
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    record = read_record(args.dataset)
-    if record is None:
-        parser.error(f"{args.dataset} is no dataset of v2p generate")
+    if args.lerobot and args.dataset is None:
+        parser.error("--lerobot reads a --dataset")
     networks = NETWORKS if args.device == "cpu" else GPU_NETWORKS
+    if args.networks is not None:
+        networks = {k: v for k, v in networks.items() if k.split()[0] in args.networks}
     rows = []
     for name, (batch_size, network) in networks.items():
-        student = Student.of_dataset(
-            args.dataset,
-            str(record.counts["repo_id"]),
-            V2PBCConfig(device=args.device, num_labels=3, **network),
-            args.cache / name.replace(" ", "_"),
-            seed=0,
-            device=args.device,
-            num_threads=args.threads,
-        )
+        cfg = V2PBCConfig(device=args.device, num_labels=NUM_LABELS, **network)
+        if args.dataset is None:
+            student = _student_of_random_frames(cfg, args)
+        else:
+            student = Student.of_dataset(
+                args.dataset,
+                _repo_id(args.dataset),
+                cfg,
+                args.cache / name.replace(" ", "_"),
+                seed=0,
+                device=args.device,
+                num_threads=args.threads,
+            )
         row = {"network": name, "batch_size": batch_size, **_measured(student, batch_size, args)}
         if args.lerobot:
-            row["lerobot_loader"] = _lerobots_loader(args.dataset, str(record.counts["repo_id"]), batch_size)  # fmt: skip
+            row["lerobot_loader"] = _lerobots_loader(args.dataset, _repo_id(args.dataset), batch_size)  # fmt: skip
         rows.append(row)
         print(json.dumps(row), flush=True)
     print(
@@ -78,6 +101,39 @@ def main() -> None:
         print(
             f"| {row['network']} | {row['loop']:.0f} | {fetched} | {row['bare']:.0f} | {row['ratio']:.2f} |"
         )
+
+
+def _repo_id(dataset: Path) -> str:
+    record = read_record(dataset)
+    if record is None:
+        sys.exit(f"{dataset} is no dataset of v2p generate")
+    return str(record.counts["repo_id"])
+
+
+def _student_of_random_frames(cfg: V2PBCConfig, args: argparse.Namespace) -> Student:
+    """Return a student whose frames are noise in the form of our datasets."""
+    cfg.input_features = {
+        MASK: PolicyFeature(FeatureType.VISUAL, (3, SIZE_PX, SIZE_PX)),
+        STATE: PolicyFeature(FeatureType.STATE, (STATE_DIM,)),
+    }
+    cfg.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, (ACT_DIM,))}
+    one = np.ones(ACT_DIM)
+    stats = {
+        STATE: {"mean": np.zeros(STATE_DIM), "std": np.ones(STATE_DIM)},
+        ACTION: {"min": -one, "max": one, "mean": 0 * one, "std": one},
+    }
+    policy, processors = make_policy(cfg, stats, seed=0, device=args.device)
+    rng, frames = np.random.default_rng(0), args.frames
+    greys = np.array(cfg.mask_greys[:NUM_LABELS], np.uint8)
+    table = frames_of(
+        net=policy.net,
+        pictures={MASK: greys[rng.integers(0, NUM_LABELS, (frames, SIZE_PX, SIZE_PX))]},
+        vectors={STATE: rng.normal(size=(frames, STATE_DIM)).astype(np.float32)},
+        action=rng.uniform(-1, 1, (frames, ACT_DIM)).astype(np.float32),
+        task="lift the box",
+        lengths=[EPISODE] * (frames // EPISODE) + [frames % EPISODE] * (frames % EPISODE > 0),
+    )
+    return Student(policy=policy, processors=processors, table=table, num_threads=args.threads)
 
 
 def _measured(student: Student, batch_size: int, args: argparse.Namespace) -> dict[str, float]:
@@ -106,7 +162,7 @@ def _measured(student: Student, batch_size: int, args: argparse.Namespace) -> di
 
     torch.set_num_threads(args.threads)
     bare()
-    steps = max(3, round(SECONDS_A_TURN / _seconds(bare, device)))
+    steps = max(3, round(args.seconds / _seconds(bare, device)))
     rates: dict[str, list[float]] = {"loop": [], "bare": []}
 
     def loop(name: str) -> None:
@@ -116,7 +172,7 @@ def _measured(student: Student, batch_size: int, args: argparse.Namespace) -> di
         rates.setdefault(name, []).append(trained.samples_per_s)
 
     share = trainer.GPU_SHARE_FOR_FRAMES
-    for _ in range(TURNS):
+    for _ in range(args.turns):
         loop("loop")
         if device.type == "cuda":
             trainer.GPU_SHARE_FOR_FRAMES = 0.0
@@ -135,7 +191,7 @@ def _lerobots_loader(dataset: Path, repo_id: str, batch_size: int) -> float:
     """Return samples per second of LeRobot's dataset in a loader without workers, nothing trained."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    deltas = {"observation.images.mask": [-0.05, 0.0], "observation.state": [-0.05, 0.0]}
+    deltas = {MASK: [-0.05, 0.0], STATE: [-0.05, 0.0]}
     source: Any = LeRobotDataset(repo_id, root=dataset, delta_timestamps=deltas)
     loader = torch.utils.data.DataLoader(source, batch_size=batch_size, shuffle=True)
     batches = iter(loader)

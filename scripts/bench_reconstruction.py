@@ -46,6 +46,7 @@ from drawn_clips.clips import MotionKind, VideoSpec, drawing_code, random_spec, 
 from drawn_clips.score import found_of, rejected, score_clip, shown_at
 from drawn_clips.score_types import STAGES, FoundClip, TrueClip, TrueThing
 from drawn_clips.truth import Truth, load_truth, write
+from paper_tables import failure
 from policies.evaluation.rate import wilson
 from studies.results import commit
 from v2p_data.errors import ItemRejectedError
@@ -86,8 +87,6 @@ GOALS = {
     "usable": 0.65,
     "usable with boxes": 0.90,
 }
-PAPER = {"grounding": 0.60, "segmentation": 0.15, "mesh": 0.35, "pose": 0.55}
-"""Failure rates of Video2Policy, table 4: 20 videos, each stage on successes of the one before."""
 
 WAYS = {
     "boxes": "one box per named object as a hint",
@@ -314,7 +313,7 @@ def table(rows: list[Row], summary: dict[str, Any], *, boxes: bool, jobs: int) -
         both = summary["stages"][stage]
         lines.append(
             f"  {stage:14} goal < {GOALS[stage]:.0%}   {_said(both['conditional']):38}   {_said(both['all']):38}"
-            f" paper {PAPER[stage]:.0%}"
+            f" paper {failure(stage):.0%}"
         )
     goal = GOALS["usable with boxes" if boxes else "usable"]
     lines += [

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from paper_tables import success
 from policies.evaluation.paired import median_difference, success_difference
 from policies.evaluation.rate import wilson
 from policies.ppo.config import PPOConfig
@@ -161,8 +162,8 @@ def table(results: list[dict[str, Any]]) -> str:
     """Return one Markdown row per task: how often each actor succeeds over all seeds, what PPO gained, what it took."""
     lines = [
         "| task | program | taught | taught + PPO | PPO gains | PPO saves (s) | PPO kept | gradient steps | moved | steps (M) | CPU s "
-        "| reward alone | its steps (M) |",
-        "|" + "---|" * 13,
+        "| reward alone | its steps (M) | paper |",
+        "|" + "---|" * 14,
     ]
     names = benchmark_names()
     tasks = sorted(
@@ -175,7 +176,7 @@ def table(results: list[dict[str, Any]]) -> str:
             for teacher in ("programs", "none")
         }
         lines.append(
-            f"| {task} | {_taught_cells(by_teacher['programs'])} | {_alone_cells(by_teacher['none'])} |"
+            f"| {task} | {_taught_cells(by_teacher['programs'])} | {_alone_cells(by_teacher['none'])} | {success(task) if task in names else '-'} |"
         )
     return "\n".join(lines)
 

@@ -2,6 +2,7 @@
 
     python scripts/bench_warp.py                          # on a CUDA device; about ten minutes
     python scripts/bench_warp.py --num-worlds 8192 --learn-worlds 0
+    python scripts/bench_warp.py --num-worlds             # learning alone
     python scripts/bench_warp.py --device cpu --num-worlds 16 --steps 3 --learn-worlds 24 --learn-steps 384
 
 Speed: the full environment (actions, physics, states, reward, resets) under random actions, after a warm-up;
@@ -9,7 +10,8 @@ Speed: the full environment (actions, physics, states, reward, resets) under ran
 benchmark task `lift_up`, then fresh episodes on the CPU backend at the fine time step. With thousands of worlds a
 batch is thousands of times 16 steps, so minibatches grow with it; everything else is the CPU's recipe.
 
-The last line is `warp_steps_per_second: X`, of the full environment, the best of all numbers of worlds.
+The last line is `warp_steps_per_second: X`, of the full environment, the best of all numbers of worlds. Learning
+prints `warp_learned: X`, its success in the fresh episodes.
 """
 
 import sys
@@ -105,10 +107,9 @@ def learn(settings: Settings) -> None:
             seed=settings.seed + 1,
         )
     )
-    print(
-        f"fresh episodes on the CPU backend at the fine step: "
-        f"{evaluate(judge, expert.act, num_episodes=settings.eval_episodes)}"
-    )
+    rate = evaluate(judge, expert.act, num_episodes=settings.eval_episodes)
+    print(f"fresh episodes on the CPU backend at the fine step: {rate}")
+    print(f"warp_learned: {rate.value:.3f}")
 
 
 def _wait(device: torch.device) -> None:
@@ -141,7 +142,8 @@ def main(settings: Settings) -> int:
     except V2PError as error:
         print(error, file=sys.stderr)
         return 2
-    print(f"warp_steps_per_second: {best:.0f}")
+    if settings.num_worlds:
+        print(f"warp_steps_per_second: {best:.0f}")
     return 0
 
 

@@ -15,7 +15,8 @@ from policies.evaluation.rate import wilson
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results.json"
 README = ROOT / "README.md"
-BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
+NAME = "results"
+"""Of the table's marks in the README."""
 
 
 def table(results: list[dict[str, Any]]) -> str:
@@ -41,17 +42,18 @@ def table(results: list[dict[str, Any]]) -> str:
     return "\n".join(rows)
 
 
-def with_table(page: str, rows: str) -> str:
-    """Return the page with these rows between its two marks.
+def with_block(page: str, name: str, block: str) -> str:
+    """Return the page with this text between the two marks of a name.
 
     Raises:
         ValueError: a mark is missing.
     """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"the page has no {BEGIN} followed by {END}")
-    return f"{before}{BEGIN}\n{rows}\n{END}{after}"
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    before, found_begin, rest = page.partition(begin)
+    _, found_end, after = rest.partition(end)
+    if not found_begin or not found_end:
+        raise ValueError(f"the page has no {begin} followed by {end}")
+    return f"{before}{begin}\n{block}\n{end}{after}"
 
 
 def main() -> None:
@@ -63,7 +65,7 @@ def main() -> None:
         print(rows)
         return
     try:
-        README.write_text(with_table(README.read_text(), rows))
+        README.write_text(with_block(README.read_text(), NAME, rows))
     except ValueError as error:
         print(f"error: {README.name}: {error}", file=sys.stderr)
         sys.exit(2)

@@ -5,9 +5,30 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+import torch
 
 # What a user has set up on this machine, such as the model that finds hands, changes no test.
 os.environ["V2P_CACHE"] = str(Path(__file__).parent / "no_cache")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add where tests run that can run on a GPU."""
+    parser.addoption("--device", help="of tests that can run on a GPU: cpu, cuda")
+
+
+@pytest.fixture(scope="session")
+def device(pytestconfig: pytest.Config) -> str:
+    """Where a test runs that can run anywhere; the CPU unless `--device` says otherwise."""
+    return pytestconfig.getoption("--device") or "cpu"
+
+
+@pytest.fixture
+def gpu(pytestconfig: pytest.Config) -> str:
+    """What a test marked `gpu` compares with the CPU; `--device=cpu` tries such a test without a GPU."""
+    wanted = pytestconfig.getoption("--device") or "cuda"
+    if wanted.startswith("cuda") and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    return wanted
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

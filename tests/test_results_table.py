@@ -11,7 +11,9 @@ def test_the_readme_shows_the_table_of_the_recorded_results():
     rows = results_table.table(json.loads(results_table.RESULTS.read_text())["results"])
     page = results_table.README.read_text()
 
-    assert results_table.with_table(page, rows) == page, "run scripts/results_table.py --write"
+    assert results_table.with_block(page, results_table.NAME, rows) == page, (
+        "run scripts/results_table.py --write"
+    )
 
 
 def test_a_rate_is_shown_with_its_wilson_interval():
@@ -27,4 +29,4 @@ def test_a_rate_is_shown_with_its_wilson_interval():
 
 def test_a_page_without_marks_is_refused():
     with pytest.raises(ValueError, match="results: begin"):
-        results_table.with_table("# A page", "rows")
+        results_table.with_block("# A page", "results", "rows")

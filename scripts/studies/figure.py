@@ -8,10 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator, PercentFormatter
 
+from paper_tables import papers_value
+
 from .config import ARMS, Arm
 from .fits import (
-    PAPERS_TASKS,
-    PAPERS_UNSEEN,
     Row,
     by_count,
     failure_counts,
@@ -60,7 +60,10 @@ def _success(axes: Axes, rows: list[Row]) -> None:
         end = [r.value for cells in found.values() if (r := rate(cells, "at_end"))]
         axes.plot(n, end, linestyle="--", linewidth=1, color=_style(arm)["color"])
     axes.plot(
-        [PAPERS_TASKS], [PAPERS_UNSEEN["BC-V2P"]], "k*", label="paper (other scenes, other robot)"
+        [papers_value("recipe/lifting videos")],
+        [papers_value("figure 5/BC-V2P")],
+        "k*",
+        label="paper (other scenes, other robot)",
     )
     axes.set(
         title="Ten unseen objects: once (solid, 95 %), at the end (dashed)",

@@ -183,15 +183,3 @@ def by_count(rows: Iterable[Row], arm: str) -> dict[int, list[Row]]:
         if row["arm"] == arm:
             found.setdefault(row["n"], []).append(row)
     return dict(sorted(found.items()))
-
-
-# --- the paper's ---------------------------------------------------------------------------------------------
-
-PAPERS_WORDS = "the paper's numbers, of other scenes and another robot"
-PAPERS_TASKS = 100
-PAPERS_UNSEEN = {"BC-V2P": 0.75, "CoP": 0.32, "BC-CoP": 0.26}
-"""Figure 5: mean success on ten unseen lifts after 100 training tasks, 3 seeds of 10 episodes each, RGB pictures."""
-PAPERS_MASKS = 0.72
-"""Section 4.3: the policy on masks, 200 trajectories a task, in simulation."""
-PAPERS_REAL = {"mouse": 0.50, "cup": 0.40, "bread": 0.50, "average": 0.47}
-"""Table 2: that policy on the real robot."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup, escape
 
+from paper_tables import lifting_text
 from v2p_data.report.media import MediaBudget, film_uri
 
 from .cells import FILMS_FOLDER
@@ -20,7 +21,6 @@ from .table import (
     failures_table,
     laws_text,
     objects_table,
-    papers_text,
     rates_table,
 )
 
@@ -87,7 +87,7 @@ def write_page(rows: list[Row], out: Path, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
         page.render(
-            paper=papers_text(),
+            paper=lifting_text(),
             arms=ARMS,
             figure=Markup(figure),
             parts=[(title, as_html(text)) for title, text in parts.items() if text],

@@ -2,15 +2,11 @@
 
 from typing import Any
 
+from paper_tables import lifting_text
 from policies.evaluation.rate import Rate
 
 from .config import ARMS
 from .fits import (
-    PAPERS_MASKS,
-    PAPERS_REAL,
-    PAPERS_TASKS,
-    PAPERS_UNSEEN,
-    PAPERS_WORDS,
     by_count,
     failure_counts,
     fit_laws,
@@ -27,7 +23,7 @@ def table(rows: list[Row]) -> str:
     """Return all tables, one after the other."""
     parts = [rates_table(rows), objects_table(rows), laws_text(rows), differences_table(rows)]
     return "\n\n".join(
-        [p for p in (*parts, failures_table(rows), costs_table(rows), papers_text()) if p]
+        [p for p in (*parts, failures_table(rows), costs_table(rows), lifting_text()) if p]
     )
 
 
@@ -143,16 +139,6 @@ def costs_table(rows: list[Row]) -> str:
                 f"| {arm} | {n or '-'} | {tried or '-'} | {why or '-'} | {cells} | {sum(mean.values()) / 60:.1f} |"
             )
     return "\n".join(lines)
-
-
-def papers_text() -> str:
-    """Return what the paper says of the same question."""
-    unseen = ", ".join(f"{name} {value:.0%}" for name, value in PAPERS_UNSEEN.items())
-    real = ", ".join(f"{name} {value:.0%}" for name, value in PAPERS_REAL.items())
-    return (
-        f"Beside them {PAPERS_WORDS}: {unseen} on ten unseen lifts after {PAPERS_TASKS} tasks (figure 5); on masks {PAPERS_MASKS:.0%}"
-        f" in simulation, and on the real robot {real} (table 2). Figure 6 rises with the number of tasks; its values are not in the text."
-    )
 
 
 def _with_interval(found: Rate | None) -> str:

@@ -16,23 +16,29 @@ class PointMass(EnvBase):
     """
 
     def __init__(
-        self, num_envs: int, seed: int = 0, *, keeps_state: bool = True, nan_at: int | None = None
+        self,
+        num_envs: int,
+        seed: int = 0,
+        *,
+        keeps_state: bool = True,
+        nan_at: int | None = None,
+        device: str = "cpu",
     ):
-        super().__init__(device="cpu", batch_size=[num_envs])
+        super().__init__(device=device, batch_size=[num_envs])
         n = num_envs
         self.keeps_state, self.nan_at, self.num_calls = keeps_state, nan_at, 0
         self.stream = torch.Generator().manual_seed(seed)
-        self.pos, self.goal = torch.zeros(n, 2), torch.zeros(n, 2)
-        self.t = torch.zeros(n, dtype=torch.long)
+        self.pos, self.goal = (torch.zeros(n, 2, device=device) for _ in range(2))
+        self.t = torch.zeros(n, dtype=torch.long, device=device)
         self.observation_spec = Composite(
-            observation=Unbounded((n, 4)),
-            success=Binary(1, (n, 1), dtype=torch.bool),
-            components=Composite(near=Unbounded((n, 1)), batch_size=[n]),
+            observation=Unbounded((n, 4), device=device),
+            success=Binary(1, (n, 1), dtype=torch.bool, device=device),
+            components=Composite(near=Unbounded((n, 1), device=device), batch_size=[n]),
             batch_size=[n],
         )
-        self.action_spec = Bounded(-1, 1, (n, 2))
-        self.reward_spec = Unbounded((n, 1))
-        flag = Binary(1, (n, 1), dtype=torch.bool)
+        self.action_spec = Bounded(-1, 1, (n, 2), device=device)
+        self.reward_spec = Unbounded((n, 1), device=device)
+        flag = Binary(1, (n, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
             done=flag, terminated=flag.clone(), truncated=flag.clone(), batch_size=[n]
         )
@@ -53,14 +59,14 @@ class PointMass(EnvBase):
         }
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
-        everyone = torch.ones(self.batch_size[0], dtype=torch.bool)
+        everyone = torch.ones(self.batch_size[0], dtype=torch.bool, device=self.device)
         mask = everyone if tensordict is None else tensordict.get("_reset", everyone).flatten()
         n = int(mask.sum())
-        self.pos[mask] = torch.rand(n, 2, generator=self.stream) * 2 - 1
-        self.goal[mask] = torch.rand(n, 2, generator=self.stream) * 2 - 1
+        for place in (self.pos, self.goal):
+            place[mask] = (torch.rand(n, 2, generator=self.stream) * 2 - 1).to(place)
         self.t[mask] = 0
         return TensorDict(
-            self._out(torch.zeros(self.batch_size[0], 1, dtype=torch.bool)), self.batch_size
+            self._out(torch.zeros_like(self.t, dtype=torch.bool)[:, None]), self.batch_size
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:

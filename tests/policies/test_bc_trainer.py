@@ -399,10 +399,9 @@ def test_frames_move_to_a_device_whole_and_give_the_same_batches():
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("encoder", ["none", "conv"])
 def test_a_gpu_that_holds_all_frames_learns_what_one_that_fetches_them_does(
-    tmp_path: Path, monkeypatch, encoder: str
+    tmp_path: Path, monkeypatch, encoder: str, gpu: str
 ):
     def trained_on(device: str, share: float) -> dict[str, torch.Tensor]:
         monkeypatch.setattr(trainer, "GPU_SHARE_FOR_FRAMES", share)
@@ -412,9 +411,7 @@ def test_a_gpu_that_holds_all_frames_learns_what_one_that_fetches_them_does(
         train(net_, processors, frames, recipe(), tmp_path / f"{device}{share}", seed=5)
         return {name: value.cpu() for name, value in weights(net_).items()}
 
-    held, fetched, on_cpu = (
-        trained_on(d, s) for d, s in (("cuda", 0.5), ("cuda", 0.0), ("cpu", 0.0))
-    )
+    held, fetched, on_cpu = (trained_on(d, s) for d, s in ((gpu, 0.5), (gpu, 0.0), ("cpu", 0.0)))
     for name in held:
         torch.testing.assert_close(held[name], fetched[name], atol=1e-6, rtol=1e-4)
         # Adam turns rounding of a gradient near zero into a whole step of the learning rate.

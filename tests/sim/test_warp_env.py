@@ -1,4 +1,4 @@
-"""The GPU backend against the CPU's, on Warp's CPU device; the same kernels run on CUDA.
+"""The GPU backend against the CPU's, on Warp's CPU device, or with `--device=cuda` on a GPU; the kernels are the same.
 
 The first run compiles kernels for about a minute; Warp keeps them in its cache folder (`WARP_CACHE_PATH`).
 """
@@ -37,7 +37,7 @@ Pair = tuple["WarpBatchEnv", BatchEnv]
 
 @pytest.fixture
 def make_pair(
-    make_bundle: Callable[..., TaskBundle], lift_task: type[Task]
+    make_bundle: Callable[..., TaskBundle], lift_task: type[Task], device: str
 ) -> Callable[..., Pair]:
     """Return the same worlds on both backends."""
 
@@ -51,11 +51,21 @@ def make_pair(
     ) -> Pair:
         bundle = make_bundle(*objects, **options)
         cfg = SimConfig(fine=fine, randomization=randomization)
-        gpu = WarpBatchEnv(bundle, cfg, num_envs=num_envs, seed=0, device="cpu", task=task)
+        gpu = WarpBatchEnv(bundle, cfg, num_envs=num_envs, seed=0, device=device, task=task)
         cpu = BatchEnv(bundle, cfg, num_envs=num_envs, seed=0, num_threads=1, task=task)
         return gpu, cpu
 
     return make
+
+
+def seen(env: "WarpBatchEnv | BatchEnv") -> dict[str, torch.Tensor]:
+    """Return the states of all worlds, on the CPU."""
+    return {name: value.cpu() for name, value in env.states().items()}
+
+
+def qpos_of(env: "WarpBatchEnv | BatchEnv") -> torch.Tensor:
+    """Return the positions of all joints, to be written to."""
+    return torch.from_numpy(env._qpos) if isinstance(env, BatchEnv) else env._sim.state()["qpos"]
 
 
 def play(pair: Pair, action: np.ndarray) -> tuple[float, float]:
@@ -63,7 +73,7 @@ def play(pair: Pair, action: np.ndarray) -> tuple[float, float]:
     gpu, cpu = pair
     gpu.step(torch.from_numpy(action))
     cpu.step(action)
-    ours, theirs = gpu.states(), cpu.states()
+    ours, theirs = seen(gpu), seen(cpu)
     mm = float((ours["eef_pos"] - theirs["eef_pos"]).norm(dim=1).max()) * 1000
     turns = [Rotation.from_quat(s["eef_quat"].numpy(), scalar_first=True) for s in (ours, theirs)]
     return mm, float(np.degrees((turns[0] * turns[1].inv()).magnitude().max()))
@@ -125,7 +135,7 @@ def test_a_seed_gives_the_same_first_worlds(
         make_object("bowl", "cylinder", (0.12, 0.12, 0.05), hollow=True, pos=(0, 0.2, 0.02)),
     )
 
-    ours, theirs = gpu.states(), cpu.states()
+    ours, theirs = seen(gpu), seen(cpu)
 
     assert set(ours) == set(theirs)
     for key, value in theirs.items():
@@ -143,14 +153,14 @@ def test_the_tool_follows_as_on_the_cpu_within_a_hundredth_of_a_millimetre(
     make_pair: Callable[..., Pair], fine: bool
 ):
     pair = make_pair(fine=fine)
-    start = pair[0].states()["eef_pos"].clone()
+    start = seen(pair[0])["eef_pos"].clone()
 
     apart = [play(pair, 0.4 * action) for action in smooth_actions(24, 8, turning=0.2)]
 
     mm, degrees = np.max(apart, axis=0)
     assert mm < 0.01
     assert degrees < 0.01
-    assert (pair[0].states()["eef_pos"] - start).norm(dim=1).min() > 0.03
+    assert (seen(pair[0])["eef_pos"] - start).norm(dim=1).min() > 0.03
 
 
 @needs_warp
@@ -176,16 +186,16 @@ def test_a_dropped_object_comes_to_rest_where_it_does_on_the_cpu(
     adr = cpu.world.objects[0].qpos_adr
     fallen = np.random.default_rng(0).normal(0, 0.05, (8, 4)) + np.array([1, 0, 0, 0])
     fallen /= np.linalg.norm(fallen, axis=1, keepdims=True)
-    for qpos in (gpu._sim.qpos.numpy(), cpu._qpos):
+    for qpos in (qpos_of(gpu), qpos_of(cpu)):
         qpos[:, adr + 2] = 0.06
-        qpos[:, adr + 3 : adr + 7] = fallen
+        qpos[:, adr + 3 : adr + 7] = torch.from_numpy(fallen)
 
     for _ in range(12):
         play((gpu, cpu), np.zeros((8, 7)))
 
-    away = (gpu.states()["cube_pos"] - cpu.states()["cube_pos"]).norm(dim=1) * 1000
+    away = (seen(gpu)["cube_pos"] - seen(cpu)["cube_pos"]).norm(dim=1) * 1000
     assert away.max() < 0.05
-    np.testing.assert_allclose(gpu.states()["cube_up"], 1.0, atol=1e-3)
+    np.testing.assert_allclose(seen(gpu)["cube_up"], 1.0, atol=1e-3)
 
 
 @needs_warp
@@ -194,11 +204,11 @@ def test_a_pushed_object_moves_as_on_the_cpu_from_step_to_step(
 ):
     none = replace(randomize.none(), mass_scale=(0.6, 1.6), friction_scale=(0.8, 1.2))
     pair = make_pair(randomization=none)
-    start = pair[1].states()["cube_pos"].clone()
+    start = seen(pair[1])["cube_pos"].clone()
 
     def towards(goal: torch.Tensor) -> np.ndarray:
         action = np.zeros((8, 7))
-        action[:, :3] = np.clip((goal - pair[1].states()["eef_pos"]).numpy() / 0.03, -1, 1)
+        action[:, :3] = np.clip((goal - seen(pair[1])["eef_pos"]).numpy() / 0.03, -1, 1)
         action[:, 6] = 1.0
         return action
 
@@ -210,10 +220,10 @@ def test_a_pushed_object_moves_as_on_the_cpu_from_step_to_step(
         action[:, 1], action[:, 6] = -0.25, 1.0
         continue_from(pair)
         play(pair, action)
-        away = pair[0].states()["cube_pos"] - pair[1].states()["cube_pos"]
+        away = seen(pair[0])["cube_pos"] - seen(pair[1])["cube_pos"]
         apart.append(away.norm(dim=1).numpy() * 1000)
 
-    pushed = pair[1].states()["cube_pos"] - start
+    pushed = seen(pair[1])["cube_pos"] - start
     assert (pushed[:, 1] < -0.03).all()
     assert np.median(apart) < 0.01
     assert np.max(apart) < 3.0  # an impact that comes a time step sooner or later
@@ -225,7 +235,7 @@ def test_a_scripted_grasp_lifts_as_often_as_on_the_cpu(make_pair: Callable[..., 
     lifted = []
     for env in (gpu, cpu):
         for t in range(60):
-            states = env.states()
+            states = seen(env)
             error = states["cube_pos"] - states["eef_pos"]
             action = torch.zeros(16, 7)
             action[:, :2] = error[:, :2] / 0.03
@@ -238,11 +248,11 @@ def test_a_scripted_grasp_lifts_as_often_as_on_the_cpu(make_pair: Callable[..., 
             if t >= 35:
                 action[:, 2] = 0.5
             result = env.step(action if env is gpu else action.numpy())
-        states = env.states()
+        states = seen(env)
         lifted.append(states["cube_pos"][:, 2] > 0.12)
         # Touches are one time step old: a pad may let go for a moment.
         assert states["cube_grasped"][lifted[-1]].mean() > 0.8
-        assert torch.as_tensor(result.held)[lifted[-1]].all()
+        assert torch.as_tensor(result.held).cpu()[lifted[-1]].all()
 
     ours, theirs = lifted
     assert ours.float().mean() > 0.8
@@ -255,16 +265,16 @@ def test_a_scripted_grasp_lifts_as_often_as_on_the_cpu(make_pair: Callable[..., 
 def test_the_same_states_give_the_same_reward_and_success(make_pair: Callable[..., Pair]):
     gpu, cpu = make_pair()
     adr = cpu.world.objects[0].qpos_adr
-    for qpos in (gpu._sim.qpos.numpy(), cpu._qpos):
-        qpos[::2, adr : adr + 3] = 0.9, 0.6, 0.5  # out of the arm's reach
+    for qpos in (qpos_of(gpu), qpos_of(cpu)):
+        qpos[::2, adr : adr + 3] = torch.tensor([0.9, 0.6, 0.5])  # out of the arm's reach
 
     ours, theirs = gpu.step(torch.zeros(8, 7)), cpu.step(np.zeros((8, 7)))
 
     assert ours.success.tolist() == theirs.success.tolist() == [True, False] * 4
-    np.testing.assert_allclose(ours.reward, theirs.reward, atol=1e-5)
+    np.testing.assert_allclose(ours.reward.cpu(), theirs.reward, atol=1e-5)
     assert ours.components.keys() == theirs.components.keys()
     for name, values in theirs.components.items():
-        np.testing.assert_allclose(ours.components[name], values, atol=1e-4)
+        np.testing.assert_allclose(ours.components[name].cpu(), values, atol=1e-4)
     assert not ours.truncated.any()
     assert not ours.terminated.any()
 
@@ -307,17 +317,17 @@ def test_resetting_some_worlds_leaves_the_others_alone(make_pair: Callable[..., 
             assert torch.equal(after[key][others], value[others]), key
     assert torch.equal(gpu.observe()[others], obs[others])
     assert (gpu.observe()[[1, 6]] != obs[[1, 6]]).any(1).all()
-    assert gpu.states()["progress"][[1, 6]].tolist() == [0, 0]
+    assert seen(gpu)["progress"][[1, 6]].tolist() == [0, 0]
 
 
 @needs_warp
 def test_a_reset_starts_at_rest_whatever_the_delay(make_pair: Callable[..., Pair]):
     gpu, _ = make_pair(randomization=replace(randomize.none(), delay_s=(0.02, 0.02)))
-    start = gpu.states()["eef_pos"].clone()
+    start = seen(gpu)["eef_pos"].clone()
 
     gpu.step(torch.zeros(8, 7))
 
-    assert (gpu.states()["eef_pos"] - start).abs().max() < 1e-4
+    assert (seen(gpu)["eef_pos"] - start).abs().max() < 1e-4
 
 
 @needs_warp
@@ -341,7 +351,7 @@ def test_a_broken_world_ends_without_reward_and_the_others_go_on(
     assert not after.terminated.any()
     others = [0, 1, 3, 4, 5, 6, 7]
     torch.testing.assert_close(
-        gpu.states()["eef_pos"][others], cpu.states()["eef_pos"][others], atol=5e-5, rtol=0
+        seen(gpu)["eef_pos"][others], seen(cpu)["eef_pos"][others], atol=5e-5, rtol=0
     )
 
 
@@ -359,8 +369,8 @@ def test_meshes_of_several_sizes_stand_at_their_own_heights(
     for _ in range(6):
         play((gpu, cpu), np.zeros((8, 7)))
 
-    heights = gpu.states()["cube_pos"][:, 2]
-    np.testing.assert_allclose(heights, cpu.states()["cube_pos"][:, 2], atol=1e-3)
+    heights = seen(gpu)["cube_pos"][:, 2]
+    np.testing.assert_allclose(heights, seen(cpu)["cube_pos"][:, 2], atol=1e-3)
     assert np.ptp(heights.numpy()) > 0.002
 
 
@@ -388,18 +398,18 @@ def test_random_actions_and_resets_stay_finite(
 @needs_warp
 @pytest.mark.slow
 @pytest.mark.parametrize("name", benchmark_names())
-def test_a_benchmark_task_has_the_same_observation_and_reward_on_both(name: str):
+def test_a_benchmark_task_has_the_same_observation_and_reward_on_both(name: str, device: str):
     cfg = SimConfig(randomization=NOISELESS)
     gpu = make_batch_env(
-        load_benchmark(name), cfg, num_envs=4, seed=0, backend="warp", device="cpu"
+        load_benchmark(name), cfg, num_envs=4, seed=0, backend="warp", device=device
     )
     cpu = make_batch_env(load_benchmark(name), cfg, num_envs=4, seed=0, num_threads=1)
 
     for action in smooth_actions(5, 4, turning=0.2):
         ours, theirs = gpu.step(torch.from_numpy(0.4 * action)), cpu.step(0.4 * action)
 
-    np.testing.assert_allclose(ours.obs, theirs.obs, atol=2e-3)
-    np.testing.assert_allclose(ours.reward, theirs.reward, atol=1e-4)
+    np.testing.assert_allclose(ours.obs.cpu(), theirs.obs, atol=2e-3)
+    np.testing.assert_allclose(ours.reward.cpu(), theirs.reward, atol=1e-4)
     assert ours.success.tolist() == theirs.success.tolist()
 
 
@@ -423,7 +433,7 @@ def test_torchrl_and_checkpoints_take_it_as_they_take_the_cpus(make_pair: Callab
     gpu, _ = make_pair(horizon=6, randomization=randomize.training())
     env = TorchRLEnv(gpu)
     check_env_specs(env)
-    still = TensorDict({"action": torch.zeros(8, 7)}, [8])
+    still = TensorDict({"action": torch.zeros(8, 7)}, [8], device=gpu.device)
     env.reset()
     env.step(still)
     saved = env.state_dict()
@@ -438,14 +448,13 @@ def test_torchrl_and_checkpoints_take_it_as_they_take_the_cpus(make_pair: Callab
 
 @needs_warp
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_does_as_warps_cpu_device(
-    make_bundle: Callable[..., TaskBundle], lift_task: type[Task]
+    make_bundle: Callable[..., TaskBundle], lift_task: type[Task], gpu: str
 ):
     cfg = SimConfig(randomization=NOISELESS)
     envs = [
         WarpBatchEnv(make_bundle(), cfg, num_envs=8, seed=0, device=device, task=lift_task)
-        for device in ("cpu", "cuda:0")
+        for device in ("cpu", gpu)
     ]
 
     for action in smooth_actions(32, 8, turning=0.15):
@@ -453,5 +462,5 @@ def test_cuda_does_as_warps_cpu_device(
             result = env.step(torch.from_numpy(action).to(env.device))
             assert result.obs.device.type == env.device.type
 
-    ours, theirs = (env.states()["eef_pos"].cpu() for env in envs)
+    ours, theirs = (seen(env)["eef_pos"] for env in envs)
     assert (ours - theirs).norm(dim=1).max() < 5e-5

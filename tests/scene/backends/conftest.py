@@ -11,20 +11,27 @@ WORDS = ["red", "brown", "blue", "box", "cup", "the", "small", "a", "photo", "of
 KINDS = ("grounding_dino", "mm_grounding_dino", "owlv2", "sam2", "depth_anything", "depth_pro")
 
 
-@pytest.fixture(scope="session")
-def checkpoint(tmp_path_factory):
-    """Return the folder of a backend's tiny checkpoint, made when first asked for."""
-    made: dict[str, Path] = {}
+class Checkpoints:
+    """Tiny checkpoints, each made when first asked for, and the device that models made of them run on."""
 
-    def folder(backend: str) -> str:
-        if backend not in made:
-            made[backend] = tmp_path_factory.mktemp(backend)
+    def __init__(self, root: pytest.TempPathFactory, device: str) -> None:
+        self.device = device
+        self._root = root
+        self._made: dict[str, Path] = {}
+
+    def __call__(self, backend: str) -> str:
+        """Return the folder of a backend's checkpoint."""
+        if backend not in self._made:
+            self._made[backend] = self._root.mktemp(backend)
             with torch.random.fork_rng():
                 torch.random.default_generator.manual_seed(0)
-                MAKERS[backend](made[backend])
-        return str(made[backend])
+                MAKERS[backend](self._made[backend])
+        return str(self._made[backend])
 
-    return folder
+
+@pytest.fixture(scope="session")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory, device: str) -> Checkpoints:
+    return Checkpoints(tmp_path_factory, device)
 
 
 @pytest.fixture

@@ -16,7 +16,9 @@ from v2p_data.scene.fitting.silhouette import camera_above
 
 
 def config(backend: str, checkpoint, **more) -> DepthConfig:
-    return DepthConfig(backend=backend, model=checkpoint(backend), device="cpu", **more)
+    return DepthConfig(
+        backend=backend, model=checkpoint(backend), device=checkpoint.device, **more
+    )
 
 
 @pytest.mark.parametrize("backend", ["depth_anything", "depth_pro"])

@@ -15,7 +15,9 @@ RED, BROWN = (6.0, 20.0, 22.0, 36.0), (40.0, 22.0, 58.0, 38.0)
 
 def config(backend: str, checkpoint, **more) -> GroundConfig:
     settings = {"box_threshold": 0.0, "text_threshold": 0.0, "max_overlap": 0.9, **more}
-    return GroundConfig(backend=backend, model=checkpoint(backend), device="cpu", **settings)
+    return GroundConfig(
+        backend=backend, model=checkpoint(backend), device=checkpoint.device, **settings
+    )
 
 
 @pytest.mark.parametrize("backend", DETECTORS)

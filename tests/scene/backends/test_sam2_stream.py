@@ -13,7 +13,7 @@ from v2p_data.scene.backends.segment import Prompt, segment_video
 @pytest.fixture
 def cfg(checkpoint):
     # Random weights draw no outline: the threshold is what decides, and half of the pixels pass this one.
-    return SegmentConfig(backend="sam2", model=checkpoint("sam2"), device="cpu")
+    return SegmentConfig(backend="sam2", model=checkpoint("sam2"), device=checkpoint.device)
 
 
 @pytest.fixture

@@ -26,7 +26,9 @@ def clip(picture) -> np.ndarray:
 
 
 def config(checkpoint, **more) -> SegmentConfig:
-    return SegmentConfig(backend="sam2", model=checkpoint("sam2"), device="cpu", **more)
+    return SegmentConfig(
+        backend="sam2", model=checkpoint("sam2"), device=checkpoint.device, **more
+    )
 
 
 def tracked_by_transformers(checkpoint, clip, start: int) -> np.ndarray:

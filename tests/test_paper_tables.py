@@ -1,0 +1,175 @@
+"""The paper's figures are those of `docs/paper_tables.json`, wherever pages, scripts and settings show them."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import paper_tables
+from paper_tables import FILE, PAGES, papers_value, success, with_column
+from policies.bc.configuration_v2p_bc import V2PBCConfig
+from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
+from results_table import ROOT
+from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.policy_config import PAPER_BATCH_SIZE, PAPER_EPOCHS
+from v2p_data.reward.config import RewardConfig
+from v2p_data.reward.programs import EVERY_STEPS
+from v2p_data.scene.backends.config import SegmentConfig
+from v2p_data.sim import randomize
+from v2p_data.sim.batch_env import SimConfig
+from v2p_data.task.benchmark import benchmark_names
+from v2p_data.task.generate import TaskConfig
+
+DATA = json.loads(FILE.read_text())
+TABLES = {name: table["rows"] for name, table in DATA["tables"].items()}
+LIKE_THE_PAPER = {
+    "recipe/codes": TaskConfig().num_samples,
+    "recipe/rewards": RewardConfig().candidates,
+    "recipe/lambda": SimConfig().success_bonus,
+    "recipe/positive points": SegmentConfig().num_points,
+    "recipe/steps between code policies": EVERY_STEPS,
+    "recipe/trajectories": EpisodesConfig().num_episodes,
+    "recipe/epochs": PAPER_EPOCHS,
+    "recipe/batch": PAPER_BATCH_SIZE,
+    "recipe/frames": V2PBCConfig(device="cpu", preset="paper").n_obs_steps,
+    "recipe/image size": V2PBCConfig(device="cpu", preset="paper").input_size_px,
+    "recipe/head size": V2PBCConfig(device="cpu", preset="paper").head_dim,
+    "recipe/state size": V2PBCConfig(device="cpu", preset="paper").state_dim,
+    "recipe/head learning rate": V2PBCConfig(device="cpu", preset="paper").optimizer_lr,
+    "recipe/backbone learning rate": PRETRAINED_BACKBONE_LR,
+    "recipe/rotation scale": SimConfig().rotation_step_rad,
+    "recipe/action noise": randomize.recording().action_noise,
+    "recipe/delay": list(randomize.recording().delay_s),
+}
+"""Settings that say they are the paper's."""
+QUOTES = [
+    ("v2p_data/reward/config.py", "the paper takes {recipe/iterations}, and {recipe/iterations self-collected} for hard"),
+    ("v2p_data/task/task.py", "the paper gives {recipe/horizon} steps"),
+    ("v2p_data/task/schema.py", "the paper's episodes have {recipe/horizon} steps"),
+    ("v2p_data/episodes/collect.py", "the paper's policies learn from {recipe/trajectories}"),
+    ("v2p_data/policy_config.py", "{recipe/epochs} epochs of batch {recipe/batch}"),
+    ("configs/paper.yaml", "{recipe/epochs} epochs of batch {recipe/batch}"),
+]  # fmt: skip
+"""Sentences of code and settings that quote the paper."""
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_shows_the_paper_s_figures(page: str):
+    text = (ROOT / page).read_text()
+
+    assert PAGES[page](text) == text, "run scripts/paper_tables.py --write"
+
+
+def test_a_marked_figure_is_the_paper_s():
+    marked = [
+        found
+        for page in (ROOT / "docs").rglob("*.md")
+        for found in re.findall(r"(\S+(?: %)?)<!-- paper: (.+?) -->", page.read_text())
+    ]
+
+    assert len(marked) >= 2
+    for shown, where in marked:
+        number = float(re.sub(r"[^\d.]", "", shown))
+        assert number == pytest.approx(papers_value(where) * (100 if "%" in shown else 1)), where
+
+
+@pytest.mark.parametrize("where", LIKE_THE_PAPER)
+def test_a_setting_that_says_it_is_the_paper_s_is(where: str):
+    assert LIKE_THE_PAPER[where] == papers_value(where)
+
+
+@pytest.mark.parametrize(("file", "sentence"), QUOTES)
+def test_a_sentence_in_the_code_quotes_the_paper(file: str, sentence: str):
+    quoted = re.sub(r"{(.+?)}", lambda found: str(papers_value(found[1])), sentence)
+
+    assert quoted in (ROOT / file).read_text()
+
+
+def test_the_average_that_table_1_prints_is_not_that_of_its_rows_as_the_note_says():
+    told = map(float, re.findall(r"0\.\d+", DATA["tables"]["table 1"]["note"]))
+
+    for method, mean in zip(
+        ("Code-as-Policy", "RoboGen", "Eureka", "Video2Policy"), told, strict=True
+    ):
+        rows = [
+            row[method]["mean"] for task, row in TABLES["table 1"].items() if task != "average"
+        ]
+        assert mean == pytest.approx(np.mean(rows), abs=0.0051)
+        assert mean != TABLES["table 1"]["average"][method]
+
+
+def test_table_1_has_a_row_for_each_task_of_the_benchmark():
+    assert set(TABLES["table 1"]) == {*benchmark_names(), "average"}
+
+
+def test_the_last_column_of_table_1_is_as_it_was_read_a_second_time():
+    """By another reader of the text, in its order."""
+    read = [1.00, 1.00, 0.93, 1.00, 0.07, 0.97, 0.43, 1.00, 0.93, 0.93, 0.97, 0.70]
+
+    rows = [row for task, row in TABLES["table 1"].items() if task != "average"]
+
+    assert [row["Video2Policy"]["mean"] for row in rows] == read
+
+
+@pytest.mark.parametrize("table", ["table 7", "table 9"])
+def test_an_average_that_the_paper_prints_is_that_of_its_three_tasks(table: str):
+    for row in TABLES[table].values():
+        tasks = [row[task]["mean"] for task in ("lift_up", "uncover", "throw_into")]
+        assert row["average"] == pytest.approx(np.mean(tasks), abs=0.005)
+
+
+@pytest.mark.parametrize("table", ["table 7", "table 9"])
+def test_tables_that_repeat_rows_of_table_1_agree_with_it(table: str):
+    repeated = [method for method in TABLES[table] if method in TABLES["table 1"]["lift_up"]]
+
+    assert len(repeated) >= 2
+    for method in repeated:
+        for task in ("lift_up", "uncover", "throw_into"):
+            assert TABLES[table][method][task] == TABLES["table 1"][task][method]
+
+
+def test_the_robot_s_average_and_the_size_errors_follow_from_their_rows():
+    real = TABLES["table 2"]["success"]
+    sizes = TABLES["table 6"]
+
+    assert real["average"] == pytest.approx(
+        np.mean([real[k] for k in ("mouse", "cup", "bread")]), abs=0.005
+    )
+    for thing, delta in sizes["delta size"].items():
+        away = np.subtract(sizes["predicted size"][thing], sizes["ground-truth size"][thing])
+        np.testing.assert_allclose(np.abs(away), delta, atol=1e-9)
+
+
+def test_hallucinations_are_those_that_run_and_those_that_do_not():
+    for column, total in TABLES["table 8"]["hallucination"].items():
+        parts = sum(TABLES["table 8"][kind][column] for kind in ("non-runnable", "runnable"))
+        assert parts == pytest.approx(total, abs=0.0101)  # rounded one by one
+
+
+def test_a_success_is_shown_as_our_tables_show_it():
+    assert success("lift_up") == "0.93"
+    assert success("cover", "Eureka") == "0.00"
+
+
+def test_a_column_is_filled_by_the_row_s_first_cell():
+    page = "# A\n\n| task | n | paper |\n|---|---|---|\n| a | 1 | x |\n| b | 2 | y |\n\n| c | 3 | z |\n"
+
+    filled = with_column(page, "paper", str.upper)
+
+    assert filled == page.replace("| x |", "| A |").replace("| y |", "| B |")
+
+
+def test_what_the_paper_does_not_have_is_named():
+    with pytest.raises(KeyError, match="no 'lift_down' of 'table 1/lift_down'"):
+        papers_value("table 1/lift_down")
+    with pytest.raises(ValueError, match="column 'paper'"):
+        with_column("# A page\n", "paper", str)
+
+
+def test_every_table_can_be_shown():
+    shown = paper_tables.tables()
+
+    assert "| cover | Cover sth. with sth. |" in shown
+    assert "| Eureka | 0.83 ± 0.13 | 0.63 ± 0.38 | 0.37 ± 0.29 | 0.61 |" in shown
+    assert shown.count("section") == len(DATA["tables"]) + len(DATA["figures"])
