@@ -52,7 +52,7 @@ def main() -> None:
     )
     parser.add_argument("--seeds", nargs="*", type=int, default=[0, 1, 2])
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--total-steps", type=int, default=400_000, help="of PPO")
+    parser.add_argument("--total-steps", type=int, default=500_000, help="of PPO")
     parser.add_argument("--max-seconds", type=float, default=36_000.0, help="of PPO")
     parser.add_argument(
         "--target-success", type=float, default=PPOConfig().target_success, help="see PPOConfig"

@@ -68,7 +68,7 @@ class PPOConfig:
     """Wall-clock safety net, added up over resumptions; a run it stops depends on the machine."""
     target_success: float = 0.95
     """From nothing, training goes on to this success of the deterministic worlds before a plateau may end it."""
-    plateau_steps: int = 100_000
+    plateau_steps: int = 150_000
     """Training stops once so many control steps brought no better success or time to success."""
     plateau_gain: float = 0.005
     """What counts as better: so much more success, or a time to success that is shorter by ten times this share of an episode."""
