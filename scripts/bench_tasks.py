@@ -42,7 +42,7 @@ CONTROL_DT_S = FINE.control_dt_s
 
 def main() -> None:
     """Read the command line, learn, judge, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/bench_tasks"))
     parser.add_argument(
         "--tasks",

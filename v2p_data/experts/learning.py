@@ -27,7 +27,7 @@ from v2p_data.experts.bank import Bank, record_bank, use_bank
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.record import Comparison, Judged, Learned
 from v2p_data.experts.solved import Solved, rank_solved
-from v2p_data.experts.teacher import Played, Teacher, Trial, play
+from v2p_data.experts.teacher import Teacher, Trial, play
 from v2p_data.seeds import seed_for
 from v2p_data.sim.backends import make_batch_env
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
@@ -241,34 +241,30 @@ def keep_better(
     """
     env = worlds.make(cfg.compare_worlds, "which is better", fine=True)
     dt_s, seed = env.physics.control_dt_s, worlds.seed_of("episodes that compare")
-    before = Expert.load(taught)
-    seen: list[np.ndarray] = []
+    before, seen = Expert.load(taught), list[np.ndarray]()
 
     def watched(obs: np.ndarray) -> np.ndarray:
         seen.append(obs.copy())
         return before.act(obs)
 
-    def judged(expert: Expert) -> tuple[Judged, Played, Expert]:
-        played = play(env, watched if expert is before else expert.act, seed)
-        return Judged.of(played, dt_s), played, expert
-
-    of_taught = judged(before)
-    best, last = (judged(Expert.load(folder)) for folder in (out, out / LAST_FOLDER))
-    of_ppo = last if last[0].score > best[0].score else best
-    updates = improved.last_actor_updates if of_ppo is last else improved.actor_updates
-    (taught_judged, taught_played, _), (ppo_judged, ppo_played, after) = of_taught, of_ppo
-    both = taught_played.once & ppo_played.once
+    of_taught = play(env, watched, seed)
+    candidates = (
+        (Expert.load(out), improved.actor_updates),
+        (Expert.load(out / LAST_FOLDER), improved.last_actor_updates),
+    )
+    played = [play(env, expert.act, seed) for expert, _ in candidates]
+    chosen = int(np.argmax([p.score for p in played]))
+    (after, updates), of_ppo = candidates[chosen], played[chosen]
+    both = of_taught.once & of_ppo.once
     states = np.concatenate(seen)
     comparison = Comparison(
-        taught=taught_judged,
-        ppo=ppo_judged,
-        success_gain=success_difference(ppo_played.once, taught_played.once),
-        time_saved_s=median_difference(
-            dt_s * taught_played.steps[both], dt_s * ppo_played.steps[both]
-        ),
+        taught=Judged.of(of_taught, dt_s),
+        ppo=Judged.of(of_ppo, dt_s),
+        success_gain=success_difference(of_ppo.once, of_taught.once),
+        time_saved_s=median_difference(dt_s * of_taught.steps[both], dt_s * of_ppo.steps[both]),
         moved=float(np.abs(after.act(states) - before.act(states)).mean()),
     )
-    is_kept = ppo_judged.score > taught_judged.score
+    is_kept = of_ppo.score > of_taught.score
     (after if is_kept else before).save(out)
     return comparison, updates if is_kept else 0
 
@@ -287,7 +283,7 @@ def _say_unchanged(title: str, improved: ExpertResult, pupil: Path | None) -> No
         raise ItemRejectedError(
             "ppo_changed_nothing",
             f"{words}; give it more with --expert.ppo.total-steps or --expert.ppo.max-seconds",
-            improved.steps,
+            float(improved.steps),
         )
     logger.warning("%s: the expert is the taught policy", words)
 

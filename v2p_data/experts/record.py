@@ -7,7 +7,6 @@ import numpy as np
 
 from policies.evaluation.paired import Difference
 from policies.evaluation.rate import Rate, wilson
-from policies.ppo.evaluate import score
 from v2p_data.experts.teacher import Played, Trial
 
 
@@ -29,9 +28,7 @@ class Judged:
         return Judged(
             success=wilson(int(once.sum()), len(once)),
             median_s=dt_s * float(np.median(steps[once])) if once.any() else None,
-            score=float(
-                np.mean([score(s, w) for s, w in zip(once, steps / played.horizon, strict=True)])
-            ),
+            score=played.score,
         )
 
 

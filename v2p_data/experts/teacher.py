@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from policies.ppo.evaluate import score
 from v2p_data.experts.primitives import (
     CLOSE,
     Actions,
@@ -120,6 +121,12 @@ class Played:
     def once(self) -> Bool[np.ndarray, "env"]:
         """Success was held at some time, which is what episodes are recorded for."""
         return self.steps <= self.horizon
+
+    @property
+    def score(self) -> float:
+        """Mean of `policies.ppo.evaluate.score` over the worlds."""
+        waited = self.steps / self.horizon
+        return float(np.mean([score(*pair) for pair in zip(self.once * 1.0, waited, strict=True)]))
 
 
 def play(env: BatchEnv, act: Act, seed: int | None = None) -> Played:
