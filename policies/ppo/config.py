@@ -66,10 +66,10 @@ class PPOConfig:
     """Control steps over all worlds; the recipe's budget: about 150 s on one core to itself."""
     max_seconds: float = 600.0
     """Wall-clock safety net, added up over resumptions; a run it stops depends on the machine."""
-    target_success: float = 0.95
-    """From nothing, training goes on to this success of the deterministic worlds before a plateau may end it."""
-    plateau_steps: int = 150_000
-    """Training stops once so many control steps brought no better success or time to success."""
+    target_success: float = 0.98
+    """Training goes on to this success of the deterministic worlds before a plateau may end it."""
+    plateau_steps: int = 100_000
+    """From then on it stops once so many control steps brought no better success or time to success."""
     plateau_gain: float = 0.005
     """What counts as better: so much more success, or a time to success that is shorter by ten times this share of an episode."""
     window_episodes: int = 128

@@ -257,8 +257,8 @@ class _Learner:
             return "steps"
         if self.is_warm and progress.success(cfg) < progress.best_success - cfg.decline:
             return "decline"
-        may_end = self.is_warm or progress.best_success >= cfg.target_success
-        if may_end and progress.steps - progress.plateau_since >= cfg.plateau_steps:
+        is_good = progress.best_success >= cfg.target_success
+        if is_good and progress.steps - progress.plateau_since >= cfg.plateau_steps:
             return "plateau"
         if progress.seconds >= cfg.max_seconds:
             return "seconds"
@@ -336,7 +336,7 @@ class _Learner:
                 outcomes.append(float(success[world, t]))
                 if world < cfg.num_deterministic:
                     waited = float(progress.waited[world] / progress.age[world])
-                    progress.scores.append(score(outcomes[-1], waited))
+                    progress.scores.append(score(float(waited > 0), waited))
                 progress.returns.append(float(progress.episode_return[world]))
             for name in ("discounted", "episode_return", "age", "waited"):
                 getattr(progress, name)[ended] = 0.0
