@@ -162,7 +162,9 @@ class WarpBatchEnv:
         poses = self.task.reset_poses(ids, self.object_names)
         for k, name in enumerate(self.object_names):
             self._object_qpos[ids, k] = poses[name].to(self.device, torch.float32)
-        self._start_pose[ids] = self._object_qpos[ids]
+        self._start_pose[ids] = start = self._object_qpos[ids]
+        where = start.cpu().numpy().astype(float)
+        check_poses(self.world, self.randomizer.size_m[rows], where, self.bundle.title)
         self._steps[ids] = 0
         self._held[ids] = 0
         self._last_action[ids] = 0
