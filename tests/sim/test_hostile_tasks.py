@@ -176,7 +176,7 @@ def test_a_thing_may_start_on_another_and_not_above_it(
         BatchEnv(task, num_envs=NUM_WORLDS, seed=0, num_threads=1)
 
     start(0.0)
-    with pytest.raises(ItemRejectedError, match="'cube' 9[01] mm above what could carry it"):
+    with pytest.raises(ItemRejectedError, match=r"'cube' 9[01] mm above what could carry it"):
         start(0.09)
 
 

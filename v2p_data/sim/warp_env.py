@@ -26,6 +26,7 @@ from v2p_data.sim import task_code
 from v2p_data.sim.batch_env import ACT_DIM, HELD_STEPS, SimConfig, robot_of
 from v2p_data.sim.randomize import Randomizer
 from v2p_data.sim.robot import COARSE, FINE, FINGER_TRAVEL_M, NUM_ARM_JOINTS
+from v2p_data.sim.start_check import check_poses
 from v2p_data.sim.tensor_states import (
     SeenTensors,
     base_observation,
