@@ -29,7 +29,8 @@ class ObjectProbe:
 
     pos: Float[np.ndarray, "env 3"]
     quat: Float[np.ndarray, "env 4"]
-    size: Float[np.ndarray, "3"]
+    size: Float[np.ndarray, "*env 3"]
+    """One for all rows, or one per row."""
     start_pos: Float[np.ndarray, "env 3"]
     start_quat: Float[np.ndarray, "env 4"]
     vel_linear: Float[np.ndarray, "env 3"]
@@ -73,7 +74,7 @@ class Probe:
                 f"{name}_quat": o.quat,
                 f"{name}_vel_linear": o.vel_linear,
                 f"{name}_vel_angular": o.vel_angular,
-                f"{name}_size": np.tile(o.size, (n, 1)),
+                f"{name}_size": np.broadcast_to(o.size, (n, 3)),
                 f"{name}_start_pos": o.start_pos,
                 f"{name}_start_quat": o.start_quat,
                 f"{name}_up": up,
@@ -138,6 +139,7 @@ def random_states(scene: Scene, count: int, rng: np.random.Generator) -> States:
     probe.gripper_width = rng.uniform(0, GRIPPER_OPENING_M, count)
     probe.eef_vel_linear = rng.normal(0, 0.1, (count, 3))
     for o in probe.objects.values():
+        o.size = o.size * rng.uniform(0.85, 1.15, (count, 3))
         shift = np.column_stack([rng.uniform(-0.1, 0.1, (count, 2)), np.zeros(count)])
         o.start_pos = o.start_pos + shift
         yaw = Rotation.from_rotvec(
