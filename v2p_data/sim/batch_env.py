@@ -218,6 +218,7 @@ class BatchEnv:
         seed: everything drawn follows from it.
         num_threads: 0 for all cores; changes no result.
         task: the task, instead of `bundle.code`.
+        base_reset: place objects as the environment does, whatever the task's own reset says.
 
     Raises:
         ItemRejectedError: an object does not suit the robot, or the objects do not fit on the table.
@@ -235,7 +236,9 @@ class BatchEnv:
         seed: int,
         num_threads: int = 0,
         task: type[Task] | None = None,
+        base_reset: bool = False,
     ) -> None:
+        self._base_reset = base_reset
         self.cfg = cfg or SimConfig()
         self.bundle = bundle
         self.num_envs = num_envs
@@ -324,7 +327,12 @@ class BatchEnv:
         self._target_pos[ids] = tool_pos
         self._target_quat[ids] = quats_pointing_down(yaw).T
         self._target_finger[ids] = self._robot.finger_travel_m
-        poses = self.task.reset_poses(torch.from_numpy(ids), self.object_names)
+        rows = torch.from_numpy(ids)
+        poses = (
+            self.sample_object_poses(rows)
+            if self._base_reset
+            else self.task.reset_poses(rows, self.object_names)
+        )
         for k, name in enumerate(self.object_names):
             self._object_qpos[ids, k] = poses[name].numpy()
         self._start_pose[ids] = start = self._object_qpos[ids]

@@ -151,13 +151,14 @@ class Case:
         return distance - self.reach(self.thing, u, time) - self.reach(self.other, -u, time)
 
     def was_reached(self) -> Bool[np.ndarray, "env"]:
-        """Tell whether the robot has been at the manipulated object, or has touched the tool that pushed it."""
+        """Tell whether the robot has been at the object that moved, or has touched the tool that pushed it."""
         thing = self.thing
         away = np.einsum(
             "tejk,tej->tek", thing.axes, self.trajectory.eef_pos - thing.pos
         )  # in the object's own frame
         outside = np.maximum(np.abs(away) - thing.size_m / 2, 0.0)
-        reached = thing.touched.any(axis=(0, 2))
+        reached = np.linalg.norm(np.ptp(thing.pos, axis=0), axis=-1) < REST_M  # then nothing moved
+        reached |= thing.touched.any(axis=(0, 2))
         reached |= (np.linalg.norm(outside, axis=-1) < REACHED_M).any(axis=0)
         if KINDS[self.scene.kind].grasps == "tool":
             reached |= self.other.touched.any(axis=(0, 2))

@@ -5,6 +5,7 @@ the sandboxed child was answered by the sample's reset is held against the layou
 the video. Poses that the environment itself drew are never faulted.
 """
 
+import ast
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,19 @@ class ResetFindings:
     """The larger of the starts' ranges along x and y."""
     outside_m: float = 0.0
     """How far the video's layout lies outside of the starts."""
+
+
+def has_own_reset(code: str) -> bool:
+    """Tell whether task code places objects in another way than the environment does."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.FunctionDef) and node.name == "reset_objects_states":
+            does = [s for s in node.body if not isinstance(s, ast.Expr)]
+            asked = does[0].value if len(does) == 1 and isinstance(does[0], ast.Return) else None
+            if not isinstance(asked, ast.Call) or not isinstance(asked.func, ast.Attribute):
+                return True
+            base = ("super().reset_objects_states", "self.envs.sample_object_poses")
+            return ast.unparse(asked.func) not in base
+    return False
 
 
 def reset_findings(scene: Scene, offered: States, result: SmokeResult) -> ResetFindings:

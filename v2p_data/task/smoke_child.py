@@ -30,6 +30,8 @@ MAX_REWARD = 1000.0
 """Ten times the bonus for success, which then hardly counts."""
 MAX_ANSWER_BYTES = 4_000_000
 SLOW_S = 1.0
+SCALED = ("_pos", "_size", "_width")
+"""How the names of states in metres end."""
 
 _HARMLESS = """
 scene_info = {}
@@ -152,11 +154,12 @@ def _demand_own_success(
         BadTaskError: it changes when two worlds with very large and very small numbers are added.
     """
     one = {k: v[:1] for k, v in states.items()}
-    scaled = ("_pos", "_size", "_vel_linear", "_width")
-    strange = [{k: v * f if k.endswith(scaled) else v for k, v in one.items()} for f in (9, 0.01)]
-    beside = {k: torch.cat([v, *(s[k] for s in strange)]) for k, v in states.items()}
-    n = len(answers.success)
-    if not torch.equal(_answers(task, beside).success[:n], answers.success):
+    wide = {k: v * 9 if k.endswith(SCALED) else v for k, v in one.items()}
+    wide |= {k: v + 1e4 for k, v in one.items() if "_vel_" in k}
+    narrow = {k: v * 0.01 if k.endswith(SCALED) else v for k, v in one.items()}
+    beside = {k: torch.cat([v, wide[k], narrow[k]]) for k, v in states.items()}
+    success = task.succeeds(lambda: {k: v.clone() for k, v in beside.items()})
+    if not torch.equal(success[: len(answers.success)], answers.success):
         raise BadTaskError(
             "success in one environment depends on the others; take the maximum, minimum or mean along a dimension"
         )
