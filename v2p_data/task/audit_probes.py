@@ -4,7 +4,7 @@ Probes are built here and answered in the child process of `smoke`; nothing here
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -22,6 +22,7 @@ from v2p_data.task.probes import (
     concatenated,
     first_pose,
     rest_height,
+    rest_heights,
 )
 from v2p_data.task.templates.variants import POSITION_ERROR_M, SIZE_ERROR_M, SIZE_ERROR_SHARE
 
@@ -46,6 +47,8 @@ YAW_SIGMA_RAD = 0.1
 SWAY_M_S, SWAY_RAD_S = 0.016, 0.1
 """Per axis: how a thing held up at the end still moves. In 32 lifts at the fine step 90 % were slower than 0.027 m/s and
 0.15 rad/s over the last quarter of a second."""
+LIFTED_M = 0.02
+"""What is higher than this above where it would rest is off the table, at a height that may be wrong, too."""
 TURNED_AWAY_M = 0.05
 """A motion longer than this on the table may also go in a wrong direction, or end too far from where it leads."""
 HANDS = ("held", "let go", "touching")
@@ -277,42 +280,37 @@ def _disturbed(
     What stands on the table stays on it; starts are those of the video.
     """
     many = [m for _ in NOISE_SCALES for m in moments for _ in range(draws)]
-    scale = np.repeat(NOISE_SCALES, len(moments) * draws)
-    shifts, factors, turns = {}, {}, {}
+    n, scale = len(many), np.repeat(NOISE_SCALES, len(moments) * draws)[:, None]
+    poses: dict[str, np.ndarray] = {}
+    sizes: dict[str, np.ndarray] = {}
+    starts: dict[str, np.ndarray] = {}
     for obj in scene.objects:
         size = np.asarray(obj.size_m)
         sigma = np.minimum(SIZE_SIGMA_M / size, SIZE_SIGMA_SHARE)
-        factors[obj.name] = np.exp(rng.normal(size=(len(many), 3)) * sigma * scale[:, None])
-        shifts[obj.name] = rng.normal(size=(len(many), 3)) * POSITION_SIGMA_M * scale[:, None]
-        turns[obj.name] = rng.normal(size=len(many)) * YAW_SIGMA_RAD * scale
+        larger = sizes[obj.name] = size * np.exp(rng.normal(size=(n, 3)) * sigma * scale)
+        shift = rng.normal(size=(n, 3)) * POSITION_SIGMA_M * scale
+        yaw = np.zeros((n, 3))
+        yaw[:, 2] = rng.normal(size=n) * YAW_SIGMA_RAD * scale[:, 0]
+        at = np.stack([m[obj.name] for m in many])
+        above = at[:, 2] - rest_heights(obj, at[:, 3:], np.tile(size, (n, 1)))
+        turned = Rotation.from_rotvec(yaw) * Rotation.from_quat(at[:, 3:], scalar_first=True)
+        at[:, 3:] = turned.as_quat(scalar_first=True)
+        at[:, :2] += shift[:, :2]
+        lifted = np.where(above > LIFTED_M, above + shift[:, 2], above)
+        at[:, 2] = rest_heights(obj, at[:, 3:], larger) + np.maximum(lifted, 0.0)
+        poses[obj.name] = at
+        first = np.tile(_tracked(scene)[0][obj.name][3:], (n, 1))
+        starts[obj.name] = rest_heights(obj, first, larger)
+    moved = [{name: at[k] for name, at in poses.items()} for k in range(n)]
     made: list[Probe] = []
     for hand in hands or hands_of(scene):
-        moved: list[Poses] = []
-        for k, poses in enumerate(many):
-            row: Poses = {}
-            for obj in scene.objects:
-                pose = poses[obj.name].copy()
-                above = pose[2] - rest_height(obj, pose[3:])
-                turn = Rotation.from_rotvec([0.0, 0.0, turns[obj.name][k]])
-                quat = turn * Rotation.from_quat(pose[3:], scalar_first=True)
-                pose[3:] = quat.as_quat(scalar_first=True)
-                larger = replace(obj, size_m=tuple(factors[obj.name][k] * obj.size_m))
-                pose[:2] += shifts[obj.name][k, :2]
-                lifted = above + shifts[obj.name][k, 2] if above > 0.02 else max(above, 0.0)
-                pose[2] = rest_height(larger, pose[3:]) + max(lifted, 0.0)
-                row[obj.name] = pose
-            moved.append(row)
         probe = _at_pose(scene, moved, hand)
         main = probe.objects[scene.manipulated.name]
-        main.vel_linear = rng.normal(size=(len(many), 3)) * SWAY_M_S * scale[:, None]
-        main.vel_angular = rng.normal(size=(len(many), 3)) * SWAY_RAD_S * scale[:, None]
-        for obj in scene.objects:
-            o = probe.objects[obj.name]
-            o.size = factors[obj.name] * obj.size_m
-            standing = np.array(
-                [rest_height(replace(obj, size_m=tuple(size)), o.start_quat[0]) for size in o.size]
-            )
-            o.start_pos[:, 2] = standing
+        main.vel_linear = rng.normal(size=(n, 3)) * SWAY_M_S * scale
+        main.vel_angular = rng.normal(size=(n, 3)) * SWAY_RAD_S * scale
+        for name, o in probe.objects.items():
+            o.size = sizes[name]
+            o.start_pos[:, 2] = starts[name]
         made.append(probe)
     return made
 

@@ -86,13 +86,20 @@ class Probe:
 
 def rest_height(obj: SceneObject, quat_wxyz: Float[np.ndarray, "4"]) -> float:
     """Return how high the centre of its bounding box is above the table when it rests turned like this [m]."""
-    R = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
-    half = np.asarray(obj.size_m) / 2
+    return float(rest_heights(obj, quat_wxyz[None], np.asarray(obj.size_m)[None])[0])
+
+
+def rest_heights(
+    obj: SceneObject, quat_wxyz: Float[np.ndarray, "n 4"], size_m: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Return `rest_height` of copies of an object, turned and sized one by one [m]."""
+    up = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()[:, 2]
+    half = size_m / 2
     if obj.shape == "sphere":
-        return float(half.max())
+        return half.max(axis=1)
     if obj.shape == "cylinder":
-        return float(half[0] * np.hypot(R[2, 0], R[2, 1]) + half[2] * abs(R[2, 2]))
-    return float(np.abs(R[2]) @ half)
+        return half[:, 0] * np.hypot(up[:, 0], up[:, 1]) + half[:, 2] * np.abs(up[:, 2])
+    return (np.abs(up) * half).sum(axis=1)
 
 
 def at_rest(scene: Scene, count: int = 1, centre: tuple[float, float] = (0.5, 0.0)) -> Probe:
