@@ -41,7 +41,7 @@ IDLE_SHARE, STOPPED_SHARE, MEANT_SHARE = 0.1, 0.3, 0.5
 
 def main() -> None:
     """Read the command line, play, judge, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/pick.jsonl"))
     parser.add_argument("--tasks", nargs="*", default=benchmark_names())
     parser.add_argument("--episodes", type=int, default=160, help="per task")
