@@ -109,7 +109,8 @@ def test_the_model_chooses_with_the_audit_before_it_among_what_the_audit_accepts
     assert written.made.picked == written.audit["picked"] == 2
     assert written.audit["pick"]["by"] == "vlm"
     assert written.audit["pick"]["reasons"]["correctness"] == "held and raised"
-    assert written.audit["pick"]["audits_pick"] == 2  # 3 cm, as code 1 asks, is a third of the lift
+    # Code 1 asks for 3 cm, which is less than a third of the way.
+    assert written.audit["pick"]["audits_pick"] == 2
     assert TaskBundle.load(written.folder / "task").code == written.made.samples[2].code
 
 
