@@ -4,7 +4,7 @@ All of them go through the same judge, so an expert's and a program's rates say 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.seeds import seed_for
+from v2p_data.task.reset_audit import has_own_reset
 from v2p_data.task.task import TaskBundle
 
 PROGRAMS = "programs"
@@ -101,6 +102,17 @@ def judge_task(
         size_px=size_px,
         on_progress=told,
     )
+
+
+def own_reset_rate(
+    play: Play, bundle: TaskBundle, cfg: EvaluationConfig, first_seed: int, runtime: Runtime
+) -> dict[str, Any] | None:
+    """Return the rate with the task's own reset, where others are judged with the environment's and the two differ."""
+    if cfg.reset == "task" or not has_own_reset(bundle.code):
+        return None
+    own = replace(cfg, reset="task")
+    judged = judge_task(play, bundle, own, first_seed, runtime, lambda _: None)
+    return wilson(int(judged.successes.sum()), len(judged.successes)).as_dict()
 
 
 def row_of(judged: Judged) -> dict[str, Any]:

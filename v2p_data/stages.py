@@ -27,7 +27,7 @@ from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.solved import find_solved, solved_digests
 from v2p_data.json_files import read_object
-from v2p_data.judging import PROGRAMS, Contestant, judge_task, play_of, row_of
+from v2p_data.judging import PROGRAMS, Contestant, judge_task, own_reset_rate, play_of, row_of
 from v2p_data.pipeline.artifact import (
     Record,
     demand_whole,
@@ -174,7 +174,7 @@ def task_stage(scene: Stage, cfg: EngineConfig) -> Stage:
         config=Seeded(config=cfg.task.recipe(), seed=cfg.seed),
         inputs={"scene": scene},
         sources=_robot_digests(robot) | task_data(asks_model=cfg.task.writer == "vlm"),
-        version=1,
+        version=2,
         make=partial(make_task, robot=robot, how=cfg.task),
     )
 
@@ -634,7 +634,7 @@ def evaluation_stage(
             **who.sources,
             **{f"task {name}": _code_digest(path) for name, path in tasks.items()},
         },
-        version=2,
+        version=3,
         make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=tuple(seen)),
     )
 
@@ -691,12 +691,13 @@ def make_evaluation(
     rows: list[dict[str, Any]] = []
     for index, (name, folder) in enumerate(tasks.items()):
         bundle = TaskBundle.load(folder)
+        seed = seed_for(cfg.seed, "evaluation", name) % 2**31
         with told_of(folder):
             judged = judge_task(
                 play,
                 bundle,
                 cfg.config,
-                seed_for(cfg.seed, "evaluation", name) % 2**31,
+                seed,
                 runtime,
                 lambda share, k=index, words=name: runtime.progress(
                     (k + share) / len(tasks), words
@@ -707,7 +708,9 @@ def make_evaluation(
         write_contact_sheet(
             bundle, judged.shown, videos / SHEET_FILE, SheetConfig(successes=3, failures=3)
         )
-        rows.append({"task": name, "seen": name in seen, "judged": who.kind, **row_of(judged)})
+        row = {"task": name, "seen": name in seen, "judged": who.kind, **row_of(judged)}
+        own = own_reset_rate(play, bundle, cfg.config, seed, runtime)
+        rows.append(row | ({"own_reset": own} if own else {}))
     (out / EVALUATION_FILE).write_text(json.dumps(rows, indent=1))
     return {"tasks": len(rows), "rows": rows}
 

@@ -1,6 +1,8 @@
 """The judge on tasks whose success can be told in advance; no policy is loaded."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -9,9 +11,12 @@ from v2p_data.errors import V2PError
 from v2p_data.evaluation.actors import ExpertActor, ProgramActor
 from v2p_data.evaluation.batch import NEVER, Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.judging import own_reset_rate
+from v2p_data.pipeline.runner import Runtime
 from v2p_data.sim.batch_env import HELD_STEPS, BatchEnv
 from v2p_data.sim.observation import PROGRESS_COLUMN
 from v2p_data.task.benchmark import load_benchmark
+from v2p_data.task.reset_audit import has_own_reset
 from v2p_data.task.task import Task, TaskBundle
 
 SIZE_PX = 32
@@ -61,6 +66,40 @@ def judged(bundle, actor, episodes=5, **settings) -> Judged:
     return judge(
         bundle, actor, episodes=episodes, first_seed=3, cfg=cfg, size_px=SIZE_PX, task=HighTool
     )
+
+
+RESET = """
+    def reset_objects_states(self, env_ids):
+        poses = self.envs.sample_object_poses(env_ids)
+        poses["tea_box"][:, :2] = poses["tea_box"][:, :2] * 0.01 + torch.tensor([0.6, 0.2])
+        return poses
+"""
+
+
+def test_an_evaluation_may_begin_where_the_environment_says_and_shows_both_rates(tmp_path: Path):
+    base = """
+    def reset_objects_states(self, env_ids):
+        return super().reset_objects_states(env_ids)
+"""
+    found = load_benchmark("lift_up")
+    own = replace(found, code=found.code.replace(base, RESET), horizon_steps=6)
+    cfg = EvaluationConfig(worlds=4, episodes=4, reset="base")
+
+    def first_places(bundle: TaskBundle, reset: Literal["task", "base"]) -> np.ndarray:
+        how = replace(cfg, reset=reset)
+        played = judge(bundle, Drive(), episodes=4, first_seed=3, cfg=how, size_px=SIZE_PX)
+        return played.shown.snapshots[0].qpos[:, -7:-4]
+
+    assert np.array_equal(first_places(own, "base"), first_places(found, "task"))
+    assert np.abs(first_places(own, "task")[:, 1] - 0.2).max() < 0.01
+    assert (has_own_reset(own.code), has_own_reset(found.code)) == (True, False)
+    both = [
+        own_reset_rate(lambda _: (Drive(), SIZE_PX), b, cfg, 3, Runtime(root=tmp_path))
+        for b in (own, found)
+    ]
+    assert both[0] is not None
+    assert both[0]["trials"] == 4
+    assert both[1] is None
 
 
 def test_success_is_lost_again_at_the_end_and_counts_once(bundle):

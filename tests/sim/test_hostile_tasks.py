@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from v2p_data.episodes.rollouts import CutConfig, roll_out
-from v2p_data.errors import V2PError
+from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.scene.scene import SceneObject
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.task import guarded
 from v2p_data.task.guarded import StatesChangedError, TaskOutputError
@@ -113,7 +114,7 @@ def test_no_idle_robot_gets_an_episode_that_counts(
     bundle = replace(make_bundle(horizon=14), code=code(**bodies), class_name="Lift")
 
     counted = 0
-    with contextlib.suppress(StatesChangedError):
+    with contextlib.suppress(StatesChangedError, ItemRejectedError):
         counted = roll_out(
             bundle,
             lambda obs: np.zeros((len(obs), 7), np.float32),
@@ -124,6 +125,79 @@ def test_no_idle_robot_gets_an_episode_that_counts(
         ).successes.sum()
 
     assert counted == 0
+
+
+COUNTING = """
+self.count = self.count + 1
+poses = self.envs.sample_object_poses(env_ids)
+if self.count > {honest}:
+    {cheat}
+return poses"""
+STARTS = {
+    "held above the table": ("poses['cube'][-1, 2] += 0.09", "starts_in_the_air", "90 mm above"),
+    "in the table": ("poses['cube'][-1, 2] -= 0.01", "starts_in_the_table", "inside the table"),
+    "far under the table": ("poses['cube'][-1, 2] -= 900.0", "starts_in_the_table", "inside the table"),
+    "900 km away": ("poses['cube'][-1, 0] += 900000.0", "starts_off_the_table", "1.4 m"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("cheat", "reason", "words"), STARTS.values(), ids=STARTS)
+@pytest.mark.parametrize("honest", [0, 2], ids=["at once", "at the third reset"])
+def test_no_world_starts_where_it_cannot_at_any_reset(
+    cheat: str, reason: str, words: str, honest: int, make_env: Callable[..., BatchEnv]
+):
+    def three_starts() -> None:
+        env = make_env(reset=COUNTING.format(honest=honest, cheat=cheat))
+        for k in (2, 5):
+            env.reset(np.array([k]))
+
+    with pytest.raises(ItemRejectedError, match="task 'test' starts 'cube'") as caught:
+        three_starts()
+
+    assert caught.value.reason == reason
+    assert words in caught.value.detail
+
+
+def test_a_thing_may_start_on_another_and_not_above_it(
+    make_bundle: Callable[..., TaskBundle], make_object: Callable[..., SceneObject]
+):
+    plate = make_object("plate", size_m=(0.1, 0.1, 0.02), role="reference", pos=(0.0, 0.2, 0.01))
+    bundle = make_bundle(make_object("cube"), plate)
+
+    def start(gap_m: float) -> None:
+        # The plate's top is at 2 cm, give or take a tenth; the cube's centre is half a cube above its lowest point.
+        onto = (
+            "poses = self.envs.sample_object_poses(env_ids)\n"
+            "height = poses['cube'][:, 2] + 2 * poses['plate'][:, 2]\n"
+            "poses['cube'][:, :2] = poses['plate'][:, :2]\n"
+            f"poses['cube'][:, 2] = height + {gap_m}\nreturn poses"
+        )
+        task = replace(bundle, code=code(reset=onto), class_name="Lift")
+        BatchEnv(task, num_envs=NUM_WORLDS, seed=0, num_threads=1)
+
+    start(0.0)
+    with pytest.raises(ItemRejectedError, match=r"'cube' 9[01] mm above what could carry it"):
+        start(0.09)
+
+
+def test_worlds_that_a_later_reset_starts_solved_never_count_and_end_it(
+    make_env: Callable[..., BatchEnv],
+):
+    lying = "poses['cube'][:, 3:] = torch.tensor([0.5 ** 0.5, 0.5 ** 0.5, 0.0, 0.0])"
+    env = make_env(
+        reset=COUNTING.format(honest=1, cheat=lying),
+        success="success = states['cube_up'].abs() < 0.5",
+    )
+    held = []
+
+    env.reset(np.arange(3))
+    for _ in range(12):
+        held.append(env.step(np.zeros((NUM_WORLDS, 7))).held)
+    env.reset(np.arange(3))
+
+    assert not np.any(held)
+    with pytest.raises(ItemRejectedError, match="starts solved: its success is true at 6 of 9"):
+        env.step(np.zeros((NUM_WORLDS, 7)))
 
 
 def test_the_states_that_are_judged_are_those_of_the_physics(make_env: Callable[..., BatchEnv]):

@@ -6,10 +6,12 @@ import pytest
 from v2p_data.errors import ItemRejectedError
 from v2p_data.task.audit import audit
 from v2p_data.task.audit_probes import build_probes
+from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.probes import rest_height
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
 from v2p_data.task.task import TaskBundle
+from v2p_data.task.templates.write import write_samples
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +37,7 @@ def lift(success):
 
 def audits(scene, codes):
     probes = build_probes(scene, np.random.default_rng(0))
-    results = smoke_run_all(codes, scene, probes=probes.states)
+    results = smoke_run_all(codes, scene, probes=probes.states, starts=probes.starts)
     return [audit(scene, probes, r) for r in results]
 
 
@@ -56,12 +58,14 @@ def test_cheats_are_found_out(scene_of):
         ],
     )
 
-    assert good.score == 1.0
+    assert failed(good) == set()
+    assert good.score > 0.9
     assert good.is_acceptable
     assert "first pose" in at_start.vetoed
     assert "first_pose" in failed(touch)  # held at the first pose is a touch
     assert not touch.is_acceptable
     assert failed(fling) == {"flung"}
+    assert "flies past" in fling.vetoed
     assert "workspace" in never.vetoed
     assert failed(tiny) == {"becomes_true", "in_the_air"}
 
@@ -78,8 +82,8 @@ def test_it_says_from_which_pose_on_the_video_succeeds(scene_of):
 def test_noise_at_the_end_costs_points_but_is_no_veto(scene_of):
     (verdict,) = audits(scene_of("lift_up"), [lift("(height > 0.2) & (speed < 0.1)")])
 
-    assert failed(verdict) == {"last_pose"}
-    assert 0.5 < verdict.score < 1.0
+    assert failed(verdict) == {"last_pose", "accepts_end"}
+    assert 0.5 < verdict.score < 0.9
     assert verdict.is_acceptable
 
 
@@ -110,9 +114,106 @@ def test_a_scene_becomes_a_task_that_can_be_loaded_again(kind, scene_of, tmp_pat
     assert loaded.kind == kind
     assert loaded.class_name in loaded.code
     assert len(list((tmp_path / "task" / "samples").glob("*.py"))) == len(table["samples"]) == 8
-    assert made.samples[made.picked].score == max(s.score for s in made.samples) == 1.0
+    assert made.samples[made.picked].score == max(s.score for s in made.samples) > 0.8
     assert all(s.runnable for s in made.samples)
-    assert made.samples[6].score < 1.0  # the naive success
+    assert "flies past" in made.samples[6].audit.vetoed  # the naive success
+
+
+def test_the_threshold_furthest_from_start_and_end_scores_highest(scene_of):
+    # The box is lifted by 17.5 cm, give or take a centimetre and a half.
+    low, middle, high = audits(
+        scene_of("lift_up"),
+        [
+            lift(f"(height > {metres}) & (states['box_grasped'] > 0.5) & (speed < 0.1)")
+            for metres in (0.02, 0.1, 0.17)
+        ],
+    )
+
+    assert middle.score > max(low.score, high.score)
+    assert {c.name for c in low.checks if c.right is not None and c.right < 0.95} == {
+        "rejects_near_misses"
+    }
+    assert {c.name for c in high.checks if c.right is not None and c.right < 0.95} == {
+        "accepts_end"
+    }
+
+
+@pytest.mark.parametrize("name", benchmark_names())
+def test_every_benchmark_task_is_acceptable_and_its_naive_sample_refused(name):
+    scene = load_benchmark(name).scene
+    codes = write_samples(scene)
+
+    first, naive = audits(scene, [codes[0], codes[6]])
+
+    assert first.is_acceptable
+    assert "last_pose" not in failed(first)
+    assert not naive.is_acceptable
+
+
+def test_the_naive_code_of_figure_11_is_refused_for_hanging_on_other_worlds(scene_of):
+    scene = scene_of("lift_up")
+    over_worlds = (
+        "states['box_pos'][:, 2] - states['table_height'] > torch.max(states['box_size']) / 2"
+    )
+    beside = "(height > 0.1) & (speed < speed.mean() + 0.1)"
+    own = lift("states['box_pos'][:, 2] - states['table_height'] > states['box_size'].amax(dim=1)")
+
+    naive, mean, single = audits(scene, [lift(over_worlds), lift(beside), own])
+
+    assert "depends on the others" in naive.vetoed
+    assert "depends on the others" in mean.vetoed
+    assert "flies past" in single.vetoed
+
+
+RESETS = {
+    "beside its reference": (
+        "poses['can'][:, :2] = poses['bowl'][:, :2] - torch.tensor([0.0, 0.14])",
+        "near its goal",
+    ),
+    "beside it from the third reset on": (
+        "self.count = self.count + 1\n"
+        "        if self.count > 2:\n"
+        "            poses['can'][:, :2] = poses['bowl'][:, :2] - torch.tensor([0.0, 0.14])",
+        "near its goal",
+    ),
+    "always at one place": (
+        "poses['can'][:, :2] = torch.tensor([0.5, 0.0])\n"
+        "        poses['bowl'][:, :2] = torch.tensor([0.5, 0.23])",
+        "the same place",
+    ),
+    "lying": (
+        "poses['can'][:, 2] -= 0.03\n"
+        "        poses['can'][:, 3:] = torch.tensor([0.5 ** 0.5, 0.5 ** 0.5, 0.0, 0.0])",
+        "turned otherwise",
+    ),
+    "in the air": ("poses['can'][:, 2] += 0.05", "in the air"),
+    "in each other": ("poses['can'][:, :2] = poses['bowl'][:, :2]", "in success"),
+    "out of reach": ("poses['can'][:, 0] += 0.4", "out of reach"),
+    "away from where the video begins": (
+        "poses['can'][:, 1] -= 0.2\n        poses['bowl'][:, 1] -= 0.2",
+        "where the video itself begins",
+    ),
+    "in success": (
+        "poses['can'][:, :2] = poses['bowl'][:, :2] - torch.tensor([0.0, 0.081])",
+        "in success",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "words"), RESETS.values(), ids=RESETS)
+def test_a_reset_that_makes_the_task_easy_is_refused(change, words, scene_of):
+    scene = scene_of("push_next_to")
+    code = write_samples(scene, 1)[0]
+    base = "        return super().reset_objects_states(env_ids)"
+    own = f"        poses = self.envs.sample_object_poses(env_ids)\n        {change}\n        return poses"
+    made = "super().__init__(envs, urdf_assets_root, scene_info)"
+    cheat = code.replace(base, own).replace(made, f"{made}\n        self.count = 0")
+    harmless = code.replace(base, own.replace(change, "poses['can'][:, 0] += 0.01"))
+
+    refused, accepted = audits(scene, [cheat, harmless])
+
+    assert words in refused.vetoed
+    assert accepted.is_acceptable
 
 
 def test_the_seed_decides_the_probes(scene_of):

@@ -177,3 +177,16 @@ def test_the_tool_must_do_the_pushing():
 def test_doing_nothing_is_no_success(kind):
     still = track(HERE, HERE, touched_before=False)
     assert not verdict(kind, [still, STILL], BOX, REF)
+
+
+def test_what_moves_by_itself_is_no_success_and_a_finger_beside_it_is_enough():
+    alone = track(HERE, (0.5, 0.1, 0.02), touched_before=False)
+    objects = {"box": alone}
+
+    def judged(tool_at) -> bool:
+        course = Trajectory(objects=objects, eef_pos=np.tile(tool_at, (STEPS, 1, 1)))
+        return bool(referee_success("push_left", scene("push_left", BOX), course)[0])
+
+    # The box's right side is at y = -2 cm when it starts.
+    assert not judged((0.5, -0.07, 0.02))
+    assert judged((0.5, -0.05, 0.02))

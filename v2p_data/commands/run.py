@@ -435,6 +435,8 @@ def _more(row: dict[str, Any]) -> str:
     words = ""
     if row.get("at_end"):
         words += f"; at the end {row['at_end']['rate']:.0%}"
+    if row.get("own_reset"):
+        words += f"; from the task's own starts {row['own_reset']['rate']:.0%}"
     failures = [f"{kind.replace('_', ' ')} {n}" for kind, n in row.get("failures", {}).items()]
     return words + (f"; failures: {', '.join(failures)}" if failures else "")
 

@@ -136,7 +136,13 @@ def judge(
             count = min(cfg.worlds, episodes - start)
             with watch.on("physics"):
                 env = BatchEnv(
-                    bundle, sim, num_envs=count, seed=0, num_threads=num_threads, task=task
+                    bundle,
+                    sim,
+                    num_envs=count,
+                    seed=0,
+                    num_threads=num_threads,
+                    task=task,
+                    base_reset=cfg.reset == "base",
                 )
                 seeds = [stream_seed(first_seed + start + k) for k in range(count)]
                 env.reset_seeded(np.arange(count), seeds)

@@ -1,6 +1,7 @@
 """Settings of an evaluation."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from v2p_data.task.task import POLICY_HORIZON_SCALE
 
@@ -17,6 +18,10 @@ class EvaluationConfig:
     """An episode lasts at most this multiple of the task's own horizon: experts need about half of theirs."""
     at_end: bool = True
     """Go on after the first success and ask again at the end; else an episode is over with its first success."""
+
+    reset: Literal["task", "base"] = "task"
+    """Who says where an episode begins: the task's own code, or the environment, as for a task without a reset of its
+    own. With `base`, a task that has its own is judged both ways, and both rates are shown."""
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.worlds < 1:

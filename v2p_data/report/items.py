@@ -332,14 +332,9 @@ def _made_by(learning: Mapping[str, Any]) -> str:
 
 
 def _pick_words(rates: Mapping[str, Any]) -> str:
-    """Return which share of samples was of no use, before the pick and after it; nothing where it is not known."""
-    before, after = (
-        [number(as_dict(rates.get(when)).get(what)) for what in ("non_runnable", "zero_score")]
-        for when in ("before_pick", "after_pick")
-    )
-    if None in before or None in after:
+    """Return which share of the samples to pick from was of no use; nothing where it is not known."""
+    before = as_dict(rates.get("before_pick"))
+    broken, zero = number(before.get("non_runnable")), number(before.get("zero_score"))
+    if broken is None or zero is None:
         return ""
-    words = "{:.0%} of task codes did not run and {:.0%} ran and scored nothing"
-    return (
-        f"Before the pick {words.format(*before)}; after it {'{:.0%} and {:.0%}'.format(*after)}."
-    )
+    return f"Before the pick {broken:.0%} of task codes did not run and {zero:.0%} ran and scored nothing."

@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 from mujoco.batch import Batch
 
-from v2p_data.errors import V2PError
+from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.geometry.rotation import (
     exp,
     limited_to,
@@ -44,7 +44,13 @@ from v2p_data.sim.robot import (
     TARGET_LOW_M,
     ToolState,
 )
-from v2p_data.sim.start_check import check_start
+from v2p_data.sim.start_check import (
+    ADVICE,
+    SOLVED_AT_MOST,
+    SOLVED_BY_CHANCE,
+    check_poses,
+    check_start,
+)
 from v2p_data.sim.states import Observed, StateBlock
 from v2p_data.sim.world import CAMERA, World, build_world
 from v2p_data.task.task import Task, TaskBundle
@@ -54,7 +60,9 @@ HELD_STEPS = 5
 """Success counts when it is true for this many steps on end (0.25 s)."""
 
 STARTS_LOOKED_AT = 8
-"""Worlds whose first poses are checked when an environment is made."""
+"""Worlds whose first poses are held against MuJoCo's collisions when an environment is made."""
+FRESH, BEGAN_SOLVED = -1, -2
+"""Values of `_held`: before an episode's first step, and all through one that began in success."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,6 +218,7 @@ class BatchEnv:
         seed: everything drawn follows from it.
         num_threads: 0 for all cores; changes no result.
         task: the task, instead of `bundle.code`.
+        base_reset: place objects as the environment does, whatever the task's own reset says.
 
     Raises:
         ItemRejectedError: an object does not suit the robot, or the objects do not fit on the table.
@@ -227,7 +236,9 @@ class BatchEnv:
         seed: int,
         num_threads: int = 0,
         task: type[Task] | None = None,
+        base_reset: bool = False,
     ) -> None:
+        self._base_reset = base_reset
         self.cfg = cfg or SimConfig()
         self.bundle = bundle
         self.num_envs = num_envs
@@ -239,6 +250,7 @@ class BatchEnv:
         self.object_names = [o.name for o in self.world.objects]
         self.broken_count = 0
         """Worlds whose simulation broke down since the environment was made."""
+        self._num_starts = self._num_solved = 0
         self.starts: ResetSource | None = None
         """Where some episodes begin in the middle; for training only."""
         self._bind(num_threads)
@@ -315,12 +327,18 @@ class BatchEnv:
         self._target_pos[ids] = tool_pos
         self._target_quat[ids] = quats_pointing_down(yaw).T
         self._target_finger[ids] = self._robot.finger_travel_m
-        poses = self.task.reset_poses(torch.from_numpy(ids), self.object_names)
+        rows = torch.from_numpy(ids)
+        poses = (
+            self.sample_object_poses(rows)
+            if self._base_reset
+            else self.task.reset_poses(rows, self.object_names)
+        )
         for k, name in enumerate(self.object_names):
             self._object_qpos[ids, k] = poses[name].numpy()
-        self._start_pose[ids] = self._object_qpos[ids]
+        self._start_pose[ids] = start = self._object_qpos[ids]
+        check_poses(self.world, self.randomizer.size_m[ids], start, self.bundle.title)
         self._steps[ids] = 0
-        self._held[ids] = 0
+        self._held[ids] = FRESH
         self._last_action[ids] = 0
         self._touches[ids] = 0
         self._broken[ids] = False
@@ -661,7 +679,7 @@ class BatchEnv:
                 f"the reward of task '{self.bundle.title}' is {task_reward[env]} in world {env} although its state "
                 f"is finite; parts: { {k: float(v[env]) for k, v in said.components.items()} }"
             )
-        self._held = np.where(success, self._held + 1, 0)
+        self._count_held(success)
         reward = (task_reward + self.cfg.success_bonus * success) / self.cfg.reward_scale
         return StepResult(
             obs=obs,
@@ -673,6 +691,27 @@ class BatchEnv:
             task_reward=task_reward,
             components={k: self._of_sound_worlds(v) for k, v in said.components.items()},
         )
+
+    def _count_held(self, success: Bool[np.ndarray, "env"]) -> None:
+        """Count the steps for which success has been true on end; an episode that began in success never counts.
+
+        Raises:
+            ItemRejectedError: `starts_solved`: more episodes began so than chance explains.
+        """
+        is_fresh = self._held == FRESH
+        began = (self._held == BEGAN_SOLVED) | (is_fresh & success)
+        self._held = np.where(success, np.maximum(self._held, 0) + 1, 0)
+        self._held[began] = BEGAN_SOLVED
+        if is_fresh.any():
+            self._num_starts += int(is_fresh.sum())
+            self._num_solved += int((is_fresh & success).sum())
+            if self._num_solved > max(SOLVED_BY_CHANCE, SOLVED_AT_MOST * self._num_starts):
+                raise ItemRejectedError(
+                    "starts_solved",
+                    f"task '{self.bundle.title}' starts solved: its success is true at {self._num_solved} of "
+                    f"{self._num_starts} starts, before the robot has done anything; {ADVICE}",
+                    self._num_solved / self._num_starts,
+                )
 
     def _of_sound_worlds(self, value: torch.Tensor) -> Float32[np.ndarray, "env"]:
         """Return a copy of what the task gave, 0 for broken worlds."""

@@ -11,6 +11,7 @@ import torch
 from v2p_data.errors import ItemRejectedError
 from v2p_data.seeds import rng_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.start_check import SOLVED_AT_MOST
 from v2p_data.task.audit_probes import build_probes
 from v2p_data.task.guarded import GuardedTask, Show
 from v2p_data.task.task import Task, TaskBundle
@@ -18,8 +19,6 @@ from v2p_data.task.task import Task, TaskBundle
 NUM_WORLDS = 64
 IDLE_STEPS = 30
 """The robot stays where it is for this long (1.5 s), until everything has come to rest."""
-AT_MOST = 0.1
-"""Share of episodes that may start in success: some layouts of some tasks do by chance."""
 
 
 def check_task(
@@ -50,7 +49,7 @@ def check_task(
             "compute_success must ask what has become of the object",
             1.0,
         )
-    if at_start > AT_MOST:
+    if at_start > SOLVED_AT_MOST:
         raise ItemRejectedError(
             "success_at_start",
             f"{where} is true at {at_start:.0%} of {NUM_WORLDS} starts, before the robot has moved; "
@@ -60,7 +59,7 @@ def check_task(
     idle = np.zeros((NUM_WORLDS, env.act_dim))
     held = [env.step(idle).held for _ in range(IDLE_STEPS)]
     by_itself = float(held[-1].mean())
-    if by_itself > AT_MOST:
+    if by_itself > SOLVED_AT_MOST:
         raise ItemRejectedError(
             "success_by_itself",
             f"{where} is true in {by_itself:.0%} of {NUM_WORLDS} worlds after {IDLE_STEPS} steps without any action; "

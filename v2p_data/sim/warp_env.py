@@ -26,6 +26,7 @@ from v2p_data.sim import task_code
 from v2p_data.sim.batch_env import ACT_DIM, HELD_STEPS, SimConfig, robot_of
 from v2p_data.sim.randomize import Randomizer
 from v2p_data.sim.robot import COARSE, FINE, FINGER_TRAVEL_M, NUM_ARM_JOINTS
+from v2p_data.sim.start_check import check_poses
 from v2p_data.sim.tensor_states import (
     SeenTensors,
     base_observation,
@@ -162,7 +163,9 @@ class WarpBatchEnv:
         poses = self.task.reset_poses(ids, self.object_names)
         for k, name in enumerate(self.object_names):
             self._object_qpos[ids, k] = poses[name].to(self.device, torch.float32)
-        self._start_pose[ids] = self._object_qpos[ids]
+        self._start_pose[ids] = start = self._object_qpos[ids]
+        where = start.cpu().numpy().astype(float)
+        check_poses(self.world, self.randomizer.size_m[rows], where, self.bundle.title)
         self._steps[ids] = 0
         self._held[ids] = 0
         self._last_action[ids] = 0

@@ -22,7 +22,9 @@ from v2p_data.task.probes import (
     concatenated,
     first_pose,
     rest_height,
+    rest_heights,
 )
+from v2p_data.task.templates.variants import POSITION_ERROR_M, SIZE_ERROR_M, SIZE_ERROR_SHARE
 
 RESET_ROWS = 32
 PATH_ROWS = 31
@@ -33,6 +35,22 @@ AT_END = 20
 REACH_ROWS = 600
 MAX_TRACKED = 24
 FLUNG_M_S = 2.0
+NOISE_SCALES = (0.5, 1.0, 1.5, 2.0)
+"""Multiples of the measured errors by which poses and sizes are disturbed."""
+NOISE_DRAWS = 12
+"""Disturbed copies of a pose per scale; a near miss gets a quarter of them."""
+POSITION_SIGMA_M = POSITION_ERROR_M / 1.54
+"""Per axis: the median length of a vector of three normal numbers is 1.54 standard deviations."""
+SIZE_SIGMA_M, SIZE_SIGMA_SHARE = SIZE_ERROR_M / 0.674, SIZE_ERROR_SHARE / 0.674
+"""The median of a normal number's amount is 0.674 standard deviations. The smaller of the two counts."""
+YAW_SIGMA_RAD = 0.1
+SWAY_M_S, SWAY_RAD_S = 0.016, 0.1
+"""Per axis: how a thing held up at the end still moves. In 32 lifts at the fine step 90 % were slower than 0.027 m/s and
+0.15 rad/s over the last quarter of a second."""
+LIFTED_M = 0.02
+"""What is higher than this above where it would rest is off the table, at a height that may be wrong, too."""
+TURNED_AWAY_M = 0.05
+"""A motion longer than this on the table may also go in a wrong direction, or end too far from where it leads."""
 HANDS = ("held", "let go", "touching")
 """What the robot may be doing at a pose of the video, which shows a hand instead; any of them may count."""
 
@@ -45,6 +63,8 @@ class AuditProbes:
     rows: dict[str, list[int]]
     path_m: tuple[float, ...]
     """Displacement of the manipulated object along the path rows [m]."""
+    starts: States
+    """Layouts that the environment offers to a task's reset."""
 
 
 def build_probes(scene: Scene, rng: np.random.Generator) -> AuditProbes:
@@ -63,6 +83,9 @@ def build_probes(scene: Scene, rng: np.random.Generator) -> AuditProbes:
         "in_the_air": lambda: [_in_the_air(scene)],
         "off_the_table": lambda: [_off_the_table(scene)],
         "reachable": lambda: [_anywhere(scene, rng, hand) for hand in hands_of(scene)],
+        "disturbed_last": lambda: _disturbed(scene, [_end(scene)], NOISE_DRAWS, rng),
+        "disturbed_first": lambda: _disturbed(scene, _tracked(scene)[:1], NOISE_DRAWS, rng),
+        "near_misses": lambda: _near_misses(scene, rng),
     }
     batches: list[States] = []
     rows: dict[str, list[int]] = {}
@@ -73,7 +96,9 @@ def build_probes(scene: Scene, rng: np.random.Generator) -> AuditProbes:
         rows[name] = list(range(count, count + size))
         count += size
         batches += made
-    return AuditProbes(states=concatenated(batches), rows=rows, path_m=path_m)
+    states = concatenated(batches)
+    starts = {key: value[rows["reset"]] for key, value in states.items()}
+    return AuditProbes(states=states, rows=rows, path_m=path_m, starts=starts)
 
 
 Poses = dict[str, np.ndarray]
@@ -114,9 +139,7 @@ def _path(scene: Scene) -> tuple[list[Poses], tuple[float, ...]]:
     """Return poses on the straight line from the first to the last, and beyond, with their displacement."""
     tracked = _tracked(scene)
     name = scene.manipulated.name
-    first, last = tracked[0][name], tracked[-1][name]
-    if KINDS[scene.kind].end == "in_air":  # hands often set things down again before the clip ends
-        last = max((p[name] for p in tracked), key=lambda pose: float(pose[2]))
+    first, last = tracked[0][name], _end(scene)[name]
     turn = Slerp([0, 1], Rotation.from_quat(np.stack([first[3:], last[3:]]), scalar_first=True))
     out: list[Poses] = []
     for t in np.linspace(0, PATH_END, PATH_ROWS):
@@ -217,11 +240,130 @@ def _resets(scene: Scene, rng: np.random.Generator) -> Probe:
 
 
 def _flung(scene: Scene, moments: list[Poses]) -> Probe:
-    """The object passes the end of the path at high speed, nobody holding it."""
-    probe = _at_pose(scene, moments * 4, "let go")
-    o = probe.objects[scene.manipulated.name]
-    o.vel_linear = FLUNG_M_S * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    """The object passes the end of the path at high speed, nobody holding it; and slides by, a hand's breadth aside."""
+    name = scene.manipulated.name
+    aside = []
+    for direction in np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
+        pose = _tracked(scene)[0][name].copy()
+        pose[:3] += direction * (0.1 + _outline(scene))
+        aside.append({**moments[0], name: pose})
+    probe = _at_pose(scene, moments * 4 + aside, "let go")
+    ways = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], *[[0.7, 0.7, 0]] * 4])
+    probe.objects[name].vel_linear = FLUNG_M_S * ways
     return probe
+
+
+def _outline(scene: Scene) -> float:
+    """Return how far apart the two objects' centres are when they stand side by side [m]; one's half without another."""
+    sizes = [max(o.size_m[:2]) for o in scene.objects[:2]]
+    return sum(sizes) / 2
+
+
+def _end(scene: Scene) -> Poses:
+    """Return the video's last poses; of a lift the highest ones, because hands often set things down again."""
+    name = scene.manipulated.name
+    tracked = _tracked(scene)
+    if KINDS[scene.kind].end == "in_air":
+        return max(tracked, key=lambda poses: float(poses[name][2]))
+    return tracked[-1]
+
+
+def _disturbed(
+    scene: Scene,
+    moments: list[Poses],
+    draws: int,
+    rng: np.random.Generator,
+    hands: tuple[str, ...] = (),
+) -> list[Probe]:
+    """Return moments with positions and sizes as wrong as reconstruction makes them, per hand scale by scale.
+
+    What stands on the table stays on it; starts are those of the video.
+    """
+    many = [m for _ in NOISE_SCALES for m in moments for _ in range(draws)]
+    n, scale = len(many), np.repeat(NOISE_SCALES, len(moments) * draws)[:, None]
+    poses: dict[str, np.ndarray] = {}
+    sizes: dict[str, np.ndarray] = {}
+    starts: dict[str, np.ndarray] = {}
+    for obj in scene.objects:
+        size = np.asarray(obj.size_m)
+        sigma = np.minimum(SIZE_SIGMA_M / size, SIZE_SIGMA_SHARE)
+        larger = sizes[obj.name] = size * np.exp(rng.normal(size=(n, 3)) * sigma * scale)
+        shift = rng.normal(size=(n, 3)) * POSITION_SIGMA_M * scale
+        yaw = np.zeros((n, 3))
+        yaw[:, 2] = rng.normal(size=n) * YAW_SIGMA_RAD * scale[:, 0]
+        at = np.stack([m[obj.name] for m in many])
+        above = at[:, 2] - rest_heights(obj, at[:, 3:], np.tile(size, (n, 1)))
+        turned = Rotation.from_rotvec(yaw) * Rotation.from_quat(at[:, 3:], scalar_first=True)
+        at[:, 3:] = turned.as_quat(scalar_first=True)
+        at[:, :2] += shift[:, :2]
+        lifted = np.where(above > LIFTED_M, above + shift[:, 2], above)
+        at[:, 2] = rest_heights(obj, at[:, 3:], larger) + np.maximum(lifted, 0.0)
+        poses[obj.name] = at
+        first = np.tile(_tracked(scene)[0][obj.name][3:], (n, 1))
+        starts[obj.name] = rest_heights(obj, first, larger)
+    moved = [{name: at[k] for name, at in poses.items()} for k in range(n)]
+    made: list[Probe] = []
+    for hand in hands or hands_of(scene):
+        probe = _at_pose(scene, moved, hand)
+        main = probe.objects[scene.manipulated.name]
+        main.vel_linear = rng.normal(size=(n, 3)) * SWAY_M_S * scale
+        main.vel_angular = rng.normal(size=(n, 3)) * SWAY_RAD_S * scale
+        for name, o in probe.objects.items():
+            o.size = sizes[name]
+            o.start_pos[:, 2] = starts[name]
+        made.append(probe)
+    return made
+
+
+def _near_misses(scene: Scene, rng: np.random.Generator) -> list[Probe]:
+    """Return what is nearly the end of the video and must not count, disturbed like the end itself.
+
+    A third of the way; the way in a wrong direction; beside what it should be in, on or over, or 5 cm further from what it
+    should be next to; toppled where things must stand; let go in mid-air where it must be held up; still held where it
+    must be let go; still in the air above where it must stand.
+    """
+    kind, name = KINDS[scene.kind], scene.manipulated.name
+    first, end = _tracked(scene)[0], _end(scene)
+    a, b = first[name], end[name]
+    way = b[:3] - a[:3]
+    moments: list[Poses] = []
+
+    def add(pos: np.ndarray, quat: np.ndarray) -> None:
+        pose = np.array([*pos, *quat])
+        pose[2] = max(pose[2], rest_height(scene.manipulated, quat))
+        moments.append({**first, name: pose})
+
+    if kind.end != "on_side":
+        add(a[:3] + way / 3, a[3:])
+        if np.linalg.norm(way[:2]) > TURNED_AWAY_M:
+            for angle in (np.pi / 2, -np.pi / 2, np.pi):
+                add(a[:3] + Rotation.from_rotvec([0, 0, angle]).apply(way), b[3:])
+    if scene.others and (kind.touches or kind.comes_near):
+        other = first[scene.others[0].name]
+        sizes = [max(o.size_m[:2]) / 2 for o in (scene.manipulated, scene.others[0])]
+        for angle in np.arange(4) * np.pi / 2:
+            side = np.array([np.cos(angle), np.sin(angle)])
+            if kind.touches:  # a cover that covers half of a thing stands on its edge
+                away = sizes[0] if kind.end == "over" else sum(sizes)
+                add(np.array([*(other[:2] + away * side), 0.0]), b[3:])
+        if kind.comes_near:
+            line = b[:2] - other[:2]
+            line = line / max(float(np.linalg.norm(line)), 1e-6)
+            add(np.array([*(b[:2] + TURNED_AWAY_M * line), b[2]]), b[3:])
+    if kind.stays_upright:
+        fallen = Rotation.from_rotvec([np.pi / 2, 0, 0]) * Rotation.from_quat(
+            b[3:], scalar_first=True
+        )
+        add(np.array([*b[:2], 0.0]), fallen.as_quat(scalar_first=True))
+    if not kind.may_end_high:
+        add(b[:3] + np.array([0.0, 0.0, 0.06]), b[3:])
+    few = NOISE_DRAWS // 4
+    probes = _disturbed(scene, moments, few, rng) if moments else []
+    if kind.end == "in_air":
+        probes += _disturbed(scene, [end], few, rng, ("let go",))
+    elif kind.is_put_down and not kind.may_end_held:
+        probes += _disturbed(scene, [end], few, rng, ("held",))
+    return probes
 
 
 def _in_the_air(scene: Scene) -> Probe:

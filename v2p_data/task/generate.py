@@ -99,11 +99,14 @@ class GeneratedTask:
     """Every call to a model that had a part in it."""
 
     def rates(self) -> dict[str, Any]:
-        """Return how many samples are of no use, before and after sending back and picking (the paper's table 8)."""
+        """Return how many samples are of no use, before and after sending back (the paper's table 8).
+
+        What is picked has passed the same audit: asking it again measures nothing. What a pick gains is measured
+        against the referee (`scripts/bench_pick.py`).
+        """
         return {
             "first_answers": hallucination(self.first or self.samples),
             "before_pick": hallucination(self.samples),
-            "after_pick": hallucination([self.samples[self.picked]]),
         }
 
     def save(self, folder: Path) -> None:
@@ -168,6 +171,7 @@ def generate_task(
             codes,
             scene,
             probes=probes.states,
+            starts=probes.starts,
             seconds_each=cfg.seconds_each,
             timeout_s=cfg.timeout_s,
         )

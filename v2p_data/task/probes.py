@@ -29,7 +29,8 @@ class ObjectProbe:
 
     pos: Float[np.ndarray, "env 3"]
     quat: Float[np.ndarray, "env 4"]
-    size: Float[np.ndarray, "3"]
+    size: Float[np.ndarray, "*env 3"]
+    """One for all rows, or one per row."""
     start_pos: Float[np.ndarray, "env 3"]
     start_quat: Float[np.ndarray, "env 4"]
     vel_linear: Float[np.ndarray, "env 3"]
@@ -73,7 +74,7 @@ class Probe:
                 f"{name}_quat": o.quat,
                 f"{name}_vel_linear": o.vel_linear,
                 f"{name}_vel_angular": o.vel_angular,
-                f"{name}_size": np.tile(o.size, (n, 1)),
+                f"{name}_size": np.broadcast_to(o.size, (n, 3)),
                 f"{name}_start_pos": o.start_pos,
                 f"{name}_start_quat": o.start_quat,
                 f"{name}_up": up,
@@ -85,13 +86,20 @@ class Probe:
 
 def rest_height(obj: SceneObject, quat_wxyz: Float[np.ndarray, "4"]) -> float:
     """Return how high the centre of its bounding box is above the table when it rests turned like this [m]."""
-    R = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
-    half = np.asarray(obj.size_m) / 2
+    return float(rest_heights(obj, quat_wxyz[None], np.asarray(obj.size_m)[None])[0])
+
+
+def rest_heights(
+    obj: SceneObject, quat_wxyz: Float[np.ndarray, "n 4"], size_m: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Return `rest_height` of copies of an object, turned and sized one by one [m]."""
+    up = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()[:, 2]
+    half = size_m / 2
     if obj.shape == "sphere":
-        return float(half.max())
+        return half.max(axis=1)
     if obj.shape == "cylinder":
-        return float(half[0] * np.hypot(R[2, 0], R[2, 1]) + half[2] * abs(R[2, 2]))
-    return float(np.abs(R[2]) @ half)
+        return half[:, 0] * np.hypot(up[:, 0], up[:, 1]) + half[:, 2] * np.abs(up[:, 2])
+    return (np.abs(up) * half).sum(axis=1)
 
 
 def at_rest(scene: Scene, count: int = 1, centre: tuple[float, float] = (0.5, 0.0)) -> Probe:
@@ -138,6 +146,7 @@ def random_states(scene: Scene, count: int, rng: np.random.Generator) -> States:
     probe.gripper_width = rng.uniform(0, GRIPPER_OPENING_M, count)
     probe.eef_vel_linear = rng.normal(0, 0.1, (count, 3))
     for o in probe.objects.values():
+        o.size = o.size * rng.uniform(0.85, 1.15, (count, 3))
         shift = np.column_stack([rng.uniform(-0.1, 0.1, (count, 2)), np.zeros(count)])
         o.start_pos = o.start_pos + shift
         yaw = Rotation.from_rotvec(

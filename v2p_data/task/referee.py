@@ -32,6 +32,9 @@ BELOW_M = 0.005
 """A thing this far below its support was pressed through it."""
 STEADY_M = 0.05
 """Movement over the last samples (0.2 m/s) of a thing that is held up."""
+REACHED_M = 0.04
+"""The gripper was at a thing if its tool centre came this near its box: fingers also push with their sides, which no
+pad feels. Pushes without a pad came within 2.2 cm in 64 episodes; arms start at least 5 cm away."""
 FALLEN_RAD = np.deg2rad(60)
 STANDS_RAD = np.deg2rad(25)
 
@@ -147,6 +150,20 @@ class Case:
         u = u / np.linalg.norm(u, axis=-1, keepdims=True)
         return distance - self.reach(self.thing, u, time) - self.reach(self.other, -u, time)
 
+    def was_reached(self) -> Bool[np.ndarray, "env"]:
+        """Tell whether the robot has been at the object that moved, or has touched the tool that pushed it."""
+        thing = self.thing
+        away = np.einsum(
+            "tejk,tej->tek", thing.axes, self.trajectory.eef_pos - thing.pos
+        )  # in the object's own frame
+        outside = np.maximum(np.abs(away) - thing.size_m / 2, 0.0)
+        reached = np.linalg.norm(np.ptp(thing.pos, axis=0), axis=-1) < REST_M  # then nothing moved
+        reached |= thing.touched.any(axis=(0, 2))
+        reached |= (np.linalg.norm(outside, axis=-1) < REACHED_M).any(axis=0)
+        if KINDS[self.scene.kind].grasps == "tool":
+            reached |= self.other.touched.any(axis=(0, 2))
+        return reached
+
     def within(self) -> Bool[np.ndarray, "env"]:
         """Tell whether the manipulated object's centre lies over the other's footprint at the end."""
         local = np.einsum(
@@ -174,13 +191,13 @@ Verdict = Bool[np.ndarray, "env"]
 
 
 def referee_success(kind: Kind, scene: Scene, trajectory: Trajectory) -> Bool[np.ndarray, "env"]:
-    """Return per world whether the episode did what its kind of task says.
+    """Return per world whether the robot did what its kind of task says; what comes about by itself never counts.
 
     Raises:
         V2PError: the kind needs an object that the scene lacks.
     """
     case = Case(scene=scene, trajectory=trajectory)
-    return np.asarray(RULES[kind](case) & case.is_above_table(), bool)
+    return np.asarray(RULES[kind](case) & case.is_above_table() & case.was_reached(), bool)
 
 
 def _lifted(case: Case) -> Verdict:

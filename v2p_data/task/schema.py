@@ -52,6 +52,7 @@ class CheckEntry(FileModel):
     share: Amount
     weight: Amount
     is_veto: bool
+    right: Amount | None = None
 
 
 class AuditEntry(FileModel):

@@ -9,10 +9,11 @@ import json
 import math
 import subprocess
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from v2p_data.errors import V2PError
 from v2p_data.processes import end_group, own_python
@@ -45,11 +46,23 @@ class SmokeResult:
     probe_success: tuple[bool, ...] = ()
     """The success function's answer for each row of the probes."""
     probe_reward: tuple[float, ...] = ()
+    start_poses: dict[str, Float[np.ndarray, "start 7"]] = field(
+        default_factory=dict, compare=False
+    )
+    """Where the sample's own reset put each object, reset after reset."""
+    start_rows: tuple[int, ...] = ()
+    """Which of the offered layouts each of these came from."""
+    start_success: tuple[bool, ...] = ()
     seconds: float = 0.0
 
     @staticmethod
-    def from_json(data: Any, num_probes: int) -> "SmokeResult":
+    def from_json(data: Any, num_probes: int, num_starts: int = 0) -> "SmokeResult":
         """Read a child's answer, which is data from a stranger.
+
+        Args:
+            data: the answer.
+            num_probes: moments that were asked about.
+            num_starts: layouts that were offered to the sample's reset.
 
         Raises:
             TypeError, ValueError: it is not what it should be.
@@ -62,6 +75,18 @@ class SmokeResult:
             raise ValueError(f"{len(success)} answers to {num_probes} probes")
         if not all(math.isfinite(r) for r in reward):
             raise ValueError("a reward that is no number")
+        starts = {
+            str(name): np.array(poses, float).reshape(-1, 7)
+            for name, poses in dict(data.get("start_poses", {})).items()
+        }
+        start_rows = [int(row) for row in data.get("start_rows", [])]
+        start_success = [bool(x) for x in data.get("start_success", [])]
+        if not all(np.isfinite(poses).all() for poses in starts.values()) or not all(
+            len(x) == len(start_rows) for x in [start_success, *starts.values()]
+        ):
+            raise ValueError("reset poses that are no numbers")
+        if data["runnable"] and num_starts and set(start_rows) != set(range(num_starts)):
+            raise ValueError("not every layout was reset")
         components = tuple(str(c) for c in data.get("components", []))
         if not all(COMPONENT_NAME.fullmatch(c) for c in components):
             raise ValueError("a reward component without a proper name")
@@ -73,6 +98,9 @@ class SmokeResult:
             warnings=tuple(shown(w, 300) for w in data.get("warnings", [])),
             probe_success=tuple(success),
             probe_reward=tuple(reward),
+            start_poses=starts,
+            start_rows=tuple(start_rows),
+            start_success=tuple(start_success),
             seconds=float(data.get("seconds", 0.0)),
         )
 
@@ -87,22 +115,26 @@ def smoke_run_all(
     scene: Scene,
     *,
     probes: States | None = None,
+    starts: States | None = None,
     seconds_each: float = 10.0,
     timeout_s: float = 180.0,
 ) -> list[SmokeResult]:
-    """Return per source whether it runs, and what it says to the probes.
+    """Return per source whether it runs, what it says to the probes, and where its reset puts things.
 
     Args:
         sources: task codes.
         scene: whose objects the states describe.
         probes: further moments on which success and reward are wanted.
+        starts: layouts that the environment offers to its reset; without them it is not looked at.
         seconds_each: wall-clock limit per source.
         timeout_s: for all of them, with the child's start.
     """
     results: list[SmokeResult | None] = [_refused(s) for s in sources]
     asked = [i for i, r in enumerate(results) if r is None]
     if asked:
-        answers = _ask_child([sources[i] for i in asked], scene, probes, seconds_each, timeout_s)
+        answers = _ask_child(
+            [sources[i] for i in asked], scene, probes, starts, seconds_each, timeout_s
+        )
         for i, answer in zip(asked, answers, strict=True):
             results[i] = answer
     return [r for r in results if r is not None]
@@ -117,7 +149,11 @@ def _refused(source: str) -> SmokeResult | None:
 
 
 def trial_request(
-    sources: list[str], scene: Scene, probes: States | None, seconds_each: float
+    sources: list[str],
+    scene: Scene,
+    probes: States | None,
+    seconds_each: float,
+    starts: States | None = None,
 ) -> dict[str, Any]:
     """Return what the child is asked, as data that JSON can hold."""
     rng = rng_for(
@@ -132,6 +168,7 @@ def trial_request(
         "edge_states": _as_lists(_edge_states(scene)),
         "batch_sizes": rng.integers(1, count, PARTS).tolist(),
         "probes": _as_lists(probes or {}),
+        "starts": _as_lists(starts or {}),
         "seconds_each": seconds_each,
     }
 
@@ -140,11 +177,12 @@ def _ask_child(
     sources: list[str],
     scene: Scene,
     probes: States | None,
+    starts: States | None,
     seconds_each: float,
     timeout_s: float,
 ) -> list[SmokeResult]:
-    num_probes = len(next(iter(probes.values()))) if probes else 0
-    request = trial_request(sources, scene, probes, seconds_each)
+    num_probes, num_starts = (len(x["eef_pos"]) if x else 0 for x in (probes, starts))
+    request = trial_request(sources, scene, probes, seconds_each, starts)
     with (
         tempfile.TemporaryDirectory(prefix="v2p-task-") as folder,
         subprocess.Popen(
@@ -170,12 +208,14 @@ def _ask_child(
             ] * len(sources)
         finally:
             end_group(child)
-    return _read(answer, complaint, len(sources), num_probes)
+    return _read(answer, complaint, len(sources), num_probes, num_starts)
 
 
-def _read(answer: bytes, complaint: bytes, count: int, num_probes: int) -> list[SmokeResult]:
+def _read(
+    answer: bytes, complaint: bytes, count: int, num_probes: int, num_starts: int
+) -> list[SmokeResult]:
     try:
-        return _results(answer, count, num_probes)
+        return _results(answer, count, num_probes, num_starts)
     except (ValueError, TypeError) as error:
         tail = complaint.decode(errors="replace").strip().splitlines()[-1:]
         raise V2PError(
@@ -184,19 +224,19 @@ def _read(answer: bytes, complaint: bytes, count: int, num_probes: int) -> list[
         ) from error
 
 
-def _results(answer: bytes, count: int, num_probes: int) -> list[SmokeResult]:
+def _results(answer: bytes, count: int, num_probes: int, num_starts: int = 0) -> list[SmokeResult]:
     if len(answer) > MAX_ANSWER_CHARS:
         raise ValueError("the answer is too long")
     data = json.loads(answer)
     if not isinstance(data, list) or len(data) != count:
         raise ValueError(f"{count} answers wanted")
-    return [_result(d, num_probes) for d in data]
+    return [_result(d, num_probes, num_starts) for d in data]
 
 
-def _result(data: Any, num_probes: int) -> SmokeResult:
+def _result(data: Any, num_probes: int, num_starts: int) -> SmokeResult:
     """Return one sample's answer; one that cannot be read is that sample's own failure."""
     try:
-        return SmokeResult.from_json(data, num_probes)
+        return SmokeResult.from_json(data, num_probes, num_starts)
     except (ValueError, TypeError, OverflowError) as error:
         return SmokeResult(runnable=False, error=f"its answer cannot be read: {shown(error, 200)}")
 
@@ -213,4 +253,9 @@ def _edge_states(scene: Scene) -> States:
 
 
 def _as_lists(states: States) -> dict[str, Any]:
-    return {k: np.asarray(v, float).tolist() for k, v in states.items()}
+    """Return states as lists, without a base observation that says nothing: the child fills in the zeros."""
+    return {
+        k: np.asarray(v, float).tolist()
+        for k, v in states.items()
+        if k != "base_observation" or np.any(v)
+    }

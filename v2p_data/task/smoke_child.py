@@ -21,6 +21,7 @@ from v2p_data.task.confine import confine, leave_the_network
 from v2p_data.task.guarded import Answers, GuardedTask, TaskOutputError, demand_equal
 from v2p_data.task.reader.refusal import TaskCodeError
 from v2p_data.task.sandbox import make_task
+from v2p_data.task.task import BASE_OBSERVATION_DIM
 from v2p_data.task.time_limit import line_in_task_code
 
 MEMORY_BYTES = 2 * 1024**3
@@ -29,6 +30,8 @@ MAX_REWARD = 1000.0
 """Ten times the bonus for success, which then hardly counts."""
 MAX_ANSWER_BYTES = 4_000_000
 SLOW_S = 1.0
+SCALED = ("_pos", "_size", "_width")
+"""How the names of states in metres end."""
 
 _HARMLESS = """
 scene_info = {}
@@ -53,8 +56,12 @@ class FakePlacer:
     """Stands in for the environment: every object is put where the states say."""
 
     def __init__(self, states: dict[str, torch.Tensor], names: list[str]) -> None:
-        self._states = states
         self._names = names
+        self.offer(states)
+
+    def offer(self, states: dict[str, torch.Tensor]) -> None:
+        """Let resets be offered other layouts from now on."""
+        self._states = states
 
     @property
     def num_envs(self) -> int:
@@ -94,7 +101,8 @@ def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
     begin = time.monotonic()
     states = _tensors(request["states"])
     names: list[str] = request["object_names"]
-    task = make_task(source, FakePlacer(states, names), "")
+    placer = FakePlacer(states, names)
+    task = make_task(source, placer, "")
     n = len(states["eef_pos"])
     task.reset_poses(torch.arange(n), names)
 
@@ -110,6 +118,7 @@ def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
         if not all(_close(a[:count], b) for a, b in _pairs(first, some)):
             warnings.append("the result for one environment depends on the others")
             break
+    _demand_own_success(task, states, first)
     edge = _answers(task, _tensors(request["edge_states"]))
     biggest = max(float(first.reward.max()), float(edge.reward.max()))
     if biggest > MAX_REWARD:
@@ -124,12 +133,62 @@ def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
         "seconds": time.monotonic() - begin,
     }
     if request["probes"]:
-        probes = _answers(task, _tensors(request["probes"]))
+        asked = _tensors(request["probes"])
+        probes = _answers(task, asked)
+        _demand_own_success(task, asked, probes)
         answer |= {
             "probe_success": probes.success.int().tolist(),
             "probe_reward": probes.reward.tolist(),
         }
+    if request["starts"]:
+        answer |= _starts(task, placer, _tensors(request["starts"]), names)
     return answer
+
+
+def _demand_own_success(
+    task: GuardedTask, states: dict[str, torch.Tensor], answers: Answers
+) -> None:
+    """Demand that success in one world does not depend on the others, as that of a maximum over worlds does.
+
+    Raises:
+        BadTaskError: it changes when two worlds with very large and very small numbers are added.
+    """
+    one = {k: v[:1] for k, v in states.items()}
+    wide = {k: v * 9 if k.endswith(SCALED) else v for k, v in one.items()}
+    wide |= {k: v + 1e4 for k, v in one.items() if "_vel_" in k}
+    narrow = {k: v * 0.01 if k.endswith(SCALED) else v for k, v in one.items()}
+    beside = {k: torch.cat([v, wide[k], narrow[k]]) for k, v in states.items()}
+    success = task.succeeds(lambda: {k: v.clone() for k, v in beside.items()})
+    if not torch.equal(success[: len(answers.success)], answers.success):
+        raise BadTaskError(
+            "success in one environment depends on the others; take the maximum, minimum or mean along a dimension"
+        )
+
+
+def _starts(
+    task: GuardedTask, placer: FakePlacer, offered: dict[str, torch.Tensor], names: list[str]
+) -> dict[str, Any]:
+    """Return where the task's reset puts the objects, and what its success says there.
+
+    All layouts are reset, then some of them again and again, then all: a task may count its resets.
+    """
+    placer.offer(offered)
+    everyone = torch.arange(placer.num_envs)
+    some = everyone[: len(everyone) // 4]
+    ids = [everyone, some, some, some, everyone]
+    made = [task.reset_poses(each, names) for each in ids]
+    rows = torch.cat(ids)
+    states = {k: v[rows] for k, v in offered.items()}
+    poses = {name: torch.cat([poses[name].float() for poses in made]) for name in names}
+    for name, pose in poses.items():
+        states |= {f"{name}_pos": pose[:, :3], f"{name}_start_pos": pose[:, :3].clone()}
+        states |= {f"{name}_quat": pose[:, 3:], f"{name}_start_quat": pose[:, 3:].clone()}
+        states[f"{name}_up"] = 1 - 2 * (pose[:, 4] ** 2 + pose[:, 5] ** 2)
+    return {
+        "start_poses": {name: pose.tolist() for name, pose in poses.items()},
+        "start_rows": rows.tolist(),
+        "start_success": _answers(task, states).success.int().tolist(),
+    }
 
 
 def _answers(task: GuardedTask, given: dict[str, torch.Tensor]) -> Answers:
@@ -164,7 +223,10 @@ def _close(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 
 def _tensors(lists: dict[str, Any]) -> dict[str, torch.Tensor]:
-    return {k: torch.tensor(v, dtype=torch.float32) for k, v in lists.items()}
+    states = {k: torch.tensor(v, dtype=torch.float32) for k, v in lists.items()}
+    if states and "base_observation" not in states:
+        states["base_observation"] = torch.zeros(len(states["eef_pos"]), BASE_OBSERVATION_DIM)
+    return states
 
 
 # --- confinement ---------------------------------------------------------------------------------------------

@@ -109,11 +109,12 @@ def test_the_model_chooses_with_the_audit_before_it_among_what_the_audit_accepts
     assert written.made.picked == written.audit["picked"] == 2
     assert written.audit["pick"]["by"] == "vlm"
     assert written.audit["pick"]["reasons"]["correctness"] == "held and raised"
-    assert written.audit["pick"]["audits_pick"] == 1
+    # Code 1 asks for 3 cm, which is less than a third of the way.
+    assert written.audit["pick"]["audits_pick"] == 2
     assert TaskBundle.load(written.folder / "task").code == written.made.samples[2].code
 
 
-def test_useless_samples_are_counted_before_and_after_sending_back_and_picking(written):
+def test_useless_samples_are_counted_before_and_after_sending_back(written):
     rates = written.audit["rates"]
 
     assert rates["first_answers"] == {
@@ -123,7 +124,6 @@ def test_useless_samples_are_counted_before_and_after_sending_back_and_picking(w
         0,
         0.3333,
     )
-    assert rates["after_pick"]["hallucination"] == 0
     assert written.audit["writer"] == "vlm"
     assert written.audit["codes_asked_for"] == 4
     assert written.audit["spent"]["calls"] == len(written.server.requests) == 6

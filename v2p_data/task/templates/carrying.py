@@ -8,16 +8,18 @@ from v2p_data.task.templates.phrases import (
     LEAVE_REF,
     REF_MOVED,
     REF_STILL,
-    STILL_UPRIGHT,
     grasp_setup,
     is_still,
     shifted,
+    stands,
 )
-from v2p_data.task.templates.variants import Variant
+from v2p_data.task.templates.variants import Variant, tolerance, way
 
 
 def lift(m: Measured, v: Variant) -> Draft:
-    height = round(float(np.clip(0.7 * m.lift_m, 0.08, 0.12)) * v.strictness, 3)
+    height = way(float(np.clip(0.7 * m.lift_m, 0.08, 0.12)), v)
+    rise = "lowest_point(obj_pos, obj_quat, obj_size)" if v.goal == "video" else "height"
+    held = "(torch.norm(obj_pos - eef_pos, dim=-1) < reach_limit)"
     return Draft(
         thoughts=[
             "Reach the object.",
@@ -26,11 +28,9 @@ def lift(m: Measured, v: Variant) -> Draft:
         ],
         setup=[HEIGHT],
         success=[
-            ("is_high", f"height > {height}"),
-            (
-                "is_held",
-                "(obj_grasped > 0.5) & (torch.norm(obj_pos - eef_pos, dim=-1) < reach_limit)",
-            ),
+            ("is_high", f"{rise} > {height}"),
+            ("is_held", held if v.holds == "any" else f"(obj_grasped > 0.5) & {held}"),
+            *stands(v, is_asked=False),
             is_still(v),
         ],
         reward_setup=grasp_setup(),
@@ -53,9 +53,10 @@ def lift(m: Measured, v: Variant) -> Draft:
     )
 
 
-def insert(_: Measured, v: Variant) -> Draft:
-    depth = round(0.5 / v.strictness, 3)
+def insert(m: Measured, v: Variant) -> Draft:
+    depth = round(0.5 + 0.15 * v.slack, 3)
     return _carry(
+        m,
         v,
         thoughts=[
             "Grasp the object.",
@@ -70,14 +71,18 @@ def insert(_: Measured, v: Variant) -> Draft:
         arrived="to_goal < 0.7 * inner",
         falls_m=0.15,
         conditions=[
-            ("is_inside", f"(to_goal < inner) & (obj_pos[:, 2] < rim + {depth} * half_height)"),
+            (
+                "is_inside",
+                f"(to_goal < {_near_enough(m, v, 'inner')}) & (obj_pos[:, 2] < rim + {depth} * half_height)",
+            ),
             ("is_not_below", "lowest_point(obj_pos, obj_quat, obj_size) > -0.01"),
         ],
     )
 
 
-def place_onto(_: Measured, v: Variant) -> Draft:
+def place_onto(m: Measured, v: Variant) -> Draft:
     return _carry(
+        m,
         v,
         thoughts=["Grasp the object.", "Carry it over the other one.", "Set it down and let go."],
         goal=[
@@ -90,15 +95,22 @@ def place_onto(_: Measured, v: Variant) -> Draft:
         conditions=[
             (
                 "is_on_top",
-                f"(to_goal < inner.clamp(min=0.02)) & (above_goal.abs() < {0.025 / v.strictness:.3f})",
+                f"(to_goal < {_near_enough(m, v, 'inner.clamp(min=0.02)')})"
+                f" & (above_goal.abs() < {tolerance(0.025, v)})",
             ),
         ],
     )
 
 
-def drop_in_front_of(_: Measured, v: Variant) -> Draft:
-    tolerance = round(0.04 / v.strictness, 3)
+def drop_in_front_of(m: Measured, v: Variant) -> Draft:
+    x, y = (round(c, 3) for c in m.beside_m)
+    there = (
+        f"torch.norm((obj_pos - ref_pos)[:, :2] - torch.tensor([{x!r}, {y!r}], device=obj_pos.device), dim=-1)"
+        if v.goal == "video"
+        else "to_goal"
+    )
     return _carry(
+        m,
         v,
         thoughts=[
             "Grasp the object and lift it.",
@@ -115,14 +127,15 @@ def drop_in_front_of(_: Measured, v: Variant) -> Draft:
         arrived="to_goal < 0.03",
         falls_m=0.05,
         conditions=[
-            ("is_in_front", f"(to_goal < {tolerance}) & (obj_pos[:, 0] < ref_pos[:, 0])"),
+            ("is_in_front", f"({there} < {tolerance(0.04, v)}) & (obj_pos[:, 0] < ref_pos[:, 0])"),
             ("is_down", "lowest_point(obj_pos, obj_quat, obj_size).abs() < 0.015"),
         ],
     )
 
 
-def cover(_: Measured, v: Variant) -> Draft:
+def cover(m: Measured, v: Variant) -> Draft:
     return _carry(
+        m,
         v,
         thoughts=[
             "Grasp the cover.",
@@ -135,9 +148,10 @@ def cover(_: Measured, v: Variant) -> Draft:
         conditions=[
             (
                 "is_over",
-                f"(to_goal < {0.025 / v.strictness:.3f}) & (obj_pos[:, 2] + 0.002 > ref_pos[:, 2])",
+                f"(to_goal < {_near_enough(m, v, str(tolerance(0.025, v)))})"
+                " & (obj_pos[:, 2] + 0.002 > ref_pos[:, 2])",
             ),
-            ("is_upright", STILL_UPRIGHT),
+            *stands(v),
         ],
     )
 
@@ -164,8 +178,16 @@ def throw_into(m: Measured, v: Variant) -> Draft:
     return draft
 
 
-def uncover(_: Measured, v: Variant) -> Draft:
-    height = round(0.08 * v.strictness, 3)
+def uncover(m: Measured, v: Variant) -> Draft:
+    height = way(0.08, v)
+    held = "" if v.holds == "any" else " & (obj_grasped > 0.5)"
+    off = f"(height > {height}){held}"
+    if v.goal == "video":
+        moved = way(max(0.6 * float(np.linalg.norm(m.move_m)), 0.08), v)
+        off = f"(torch.norm(obj_pos - obj_start, dim=-1) > {moved}) & ({off} | (height.abs() < 0.02))"
+    elif v.holds != "strict":
+        aside = f"(aside > room + {tolerance(0.02, v)}) & (height.abs() < 0.02)"
+        off = f"({off}) | ({aside})"
     return Draft(
         thoughts=[
             "Reach the top of the cover.",
@@ -180,12 +202,9 @@ def uncover(_: Measured, v: Variant) -> Draft:
             "standing = upright(obj_quat, obj_start_quat)",
         ],
         success=[
-            (
-                "is_off",
-                f"((height > {height}) & (obj_grasped > 0.5)) | ((aside > room + 0.02) & (height.abs() < 0.02))",
-            ),
+            ("is_off", off),
             ("is_left_alone", REF_STILL),
-            ("is_upright", "standing > 0.9"),
+            *stands(v),
             is_still(v),
         ],
         reward_setup=grasp_setup(),
@@ -204,7 +223,13 @@ def uncover(_: Measured, v: Variant) -> Draft:
     )
 
 
+def _near_enough(m: Measured, v: Variant, words: str) -> str:
+    """Return how near its goal the object must be: as an expression of the words, or as near as in the video [m]."""
+    return words if v.goal == "words" else str(tolerance(float(np.hypot(*m.beside_m)) + 0.02, v))
+
+
 def _carry(
+    m: Measured,
     v: Variant,
     *,
     thoughts: list[str],
@@ -216,6 +241,7 @@ def _carry(
     """Return a draft for all tasks that take the object somewhere and let it go.
 
     Args:
+        m: what the video says.
         v: the variant.
         thoughts: steps of the task.
         goal: lines that define `goal_point`, where the object's centre comes to rest.
@@ -235,7 +261,12 @@ def _carry(
         ],
         success=[
             *conditions,
-            ("is_let_go", "obj_touched < 0.5"),
+            *([] if v.holds == "any" else [("is_let_go", "obj_touched < 0.5")]),
+            *(
+                stands(v, is_asked=False)
+                if m.stood and "is_upright" not in dict(conditions)
+                else []
+            ),
             ("is_left_alone", REF_STILL),
             is_still(v),
         ],

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from v2p_data.kinds import Kind
 from v2p_data.scene.scene import Scene, SceneObject
@@ -21,6 +22,10 @@ class Measured:
     """From the first to the last pose."""
     lift_m: float
     """The highest the centre came above its start."""
+    beside_m: tuple[float, float] = (0.0, 0.0)
+    """At the end, horizontally, from the first other object to the manipulated one."""
+    stood: bool = True
+    """Whether the object's axis that pointed up at first did so at the end, too."""
 
     @staticmethod
     def of(scene: Scene) -> "Measured":
@@ -29,10 +34,15 @@ class Measured:
         if not len(poses):
             poses = first_pose(obj)[None]
         move = poses[-1, :3] - poses[0, :3]
+        ref = scene.others[0] if scene.others else None
+        at = np.array(ref.poses_world[-1][:2]) if ref and ref.poses_world else poses[-1, :2]
+        ups = Rotation.from_quat(poses[[0, -1], 3:], scalar_first=True).as_matrix()[:, 2]
         return Measured(
             kind=scene.kind,
             obj=obj,
-            ref=scene.others[0] if scene.others else None,
+            ref=ref,
+            beside_m=(float(poses[-1, 0] - at[0]), float(poses[-1, 1] - at[1])),
+            stood=bool(ups[0] @ ups[1] > 0.8),
             move_m=(float(move[0]), float(move[1]), float(move[2])),
             lift_m=float(poses[:, 2].max() - poses[0, 2]),
         )

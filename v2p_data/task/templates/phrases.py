@@ -12,7 +12,6 @@ _LEAN_SETUP = [
     "vertical[:, 2] = 1",
     "lean = torch.norm(in_world_frame(eef_quat, vertical)[:, :2], dim=-1)",
 ]
-STILL_UPRIGHT = "(upright(obj_quat, obj_start_quat) > 0.9)"
 # Withholds what pushing earns once the object topples. A penalty instead teaches not to touch tall objects at all:
 # 0 % for a 5 x 8 cm cylinder.
 STANDING = "upright(obj_quat, obj_start_quat).clamp(0.0, 1.0)"
@@ -44,7 +43,22 @@ def grasp_setup(name: str = "obj") -> list[str]:
 
 def is_still(v: Variant) -> tuple[str, str]:
     """Return the condition that the object has come to rest."""
-    return "is_still", f"torch.norm(obj_vel, dim=-1) < {v.still_m_s}"
+    still = f"torch.norm(obj_vel, dim=-1) < {v.still_m_s}"
+    if v.still_rad_s:
+        still = f"({still}) & (torch.norm(obj_spin, dim=-1) < {v.still_rad_s})"
+    return "is_still", still
+
+
+def stands(v: Variant, *, is_asked: bool = True) -> list[tuple[str, str]]:
+    """Return the condition that the object stands as at the start; none where it is not asked.
+
+    Args:
+        v: the variant.
+        is_asked: whether the words of the kind of task ask for it.
+    """
+    lean = {"words": 0.9 if is_asked else 0.0, "any": 0.0, "strict": 0.95 if is_asked else 0.7}
+    least = lean[v.upright]
+    return [("is_upright", f"upright(obj_quat, obj_start_quat) > {least}")] if least else []
 
 
 def shifted(point: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> str:

@@ -9,22 +9,27 @@ from v2p_data.task.templates.phrases import (
     REF_MOVED,
     REF_STILL,
     STANDING,
-    STILL_UPRIGHT,
     grasp_setup,
     is_still,
     push_point_setup,
     shifted,
+    stands,
 )
-from v2p_data.task.templates.variants import Variant
+from v2p_data.task.templates.variants import Variant, tolerance, way
 
 
 def push(m: Measured, v: Variant) -> Draft:
     sign = 1.0 if m.kind == "push_left" else -1.0
-    way = round(float(np.clip(0.6 * abs(m.move_m[1]), 0.08, 0.15)) * v.strictness, 3)
+    far = way(float(np.clip(0.6 * abs(m.move_m[1]), 0.08, 0.15)), v)
     # Hands push at a slant; the words allow some of it.
     slant = round(
         float(np.clip(1.15 * abs(m.move_m[0]) / max(abs(m.move_m[1]), 1e-3), 0.5, 1.0)), 2
     )
+    there = "moved"
+    if v.goal == "video":
+        x, y = (round(c / float(np.hypot(*m.move_m[:2])), 3) for c in m.move_m[:2])
+        there = f"({shifted('torch.zeros_like(obj_pos)', x=x, y=y)})"
+        there = f"((obj_pos - obj_start) * {there}).sum(dim=-1)"
     return Draft(
         thoughts=[
             f"Go behind the object, on its {'right' if sign > 0 else 'left'}.",
@@ -37,26 +42,29 @@ def push(m: Measured, v: Variant) -> Draft:
             "sideways = (obj_pos[:, 0] - obj_start[:, 0]).abs()",
         ],
         success=[
-            ("is_there", f"moved > {way}"),
+            ("is_there", f"{there} > {far}"),
             ("is_straight", f"sideways < ({slant} * moved).clamp(min=0.05)"),
             ("is_down", LOW),
-            ("is_upright", STILL_UPRIGHT),
+            *stands(v),
+            *_not_held(v),
             is_still(v),
         ],
         reward_setup=push_point_setup(clearance_m=0.02),
         target="push_point",
-        progress=f"(moved / {way + 0.02:.3f}).clamp(-1.0, 1.0) * {LOW}.float() * {STANDING}",
-        remaining=f"({way} - moved).clamp(min=0.0)",
-        goal=shifted("obj_start", y=sign * (way + 0.02)),
+        progress=f"(moved / {far + 0.02:.3f}).clamp(-1.0, 1.0) * {LOW}.float() * {STANDING}",
+        remaining=f"({far} - moved).clamp(min=0.0)",
+        goal=shifted("obj_start", y=sign * (far + 0.02)),
         extras=[
             ("straight", "-0.5 * (sideways - 0.02).clamp(0.0, 0.2)"),
-            ("not_too_far", f"-0.3 * (moved - {way + 0.07:.3f}).clamp(0.0, 1.0)"),
+            ("not_too_far", f"-0.3 * (moved - {far + 0.07:.3f}).clamp(0.0, 1.0)"),
             LEVEL,
         ],
     )
 
 
 def tip_over(_: Measured, v: Variant) -> Draft:
+    # It came to lie on its side, not on its head.
+    lies = "standing.abs()" if v.goal == "video" or v.upright == "strict" else "standing"
     return Draft(
         thoughts=[
             "Go to the upper part of the object.",
@@ -65,9 +73,10 @@ def tip_over(_: Measured, v: Variant) -> Draft:
         ],
         setup=["standing = upright(obj_quat, obj_start_quat)"],
         success=[
-            ("is_tipped", f"standing < {round(min(0.3 / v.strictness, 0.4), 3)}"),
+            ("is_tipped", f"{lies} < {round(0.3 + 0.05 * v.slack, 3)}"),
             ("is_down", "lowest_point(obj_pos, obj_quat, obj_size) < 0.015"),
             ("is_near", "torch.norm((obj_pos - obj_start)[:, :2], dim=-1) < 0.25"),
+            *([("is_let_go", "obj_touched < 0.5")] if v.holds == "strict" else []),
             is_still(v),
         ],
         reward_setup=[
@@ -89,8 +98,12 @@ def tip_over(_: Measured, v: Variant) -> Draft:
     )
 
 
-def push_next_to(_: Measured, v: Variant) -> Draft:
-    gap = round(0.02 / v.strictness, 3)
+def push_next_to(m: Measured, v: Variant) -> Draft:
+    gap = tolerance(0.02, v)
+    beside = f"gap < {gap}"
+    if v.goal == "video":
+        distance = round(float(np.hypot(*m.beside_m)), 3)
+        beside = f"(torch.norm(between, dim=-1) - {distance}).abs() < {tolerance(0.02, v)}"
     return Draft(
         thoughts=[
             "Go behind the object, seen from the other one.",
@@ -106,10 +119,11 @@ def push_next_to(_: Measured, v: Variant) -> Draft:
             REF_MOVED,
         ],
         success=[
-            ("is_next_to", f"gap < {gap}"),
+            ("is_next_to", beside),
             ("is_left_alone", REF_STILL),
             ("is_down", LOW),
-            ("is_upright", STILL_UPRIGHT),
+            *stands(v),
+            *_not_held(v),
             is_still(v),
         ],
         reward_setup=[
@@ -131,8 +145,11 @@ def push_next_to(_: Measured, v: Variant) -> Draft:
 
 def push_with(m: Measured, v: Variant) -> Draft:
     """The tool is grasped and pushes; the gripper never touches the object."""
-    way = round(float(np.clip(0.6 * np.hypot(m.move_m[0], m.move_m[1]), 0.07, 0.12)), 3)
-    way = round(way * v.strictness, 3)
+    far = way(float(np.clip(0.6 * np.hypot(m.move_m[0], m.move_m[1]), 0.07, 0.12)), v)
+    there = "moved"
+    if v.goal == "video":
+        there = "torch.norm((obj_pos - obj_start)[:, :2], dim=-1)"
+    by_tool = {"words": "(ref_touched > 0.5) & ", "any": "", "strict": "(ref_grasped > 0.5) & "}
     return Draft(
         thoughts=[
             "Grasp the tool.",
@@ -150,10 +167,10 @@ def push_with(m: Measured, v: Variant) -> Draft:
             "gap = torch.norm(between, dim=-1) - obj_half(obj_quat, obj_size, line) - ref_half(ref_quat, ref_size, line)",
         ],
         success=[
-            ("is_there", f"moved > {way}"),
-            ("is_by_tool", "(ref_touched > 0.5) & (obj_touched < 0.5) & (gap < 0.1)"),
+            ("is_there", f"{there} > {far}"),
+            ("is_by_tool", by_tool[v.holds] + "(obj_touched < 0.5) & (gap < 0.1)"),
             ("is_down", LOW),
-            ("is_upright", STILL_UPRIGHT),
+            *stands(v),
             is_still(v),
         ],
         reward_setup=[
@@ -164,11 +181,16 @@ def push_with(m: Measured, v: Variant) -> Draft:
         target="grasp_point",
         contact="ref_grasped * near",
         pays_contact=True,
-        progress=f"(moved / {way + 0.02:.3f}).clamp(-1.0, 1.0) * contact * {LOW}.float() * {STANDING}",
-        remaining=f"({way} - moved).clamp(min=0.0)",
-        goal=shifted("obj_start", z=0.0) + f" + goal_direction * {way + 0.02:.3f}",
+        progress=f"(moved / {far + 0.02:.3f}).clamp(-1.0, 1.0) * contact * {LOW}.float() * {STANDING}",
+        remaining=f"({far} - moved).clamp(min=0.0)",
+        goal=shifted("obj_start", z=0.0) + f" + goal_direction * {far + 0.02:.3f}",
         extras=[
             ("tool_near", "0.4 * contact * tool_low * closer"),
             ("hands_off", "-0.3 * obj_touched"),
         ],
     )
+
+
+def _not_held(v: Variant) -> list[tuple[str, str]]:
+    """Return the condition that the gripper does not have what it pushed."""
+    return [("is_free", "obj_grasped < 0.5")] if v.holds == "strict" else []

@@ -7,8 +7,14 @@ import numpy as np
 from v2p_data.kinds import KINDS, Kind, check_every_kind
 from v2p_data.task.templates import carrying, pushing
 from v2p_data.task.templates.draft import Draft, Measured
-from v2p_data.task.templates.phrases import grasp_setup, is_still, push_point_setup, shifted
-from v2p_data.task.templates.variants import Variant
+from v2p_data.task.templates.phrases import (
+    grasp_setup,
+    is_still,
+    push_point_setup,
+    shifted,
+    stands,
+)
+from v2p_data.task.templates.variants import Variant, tolerance
 
 Recipe = Callable[[Measured, Variant], Draft]
 
@@ -30,16 +36,16 @@ def _generic(m: Measured, v: Variant) -> Draft:
     if not lifts:
         move[2] = 0.0
     x, y, z = (round(float(c), 3) for c in move)
-    tolerance = round(float(np.clip(0.4 * wanted, 0.04, 0.08)) / v.strictness, 3)
     success = [
-        ("is_there", f"remaining < {tolerance}"),
+        ("is_there", f"remaining < {tolerance(float(np.clip(0.4 * wanted, 0.04, 0.08)), v)}"),
         (
             "is_on_its_way",
             f"((obj_pos - obj_start) * goal_direction).sum(dim=-1) > {0.5 * wanted:.3f}",
         ),
+        *(stands(v, is_asked=False) if m.stood else []),
         is_still(v),
     ]
-    if lifts:
+    if lifts and v.holds != "any":
         success.insert(1, ("is_held", "obj_grasped > 0.5"))
     return Draft(
         thoughts=["Reach the object.", "Move it as in the video.", "Keep it there."],

@@ -118,6 +118,7 @@ def _state_lines(m: Measured) -> list[str]:
         *lines,
         f'obj_start_quat = states["{n}_start_quat"]',
         f'obj_vel = states["{n}_vel_linear"]',
+        f'obj_spin = states["{n}_vel_angular"]',
         "half_height = obj_start[:, 2] - table_height",
         "reach_limit = 0.05 + half_height",
     ]

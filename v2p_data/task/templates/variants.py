@@ -1,10 +1,23 @@
-"""The eight samples of a task: how strict, how smooth, in which form, with which extra observations.
+"""The eight samples of a task: what is not sure about the video, how smooth, in which form, with which extra observations.
 
-Sample 0 has the shapes that were measured to train fastest, the others are the kinds of alternatives a language
-model writes, down to the naive success of the paper's figure 11.
+Sample 0 has the shapes that were measured to train fastest. The others differ in what a video leaves open: how far is
+far enough, given the error of what was measured; how still is still; whether the goal is what the words say or where
+the video ended; whether the object must be held, or let go; how it must be turned. Sample 6 is the naive success of the
+paper's figure 11, on purpose: the audit must refuse it.
 """
 
 from dataclasses import dataclass
+from typing import Literal
+
+POSITION_ERROR_M = 0.015
+"""Median distance between a reconstructed and the true position, both ends of a clip: docs/lab/reconstruction.md,
+"Measured on drawn clips"."""
+SIZE_ERROR_M, SIZE_ERROR_SHARE = 0.0084, 0.11
+"""Median error of a reconstructed extent, in metres and as a share of it: same table."""
+TOLERANCE_STEP_M = POSITION_ERROR_M / 2
+"""A tolerance of a few centimetres changes by this where a way changes by the whole error."""
+Asked = Literal["words", "any", "strict"]
+"""What success demands: what the words of the kind of task say, nothing, or more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,10 +26,18 @@ class Variant:
 
     idea: str
     """One sentence; goes into the reward's docstring."""
-    strictness: float = 1.0
-    """Factor on the distance that success demands."""
+    slack: float = 0.0
+    """Errors of measurement by which success is satisfied with less than what was measured; below 0, asks for more."""
     still_m_s: float = 0.15
     """Success demands that the object is slower than this."""
+    still_rad_s: float = 0.0
+    """And that it turns slower than this; 0 where it is not asked."""
+    goal: Literal["words", "video"] = "words"
+    """Whether success is what the words say of the objects, or where the object came to be in the video."""
+    holds: Asked = "words"
+    """Whether the gripper must have the object at the end, or must have let go."""
+    upright: Asked = "words"
+    """Whether the object must still stand as at the start."""
     is_naive: bool = False
     """Success looks at the main condition only."""
     kernel: str = "tanh"
@@ -41,6 +62,7 @@ VARIANTS = (
         idea="As gentle slopes as possible; the policy is told its distance from the object.",
         kernel="tanh",
         temperature=5.0,
+        slack=1.0,
         still_m_s=0.1,
         progress=0.8,
         observes=("distance",),
@@ -48,6 +70,7 @@ VARIANTS = (
     Variant(
         idea="A coarse and a fine slope, so that neither far nor near is flat.",
         kernel="mixed",
+        goal="video",
         reach=0.3,
         contact=0.1,
         observes=("remaining",),
@@ -55,13 +78,17 @@ VARIANTS = (
     Variant(
         idea="Stages: once in contact, only what follows counts.",
         form="staged",
-        strictness=0.85,
+        slack=-1.0,
+        still_rad_s=1.0,
+        upright="strict",
         contact=0.3,
         progress=0.8,
     ),
     Variant(
         idea="Progress counts fully only while the gripper is near.",
         form="product",
+        slack=0.5,
+        holds="any",
         kernel="rational",
         temperature=12.0,
         progress=0.8,
@@ -74,7 +101,9 @@ VARIANTS = (
         progress=0.4,
         speed=0.3,
         step_cost=0.01,
-        strictness=1.15,
+        goal="video",
+        slack=1.0,
+        holds="strict",
         observes=("goal",),
     ),
     Variant(
@@ -93,9 +122,21 @@ VARIANTS = (
         reach=0.1,
         contact=0.0,
         progress=0.3,
-        strictness=1.3,
+        slack=2.0,
         still_m_s=0.05,
+        still_rad_s=0.5,
+        upright="any",
         observes=("distance", "goal"),
     ),
 )
 NUM_VARIANTS = len(VARIANTS)
+
+
+def way(measured_m: float, v: Variant) -> float:
+    """Return a distance that success demands, less the variant's slack [m]."""
+    return round(max(measured_m - v.slack * POSITION_ERROR_M, 0.03), 3)
+
+
+def tolerance(measured_m: float, v: Variant) -> float:
+    """Return how far from its goal success allows an object to be, with the variant's slack [m]."""
+    return round(max(measured_m + v.slack * TOLERANCE_STEP_M, measured_m / 2), 3)
