@@ -93,3 +93,18 @@ def test_without_the_sample_clips_the_demo_says_what_it_needs(capsys, clone: Pat
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)
 def test_the_settings_files_that_we_give_are_settings(path: Path):
     assert load_settings(path, EngineConfig) != EngineConfig()
+
+
+def test_the_papers_settings_are_the_papers_numbers():
+    cfg = load_settings(ROOT / "configs" / "paper.yaml", EngineConfig)
+
+    assert (cfg.task.num_samples, cfg.task.vlm.pick) == (8, "vlm")
+    assert (cfg.reward.num_iterations, cfg.reward.num_candidates) == (5, 8)
+    assert (cfg.reward.method, cfg.reward.without, cfg.reward.start) == ("v2p", (), "nothing")
+    assert cfg.reward.steps_at_most() < cfg.reward.steps_without_halving()
+    assert (cfg.expert.teacher, cfg.expert.warm_start, cfg.expert.bank.share) == ("none", None, 0)
+    assert (cfg.episodes.num_episodes, cfg.distillation.rounds) == (100, 0)
+    policy = cfg.policy.resolved
+    assert (policy.epochs, policy.batch_size, policy.n_obs_steps) == (30, 1024, 2)
+    assert (policy.encoder, policy.input_size_px) == ("resnet18", 256)
+    assert (policy.learning_rate, PRETRAINED_BACKBONE_LR) == (3e-4, 3e-5)

@@ -42,6 +42,7 @@ REWARD = "def reward_function(actions, states):\n"
 GOOD = "    total = states['eef_pos'][:, 0]\n"
 FAULTY = {
     "not_finite": "    total = states['eef_pos'][:, 0] * float('1e30') * 1e30\n",
+    "unbounded": "    total = 1e6 + states['eef_pos'][:, 0]\n",
     "out_of_memory": "    total = torch.zeros((1000, 1000, 10000, len(actions)))[0, 0, 0]\n",
 }
 
@@ -82,7 +83,7 @@ def job(bundle: TaskBundle, folder: Path, body: str) -> Job:
         mark=1,
         request={
             "job": "train", "bundle": str(folder / BUNDLE_FOLDER), "code": str(place / "code.py"),
-            "seed": 0, "eval_seed": 1, "steps_per_mark": 1, "success_bonus": 100.0, "num_envs": 8,
+            "seed": 0, "eval_seed": 1, "steps_per_mark": 1, "bonus_ratio": 1.0, "num_envs": 8,
             "num_threads": 1, "eval_worlds": 2, "evaluations": 1, "target_success": 2.0,
             "sees_video": True, "warm_start": None,
         },
@@ -92,10 +93,10 @@ def job(bundle: TaskBundle, folder: Path, body: str) -> Job:
 # --- what fails ----------------------------------------------------------------------------------------------
 
 
-def test_nan_and_memory_are_each_candidates_own_result(
+def test_nan_bounds_and_memory_are_each_candidates_own_result(
     bundle: TaskBundle, jobs: Jobs, tmp_path: Path
 ):
-    asked = {kind: job(bundle, tmp_path, FAULTY[kind]) for kind in ("not_finite", "out_of_memory")}
+    asked = {kind: job(bundle, tmp_path, body) for kind, body in FAULTY.items()}
     good = job(bundle, tmp_path, GOOD)
 
     jobs.run([*asked.values(), good])

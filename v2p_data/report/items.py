@@ -40,6 +40,7 @@ from v2p_data.report.searches import SEARCH_FOLDER
 from v2p_data.report.training import training_charts
 from v2p_data.scene.scene import Scene, SceneObject
 
+MAX_MODEL_CHARS = 100
 STRIP_MOMENTS = 6
 """Masks side by side, for those who do not press play."""
 
@@ -98,7 +99,7 @@ class ItemView:
     audit: AuditView | None = None
     samples: list[SampleView] = field(default_factory=list[SampleView])
     pick: str = ""
-    """What picking one of the samples was good for, in a sentence."""
+    """Who wrote and who picked, and what picking was good for."""
     reward: RewardView | None = None
     rate: Rate | None = None
     charts: list[Markup] = field(default_factory=list[Markup])
@@ -204,7 +205,7 @@ def _add_task(view: ItemView, result: Result) -> None:
         _sample_view(sample, k == table.get("picked"))
         for k, sample in enumerate(as_dicts(table.get("samples")))
     ]
-    view.pick = _pick_words(as_dict(table.get("rates")))
+    view.pick = " ".join([*_authors(table), *_pick_words(as_dict(table.get("rates")))])
 
 
 def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
@@ -308,15 +309,23 @@ def _sample_view(sample: Mapping[str, Any], is_picked: bool) -> SampleView:
     )
 
 
-def _pick_words(rates: Mapping[str, Any]) -> str:
+def _authors(table: Mapping[str, Any]) -> list[str]:
+    """Return who wrote the samples and who picked one; nothing where it is not known."""
+    model = f"the model {str(table.get('model') or '')[:MAX_MODEL_CHARS]}".rstrip()
+    writer = {"templates": "templates", "vlm": model}.get(str(table.get("writer")))
+    picker = {"audit": "the audit", "vlm": model}.get(str(as_dict(table.get("pick")).get("by")))
+    return [f"Written by {writer}, picked by {picker}."] if writer and picker else []
+
+
+def _pick_words(rates: Mapping[str, Any]) -> list[str]:
     """Return which share of samples was of no use, before the pick and after it; nothing where it is not known."""
     before, after = (
         [number(as_dict(rates.get(when)).get(what)) for what in ("non_runnable", "zero_score")]
         for when in ("before_pick", "after_pick")
     )
     if None in before or None in after:
-        return ""
+        return []
     words = "{:.0%} of task codes did not run and {:.0%} ran and scored nothing"
-    return (
+    return [
         f"Before the pick {words.format(*before)}; after it {'{:.0%} and {:.0%}'.format(*after)}."
-    )
+    ]
