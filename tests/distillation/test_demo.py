@@ -10,9 +10,12 @@ import pytest
 import toy_run
 from toy_run import made, record_of
 
+from policies.bc.configuration_v2p_bc import V2PBCConfig
+from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
 from v2p_data.cli import run
 from v2p_data.commands import run as commands
 from v2p_data.pipeline.settings import load_settings
+from v2p_data.policy_config import PolicyConfig
 from v2p_data.stages import EngineConfig
 
 ROOT = Path(__file__).parents[2]
@@ -104,7 +107,21 @@ def test_the_papers_settings_are_the_papers_numbers():
     assert cfg.reward.steps_at_most() < cfg.reward.steps_without_halving()
     assert (cfg.expert.teacher, cfg.expert.warm_start, cfg.expert.bank.share) == ("none", None, 0)
     assert (cfg.episodes.num_episodes, cfg.distillation.rounds) == (100, 0)
-    policy = cfg.policy.resolved
-    assert (policy.epochs, policy.batch_size, policy.n_obs_steps) == (30, 1024, 2)
-    assert (policy.encoder, policy.input_size_px) == ("resnet18", 256)
-    assert (policy.learning_rate, PRETRAINED_BACKBONE_LR) == (3e-4, 3e-5)
+    # What `v2p train` reads of it is the preset, whatever stands before the dataset.
+    assert cfg.policy == PolicyConfig(preset="paper")
+    assert (cfg.policy.resolved.epochs, cfg.policy.resolved.batch_size) == (30, 1024)
+    network = V2PBCConfig(**cfg.policy.network())
+    assert (network.encoder, network.input_size_px, network.n_obs_steps) == ("resnet18", 256, 2)
+    assert (network.head, network.state_dim, network.head_dim) == ("regression", 256, 512)
+    assert (network.optimizer_lr, PRETRAINED_BACKBONE_LR) == (3e-4, 3e-5)
+
+
+def test_with_the_papers_settings_pictures_are_an_option():
+    path = str(ROOT / "configs" / "paper.yaml")
+    to = ["--out", "run", "--repo-id", "someone/lifts"]
+
+    masks = commands._with_config(commands.Generate, ["clips", *to, "--config", path], "generate")
+    rgb = commands._with_config(commands.Generate, ["clips", *to, "--config", path, "--episodes.render=rgb"], "generate")  # fmt: skip
+
+    assert (masks.engine.episodes.render, rgb.engine.episodes.render) == ("masks", "rgb")
+    assert rgb.engine.reward.iterations == masks.engine.reward.iterations == 5

@@ -427,6 +427,29 @@ def test_the_expert_goes_without_the_bonus_that_its_reward_went_without(tmp_path
     assert first_batch(made.folder)["return"] < 2.0
 
 
+def test_a_task_whose_reward_was_edited_to_a_constant_gets_no_expert_and_one_sentence(
+    tmp_path: Path,
+):
+    expert = expert_of(tmp_path, *TINY_EXPERT)
+    bundle = bundle_with(ANY_GRIP)
+    edited = replace(bundle, code=with_reward(bundle.code, REWARD.format(FLAT)))
+    save_bundle(edited, expert.inputs["task"].folder(tmp_path))
+
+    made = make_stage(expert, Runtime(root=tmp_path))
+
+    assert made.status == "rejected"
+    assert "reward of task 'lift_up' (lift_up) is 5 in each of" in made.detail
+    assert not made.folder.exists()
+
+
+def test_the_ratio_of_the_bonus_is_one_setting_for_search_and_expert(tmp_path: Path):
+    searched = expert_of(tmp_path, "--reward.iterations=1", "--reward.bonus-ratio=7")
+    plain = expert_of(tmp_path, "--reward.bonus-ratio=7")
+
+    assert searched.sources == plain.sources == {"bonus ratio": "7"}
+    assert searched.inputs["task"].config.config.bonus_ratio == 7
+
+
 def test_only_a_missing_bonus_makes_the_expert_another_recipe(tmp_path: Path):
     methods = ("v2p", "eureka", "robogen")
     experts = [

@@ -82,7 +82,7 @@ def prepare(
         V2PError: the writer gives no code that runs.
     """
     seen = what_the_writer_sees(bundle.scene, cfg)
-    is_own_success = cfg.method == "eureka" or "pick" in cfg.without or seen is not bundle.scene
+    is_own_success = writes_success(cfg)
     if writer is not None:
         if not is_own_success:
             return Prepared(bundle=bundle, seen=seen, codes=(bundle.code,), origins=("given",))
@@ -114,6 +114,11 @@ def told(vlm: VlmConfig, cfg: RewardConfig) -> VlmConfig:
     if _is_blind(cfg):
         return replace(vlm, images=False, tracking=False)
     return replace(vlm, tracking=vlm.tracking and "tracking" not in cfg.without)
+
+
+def writes_success(cfg: RewardConfig) -> bool:
+    """Tell whether a method trains on another success than the audited one."""
+    return _is_blind(cfg) or "tracking" in cfg.without or "pick" in cfg.without
 
 
 def _is_blind(cfg: RewardConfig) -> bool:

@@ -374,7 +374,7 @@ class _Search:
         """Return what the model wrote, if there is one, and in words how much of it is missing."""
         if self.writer is None or count < 1:
             return _Asked()
-        fault = "the others were tried before"
+        fault = "the others do not run, or were tried before"
         try:
             codes = ask(self.writer, count)
         except UnusableAnswersError as error:
