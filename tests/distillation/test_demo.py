@@ -114,14 +114,3 @@ def test_the_papers_settings_are_the_papers_numbers():
     assert (network.encoder, network.input_size_px, network.n_obs_steps) == ("resnet18", 256, 2)
     assert (network.head, network.state_dim, network.head_dim) == ("regression", 256, 512)
     assert (network.optimizer_lr, PRETRAINED_BACKBONE_LR) == (3e-4, 3e-5)
-
-
-def test_with_the_papers_settings_pictures_are_an_option():
-    path = str(ROOT / "configs" / "paper.yaml")
-    to = ["--out", "run", "--repo-id", "someone/lifts"]
-
-    masks = commands._with_config(commands.Generate, ["clips", *to, "--config", path], "generate")
-    rgb = commands._with_config(commands.Generate, ["clips", *to, "--config", path, "--episodes.render=rgb"], "generate")  # fmt: skip
-
-    assert (masks.engine.episodes.render, rgb.engine.episodes.render) == ("masks", "rgb")
-    assert rgb.engine.reward.iterations == masks.engine.reward.iterations == 5

@@ -439,7 +439,7 @@ def test_a_task_whose_reward_was_edited_to_a_constant_gets_no_expert_and_one_sen
 
     assert made.status == "rejected"
     assert "reward of task 'lift_up' (lift_up) is 5 in each of" in made.detail
-    assert not made.folder.exists()
+    assert not list(made.folder.rglob("*.safetensors"))
 
 
 def test_the_ratio_of_the_bonus_is_one_setting_for_search_and_expert(tmp_path: Path):
