@@ -104,6 +104,7 @@ def test_the_papers_settings_are_the_papers_numbers():
     assert (cfg.task.num_samples, cfg.task.vlm.pick) == (8, "vlm")
     assert (cfg.reward.num_iterations, cfg.reward.num_candidates) == (5, 8)
     assert (cfg.reward.method, cfg.reward.without, cfg.reward.start) == ("v2p", (), "nothing")
+    assert cfg.reward.paid_bonus_ratio == 100
     assert cfg.reward.steps_at_most() < cfg.reward.steps_without_halving()
     assert (cfg.expert.teacher, cfg.expert.warm_start, cfg.expert.bank.share) == ("none", None, 0)
     assert (cfg.episodes.num_episodes, cfg.distillation.rounds) == (100, 0)
