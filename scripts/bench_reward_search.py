@@ -1,7 +1,8 @@
-"""What successive halving costs, and what it loses: the same rewards, raced against each other and all trained to the end.
+"""What successive halving costs, what it loses, and whether later rounds beat the first one at equal steps.
 
     python scripts/bench_reward_search.py --quick          # under a minute on an idle core; a mechanism, not a result
     python scripts/bench_reward_search.py --task lift_up   # five rounds of eight, as in the paper: hours
+    python scripts/bench_reward_search.py --first-round --tasks lift_up uncover throw_into --seeds 0 1 2 3 4 --out outputs/rounds
 
 First the search runs. Then every candidate that it stopped goes on from its checkpoint to the end, which is what training all
 of them would have come to, step for step. The final policy of the search's choice and that of the best of all are
@@ -10,23 +11,42 @@ played on the same fresh episodes, which decided nothing. A candidate that has n
 Among the lines are `cost_share: X` (control steps, evaluations included, of the search and its confirmation over those of
 all to the end), `cost_share_at_most: X` (what halving allows, however the candidates do), `success_lost_at_most: X` (what
 the choice lacks to 100 %; with `--bound` the end, for nothing trains after the search) and, last, `success_lost: X`.
+
+With `--first-round` every task and seed is searched, and the control steps of its later rounds, evaluations included, are
+spent on the first round instead, in two ways: its best reward trains on from its checkpoint (`longer`), or the round has
+more first rewards (`wider`). All final policies are judged by the referee on the same fresh episodes at the fine time
+step. No target ends anything early. Each arm is a line of `results.jsonl` with its episodes' outcomes in order; what is
+there is not done again, and a search that was stopped goes on. Last comes a table of paired differences over seeds.
 """
 
 import json
+import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import tyro
+from scipy import stats
 
 from policies.evaluation.rate import Rate, wilson
 from policies.ppo.policy import Expert
+from studies.results import Row, append_result, letters_of, results_in
+from v2p_data.episodes.collect import judge_expert
 from v2p_data.experts.teacher import play
-from v2p_data.reward.candidate import Candidate, load_candidates
+from v2p_data.reward.candidate import (
+    LAST_POLICY,
+    TRAIN_FOLDER,
+    Candidate,
+    Training,
+    load_candidates,
+)
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.jobs import REQUEST_FILE, Job, Jobs
-from v2p_data.reward.search import How, search_reward
+from v2p_data.reward.search import Found, How, search_reward
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.task.benchmark import load_benchmark
@@ -46,6 +66,7 @@ QUICK = RewardConfig(
     target_success=1.01,
 )
 FULL = RewardConfig(iterations=5)
+ARMS = ("search", "first", "longer", "wider")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +75,12 @@ class Settings:
 
     task: str = "lift_up"
     """A benchmark task."""
+    first_round: bool = False
+    """Compare later rounds with more of the first one instead."""
+    tasks: tuple[str, ...] = ("lift_up", "uncover", "throw_into")
+    """Benchmark tasks of that comparison."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Of that comparison."""
     quick: bool = False
     """Two rounds of three and few steps."""
     iterations: int | None = None
@@ -73,7 +100,7 @@ class Settings:
     bound: bool = False
     """Train nothing after the search: what it lost is then only bounded, by what its choice lacks to 100 %."""
     out: Path | None = None
-    """Folder of the search, to go on with it later; by default a temporary one."""
+    """Folder of the search or of the comparison, to go on with it later; by default a temporary one."""
 
 
 def main() -> None:
@@ -93,12 +120,22 @@ def main() -> None:
         if (value := getattr(settings, name)) is not None
     }
     cfg = replace(QUICK if settings.quick else FULL, **given)
-    bundle = load_benchmark(settings.task)
     with (
         tempfile.TemporaryDirectory(prefix="v2p-bench-") as folder,
         Jobs(workers=settings.workers) as jobs,
     ):
         out = settings.out or Path(folder)
+        if settings.first_round:
+            cfg = replace(cfg, target_success=2.0, confirm_seeds=1)
+            for task in settings.tasks:
+                for seed in settings.seeds:
+                    for row in compare_rounds(
+                        load_benchmark(task), cfg, out, jobs, settings, seed
+                    ):
+                        print(json.dumps(row), flush=True)
+            print(differences(results_in(out)))
+            return
+        bundle = load_benchmark(settings.task)
         for line in measure(bundle, cfg, out, jobs, settings):
             print(line, flush=True)
 
@@ -137,9 +174,141 @@ def measure(
     yield f"success_lost: {best_rate.value - rate.value:.3f}"
 
 
+# --- later rounds against the first one ----------------------------------------------------------------------------
+
+
+def compare_rounds(
+    bundle: TaskBundle,
+    cfg: RewardConfig,
+    out: Path,
+    jobs: Jobs,
+    settings: Settings,
+    seed: int,
+) -> Iterator[Row]:
+    """Yield the lines of one task and seed that are not in `out` yet, and write them there."""
+    out.mkdir(parents=True, exist_ok=True)
+    there = {r["arm"] for r in results_in(out) if (r["task"], r["seed"]) == (bundle.title, seed)}
+    if there >= set(ARMS):
+        return
+    place, how = out / f"{bundle.title}-{seed}", How(workers=jobs.workers)
+    began = time.monotonic()
+    found = search_reward(bundle, cfg, place / "search", seed=seed, how=how, jobs=jobs)
+    steps = _spent(found)
+    first = [c for c in load_candidates(place / "search") if c.iteration == 0]
+    best = max(first, key=lambda c: (_standing(c, cfg), -c.number))
+    first_steps = sum(_steps_of(c.training(), cfg) for c in first)
+    policies: dict[str, tuple[Path, int]] = {
+        "search": (found.policy, steps),
+        "first": (best.policy_folder(), first_steps),
+    }
+    for arm in ARMS:
+        if arm in there:
+            continue
+        if arm == "longer":
+            more = (steps - first_steps) // _steps_per_mark(bundle, cfg)
+            longer = _trained_on(best, more, place / "longer", jobs)
+            spent = first_steps + _steps_of(longer, cfg) - _steps_of(best.training(), cfg)
+            policies[arm] = (longer.folder / TRAIN_FOLDER / LAST_POLICY, spent)
+        if arm == "wider":
+            wider = _as_wide_as(cfg, steps, bundle)
+            made = search_reward(bundle, wider, place / "wider", seed=seed, how=how, jobs=jobs)
+            policies[arm] = (made.policy, _spent(made))
+        policy, spent = policies[arm]
+        judged = judge_expert(
+            bundle,
+            Expert.load(policy).act,
+            episodes=settings.episodes,
+            seed=seed_for(seed, "later rounds", bundle.title),
+        )
+        row: Row = {
+            "task": bundle.title,
+            "seed": seed,
+            "arm": arm,
+            "success": float(judged.successes.mean()),
+            "episodes": letters_of(judged.successes),
+            "control_steps": spent,
+            "origin": found.origin if arm == "search" else "",
+            "chosen_round": _round_of(found, place / "search") if arm == "search" else 0,
+            "seconds": round(time.monotonic() - began, 1),
+        }
+        began = time.monotonic()
+        append_result(out, row)
+        yield row
+
+
+def differences(rows: list[Row]) -> str:
+    """Return per task and arm how much more the search succeeds: mean over seeds with its 95 % t-interval."""
+    lines = ["| task | search minus | seeds | mean difference | 95 % interval | steps of the arm / search |", "|---|---|---|---|---|---|"]  # fmt: skip
+    by_arm = {(r["task"], r["seed"], r["arm"]): r for r in rows}
+    for task in dict.fromkeys(r["task"] for r in rows):
+        for arm in ARMS[1:]:
+            seeds = sorted(
+                s for t, s, a in by_arm if (t, a) == (task, arm) and (task, s, "search") in by_arm
+            )
+            pairs = [(by_arm[task, s, "search"], by_arm[task, s, arm]) for s in seeds]
+            apart = np.array([a["success"] - b["success"] for a, b in pairs])
+            cost = np.mean([b["control_steps"] / a["control_steps"] for a, b in pairs])
+            interval = "-"
+            if len(apart) > 1:
+                half = stats.t.ppf(0.975, len(apart) - 1) * apart.std(ddof=1) / np.sqrt(len(apart))
+                interval = f"{apart.mean() - half:+.3f} to {apart.mean() + half:+.3f}"
+            lines.append(
+                f"| {task} | {arm} | {len(apart)} | {apart.mean():+.3f} | {interval} | {cost:.2f} |"
+            )
+    return "\n".join(lines)
+
+
+def _spent(found: Found) -> int:
+    return found.trained_steps + found.evaluated_steps
+
+
+def _steps_of(training: Training, cfg: RewardConfig) -> int:
+    per_mark = round(cfg.steps * cfg.rungs[0])
+    return sum(per_mark + e.control_steps for e in training.evaluations)
+
+
+def _steps_per_mark(bundle: TaskBundle, cfg: RewardConfig) -> int:
+    return round(cfg.steps * cfg.rungs[0]) + cfg.eval_worlds * bundle.horizon_steps
+
+
+def _standing(candidate: Candidate, cfg: RewardConfig) -> tuple[bool, float]:
+    """Return what the search ranks by: trained to the end first."""
+    training = candidate.training()
+    return training.done >= cfg.marks[-1], training.rank(cfg.evaluations)
+
+
+def _trained_on(best: Candidate, more: int, place: Path, jobs: Jobs) -> Training:
+    """Return a copy of a candidate's training after so many more evaluations' worth of steps."""
+    if not place.is_dir():
+        shutil.copytree(best.training_folder(), place.with_suffix(".partial"), dirs_exist_ok=True)
+        place.with_suffix(".partial").rename(place)
+    mark = best.training().done + more
+    jobs.run([Job(folder=place, mark=mark, request=_request(best))])
+    return Training.load(place)
+
+
+def _as_wide_as(cfg: RewardConfig, steps: int, bundle: TaskBundle) -> RewardConfig:
+    """Return one round of as many rewards as take at most so many control steps, evaluations included."""
+    share = _steps_per_mark(bundle, cfg) / round(cfg.steps * cfg.rungs[0])
+    wide = replace(cfg, iterations=1)
+    while replace(wide, candidates=wide.candidates + 1).steps_at_most() * share <= steps:
+        wide = replace(wide, candidates=wide.candidates + 1)
+    return wide
+
+
+def _round_of(found: Found, search: Path) -> int:
+    return next(c.iteration for c in load_candidates(search) if c.number == found.chosen)
+
+
+# --- halving ---------------------------------------------------------------------------------------------------
+
+
 def _to_the_end(candidate: Candidate, mark: int) -> Job:
-    folder = candidate.training_folder()
-    return Job(folder=folder, mark=mark, request=json.loads((folder / REQUEST_FILE).read_text()))
+    return Job(folder=candidate.training_folder(), mark=mark, request=_request(candidate))
+
+
+def _request(candidate: Candidate) -> dict[str, Any]:
+    return json.loads((candidate.training_folder() / REQUEST_FILE).read_text())
 
 
 def _rate(worlds: BatchEnv, candidate: Candidate) -> Rate:

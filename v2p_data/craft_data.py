@@ -12,7 +12,7 @@ from v2p_data.pipeline.fingerprint import file_digest
 PACKAGE = Path(__file__).parent
 SCENE_DATA = ("*.tsv", "*.json", "*.safetensors")
 """Nouns, how likely a thing is meant, and the networks; they lie in the rooms of `scene`."""
-PROMPTS = ("prompts.py", "example_tasks.py", "vlm_writer.py")
+PROMPTS = ("prompts.py", "example_refinements.py", "example_tasks.py", "vlm_writer.py")
 
 
 def scene_data() -> dict[str, str]:

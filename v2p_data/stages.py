@@ -246,7 +246,7 @@ def reward_stage(task: Stage, cfg: EngineConfig) -> Stage:
         inputs={"task": task},
         sources=task_data(asks_model=vlm is not None)
         | ({} if vlm is None else {"model": fingerprint(vlm.recipe())}),
-        version=1,
+        version=2,
         make=partial(make_reward, vlm=vlm),
         resumes=True,
     )
@@ -260,25 +260,27 @@ def make_reward(
     *,
     vlm: VlmConfig | None,
 ) -> dict[str, Any]:
-    """Search, and write the task with the reward that was found; a model, if there is one, writes half of them."""
+    """Search, and write the task with the reward that was found; a model, if there is one, writes the rewards."""
+    from v2p_data.reward.methods import told
     from v2p_data.reward.search import How, search_reward
     from v2p_data.task.task import SCENE_FOLDER, TaskBundle
 
     bundle = TaskBundle.load(inputs["task"])
     seed = seed_for(cfg.seed, "reward", bundle.title)
-    ask_model = None
+    writer = None
     if vlm is not None:
         from v2p_data.task.vlm import VlmClient
-        from v2p_data.task.vlm_writer import improve_reward
+        from v2p_data.task.vlm_writer import ModelWriter
 
-        ask_model = partial(improve_reward, VlmClient(vlm, out / "calls", seed))
+        client = VlmClient(told(vlm, cfg.config), out / "calls", seed)
+        writer = ModelWriter(client=client, pools=(runtime.root / SOLVED_POOL_FOLDER,))
     found = search_reward(
         bundle,
         cfg.config,
         out / REWARD_SEARCH_FOLDER,
         seed=seed,
         how=How(num_threads=runtime.num_threads),
-        ask_model=ask_model,
+        writer=writer,
         on_progress=runtime.progress,
     )
     shutil.rmtree(out / SCENE_FOLDER, ignore_errors=True)  # of a run that was killed just here
@@ -295,9 +297,9 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
     A killed training starts anew: it lasts a minute or two, and only then is its result the same as an
     undisturbed one's. It learns with the bonus for success that its reward was searched with; a usual one is not named.
     """
-    usual = RewardConfig().success_bonus
-    bonus = task.config.config.success_bonus if task.name == "reward" else usual
-    named = {} if bonus == usual else {"success bonus": f"{bonus:g}"}
+    is_searched = task.name == "reward"
+    bonus = cfg.reward.paid_bonus_ratio if is_searched else cfg.reward.bonus_ratio
+    named = {} if bonus == RewardConfig().bonus_ratio else {"bonus ratio": f"{bonus:g}"}
     return Stage(
         name="expert",
         item=task.item,
@@ -309,7 +311,7 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
             make_expert,
             warm_start=cfg.expert.warm_start,
             teaches_model=cfg.task.writer == "vlm",
-            success_bonus=bonus,
+            bonus_ratio=bonus,
         ),
     )
 
@@ -322,25 +324,26 @@ def make_expert(
     *,
     warm_start: Path | None,
     teaches_model: bool,
-    success_bonus: float,
+    bonus_ratio: float,
 ) -> dict[str, Any]:
     """Find a teacher, imitate it, go on with PPO; judge with the independent referee."""
     from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.experts.learning import Worlds, learn
     from v2p_data.report.sheet import write_contact_sheet
-    from v2p_data.sim.task_check import check_task
+    from v2p_data.sim.task_check import check_reward, check_task
     from v2p_data.task.pool import add_solved
     from v2p_data.task.task import TaskBundle
 
     expert_cfg: ExpertConfig = cfg.config
     bundle = TaskBundle.load(inputs["task"])
     check_task(bundle, num_threads=runtime.num_threads)
+    check_reward(bundle)
     worlds = Worlds(
         bundle=bundle,
         seed=seed_for(cfg.seed, "expert", bundle.title),
         num_threads=runtime.num_threads,
-        success_bonus=success_bonus,
+        bonus_ratio=bonus_ratio,
     )
     learned = learn(
         worlds,

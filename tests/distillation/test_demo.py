@@ -10,9 +10,12 @@ import pytest
 import toy_run
 from toy_run import made, record_of
 
+from policies.bc.configuration_v2p_bc import V2PBCConfig
+from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
 from v2p_data.cli import run
 from v2p_data.commands import run as commands
 from v2p_data.pipeline.settings import load_settings
+from v2p_data.policy_config import PolicyConfig
 from v2p_data.stages import EngineConfig
 
 ROOT = Path(__file__).parents[2]
@@ -93,3 +96,22 @@ def test_without_the_sample_clips_the_demo_says_what_it_needs(capsys, clone: Pat
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)
 def test_the_settings_files_that_we_give_are_settings(path: Path):
     assert load_settings(path, EngineConfig) != EngineConfig()
+
+
+def test_the_papers_settings_are_the_papers_numbers():
+    cfg = load_settings(ROOT / "configs" / "paper.yaml", EngineConfig)
+
+    assert (cfg.task.num_samples, cfg.task.vlm.pick) == (8, "vlm")
+    assert (cfg.reward.num_iterations, cfg.reward.num_candidates) == (5, 8)
+    assert (cfg.reward.method, cfg.reward.without, cfg.reward.start) == ("v2p", (), "nothing")
+    assert cfg.reward.paid_bonus_ratio == 100
+    assert cfg.reward.steps_at_most() < cfg.reward.steps_without_halving()
+    assert (cfg.expert.teacher, cfg.expert.warm_start, cfg.expert.bank.share) == ("none", None, 0)
+    assert (cfg.episodes.num_episodes, cfg.distillation.rounds) == (100, 0)
+    # What `v2p train` reads of it is the preset, whatever stands before the dataset.
+    assert cfg.policy == PolicyConfig(preset="paper")
+    assert (cfg.policy.resolved.epochs, cfg.policy.resolved.batch_size) == (30, 1024)
+    network = V2PBCConfig(**cfg.policy.network())
+    assert (network.encoder, network.input_size_px, network.n_obs_steps) == ("resnet18", 256, 2)
+    assert (network.head, network.state_dim, network.head_dim) == ("regression", 256, 512)
+    assert (network.optimizer_lr, PRETRAINED_BACKBONE_LR) == (3e-4, 3e-5)

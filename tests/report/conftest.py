@@ -97,7 +97,17 @@ class FakeRun:
             {"runnable": True, "error": "", "score": 0.85, "audit": audit},
         ]
         (folder / "task.json").write_text(json.dumps({"kind": "lift_up", "audit": audit}))
-        (folder / "audit.json").write_text(json.dumps({"picked": 1, "samples": samples}))
+        (folder / "audit.json").write_text(
+            json.dumps(
+                {
+                    "picked": 1,
+                    "writer": "vlm",
+                    "model": "gpt-4o",
+                    "pick": {"by": "audit"},
+                    "samples": samples,
+                }
+            )
+        )
         return self.record(folder, counts={"kind": "lift_up", "picked": 1}, seconds=3.0)
 
     def expert(self, item: str, rejected=None) -> Path:

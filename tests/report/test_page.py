@@ -81,7 +81,7 @@ def test_each_video_has_its_caption_objects_task_expert_and_episodes(whole):
     for words in (
         "Lifting a mug", "8.0 \u00d7 8.0 \u00d7 10.0", "noun table: mug", "250 g", "volume and density", "a weak shadow",
         "class LiftMug(Task):", "false at every reset?", "after 7.1 cm", "true in 25 % of moments",
-        "2 task codes were tried", "1, picked", "NameError: mug", "60 of 64, 95 % interval 85 % to 98 %", "Success while training",
+        "2 task codes were tried", "1, picked", "Written by the model gpt-4o, picked by the audit.", "NameError: mug", "60 of 64, 95 % interval 85 % to 98 %", "Success while training",
         "lift_mug_0000", "lift_mug_0002", "3 episodes were kept from 5 rollouts", "background 0, robot 64, mug 128", "gripper",
     ):  # fmt: skip
         assert words in whole.text

@@ -111,12 +111,12 @@ def test_a_finished_search_shows_choice_seeds_analysis_audit_origin_and_code(run
     text = text_of(page)
 
     for words in (
-        "Candidate 2 of 3 was chosen: 70 % success, the mean over 3 seeds of its own training (75 %, 65 %, 70 %)",
+        "Candidate 2 of 3 was chosen (written by rules): 70 % success, the mean over 3 seeds of its own training (75 %, 65 %, 70 %)",
         "after its last round and took 31 % of the steps", "3 rewards in 2 rounds", "stopped at rung 2 of 4", "10, 20 %",
-        "hung", "no progress for 120 s; it was ended", "trained to the end", "reflection from 0", "1 min 15 s",
+        "hung", "no progress for 120 s; it was ended", "trained to the end", "rules, from 0", "1 min 15 s",
         "Of 64 episodes of its last policy 48 succeeded; 88 % had success at some step; it took 1.2 s (median), in episodes of 3.0 s.",
         "with probability 0.81; chance is 0.50", "reach: reached in 100 %, touched in 50 %, grasped in 25 %, raised in 0 % of episodes; moved by 3.1 cm",
-        "false when flung?", "score 0.90 of 1", "Candidate 2 was written from candidate 0 by the rules of reflection:",
+        "false when flung?", "score 0.90 of 1", "Candidate 2 was written from candidate 0 by rules:",
         "temperature times 0.32", "- reach = 1.0 + reach = 0.5", "Code of candidate 2, 3 lines",
     ):  # fmt: skip
         assert words in text

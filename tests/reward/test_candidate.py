@@ -53,10 +53,25 @@ def test_where_nobody_succeeds_who_is_on_the_way_ranks_first_but_never_above_a_s
     assert idle.rank < on_its_way.rank < succeeds.rank
 
 
+def test_of_rewards_that_succeed_alike_the_one_that_pays_successes_more_than_failures_ranks_first():
+    pays_failures = Evaluation.of(entry(0.50, ranking=0.1))
+    pays_successes = Evaluation.of(entry(0.48, ranking=0.9))
+    succeeds_more = Evaluation.of(entry(0.62, ranking=0.1))
+    fails = Evaluation.of(entry(0.0, ranking=None))
+    succeeds_once = Evaluation.of(entry(1 / 64, ranking=0.0))
+    always = Evaluation.of(entry(1.0, ranking=None))
+
+    assert pays_failures.success > pays_successes.success
+    assert pays_failures.rank < pays_successes.rank < succeeds_more.rank
+    assert fails.rank < succeeds_once.rank
+    assert always.rank > Evaluation.of(entry(0.98, ranking=1.0)).rank
+
+
 @pytest.mark.parametrize(
     "entries",
     [
         [entry(float("nan"))],
+        [entry(0.5, ranking=float("nan"))],
         [entry(1.5)],
         [{"success": "all"}],
         {"success": 1.0},
@@ -176,14 +191,13 @@ def test_without_tracking_sizes_are_still_known(bundle: TaskBundle):
 def test_robogen_trains_one_reward_once_and_without_a_bonus_for_success(bundle: TaskBundle):
     cfg = RewardConfig(method="robogen", iterations=5)
 
-    assert (cfg.num_iterations, cfg.num_candidates, cfg.success_bonus) == (1, 1, 0.0)
+    assert (cfg.num_iterations, cfg.num_candidates, cfg.paid_bonus_ratio) == (1, 1, 0.0)
     assert len(prepared(bundle, cfg).codes) == 1
 
 
 def test_the_switches_take_rounds_and_samples_away():
     assert RewardConfig(iterations=5, without=("iteration",)).num_iterations == 1
     assert RewardConfig(iterations=5, without=("samples",)).num_candidates == 1
-    assert RewardConfig(iterations=5).success_bonus == 100.0  # the paper's lambda
 
 
 def test_without_the_pick_success_is_that_of_any_sample(bundle: TaskBundle):

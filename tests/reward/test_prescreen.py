@@ -37,7 +37,13 @@ def test_rewards_that_rank_failures_first_or_say_nothing_are_turned_away(scenes)
     scene = scenes["lift_up"]
     stored = stored_lifts(scene, np.arange(EPISODES) < EPISODES // 2)
     base = write_samples(scene)[0]
-    formulas = ("h", "-h", "h * 0 + 2.0", "torch.log(0.2 - h * (h > 0.1).float() * 3)")
+    formulas = (
+        "h",
+        "-h",
+        "h * 0 + 2.0",
+        "h * 1.0e6",
+        "torch.log(0.2 - h * (h > 0.1).float() * 3)",
+    )
     codes = [
         transplanted(base, f"def reward_function(actions, states):\n    {HEIGHT}\n    r = {f}\n    return r, {{'r': r}}\n")
         for f in formulas
@@ -45,11 +51,16 @@ def test_rewards_that_rank_failures_first_or_say_nothing_are_turned_away(scenes)
 
     verdicts = prescreen(codes, scene, [stored])
 
-    assert [v.accepted for v in verdicts] == [True, False, False, False]
-    assert [v.reason for v in verdicts[1:]] == ["ranks_failures_first", "constant", "not_runnable"]
+    assert [v.accepted for v in verdicts] == [True, False, False, False, False]
+    assert [v.reason for v in verdicts[1:]] == [
+        "ranks_failures_first",
+        "constant",
+        "unbounded",
+        "not_runnable",
+    ]
     assert (verdicts[0].auc, verdicts[1].auc) == (1.0, 0.0)
     assert "0.00" in verdicts[1].detail
-    assert "finite" in verdicts[3].detail
+    assert "finite" in verdicts[4].detail
 
 
 def test_returns_are_discounted_and_every_moment_stands_for_the_steps_before_it(scenes):

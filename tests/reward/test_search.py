@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from policies.ppo.policy import Expert, weights_of
+from v2p_data.cli import run
 from v2p_data.commands.reward import bars, shown
 from v2p_data.errors import V2PError
 from v2p_data.reward.candidate import EVALUATIONS_FILE, Training, load_candidates
@@ -42,6 +43,7 @@ REWARD = "def reward_function(actions, states):\n"
 GOOD = "    total = states['eef_pos'][:, 0]\n"
 FAULTY = {
     "not_finite": "    total = states['eef_pos'][:, 0] * float('1e30') * 1e30\n",
+    "unbounded": "    total = 1e6 + states['eef_pos'][:, 0]\n",
     "out_of_memory": "    total = torch.zeros((1000, 1000, 10000, len(actions)))[0, 0, 0]\n",
 }
 
@@ -82,7 +84,7 @@ def job(bundle: TaskBundle, folder: Path, body: str) -> Job:
         mark=1,
         request={
             "job": "train", "bundle": str(folder / BUNDLE_FOLDER), "code": str(place / "code.py"),
-            "seed": 0, "eval_seed": 1, "steps_per_mark": 1, "success_bonus": 100.0, "num_envs": 8,
+            "seed": 0, "eval_seed": 1, "steps_per_mark": 1, "bonus_ratio": 1.0, "num_envs": 8,
             "num_threads": 1, "eval_worlds": 2, "evaluations": 1, "target_success": 2.0,
             "sees_video": True, "warm_start": None,
         },
@@ -92,10 +94,10 @@ def job(bundle: TaskBundle, folder: Path, body: str) -> Job:
 # --- what fails ----------------------------------------------------------------------------------------------
 
 
-def test_nan_and_memory_are_each_candidates_own_result(
+def test_nan_bounds_and_memory_are_each_candidates_own_result(
     bundle: TaskBundle, jobs: Jobs, tmp_path: Path
 ):
-    asked = {kind: job(bundle, tmp_path, FAULTY[kind]) for kind in ("not_finite", "out_of_memory")}
+    asked = {kind: job(bundle, tmp_path, body) for kind, body in FAULTY.items()}
     good = job(bundle, tmp_path, GOOD)
 
     jobs.run([*asked.values(), good])
@@ -147,6 +149,22 @@ def test_generated_code_runs_with_few_files_and_little_memory(
     assert int(soft["Max open files"]) <= 256
     assert int(soft["Max address space"]) < 2**40
     assert int(soft["Max core file size"]) == 0
+
+
+@pytest.mark.parametrize("flags", [["--reward.method=eureka"], ["--reward.without", "pick"]])
+def test_a_success_of_a_models_hand_is_not_replaced_by_a_templates(
+    bundle: TaskBundle, flags: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    save_bundle(bundle, tmp_path / "task")
+    (tmp_path / "task" / "audit.json").write_text(json.dumps({"writer": "vlm"}))
+
+    ended = run(
+        ["reward", "search", str(tmp_path / "task"), "--out", str(tmp_path / "out"), *flags]
+    )
+
+    assert ended == 2
+    assert "a model wrote" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 # --- halving -------------------------------------------------------------------------------------------------
@@ -219,6 +237,27 @@ def test_the_benchmark_trains_what_halving_stopped_to_the_end(
     assert [c.training().done for c in load_candidates(out)] == [2, 2]
     assert lines[2:4] == ["cost_share: 0.750", "cost_share_at_most: 0.750"]
     assert re.fullmatch(r"success_lost: -?\d\.\d{3}", lines[-1])
+
+
+def test_the_benchmark_spends_a_searchs_steps_on_its_first_round_and_judges_all_on_the_same_episodes(
+    bundle: TaskBundle, jobs: Jobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.syspath_prepend(BENCH.parent)
+    bench = runpy.run_path(str(BENCH))
+    settings = bench["Settings"](episodes=4)
+    cfg = replace(TINY, iterations=2, target_success=2.0)
+
+    rows = list(bench["compare_rounds"](bundle, cfg, tmp_path, jobs, settings, 7))
+
+    assert [row["arm"] for row in rows] == list(bench["ARMS"])
+    steps = {row["arm"]: row["control_steps"] for row in rows}
+    one = 24 * 16 + 4 * 20  # a mark of training and its evaluation
+    assert steps["first"] == 3 * one
+    assert steps["longer"] == steps["search"] > steps["first"]
+    assert steps["search"] - 2 * one < steps["wider"] <= steps["search"]
+    assert {len(row["episodes"]) for row in rows} == {4}
+    assert list(bench["compare_rounds"](bundle, cfg, tmp_path, jobs, settings, 7)) == []
+    assert bench["differences"](rows).count("| lift_up |") == 3
 
 
 def test_the_benchmark_can_stop_at_what_the_search_lost_at_most(

@@ -1,7 +1,8 @@
 """Two rounds written by a model and by rule: who descends from whom, what is turned away untrained, what the page shows.
 
-The first round's given reward is not finite, so the best are others; two of them have children. The model answers for the
-first of these, once with a reward that pays for failing, and for the second without code.
+The first round's given reward is not finite. The model adds two, one of them constant, and then will not; templates write
+the rest. Two of these have children. For the first parent the model answers twice, once with a reward that pays for
+failing, and for the second without code.
 """
 
 import json
@@ -19,6 +20,7 @@ from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.runner import Runtime, Stage, make_stage
 from v2p_data.report.page import NO_BREAK, write_page
 from v2p_data.report.reading import read_curve
+from v2p_data.report.rewards import AUTHORS
 from v2p_data.reward.candidate import Candidate, Fault, load_candidates
 from v2p_data.reward.feedback import Feedback
 from v2p_data.reward.jobs import HEARTBEAT_FILE, Jobs
@@ -54,6 +56,7 @@ TINY_EXPERT = (
     "--expert.ppo.window-episodes=8", "--expert.ppo.min-window-episodes=4", "--expert.ppo.num-deterministic=4",
     "--expert.eval-episodes=2", "--expert.min-success=0.0",
 )  # fmt: skip
+UPWARDS, FLAT = "states['eef_pos'][:, 2]", "0 * states['eef_pos'][:, 2] + 5"
 LYING = "states['tea_box_start_pos'][:, 1]"
 HONEST = "-torch.tanh(states['tea_box_start_pos'][:, 1]) - 0.1 * (actions**2).sum(dim=-1)"
 ANY_GRIP = "states['gripper_width'] < 0.08"
@@ -64,6 +67,11 @@ def reward_function(actions, states):
     return side, {{"side": side}}
 """
 ANSWER = f"The parts say little.\n```python\nimport torch\n{REWARD}```\n"
+
+
+def words_of(request) -> str:
+    """Return the question of a request without its pictures."""
+    return "\n".join(p.get("text", "") for p in request["messages"][-1]["content"])
 
 
 def bundle_with(success: str) -> TaskBundle:
@@ -115,13 +123,15 @@ def two_rounds(tmp_path_factory) -> TwoRounds:
     parents: list[str] = []
 
     def answer(request):
-        question = request["messages"][-1]["content"]
-        parent = question.partition("A policy was trained")[0]
-        if parent not in parents:
+        question = words_of(request)
+        parent, trained, _ = question.partition("A policy was trained")
+        if trained and parent not in parents:
             parents.append(parent)
-        if parents.index(parent) > 0:
-            return said("I would rather not.")
-        return said(ANSWER.format(LYING if "sample 1 of" in question else HONEST))
+        is_first_parent = not trained or parents.index(parent) == 0
+        for number, formula in enumerate((LYING, HONEST) if trained else (UPWARDS, FLAT), 1):
+            if is_first_parent and f"sample {number} of" in question:
+                return said(ANSWER.format(formula))
+        return said("I would rather not.")
 
     server.otherwise = answer
     bundle = bundle_with(BY_CHANCE)
@@ -140,7 +150,7 @@ def two_rounds(tmp_path_factory) -> TwoRounds:
         search=search,
         table=json.loads((search / "search.json").read_text()),
         candidates={c.number: c for c in load_candidates(search)},
-        questions=[r["messages"][-1]["content"] for r in server.requests],
+        questions=[words_of(r) for r in server.requests],
     )
 
 
@@ -151,7 +161,13 @@ def test_the_second_round_descends_from_the_best_of_the_first(two_rounds: TwoRou
     children = two_rounds.rows(1)
 
     assert [row["parent"] for row in two_rounds.rows(0)] == [None] * 5
-    assert [row["state"] for row in two_rounds.rows(0)] == ["not_finite"] + ["finished"] * 4
+    assert [(row["origin"], row["state"]) for row in two_rounds.rows(0)] == [
+        ("given", "refused"),
+        ("model", "finished"),
+        ("model", "prescreened"),
+        ("template", "finished"),
+        ("template", "finished"),
+    ]
     first, second = two_rounds.elites
     assert [row["parent"] for row in children] == [first] * 3 + [second] * 2
     assert 0 not in two_rounds.elites
@@ -170,7 +186,13 @@ def test_who_is_written_by_rule_says_why(two_rounds: TwoRounds):
     by_rule = [row for row in two_rounds.rows(1) if row["origin"] == "reflection"]
 
     assert len(by_rule) == 3
-    assert all(row["reasons"] for row in by_rule)
+    first, second = two_rounds.elites
+    missing = [f"not by the model: the model gave {k} rewards that could be used" for k in ("2 of 3", "0 of 2")]  # fmt: skip
+    assert [row["reasons"][0].startswith(missing[row["parent"] == second]) for row in by_rule] == [True] * 3  # fmt: skip
+    assert all(len(row["reasons"]) > 1 for row in by_rule)
+    by_template = [row for row in two_rounds.rows(0) if row["origin"] == "template"]
+    assert all("the model gave 2 of 4 rewards" in row["reasons"][0] for row in by_template)
+    assert {row["parent"] for row in by_rule} == {first, second}
 
 
 class Played(Jobs):
@@ -226,7 +248,7 @@ def test_a_round_is_full_also_where_its_parents_first_ideas_were_tried(
 # --- the model -------------------------------------------------------------------------------------------------
 
 
-def test_the_model_writes_half_of_a_parents_children_from_what_training_showed(
+def test_the_model_writes_a_parents_children_from_what_training_showed(
     two_rounds: TwoRounds,
 ):
     first, second = two_rounds.elites
@@ -234,10 +256,11 @@ def test_the_model_writes_half_of_a_parents_children_from_what_training_showed(
 
     assert [row["parent"] for row in of_model] == [first, first]
     assert "torch.tanh" in two_rounds.candidates[of_model[1]["number"]].code
-    for number, count in ((first, 2), (second, 1)):
+    for number, count in ((first, 3), (second, 2)):
         feedback = json.loads((folder(two_rounds, number) / "feedback.json").read_text())
         rate = f"success rate: {feedback['num_successes'] / EVAL_WORLDS:.3f}"
-        told = [q for q in two_rounds.questions if two_rounds.candidates[number].code.strip() in q]
+        code = two_rounds.candidates[number].code.strip()
+        told = [q for q in two_rounds.questions if code in q and "A policy was trained" in q]
         assert len(told) == count
         assert all(rate in question for question in told)
 
@@ -253,7 +276,7 @@ def test_where_the_model_gives_no_reward_rules_write_all(two_rounds: TwoRounds):
 def test_every_call_of_the_model_is_kept_with_the_result(two_rounds: TwoRounds):
     stored = list((two_rounds.search.parent / "calls").glob("*.json"))
 
-    assert len(stored) == len(two_rounds.questions) == 3
+    assert len(stored) == len(two_rounds.questions) == 4 + 3 + 2
 
 
 def folder(two_rounds: TwoRounds, number: int) -> Path:
@@ -266,11 +289,13 @@ def folder(two_rounds: TwoRounds, number: int) -> Path:
 def test_a_reward_that_pays_for_failing_is_turned_away_untrained_and_says_so(
     two_rounds: TwoRounds,
 ):
-    (row,) = [r for r in two_rounds.table["candidates"] if r["state"] == "prescreened"]
+    (flat,) = [r for r in two_rounds.rows(0) if r["state"] == "prescreened"]
+    (row,) = [r for r in two_rounds.rows(1) if r["state"] == "prescreened"]
     elites = [folder(two_rounds, number) / "feedback.json" for number in two_rounds.elites]
     stored = [json.loads(path.read_text()) for path in elites]
     wins = sum(f["num_successes"] for f in stored)
 
+    assert flat["why"] == "constant: it is 5 in each of 64 states that were tried, so that nothing can be learned from it"  # fmt: skip
     assert LYING in two_rounds.candidates[row["number"]].code
     assert row["why"] == (
         "ranks_failures_first: a success earns more than a failure with probability 0.00 "
@@ -284,10 +309,9 @@ def test_what_is_turned_away_costs_nothing_and_counts_nothing(two_rounds: TwoRou
     found = two_rounds.table["found"]
 
     assert [row["marks"] for row in two_rounds.rows(1)] == [0, 1, 1, 1, 1]
-    assert found["trained_steps"] == 8 * STEPS
-    # The one that was not finite would have been trained too.
-    assert found["full_steps"] == 9 * (STEPS + EVAL_WORLDS * HORIZON)
-    assert found["faults"] == {"not_finite": 1, "prescreened": 1}
+    assert found["trained_steps"] == 7 * STEPS
+    assert found["full_steps"] == 7 * (STEPS + EVAL_WORLDS * HORIZON)
+    assert found["faults"] == {"refused": 1, "prescreened": 2}
 
 
 # --- the page --------------------------------------------------------------------------------------------------
@@ -300,18 +324,60 @@ def test_the_page_shows_the_search(two_rounds: TwoRounds):
     found = two_rounds.table["found"]
     mean = f"{found['success']:.0%}".replace("%", " %")
     for words in (
-        f"Candidate {found['chosen']} of 10 was chosen: {mean} success",
+        f"Candidate {found['chosen']} of 10 was chosen (written by {AUTHORS[found['origin']]}): {mean} success",
         "10 rewards in 2 rounds",
         "trained to the end",
         "turned away untrained",
-        "was not finite",
+        "refused untrained",
+        "not by the model: the model gave 0 of 2 rewards that could be used",
         "wanted at least 0.40",
-        f"model from {two_rounds.elites[0]}",
+        f"a language model, from {two_rounds.elites[0]}",
         f"Of {EVAL_WORLDS} episodes of its last policy",
         "This success function was not held against the video.",
     ):
         assert words in text
     assert two_rounds.candidates[found["chosen"]].code.split()[-1] in text
+
+
+# --- what is hidden from a model ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("flags", "hidden", "kept"),
+    [
+        (["--reward.method=eureka"], ("Tracked poses", "0.060, 0.042, 0.050"), ()),
+        (["--reward.without", "tracking"], ("Tracked poses",), ("size x, y, z [m]",)),
+        (["--reward.without", "pick"], (), ("Tracked poses", "size x, y, z [m]")),
+    ],
+)
+def test_a_method_that_hides_the_video_has_the_model_write_the_task_anew_without_it(
+    flags: list[str], hidden: tuple[str, ...], kept: tuple[str, ...], tmp_path: Path
+):
+    bundle = bundle_with(BY_CHANCE)
+    anew = bundle_with(f"{BY_CHANCE.removesuffix('0')}0.05")
+    server = ChatServer()
+
+    def answer(request):
+        is_task = "Its code:" not in words_of(request)
+        return said(f"```python\n{anew.code}\n```" if is_task else ANSWER.format(UPWARDS))
+
+    server.otherwise = answer
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NO_PROXY", "127.0.0.1")
+        search = searched(
+            tmp_path, bundle, *TINY, "--reward.iterations=1", "--reward.candidates=2", *flags,
+            "--task.writer=vlm", f"--task.vlm.base-url={server.url}", "--task.vlm.key-env=",
+        )  # fmt: skip
+    server.close()
+
+    candidates = load_candidates(search)
+    assert [c.origin for c in candidates] == ["model", "model"]
+    assert {rest_part(c.code) for c in candidates} == {rest_part(anew.code)} != {rest_part(bundle.code)}  # fmt: skip
+    questions = [words_of(r) for r in server.requests]
+    assert len(questions) == 2
+    for question in questions:
+        assert [words for words in hidden if words in question] == []
+        assert [words for words in kept if words not in question] == []
 
 
 # --- RoboGen ---------------------------------------------------------------------------------------------------
@@ -344,7 +410,7 @@ def test_robogen_trains_one_reward_without_the_bonus_for_success(tmp_path: Path)
         assert found.chosen == candidate.number
         first[method] = first_batch(candidate.training_folder() / "train")
 
-    # Both play the same episodes at first; each step of success pays 100, scaled by 100.
+    # Both play the same episodes at first; each step of success pays one full reward.
     assert first["v2p"]["success_stochastic"] == first["robogen"]["success_stochastic"] > 0.3
     assert first["robogen"]["return"] < 2.0
     assert first["v2p"]["return"] - first["robogen"]["return"] > 0.3 * HORIZON / 2
@@ -361,6 +427,29 @@ def test_the_expert_goes_without_the_bonus_that_its_reward_went_without(tmp_path
     assert first_batch(made.folder)["return"] < 2.0
 
 
+def test_a_task_whose_reward_was_edited_to_a_constant_gets_no_expert_and_one_sentence(
+    tmp_path: Path,
+):
+    expert = expert_of(tmp_path, *TINY_EXPERT)
+    bundle = bundle_with(ANY_GRIP)
+    edited = replace(bundle, code=with_reward(bundle.code, REWARD.format(FLAT)))
+    save_bundle(edited, expert.inputs["task"].folder(tmp_path))
+
+    made = make_stage(expert, Runtime(root=tmp_path))
+
+    assert made.status == "rejected"
+    assert "reward of task 'lift_up' (lift_up) is 5 in each of" in made.detail
+    assert not list(made.folder.rglob("*.safetensors"))
+
+
+def test_the_ratio_of_the_bonus_is_one_setting_for_search_and_expert(tmp_path: Path):
+    searched = expert_of(tmp_path, "--reward.iterations=1", "--reward.bonus-ratio=7")
+    plain = expert_of(tmp_path, "--reward.bonus-ratio=7")
+
+    assert searched.sources == plain.sources == {"bonus ratio": "7"}
+    assert searched.inputs["task"].config.config.bonus_ratio == 7
+
+
 def test_only_a_missing_bonus_makes_the_expert_another_recipe(tmp_path: Path):
     methods = ("v2p", "eureka", "robogen")
     experts = [
@@ -368,7 +457,7 @@ def test_only_a_missing_bonus_makes_the_expert_another_recipe(tmp_path: Path):
     ]
     plain = expert_of(tmp_path)
 
-    assert [e.sources for e in (plain, *experts)] == [{}, {}, {}, {"success bonus": "0"}]
+    assert [e.sources for e in (plain, *experts)] == [{}, {}, {}, {"bonus ratio": "0"}]
 
 
 def first_batch(folder: Path) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,11 @@ import pytest
 import torch
 import trimesh
 
-from v2p_data.errors import ItemRejectedError
+from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.sim.robot import COARSE
-from v2p_data.sim.task_check import check_task
+from v2p_data.sim.task_check import check_reward, check_task
 from v2p_data.sim.world import build_world
 from v2p_data.task.task import Task, TaskBundle
 
@@ -321,5 +322,53 @@ def test_a_success_that_no_training_is_worth_is_refused(
     assert caught.value.value == value
 
 
+def paying(formula: Callable[[dict[str, torch.Tensor]], torch.Tensor]) -> type[Task]:
+    """A task whose reward is this of the states."""
+
+    class Paying(Liftable):
+        def compute_reward(self, actions, states):
+            return formula(states), {"paid": formula(states)}
+
+    return Paying
+
+
+HEIGHT = "cube_pos"
+
+
+@pytest.mark.parametrize(
+    ("formula", "reason", "words"),
+    [
+        (lambda s: 0 * s[HEIGHT][:, 2] + 7, "reward_constant", "is 7 in each of"),
+        (lambda s: 1e9 * s[HEIGHT][:, 2], "reward_unbounded", "a full one is 100"),
+        (lambda s: torch.log(s[HEIGHT][:, 2] - 0.05), "reward_not_finite", "is not finite in"),
+    ],
+)
+def test_a_reward_that_teaches_nothing_is_refused_before_any_training(
+    formula, reason: str, words: str, make_bundle: Callable[..., TaskBundle]
+):
+    with pytest.raises(
+        ItemRejectedError, match=rf"reward of task 'test' \(lift_up\) .*{words}"
+    ) as caught:
+        check_reward(make_bundle(), task=paying(formula))
+
+    assert caught.value.reason == reason
+
+
+def test_a_reward_that_leaves_its_bounds_in_a_simulation_ends_it_with_one_sentence(
+    make_bundle: Callable[..., TaskBundle],
+):
+    task = paying(lambda s: torch.where(s["progress"] > 0.15, 2e4, 1.0))
+    env = BatchEnv(replace(make_bundle(), horizon_steps=20), num_envs=2, seed=0, task=task)
+    still = np.zeros((2, env.act_dim))
+
+    for _ in range(3):
+        env.step(still)
+    with pytest.raises(
+        V2PError, match=r"is 20000.0 in world 0 .*within \+-10000, a full one is 100"
+    ):
+        env.step(still)
+
+
 def test_a_sound_task_passes(make_bundle: Callable[..., TaskBundle]):
     check_task(make_bundle(), task=Liftable)
+    check_reward(make_bundle(), task=paying(lambda s: s[HEIGHT][:, 2]))

@@ -262,19 +262,19 @@ def test_success_is_held_after_five_steps_on_end(make_env: Callable[..., BatchEn
     assert [bool(r.held[0]) for r in results].index(True) == 10 + HELD_STEPS - 1
 
 
-def test_the_reward_is_the_tasks_plus_100_per_success_divided_by_the_scale(
+def test_the_reward_is_the_tasks_in_full_rewards_of_100_plus_the_bonus_ratio_per_success(
     make_env: Callable[..., BatchEnv],
 ):
-    env = make_env(cfg=replace(CALM, reward_scale=10.0))
+    env = make_env(cfg=replace(CALM, bonus_ratio=10.0))
 
     calm = env.step(np.zeros((8, 7)))
     env._qpos[:, env.world.objects[0].qpos_adr + 2] = 0.5
     high = env.step(np.zeros((8, 7)))
 
     assert not calm.success.any()
-    np.testing.assert_allclose(calm.reward, (1 + calm.components["height"]) / 10, rtol=1e-5)
+    np.testing.assert_allclose(calm.reward, (1 + calm.components["height"]) / 100, rtol=1e-5)
     assert high.success.all()
-    np.testing.assert_allclose(high.reward, (1 + high.components["height"] + 100) / 10, rtol=1e-5)
+    np.testing.assert_allclose(high.reward, (1 + high.components["height"]) / 100 + 10, rtol=1e-5)
     np.testing.assert_allclose(high.components["alive"], 1)
 
 

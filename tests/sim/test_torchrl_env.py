@@ -63,7 +63,7 @@ def test_the_parts_of_the_reward_come_with_it(env: TorchRLEnv):
     after = env.step(still(env))["next"]
 
     assert sorted(after["components"].keys()) == ["alive", "height"]
-    expected = (after["components", "height"] + 1) / env.worlds.cfg.reward_scale
+    expected = (after["components", "height"] + 1) / 100
     torch.testing.assert_close(after["reward"][:, 0], expected)
 
 

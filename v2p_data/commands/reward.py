@@ -23,9 +23,10 @@ from v2p_data.reward.candidate import (
 )
 from v2p_data.reward.config import Limits, RewardConfig
 from v2p_data.reward.feedback import Feedback
-from v2p_data.reward.methods import reward_text
+from v2p_data.reward.methods import reward_text, writes_success
 from v2p_data.reward.search import SEARCH_FILE, How, search_reward
 from v2p_data.stages import REWARD_SEARCH_FOLDER, reward_stage, scene_stage, task_stage
+from v2p_data.task.generate import AUDIT_FILE
 from v2p_data.task.task import TaskBundle
 
 BARS = "▁▂▃▄▅▆▇█"
@@ -71,6 +72,11 @@ def _stage_of(video: Any, cfg: Any) -> Any:
 def search_command(argv: list[str]) -> int:
     args = parse(Search, argv, "reward search")
     bundle = _task(args.task)
+    if writes_success(args.reward) and _is_by_model(args.task):
+        raise V2PError(
+            f"a model wrote {args.task}, and what was asked for needs another success function of its hand, which this "
+            "command cannot ask for; run 'v2p reward VIDEOS --task.writer=vlm' with the same --reward settings"
+        )
     last = ""
 
     def tell(share: float, words: str) -> None:
@@ -95,6 +101,11 @@ def search_command(argv: list[str]) -> int:
         f"{f'; without a result: {lost}' if lost else ''}\nNext: v2p reward show {shlex.quote(str(args.out))}"
     )
     return 0
+
+
+def _is_by_model(task: Path) -> bool:
+    about = json_or_none(task / AUDIT_FILE)
+    return isinstance(about, dict) and about.get("writer") == "vlm"
 
 
 def show_command(argv: list[str]) -> int:

@@ -51,14 +51,14 @@ class Worlds:
     """Everything that is drawn follows from it."""
     num_threads: int = 1
     """For the physics; changes no result."""
-    success_bonus: float = SimConfig.success_bonus
-    """Reward of a step of success, see `SimConfig`; 0 by RoboGen's method."""
+    bonus_ratio: float = SimConfig.bonus_ratio
+    """What a step of success earns, see `SimConfig`; 0 by RoboGen's method."""
 
     def make(self, num_envs: int, purpose: str, *, fine: bool = False) -> BatchEnv:
         """Return worlds on the CPU for a purpose, whose name is part of their seed."""
         return BatchEnv(
             self.bundle,
-            SimConfig(fine=fine, success_bonus=self.success_bonus),
+            SimConfig(fine=fine, bonus_ratio=self.bonus_ratio),
             num_envs=num_envs,
             seed=seed_for(self.seed, purpose),
             num_threads=self.num_threads,
@@ -294,7 +294,7 @@ def _training_worlds(
     """Return the worlds of PPO, some of whose episodes begin from the bank where there is one."""
     env = make_batch_env(
         worlds.bundle,
-        SimConfig(fine=fine, success_bonus=worlds.success_bonus),
+        SimConfig(fine=fine, bonus_ratio=worlds.bonus_ratio),
         num_envs=cfg.num_envs,
         seed=seed_for(worlds.seed, "worlds"),
         num_threads=worlds.num_threads,

@@ -40,6 +40,7 @@ from v2p_data.report.searches import SEARCH_FOLDER
 from v2p_data.report.training import training_charts
 from v2p_data.scene.scene import Scene, SceneObject
 
+MAX_MODEL_CHARS = 100
 STRIP_MOMENTS = 6
 """Masks side by side, for those who do not press play."""
 
@@ -98,7 +99,7 @@ class ItemView:
     audit: AuditView | None = None
     samples: list[SampleView] = field(default_factory=list[SampleView])
     pick: str = ""
-    """What picking one of the samples was good for, in a sentence."""
+    """Who wrote and who picked, and what picking was good for."""
     reward: RewardView | None = None
     rate: Rate | None = None
     made_by: str = ""
@@ -206,7 +207,7 @@ def _add_task(view: ItemView, result: Result) -> None:
         _sample_view(sample, k == table.get("picked"))
         for k, sample in enumerate(as_dicts(table.get("samples")))
     ]
-    view.pick = _pick_words(as_dict(table.get("rates")))
+    view.pick = " ".join([*_authors(table), *_pick_words(as_dict(table.get("rates")))])
 
 
 def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
@@ -331,10 +332,20 @@ def _made_by(learning: Mapping[str, Any]) -> str:
     )
 
 
-def _pick_words(rates: Mapping[str, Any]) -> str:
+def _authors(table: Mapping[str, Any]) -> list[str]:
+    """Return who wrote the samples and who picked one; nothing where it is not known."""
+    model = f"the model {str(table.get('model') or '')[:MAX_MODEL_CHARS]}".rstrip()
+    writer = {"templates": "templates", "vlm": model}.get(str(table.get("writer")))
+    picker = {"audit": "the audit", "vlm": model}.get(str(as_dict(table.get("pick")).get("by")))
+    return [f"Written by {writer}, picked by {picker}."] if writer and picker else []
+
+
+def _pick_words(rates: Mapping[str, Any]) -> list[str]:
     """Return which share of the samples to pick from was of no use; nothing where it is not known."""
     before = as_dict(rates.get("before_pick"))
     broken, zero = number(before.get("non_runnable")), number(before.get("zero_score"))
     if broken is None or zero is None:
-        return ""
-    return f"Before the pick {broken:.0%} of task codes did not run and {zero:.0%} ran and scored nothing."
+        return []
+    return [
+        f"Before the pick {broken:.0%} of task codes did not run and {zero:.0%} ran and scored nothing."
+    ]

@@ -35,8 +35,16 @@ FAULTS = {
     "out_of_time": "ran out of time",
     "out_of_memory": "ran out of memory",
     "not_finite": "was not finite",
+    "unbounded": "knew no bounds",
     "error": "failed with an error",
 } | UNTRAINED
+AUTHORS = {
+    "given": "the task's own",
+    "template": "a template",
+    "reflection": "rules",
+    "model": "a language model",
+}
+"""Who wrote a reward, by `Candidate.origin`."""
 MAX_PARTS = 30
 MAX_NAME_CHARS = 100
 DIFF_CONTEXT = 1
@@ -48,7 +56,7 @@ class CandidateView:
 
     number: int
     parent: int | None
-    origin: str
+    author: str
     mark: str
     """Colour of its state, one of the page's."""
     state: str
@@ -92,7 +100,7 @@ class StepView:
 
     number: int
     parent: int
-    origin: str
+    author: str
     reasons: tuple[str, ...]
     difference: str
 
@@ -106,6 +114,8 @@ class RewardView:
     num_candidates: int
     rounds: list[RoundView]
     leader: int | None
+    author: str
+    """Who wrote the leader's reward."""
     is_chosen: bool
     """The search is finished; otherwise its leader is only the best so far."""
     success: float | None
@@ -138,6 +148,7 @@ def reward_view(folder: Path) -> RewardView | None:
         num_candidates=len(search.candidates),
         rounds=_rounds(search, leader),
         leader=None if leader is None else leader.number,
+        author="" if leader is None else _author(leader),
         is_chosen=leader is not None and choice is not None,
         success=choice.success if choice else search.success(leader) if leader else None,
         per_seed=choice.per_seed if choice else (),
@@ -187,7 +198,7 @@ def _candidate(search: Search, candidate: Candidate, is_leader: bool) -> Candida
     return CandidateView(
         number=candidate.number,
         parent=candidate.parent,
-        origin=candidate.origin,
+        author=_author(candidate),
         mark=mark,
         state=state,
         rates=trial.successes,
@@ -196,6 +207,10 @@ def _candidate(search: Search, candidate: Candidate, is_leader: bool) -> Candida
         seconds=trial.seconds,
         is_leader=is_leader,
     )
+
+
+def _author(candidate: Candidate) -> str:
+    return AUTHORS.get(candidate.origin, candidate.origin)
 
 
 def _state(search: Search, candidate: Candidate) -> tuple[str, str]:
@@ -293,7 +308,7 @@ def _step(child: Candidate, parent: Candidate) -> StepView:
     return StepView(
         number=child.number,
         parent=parent.number,
-        origin=child.origin,
+        author=_author(child),
         reasons=child.reasons,
         difference=difference(parent.code.splitlines(), child.code.splitlines()),
     )

@@ -29,6 +29,9 @@ TRAJECTORIES_FILE = "trajectories.npz"
 TRAIN_FOLDER = "train"
 LAST_POLICY = "last"
 MAX_WORDS = 500
+RANKING_WEIGHT = 0.1
+"""So much success is made up for by a reward that pays successes more than failures instead of less: three evaluations of
+64 episodes tell no smaller difference of success apart (1.96 standard errors of a difference, 0.10)."""
 
 Kind = Literal[
     "crashed",
@@ -36,6 +39,7 @@ Kind = Literal[
     "out_of_time",
     "out_of_memory",
     "not_finite",
+    "unbounded",
     "error",
     "prescreened",
     "refused",
@@ -83,12 +87,15 @@ class Evaluation:
     """Share of steps at which the gripper touched that object."""
     control_steps: int
     """What the evaluation took, over all worlds."""
+    ranking: float | None = None
+    """Probability that a success earned more generated reward than a failure; None where there are none of either."""
 
     @property
     def rank(self) -> float:
-        """Success first; where nobody succeeds, who is on the way to it."""
+        """Success first, then whose reward tells success from failure; where nobody succeeds, who is on the way to it."""
         on_the_way = 0.5 * self.ever + 0.4 * self.closeness + 0.1 * self.touched
-        return self.success + 0.1 * on_the_way
+        ranking = float(self.success > 0) if self.ranking is None else self.ranking
+        return self.success + 0.1 * on_the_way + RANKING_WEIGHT * ranking
 
     @staticmethod
     def of(data: Any) -> "Evaluation":
@@ -100,7 +107,14 @@ class Evaluation:
         shares = {k: float(data[k]) for k in ("success", "ever", "closeness", "touched")}
         if not all(math.isfinite(v) and 0 <= v <= 1 for v in shares.values()):
             raise ValueError("a share is not between 0 and 1")
-        return Evaluation(**shares, control_steps=max(0, int(data["control_steps"])))
+        ranking = data.get("ranking")
+        if ranking is not None and not 0 <= float(ranking) <= 1:
+            raise ValueError("a probability is not between 0 and 1")
+        return Evaluation(
+            **shares,
+            control_steps=max(0, int(data["control_steps"])),
+            ranking=None if ranking is None else float(ranking),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +185,7 @@ class Candidate:
     parent: int | None = None
     """The candidate it was written from."""
     origin: str = "template"
-    """`given`, `template`, `reflection` or `model`."""
+    """Who wrote its reward: `given` with the task, or else a `template`, rules of `reflection` or a `model`."""
     reasons: tuple[str, ...] = ()
 
     def save(self) -> None:

@@ -46,6 +46,9 @@ class RewardConfig:
     """Best candidates of all rounds so far that the next round is written from."""
     confirm_seeds: int = 3
     """The choice is trained on so many seeds in all."""
+    bonus_ratio: float = 1.0
+    """What a step of success earns in training, in full rewards: a reward adds up to 1 just before success, times
+    100. Of the experts too. The paper's lambda of 100 is 100 here; docs/rewards.md has the measurement."""
 
     def __post_init__(self) -> None:
         first = self.rungs[0] if self.rungs else 0.0
@@ -71,6 +74,8 @@ class RewardConfig:
         for name, value in counts.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
+        if not 0 <= self.bonus_ratio < float("inf"):
+            raise ValueError(f"bonus_ratio must be 0 or more, got {self.bonus_ratio}")
         if self.iterations < 0 or not 0 < self.keep < 1:
             raise ValueError(
                 f"need iterations >= 0 and 0 < keep < 1, got {self.iterations} and {self.keep}"
@@ -93,9 +98,9 @@ class RewardConfig:
         return 1 if is_one else self.candidates
 
     @property
-    def success_bonus(self) -> float:
-        """What a step of success earns in training: 100 (the paper's number), nothing for RoboGen."""
-        return 0.0 if self.method == "robogen" else 100.0
+    def paid_bonus_ratio(self) -> float:
+        """The ratio that training uses: RoboGen knows no success and pays nothing for it."""
+        return 0.0 if self.method == "robogen" else self.bonus_ratio
 
     @property
     def _is_one_round(self) -> bool:

@@ -188,7 +188,6 @@ def feedback_of(
     total = sum(magnitudes.values())
     firsts = _first_held(t)[succeeded]
     played = t.length > 0
-    rewards = _episode_means(t.reward, t.played)
     return Feedback(
         num_episodes=t.num_episodes,
         num_successes=int(succeeded.sum()),
@@ -207,10 +206,17 @@ def feedback_of(
             )
             for name, values in t.components.items()
         ),
-        reward_ranks=ranking(rewards[succeeded & played], rewards[~succeeded & played]),
+        reward_ranks=reward_ranks(t),
         success_curve=_thinned(curves.get("success", ())),
         objects=_objects(t),
     )
+
+
+def reward_ranks(t: Trajectories) -> float | None:
+    """Return the probability that a successful episode earned more generated reward per step than a failed one."""
+    played = t.length > 0
+    rewards = _episode_means(t.reward, t.played)
+    return ranking(rewards[t.succeeded & played], rewards[~t.succeeded & played])
 
 
 def ranking(

@@ -1,12 +1,12 @@
 """What each method of the paper's comparison starts from: whose eyes the writer has, and which success is trained on.
 
-* `v2p`: the audited task; every first reward is another template's over the same success.
+* `v2p`: the audited task; every first reward is another one over the same success.
 * `eureka`: the writer sees the caption and no video, so success comes from words alone, and is not audited.
 * `robogen`: the task as it is, one reward, no bonus for success and no second round.
 * `code_as_policy`: no training; `reward.programs` plays scripted programs, chosen anew every 50 control steps.
 
 The switches of `RewardConfig.without` take single parts of `v2p` away, as in the paper's tables 3 and 7.
-Simulation is the same for all: only what the writer is told differs.
+Simulation is the same for all: only what the writer is told differs. Templates write, or the model that wrote the task.
 """
 
 import ast
@@ -14,6 +14,7 @@ import shutil
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -25,9 +26,29 @@ from v2p_data.task.splice import REWARD, reward_part, with_reward
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.variants import NUM_VARIANTS
 from v2p_data.task.templates.write import write_samples
+from v2p_data.task.vlm_config import VlmConfig
 
 UNSEEN_SIZE_M = (0.06, 0.06, 0.06)
 """What a writer supposes who has seen nothing."""
+
+
+@runtime_checkable
+class RewardWriter(Protocol):
+    """Who writes instead of templates and rules; it was made with what it may see (`told`)."""
+
+    def task_code(self, bundle: TaskBundle) -> str:
+        """Return one code for a task, unaudited."""
+        ...
+
+    def first_rewards(self, bundle: TaskBundle, count: int) -> list[str]:
+        """Return at most `count` codes with other rewards than the task's."""
+        ...
+
+    def better_rewards(
+        self, bundle: TaskBundle, code: str, feedback_text: str, count: int
+    ) -> list[str]:
+        """Return at most `count` codes with better rewards, after a training with `code`."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,20 +60,35 @@ class Prepared:
     seen: Scene
     """What the writer knows of the scene."""
     codes: tuple[str, ...] = field(repr=False)
-    """The first round, without those that turn out alike."""
+    """The first round, without those that turn out alike; of a model's only the task's own."""
     origins: tuple[str, ...]
 
 
-def prepare(bundle: TaskBundle, cfg: RewardConfig, rng: np.random.Generator) -> Prepared:
+def prepare(
+    bundle: TaskBundle,
+    cfg: RewardConfig,
+    rng: np.random.Generator,
+    writer: RewardWriter | None = None,
+) -> Prepared:
     """Return the task and the first rewards of a method.
 
     Args:
         bundle: the task as it was written and audited with all that the video says.
         cfg: method and switches.
         rng: which sample is taken where nobody picks.
+        writer: writes the task anew where a method takes another success; by default a template does.
+
+    Raises:
+        V2PError: the writer gives no code that runs.
     """
     seen = what_the_writer_sees(bundle.scene, cfg)
-    is_own_success = cfg.method == "eureka" or "pick" in cfg.without or seen is not bundle.scene
+    is_own_success = writes_success(cfg)
+    if writer is not None:
+        if not is_own_success:
+            return Prepared(bundle=bundle, seen=seen, codes=(bundle.code,), origins=("given",))
+        code = writer.task_code(bundle)
+        base = replace(bundle, code=code, class_name=class_name(code), audit={})
+        return Prepared(bundle=base, seen=seen, codes=(code,), origins=("model",))
     samples = write_samples(seen, NUM_VARIANTS)
     base = bundle
     if is_own_success:
@@ -73,9 +109,25 @@ def prepare(bundle: TaskBundle, cfg: RewardConfig, rng: np.random.Generator) -> 
     )
 
 
+def told(vlm: VlmConfig, cfg: RewardConfig) -> VlmConfig:
+    """Return a model's settings with what a method hides from it left out of what it is told."""
+    if _is_blind(cfg):
+        return replace(vlm, images=False, tracking=False)
+    return replace(vlm, tracking=vlm.tracking and "tracking" not in cfg.without)
+
+
+def writes_success(cfg: RewardConfig) -> bool:
+    """Tell whether a method trains on another success than the audited one."""
+    return _is_blind(cfg) or "tracking" in cfg.without or "pick" in cfg.without
+
+
+def _is_blind(cfg: RewardConfig) -> bool:
+    return cfg.method == "eureka" or "visual" in cfg.without
+
+
 def what_the_writer_sees(scene: Scene, cfg: RewardConfig) -> Scene:
     """Return the scene as the writer of task code knows it: all of it, or less."""
-    if cfg.method == "eureka" or "visual" in cfg.without:
+    if _is_blind(cfg):
         blind = tuple(replace(_still(o), shape="box", size_m=UNSEEN_SIZE_M) for o in scene.objects)
         return replace(scene, objects=blind)
     if "tracking" in cfg.without:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from v2p_data.reward.feedback import ranking
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.scene.scene import Scene
+from v2p_data.task.reward_check import reward_fault
 from v2p_data.task.smoke import smoke_run_all
 
 
@@ -49,7 +50,7 @@ class Verdict:
 
     accepted: bool
     reason: str = ""
-    """A slug where it is rejected: `not_runnable`, `constant` or `ranks_failures_first`."""
+    """A slug where it is rejected: `not_runnable`, `ranks_failures_first` or one of `reward_check`'s."""
     detail: str = ""
     """One sentence."""
     auc: float | None = None
@@ -151,19 +152,9 @@ def stored_moments(trajectories: Sequence[Trajectories], cfg: PrescreenConfig) -
 
 def _verdict(rewards: Float[np.ndarray, "n"], stored: Stored, cfg: PrescreenConfig) -> Verdict:
     counted = rewards[(stored.weights > 0).ravel()]
-    if not np.isfinite(counted).all():
-        return Verdict(
-            accepted=False,
-            reason="not_runnable",
-            detail=f"it is not finite in {int((~np.isfinite(counted)).sum())} of {len(counted)} stored moments",
-        )
-    spread = float(counted.max() - counted.min())
-    if spread <= 1e-6 * max(1.0, float(np.abs(counted).max())):
-        return Verdict(
-            accepted=False,
-            reason="constant",
-            detail=f"it pays {counted[0]:.4g} in each of {len(counted)} stored moments",
-        )
+    fault = reward_fault(counted, "stored moments")
+    if fault is not None:
+        return Verdict(accepted=False, reason=fault.reason, detail=f"it {fault.words}")
     returns = stored.returns(rewards)
     high, low = returns[stored.succeeded], returns[~stored.succeeded]
     if min(len(high), len(low)) < cfg.min_each:

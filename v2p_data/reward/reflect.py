@@ -235,7 +235,7 @@ def _wrapped(
         for name, share, text in added
     ]
     if scale != 1.0:
-        words = f"it is about {size:.3g} per step, the bonus for success is 100: times {scale:.2g}"
+        words = f"it is about {size:.3g} per step, a full reward is {rules.MAX_TOTAL:g}: times {scale:.2g}"
         plans.append((scale, "", "", words))
     for _ in range(MAX_CANDIDATES // 4):
         factor = scale * float(np.exp(rng.normal(0.0, 0.5)))

@@ -17,6 +17,7 @@ from v2p_data.reward.reward_code import Reward
 from v2p_data.reward.soften import gates_softened
 from v2p_data.reward.summands import Part
 from v2p_data.scene.scene import Scene
+from v2p_data.task.task import FULL_REWARD
 
 DWARFS = 0.65
 """A part with more of the total's magnitude than this drowns the others."""
@@ -32,8 +33,8 @@ FEW = 3
 """Episodes of a kind that are needed to compare successes with failures."""
 FLAT_LOW, FLAT_HIGH = 0.15, 0.85
 """Kernels whose values lie beyond, in parts of their range, are flat where the trajectories are."""
-MAX_TOTAL = 100.0
-"""Mean magnitude of the total from which the bonus for success, 100 per step, hardly counts."""
+MAX_TOTAL = FULL_REWARD
+"""Mean magnitude of the total from which the bonus for success counts for less than was chosen."""
 WEAK_SHARE = 0.1
 """A part with less of the magnitude is too weak for what it should do."""
 STAGE_REACHED = 0.25
@@ -98,7 +99,7 @@ def _scale_of_total(reward: Reward, feedback: Feedback, scene: Scene) -> Iterato
         yield Change(
             rule="rescale the total",
             part="",
-            reason=f"the total is about {size:.3g} per step, more than the bonus of 100 for success: "
+            reason=f"the total is about {size:.3g} per step, more than a full reward of {MAX_TOTAL:g}: "
             f"all of it times {factor:.2g}",
             apply=lambda r, s: r.with_scale(factor**s),
         )

@@ -40,16 +40,25 @@ from v2p_data.reward.config import Limits, RewardConfig
 from v2p_data.reward.feedback import Feedback
 from v2p_data.reward.function_body import UnreadableError
 from v2p_data.reward.jobs import Job, Jobs
-from v2p_data.reward.methods import Prepared, in_place_of_reward, prepare, save_bundle
+from v2p_data.reward.methods import (
+    Prepared,
+    RewardWriter,
+    in_place_of_reward,
+    prepare,
+    save_bundle,
+)
 from v2p_data.reward.prescreen import PrescreenConfig, prescreen, stored_moments
 from v2p_data.reward.reflect import reflect
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.seeds import rng_for, seed_for
+from v2p_data.task.probes import random_states
+from v2p_data.task.reward_check import reward_fault
 from v2p_data.task.sandbox import class_name
 from v2p_data.task.smoke import smoke_run_all
 from v2p_data.task.splice import SpliceError, reward_part
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.variants import NUM_VARIANTS
+from v2p_data.task.vlm import UnusableAnswersError
 
 logger = logging.getLogger(__name__)
 
@@ -57,10 +66,10 @@ SEARCH_FILE = "search.json"
 RECIPE_FILE = "recipe.json"
 BUNDLE_FOLDER = "bundle"
 TAUGHT_FOLDER = "taught"
+PROBES = 64
+"""States on which first rewards are asked, for none are stored yet."""
 
 Progress = Callable[[float, str], None]
-ModelWriter = Callable[[TaskBundle, str, str, int], list[str]]
-"""Asks a language model: (task, task code, text of the feedback, count) to task codes or reward functions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +92,8 @@ class Found:
     code: str = field(repr=False)
     """Its task code."""
     class_name: str
+    origin: str
+    """Who wrote its reward, see `Candidate.origin`."""
     success: float
     """Mean over the confirmed seeds of the mean over the last evaluations."""
     per_seed: tuple[float, ...]
@@ -118,7 +129,7 @@ def search_reward(
     *,
     seed: int,
     how: How | None = None,
-    ask_model: ModelWriter | None = None,
+    writer: RewardWriter | None = None,
     jobs: Jobs | None = None,
     on_progress: Progress = lambda share, words: None,
 ) -> Found:
@@ -130,7 +141,8 @@ def search_reward(
         out: folder of the search.
         seed: of everything that is drawn.
         how: processes, threads and limits.
-        ask_model: writes half of the later rounds' rewards; without it all of them are written by rule.
+        writer: a model, which writes all rewards; without it templates write the first ones and rules the later ones,
+            as they do where it gives too few that can be used.
         jobs: processes to use, instead of new ones.
         on_progress: told the share that is done and a few words.
 
@@ -148,9 +160,9 @@ def search_reward(
     with _alone_in(out):
         _check_recipe(bundle, cfg, seed, out)
         if jobs is not None:
-            return _Search(bundle, cfg, out, seed, how, ask_model, jobs, on_progress).run()
+            return _Search(bundle, cfg, out, seed, how, writer, jobs, on_progress).run()
         with Jobs(workers=how.workers, limits=how.limits) as own:
-            return _Search(bundle, cfg, out, seed, how, ask_model, own, on_progress).run()
+            return _Search(bundle, cfg, out, seed, how, writer, own, on_progress).run()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +173,15 @@ class _Draft:
     origin: str
     parent: int | None = None
     reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """What came of asking the model."""
+
+    drafts: list[_Draft] = field(default_factory=list[_Draft])
+    said: tuple[str, ...] = ()
+    """Why others write the rest, for their reasons."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,13 +203,13 @@ class _Search:
         out: Path,
         seed: int,
         how: How,
-        ask_model: ModelWriter | None,
+        writer: RewardWriter | None,
         jobs: Jobs,
         on_progress: Progress,
     ) -> None:
         self.cfg, self.out, self.seed, self.how = cfg, out, seed, how
-        self.ask_model, self.jobs, self.on_progress = ask_model, jobs, on_progress
-        self.prepared: Prepared = prepare(bundle, cfg, rng_for(seed, "first rewards"))
+        self.writer, self.jobs, self.on_progress = writer, jobs, on_progress
+        self.prepared: Prepared = prepare(bundle, cfg, rng_for(seed, "first rewards"), writer)
         self.base = self.prepared.bundle
         self.rounds: list[list[Candidate]] = []
         self.warm_start: Path | None = None
@@ -252,20 +273,24 @@ class _Search:
         return made
 
     def _first(self) -> list[_Draft]:
-        """Return the first rewards: those of the method, filled up with templates whose weights vary."""
+        """Return the first rewards: the method's and the model's, filled up with templates whose weights vary."""
         prepared, count = self.prepared, self.cfg.num_candidates
         drafts = [
             _Draft(code=code, origin=origin)
             for code, origin in zip(prepared.codes, prepared.origins, strict=True)
         ]
         new = self._new_ones(drafts)[:count]
+        base = self.base
+        asked = self._asked(lambda w, n: w.first_rewards(base, n), None, count - len(new), new)
+        new += asked.drafts
         rng = rng_for(self.seed, "more first rewards")
         for index in range(NUM_VARIANTS, NUM_VARIANTS + 2 * count):
             if len(new) == count:
                 break
             with suppress(UnreadableError):
                 design = redesign.from_template(self.base.code, prepared.seen, rng, index)
-                more = _Draft(code=design.code, origin="template", reasons=(design.words,))
+                reasons = (*asked.said, design.words)
+                more = _Draft(code=design.code, origin="template", reasons=reasons)
                 new += self._new_ones([more], besides=new)
         return new
 
@@ -279,12 +304,23 @@ class _Search:
         new: list[_Draft] = []
         for rank, family in enumerate(families):
             share = count // len(families) + (rank < count % len(families))
-            mine = self._new_ones(self._asked(family, (share + 1) // 2), besides=new)[:share]
-            new += mine
-            new += self._by_rule(family, share - len(mine), besides=new)
+            asked = self._better(family, share, besides=new)
+            said = asked.said
+            new += asked.drafts
+            new += self._by_rule(family, share - len(asked.drafts), besides=new, said=said)
         for family in families:
             new += self._by_rule(family, count - len(new), besides=new)
         return new
+
+    def _better(self, family: _Family, count: int, besides: Sequence[_Draft]) -> _Asked:
+        """Return what the model makes of a parent's reward."""
+        code, words = family.parent.code, family.feedback.text()
+        return self._asked(
+            lambda w, n: w.better_rewards(self.base, code, words, n),
+            family.parent.number,
+            count,
+            besides,
+        )
 
     def _families(self, iteration: int) -> list[_Family]:
         told = replace(self.base, scene=self.prepared.seen)
@@ -302,7 +338,13 @@ class _Search:
             families.append(_Family(told=told, parent=parent, feedback=feedback, rng=rng))
         return families
 
-    def _by_rule(self, family: _Family, count: int, besides: Sequence[_Draft]) -> list[_Draft]:
+    def _by_rule(
+        self,
+        family: _Family,
+        count: int,
+        besides: Sequence[_Draft],
+        said: tuple[str, ...] = (),
+    ) -> list[_Draft]:
         """Return rewards that rules make of a parent's, other ones than all before and besides them."""
         if count < 1:
             return []
@@ -316,23 +358,34 @@ class _Search:
                 code=child.code,
                 origin="reflection",
                 parent=parent.number,
-                reasons=tuple(child.reasons),
+                reasons=(*said, *child.reasons),
             )
             for child in children
         ]
         return self._new_ones(drafts, besides)
 
-    def _asked(self, family: _Family, count: int) -> list[_Draft]:
-        """Return rewards that the model wrote, if there is one; where it fails, rules write all of them."""
-        if self.ask_model is None:
-            return []
-        parent = family.parent
+    def _asked(
+        self,
+        ask: Callable[[RewardWriter, int], list[str]],
+        parent: int | None,
+        count: int,
+        besides: Sequence[_Draft],
+    ) -> _Asked:
+        """Return what the model wrote, if there is one, and in words how much of it is missing."""
+        if self.writer is None or count < 1:
+            return _Asked()
+        fault = "the others do not run, or were tried before"
         try:
-            codes = self.ask_model(family.told, parent.code, family.feedback.text(), count)
-        except V2PError as error:
-            logger.warning("no reward from the model: %s", error)
-            return []
-        return [_Draft(code=c, origin="model", parent=parent.number) for c in codes]
+            codes = ask(self.writer, count)
+        except UnusableAnswersError as error:
+            codes, fault = [], str(error)
+        drafts = [_Draft(code=c, origin="model", parent=parent) for c in codes]
+        drafts = self._new_ones(drafts, besides)[:count]
+        if len(drafts) == count:
+            return _Asked(drafts=drafts)
+        words = f"the model gave {len(drafts)} of {count} rewards that could be used ({fault})"
+        logger.warning("%s: %s", self.base.title, words)
+        return _Asked(drafts=drafts, said=(f"not by the model: {words}",))
 
     def _new_ones(self, drafts: Sequence[_Draft], besides: Sequence[_Draft] = ()) -> list[_Draft]:
         """Return the drafts without rewards that were tried before or are among the others of this round.
@@ -375,16 +428,24 @@ class _Search:
         return faults
 
     def _refused(self, drafts: Sequence[_Draft]) -> list[Fault | None]:
-        """Return per draft why it does not run, or None; on stored states the pre-screen finds that out."""
+        """Return per draft why it cannot be learned from, or None; on stored states the pre-screen finds that out."""
         # Templates are ours, and what `reflect` gives has run already.
-        unknown = [d.code for d in drafts if d.origin == "model"]
-        results = iter(smoke_run_all(unknown, self.base.scene))
-        return [
-            None
-            if draft.origin != "model" or (result := next(results)).runnable
-            else Fault(kind="refused", reason=result.error)
-            for draft in drafts
-        ]
+        unknown = [d.code for d in drafts if d.origin in ("model", "given")]
+        probes = random_states(self.base.scene, PROBES, rng_for(self.seed, "probes"))
+        results = iter(smoke_run_all(unknown, self.base.scene, probes=probes))
+        faults: list[Fault | None] = []
+        for draft in drafts:
+            if draft.code not in unknown:
+                faults.append(None)
+                continue
+            result = next(results)
+            if not result.runnable:
+                faults.append(Fault(kind="refused", reason=result.error))
+                continue
+            found = reward_fault(np.array(result.probe_reward), "states that were tried")
+            words = found and f"{found.reason}: it {found.words}"
+            faults.append(None if words is None else Fault(kind="prescreened", reason=words))
+        return faults
 
     def _stored_trajectories(self) -> list[Trajectories]:
         """Return what the elites' policies did, successes and failures."""
@@ -436,7 +497,7 @@ class _Search:
                 "seed": seed_for(self.seed, "training", seed),
                 "eval_seed": seed_for(self.seed, "evaluation", seed),
                 "steps_per_mark": self._steps_per_mark,
-                "success_bonus": cfg.success_bonus,
+                "bonus_ratio": cfg.paid_bonus_ratio,
                 "num_envs": cfg.num_envs,
                 "num_threads": self.how.num_threads,
                 "eval_worlds": cfg.eval_worlds,
@@ -523,6 +584,7 @@ class _Search:
             chosen=best.number,
             code=best.code,
             class_name=class_name(best.code),
+            origin=best.origin,
             success=float(np.mean(per_seed)),
             per_seed=per_seed,
             policy=best.policy_folder(),

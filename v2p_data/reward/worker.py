@@ -47,7 +47,7 @@ from v2p_data.reward.candidate import (
     Fault,
     Kind,
 )
-from v2p_data.reward.feedback import feedback_of
+from v2p_data.reward.feedback import feedback_of, reward_ranks
 from v2p_data.reward.jobs import HEARTBEAT_FILE, LOG_FILE, REQUEST_FILE
 from v2p_data.reward.methods import load_candidate
 from v2p_data.reward.record import record_trajectories
@@ -153,6 +153,8 @@ def fault_of(error: Exception) -> Fault:
     kind: Kind = "error"
     if isinstance(error, NotFiniteError) or re.search(r"\bis (nan|-?inf)\b", words):
         kind = "not_finite"
+    elif "rewards lie within" in words:
+        kind = "unbounded"
     elif isinstance(error, MemoryError) or re.search(r"alloc|out of memory", words, re.I):
         kind = "out_of_memory"
     return Fault(
@@ -171,7 +173,7 @@ def _say(message: dict[str, Any]) -> None:
 def train(request: dict[str, Any], folder: Path) -> None:
     """Train one candidate up to a mark, or until its evaluations reach the target."""
     bundle = load_candidate(Path(request["bundle"]), Path(request["code"]))
-    sim = SimConfig(success_bonus=float(request["success_bonus"]))
+    sim = SimConfig(bonus_ratio=float(request["bonus_ratio"]))
     seed, every = int(request["seed"]), int(request["steps_per_mark"])
     num_envs, threads = int(request["num_envs"]), int(request["num_threads"])
     env = BatchEnv(
@@ -260,6 +262,7 @@ def evaluation_of(t: Trajectories, obj: SceneObject, sees_video: bool) -> dict[s
         "closeness": float(closeness(moved, obj).mean()) if sees_video else 0.0,
         "touched": float((t.states[f"{obj.name}_touched"] > 0.5).mean()),
         "control_steps": int(t.success.size),
+        "ranking": reward_ranks(t),
     }
 
 

@@ -53,7 +53,7 @@ from v2p_data.sim.start_check import (
 )
 from v2p_data.sim.states import Observed, StateBlock
 from v2p_data.sim.world import CAMERA, World, build_world
-from v2p_data.task.task import Task, TaskBundle
+from v2p_data.task.task import FULL_REWARD, MAX_REWARD, Task, TaskBundle
 
 ACT_DIM = 7
 HELD_STEPS = 5
@@ -85,10 +85,9 @@ class SimConfig:
     """The target of a finger that is blocked by an object runs ahead by this much at most."""
     tilt_limit_rad: float = 0.35
     """How far the gripper may lean from pointing straight down."""
-    success_bonus: float = 100.0
-    """Added to the task's reward at every step that counts as a success (the paper's value)."""
-    reward_scale: float = 100.0
-    """The sum is divided by this, so that values are about 1."""
+    bonus_ratio: float = 1.0
+    """What a step of success earns on top, in full rewards (`FULL_REWARD`); PPO knows only this ratio, for it scales
+    rewards by their returns. See docs/rewards.md for the measurement."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +96,7 @@ class StepResult:
 
     obs: Float32[np.ndarray, "env obs"]
     reward: Float32[np.ndarray, "env"]
-    """`(task_reward + success_bonus * success) / reward_scale`."""
+    """`task_reward / FULL_REWARD + bonus_ratio * success`."""
     success: Bool[np.ndarray, "env"]
     """The task's own judgement of this very moment."""
     held: Bool[np.ndarray, "env"]
@@ -673,14 +672,16 @@ class BatchEnv:
             )
         success = said.success.numpy() & ok
         task_reward = self._of_sound_worlds(said.reward)
-        if not np.isfinite(task_reward).all():
-            env = int(np.flatnonzero(~np.isfinite(task_reward))[0])
+        is_fair = np.abs(task_reward) <= MAX_REWARD  # false for NaN too
+        if not is_fair.all():
+            env = int(np.flatnonzero(~is_fair)[0])
             raise V2PError(
                 f"the reward of task '{self.bundle.title}' is {task_reward[env]} in world {env} although its state "
-                f"is finite; parts: { {k: float(v[env]) for k, v in said.components.items()} }"
+                f"is finite; rewards lie within +-{MAX_REWARD:g}, a full one is {FULL_REWARD:g}; "
+                f"parts: { {k: float(v[env]) for k, v in said.components.items()} }"
             )
         self._count_held(success)
-        reward = (task_reward + self.cfg.success_bonus * success) / self.cfg.reward_scale
+        reward = task_reward / FULL_REWARD + self.cfg.bonus_ratio * success
         return StepResult(
             obs=obs,
             reward=reward.astype(np.float32),

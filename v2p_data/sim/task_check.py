@@ -1,8 +1,9 @@
-"""Is a success function worth training for? Asked of the real simulator before any training starts.
+"""Is a task worth training for? Asked of the real simulator before any training starts.
 
 Three things make a training useless whatever it learns: a success that is always true, one that is true already at
 the start or comes about by itself, and one that nothing can bring about. The first two are asked of states that the
-simulator resets to and rests in; the last of the audit's search over the workspace.
+simulator resets to and rests in; the last of the audit's search over the workspace. So is the reward: one that is
+constant, unbounded or not finite teaches nothing.
 """
 
 import numpy as np
@@ -14,6 +15,7 @@ from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.start_check import SOLVED_AT_MOST
 from v2p_data.task.audit_probes import build_probes
 from v2p_data.task.guarded import GuardedTask, Show
+from v2p_data.task.reward_check import reward_fault
 from v2p_data.task.task import Task, TaskBundle
 
 NUM_WORLDS = 64
@@ -75,11 +77,40 @@ def check_task(
         )
 
 
+def check_reward(bundle: TaskBundle, *, seed: int = 0, task: type[Task] | None = None) -> None:
+    """Demand a reward that is finite, bounded and not the same everywhere, by the audit's search over the workspace.
+
+    Args:
+        bundle: the task.
+        seed: of the worlds and of the search.
+        task: the task, instead of `bundle.code`.
+
+    Raises:
+        ItemRejectedError: `reward_not_finite`, `reward_unbounded` or `reward_constant`; or whatever making a
+            `BatchEnv` raises.
+    """
+    env = BatchEnv(bundle, SimConfig(), num_envs=1, seed=seed, task=task)
+    states = _search_states(bundle, seed)
+    count = len(states["eef_pos"])
+    said = env.task.judge(lambda: dict(states), torch.zeros((count, env.act_dim)))
+    fault = reward_fault(said.reward.numpy(), "states all over the workspace")
+    if fault is not None:
+        raise ItemRejectedError(
+            f"reward_{fault.reason}",
+            f"the reward of task '{bundle.title}' ({bundle.kind}) {fault.words}",
+            fault.value,
+        )
+
+
 def _searched(env: BatchEnv, bundle: TaskBundle, seed: int) -> tuple[float, int]:
     """Return the share of the audit's states in which success is true, and their number."""
+    states = _search_states(bundle, seed)
+    return _share(env.task, lambda: states), len(states["eef_pos"])
+
+
+def _search_states(bundle: TaskBundle, seed: int) -> dict[str, torch.Tensor]:
     probes = build_probes(bundle.scene, rng_for(seed, "audit", bundle.title))
-    states = {name: torch.from_numpy(values) for name, values in probes.states.items()}
-    return _share(env.task, lambda: states), len(probes.states["eef_pos"])
+    return {name: torch.from_numpy(values) for name, values in probes.states.items()}
 
 
 def _share(task: GuardedTask, show: Show) -> float:

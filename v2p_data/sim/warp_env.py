@@ -38,7 +38,7 @@ from v2p_data.sim.tensor_states import (
 )
 from v2p_data.sim.warp_physics import CONTACTS_PER_WORLD, WarpPhysics
 from v2p_data.sim.world import World, build_world
-from v2p_data.task.task import Task, TaskBundle
+from v2p_data.task.task import FULL_REWARD, MAX_REWARD, Task, TaskBundle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,7 +347,7 @@ class WarpBatchEnv:
         task_reward = torch.where(ok, total.detach(), zero).float()
         self._check(task_reward, parts)
         self._held = torch.where(success, self._held + 1, 0)
-        reward = (task_reward + self.cfg.success_bonus * success) / self.cfg.reward_scale
+        reward = task_reward / FULL_REWARD + self.cfg.bonus_ratio * success
         return TensorStepResult(
             obs=obs,
             reward=reward,
@@ -360,13 +360,14 @@ class WarpBatchEnv:
         )
 
     def _check(self, task_reward: torch.Tensor, parts: dict[str, torch.Tensor]) -> None:
-        bad = ~torch.isfinite(task_reward)
+        bad = ~(task_reward.abs() <= MAX_REWARD)  # of NaN too
         flags = torch.stack([bad.any(), self._sim.dropped_contacts()]).tolist()
         if flags[0]:
             env = int(bad.nonzero()[0])
             raise V2PError(
                 f"the reward of task '{self.bundle.title}' is {float(task_reward[env])} in world {env} although "
-                f"its state is finite; parts: { {k: float(v[env]) for k, v in parts.items()} }"
+                f"its state is finite; rewards lie within +-{MAX_REWARD:g}, a full one is {FULL_REWARD:g}; "
+                f"parts: { {k: float(v[env]) for k, v in parts.items()} }"
             )
         if flags[1]:
             raise V2PError(

@@ -12,10 +12,11 @@ import numpy as np
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task import allowed
 from v2p_data.task.audit import ACCEPTABLE_SCORE, Audit
+from v2p_data.task.example_refinements import Refinement
 from v2p_data.task.example_tasks import Example
 from v2p_data.task.pictures import Picture
 from v2p_data.task.probes import WORKSPACE_M
-from v2p_data.task.task import states_table
+from v2p_data.task.task import FULL_REWARD, states_table
 
 Message = dict[str, object]
 
@@ -35,8 +36,8 @@ You write tasks for a robot arm with a parallel gripper in a physics simulator. 
    `reward_function(actions, states)`, decorated with `@torch.jit.script`, which returns the total reward (env,) float32
    and a dict of its named components, each (env,). `actions` is (env, 7), -1 to 1. The docstring holds your chain of
    thoughts for the reward and the list of its components. Weigh the components so that they add up to about 1 just before
-   success and return 100 times their sum. To each step in success the trainer adds another 100 by itself, so do not pay for
-   success. Let the total rise smoothly from anywhere, reward the next step more than staying in the last, and let no moment
+   success and return {full:g} times their sum. To each step in success the trainer adds a bonus by itself, so do not pay
+   for success. Let the total rise smoothly from anywhere, reward the next step more than staying in the last, and let no moment
    before success be worth staying in for ever.
 
 The class derives from `Task` (`from factory.tasks.task import Task`) and its constructor is
@@ -90,16 +91,32 @@ change success, reset or observations, and code for them is ignored. Nothing aft
 LINE_OF_FAULT = re.compile(r"\bline (\d+)")
 
 
-def system_message(object_names: Sequence[str], examples: Sequence[Example] = ()) -> Message:
+def system_message(
+    object_names: Sequence[str],
+    examples: Sequence[Example] = (),
+    refinements: Sequence[Refinement] = (),
+) -> Message:
     """Return the part that is the same for all samples of a scene: interface, states, rules, examples."""
     (x0, y0), (x1, y1) = WORKSPACE_M
     parts = [
-        INTERFACE.format(x0=x0, x1=x1, y0=y0, y1=y1, states=states_table(list(object_names))),
+        INTERFACE.format(x0=x0, x1=x1, y0=y0, y1=y1, full=FULL_REWARD, states=states_table(list(object_names))),
         rules(),
     ]  # fmt: skip
     for number, example in enumerate(examples, 1):
         parts.append(
             f"Example {number}: {example.task}\n\nThoughts: {example.thoughts}\n\n```python\n{example.code.strip()}\n```"
+        )
+    for number, refined in enumerate(refinements, 1):
+        parts.append(
+            REFINEMENT.format(
+                number=number,
+                task=refined.task,
+                before=refined.before.strip(),
+                seen=refined.seen.strip(),
+                thoughts=refined.thoughts,
+                after=refined.after.strip(),
+                came_to=refined.came_to,
+            )
         )
     return {"role": "system", "content": "\n\n".join(parts)}
 
@@ -122,10 +139,16 @@ def rules() -> str:
 
 
 def scene_message(
-    scene: Scene, pictures: Sequence[Picture], *, tracking: bool, end: str
+    scene: Scene,
+    pictures: Sequence[Picture],
+    *,
+    tracking: bool,
+    shapes: bool,
+    then: str = f"{QUESTIONS}\n\n{FORMAT}",
+    end: str,
 ) -> Message:
-    """Return the question: the scene in words and pictures, then `end`, which alone differs between samples."""
-    text = f"{scene_words(scene, tracking=tracking)}\n\n{QUESTIONS}\n\n{FORMAT}"
+    """Return the question: the scene in words, what to do, pictures, then `end`, which alone differs between samples."""
+    text = f"{scene_words(scene, tracking=tracking, shapes=shapes)}\n\n{then}"
     parts: list[dict[str, object]] = [{"type": "text", "text": text}]
     for picture in pictures:
         parts.append({"type": "text", "text": f"This picture shows {picture.shows}:"})
@@ -134,10 +157,28 @@ def scene_message(
     return {"role": "user", "content": parts}
 
 
-def scene_words(scene: Scene, *, tracking: bool) -> str:
-    """Return caption, objects with their sizes, and the tracked poses of the first and last frame with their difference."""
+def scene_words(scene: Scene, *, tracking: bool, shapes: bool) -> str:
+    """Return caption, objects, and the tracked poses of the first and last frame with their difference.
+
+    Args:
+        scene: what was understood of the video.
+        tracking: tell the poses.
+        shapes: tell shapes, sizes and masses; without them only caption, names and roles.
+    """
+    caption = f'The task is what this video shows: "{" ".join(scene.description.split())}".'
+    if not shapes:
+        rows = [f"| `{o.name}` | {o.label} | {o.role} |" for o in scene.objects]
+        return "\n".join(
+            [
+                f"{caption} Nothing else of the video is known: no picture, no size, no motion.",
+                "",
+                "| object | in the caption | role |",
+                "|---|---|---|",
+                *rows,
+            ]
+        )
     lines = [
-        f'The task is what this video shows: "{" ".join(scene.description.split())}".',
+        caption,
         "",
         "| object | in the caption | role | shape | size x, y, z [m] | mass [kg] |",
         "|---|---|---|---|---|---|",
@@ -198,17 +239,15 @@ def objection_message(table: str) -> Message:
 
 
 PICK = """\
-Below are {count} codes for the task "{task}", each with the table of an audit: its success function was evaluated on the
-video's own tracked poses, at simulated resets and on made-up moments that must not count.
+Below are {count} codes for the task "{task}"{audited}.
 
 {scene}
 
 Judge each code by
-- correctness: read and analyse the success part. Does it say what the caption says, and does the audit agree?
+- correctness: read and analyse the success part. Does it say what the caption says{agrees}?
 - reasonability: avoid code that assumes scalar values or states that nothing gives, thresholds out of proportion to the
   objects, and successes that a touch or a fling would satisfy.
-- efficiency: will a policy learn quickly from this reward and these observations?
-The audit can err about noise in the tracking (a wrong last pose), hardly about the rest.
+- efficiency: will a policy learn quickly from this reward and these observations?{errs}
 
 {candidates}
 
@@ -216,18 +255,30 @@ Compare the codes in a few sentences. Then end with one line of JSON and nothing
 {{"index": <one of {indices}>, "correctness": "<why>", "reasonability": "<why>", "efficiency": "<why>"}}"""
 
 
+AUDITED = """, each with the table of an audit: its success function was evaluated on the
+video's own tracked poses, at simulated resets and on made-up moments that must not count"""
+AUDIT_ERRS = (
+    "\nThe audit can err about noise in the tracking (a wrong last pose), hardly about the rest."
+)
+
+
 def pick_message(
-    scene: Scene, candidates: dict[int, tuple[str, Audit]], *, tracking: bool
+    scene: Scene, candidates: dict[int, tuple[str, Audit]], *, tracking: bool, shapes: bool
 ) -> Message:
-    """Return the question which of some codes is the best, with their audit tables."""
+    """Return the question which of some codes is the best, with their audit tables where the video may be told of."""
     shown = [
-        f"## Code {i}\n\n{audit_table(verdict)}\n\n```python\n{code.strip()}\n```"
+        f"## Code {i}\n\n"
+        + f"{audit_table(verdict)}\n\n" * shapes
+        + f"```python\n{code.strip()}\n```"
         for i, (code, verdict) in candidates.items()
     ]
     text = PICK.format(
         count=len(candidates),
         task=" ".join(scene.description.split()),
-        scene=scene_words(scene, tracking=tracking),
+        audited=AUDITED * shapes,
+        agrees=", and does the audit agree" * shapes,
+        errs=AUDIT_ERRS * shapes,
+        scene=scene_words(scene, tracking=tracking, shapes=shapes),
         candidates="\n\n".join(shown),
         indices=", ".join(map(str, candidates)),
     )
@@ -256,28 +307,46 @@ def audit_table(verdict: Audit) -> str:
 # --- rewards -------------------------------------------------------------------------------------------------
 
 
-def first_reward_message(description: str, code: str) -> Message:
+REFINEMENT = """\
+Example {number} of a refinement: {task}. The reward was
+
+```python
+{before}
+```
+
+A policy was trained with it. What was seen:
+
+{seen}
+
+Thoughts: {thoughts}
+
+```python
+{after}
+```
+
+{came_to}"""
+
+
+def first_reward_question(code: str) -> str:
     """Return the question for another reward of a task that was not trained yet."""
-    return {
-        "role": "user",
-        "content": f'The task is "{description}". Its code:\n\n```python\n{code.strip()}\n```\n\n'
+    return (
+        f"Its code:\n\n```python\n{code.strip()}\n```\n\n"
         "Write another reward_function for it, of another design than this one: think of which steps lead to success, "
-        f"and which component pulls the policy through each.\n\n{REWARD_FORMAT}",
-    }
+        f"and which component pulls the policy through each.\n\n{REWARD_FORMAT}"
+    )
 
 
-def better_reward_message(description: str, code: str, feedback: str) -> Message:
+def better_reward_question(code: str, feedback: str) -> str:
     """Return the question for a better reward, given what training with this one showed."""
-    return {
-        "role": "user",
-        "content": f'The task is "{description}". Its code:\n\n```python\n{code.strip()}\n```\n\n'
+    return (
+        f"Its code:\n\n```python\n{code.strip()}\n```\n\n"
         f"A policy was trained with this reward. What was seen:\n\n{feedback.strip()}\n\n"
         "Analyse each component first: what do its values in successful and in failed episodes say? A component that hardly "
         "changes is to be rescaled, given another temperature, rewritten or dropped; one that is far larger than the "
         "others is to be scaled down; one that is highest in failed episodes leads astray; a missing step needs a "
-        "component. If nothing succeeded, design the reward anew. Then write the better reward_function.\n\n"
-        f"{REWARD_FORMAT}",
-    }
+        "component. Successful episodes must earn more than failed ones. If nothing succeeded, design the reward anew. "
+        f"Then write the better reward_function.\n\n{REWARD_FORMAT}"
+    )
 
 
 def _object_row(o: SceneObject) -> str:

@@ -27,7 +27,7 @@ from v2p_data.task.time_limit import line_in_task_code
 MEMORY_BYTES = 2 * 1024**3
 """On top of what importing torch has mapped."""
 MAX_REWARD = 1000.0
-"""Ten times the bonus for success, which then hardly counts."""
+"""Ten full rewards: beside them the bonus for success hardly counts."""
 MAX_ANSWER_BYTES = 4_000_000
 SLOW_S = 1.0
 SCALED = ("_pos", "_size", "_width")
@@ -123,7 +123,7 @@ def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
     biggest = max(float(first.reward.max()), float(edge.reward.max()))
     if biggest > MAX_REWARD:
         warnings.append(
-            f"the reward reaches {biggest:.3g}; the bonus for success, 100, hardly counts"
+            f"the reward reaches {biggest:.3g}, a full one is 100; beside it the bonus for success hardly counts"
         )
     answer = {
         "runnable": True,

@@ -75,6 +75,14 @@ def reward_part(code: str) -> str:
     return "\n".join(ast.dump(_bare(there[name])) for name in used)
 
 
+def reward_source(code: str) -> str:
+    """Return the text of a code's reward and of what it uses, for a reader."""
+    tree = ast.parse(code)
+    there = _definitions(tree)
+    used = _reachable(there[REWARD], there) | {REWARD}
+    return "\n\n\n".join(_source(code, node) for node in tree.body if _defined(node) in used)
+
+
 def rest_part(code: str) -> str:
     """Return a normal form of everything but the reward: success, reset, observations, and what they use."""
     tree = ast.parse(code)

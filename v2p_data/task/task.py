@@ -31,6 +31,11 @@ ROBOT_FOLDER = "robot"
 BASE_OBSERVATION_DIM = 90
 """Length of `states['base_observation']`, the same for every task so that experts can warm-start each other."""
 
+FULL_REWARD = 100.0
+"""What a task's reward is written to add up to just before success; values are divided by it in training."""
+MAX_REWARD = 100 * FULL_REWARD
+"""A reward beyond this, either way, is a fault: beside it neither success nor any other part counts."""
+
 POLICY_HORIZON_SCALE = 2.0
 """A policy gets this multiple of the task's horizon: experts need about half of theirs, the paper gives 300 steps."""
 

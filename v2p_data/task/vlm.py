@@ -39,6 +39,10 @@ class BudgetError(V2PError):
     """The money, tokens or time that were allowed are used up."""
 
 
+class UnusableAnswersError(V2PError):
+    """The model answered, and none of its answers could be used."""
+
+
 class FaultyAnswerError(Exception):
     """An answer that is of no use, in words that tell the model what to do about it."""
 

@@ -57,7 +57,7 @@ class VlmConfig:
     price_out_per_million: float = 10.0
     """Price of a million tokens received."""
     images: bool = True
-    """Send pictures of the scene; off for models without eyes, and for the ablation without visual information."""
+    """Send pictures of the scene; off for models without eyes. With `tracking` off too, only caption and names are told."""
     tracking: bool = True
     """Send the tracked poses of the first and last frame; off for the ablation without tracking."""
     image_side_px: int = 768
@@ -74,6 +74,11 @@ class VlmConfig:
     """Folder in and below which calls are looked for and into which they are written; without one the caller's."""
     pool: Path | None = None
     """Folder of solved tasks of other runs, to be shown as examples too."""
+
+    @property
+    def tells_shapes(self) -> bool:
+        """Tell sizes, shapes and masses: they come from the video too, and are hidden where nothing of it is told."""
+        return self.images or self.tracking
 
     def recipe(self) -> "VlmConfig":
         """Return the settings that decide what is asked; those of how, how long and for how much are the defaults."""

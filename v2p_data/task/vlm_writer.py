@@ -7,29 +7,31 @@ does not run. Nothing it says overrules the audit: it chooses among codes that t
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
-from v2p_data.errors import V2PError
 from v2p_data.scene.scene import Scene
 from v2p_data.task.answers import choice_in, reward_code_in, task_code_in
 from v2p_data.task.audit import Audit
+from v2p_data.task.example_refinements import REFINEMENTS
 from v2p_data.task.example_tasks import Example
-from v2p_data.task.pictures import scene_pictures
+from v2p_data.task.pictures import Picture, scene_pictures
+from v2p_data.task.pool import examples_for, read_pool
 from v2p_data.task.prompts import (
     Message,
-    better_reward_message,
+    better_reward_question,
     fault_message,
-    first_reward_message,
+    first_reward_question,
     objection_message,
     pick_message,
     scene_message,
     system_message,
 )
 from v2p_data.task.smoke import SmokeResult, smoke_run_all
-from v2p_data.task.splice import SpliceError, reward_part, with_reward
+from v2p_data.task.splice import SpliceError, reward_part, reward_source, with_reward
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.variants import VARIANTS
-from v2p_data.task.vlm import FaultyAnswerError, VlmClient
+from v2p_data.task.vlm import FaultyAnswerError, UnusableAnswersError, VlmClient
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +42,7 @@ Objections = Callable[[Sequence[Written]], list[str]]
 """Says of each code what an audit has against it; empty where it is acceptable."""
 MAX_OBJECTIONS = 1
 """Times all samples go back with their audits where none is acceptable."""
+STRONGER = "Try a stronger model, or --task.vlm.max-regenerations"
 IDEAS = tuple(v.idea for v in VARIANTS if not v.is_naive)
 """For variety among samples: what each reward may be like."""
 
@@ -110,12 +113,18 @@ def write_samples(
     """
     cfg = client.cfg
     system = system_message([o.name for o in scene.objects], examples)
-    pictures = scene_pictures(scene, cfg.image_side_px, cfg.sheet_frames) if cfg.images else []
+    pictures = _pictures(client, scene)
     drafts = [
         _Draft(
             talk=[
                 system,
-                scene_message(scene, pictures, tracking=cfg.tracking, end=_end(i, count)),
+                scene_message(
+                    scene,
+                    pictures,
+                    tracking=cfg.tracking,
+                    shapes=cfg.tells_shapes,
+                    end=_end(i, count),
+                ),
             ]
         )
         for i in range(count)
@@ -124,7 +133,8 @@ def write_samples(
     answers = rounds = 0
     for turn in range(cfg.max_regenerations + 1):
         open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
-        if not open_ones and rounds < MAX_OBJECTIONS:
+        # The audit speaks of the video.
+        if not open_ones and rounds < MAX_OBJECTIONS and cfg.tells_shapes:
             rounds += 1
             faults = objections([(d.code, d.result) for d in drafts])
             if all(faults):
@@ -146,6 +156,11 @@ def write_samples(
             broken, count, scene.title, cfg.max_regenerations,
         )  # fmt: skip
     return WrittenSamples(first=tuple(first), final=final, answers=answers)
+
+
+def _pictures(client: VlmClient, scene: Scene) -> list[Picture]:
+    cfg = client.cfg
+    return scene_pictures(scene, cfg.image_side_px, cfg.sheet_frames) if cfg.images else []
 
 
 def _end(index: int, count: int) -> str:
@@ -212,7 +227,8 @@ def pick_sample(
         return Pick(
             index=audits_pick, by="audit", reasons={"why": "no other sample is acceptable"}
         )
-    question = pick_message(scene, candidates, tracking=client.cfg.tracking)
+    cfg = client.cfg
+    question = pick_message(scene, candidates, tracking=cfg.tracking, shapes=cfg.tells_shapes)
     allowed = list(candidates)
     try:
         (index, reasons), _ = client.ask(
@@ -230,73 +246,129 @@ def pick_sample(
 # --- rewards -------------------------------------------------------------------------------------------------
 
 
-def first_rewards(client: VlmClient, bundle: TaskBundle, count: int) -> list[str]:
-    """Return the task's code with `count` other rewards, before anything was trained.
+@dataclass(frozen=True, kw_only=True)
+class ModelWriter:
+    """A model as the writer of a reward search: it sees what its settings let it see.
 
-    Raises:
-        BudgetError: the budget is used up.
-        V2PError: no answer could be used, or the server cannot be asked.
+    Every code that it gives has run in the sandbox on the task's scene.
     """
-    question = first_reward_message(bundle.description, bundle.code)
-    return _rewards(client, bundle, bundle.code, question, count, "first reward")
 
+    client: VlmClient
+    pools: tuple[Path, ...] = ()
+    """Of solved tasks, whose rewards are shown as good ones."""
 
-def improve_reward(
-    client: VlmClient, bundle: TaskBundle, code: str, feedback_text: str, count: int
-) -> list[str]:
-    """Return `code` with `count` better rewards; everything but the reward is the same, so success cannot move.
+    def task_code(self, bundle: TaskBundle) -> str:
+        """Return one code for a task, its first thought: neither picked nor audited.
 
-    All of them run in the sandbox on the bundle's scene, and they differ from `code` and from each other. There are fewer
-    than `count` where the model gave no more in a bounded number of turns.
-
-    Args:
-        client: the model.
-        bundle: the task, for its scene and its words.
-        code: the task code that was trained with.
-        feedback_text: what the training showed, component by component.
-        count: how many.
-
-    Raises:
-        BudgetError: the budget is used up.
-        V2PError: no answer could be used, the code's success depends on its reward, or the server cannot be asked.
-    """
-    question = better_reward_message(bundle.description, code, feedback_text)
-    return _rewards(client, bundle, code, question, count, "better reward")
-
-
-def _rewards(
-    client: VlmClient, bundle: TaskBundle, parent: str, question: Message, count: int, what: str
-) -> list[str]:
-    system = system_message([o.name for o in bundle.scene.objects])
-    drafts = [_Draft(talk=[system, _with_idea(question, i, count)]) for i in range(count)]
-
-    def read(text: str) -> str:
-        try:
-            return with_reward(parent, reward_code_in(text))
-        except SpliceError as fault:
-            raise FaultyAnswerError(str(fault)) from fault
-
-    for turn in range(client.cfg.max_regenerations + 1):
-        open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
-        if not open_ones:
-            break
-        purpose = f"{what} for {bundle.title}, turn {turn}, sample "
-        _ask_all(
-            client, {f"{purpose}{i}": drafts[i] for i in open_ones}, read,
-            lambda codes: smoke_run_all(codes, bundle.scene),
-        )  # fmt: skip
-        _send_back_twins(drafts)
-    made = [d.code for d in drafts if d.result.runnable]
-    if not made:
-        raise V2PError(
-            f"no {what} for '{bundle.title}' could be used; the last one's fault: {drafts[-1].result.error}. "
-            "Try a stronger model, or --task.vlm.max-regenerations"
+        Raises:
+            BudgetError: the budget is used up.
+            UnusableAnswersError: no answer runs.
+            V2PError: the server cannot be asked.
+        """
+        scene = bundle.scene
+        made = write_samples(
+            self.client,
+            scene,
+            1,
+            self._examples(bundle),
+            lambda codes: smoke_run_all(codes, scene),
+            lambda written: [""] * len(written),
         )
-    return made
+        ((code, result),) = made.final
+        if not result.runnable:
+            raise UnusableAnswersError(
+                f"no code for '{bundle.title}' could be used; the last one's fault: {result.error}. {STRONGER}"
+            )
+        return code
 
+    def first_rewards(self, bundle: TaskBundle, count: int) -> list[str]:
+        """Return the task's code with up to `count` other rewards, before anything was trained.
 
-def _with_idea(question: Message, index: int, count: int) -> Message:
-    return {**question, "content": f"{question['content']}\n\n{_end(index, count)}"}
+        Raises:
+            BudgetError: the budget is used up.
+            UnusableAnswersError: no answer could be used.
+            V2PError: the server cannot be asked.
+        """
+        return self._rewards(
+            bundle, bundle.code, first_reward_question(bundle.code), count, "first reward"
+        )
+
+    def better_rewards(
+        self, bundle: TaskBundle, code: str, feedback_text: str, count: int
+    ) -> list[str]:
+        """Return `code` with up to `count` better rewards; everything else is the same, so success cannot move.
+
+        They differ from `code` and from each other.
+
+        Args:
+            bundle: the task, for its scene and its words.
+            code: the task code that was trained with.
+            feedback_text: what the training showed, component by component.
+            count: how many.
+
+        Raises:
+            BudgetError: the budget is used up.
+            UnusableAnswersError: no answer could be used.
+            V2PError: the code's success depends on its reward, or the server cannot be asked.
+        """
+        question = better_reward_question(code, feedback_text)
+        return self._rewards(bundle, code, question, count, "better reward")
+
+    def _examples(self, bundle: TaskBundle) -> list[Example]:
+        cfg = self.client.cfg
+        pools = [*self.pools, *([cfg.pool] if cfg.pool else [])]
+        return examples_for(bundle.scene, read_pool(*pools), cfg.num_examples)
+
+    def _rewards(
+        self, bundle: TaskBundle, parent: str, question: str, count: int, what: str
+    ) -> list[str]:
+        client, scene = self.client, bundle.scene
+        system = system_message(
+            [o.name for o in scene.objects],
+            [replace(e, code=reward_source(e.code)) for e in self._examples(bundle)],
+            REFINEMENTS,
+        )
+        pictures = _pictures(client, scene)
+        drafts = [
+            _Draft(
+                talk=[
+                    system,
+                    scene_message(
+                        scene,
+                        pictures,
+                        tracking=client.cfg.tracking,
+                        shapes=client.cfg.tells_shapes,
+                        then=question,
+                        end=_end(i, count),
+                    ),
+                ]
+            )
+            for i in range(count)
+        ]
+
+        def read(text: str) -> str:
+            try:
+                return with_reward(parent, reward_code_in(text))
+            except SpliceError as fault:
+                raise FaultyAnswerError(str(fault)) from fault
+
+        for turn in range(client.cfg.max_regenerations + 1):
+            open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
+            if not open_ones:
+                break
+            purpose = f"{what} for {bundle.title}, turn {turn}, sample "
+            _ask_all(
+                client, {f"{purpose}{i}": drafts[i] for i in open_ones}, read,
+                lambda codes: smoke_run_all(codes, scene),
+            )  # fmt: skip
+            _send_back_twins(drafts)
+        made = [d.code for d in drafts if d.result.runnable]
+        if not made:
+            raise UnusableAnswersError(
+                f"no {what} for '{bundle.title}' could be used; the last one's fault: {drafts[-1].result.error}. "
+                f"{STRONGER}"
+            )
+        return made
 
 
 def _send_back_twins(drafts: list[_Draft]) -> None:

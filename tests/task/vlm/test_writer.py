@@ -2,19 +2,22 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 
-from v2p_data.errors import V2PError
 from v2p_data.task.audit import Audit, Check
+from v2p_data.task.benchmark import load_benchmark
+from v2p_data.task.example_refinements import REFINEMENTS
 from v2p_data.task.example_tasks import GRASP_A_BLOCK, REACH_A_BLOCK, block_scene
 from v2p_data.task.generate import TaskConfig, generate_task
-from v2p_data.task.pool import examples_for
+from v2p_data.task.pool import add_solved, examples_for
 from v2p_data.task.smoke import SmokeResult
-from v2p_data.task.splice import rest_part, reward_part
+from v2p_data.task.splice import rest_part, reward_part, reward_source
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples as write_by_template
-from v2p_data.task.vlm import BudgetError, VlmClient
-from v2p_data.task.vlm_writer import first_rewards, improve_reward, pick_sample, write_samples
+from v2p_data.task.vlm import BudgetError, UnusableAnswersError, VlmClient
+from v2p_data.task.vlm_writer import ModelWriter, pick_sample, write_samples
 
 pytestmark = pytest.mark.slow
 
@@ -292,7 +295,37 @@ def test_without_visual_information_only_the_caption_and_the_objects_are_told(ch
 
     question = text_of(chat.requests[0])[1]
     assert "lift up the block" in question
-    assert "Tracked poses" not in question
+    assert "| `block` | block | manipulated |" in question
+    # Its size, shape and mass, its motion, and how far an audit says that it went.
+    for told in ("0.05", "box", "0.10", "Tracked poses", "0.100", "audit"):
+        assert told not in question, told
+    assert "image_url" not in json.dumps(chat.requests)
+
+
+def test_without_visual_information_the_audit_that_knows_the_video_is_not_told_of_either(
+    chat, client, say
+):
+    chat.script = [say(fenced(GRASP_A_BLOCK)), say(fenced(GRASP_A_BLOCK)), say(json.dumps(CHOICE | {"index": 1}))]  # fmt: skip
+    blind = client(tracking=False, images=False)
+
+    write_samples(blind, lifting_scene(), 2, [], runs, lambda written: ["it went 0.1 m"] * 2)
+    pick = pick_sample(blind, lifting_scene(), [("a", GOOD), ("b", GOOD)], audits_pick=0)
+
+    assert len(chat.requests) == 3
+    (question,) = text_of(chat.requests[2])
+    assert (pick.index, pick.by) == (1, "vlm")
+    for told in ("Audit: score", "the table of an audit", "0.05", "box", "Tracked poses"):
+        assert told not in question, told
+
+
+def test_a_model_without_eyes_is_still_told_sizes_and_poses(chat, client, say):
+    chat.otherwise = say(fenced(GRASP_A_BLOCK))
+
+    write_samples(client(images=False), lifting_scene(), 1, [], runs, no_objection)
+
+    question = text_of(chat.requests[0])[1]
+    assert "| `block` | block | manipulated | box | 0.050, 0.050, 0.050 | 0.10 |" in question
+    assert "Tracked poses" in question
 
 
 # --- rewards -------------------------------------------------------------------------------------------------
@@ -314,13 +347,10 @@ def test_better_rewards_come_as_whole_tasks_that_run_and_whose_success_is_the_pa
         return say(a_reward("-torch.norm(states['block_pos'] - states['eef_pos'], dim=-1)"))
 
     chat.otherwise = answer
-    scene = lifting_scene()
-    bundle = TaskBundle(
-        title="lift", description="lift up the block", kind="lift_up", class_name="GraspABlock",
-        code=GRASP_A_BLOCK, scene=scene,
-    )  # fmt: skip
 
-    made = improve_reward(client(), bundle, GRASP_A_BLOCK, "raise: 0.00 in all episodes", 2)
+    made = ModelWriter(client=client()).better_rewards(
+        lifting_task(), GRASP_A_BLOCK, "raise: 0.00 in all episodes", 2
+    )
 
     assert len(made) == len({reward_part(c) for c in [*made, GRASP_A_BLOCK]}) - 1 == 2
     assert all(rest_part(c) == rest_part(GRASP_A_BLOCK) for c in made)
@@ -331,12 +361,60 @@ def test_better_rewards_come_as_whole_tasks_that_run_and_whose_success_is_the_pa
     ]
 
 
-def test_a_model_without_a_usable_reward_is_named_with_its_fault(chat, client, say):
-    chat.otherwise = say("I would rather not.")
-    bundle = TaskBundle(
-        title="lift", description="lift", kind="lift_up", class_name="GraspABlock",
-        code=GRASP_A_BLOCK, scene=lifting_scene(),
+def lifting_task(scene=None):
+    return TaskBundle(
+        title="lift", description="lift up the block", kind="lift_up", class_name="GraspABlock",
+        code=GRASP_A_BLOCK, scene=scene or lifting_scene(),
     )  # fmt: skip
 
-    with pytest.raises(V2PError, match=r"no first reward for 'lift' could be used; .*no code"):
-        first_rewards(client(max_regenerations=0, max_reasks=0), bundle, 2)
+
+def test_questions_for_rewards_show_the_scene_its_pictures_a_refinement_and_rewards_of_solved_tasks(
+    chat, client, say, tmp_path
+):
+    chat.otherwise = say(a_reward("states['block_pos'][:, 2]"))
+    solved = load_benchmark("push_left")
+    add_solved(tmp_path / "pool", solved, 0.9)
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    lifting_scene().save(folder)
+    cv2.imwrite(str(folder / "frame_first.jpg"), np.zeros((8, 8, 3), np.uint8))
+    task = lifting_task(type(block_scene()).load(folder))
+    writer = ModelWriter(client=client(), pools=(tmp_path / "pool",))
+
+    writer.first_rewards(task, 1)
+    writer.better_rewards(task, GRASP_A_BLOCK, "raise: 0.00 in all episodes", 1)
+
+    for request in chat.requests:
+        system, question = text_of(request)[:2]
+        assert f"Example 3: {solved.description}" in system
+        assert reward_source(solved.code) in system
+        assert "def compute_success" not in system.partition("Example 1")[2]
+        (refined,) = REFINEMENTS
+        assert all(
+            part.strip() in system for part in (refined.before, refined.seen, refined.after)
+        )
+        assert "Tracked poses" in question
+        assert "the first frame of the video" in question
+        assert any("image_url" in part for part in request["messages"][1]["content"])
+    assert "raise: 0.00 in all episodes" in text_of(chat.requests[1])[1]
+
+
+def test_a_task_without_visual_information_is_written_anew_from_the_caption(chat, client, say):
+    chat.otherwise = say(fenced(GRASP_A_BLOCK))
+
+    code = ModelWriter(client=client(images=False, tracking=False)).task_code(lifting_task())
+
+    assert code == GRASP_A_BLOCK
+    assert "0.05" not in text_of(chat.requests[0])[1]
+
+
+def test_a_model_without_a_usable_answer_is_named_with_its_fault(chat, client, say):
+    chat.otherwise = say("I would rather not.")
+    writer = ModelWriter(client=client(max_regenerations=0, max_reasks=0))
+
+    with pytest.raises(
+        UnusableAnswersError, match=r"no first reward for 'lift' could be used; .*no code"
+    ):
+        writer.first_rewards(lifting_task(), 2)
+    with pytest.raises(UnusableAnswersError, match=r"no code for 'lift' could be used; .*no code"):
+        writer.task_code(lifting_task())
