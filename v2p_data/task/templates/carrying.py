@@ -35,7 +35,7 @@ def lift(m: Measured, v: Variant) -> Draft:
         ],
         reward_setup=grasp_setup(),
         target="grasp_point",
-        contact="obj_grasped * near",
+        contact="gripped * near",
         pays_contact=True,
         progress=f"(height / {max(height + 0.02, 0.12):.3f}).clamp(0.0, 1.0) * contact",
         remaining=f"({height} - height).clamp(min=0.0)",
@@ -125,7 +125,7 @@ def drop_in_front_of(m: Measured, v: Variant) -> Draft:
             "goal_point[:, 2] = obj_start[:, 2]",
         ],
         arrived="to_goal < 0.03",
-        falls_m=0.05,
+        falls_m=0.12,
         conditions=[
             ("is_in_front", f"({there} < {tolerance(0.04, v)}) & (obj_pos[:, 0] < ref_pos[:, 0])"),
             ("is_down", "lowest_point(obj_pos, obj_quat, obj_size).abs() < 0.015"),
@@ -171,8 +171,8 @@ def throw_into(m: Measured, v: Variant) -> Draft:
         "aim = 1 - torch.tanh(3.0 * torch.norm(goal_point[:, :2] - landing, dim=-1))",
     ]
     draft.progress = (
-        "torch.where(arrived, 2.5 + 0.6 * lowered,"
-        " raised * (0.4 + 0.6 * aim) * obj_grasped * near + 1.2 * aim * (1 - obj_touched))"
+        "torch.where(arrived, 2.5 + lowered,"
+        " raised * (0.4 + 0.6 * aim) * gripped * near + 1.2 * aim * (1 - obj_touched))"
     )
     draft.extras = draft.extras[:1]
     return draft
@@ -209,7 +209,7 @@ def uncover(m: Measured, v: Variant) -> Draft:
         ],
         reward_setup=grasp_setup(),
         target="grasp_point",
-        contact="obj_grasped * near",
+        contact="gripped * near",
         pays_contact=True,
         # A factor, not a fine: fined for every tilt, a policy learns to stay away from the cover.
         progress=f"torch.maximum((height / {height + 0.02:.3f}).clamp(0.0, 1.0) * contact, (aside / (room + 0.03)).clamp(0.0, 1.0) * 0.6) * standing.clamp(0.0, 1.0)",
@@ -275,17 +275,17 @@ def _carry(
             "raised = (height / 0.08).clamp(0.0, 1.0)",
             "way = torch.norm((goal_point - obj_start)[:, :2], dim=-1).clamp(min=0.05)",
             "carried = (1 - to_goal / way).clamp(-1.0, 1.0)",
-            "lowered = 1 - torch.tanh(8.0 * above_goal.abs())",
+            "lowered = (1 - above_goal / 0.15).clamp(0.0, 1.0)",
             f"opened = (gripper_width / 0.085).clamp(0.0, 1.0) * (1 - above_goal / {falls_m}).clamp(0.0, 1.0)",
         ],
         target="grasp_point",
-        contact="torch.maximum(obj_grasped * near, arrived.float())",
+        contact="torch.maximum(gripped * near, arrived.float())",
         pays_contact=True,
         # Each stage pays more than the most that can be had by staying in the one before: 0 to 1 for raising, 1 to 2
         # for carrying, from 2.5 on over the goal. None is flat.
         progress=(
-            "torch.where(arrived, 2.5 + 0.6 * lowered + 0.8 * opened,"
-            " raised * (1 + carried) * obj_grasped * near)"
+            "torch.where(arrived, 2.5 + lowered + 0.8 * opened,"
+            " raised * (1 + carried) * gripped * near)"
         ),
         remaining="to_goal",
         goal="goal_point",
@@ -293,5 +293,11 @@ def _carry(
         extras=[
             LEAVE_REF,
             ("not_too_high", "-1.0 * (height - 0.2).clamp(0.0, 0.3)"),
+            # Summed over the way it costs as much as it would earn at the goal, at whatever speed.
+            (
+                "dragged",
+                "-15.0 * torch.norm(obj_vel[:, :2], dim=-1).clamp(max=1.0)"
+                " * ((height < 0.02) & (to_goal < way - 0.03) & ~arrived).float()",
+            ),
         ],
     )

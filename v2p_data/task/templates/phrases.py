@@ -37,6 +37,8 @@ def grasp_setup(name: str = "obj") -> list[str]:
         "closing[:, 1] = 1",
         "closing = in_world_frame(eef_quat, closing)",
         f"pads_apart = 2 * {name}_half({name}_quat, {name}_size, closing)",
+        # Closed fingers that press on the top of a cover touch it with both pads too.
+        f"gripped = {name}_grasped * (eef_pos[:, 2] - {name}_pos[:, 2] < (tall - 0.002).clamp(min=0.02)).float()",
         f"diagonal = torch.norm({name}_size[:, :2], dim=-1)",
     ]
 

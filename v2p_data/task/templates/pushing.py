@@ -179,7 +179,7 @@ def push_with(m: Measured, v: Variant) -> Draft:
             "closer = (1 - gap / 0.2).clamp(0.0, 1.0)",
         ],
         target="grasp_point",
-        contact="ref_grasped * near",
+        contact="gripped * near",
         pays_contact=True,
         progress=f"(moved / {far + 0.02:.3f}).clamp(-1.0, 1.0) * contact * {LOW}.float() * {STANDING}",
         remaining=f"({far} - moved).clamp(min=0.0)",

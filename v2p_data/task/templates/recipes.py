@@ -57,7 +57,7 @@ def _generic(m: Measured, v: Variant) -> Draft:
         success=success,
         reward_setup=grasp_setup() if lifts else push_point_setup(clearance_m=0.02),
         target="grasp_point" if lifts else "push_point",
-        contact="obj_grasped * near" if lifts else "near",
+        contact="gripped * near" if lifts else "near",
         pays_contact=bool(lifts),
         progress=f"(1 - remaining / {wanted:.3f}).clamp(-1.0, 1.0)",
         remaining="remaining",

@@ -10,13 +10,15 @@ _TURN = (
 """Without it, open fingers get wedged over the diagonal of a wide box, and closing them achieves nothing. It counts near
 the object only: paid everywhere, turning is learned instead of reaching, and after 0.1 million steps the object is in
 the gripper a tenth as often."""
-_CLOSE = (
-    "close",
-    "0.1 * (distance < 0.025).float() * (gripper_width > pads_apart - 0.004).float()"
-    " * (1 - (gripper_width - pads_apart) / 0.085).clamp(0.0, 1.0)",
+_FINGERS = (
+    "fingers",
+    "0.05 * torch.where(distance < 0.025, (gripper_width > pads_apart - 0.004).float()"
+    " * (2 - (gripper_width - pads_apart) / 0.085).clamp(0.0, 2.0),"
+    " reach * ((gripper_width - pads_apart) / 0.01).clamp(0.0, 1.0))",
 )
-"""Closing takes four steps, and only the last one makes contact. It counts where the object is between the pads: fingers
-that have closed above it are narrower than it."""
+"""Wide enough on the way, then ever closer around the object. Without it fingers wander until they do not fit over wide
+things, and closing takes four steps of which only the last one makes contact. Fingers that have closed above the object
+are narrower than it."""
 
 
 def docstring_lines(v: Variant, d: Draft) -> list[str]:
@@ -71,7 +73,7 @@ def _components(v: Variant, d: Draft) -> list[tuple[str, str]]:
         progress = f"{v.progress} * progress * (0.3 + 0.7 * reach)"
     parts.append(("reach", reach))
     if v.contact and d.pays_contact:
-        parts += [_TURN, _CLOSE]
+        parts += [_TURN, _FINGERS]
         parts.append(("contact", f"{v.contact} * contact"))
     parts.append(("progress", progress))
     if v.speed:

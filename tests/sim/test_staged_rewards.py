@@ -1,0 +1,135 @@
+"""The rewards of kinds whose objects are gripped, at moments made by hand: each world of a batch is one moment."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.task.benchmark import load_benchmark
+
+OPEN_M = 0.085
+WORLDS = 10
+
+
+class Moments:
+    """Worlds of one benchmark task, all with the start and the sizes of the first."""
+
+    def __init__(self, name: str) -> None:
+        self.env = BatchEnv(load_benchmark(name), num_envs=WORLDS, seed=0, num_threads=1)
+        self.states = {
+            key: value[:1].expand(value.shape).clone() for key, value in self.env.states().items()
+        }
+        self.states["gripper_width"][:] = OPEN_M
+
+    def start(self, thing: str) -> np.ndarray:
+        return self.states[f"{thing}_start_pos"][0].double().numpy()
+
+    def widest(self, thing: str) -> float:
+        return float(self.states[f"{thing}_size"][0, :2].max())
+
+    def narrowest(self, thing: str) -> float:
+        return float(self.states[f"{thing}_size"][0, :2].min())
+
+    def pay(self, moments: list[dict[str, Any]]) -> list[float]:
+        """Return the rewards of moments, each of which says what differs from the start."""
+        states = {key: value.clone() for key, value in self.states.items()}
+        for world, moment in enumerate(moments):
+            for key, value in moment.items():
+                states[key][world] = torch.as_tensor(value, dtype=torch.float32)
+        said = self.env.task.judge(lambda: dict(states), torch.zeros(WORLDS, 7))
+        return said.reward[: len(moments)].tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "thing", "other"),
+    [
+        ("insert", "fork", "container"),
+        ("cover", "cup", "cube"),
+        ("drop_in_front_of", "matchbox", "mug"),
+    ],
+)
+def test_each_stage_of_carrying_pays_more_than_the_one_before(name, thing, other):
+    moments = Moments(name)
+    start, goal = moments.start(thing), moments.start(other)
+    if name == "drop_in_front_of":
+        goal[0] -= (moments.widest(thing) + moments.widest(other)) / 2 + 0.02
+    goal[2] = start[2]
+    up, grip = np.array([0, 0, 0.08]), np.array([0, 0, max(start[2] - 0.035, 0.0)])
+
+    def at(pos: np.ndarray, *, held: bool) -> dict[str, Any]:
+        return {
+            f"{thing}_pos": pos,
+            f"{thing}_grasped": float(held),
+            f"{thing}_touched": float(held),
+            "eef_pos": pos + grip,
+            "gripper_width": moments.narrowest(thing) if held else OPEN_M,
+        }
+
+    paid = moments.pay(
+        [
+            at(start, held=False),
+            at(start, held=True),
+            at(start + up / 2, held=True),
+            at(start + up, held=True),
+            at(start + up + 0.3 * (goal - start), held=True),
+            at(start + up + 0.6 * (goal - start), held=True),
+            at(goal + up, held=True),
+            at(goal + up / 2, held=True),
+            at(goal + up / 2, held=False),
+            at(goal + up / 4, held=False),
+        ]
+    )
+
+    assert all(np.diff(paid) > 0), paid
+
+
+def test_dragging_a_thing_along_the_table_costs_while_carrying_it_pays():
+    moments = Moments("drop_in_front_of")
+    start, mug = moments.start("matchbox"), moments.start("mug")
+    midway = start + np.append(0.5 * (mug - start)[:2], 0.0)
+    moving = {"matchbox_vel_linear": [0.0, 0.2, 0.0], "matchbox_grasped": 1.0}
+
+    dragged, left, carried = moments.pay(
+        [
+            moving | {"matchbox_pos": midway, "eef_pos": midway},
+            {},
+            moving | {"matchbox_pos": midway + [0, 0, 0.06], "eef_pos": midway + [0, 0, 0.06]},  # noqa: RUF005
+        ]
+    )
+
+    assert dragged < left < carried
+
+
+def test_fingers_that_close_around_a_thing_earn_more_and_more_and_those_closed_above_it_do_not():
+    moments = Moments("drop_in_front_of")
+    around = {"eef_pos": moments.start("matchbox")}
+
+    open_wide, halfway, nearly, above = moments.pay(
+        [around | {"gripper_width": width_m} for width_m in (0.085, 0.075, 0.065, 0.0)]
+    )
+
+    assert open_wide < halfway < nearly
+    assert above < open_wide
+
+
+def test_closed_fingers_that_press_on_the_top_of_a_cover_have_not_gripped_it():
+    moments = Moments("uncover")
+    cup = moments.start("cup")
+    touching = {"cup_grasped": 1.0, "cup_touched": 1.0, "gripper_width": 0.0}
+    top = np.array([0, 0, cup[2] + 0.003])
+
+    pressed, near = moments.pay([touching | {"eef_pos": cup + top}, {"eef_pos": cup + top}])
+
+    assert pressed <= near
+
+
+def test_going_straight_at_the_side_of_a_tall_thing_pays_less_than_being_above_it():
+    moments = Moments("uncover")
+    cup = moments.start("cup")
+    grasp = cup + np.array([0, 0, cup[2] - 0.035])
+
+    beside, above = moments.pay([{"eef_pos": grasp + np.array([0.06, 0, z])} for z in (0.0, 0.06)])
+
+    assert above > beside
