@@ -200,7 +200,12 @@ def test_recorded_states_are_those_that_the_reward_was_paid_for(scenes):
     assert recorded.moments.tolist() == [0, 3, 6, 8, 11]
     # The effort is -0.005 |a|^2 with |a|^2 = 7 / 4; the reach follows from the states that were kept.
     np.testing.assert_allclose(recorded.components["effort"], -0.005 * 7 / 4, rtol=1e-5)
-    away = np.linalg.norm(recorded.states["box_pos"] - recorded.states["eef_pos"], axis=-1)
+    # From beside it, the point to reach for lies above the box, by its height at most.
+    away = recorded.states["box_pos"] - recorded.states["eef_pos"]
+    beside = np.linalg.norm(away[..., :2], axis=-1)
+    height = 2 * recorded.states["box_start_pos"][..., 2]
+    above = np.minimum(1.5 * np.maximum(beside - 0.01, 0), height)
+    away = np.hypot(beside, away[..., 2] + above)
     paid = recorded.components["reach"][recorded.moments]
     np.testing.assert_allclose(paid, 0.2 * (1 - np.tanh(8 * away)), atol=1e-5)
     total = 100 * sum(recorded.components.values())
