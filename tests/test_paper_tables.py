@@ -26,7 +26,7 @@ TABLES = {name: table["rows"] for name, table in DATA["tables"].items()}
 LIKE_THE_PAPER = {
     "recipe/codes": TaskConfig().num_samples,
     "recipe/rewards": RewardConfig().candidates,
-    "recipe/lambda": SimConfig().success_bonus,
+    "recipe/lambda": SimConfig().bonus_ratio,
     "recipe/positive points": SegmentConfig().num_points,
     "recipe/steps between code policies": EVERY_STEPS,
     "recipe/trajectories": EpisodesConfig().num_episodes,

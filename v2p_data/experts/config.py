@@ -31,6 +31,9 @@ class ExpertConfig:
     backend: Backend = "cpu"
     """Where PPO's worlds are simulated: `warp` is for the GPU of `--device` and 8192 worlds; all else stays on
     the CPU."""
+    taught_bonus_factor: float = 100.0
+    """After imitation a step of success pays so many times its usual bonus: what is left to learn is success and its time,
+    not how to get there."""
     compare_worlds: int = 256
     """Episodes at the fine time step that the taught policy and PPO's both play; the better one becomes the expert."""
     eval_episodes: int = 64

@@ -119,7 +119,7 @@ def learn(
             steps += cfg.trial_worlds * worlds.bundle.horizon_steps
         del trial_env
     pupil = taught.folder if taught else None
-    env = _training_worlds(worlds, cfg, bank, device, fine=pupil is not None and bank is None)
+    env = _training_worlds(worlds, cfg, bank, device, is_taught=pupil is not None)
     ranked = rank_solved(worlds.bundle, env.worlds.obs_dim, solved) if pupil is None else []
     other = ranked[0].folder if ranked else None
     if other is not None:
@@ -289,12 +289,16 @@ def _say_unchanged(title: str, improved: ExpertResult, pupil: Path | None) -> No
 
 
 def _training_worlds(
-    worlds: Worlds, cfg: ExpertConfig, bank: Bank | None, device: str, *, fine: bool
+    worlds: Worlds, cfg: ExpertConfig, bank: Bank | None, device: str, *, is_taught: bool
 ) -> TorchRLEnv:
-    """Return the worlds of PPO, some of whose episodes begin from the bank where there is one."""
+    """Return the worlds of PPO, some of whose episodes begin from the bank where there is one.
+
+    A taught policy goes on at the fine time step, but for a bank, whose moments are those of the coarse one.
+    """
+    bonus = worlds.bonus_ratio * (cfg.taught_bonus_factor if is_taught else 1.0)
     env = make_batch_env(
         worlds.bundle,
-        SimConfig(fine=fine, bonus_ratio=worlds.bonus_ratio),
+        SimConfig(fine=is_taught and bank is None, bonus_ratio=bonus),
         num_envs=cfg.num_envs,
         seed=seed_for(worlds.seed, "worlds"),
         num_threads=worlds.num_threads,
