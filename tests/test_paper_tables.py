@@ -12,6 +12,7 @@ from policies.bc.configuration_v2p_bc import V2PBCConfig
 from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
 from results_table import ROOT
 from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.experts.config import ExpertConfig
 from v2p_data.policy_config import PAPER_BATCH_SIZE, PAPER_EPOCHS
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.programs import EVERY_STEPS
@@ -26,7 +27,7 @@ TABLES = {name: table["rows"] for name, table in DATA["tables"].items()}
 LIKE_THE_PAPER = {
     "recipe/codes": TaskConfig().num_samples,
     "recipe/rewards": RewardConfig().candidates,
-    "recipe/lambda": SimConfig().bonus_ratio,
+    "recipe/lambda": ExpertConfig().taught_bonus_factor,
     "recipe/positive points": SegmentConfig().num_points,
     "recipe/steps between code policies": EVERY_STEPS,
     "recipe/trajectories": EpisodesConfig().num_episodes,
