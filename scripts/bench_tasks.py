@@ -57,6 +57,12 @@ def main() -> None:
     parser.add_argument(
         "--target-success", type=float, default=PPOConfig().target_success, help="see PPOConfig"
     )
+    parser.add_argument(
+        "--taught-bonus-factor",
+        type=float,
+        default=ExpertConfig().taught_bonus_factor,
+        help="see ExpertConfig",
+    )
     parser.add_argument("--teacher", choices=["programs", "none"], default="programs")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print the results so far and stop")
@@ -77,7 +83,7 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
     bundle = TaskBundle.load(Path(task)) if Path(task).is_dir() else load_benchmark(task)
     task = Path(task).name
     folder = args.out / f"{task}-{args.teacher}-{seed}"
-    base = ExpertConfig(teacher=args.teacher)
+    base = ExpertConfig(teacher=args.teacher, taught_bonus_factor=args.taught_bonus_factor)
     cfg = replace(
         base,
         ppo=replace(
@@ -112,6 +118,7 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
         "task": task,
         "seed": seed,
         "teacher": args.teacher,
+        "taught_bonus_factor": args.taught_bonus_factor,
         "commit": commit(),
         "judged": {who: _judged(rollouts) for who, rollouts in judged.items()},
         "episodes": args.episodes,
