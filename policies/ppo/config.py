@@ -103,7 +103,7 @@ class PPOConfig:
     """Exploration of a policy that starts from another expert's weights."""
     warm_start_learning_rate: float = 2e-4
     """At the start of such a training."""
-    warm_start_critic_batches: int = 2
+    warm_start_critic_batches: int = 6
     """So many batches teach only the value after a warm start: a value that knows nothing spoils a good policy."""
     checkpoint_seconds: float = 10.0
     """A kill loses at most about this much work."""
