@@ -10,7 +10,7 @@ from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.task.benchmark import load_benchmark
 
 OPEN_M = 0.085
-WORLDS = 10
+WORLDS = 12
 
 
 class Moments:
@@ -75,6 +75,8 @@ def test_each_stage_of_carrying_pays_more_than_the_one_before(name, thing, other
             at(start + up, held=True),
             at(start + up + 0.3 * (goal - start), held=True),
             at(start + up + 0.6 * (goal - start), held=True),
+            at(goal + 4 * up, held=True),
+            at(goal + 2 * up, held=True),
             at(goal + up, held=True),
             at(goal + up / 2, held=True),
             at(goal + up / 2, held=False),
