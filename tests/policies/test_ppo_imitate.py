@@ -212,6 +212,23 @@ def test_the_actor_s_first_step_after_a_warm_start_is_a_careful_one(pupil: Path,
     assert moved("b", 5e-5) == pytest.approx(5e-5, rel=0.05)
 
 
+@pytest.mark.parametrize(("batches", "updates"), [(1, 0), (3, 2)])
+def test_only_gradient_steps_that_move_the_actor_are_counted(
+    pupil: Path, tmp_path: Path, batches: int, updates: int
+):
+    cfg = replace(
+        PPO,
+        total_steps=batches * BATCH,
+        epochs=1,
+        minibatch=BATCH,
+        warm_start_critic_batches=1,
+    )
+
+    result = train_expert(PointMass(NUM_ENVS, seed=2), cfg, tmp_path, warm_start=pupil)
+
+    assert result.last_actor_updates == updates
+
+
 @pytest.mark.slow
 def test_going_on_does_not_lose_a_policy_that_succeeds(pupil: Path, tmp_path: Path):
     before = success(pupil)

@@ -87,6 +87,21 @@ def test_a_point_learns_to_reach_its_goal(tmp_path: Path):
     assert (tmp_path / "curve.png").stat().st_size > 1000
 
 
+def test_a_plateau_does_not_end_a_training_that_is_not_good_enough(tmp_path: Path):
+    cfg = replace(steps(6), plateau_steps=BATCH, plateau_gain=1.0)
+
+    assert train_expert(PointMass(64, seed=1), cfg, tmp_path).stopped_by == "steps"
+
+
+def test_a_plateau_ends_a_training_that_is_good_enough(tmp_path: Path):
+    cfg = replace(steps(60), target_success=0.0, plateau_steps=BATCH, plateau_gain=1.0)
+
+    result = train_expert(PointMass(64, seed=1), cfg, tmp_path)
+
+    assert result.stopped_by == "plateau"
+    assert result.steps < 60 * BATCH
+
+
 def test_an_untrained_point_rarely_reaches_its_goal(tmp_path: Path):
     result = train_expert(
         PointMass(64, seed=1), steps(1), tmp_path, eval_env=PointMass(64, seed=2)
