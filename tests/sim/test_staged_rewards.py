@@ -104,12 +104,13 @@ def test_dragging_a_thing_along_the_table_costs_while_carrying_it_pays():
     assert dragged < left < carried
 
 
-def test_fingers_that_close_around_a_thing_earn_more_and_more_and_those_closed_above_it_do_not():
-    moments = Moments("drop_in_front_of")
-    around = {"eef_pos": moments.start("matchbox")}
+def test_fingers_that_close_around_a_wide_thing_earn_more_and_more_and_those_closed_above_it_do_not():
+    moments = Moments("uncover")
+    cup = moments.start("cup")
+    around = {"eef_pos": cup + np.array([0, 0, cup[2] - 0.035])}
 
     open_wide, halfway, nearly, above = moments.pay(
-        [around | {"gripper_width": width_m} for width_m in (0.085, 0.075, 0.065, 0.0)]
+        [around | {"gripper_width": width_m} for width_m in (0.085, 0.083, 0.081, 0.0)]
     )
 
     assert open_wide < halfway < nearly

@@ -40,6 +40,7 @@ def grasp_setup(name: str = "obj") -> list[str]:
         # Closed fingers that press on the top of a cover touch it with both pads too.
         f"gripped = {name}_grasped * (eef_pos[:, 2] - {name}_pos[:, 2] < (tall - 0.002).clamp(min=0.02)).float()",
         f"diagonal = torch.norm({name}_size[:, :2], dim=-1)",
+        f"snug = (torch.minimum({name}_size[:, 0], {name}_size[:, 1]) > 0.06).float()",
     ]
 
 

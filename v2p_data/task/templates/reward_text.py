@@ -12,13 +12,13 @@ the object only: paid everywhere, turning is learned instead of reaching, and af
 the gripper a tenth as often."""
 _FINGERS = (
     "fingers",
-    "0.05 * torch.where(distance < 0.025, (gripper_width > pads_apart - 0.004).float()"
+    "0.05 * snug * torch.where(distance < 0.025, (gripper_width > pads_apart - 0.004).float()"
     " * (2 - (gripper_width - pads_apart) / 0.085).clamp(0.0, 2.0),"
     " reach * ((gripper_width - pads_apart) / 0.01).clamp(0.0, 1.0))",
 )
-"""Wide enough on the way, then ever closer around the object. Without it fingers wander until they do not fit over wide
-things, and closing takes four steps of which only the last one makes contact. Fingers that have closed above the object
-are narrower than it."""
+"""Wide enough on the way, then ever closer around the object, for what nearly fills the gripper: fingers that wander do
+not fit over it. Fingers that have closed above it are narrower than it. Paid for a box of 4 x 6 cm too, it teaches to keep
+the fingers open: the box was in them half as often after 0.12 million steps."""
 
 
 def docstring_lines(v: Variant, d: Draft) -> list[str]:
