@@ -8,7 +8,6 @@ Nothing stops a training early; the policy at its end is judged by the referee o
 
 import csv
 import json
-import subprocess
 import tempfile
 import time
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ import tyro
 
 from policies.ppo.policy import Expert
 from policies.ppo.train import train_expert
-from studies.results import append_result, results_in
+from studies.results import append_result, commit, results_in
 from v2p_data.episodes.collect import judge_expert
 from v2p_data.reward.candidate import LAST_POLICY
 from v2p_data.reward.worker import ppo_config
@@ -101,15 +100,8 @@ def measured(task: str, ratio: float, seed: int, settings: Settings) -> dict[str
         "mean_success_in_training": round(sum(known) / len(curve), 4),
         "steps_to_half": next((n for n, s in curve if s >= 0.5), None),
         "cpu_seconds": round(cpu, 1),
-        "commit": _commit(),
+        "commit": commit(),
     }
-
-
-def _commit() -> str:
-    made = subprocess.run(
-        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-    )
-    return made.stdout.strip()
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ them. Results are appended to a JSON-lines file, so that a stopped run goes on w
 import argparse
 import logging
 import os
+import shutil
 import time
 from dataclasses import replace
 from functools import partial
@@ -72,7 +73,7 @@ def main() -> None:
     if not args.table:
         for seed in args.seeds:
             for task in args.tasks:
-                if (Path(task).name, seed, args.teacher) not in {
+                if (Path(task).name, seed, args.teacher, args.taught_bonus_factor) not in {
                     _key(r) for r in results_in(args.out)
                 }:
                     _one(task, seed, args)
@@ -82,7 +83,9 @@ def main() -> None:
 def _one(task: str, seed: int, args: argparse.Namespace) -> None:
     bundle = TaskBundle.load(Path(task)) if Path(task).is_dir() else load_benchmark(task)
     task = Path(task).name
-    folder = args.out / f"{task}-{args.teacher}-{seed}"
+    folder = args.out / f"{task}-{args.teacher}-{args.taught_bonus_factor:g}-{seed}"
+    if args.teacher == "programs":  # a half-made training is not gone on with after imitation anew
+        shutil.rmtree(folder, ignore_errors=True)
     base = ExpertConfig(teacher=args.teacher, taught_bonus_factor=args.taught_bonus_factor)
     cfg = replace(
         base,
@@ -161,8 +164,8 @@ def _curve(folder: Path, points: int = 12) -> list[list[float | None]]:
     ]
 
 
-def _key(result: dict) -> tuple[str, int, str]:
-    return result["task"], result["seed"], result["teacher"]
+def _key(result: dict) -> tuple[str, int, str, float]:
+    return result["task"], result["seed"], result["teacher"], result["taught_bonus_factor"]
 
 
 def table(results: list[dict[str, Any]]) -> str:
@@ -193,16 +196,20 @@ def _taught_cells(group: list[dict[str, Any]]) -> str:
     if not group:
         return " | ".join("-" * 10)
     learned = [r["learned"] for r in group]
-    expert, taught = (_successes(group, who) for who in ("expert", "taught"))
-    both = expert & taught
-    gain = success_difference(expert, taught)
-    saved = median_difference(
-        CONTROL_DT_S * _steps(group, "taught")[both], CONTROL_DT_S * _steps(group, "expert")[both]
-    )
+    pairs = [r for r in group if "taught" in r["judged"]]
+    gain = saved = None
+    if pairs:
+        expert, taught = (_successes(pairs, who) for who in ("expert", "taught"))
+        both = expert & taught
+        gain = success_difference(expert, taught)
+        saved = median_difference(
+            CONTROL_DT_S * _steps(pairs, "taught")[both],
+            CONTROL_DT_S * _steps(pairs, "expert")[both],
+        )
     return " | ".join(
         (
             *(_rate(group, who) for who in ("program", "taught", "expert")),
-            f"{gain.value:+.3f} ({gain.low:+.3f} to {gain.high:+.3f})",
+            f"{gain.value:+.3f} ({gain.low:+.3f} to {gain.high:+.3f})" if gain else "-",
             f"{saved.value:+.2f} ({saved.low:+.2f} to {saved.high:+.2f})" if saved else "-",
             f"{sum(one['kept'] == 'ppo' for one in learned)} of {len(group)}",
             _range([one["actor_updates"] for one in learned], ",.0f"),

@@ -69,7 +69,7 @@ class PPOConfig:
     target_success: float = 0.98
     """Training goes on to this success of the deterministic worlds before a plateau may end it."""
     plateau_steps: int = 100_000
-    """From then on it stops once so many control steps brought no better success or time to success."""
+    """It stops then, if so many control steps, and eight batches, have brought no better success or time to success."""
     plateau_gain: float = 0.005
     """What counts as better: so much more success, or a time to success that is shorter by ten times this share of an episode."""
     window_episodes: int = 128

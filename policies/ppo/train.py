@@ -54,6 +54,8 @@ FINITE_KEYS = (("next", "observation"), ("next", "reward"), "observation", "acti
 COMPONENTS_KEY = ("next", "components")
 
 
+LEAST_PLATEAU_BATCHES = 8
+"""So many batches without a gain are no plateau yet, however many worlds a batch has."""
 StoppedBy = Literal["plateau", "steps", "seconds", "decline"]
 
 
@@ -64,7 +66,7 @@ class ExpertResult:
     folder: Path
     """The best expert."""
     success: float
-    """Deterministic success of the best window in training: chosen as the best of many, hence a little flattering."""
+    """Highest success at the end of deterministic episodes over a window of training: flattering, as the best of many."""
     actor_updates: int
     """Gradient steps that the best expert's actor took; 0 for an actor that is still as it was at the start."""
     last_actor_updates: int
@@ -128,7 +130,7 @@ def train_expert(
     on_progress: Callable[[int, int, float], None] | None = None,
     draws: bool = True,
 ) -> ExpertResult:
-    """Train until the target, the step budget or the time limit; go on from `out/checkpoint.pt` if it exists.
+    """Train until a plateau, a decline, the step budget or the time limit; go on from `out/checkpoint.pt` if it exists.
 
     Args:
         env: a batch of worlds (see the room's docstring) which the caller has seeded.
@@ -257,8 +259,10 @@ class _Learner:
             return "steps"
         if self.is_warm and progress.success(cfg) < progress.best_success - cfg.decline:
             return "decline"
-        is_good = progress.best_success >= cfg.target_success
-        if is_good and progress.steps - progress.plateau_since >= cfg.plateau_steps:
+        batch = self.num_envs * cfg.batch_time
+        since = max(progress.plateau_since, self.critic_batches * batch)
+        patience = max(cfg.plateau_steps, LEAST_PLATEAU_BATCHES * batch)
+        if progress.best_success >= cfg.target_success and progress.steps - since >= patience:
             return "plateau"
         if progress.seconds >= cfg.max_seconds:
             return "seconds"
@@ -313,7 +317,8 @@ class _Learner:
             progress.best_actor_updates = progress.actor_updates
             self.best_weights = weights_of(self.model)
         if now >= progress.plateau_score + self.cfg.plateau_gain:
-            progress.plateau_score, progress.plateau_since = now, progress.steps
+            progress.plateau_score = now
+            progress.plateau_since = progress.steps + self.num_envs * self.cfg.batch_time
 
     def _follow_episodes(self, batch: TensorDictBase) -> None:
         """Take note of finished episodes and of the scale of the returns."""

@@ -220,3 +220,23 @@ def test_a_scene_that_never_lay_on_disk_is_saved_whole(bundle: TaskBundle, tmp_p
     assert loaded.scene.objects == bundle.scene.objects
     assert reward_text(loaded.code) != reward_text(bundle.code)
     assert not (tmp_path / "bundle.partial").exists()
+
+
+class SilentWriter:
+    """A model that must not be asked."""
+
+    def task_code(self, bundle: TaskBundle) -> str:
+        raise AssertionError("asked for another success")
+
+    first_rewards = better_rewards = task_code
+
+
+def test_a_search_that_goes_on_keeps_the_success_that_it_began_with(bundle: TaskBundle):
+    made = replace(bundle, code=bundle.code + "\n# as it was made\n")
+
+    prepared = prepare(
+        bundle, RewardConfig(method="eureka"), np.random.default_rng(0), SilentWriter(), made
+    )
+
+    assert prepared.codes == (made.code,)
+    assert prepared.bundle.code == made.code

@@ -135,7 +135,7 @@ def learn(
     )
     del env
     comparison, updates = None, improved.actor_updates
-    if improved.last_actor_updates == 0:
+    if improved.last_actor_updates == 0 or (pupil is None and updates == 0):
         _say_unchanged(worlds.bundle.title, improved, pupil)
     elif pupil is not None:
         comparison, updates = keep_better(worlds, cfg, pupil, out, improved)
@@ -270,7 +270,7 @@ def keep_better(
 
 
 def _say_unchanged(title: str, improved: ExpertResult, pupil: Path | None) -> None:
-    """Warn that PPO changed nothing of a taught policy.
+    """Warn that PPO changed nothing of the policy that it started from, or nothing for the better.
 
     Raises:
         ItemRejectedError: `ppo_changed_nothing`: there is no taught policy either.

@@ -69,6 +69,7 @@ def prepare(
     cfg: RewardConfig,
     rng: np.random.Generator,
     writer: RewardWriter | None = None,
+    made: TaskBundle | None = None,
 ) -> Prepared:
     """Return the task and the first rewards of a method.
 
@@ -77,6 +78,7 @@ def prepare(
         cfg: method and switches.
         rng: which sample is taken where nobody picks.
         writer: writes the task anew where a method takes another success; by default a template does.
+        made: the task of a search that was stopped: a writer that is asked again may give another success.
 
     Raises:
         V2PError: the writer gives no code that runs.
@@ -86,7 +88,7 @@ def prepare(
     if writer is not None:
         if not is_own_success:
             return Prepared(bundle=bundle, seen=seen, codes=(bundle.code,), origins=("given",))
-        code = writer.task_code(bundle)
+        code = writer.task_code(bundle) if made is None else made.code
         base = replace(bundle, code=code, class_name=class_name(code), audit={})
         return Prepared(bundle=base, seen=seen, codes=(code,), origins=("model",))
     samples = write_samples(seen, NUM_VARIANTS)

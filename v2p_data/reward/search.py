@@ -209,11 +209,14 @@ class _Search:
     ) -> None:
         self.cfg, self.out, self.seed, self.how = cfg, out, seed, how
         self.writer, self.jobs, self.on_progress = writer, jobs, on_progress
-        self.prepared: Prepared = prepare(bundle, cfg, rng_for(seed, "first rewards"), writer)
+        made = TaskBundle.load(out / BUNDLE_FOLDER) if (out / BUNDLE_FOLDER).is_dir() else None
+        self.prepared: Prepared = prepare(
+            bundle, cfg, rng_for(seed, "first rewards"), writer, made
+        )
         self.base = self.prepared.bundle
         self.rounds: list[list[Candidate]] = []
         self.warm_start: Path | None = None
-        if not (out / BUNDLE_FOLDER).is_dir():
+        if made is None:
             save_bundle(self.base, out / BUNDLE_FOLDER)
 
     def run(self) -> Found:

@@ -75,16 +75,16 @@ def reset_findings(scene: Scene, offered: States, result: SmokeResult) -> ResetF
     rows = np.array(result.start_rows, int)
     if not len(rows):
         return ResetFindings()
-    solved = float(np.mean(result.start_success))
+    solved = np.array(result.start_success, bool)
     made, given = result.start_poses, _poses(scene, offered, rows)
     own = np.zeros(len(rows), bool)
     for name, pose in made.items():
         own |= ~np.isclose(pose, given[name], atol=1e-4).all(axis=1)
     if not own.any():
-        return ResetFindings(solved=solved)
+        return ResetFindings()
     at = made[scene.manipulated.name]
     return ResetFindings(
-        solved=solved,
+        solved=float((solved & own).mean()),
         impossible=float((_impossible(scene, made) & own).mean()),
         near_goal=float((_near_goal(scene, made, given) & own).mean()),
         leaning=float((_leans(scene.manipulated, at) & own).mean()),

@@ -26,7 +26,7 @@ from v2p_data.task.time_limit import line_in_task_code
 
 MEMORY_BYTES = 2 * 1024**3
 """On top of what importing torch has mapped."""
-MAX_REWARD = 1000.0
+LARGE_REWARD = 1000.0
 """Ten full rewards: beside them the bonus for success hardly counts."""
 MAX_ANSWER_BYTES = 4_000_000
 SLOW_S = 1.0
@@ -121,7 +121,7 @@ def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
     _demand_own_success(task, states, first)
     edge = _answers(task, _tensors(request["edge_states"]))
     biggest = max(float(first.reward.max()), float(edge.reward.max()))
-    if biggest > MAX_REWARD:
+    if biggest > LARGE_REWARD:
         warnings.append(
             f"the reward reaches {biggest:.3g}, a full one is 100; beside it the bonus for success hardly counts"
         )
