@@ -23,7 +23,7 @@ from v2p_data.task.benchmark import load_benchmark
 
 PASSING = toy_run.CODE.replace(
     'return (states["eef_pos"][:, 1] > 0.08) & (states["cube_pos"][:, 0] < 0.55)',
-    'return (states["eef_pos"][:, 1] > 0.02) & (states["eef_pos"][:, 1] < 0.2)',
+    'return (states["eef_pos"][:, 1] > 0.13) & (states["eef_pos"][:, 1] < 0.3)',
 )
 
 

@@ -23,7 +23,7 @@ class LiftCube(Task):
         self.task_description = "lifting a cube"
 
     def compute_success(self, states):
-        return states["cube_pos"][:, 2] > HEIGHT
+        return (states["cube_pos"][:, 2] > HEIGHT) & (states["progress"] > AFTER)
 
     def compute_reward(self, actions, states):
         height = states["cube_pos"][:, 2]
@@ -36,13 +36,20 @@ def write_task(make_bundle, tmp_path):
     """Write a task folder whose success is the cube's centre being above some height."""
     from dataclasses import replace
 
-    def write(folder: Path, height: float = 0.12, horizon: int = 6, kind: str = "lift_up") -> Path:
+    def write(
+        folder: Path,
+        height: float = 0.12,
+        horizon: int = 6,
+        kind: str = "lift_up",
+        after: float = -1.0,
+    ) -> Path:
         scene_folder = tmp_path / "scene"
         scene_folder.mkdir(exist_ok=True)
         bundle = make_bundle(folder=scene_folder, horizon=horizon, kind=kind)
         bundle.scene.save(scene_folder)
         folder.mkdir(parents=True)
-        replace(bundle, code=LIFT.replace("HEIGHT", str(height)), title=folder.name).save(folder)
+        code = LIFT.replace("HEIGHT", str(height)).replace("AFTER", str(after))
+        replace(bundle, code=code, title=folder.name).save(folder)
         return folder
 
     return write
@@ -134,15 +141,15 @@ def test_an_episode_without_success_ends_at_a_multiple_of_the_horizon(
 
 
 def test_success_counts_when_held_and_ends_the_episode(write_task, tmp_path):
-    """The cube is above -1 m all the time, and it rests, which is all the video shows."""
-    folder = write_task(tmp_path / "easy", height=-1.0, horizon=20, kind="generic")
+    """From the second of 20 steps on the cube is above -1 m, and it rests, which is all the video shows."""
+    folder = write_task(tmp_path / "easy", height=-1.0, horizon=20, kind="generic", after=0.06)
     env = V2PEnv(str(folder))
     env.reset(seed=0)
 
-    steps = [env.step(np.zeros(7, np.float32)) for _ in range(5)]
+    steps = [env.step(np.zeros(7, np.float32)) for _ in range(6)]
 
-    assert [info["is_success"] for *_, info in steps] == [False] * 4 + [True]
-    assert [terminated for _, _, terminated, *_ in steps] == [False] * 4 + [True]
+    assert [info["is_success"] for *_, info in steps] == [False] * 5 + [True]
+    assert [terminated for _, _, terminated, *_ in steps] == [False] * 5 + [True]
     env.close()
 
 
@@ -180,7 +187,7 @@ def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(wri
 
     run = tmp_path / "run" / "task"
     for name in ("b-push", "a-lift"):
-        write_task(run / name, height=-1.0, kind="generic")
+        write_task(run / name, height=-1.0, kind="generic", after=0.2)
     write_task(run / "c-torn.partial")
     config = make_env_config("v2p", tasks=str(run))
 
@@ -191,10 +198,10 @@ def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(wri
     assert env.call("task_description") == ("lifting a cube",) * 2
     assert env.call("_max_episode_steps") == (12, 12)
     env.reset(seed=[1, 2])
-    infos = [env.step(np.zeros((2, 7), np.float32))[4] for _ in range(7)]
-    assert "final_info" not in infos[3]
-    assert infos[4]["final_info"]["is_success"].tolist() == [True, True]
-    assert infos[6]["final_info"]["is_success"].tolist() == [True, True]
+    infos = [env.step(np.zeros((2, 7), np.float32))[4] for _ in range(8)]
+    assert "final_info" not in infos[4]
+    assert infos[5]["final_info"]["is_success"].tolist() == [True, True]
+    assert infos[7]["final_info"]["is_success"].tolist() == [True, True]
     for env in envs["v2p"].values():
         env.close()
 
