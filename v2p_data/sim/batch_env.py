@@ -305,6 +305,7 @@ class BatchEnv:
         steps = self._rng.integers(0, self.horizon, self.num_envs)
         stays = (self._bank_row >= 0) | (np.arange(self.num_envs) < first)
         self._steps[:] = np.where(stays, self._steps, steps)
+        self._held[~stays] = 0  # no starts, but moments of episodes
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Start new episodes in the worlds `ids`."""
