@@ -59,8 +59,8 @@ TINY_EXPERT = (
 UPWARDS, FLAT = "states['eef_pos'][:, 2]", "0 * states['eef_pos'][:, 2] + 5"
 LYING = "states['tea_box_start_pos'][:, 1]"
 HONEST = "-torch.tanh(states['tea_box_start_pos'][:, 1]) - 0.1 * (actions**2).sum(dim=-1)"
-ANY_GRIP = "states['gripper_width'] < 0.08"
-"""False while nothing is done, and true for much of what an untrained arm does."""
+ANY_GRIP = "(states['gripper_width'] < 0.08) & (states['progress'] > 0.06)"
+"""False at the first step, and true for much of what an untrained arm does."""
 REWARD = """
 def reward_function(actions, states):
     side = {}
