@@ -1,22 +1,19 @@
 """What the lines of a study say together: rates with intervals, paired differences, and laws of failure against N."""
 
-import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
-from scipy.special import ndtri
 
+from policies.evaluation.paired import success_difference
 from policies.evaluation.rate import Rate, wilson
 
 Row = dict[str, Any]
 When = Literal["once", "at_end"]
 Group = Literal["all", "shape", "category"]
-Z_95 = float(ndtri(0.975))
-"""Two-sided 95 % quantile of the normal distribution."""
 PARAMETERS = 2
 """Of either law; a fit of as many points says nothing."""
 
@@ -56,40 +53,26 @@ class Difference:
 
 
 def paired(ours: Sequence[Row], others: Sequence[Row], when: When = "once") -> Difference | None:
-    """Return the difference of two arms over the seeds and objects that both have; None without any.
-
-    The interval is the normal one after half a pair was added to each of the four outcomes, so that it does not shrink
-    to nothing where no pair differs.
-
-    Source: Agresti & Min 2005, section 2.
-    """
+    """Return the difference of two arms over the seeds and objects that both have; None without any."""
     theirs = {row["seed"]: row for row in others}
-    parts: list[np.ndarray] = []
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
     for row in ours:
         other = theirs.get(row["seed"])
         if other is None:
             continue
-        parts.append(
-            np.array(
-                [
-                    int(a) - int(b)
-                    for name, judged in row["objects"].items()
-                    for a, b in zip(judged[when], other["objects"][name][when], strict=True)
-                ],
-                float,
-            )
-        )
-    if not parts:
+        both = [
+            (a == "1", b == "1")
+            for name, judged in row["objects"].items()
+            for a, b in zip(judged[when], other["objects"][name][when], strict=True)
+        ]
+        mine, its = np.array(both, bool).reshape(-1, 2).T
+        pairs.append((mine, its))
+    if not pairs:
         return None
-    all_of = np.concatenate(parts)
-    n, net, changed = len(all_of) + 2, all_of.sum(), np.abs(all_of).sum() + 1
-    half = Z_95 * math.sqrt(changed - net**2 / n) / n
+    difference = success_difference(*(np.concatenate(side) for side in zip(*pairs, strict=True)))
     return Difference(
-        value=float(all_of.mean()),
-        low=float(net / n - half),
-        high=float(net / n + half),
-        pairs=len(all_of),
-        seeds=tuple(float(p.mean()) for p in parts),
+        **asdict(difference),
+        seeds=tuple(float(mine.mean() - its.mean()) for mine, its in pairs),
     )
 
 

@@ -354,7 +354,7 @@ def test_a_method_that_hides_the_video_has_the_model_write_the_task_anew_without
     flags: list[str], hidden: tuple[str, ...], kept: tuple[str, ...], tmp_path: Path
 ):
     bundle = bundle_with(BY_CHANCE)
-    anew = bundle_with(f"{BY_CHANCE.removesuffix('0')}0.05")
+    anew = bundle_with(BY_CHANCE.replace("[:, 1] < 0)", "[:, 1] < 0.05)"))
     server = ChatServer()
 
     def answer(request):

@@ -79,7 +79,11 @@ class Rollouts:
             return {"reason": "simulation_broke", "detail": "the state was not finite",
                     "value": int(self.num_frames[world])}  # fmt: skip
         if not self.task_successes[world]:
-            how = "from the start, which never counts" if self.success[0, world] else "and never held"
+            how = (
+                "from the start, which never counts"
+                if self.success[0, world]
+                else "and never held"
+            )
             return {"reason": "not_successful", "value": steps_true,
                     "detail": f"success was true in {steps_true} steps {how}"}  # fmt: skip
         return {"reason": "referee_disagrees", "value": int(self.num_frames[world]),
