@@ -10,6 +10,8 @@ Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
 LEAST_PAIRS = 6
 """Fewer pairs give no 95 % interval of a median, whatever they are."""
+TIME_WEIGHT = 0.1
+"""What the time to success counts beside success itself: an episode that succeeds at its very end is worth 0.9."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,3 +73,13 @@ def median_difference(
         high=float(interval.high),
         pairs=len(pairs),
     )
+
+
+def score(success: float, waited: float) -> float:
+    """Return what an episode is worth: 0 for a failure, else 1 minus a little for the time to success.
+
+    Args:
+        success: 1 for a success, else 0.
+        waited: share of the episode before success was first held.
+    """
+    return success * (1 - TIME_WEIGHT * waited)

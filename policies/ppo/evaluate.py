@@ -9,19 +9,6 @@ from torchrl.envs import EnvBase
 
 from policies.evaluation.rate import Rate, wilson
 
-TIME_WEIGHT = 0.1
-"""What the time to success counts beside success itself: an episode that succeeds at its very end is worth 0.9."""
-
-
-def score(success: float, waited: float) -> float:
-    """Return what an episode is worth: 0 for a failure, else 1 minus a little for the time to success.
-
-    Args:
-        success: 1 for a success, else 0.
-        waited: share of the episode before success was first held.
-    """
-    return success * (1 - TIME_WEIGHT * waited)
-
 
 @torch.no_grad()
 def evaluate(

@@ -30,6 +30,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from policies.evaluation.paired import score
 from policies.evaluation.rate import Rate
 from policies.ppo.config import PPOConfig
 from policies.ppo.curve import (
@@ -41,7 +42,7 @@ from policies.ppo.curve import (
     cut_after,
     plot_curve,
 )
-from policies.ppo.evaluate import evaluate, outcome, score
+from policies.ppo.evaluate import evaluate, outcome
 from policies.ppo.policy import ActorCritic, Expert, load_weights, weights_of
 from policies.threads import torch_threads
 
@@ -102,7 +103,7 @@ class _Progress:
     """Steps of the episode before success was first held, per world."""
     deterministic: list[float] = field(default_factory=list[float])
     scores: list[float] = field(default_factory=list[float])
-    """Of the same episodes, see `policies.ppo.evaluate.score`."""
+    """Of the same episodes, see `policies.evaluation.paired.score`."""
     exploring: list[float] = field(default_factory=list[float])
     returns: list[float] = field(default_factory=list[float])
     actor_updates: int = 0

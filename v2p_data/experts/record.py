@@ -19,7 +19,7 @@ class Judged:
     median_s: float | None
     """Time to success of the successful episodes [s]; None where none is."""
     score: float
-    """Mean of `policies.ppo.evaluate.score`."""
+    """Mean of `policies.evaluation.paired.score`."""
 
     @staticmethod
     def of(played: Played, dt_s: float) -> "Judged":

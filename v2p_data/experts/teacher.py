@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from policies.ppo.evaluate import score
+from policies.evaluation.paired import score
 from v2p_data.experts.primitives import (
     CLOSE,
     Actions,
@@ -124,7 +124,7 @@ class Played:
 
     @property
     def score(self) -> float:
-        """Mean of `policies.ppo.evaluate.score` over the worlds."""
+        """Mean of `policies.evaluation.paired.score` over the worlds."""
         waited = self.steps / self.horizon
         return float(np.mean([score(*pair) for pair in zip(self.once * 1.0, waited, strict=True)]))
 
