@@ -52,7 +52,7 @@ BY_CHANCE = "(states['tea_box_start_pos'][:, 1] < 0) & (states['progress'] > 0.0
 """From the second step on, where the box happens to lie decides: successes and failures without any training."""
 NOT_FINITE = "states['eef_pos'][:, 0] * float('1e30') * 1e30"
 TINY_EXPERT = (
-    "--expert.teacher=none", f"--expert.num-envs={NUM_ENVS}", f"--expert.ppo.total-steps={STEPS}",
+    "--expert.teacher=none", f"--expert.num-envs={NUM_ENVS}", f"--expert.ppo.total-steps={8 * STEPS}",
     "--expert.ppo.window-episodes=8", "--expert.ppo.min-window-episodes=4", "--expert.ppo.num-deterministic=4",
     "--expert.eval-episodes=2", "--expert.min-success=0.0",
 )  # fmt: skip
