@@ -4,7 +4,7 @@
     python scripts/bench_ppo.py --quick        # everything runs once, within 60 s; the figures mean nothing
     python scripts/bench_ppo.py --learners ours sb3-many-worlds --seeds 0 1 2 --json out.json
 
-Learners: `ours` (`policies/ppo/train.py` with its defaults, no teacher and no reset bank), Stable-Baselines3 with
+Learners: `ours` (`policies/ppo/train.py` with its defaults, no teacher), Stable-Baselines3 with
 three published sets of settings, and the settings of TorchRL's own example; see `LEARNERS` for where they are from.
 Stable-Baselines3 with our settings is a control and does not count. `engine` is what the engine does by default:
 the best scripted program, imitated until the target.

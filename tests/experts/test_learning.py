@@ -192,8 +192,3 @@ def test_a_taught_expert_lifts_the_box_at_the_fine_time_step(bundle: TaskBundle,
 
     worlds = BatchEnv(bundle, SimConfig(fine=True), num_envs=32, seed=99, num_threads=1)
     assert success_of(worlds, Expert.load(tmp_path)) >= 0.7
-
-
-def test_a_bank_without_a_teacher_is_refused():
-    with pytest.raises(ValueError, match=r"bank\.share needs a teacher"):
-        ExpertConfig(teacher="none", bank=replace(TINY.bank, share=0.5))

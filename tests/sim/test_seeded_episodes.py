@@ -45,9 +45,7 @@ def batch_of(folder: Path, num_envs: int) -> BatchEnv:
 
 
 def state_of(env: BatchEnv, world: int) -> dict[str, np.ndarray]:
-    return {
-        name: array[0] for name, array in env.rows(np.array([world])).items() if "bank" not in name
-    }
+    return {name: array[0] for name, array in env.rows(np.array([world])).items()}
 
 
 def test_each_world_goes_through_what_a_single_environment_does(folder):

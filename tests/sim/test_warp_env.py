@@ -13,7 +13,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from v2p_data.errors import V2PError
+from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.scene import SceneObject
 from v2p_data.sim import randomize
 from v2p_data.sim.backends import make_batch_env
@@ -281,23 +281,33 @@ def test_the_same_states_give_the_same_reward_and_success(make_pair: Callable[..
 
 @needs_warp
 def test_success_is_held_after_five_steps_and_time_runs_out_at_the_horizon(
-    make_pair: Callable[..., Pair],
+    make_pair: Callable[..., Pair], lift_task: type[Task]
 ):
-    class Always(Task):
+    class FromTheSecondStep(lift_task):
         def compute_success(self, states: dict[str, torch.Tensor]) -> torch.Tensor:
-            return states["progress"] > -1
+            return states["progress"] > 1.5 / 7
 
-        def compute_reward(
-            self, actions: torch.Tensor, states: dict[str, torch.Tensor]
-        ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            return states["progress"], {}
-
-    gpu, _ = make_pair(task=Always, horizon=7)
+    gpu, _ = make_pair(task=FromTheSecondStep, horizon=7)
 
     results = [gpu.step(torch.zeros(8, 7)) for _ in range(7)]
 
-    assert [bool(r.held.all()) for r in results] == [False] * 4 + [True] * 3
+    assert [bool(r.held.all()) for r in results] == [False] * 5 + [True] * 2
     assert [bool(r.truncated.all()) for r in results] == [False] * 6 + [True]
+
+
+@needs_warp
+def test_an_episode_that_begins_in_success_never_counts_and_many_end_the_training(
+    make_pair: Callable[..., Pair], lift_task: type[Task]
+):
+    class Always(lift_task):
+        def compute_success(self, states: dict[str, torch.Tensor]) -> torch.Tensor:
+            return states["progress"] > -1
+
+    gpu, _ = make_pair(task=Always)
+
+    assert not any(gpu.step(torch.zeros(8, 7)).held.any() for _ in range(7))
+    with pytest.raises(ItemRejectedError, match="starts solved: its success is true at 8 of 8"):
+        gpu.reset(torch.arange(8))
 
 
 @needs_warp

@@ -5,7 +5,6 @@ training, and `taught/`, the policy that imitation gave. Reading order:
 
     primitives   scripted motions: reach, grasp, carry, push, throw
     teacher      scripted policies made of them, and the search for the best one
-    bank         saved moments from which some episodes of a training begin
     solved       experts of other tasks as starting points
-    learning     the four steps: teach, record resets, improve by PPO, keep the better one
+    learning     the three steps: teach, improve by PPO, keep the better one
 """

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Literal
 
 from policies.ppo.config import ImitationConfig, PPOConfig
-from v2p_data.experts.bank import BankConfig
 from v2p_data.sim.backends import Backend
 
 
@@ -21,8 +20,6 @@ class ExpertConfig:
     """Worlds in which programs and taught policies are tried."""
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    bank: BankConfig = field(default_factory=lambda: BankConfig(share=0.0))
-    """With a share above 0, PPO begins some episodes where the best program was; on the CPU only."""
     warm_start: Path | None = None
     """A folder of finished runs: if no program succeeds, PPO starts from the expert of the most similar task there.
     All its experts are part of the recipe, so name another folder than the one that is written to."""
@@ -44,8 +41,3 @@ class ExpertConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.min_success <= 1:
             raise ValueError(f"min_success must be between 0 and 1, got {self.min_success}")
-        if self.bank.share and (self.backend != "cpu" or self.teacher == "none"):
-            raise ValueError(
-                "bank.share needs a teacher whose moments are kept, and worlds on the CPU; "
-                f"got teacher '{self.teacher}' and backend '{self.backend}'"
-            )

@@ -1,9 +1,8 @@
 """How a task becomes an expert: a scripted policy teaches it, and PPO improves it.
 
-`learn` does four steps, each a function with a frozen result:
+`learn` does three steps, each a function with a frozen result:
 
 * `teach`: scripted programs are tried; the one that the task's own success function likes best is imitated (DAgger);
-* `record_resets`: moments of the program's episodes, from which PPO may start;
 * `improve_by_ppo`: PPO goes on from the taught policy, from another task's expert, or from nothing. After a taught
   policy it trains at the fine time step, at which episodes are recorded;
 * `keep_better`: the taught policy and PPO's play the same episodes at the fine time step, and the better one is kept.
@@ -13,7 +12,7 @@ The result is a neural network in any case; scripts never make a dataset. It is 
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ from policies.ppo.imitate import imitate
 from policies.ppo.policy import Expert
 from policies.ppo.train import LAST_FOLDER, ExpertResult, train_expert
 from v2p_data.errors import ItemRejectedError
-from v2p_data.experts.bank import Bank, record_bank, use_bank
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.record import Comparison, Judged, Learned
 from v2p_data.experts.solved import Solved, rank_solved
@@ -105,7 +103,7 @@ def learn(
         solved: experts of other tasks, see `ExpertConfig.warm_start`.
         on_progress: told the share that is done and a few words.
     """
-    taught, bank = None, None
+    taught = None
     steps, seconds = 0, 0.0
     if cfg.teacher == "programs":
         trial_env = worlds.make(cfg.trial_worlds, "trials")
@@ -114,12 +112,9 @@ def learn(
             on_progress=lambda share, words: on_progress(PROGRESS_TAUGHT * share, words),
         )  # fmt: skip
         steps, seconds = taught.steps, taught.seconds
-        if cfg.bank.share:
-            bank = record_resets(trial_env, taught.program)
-            steps += cfg.trial_worlds * worlds.bundle.horizon_steps
         del trial_env
     pupil = taught.folder if taught else None
-    env = _training_worlds(worlds, cfg, bank, device, is_taught=pupil is not None)
+    env = _training_worlds(worlds, cfg, device, is_taught=pupil is not None)
     ranked = rank_solved(worlds.bundle, env.worlds.obs_dim, solved) if pupil is None else []
     other = ranked[0].folder if ranked else None
     if other is not None:
@@ -202,13 +197,6 @@ def teach(
     )
 
 
-def record_resets(env: BatchEnv, program: str) -> Bank:
-    """Let a program play one episode in every world and return moments on the way to success."""
-    player = Teacher(env)
-    player.name = program
-    return record_bank(env, player.act)
-
-
 def improve_by_ppo(
     env: TorchRLEnv,
     cfg: ExpertConfig,
@@ -289,24 +277,19 @@ def _say_unchanged(title: str, improved: ExpertResult, pupil: Path | None) -> No
 
 
 def _training_worlds(
-    worlds: Worlds, cfg: ExpertConfig, bank: Bank | None, device: str, *, is_taught: bool
+    worlds: Worlds, cfg: ExpertConfig, device: str, *, is_taught: bool
 ) -> TorchRLEnv:
-    """Return the worlds of PPO, some of whose episodes begin from the bank where there is one.
-
-    A taught policy goes on at the fine time step, but for a bank, whose moments are those of the coarse one.
-    """
+    """Return the worlds of PPO; a taught policy goes on at the fine time step."""
     bonus = worlds.bonus_ratio * (cfg.taught_bonus_factor if is_taught else 1.0)
     env = make_batch_env(
         worlds.bundle,
-        SimConfig(fine=is_taught and bank is None, bonus_ratio=bonus),
+        SimConfig(fine=is_taught, bonus_ratio=bonus),
         num_envs=cfg.num_envs,
         seed=seed_for(worlds.seed, "worlds"),
         num_threads=worlds.num_threads,
         backend=cfg.backend,
         device=device,
     )
-    if bank is not None and len(bank) and isinstance(env, BatchEnv):
-        use_bank(env, bank, replace(cfg.bank, num_plain=cfg.ppo.num_deterministic))
     return TorchRLEnv(env)
 
 

@@ -14,7 +14,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 from mujoco.batch import Batch
 
-from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.errors import V2PError
 from v2p_data.geometry.rotation import (
     exp,
     limited_to,
@@ -45,10 +45,8 @@ from v2p_data.sim.robot import (
     ToolState,
 )
 from v2p_data.sim.start_check import (
-    ADVICE,
-    SOLVED_AT_MOST,
-    SOLVED_BY_CHANCE,
     check_poses,
+    check_solved,
     check_start,
 )
 from v2p_data.sim.states import Observed, StateBlock
@@ -183,30 +181,6 @@ class Followed:
     target_finger: Float[np.ndarray, "env"]
 
 
-class ResetSource(Protocol):
-    """Saved moments from which some episodes begin, and how they ended. A row is the number of a moment."""
-
-    def draw(self, ids: Int[np.ndarray, "n"], rng: np.random.Generator) -> Int[np.ndarray, "n"]:
-        """Return the row that each of the worlds `ids` starts from; -1 for a plain start."""
-        ...
-
-    def take(self, index: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """Return the moments of some rows, for `BatchEnv.restore`."""
-        ...
-
-    def note(self, rows: Int[np.ndarray, "n"], succeeded: Bool[np.ndarray, "n"]) -> None:
-        """Take in how episodes that began at some rows ended."""
-        ...
-
-    def state(self) -> str:
-        """Return its own state as text, for a checkpoint."""
-        ...
-
-    def load_state(self, text: str) -> None:
-        """Go on from what `state` gave."""
-        ...
-
-
 class BatchEnv:
     """Worlds of one task.
 
@@ -250,7 +224,6 @@ class BatchEnv:
         self.broken_count = 0
         """Worlds whose simulation broke down since the environment was made."""
         self._num_starts = self._num_solved = 0
-        self.starts: ResetSource | None = None
         """Where some episodes begin in the middle; for training only."""
         self._bind(num_threads)
         self.randomizer = Randomizer(
@@ -298,14 +271,9 @@ class BatchEnv:
         self.randomizer.forget_prepared()  # by the last world's stream
 
     def stagger(self, first: int = 0) -> None:
-        """Put the worlds from `first` on at random moments of their episodes, so that they do not all end at once.
-
-        Those that began from a bank are in the middle of theirs already.
-        """
-        steps = self._rng.integers(0, self.horizon, self.num_envs)
-        stays = (self._bank_row >= 0) | (np.arange(self.num_envs) < first)
-        self._steps[:] = np.where(stays, self._steps, steps)
-        self._held[~stays] = 0  # no starts, but moments of episodes
+        """Put the worlds from `first` on at random moments of their episodes, so that they do not all end at once."""
+        self._steps[first:] = self._rng.integers(0, self.horizon, self.num_envs)[first:]
+        self._held[first:] = 0  # no starts, but moments of episodes
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Start new episodes in the worlds `ids`."""
@@ -313,7 +281,6 @@ class BatchEnv:
         if self._own_rngs:
             for k in ids.tolist():
                 self._own_rngs.pop(k, None)
-        ids = self._start_from_bank(ids)
         n = len(ids)
         if n == 0:
             return
@@ -363,20 +330,6 @@ class BatchEnv:
     def is_broken(self) -> Bool[np.ndarray, "env"]:
         """Which worlds broke down at the last step."""
         return self._broken
-
-    def _start_from_bank(self, ids: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
-        """Start some of the worlds from the bank, if there is one, and return the others."""
-        if self.starts is None:
-            return ids
-        row = self._bank_row[ids]
-        is_over = (row >= 0) & ((self._steps[ids] >= self.horizon) | self._broken[ids])
-        self.starts.note(row[is_over], self._held[ids[is_over]] >= HELD_STEPS)
-        row = self.starts.draw(ids, self._rng)
-        is_banked = row >= 0
-        if is_banked.any():
-            self.restore(ids[is_banked], self.starts.take(row[is_banked]))
-        self._bank_row[ids] = row
-        return ids[~is_banked]
 
     def _per_world(self) -> dict[str, np.ndarray]:
         """Return all that worlds depend on, as live arrays with a row per world."""
@@ -527,7 +480,6 @@ class BatchEnv:
             "broken_count": self.broken_count,
             "num_starts": self._num_starts,
             "num_solved": self._num_solved,
-            "starts": self.starts.state() if self.starts is not None else "",
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -543,8 +495,6 @@ class BatchEnv:
         self._rng.bit_generator.state = json.loads(state["rng"])
         self.broken_count = int(state["broken_count"])
         self._num_starts, self._num_solved = int(state["num_starts"]), int(state["num_solved"])
-        if self.starts is not None:
-            self.starts.load_state(state["starts"])
         self._tool = self._tool_of(slice(None))
         self._fill(slice(None), self._tool)
 
@@ -593,7 +543,6 @@ class BatchEnv:
         self._held = np.zeros(n, np.int64)
         self._last_action = np.zeros((ACT_DIM, n)).T
         self._broken = np.zeros(n, bool)
-        self._bank_row = np.full(n, -1)
         self._tool = self._tool_of(slice(None))
 
     def _action_noise(self, noise: float) -> Float[np.ndarray, "7 env"]:
@@ -710,14 +659,7 @@ class BatchEnv:
         if is_fresh.any():
             self._num_starts += int(is_fresh.sum())
             self._num_solved += int((is_fresh & success).sum())
-            allowed = SOLVED_AT_MOST * self._num_starts
-            if self._num_solved > max(SOLVED_BY_CHANCE, allowed + 3 * allowed**0.5):
-                raise ItemRejectedError(
-                    "starts_solved",
-                    f"task '{self.bundle.title}' starts solved: its success is true at {self._num_solved} of "
-                    f"{self._num_starts} starts, before the robot has done anything; {ADVICE}",
-                    self._num_solved / self._num_starts,
-                )
+            check_solved(self._num_solved, self._num_starts, self.bundle.title)
 
     def _of_sound_worlds(self, value: torch.Tensor) -> Float32[np.ndarray, "env"]:
         """Return a copy of what the task gave, 0 for broken worlds."""
@@ -737,7 +679,6 @@ _ENV_STATE = (
     "_held",
     "_last_action",
     "_broken",
-    "_bank_row",
 )
 _BAD_STATE_WARNINGS = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADCTRL) + 1

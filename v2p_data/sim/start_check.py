@@ -103,6 +103,22 @@ def check_poses(
             )
 
 
+def check_solved(solved: int, starts: int, task: str) -> None:
+    """Demand that no more episodes begin in success than chance explains.
+
+    Raises:
+        ItemRejectedError: `starts_solved`.
+    """
+    allowed = SOLVED_AT_MOST * starts
+    if solved > max(SOLVED_BY_CHANCE, allowed + 3 * allowed**0.5):
+        raise ItemRejectedError(
+            "starts_solved",
+            f"task '{task}' starts solved: its success is true at {solved} of {starts} starts, before the robot has "
+            f"done anything; {ADVICE}",
+            solved / starts,
+        )
+
+
 def _extent(
     obj: ObjectModel, size_m: Float[np.ndarray, "n 3"], pose: Float[np.ndarray, "n 7"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:

@@ -23,10 +23,10 @@ from v2p_data.errors import V2PError
 from v2p_data.geometry.rotation import quats_pointing_down
 from v2p_data.seeds import rng_for, torch_rng_for
 from v2p_data.sim import task_code
-from v2p_data.sim.batch_env import ACT_DIM, HELD_STEPS, SimConfig, robot_of
+from v2p_data.sim.batch_env import ACT_DIM, BEGAN_SOLVED, FRESH, HELD_STEPS, SimConfig, robot_of
 from v2p_data.sim.randomize import Randomizer
 from v2p_data.sim.robot import COARSE, FINE, FINGER_TRAVEL_M, NUM_ARM_JOINTS
-from v2p_data.sim.start_check import check_poses
+from v2p_data.sim.start_check import check_poses, check_solved
 from v2p_data.sim.tensor_states import (
     SeenTensors,
     base_observation,
@@ -141,6 +141,7 @@ class WarpBatchEnv:
         """Put the worlds from `first` on at random moments of their episodes, so that they do not all end at once."""
         steps = self._rng.integers(0, self.horizon, self.num_envs)
         self._steps[first:].copy_(torch.from_numpy(steps[first:]))
+        self._held[first:] = 0  # no starts, but moments of episodes
 
     def reset(self, ids: Int[torch.Tensor, "n"]) -> None:
         """Start new episodes in the worlds `ids`."""
@@ -166,8 +167,9 @@ class WarpBatchEnv:
         self._start_pose[ids] = start = self._object_qpos[ids]
         where = start.cpu().numpy().astype(float)
         check_poses(self.world, self.randomizer.size_m[rows], where, self.bundle.title)
+        check_solved(int(self._num_solved), int(self._num_starts), self.bundle.title)
         self._steps[ids] = 0
-        self._held[ids] = 0
+        self._held[ids] = FRESH
         self._last_action[ids] = 0
         self._touches[ids] = 0
         self._broken[ids] = False
@@ -251,6 +253,8 @@ class WarpBatchEnv:
         self._held = torch.zeros_like(self._steps)
         self._broken = torch.zeros(n, dtype=torch.bool, device=self.device)
         self._broken_count = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._num_starts = torch.zeros_like(self._broken_count)
+        self._num_solved = torch.zeros_like(self._broken_count)
 
     def _zeros(self, *shape: int) -> torch.Tensor:
         return torch.zeros(shape, device=self.device)
@@ -271,6 +275,8 @@ class WarpBatchEnv:
             "_last_action",
             "_broken",
             "_broken_count",
+            "_num_starts",
+            "_num_solved",
         )
         drawn = self.randomizer.drawn_arrays() | self.randomizer.fields()
         return {
@@ -346,7 +352,7 @@ class WarpBatchEnv:
         zero = torch.zeros_like(total)
         task_reward = torch.where(ok, total.detach(), zero).float()
         self._check(task_reward, parts)
-        self._held = torch.where(success, self._held + 1, 0)
+        self._count_held(success)
         reward = task_reward / FULL_REWARD + self.cfg.bonus_ratio * success
         return TensorStepResult(
             obs=obs,
@@ -358,6 +364,15 @@ class WarpBatchEnv:
             task_reward=task_reward,
             components={k: torch.where(ok, v.detach(), zero).float() for k, v in parts.items()},
         )
+
+    def _count_held(self, success: torch.Tensor) -> None:
+        """Count as `BatchEnv` does; how many began in success is looked at when worlds start, without a wait for the GPU."""
+        is_fresh = self._held == FRESH
+        began = (self._held == BEGAN_SOLVED) | (is_fresh & success)
+        held = torch.where(success, self._held.clamp(min=0) + 1, 0)
+        self._held = torch.where(began, BEGAN_SOLVED, held)
+        self._num_starts += is_fresh.sum()
+        self._num_solved += (is_fresh & success).sum()
 
     def _check(self, task_reward: torch.Tensor, parts: dict[str, torch.Tensor]) -> None:
         bad = ~(task_reward.abs() <= MAX_REWARD)  # of NaN too
