@@ -31,7 +31,7 @@ from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward
 from v2p_data.seeds import seed_for
 from v2p_data.sim import randomize
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.verdict import Witness
+from v2p_data.sim.verdict import Course
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 
@@ -125,15 +125,15 @@ def judge(bundle: TaskBundle, act: Act | None, episodes: int, seed: int) -> int:
     sim = SimConfig(fine=True, randomization=randomize.recording())
     env = BatchEnv(bundle, sim, num_envs=episodes, seed=seed, num_threads=1)
     programs = ProgramPolicy(env)
-    witness = Witness(env)
+    course = Course(env)
     env.reset(np.arange(episodes))
     programs.restart()
-    witness.restart()
+    course.restart()
     obs = env.observe()
     for _ in range(env.horizon):
         obs = env.step(programs.act() if act is None else act(obs)).obs
-        witness.note()
-    return int(witness.verdict().sum())
+        course.note()
+    return int(course.verdict().sum())
 
 
 def _key(result: dict[str, Any]) -> tuple[str, str, int]:

@@ -5,11 +5,11 @@ import pytest
 import toy_run
 from toy_task import act
 
-from v2p_data.distillation import handover
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.handover import Handovers, hand_over
 from v2p_data.sim import verdict
 from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.observation import PROGRESS_COLUMN
 
 CFG = DistillationConfig(worlds=5, takeover=(0.1, 0.5))
 
@@ -122,7 +122,7 @@ def test_an_expert_sees_no_more_of_the_time_than_it_learned(agreeing_referee):
     shares: list[float] = []
 
     def watching(obs: np.ndarray) -> np.ndarray:
-        shares.append(float(obs[:, handover.PROGRESS_COLUMN].max()))
+        shares.append(float(obs[:, PROGRESS_COLUMN].max()))
         return 0 * act(obs)  # never done, hence to the end of 1.35 horizons
 
     found = run(expert=watching)

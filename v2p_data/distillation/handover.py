@@ -17,9 +17,8 @@ from v2p_data.episodes.rollouts import CutConfig, EpisodeEnds
 from v2p_data.seeds import rng_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.masks import MaskRenderer
-from v2p_data.sim.observation import PROGRESS_COLUMN
 from v2p_data.sim.randomize import RandomizationConfig
-from v2p_data.sim.verdict import Witness
+from v2p_data.sim.verdict import Course
 from v2p_data.task.task import TaskBundle
 
 ExpertAct = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
@@ -100,8 +99,8 @@ def hand_over(
     earliest, latest = (round(share * env.horizon) for share in cfg.takeover)
     takeover = rng_for(seed, "takeover").integers(earliest, latest + 1, n)
     params = tuple(env.episode_params(k) for k in range(n))
-    witness = Witness(env)
-    witness.restart()
+    course = Course(env)
+    course.restart()
     student.reset(bundle.description)
     obs = env.observe()
     labels = np.zeros((n, size_px, size_px), np.uint8)
@@ -115,7 +114,6 @@ def hand_over(
             snapshot = env.snapshot(going)
             labels[going] = renderer.draw_many([(snapshot, k) for k in range(len(going))])
             state = env.robot_state()
-            obs[:, PROGRESS_COLUMN] = np.minimum(obs[:, PROGRESS_COLUMN], 1.0)
             label = np.clip(np.asarray(expert(obs), np.float32), -1.0, 1.0)
             action = label
             if (is_students := (t < takeover) & is_going).any():
@@ -125,7 +123,7 @@ def hand_over(
             actions.append(label)
             result = env.step(action)
             obs = result.obs
-            witness.note()
+            course.note()
             ends.note(t, result)
             if ends.all_over(t):
                 break
@@ -138,7 +136,7 @@ def hand_over(
         num_frames=ends.num_frames,
         held_at=ends.held_at,
         task_successes=ends.successes,
-        referee=witness.verdict_as_cut(ends.num_frames) & ends.successes,
+        referee=course.verdict_as_cut(ends.num_frames) & ends.successes,
         broke=ends.broke,
         params=params,
     )

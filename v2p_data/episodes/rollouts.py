@@ -13,13 +13,12 @@ from jaxtyping import Bool, Float32, Int
 
 from v2p_data.episodes.features import FPS
 from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot, StepResult
-from v2p_data.sim.verdict import as_cut, referee_verdict
+from v2p_data.sim.verdict import Course, referee_verdict
 from v2p_data.task.task import Task, TaskBundle
 
 Act = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
-Course = Mapping[str, np.ndarray]
-"""Per key of the task interface's `states` an array `(time, env, ...)`, the moment after the reset first."""
-Referee = Callable[[TaskBundle, Course], Bool[np.ndarray, "env"]]
+Referee = Callable[[TaskBundle, Mapping[str, np.ndarray]], Bool[np.ndarray, "env"]]
+"""Given a task and `Course.as_cut`, tells which episodes succeeded."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,8 @@ def roll_out(
     acts = act.begin(env) if isinstance(act, InWorlds) else act
     obs = env.observe()
     states, actions, successes, snapshots = [], [], [], []
-    trajectory = [_copied(env)]
+    course = Course(env)
+    course.restart()
     ends = EpisodeEnds(num_worlds, env.horizon, cut)
     for t in range(env.horizon):
         states.append(env.robot_state())
@@ -162,13 +162,13 @@ def roll_out(
         obs = result.obs
         actions.append(action)
         successes.append(result.success)
-        trajectory.append(_copied(env))
+        course.note()
         ends.note(t, result)
         if ends.all_over(t):
             break
     held = ends.successes
     judge = referee or referee_verdict
-    verdict = judge(bundle, as_cut(trajectory, ends.num_frames)) & held if held.any() else held
+    verdict = judge(bundle, course.as_cut(ends.num_frames)) & held if held.any() else held
     return Rollouts(
         seed=seed,
         state=np.stack(states),
@@ -182,11 +182,3 @@ def roll_out(
         broke=ends.broke,
         params=params,
     )
-
-
-def _copied(env: BatchEnv) -> dict[str, np.ndarray]:
-    return {
-        key: value.numpy().copy()
-        for key, value in env.states().items()
-        if key != "base_observation"
-    }

@@ -13,7 +13,6 @@ from v2p_data.errors import V2PError
 from v2p_data.experts.teacher import Teacher
 from v2p_data.seeds import seed_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.observation import PROGRESS_COLUMN
 
 TRIAL_WORLDS = 64
 """Episodes in which each scripted program is tried before one is chosen."""
@@ -62,10 +61,9 @@ class ExpertActor:
     ) -> None:
         self._act = act
         self._obs_dim = obs_dim
-        self._progress: list[int] = []
 
     def begin(self, env: BatchEnv) -> None:
-        """Find where the observation tells how much of the episode has passed.
+        """Demand that the worlds' observation is the one that the expert knows.
 
         Raises:
             V2PError: the task's observation is not the expert's.
@@ -75,14 +73,10 @@ class ExpertActor:
                 f"the expert knows observations of length {self._obs_dim}, and task '{env.bundle.title}' makes ones of"
                 f" length {env.obs_dim}: it is another task's expert"
             )
-        self._progress = _progress_columns(env)
 
     def act_in(self, env: BatchEnv) -> Float32[np.ndarray, "env 7"]:
-        """Return the expert's actions; beyond the task's horizon it is told that the time is just up."""
-        obs = env.observe().copy()
-        for column in self._progress:
-            np.minimum(obs[:, column], 1.0, out=obs[:, column])
-        return self._act(obs)
+        """Return the expert's actions."""
+        return self._act(env.observe())
 
 
 class ProgramActor:
@@ -117,15 +111,3 @@ class ProgramActor:
         del env  # the teacher's own
         assert self._teacher is not None, "begin comes first"
         return self._teacher.act()
-
-
-def _progress_columns(env: BatchEnv) -> list[int]:
-    states = env.task_states()
-    found, start = [], 0
-    for key in env.task.observed_keys(states):
-        if key == "base_observation":
-            found.append(start + PROGRESS_COLUMN)
-        elif key == "progress":
-            found.append(start)
-        start += states[key].shape[1] if states[key].ndim == 2 else 1
-    return found

@@ -24,7 +24,7 @@ from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW, stream_seed
 from v2p_data.sim.masks import MaskRenderer
 from v2p_data.sim.randomize import RandomizationConfig
-from v2p_data.sim.verdict import course_keys, referee_verdict
+from v2p_data.sim.verdict import Course
 from v2p_data.task.task import Task, TaskBundle
 
 NEVER = -1
@@ -203,7 +203,8 @@ def _play(
 ) -> _Played:
     """Play one episode in every world, from where the worlds are."""
     n = env.num_envs
-    course = _Course(env, steps)
+    course = Course(env)
+    course.restart()
     film = _Film(env, steps) if is_shown else None
     success_step = np.full(n, NEVER)
     broke, over, last = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
@@ -222,7 +223,7 @@ def _play(
         asked = np.flatnonzero(is_asked)
         if len(asked):
             with watch.on("referee"):
-                agreed = asked[referee_verdict(env.bundle, course.of(asked))]
+                agreed = asked[course.verdict(asked)]
             success_step[agreed[success_step[agreed] == NEVER]] = t
             if t + 1 == steps:
                 last[agreed] = True
@@ -235,9 +236,7 @@ def _play(
     failures = np.full(n, "", dtype=object)
     failures[failed] = failure_kinds(env.bundle, course.of(failed), broke[failed])
     succeeded = success_step != NEVER
-    end = np.where(
-        succeeded, np.minimum(success_step + 2 + TAIL_STEPS, course.length), course.length
-    )
+    end = np.where(succeeded, np.minimum(success_step + 2 + TAIL_STEPS, len(course)), len(course))
     shown = None
     if film is not None:
         shown = Shown(successes=succeeded, num_frames=end, snapshots=film.snapshots())
@@ -248,28 +247,6 @@ def _play(
         failures=tuple(str(kind) for kind in failures),
         shown=shown,
     )
-
-
-class _Course:
-    """What the referee sees of all worlds, from the start on."""
-
-    def __init__(self, env: BatchEnv, steps: int) -> None:
-        self._env = env
-        states = env.states()
-        self._arrays = {key: np.zeros((steps + 1, *states[key].shape)) for key in course_keys(env)}
-        self.length = 0
-        """Moments so far."""
-        self.note()
-
-    def note(self) -> None:
-        states = self._env.states()
-        for key, array in self._arrays.items():
-            array[self.length] = states[key].numpy()
-        self.length += 1
-
-    def of(self, worlds: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """Return the course of some worlds up to now."""
-        return {key: array[: self.length, worlds] for key, array in self._arrays.items()}
 
 
 class _Film:

@@ -611,7 +611,7 @@ class BatchEnv:
                 target_pos=self._target_pos[rows],
                 target_finger=self._target_finger[rows],
                 last_action=self._last_action[rows],
-                progress=self._steps[rows] / self.horizon,
+                progress=np.minimum(self._steps[rows] / self.horizon, 1.0),
             ),
         )
 

@@ -27,7 +27,7 @@ from v2p_data.errors import V2PError
 from v2p_data.sim import randomize
 from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.masks import MaskRenderer, labels_to_rgb
-from v2p_data.sim.verdict import Witness
+from v2p_data.sim.verdict import Course
 from v2p_data.sim.world import World
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
 
@@ -87,7 +87,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         sim = SimConfig(fine=True, randomization=randomization)
         with told_of(bundle.folder):
             self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
-        self._witness = Witness(self._world)
+        self._course = Course(self._world)
         self._masks = MaskRenderer(self._world.world, size_px)
         self.observation_space = spaces.Dict(
             {
@@ -109,16 +109,16 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         self._world.seed(_next_seed(self.np_random))
         self._world.reset(np.array([0]))
         self._num_steps = 0
-        self._witness.restart()
+        self._course.restart()
         return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Carry out one action; it is clipped to [-1, 1]."""
         result = self._world.step(np.asarray(action, float)[None])
-        self._witness.note()
+        self._course.note()
         self._num_steps += 1
         broke = bool(result.terminated[0])
-        success = not broke and bool(result.held[0]) and bool(self._witness.verdict()[0])
+        success = not broke and bool(result.held[0]) and bool(self._course.verdict()[0])
         terminated = success or broke
         return (
             self._observe(),

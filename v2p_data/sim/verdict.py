@@ -1,6 +1,6 @@
 """The independent referee on episodes that a `BatchEnv` is running: what happened so far, and is it success?"""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -30,48 +30,45 @@ def referee_verdict(
     return referee_success(bundle.kind, bundle.scene, trajectory)
 
 
-def as_cut(
-    moments: Sequence[Mapping[str, np.ndarray]], end: Int[np.ndarray, "env"]
-) -> dict[str, np.ndarray]:
-    """Return the moments stacked, each world standing still from its episode's end on."""
-    time = np.minimum(np.arange(len(moments))[:, None], end[None])
-    worlds = np.arange(len(end))
-    return {key: np.stack([m[key] for m in moments])[time, worlds] for key in moments[0]}
-
-
-def course_keys(env: BatchEnv) -> list[str]:
-    """Return the states that `referee_verdict` looks at."""
-    return ["eef_pos"] + [
-        f"{name}_{key}"
-        for name in env.object_names
-        for key in ("pos", "quat", "size", "touched", "grasped")
-    ]
-
-
-class Witness:
-    """Remembers the courses of all worlds of an environment, which start and end together."""
+class Course:
+    """What the referee looks at, of all worlds of an environment, which start and end together."""
 
     def __init__(self, env: BatchEnv) -> None:
-        self.env = env
-        self.moments: list[dict[str, np.ndarray]] = []
+        self._env = env
+        self._keys = ["eef_pos"] + [
+            f"{name}_{key}"
+            for name in env.object_names
+            for key in ("pos", "quat", "size", "touched", "grasped")
+        ]
+        self._moments: list[dict[str, np.ndarray]] = []
 
     def restart(self) -> None:
         """Forget everything and note the start of new episodes; call after a reset."""
-        self.moments = []
+        self._moments = []
         self.note()
 
     def note(self) -> None:
         """Note the present moment; call after each step."""
-        states = self.env.states()
-        self.moments.append(
-            {key: states[key].numpy().astype(float) for key in course_keys(self.env)}
-        )
+        states = self._env.states()
+        self._moments.append({key: states[key].numpy().astype(float) for key in self._keys})
+
+    def __len__(self) -> int:
+        """Return the number of moments so far."""
+        return len(self._moments)
+
+    def of(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> dict[str, np.ndarray]:
+        """Return the course of some worlds up to now, per key an array `(time, world, ...)`."""
+        return {key: np.stack([m[key][worlds] for m in self._moments]) for key in self._keys}
+
+    def as_cut(self, end: Int[np.ndarray, "env"]) -> dict[str, np.ndarray]:
+        """Return the course in which each world stands still from the step `end` on."""
+        time = np.minimum(np.arange(len(self))[:, None], end[None])
+        return {key: array[time, np.arange(len(end))] for key, array in self.of().items()}
+
+    def verdict(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> Bool[np.ndarray, "n"]:
+        """Return what the referee says of the episodes of some worlds so far."""
+        return referee_verdict(self._env.bundle, self.of(worlds))
 
     def verdict_as_cut(self, end: Int[np.ndarray, "env"]) -> Bool[np.ndarray, "env"]:
         """Return what the referee says of episodes of `end` steps each; see `as_cut`."""
-        return referee_verdict(self.env.bundle, as_cut(self.moments, end))
-
-    def verdict(self) -> Bool[np.ndarray, "env"]:
-        """Return what the referee says of the episodes so far."""
-        course = {key: np.stack([m[key] for m in self.moments]) for key in self.moments[0]}
-        return referee_verdict(self.env.bundle, course)
+        return referee_verdict(self._env.bundle, self.as_cut(end))

@@ -339,7 +339,7 @@ class WarpBatchEnv:
             target_pos=self._target_pos,
             target_finger=self._target_finger,
             last_action=self._last_action,
-            progress=self._steps / self.horizon,
+            progress=(self._steps / self.horizon).clamp(max=1.0),
         )
         self._robot, self._objects = robot_block(seen), object_block(seen)
         self._base = base_observation(seen, self._is_round)

@@ -195,15 +195,6 @@ class GuardedTask:
                 raise TaskOutputError("get_observation_space must return a whole number")
         return said
 
-    def observed_keys(self, states: States) -> list[str]:
-        """Return the keys that make up the observation.
-
-        Args:
-            states: copies; what the task adds is entered here.
-        """
-        with self._named(), torch.inference_mode():
-            return self._keys(_Watch(states))
-
     def observe(self, show: Show) -> Float[torch.Tensor, "env obs"]:
         """Return the observation; it may share memory with what `show` gave."""
         states = show()

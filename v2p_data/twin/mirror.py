@@ -15,7 +15,7 @@ from v2p_data.sim.batch_env import BatchEnv, Followed, SimConfig, StepResult, ro
 from v2p_data.sim.gym_env import stream_seed
 from v2p_data.sim.robot import FINGER_TRAVEL_M
 from v2p_data.sim.targets import ToolPose
-from v2p_data.sim.verdict import course_keys, referee_verdict
+from v2p_data.sim.verdict import Course
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.world import TwinWorld
 
@@ -71,7 +71,7 @@ class Mirror:
             )
         self.bundle = bundle
         self.env = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
-        self.moments: list[dict[str, np.ndarray]] = []
+        self.course = Course(self.env)
 
     def start(self, seed: int) -> Start:
         """Return how the episode of `V2PEnv.reset(seed=seed)` begins."""
@@ -90,28 +90,17 @@ class Mirror:
         """Take over the first moment of an episode."""
         self.env.randomizer.size_m[0] = world.size_m
         self.env.begin_following(_followed(truth, target))
-        self.moments = []
-        self._note()
+        self.course.restart()
 
     def follow(self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]) -> StepResult:
         """Take over the moment that an action led to, and say what the task's own success says of it."""
         result = self.env.follow(_followed(truth, target), action[None])
-        self._note()
+        self.course.note()
         return result
-
-    def course(self) -> dict[str, np.ndarray]:
-        """Return the episode so far, per key of the task interface's `states` an array `(time, 1, ...)`."""
-        return {key: np.stack([m[key] for m in self.moments]) for key in self.moments[0]}
 
     def verdict(self) -> bool:
         """Return whether the independent referee calls the episode so far a success."""
-        return bool(referee_verdict(self.bundle, self.course())[0])
-
-    def _note(self) -> None:
-        states = self.env.states()
-        self.moments.append(
-            {key: states[key].numpy().astype(float) for key in course_keys(self.env)}
-        )
+        return bool(self.course.verdict()[0])
 
 
 def _followed(truth: Truth, target: ToolPose) -> Followed:
