@@ -11,14 +11,13 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "episodes"))
 import toy_run
 
 from v2p_data.episodes import rollouts
-from v2p_data.evaluation import batch
 from v2p_data.sim import verdict
 
 
 @pytest.fixture
 def agreeing_referee(monkeypatch: pytest.MonkeyPatch) -> None:
     """The toy task is one that no referee knows: only the tool moves."""
-    for module in (verdict, rollouts, batch):
+    for module in (verdict, rollouts):
         monkeypatch.setattr(module, "referee_verdict", toy_run.agree)
 
 

@@ -5,6 +5,7 @@ import pytest
 import toy_run
 from toy_task import act
 
+from v2p_data.distillation import handover
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.handover import Handovers, hand_over
 from v2p_data.sim import verdict

@@ -35,12 +35,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     from toy_run import agree
 
     from v2p_data.episodes import rollouts
-    from v2p_data.evaluation import batch
     from v2p_data.sim import verdict
 
     root = tmp_path_factory.mktemp(MAKER) / "my runs" / "run"
     with pytest.MonkeyPatch.context() as patch:
-        for module in (verdict, rollouts, batch):
+        for module in (verdict, rollouts):
             patch.setattr(module, "referee_verdict", agree)
         patch.setattr(commands, "run_stages", made)
         patch.setattr(
