@@ -133,51 +133,60 @@ def _tasks() -> Iterator[tuple[str, Case]]:
 
 def _policies() -> Iterator[tuple[str, Case]]:
     import spoiled  # pyright: ignore[reportMissingImports]
+    import torch
 
     from v2p_data.judging import contestant, play_of
 
     def case(spoil: Callable[[Path], None]) -> Case:
         def opened(folder: Path) -> str:
-            policy = spoiled.good_policy(folder / "policy")
-            play_of(contestant(policy), 0, "cpu")
+            policy = Path(shutil.copytree(good, folder / "policy"))
             spoil(policy)
+            outcome = "violation: it was opened"
             try:
                 play_of(contestant(policy), 0, "cpu")
-            finally:
-                if spoiled.canary(policy).exists():
-                    return "violation: a program ran"
-            return "violation: it was opened"
+            except V2PError:
+                if not spoiled.canary(policy).exists():
+                    raise
+            return "violation: a program ran" if spoiled.canary(policy).exists() else outcome
 
         return opened
 
-    for name, spoil in spoiled.POLICIES.items():
-        yield name, case(spoil)
+    torch.set_num_threads(1)  # more do not survive a fork
+    with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as place:
+        good = spoiled.good_policy(Path(place) / "good")
+        play_of(contestant(good), 0, "cpu")  # imports what every case needs
+        for name, spoil in spoiled.POLICIES.items():
+            yield name, case(spoil)
 
 
 def _caches() -> Iterator[tuple[str, Case]]:
     import small_dataset  # pyright: ignore[reportMissingImports]
     import spoiled  # pyright: ignore[reportMissingImports]
+    import torch
 
     from policies.bc.frames import read_frames
 
     def case(spoil: Callable[[Path], None]) -> Case:
         def read(folder: Path) -> str:
-            small_dataset.write_dataset(folder / "dataset")
-            net = small_dataset.policy()[0].net
-            given = (folder / "dataset", small_dataset.REPO_ID, net, folder / "decoded")
-            whole = {
-                name: value.clone()
-                for name, value in read_frames(*given).pictures[spoiled.MASK].items()
-            }
-            spoil(folder / "decoded" / spoiled.MASK)
-            again = read_frames(*given).pictures[spoiled.MASK]
+            cache = Path(shutil.copytree(place / "cache", folder / "cache"))
+            spoil(cache / spoiled.MASK)
+            again = read_frames(dataset, small_dataset.REPO_ID, net, cache).pictures[spoiled.MASK]
             same = small_dataset.are_equal(whole, again)
             return "made anew" if same else "violation: it is trained on"
 
         return read
 
-    for name, spoil in spoiled.CACHES.items():
-        yield name, case(spoil)
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as folder:
+        place = Path(folder)
+        dataset = place / "dataset"
+        small_dataset.write_dataset(dataset)
+        net = small_dataset.policy()[0].net
+        whole = read_frames(dataset, small_dataset.REPO_ID, net, place / "cache").pictures[
+            spoiled.MASK
+        ]
+        for name, spoil in spoiled.CACHES.items():
+            yield name, case(spoil)
 
 
 def _videos() -> Iterator[tuple[str, Case]]:

@@ -31,6 +31,8 @@ MAX_HEADER_BYTES = 16_000_000
 """Of a file of tensors: names and shapes."""
 CHECKED_AT_ONCE = 2**24
 """Numbers of a tensor."""
+MAX_SEEN = 32_000_000
+"""Numbers of an observation, past steps included: five colour pictures of 1920 x 1080 pixels."""
 ANEW = "copy the policy anew"
 Type = Literal[
     "v2p_bc", "act", "diffusion", "vqbet", "tdmpc", "multi_task_dit", "smolvla", "pi0", "pi05"
@@ -136,6 +138,12 @@ class ConfigFile(FileModel):
     @model_validator(mode="after")
     def _is_bounded(self) -> "ConfigFile":
         bounded(self.model_extra, "settings")
+        seen = sum(math.prod(feature.shape) for feature in (self.input_features or {}).values())
+        if self.n_obs_steps * seen > MAX_SEEN:
+            raise ValueError(
+                f"an observation of {self.n_obs_steps} steps holds {self.n_obs_steps * seen:.3g} numbers; at most {MAX_SEEN:g}"
+                " are taken"
+            )
         return self
 
 

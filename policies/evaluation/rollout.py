@@ -5,6 +5,7 @@ the same successes (`actor`); this one is what it is compared with. The tasks co
 `v2p`, which the plugin `lerobot_policy_v2p` registers.
 """
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -145,7 +146,7 @@ def _check_weights(folder: Path, config: Any) -> None:
 
     kind = get_policy_class(config.type)
     with torch.device("meta"):
-        wanted = kind(config).state_dict(keep_vars=True)
+        wanted = kind(copy.deepcopy(config)).state_dict(keep_vars=True)
     with safe_open(folder / "model.safetensors", framework="pt") as file:
         shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
     known = {

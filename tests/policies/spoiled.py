@@ -133,6 +133,12 @@ for _name, _value in {
     "nested": {"a": {"b": [1e300]}},
 }.items():
     POLICIES[f"another setting {_name}"] = with_value(CONFIG, _name, _value)
+POLICIES["pictures of 2,000 px, 64 at once"] = changed(
+    CONFIG,
+    lambda data: data.update(
+        n_obs_steps=64, input_features={MASK: {"type": "VISUAL", "shape": [3, 2000, 2000]}}
+    ),
+)
 POLICIES["no type"] = without(CONFIG, "type")
 POLICIES["1,000 more settings"] = changed(
     CONFIG, lambda data: data.update({f"x{k}": k for k in range(1000)})
