@@ -1,8 +1,8 @@
 """Damage files and folders of every kind that the engine reads, and look at what its commands answer.
 
-Three corpora of the tests are tried whole or in a random part: task folders as strangers may make them
-(`tests/task/strangers.py`), odd videos, captions, labels and boxes (`tests/video/odd_files.py`), and harms to each kind
-of file of a finished run (`tests/pipeline/damage.py`). Every case runs in a process of its own with a time limit.
+Four corpora of the tests are tried whole or in a random part: task folders as strangers may make them
+(`tests/task/strangers.py`), policies and decoded caches (`tests/policies/spoiled.py`), odd videos, captions, labels and
+boxes (`tests/video/odd_files.py`), and harms to each kind of file of a finished run (`tests/pipeline/damage.py`). Every case runs in a process of its own with a time limit.
 
     python scripts/fuzz_artefacts.py --run outputs/demo --harms 200 --seed 1
 
@@ -50,14 +50,22 @@ def main() -> None:
         "--run", type=Path, default=ROOT / "outputs" / "demo", help="a finished run"
     )
     parser.add_argument("--harms", type=int, default=200, help="harms to the run's files, drawn")
-    parser.add_argument("--parts", nargs="*", default=["tasks", "videos", "run"])
+    parser.add_argument(
+        "--parts", nargs="*", default=["tasks", "policies", "caches", "videos", "run"]
+    )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    for folder in ("task", "video", "pipeline"):
+    for folder in ("task", "policies", "video", "pipeline"):
         sys.path.insert(0, str(ROOT / "tests" / folder))
     outcomes: dict[str, Counter[str]] = {}
     violations: list[str] = []
-    parts = {"tasks": _tasks, "videos": _videos, "run": lambda: _harms(args)}
+    parts = {
+        "tasks": _tasks,
+        "policies": _policies,
+        "caches": _caches,
+        "videos": _videos,
+        "run": lambda: _harms(args),
+    }
     for part in args.parts:
         outcomes[part] = Counter()
         for name, case in parts[part]():
@@ -121,6 +129,64 @@ def _tasks() -> Iterator[tuple[str, Case]]:
 
     for name, spoil in strangers.CASES.items():
         yield name, case(spoil)
+
+
+def _policies() -> Iterator[tuple[str, Case]]:
+    import spoiled  # pyright: ignore[reportMissingImports]
+    import torch
+
+    from v2p_data.judging import contestant, play_of
+
+    def case(spoil: Callable[[Path], None]) -> Case:
+        def opened(folder: Path) -> str:
+            policy = Path(shutil.copytree(good, folder / "policy"))
+            spoil(policy)
+            outcome = "violation: it was opened"
+            try:
+                play_of(contestant(policy), 0, "cpu")
+            except V2PError:
+                if not spoiled.canary(policy).exists():
+                    raise
+            return "violation: a program ran" if spoiled.canary(policy).exists() else outcome
+
+        return opened
+
+    torch.set_num_threads(1)  # more do not survive a fork
+    with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as place:
+        good = spoiled.good_policy(Path(place) / "good")
+        play_of(contestant(good), 0, "cpu")  # imports what every case needs
+        for name, spoil in spoiled.POLICIES.items():
+            yield name, case(spoil)
+
+
+def _caches() -> Iterator[tuple[str, Case]]:
+    import small_dataset  # pyright: ignore[reportMissingImports]
+    import spoiled  # pyright: ignore[reportMissingImports]
+    import torch
+
+    from policies.bc.frames import read_frames
+
+    def case(spoil: Callable[[Path], None]) -> Case:
+        def read(folder: Path) -> str:
+            cache = Path(shutil.copytree(place / "cache", folder / "cache"))
+            spoil(cache / spoiled.MASK)
+            again = read_frames(dataset, small_dataset.REPO_ID, net, cache).pictures[spoiled.MASK]
+            same = small_dataset.are_equal(whole, again)
+            return "made anew" if same else "violation: it is trained on"
+
+        return read
+
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as folder:
+        place = Path(folder)
+        dataset = place / "dataset"
+        small_dataset.write_dataset(dataset)
+        net = small_dataset.policy()[0].net
+        whole = read_frames(dataset, small_dataset.REPO_ID, net, place / "cache").pictures[
+            spoiled.MASK
+        ]
+        for name, spoil in spoiled.CACHES.items():
+            yield name, case(spoil)
 
 
 def _videos() -> Iterator[tuple[str, Case]]:

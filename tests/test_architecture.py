@@ -21,6 +21,8 @@ BELOW: dict[str, set[str]] = {
     "task": {"scene", "video", "geometry", "seeds", "kinds"},
     # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
     "sim": {"task", "scene", "geometry", "seeds", "kinds"},
+    # A policy of LeRobot's as files; opening it is for `policies.evaluation`.
+    "checkpoint": {"scene"},
     # It trains policies, as the reward search does: the two rooms below the top that know `policies`.
     "experts": {"sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
     "episodes": {"sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
@@ -51,6 +53,7 @@ BELOW: dict[str, set[str]] = {
     "reward": {"experts", "task", "sim", "scene", "pipeline", "seeds", "kinds"},
     # It sees the arm that policies were trained with, and what a robot is; never the twin's inside.
     "deployment": {
+        "checkpoint",
         "twin",
         "evaluation",
         "episodes",

@@ -3,12 +3,14 @@
 All of them go through the same judge, so an expert's and a program's rates say what a policy can reach at best.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from policies.evaluation.rate import wilson
+from v2p_data.checkpoint import WEIGHTS_FILE, check_checkpoint
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
@@ -20,11 +22,7 @@ from v2p_data.task.task import TaskBundle
 
 PROGRAMS = "programs"
 """What `v2p eval` is told in a policy's place for the scripted programs."""
-POLICY_FILE, EXPERT_FILE, EXPERT_WEIGHTS_FILE = (
-    "model.safetensors",
-    "expert.json",
-    "weights.safetensors",
-)
+EXPERT_FILE, EXPERT_WEIGHTS_FILE = "expert.json", "weights.safetensors"
 UNSEEN_PX = 256
 """Size of pictures that nobody looks at."""
 Kind = Literal["policy", "expert", "programs"]
@@ -47,7 +45,7 @@ class Contestant:
         """Return what identifies it."""
         match self.kind:
             case "policy":
-                return {"policy": file_digest(self.folder / POLICY_FILE)}
+                return {"policy": file_digest(self.folder / WEIGHTS_FILE)}
             case "expert":
                 return {"expert": file_digest(self.folder / EXPERT_WEIGHTS_FILE)}
             case "programs":
@@ -58,16 +56,17 @@ def contestant(path: Path) -> Contestant:
     """Return who lies at `path`.
 
     Raises:
-        V2PError: nobody that can be judged.
+        V2PError: nobody that can be judged, or a policy that cannot be opened safely.
     """
     if str(path) == PROGRAMS and not path.is_dir():
         return Contestant(kind="programs", folder=path)
-    if (path / POLICY_FILE).is_file():
+    if os.path.lexists(path / WEIGHTS_FILE):
+        check_checkpoint(path)
         return Contestant(kind="policy", folder=path.resolve())
     if (path / EXPERT_FILE).is_file() and (path / EXPERT_WEIGHTS_FILE).is_file():
         return Contestant(kind="expert", folder=path.resolve())
     raise V2PError(
-        f"{path} holds no {POLICY_FILE}: it is no LeRobot policy. It holds no {EXPERT_FILE} either: it is no expert;"
+        f"{path} holds no {WEIGHTS_FILE}: it is no LeRobot policy. It holds no {EXPERT_FILE} either: it is no expert;"
         f" the scripted programs are judged by 'v2p eval {PROGRAMS} --tasks TASKS'"
     )
 

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from v2p_data.checkpoint import check_checkpoint
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import V2PError
@@ -222,6 +223,8 @@ def new_student(
     from policies.bc.configuration_v2p_bc import V2PBCConfig
     from policies.bc.student import Student
 
+    if start_from is not None:
+        check_checkpoint(start_from)
     try:
         network = V2PBCConfig(**policy.network(), num_labels=_num_labels(dataset), device="cpu")
     except ValueError as error:

@@ -2,7 +2,8 @@
 
 Video is decoded once, from the first frame of each file to the last, and what the encoders prepare of it is kept in a
 cache of memory-mapped arrays beside the training. The cache knows which dataset and which encoder it was made for and
-is made anew when either has changed. It is whole or absent, and one process at a time reads or writes it.
+is made anew when either has changed, or where its arrays have not the checksums that were written beside them. It is
+whole or absent, and one process at a time reads or writes it.
 """
 
 import contextlib
@@ -11,6 +12,7 @@ import hashlib
 import json
 import logging
 import shutil
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +31,7 @@ from policies.bc.modeling_v2p_bc import BCNet
 logger = logging.getLogger(__name__)
 
 CACHE_FILE = "cache.json"
+CACHE_VERSION = 2
 DECODED_AT_ONCE = 64
 ACTION = "action"
 
@@ -260,7 +263,7 @@ def _cached_pictures(dataset: Path, meta: Any, net: BCNet, key: str, cache: Path
     num_frames = int(np.sum(meta.episodes["length"]))
     identity = _identity(dataset, meta, net, key)
     with _locked(cache):
-        stored = _open_cache(cache, identity, num_frames)
+        stored = _open_cache(cache, identity)
         if stored is not None:
             return stored
         partial = cache.with_name(f"{cache.name}.partial")
@@ -280,11 +283,12 @@ def _cached_pictures(dataset: Path, meta: Any, net: BCNet, key: str, cache: Path
             done += len(frames)
         for array in arrays.values():
             array.flush()  # pyright: ignore[reportAttributeAccessIssue] - a memmap
-        sizes = {name: (partial / f"{name}.npy").stat().st_size for name in sorted(arrays)}
-        (partial / CACHE_FILE).write_text(json.dumps({"identity": identity, "bytes": sizes}))
+        (partial / CACHE_FILE).write_text(
+            json.dumps({"identity": identity, "crc32": _checksums(partial)})
+        )
         shutil.rmtree(cache, ignore_errors=True)
         partial.rename(cache)
-        stored = _open_cache(cache, identity, num_frames)
+        stored = _open_cache(cache, identity)
     assert stored is not None
     return stored
 
@@ -312,33 +316,36 @@ def _identity(dataset: Path, meta: Any, net: BCNet, key: str) -> str:
     cfg = net.cfg
     settings = (
         *(cfg.is_mask(key), cfg.mask_greys, cfg.num_labels, cfg.input_size_px),
-        *(cfg.encoder, cfg.mask_moments, PREPARE_VERSION),
+        *(cfg.encoder, cfg.mask_moments, PREPARE_VERSION, CACHE_VERSION),
     )
     digest.update(repr(settings).encode())
     return digest.hexdigest()
 
 
-def _open_cache(cache: Path, identity: str, num_frames: int) -> Prepared | None:
+def _open_cache(cache: Path, identity: str) -> Prepared | None:
     """Return the arrays of a cache, None where it is not of this dataset or damaged."""
     try:
         described = json.loads((cache / CACHE_FILE).read_text())
         if described["identity"] != identity:
             return None
-        sizes = {name: (cache / f"{name}.npy").stat().st_size for name in described["bytes"]}
+        if (found := _checksums(cache)) != described["crc32"]:
+            raise ValueError(f"the checksums of its arrays are {found}")  # noqa: TRY301
         # Copy on write: torch wants writable memory, and nothing writes.
-        arrays = {name: np.load(cache / f"{name}.npy", mmap_mode="c") for name in sizes}
-        is_whole = sizes == described["bytes"] and all(
-            len(array) == num_frames for array in arrays.values()
-        )
+        arrays = {name: np.load(cache / f"{name}.npy", mmap_mode="c") for name in found}
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         logger.warning("the cache %s is damaged (%s) and is made anew", cache, error)
         return None
-    if not is_whole:
-        logger.warning("the cache %s is damaged (an array is cut) and is made anew", cache)
-        return None
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+
+def _checksums(cache: Path) -> dict[str, int]:
+    """Return a checksum of each array's file: 3 GB/s on one core."""
+    return {
+        path.stem: zlib.crc32(np.memmap(path, np.uint8, "r"))
+        for path in sorted(cache.glob("*.npy"))
+    }
 
 
 def _prepared(net: BCNet, key: str, frames: UInt8[Tensor, "frame c h w"]) -> Prepared:

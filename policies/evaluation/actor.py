@@ -4,6 +4,7 @@ Each step is `lerobot-eval`'s: observation, environment's processor, policy's pr
 mode, at the policy's own precision. Whoever makes the pictures says which grey stands for a label.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,17 +14,18 @@ import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
 
-from policies.evaluation.rollout import LoadedPolicy, env_config, load_policy
+from policies.evaluation.rollout import (
+    LoadedPolicy,
+    UnsuitablePolicyError,
+    env_config,
+    load_policy,
+)
 
 MASK_KEY = "observation.images.mask"
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 GREY_TYPE = "v2p_bc"
 """The policy type that takes masks as one channel of greys, 0 to 255."""
-
-
-class UnsuitablePolicyError(ValueError):
-    """The policy wants to see or do something that the simulator does not have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,13 +86,22 @@ def load_actor(
         device: where the policy runs; by default, where its settings say.
 
     Raises:
-        UnsuitablePolicyError: it wants to see or do what the simulator does not have.
+        UnsuitablePolicyError: it cannot be opened, or wants to see or do what the simulator does not have.
     """
     from lerobot.envs.factory import make_env_pre_post_processors
 
     config = env_config()
-    height, width = check_features(folder, config)
-    loaded = load_policy(folder, config, device)
+    try:
+        height, width = check_features(folder, config)
+        loaded = load_policy(folder, config, device)
+    except UnsuitablePolicyError:
+        raise
+    except Exception as error:  # of LeRobot, of any kind
+        reason = re.sub(r"\s+", " ", str(error)).strip()[:200]
+        raise UnsuitablePolicyError(
+            f"the policy in {folder} cannot be loaded ({type(error).__name__}: {reason}); its network is of another version,"
+            " or it is damaged: train it anew"
+        ) from error
     before, after = make_env_pre_post_processors(config, loaded.policy.config)
     is_grey = loaded.policy.config.type == GREY_TYPE
     values = np.asarray(greys, np.uint8)

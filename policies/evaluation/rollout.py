@@ -5,6 +5,7 @@ the same successes (`actor`); this one is what it is compared with. The tasks co
 `v2p`, which the plugin `lerobot_policy_v2p` registers.
 """
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,12 @@ import torch
 
 ENV_TYPE = "v2p"
 NUM_VIDEOS = 3
+SETTINGS_ALONE = ("v2p_bc", "act", "diffusion", "vqbet", "tdmpc")
+"""Policy types whose networks follow from their settings; the others' are those of other models, which are named."""
+
+
+class UnsuitablePolicyError(ValueError):
+    """A policy cannot be opened, or wants to see or do something that the simulator does not have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +35,11 @@ class LoadedPolicy:
 def load_policy(folder: Path, env_config: Any, device: str | None = None) -> LoadedPolicy:
     """Read a checkpoint of any policy type LeRobot knows, checked against the environment's features.
 
-    It runs on `device`, by default where its settings say.
+    It runs on `device`, by default where its settings say. Whoever made the checkpoint is trusted: LeRobot runs what its
+    processors name, unless the engine has looked at them before (`v2p_data.checkpoint`).
+
+    Raises:
+        UnsuitablePolicyError: its weights are not those of the network in its settings.
     """
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import make_policy, make_pre_post_processors
@@ -38,6 +49,10 @@ def load_policy(folder: Path, env_config: Any, device: str | None = None) -> Loa
     config.pretrained_path = folder
     if device is not None:
         config.device = device
+    if getattr(config, "pretrained_backbone_weights", None):
+        config.pretrained_backbone_weights = None  # type: ignore[attr-defined] - would be fetched; the checkpoint's follow
+    if config.type in SETTINGS_ALONE:
+        _check_weights(folder, config)
     policy = make_policy(config, env_cfg=env_config)
     preprocessor, postprocessor = make_pre_post_processors(
         policy_cfg=config,
@@ -119,6 +134,35 @@ def evaluate_policy(
         loaded, envs, config, episodes=episodes, first_seed=first_seed, videos=videos
     )
     return [success for task in sorted(results) for success in results[task]]
+
+
+def _check_weights(folder: Path, config: Any) -> None:
+    """Demand the weights of the network that the settings describe, before a network of any size takes memory.
+
+    LeRobot takes a file without some of the weights, and leaves those random.
+    """
+    from lerobot.policies.factory import get_policy_class
+    from safetensors import safe_open
+
+    kind = get_policy_class(config.type)
+    with torch.device("meta"):
+        wanted = kind(copy.deepcopy(config)).state_dict(keep_vars=True)
+    with safe_open(folder / "model.safetensors", framework="pt") as file:
+        shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+    known = {
+        id(wanted[name]) for name in shapes.keys() & wanted.keys()
+    }  # tied weights are written once
+    for name, value in wanted.items():
+        if id(value) not in known:
+            raise UnsuitablePolicyError(
+                f"the weights of the policy in {folder} lack '{name}' of the network in its config.json: weights and"
+                " settings are not of one training; copy both anew"
+            )
+        if shapes.get(name, tuple(value.shape)) != tuple(value.shape):
+            raise UnsuitablePolicyError(
+                f"'{name}' has shape {shapes[name]} in the weights of the policy in {folder}, and {tuple(value.shape)} in"
+                " the network of its config.json: weights and settings are not of one training; copy both anew"
+            )
 
 
 def _register_plugins() -> None:

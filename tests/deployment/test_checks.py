@@ -63,12 +63,22 @@ def test_a_truncated_checkpoint(policy):
 
 def test_a_missing_or_garbled_checkpoint(policy):
     (policy / "policy_preprocessor.json").write_text('{"steps": [')
-    assert "policy_preprocessor.json, line 1" in (said := told(policy))
-    assert "not valid JSON; copy the policy anew" in said
+    assert "policy_preprocessor.json: Invalid JSON" in (said := told(policy))
+    assert "at line 1 column 11; copy the policy anew" in said
     (policy / "model.safetensors").unlink()
     assert "holds no model.safetensors" in told(policy)
     (policy / "config.json").unlink()
     assert "holds no config.json: it is no LeRobot policy" in told(policy)
+
+
+def test_a_processor_that_names_a_program_is_not_asked(policy, tmp_path):
+    path = policy / "policy_postprocessor.json"
+    said = json.loads(path.read_text())
+    step = {"class": "subprocess.Popen", "config": {"args": ["touch", str(tmp_path / "canary")]}}
+    path.write_text(json.dumps({**said, "steps": [step, *said["steps"]]}))
+
+    assert "names 'subprocess.Popen'" in told(policy)
+    assert not (tmp_path / "canary").exists()
 
 
 def test_other_features(policy):

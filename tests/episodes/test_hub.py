@@ -242,6 +242,17 @@ def test_a_folder_without_a_policy_is_refused(tmp_path: Path, online: Hub):
         push_policy(tmp_path, "user/policy")
 
 
+def test_a_policy_with_a_link_is_not_sent(tmp_path: Path, online: Hub):
+    (tmp_path / "config.json").write_text('{"type": "act"}')
+    (tmp_path / "model.safetensors").write_bytes(b"weights")
+    (tmp_path / "notes.txt").symlink_to("/etc/passwd")
+
+    with pytest.raises(V2PError, match=r"notes\.txt is a link"):
+        push_policy(tmp_path, "user/policy", waits_s=())
+
+    assert online.requests == []
+
+
 def test_a_policys_card_names_its_type_and_dataset(
     tmp_path: Path, online: Hub, monkeypatch: pytest.MonkeyPatch
 ):

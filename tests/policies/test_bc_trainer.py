@@ -1,6 +1,8 @@
 """Training on frames in memory: the same seed, a stop and a continuation, the mean weights, the best checkpoint."""
 
 import csv
+import os
+import signal
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -113,6 +115,40 @@ def test_a_training_that_was_stopped_ends_in_the_weights_of_an_undisturbed_one(
 
     assert are_equal(stopped, calm)
     assert not (tmp_path / "out" / STATE_FILE).exists()
+
+
+@pytest.mark.parametrize(("step", "net"), [(1, 0), (4, 9)])
+def test_a_training_that_was_killed_while_it_saved_ends_in_the_same_files(
+    tmp_path: Path, monkeypatch, step: int, net: int
+):
+    """Killed by the kernel, with half of a state written. The batches cross the end of the table; only the first state is
+    preceded by none, so that the first weights matter."""
+
+    def files(out: Path, net: int) -> dict[str, bytes]:
+        policy_, processors = policy(small(encoder="conv", random_shift=0.2), seed=net)
+        train(policy_, processors, table(policy_.net), recipe(save_every_s=0.0), out, seed=5)
+        save_policy(out / "policy", policy_, processors)
+        return {path.name: path.read_bytes() for path in (out / "policy").iterdir()}
+
+    def half(state: dict[str, Any], path: Path) -> None:
+        whole(state, path)
+        if state["step"] == step:
+            os.truncate(path, path.stat().st_size // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    whole = torch.save
+    assert STEPS * recipe().batch_size > NUM_FRAMES
+    calm = files(tmp_path / "calm", net=0)
+
+    child = os.fork()
+    if child == 0:
+        monkeypatch.setattr(torch, "save", half)
+        files(tmp_path / "killed", net=0)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == -signal.SIGKILL
+
+    assert files(tmp_path / "killed", net) == calm
 
 
 @pytest.mark.parametrize("step", [3, 4, 5, 6])

@@ -245,12 +245,6 @@ def loaded_policy(folder: Path, task: str, device: str) -> Any:
         actor = load_actor(folder, greys=PALETTE, task=task, device=device)
     except UnsuitablePolicyError as error:
         raise V2PError(str(error)) from error
-    except Exception as error:
-        reason = re.sub(r"\s+", " ", str(error)).strip()[:200]
-        raise V2PError(
-            f"the policy in {folder} cannot be loaded ({type(error).__name__}: {reason}); its network is of another version,"
-            " or it is damaged: train it anew"
-        ) from error
     if getattr(actor.loaded.policy.config, "use_task", False) and not task:
         raise V2PError("the policy needs the task in words: --task 'Lifting red box up'")
     return actor

@@ -6,7 +6,10 @@ of the run or LeRobot's `train_config.json`, as long as it is there.
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Gt
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from v2p_data.episodes.features import ACTION_KEY, METADATA_FILE, STATE_KEY
 from v2p_data.errors import V2PError
@@ -23,7 +26,9 @@ TASKS_IN_DATASET = Path("v2p/tasks")
 class Facts:
     """Of one policy; None or empty where it is not known."""
 
-    fps: float | None = None
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    fps: Annotated[float, Gt(0)] | None = None
     state: tuple[str, ...] = ()
     """Names of the state's entries, in order."""
     action: tuple[str, ...] = ()
@@ -82,15 +87,14 @@ def read_facts(policy: Path) -> Facts:
     path = policy / FACTS_FILE
     if path.is_file():
         said = read_object(path, "delete it, or train anew")
-        lists = ("state", "action", "palette")
+        said.pop("schema", None)
         try:
-            fields: dict[str, Any] = {
-                k: tuple(v) if k in lists else v for k, v in said.items() if k != "schema"
-            }
-            return Facts(**fields)
-        except TypeError as error:
+            return TypeAdapter(Facts).validate_python(said)
+        except ValidationError as error:
+            fault = error.errors(include_url=False)[0]
+            where = ".".join(map(str, fault["loc"]))
             raise V2PError(
-                f"{path} is of another version ({error}); delete it, or train anew"
+                f"{path} is of another version ({where}: {fault['msg']}); delete it, or train anew"
             ) from error
     dataset = _dataset_of(policy)
     return facts_of_dataset(dataset) if dataset is not None else Facts()

@@ -26,6 +26,7 @@ from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.pipeline.shareable import without_places
+from v2p_data.scene.files import demand_plain_files
 
 logger = logging.getLogger(__name__)
 
@@ -137,9 +138,10 @@ def push_policy(
     """Upload a LeRobot policy (a checkpoint's `pretrained_model` folder).
 
     Raises:
-        V2PError: no policy, no token, or the Hub refuses; says what to do.
+        V2PError: no policy, links in it, no token, or the Hub refuses; says what to do.
     """
     check_repo_id(repo_id)
+    demand_plain_files(folder)
     missing = [name for name in POLICY_FILES if not (folder / name).is_file()]
     if missing:
         raise V2PError(

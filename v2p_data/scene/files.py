@@ -91,7 +91,19 @@ def copy_folder(
         ignore: as of `shutil.copytree`.
 
     Raises:
-        V2PError: it holds links, special files, or too many files. Nothing has been copied then.
+        V2PError: as `demand_plain_files`. Nothing has been copied then.
+    """
+    demand_plain_files(source, ignore)
+    shutil.copytree(source, into, ignore=ignore)
+
+
+def demand_plain_files(
+    source: Path, ignore: Callable[[str, list[str]], Iterable[str]] | None = None
+) -> None:
+    """Demand that what lies in a folder may go elsewhere; the arguments are those of `copy_folder`.
+
+    Raises:
+        V2PError: it holds links, special files, or too many files.
     """
     count = 0
     for folder, subfolders, names in os.walk(source):
@@ -108,7 +120,6 @@ def copy_folder(
             count += 1
     if count > MAX_FILES:
         raise V2PError(f"{source} holds {count} files; at most {MAX_FILES} are copied")
-    shutil.copytree(source, into, ignore=ignore)
 
 
 def _is_in_hub_cache(path: Path, where: Path) -> bool:
