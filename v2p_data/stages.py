@@ -306,7 +306,7 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
         config=Seeded(config=replace(cfg.expert, warm_start=None), seed=cfg.seed),
         inputs={"task": task},
         sources=solved_digests(cfg.expert.warm_start) | named,
-        version=3,
+        version=4,
         make=partial(
             make_expert,
             warm_start=cfg.expert.warm_start,

@@ -6,13 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from policies.evaluation.paired import Difference
+from policies.evaluation.rate import wilson
 from policies.ppo.config import ActorConfig, ImitationConfig, PPOConfig
 from policies.ppo.policy import ActorCritic, Expert, weights_of
 from policies.ppo.train import ExpertResult
 from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, keep_better, learn, success_of
-from v2p_data.experts.record import Learned
+from v2p_data.experts.record import Comparison, Judged, Learned
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
@@ -134,6 +136,35 @@ def test_a_policy_that_meets_itself_on_the_same_episodes_is_exactly_as_good(
     assert updates == 0
     assert compared.taught == compared.ppo
     assert (compared.success_gain.value, compared.moved) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("gain", "saved_s", "is_better"),
+    [
+        ((0.05, 0.01, 0.09), (-0.1, -0.2, 0.0), True),
+        ((0.05, -0.01, 0.11), (0.0, 0.0, 0.0), False),
+        ((0.0, -0.01, 0.01), (0.05, 0.05, 0.05), True),
+        ((-0.004, -0.02, 0.01), (0.1, 0.1, 0.1), False),
+        ((0.0, -0.01, 0.01), None, False),
+    ],
+)
+def test_ppo_counts_as_better_only_where_an_interval_says_so(
+    gain: tuple[float, float, float], saved_s: tuple[float, float, float] | None, is_better: bool
+):
+    def difference(value: float, low: float, high: float) -> Difference:
+        return Difference(value=value, low=low, high=high, pairs=256)
+
+    judged = Judged(success=wilson(250, 256), median_s=1.0, score=0.9)
+
+    compared = Comparison(
+        taught=judged,
+        ppo=judged,
+        success_gain=difference(*gain),
+        time_saved_s=difference(*saved_s) if saved_s else None,
+        moved=0.03,
+    )
+
+    assert compared.is_better == is_better
 
 
 @pytest.mark.slow

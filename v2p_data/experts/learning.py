@@ -5,7 +5,8 @@
 * `teach`: scripted programs are tried; the one that the task's own success function likes best is imitated (DAgger);
 * `improve_by_ppo`: PPO goes on from the taught policy, from another task's expert, or from nothing. After a taught
   policy it trains at the fine time step, at which episodes are recorded;
-* `keep_better`: the taught policy and PPO's play the same episodes at the fine time step, and the better one is kept.
+* `keep_better`: the taught policy and PPO's play the same episodes at the fine time step, and PPO's is kept if it
+  is surely better.
 
 The result is a neural network in any case; scripts never make a dataset. It is called PPO's only if PPO changed it.
 """
@@ -222,10 +223,11 @@ def improve_by_ppo(
 def keep_better(
     worlds: Worlds, cfg: ExpertConfig, taught: Path, out: Path, improved: ExpertResult
 ) -> tuple[Comparison, int]:
-    """Leave the better one of the taught policy and PPO's in `out`; also return how many gradient steps it took.
+    """Leave PPO's policy in `out` if it is surely better than the taught one, else that; also return its gradient steps.
 
     Both of PPO's policies, the best in training and the last one, and the taught one play the same episodes at the fine
-    time step. Of PPO's two the one with the higher score is compared with the taught one.
+    time step. Of PPO's two the one with the higher score is compared with the taught one. Where no difference shows, the
+    taught one is the better teacher: it saw more states, and policies cloned from it lift unseen objects more often.
     """
     env = worlds.make(cfg.compare_worlds, "which is better", fine=True)
     dt_s, seed = env.physics.control_dt_s, worlds.seed_of("episodes that compare")
@@ -252,9 +254,8 @@ def keep_better(
         time_saved_s=median_difference(dt_s * of_taught.steps[both], dt_s * of_ppo.steps[both]),
         moved=float(np.abs(after.act(states) - before.act(states)).mean()),
     )
-    is_kept = of_ppo.score > of_taught.score
-    (after if is_kept else before).save(out)
-    return comparison, updates if is_kept else 0
+    (after if comparison.is_better else before).save(out)
+    return comparison, updates if comparison.is_better else 0
 
 
 def _say_unchanged(title: str, improved: ExpertResult, pupil: Path | None) -> None:

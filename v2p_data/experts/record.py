@@ -45,6 +45,12 @@ class Comparison:
     moved: float
     """Mean absolute difference of their actions in the states that the taught policy visits; actions lie in [-1, 1]."""
 
+    @property
+    def is_better(self) -> bool:
+        """Tell whether PPO's policy is surely better: in success, or in time where it succeeds no less often."""
+        is_faster = self.time_saved_s is not None and self.time_saved_s.low > 0
+        return self.success_gain.low > 0 or (self.success_gain.value >= 0 and is_faster)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Learned:
