@@ -250,7 +250,7 @@ def test_two_names_of_one_constant_become_two_constants_and_only_what_is_used_is
 
 
 def test_an_answer_of_endless_sums_is_sent_back():
-    with pytest.raises(SpliceError, match="not Python|too large"):
+    with pytest.raises(SpliceError, match=r"not Python|too large"):
         with_reward(PARENT, reward(" + ".join(["1.0"] * 3000)))
 
 
