@@ -1,7 +1,7 @@
 """A hundred captions as people post them, in five languages, each with the words that tell what is seen.
 
-The captions were written for this test, after the manner of posts; the even ones of each language (`TRIED_ON`) were looked at
-while the rule was made, the odd ones (`JUDGED_ON`) were judged once, when it was done.
+The captions were written for this test, after the manner of posts; half of them (`TRIED_ON`) were looked at while the
+rule was made, the others (`JUDGED_ON`) were judged once, when it was done.
 """
 
 POSTED = {
@@ -116,5 +116,8 @@ POSTED = {
         ("俯拍｜拿起锅", "拿起锅"),
     ],
 }  # fmt: skip
-TRIED_ON = [(language, *pair) for language, pairs in POSTED.items() for pair in pairs[::2]]
-JUDGED_ON = [(language, *pair) for language, pairs in POSTED.items() for pair in pairs[1::2]]
+HALVES = [
+    [(language, *pair) for k, (language, pairs) in enumerate(POSTED.items()) for pair in pairs[(k + half) % 2 :: 2]]
+    for half in (0, 1)
+]  # fmt: skip
+TRIED_ON, JUDGED_ON = HALVES
