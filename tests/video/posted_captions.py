@@ -4,6 +4,7 @@ The captions were written for this test, after the manner of posts; half of them
 rule was made, the others (`JUDGED_ON`) were judged once, when it was done.
 """
 
+# ruff: noqa: RUF001 - the wide marks of Chinese are meant
 POSTED = {
     "English": [
         ("Lifting red box up #fyp #robotics", "Lifting red box up"),
@@ -116,8 +117,71 @@ POSTED = {
         ("俯拍｜拿起锅", "拿起锅"),
     ],
 }  # fmt: skip
+LATER = {
+    "English": [
+        ("ok so this is me lifting a yellow mug up lol", "lifting a yellow mug up"),
+        ("Pushing toy truck to the left (recorded on my old Nokia, don't judge)", "Pushing toy truck to the left"),
+        ("New vid!! Putting ping pong ball into cup 🏓 comment what to do next ⬇️⬇️", "Putting ping pong ball into cup"),
+        ("tipping juice box over [OC] [no audio]", "tipping juice box over"),
+        ("Moving eraser next to ruler - GoPro Hero 11, 120fps, wide angle", "Moving eraser next to ruler"),
+        ("*** lifting teapot up *** IG: @teatime.daily", "lifting teapot up"),
+        ("Covering bowl with plate – first take, one shot, no edits", "Covering bowl with plate"),
+        ("how to drop a coin behind the box (easy tutorial) #lifehack", "drop a coin behind the box"),
+        ("Day 3/30 ➡️ put the lemon into the basket, tripod is broken sorry", "put the lemon into the basket"),
+        ("Pulling tape from right to left. Camera: Canon R5. Music: none.", "Pulling tape from right to left"),
+        ("me, pouring nothing, just lifting a vase up (ignore the mess)", "lifting a vase up"),
+        ("Knocking over a tin :) rate it 1-10", "Knocking over a tin"),
+        ("Reposting: slide coaster from left to right // tripod shot", "slide coaster from left to right"),
+        ("lift the soap up >>> full vid on my channel", "lift the soap up"),
+        ("Throwing dice into tray!!! who else does this?", "Throwing dice into tray"),
+    ],
+    "German": [
+        ("Zitrone in den Korb legen 🍋 schreibt mir in die Kommentare", "Zitrone in den Korb legen"),
+        ("Spielzeugauto schieben (Kamera wackelt etwas)", "Spielzeugauto schieben"),
+        ("Teekanne anheben, gefilmt von meiner Schwester", "Teekanne anheben"),
+        ("Saftpackung umkippen - Folge mir für mehr", "Saftpackung umkippen"),
+        ("Lineal verschieben | Full HD | 50 fps", "Lineal verschieben"),
+        ("Vase anheben (Unordnung bitte ignorieren)", "Vase anheben"),
+        ("Untersetzer schieben ;) ganzes Video auf meinem Kanal", "Untersetzer schieben"),
+        ("Würfel in Schale werfen!!! wer kennt es?", "Würfel in Schale werfen"),
+    ],
+    "French": [
+        ("Mettre le citron dans le panier 🍋 dites-moi en commentaire", "Mettre le citron dans le panier"),
+        ("Pousser la petite voiture (caméra qui tremble)", "Pousser la petite voiture"),
+        ("Soulever la théière, filmé par ma sœur", "Soulever la théière"),
+        ("Renverser la brique de jus - suivez-moi pour plus", "Renverser la brique de jus"),
+        ("Déplacer la règle | qualité HD | son coupé", "Déplacer la règle"),
+        ("Soulever le vase (ne faites pas attention au désordre)", "Soulever le vase"),
+        ("Glisser le dessous de verre ;) la suite sur ma chaîne", "Glisser le dessous de verre"),
+        ("Lancer les dés dans le bol !!! vous aussi ?", "Lancer les dés dans le bol"),
+    ],
+    "Spanish": [
+        ("Poner el limón en la cesta 🍋 déjame un comentario", "Poner el limón en la cesta"),
+        ("Empujar el cochecito (la cámara tiembla)", "Empujar el cochecito"),
+        ("Levantar la tetera, grabado por mi hermana", "Levantar la tetera"),
+        ("Volcar el brik de zumo - sígueme para más", "Volcar el brik de zumo"),
+        ("Mover la regla | calidad HD | sin audio", "Mover la regla"),
+        ("Levantar el jarrón (no miren el desorden)", "Levantar el jarrón"),
+        ("Deslizar el posavasos ;) vídeo completo en mi canal", "Deslizar el posavasos"),
+        ("Tirar los dados en el cuenco !!! ¿quién más?", "Tirar los dados en el cuenco"),
+    ],
+    "Chinese": [
+        ("把柠檬放进篮子🍋评论区告诉我", "把柠檬放进篮子"),
+        ("推玩具车（镜头有点抖）", "推玩具车"),
+        ("拿起茶壶，妹妹帮我拍的", "拿起茶壶"),
+        ("推倒果汁盒 - 喜欢就收藏", "推倒果汁盒"),
+        ("移动尺子 | 高清 | 静音", "移动尺子"),
+        ("举起花瓶（忽略背景）", "举起花瓶"),
+        ("滑动杯垫～完整版在我主页", "滑动杯垫"),
+        ("把骰子扔进盘子！！！你们呢？", "把骰子扔进盘子"),
+    ],
+}  # fmt: skip
+"""Written when the rule was made, in another manner: 32 of these 47 were read right before they were looked at."""
+
+
 HALVES = [
     [(language, *pair) for k, (language, pairs) in enumerate(POSTED.items()) for pair in pairs[(k + half) % 2 :: 2]]
     for half in (0, 1)
 ]  # fmt: skip
 TRIED_ON, JUDGED_ON = HALVES
+SEEN_LATER = [(language, *pair) for language, pairs in LATER.items() for pair in pairs]

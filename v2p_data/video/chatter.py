@@ -1,9 +1,10 @@
 """What people post around a caption and what names no object: links, tags, decorations, remarks on the filming.
 
-A caption is cut into sentences and these into parts. From each part, links, mentions, tags at its ends and remarks go; what
-is left is told. The remarks are known in English, German, French, Spanish and Chinese.
+A caption is cut into sentences and these into parts. What stands in round brackets, links, mentions, tags at the
+ends and remarks go; what is left is told. The remarks are known in English, German, French, Spanish and Chinese.
 """
 
+# ruff: noqa: RUF001 - the wide marks of Chinese are meant
 import re
 import unicodedata
 
@@ -14,7 +15,9 @@ _LINK = re.compile(
 _MENTION = re.compile(r"(?<!\w)[@＠][\w.]*\w")
 _TAG = r"[#＃]\w+"
 _TAGS_AT_AN_END = re.compile(rf"^(?:\s*{_TAG})+|(?:\s*{_TAG})+\s*$")
-_SENTENCE = re.compile(r"[|｜•·~～*^\n]+|\.{2,}|…|\s[-–—]+\s|—|(?<!\bno|\bnr|\bst|\bdr|\bmr|\bpt|\bep)(?<!\bvol|\bmrs)[.!?]+(?=\s|$)|[。！？]+|:(?=\s)|：")
+_SENTENCE = re.compile(
+    r"[|｜•·~～*^\n]+|\.{2,}|…|\s[-–]\s|—|(?<!\S)[^\w\s]{2,}(?!\S)|(?<!\bno|\bnr|\bst|\bdr|\bmr|\bpt|\bep)(?<!\bvol|\bmrs)[.!?]+(?=\s|$)|[。！？]+|:(?=\s)|："
+)
 _PART = re.compile(r"(\s*[,;，；、]\s*)")
 """Between parts; where both stay, it stays."""
 _ASIDE = re.compile(r"([(\[（【])([^()\[\]（）【】]*)([)\]）】])")
@@ -30,7 +33,7 @@ _WORDS = [
     r"vue d[eu] (?:dessus|haut|côté)|gros plan|vista (?:desde arriba|superior|lateral|cenital)|primer plano|[俯侧仰][拍视]|特写",
     r"(?:sound|audio|volume) (?:on|off|up)|(?:no|without) (?:sound|audio|music|talking|cuts|edits?)|ohne (?:ton|musik|schnitt)",
     r"sans (?:le )?(?:son|musique|coupures?)|sin (?:sonido|audio|música|cortes)|[无没]有?(?:声音?|剪辑|配乐)",
-    r"unedited|uncut|raw footage|original (?:sound|video)|handyvideo|ungeschnitten|non monté|sin editar|原声|未剪辑",
+    r"lol|haha+|lmao|omg|xd|ok(?:ay)?,? so|oc|unedited|uncut|raw footage|original (?:sound|video)|handyvideo|ungeschnitten|non monté|sin editar|原声|未剪辑",
     r"(?:part|pt|teil|partie|parte|episode|ep|take|vol|folge|épisode|episodio|capítulo)\.? ?#?\d+(?:/\d+)?(?! (?:of|von|de)\b)|第 ?[\d一二三四五六七八九十]+ ?[集期部]",
 ]  # fmt: skip
 """Remarks of a word or two, which go wherever they stand."""
@@ -40,7 +43,7 @@ _ENDINGS = [
     r"(?:mit|auf|per) [\w ]{0,30}(?:gefilmt|aufgenommen|gedreht)|(?:gefilmt|aufgenommen|gedreht) (?:mit|von|auf|in)",
     r"(?:filmée?|tournée?|enregistrée?) (?:avec|sur|par|au|à|en) ",
     r"(?:grabad[oa]|filmad[oa]) (?:con|en|por|desde) ",
-    r"(?:用|拿)?\w{0,8}(?:手机|相机|gopro|iphone|华为|小米)\w{0,4}(?:拍|录)",
+    r"(?:用|拿)?\w{0,8}(?:手机|相机|gopro|iphone|华为|小米)\w{0,4}(?:拍|录)|\w{0,8}[拍录](?:的|摄)$",
 ]
 """Remarks that go on to the end of their part."""
 
@@ -92,8 +95,9 @@ def _is_decoration(char: str) -> bool:
 
 
 def _aside(brackets: re.Match[str]) -> str:
-    left = _without_remarks(brackets[2])
-    return brackets[1] + left + brackets[3] if _says(left) else " "
+    """Return what stays of a part in brackets: a place for an object, or an object that somebody listed."""
+    is_place = brackets[1] == "[" and _says(_without_remarks(brackets[2]))
+    return brackets[0] if is_place or "§" in brackets[2] else " "
 
 
 def _without_remarks(sentence: str) -> str:
