@@ -33,7 +33,7 @@ SLOW_S = 1.0
 SCALED = ("_pos", "_size", "_width")
 """How the names of states in metres end."""
 
-_FAULTS = {
+_FAULTS: dict[int, str] = {
     signal.SIGFPE: "it divides whole numbers in a way that the processor refuses (SIGFPE); use floats",
     signal.SIGSEGV: "it makes torch crash (SIGSEGV); write it with other operations",
     signal.SIGILL: "it makes torch crash (SIGILL); write it with other operations",
