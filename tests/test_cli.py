@@ -1,6 +1,9 @@
 """What a user gets for bad input: one sentence, exit code 2, and nothing made before is harmed."""
 
+import errno
 import json
+import os
+import pwd
 import shlex
 import shutil
 import subprocess
@@ -10,8 +13,11 @@ from pathlib import Path
 
 import pytest
 
+from v2p_data import cli
 from v2p_data.cli import run
 from v2p_data.commands.run import _settings_in
+from v2p_data.errors import V2PError
+from v2p_data.task.cache import cache_folder
 
 SAMPLES = Path(__file__).parents[1] / "datasets" / "sample_videos"
 
@@ -231,3 +237,36 @@ def test_only_datasets_and_policies_can_be_pushed(capsys, tmp_path):
     assert "no LeRobot dataset" in said(capsys, "verify", tmp_path)
     assert "is no dataset of v2p generate" in said(capsys, "train", tmp_path)
     assert "no LeRobot policy" in said(capsys, "eval", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.EROFS, "on a disk that can be written"),
+        (errno.EACCES, "that you may write"),
+        (errno.ENOSPC, "make room"),
+        (errno.EMFILE, "ulimit -n"),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_one_sentence(monkeypatch, capsys, number, said):
+    def refuse(*_):
+        raise OSError(number, os.strerror(number), "/some/place")
+
+    monkeypatch.setattr(cli, "_command", lambda name: refuse)
+
+    assert run(["status", "somewhere"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"v2p status: /some/place cannot be used: {os.strerror(number)}; ")
+    assert said in line
+
+
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch):
+    def nobody(_):
+        raise KeyError("no such user")
+
+    for variable in ("HOME", "XDG_CACHE_HOME", "V2P_CACHE_DIR"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", nobody)
+
+    with pytest.raises(V2PError, match="no home folder to keep files in; set V2P_CACHE_DIR to"):
+        cache_folder("convex")

@@ -22,3 +22,9 @@ def test_an_error_is_the_same_after_the_way_between_processes(error: V2PError):
     assert type(there) is type(error)
     assert str(there) == str(error)
     assert vars(there) == vars(error)
+
+
+def test_an_error_that_quotes_a_stranger_holds_no_orders_for_a_terminal():
+    error = ItemRejectedError("worker_refused", "it said 'no\x1b[2J\u202e\udce9' of 'क्\u200dष'")
+
+    assert str(error) == error.detail == "it said 'no\\x1b[2J\\u202e\\udce9' of 'क्\u200dष'"

@@ -5,6 +5,7 @@ Only light modules are imported here, so that `v2p --help` answers at once; each
 
 import contextlib
 import difflib
+import errno
 import io
 import logging
 import os
@@ -54,6 +55,17 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "reward show": ("reward", "what a search tried, with curves, analysis and differences"),
 }
 """The same for commands of two words; a folder of the second word's name is given as `./review`."""
+_WHAT_TO_DO = {
+    errno.EACCES: "choose a folder that you may write, or ask for the right to",
+    errno.EPERM: "choose a folder that you may write, or ask for the right to",
+    errno.EROFS: "choose a folder on a disk that can be written",
+    errno.ENOSPC: "make room, or choose a folder on another disk; what was finished is kept",
+    errno.EDQUOT: "make room, or choose a folder on another disk; what was finished is kept",
+    errno.EFBIG: "raise the limit on file sizes (ulimit -f); what was finished is kept",
+    errno.EMFILE: "raise the limit on open files (ulimit -n); what was finished is kept",
+    errno.ENAMETOOLONG: "choose a shorter path",
+}
+"""What no command can mend by itself, wherever it is met."""
 
 
 def main() -> None:
@@ -86,6 +98,15 @@ def run(argv: Sequence[str]) -> int:
     except V2PError as error:
         known = name in COMMANDS or name in SUBCOMMANDS
         print(f"v2p {name}: {error}" if known else f"v2p: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        if error.errno not in _WHAT_TO_DO or isinstance(error, BrokenPipeError):
+            raise
+        where = error.filename or "a file"
+        print(
+            f"v2p {name}: {where} cannot be used: {error.strerror}; {_WHAT_TO_DO[error.errno]}",
+            file=sys.stderr,
+        )
         return 2
     except KeyboardInterrupt:
         print(

@@ -6,7 +6,14 @@ from typing import Any, Literal
 
 
 class V2PError(Exception):
-    """Bad input or a bad setting: one clear sentence for the user, exit code 2."""
+    """Bad input or a bad setting: one clear sentence for the user, exit code 2.
+
+    Args:
+        sentence: may quote files of others: what a terminal would obey, or not show, is written as its code.
+    """
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(_shown(sentence))
 
 
 class ItemRejectedError(V2PError):
@@ -21,7 +28,7 @@ class ItemRejectedError(V2PError):
     def __init__(self, reason: str, detail: str, value: float | None = None) -> None:
         super().__init__(detail)
         self.reason = reason
-        self.detail = detail
+        self.detail = str(self)
         self.value = value
 
     def __reduce__(self) -> tuple[Any, ...]:  # a worker process raises it too
@@ -39,7 +46,7 @@ class UnusableError(V2PError):
     def __init__(self, reason: Literal["damaged", "newer_version"], detail: str) -> None:
         super().__init__(detail)
         self.reason = reason
-        self.detail = detail
+        self.detail = str(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.reason, self.detail)
@@ -51,3 +58,14 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, names, n=1)
     hint = f" Did you mean '{close[0]}'?" if close else ""
     return f"{hint} Known: {', '.join(names)}."
+
+
+def _shown(text: str) -> str:
+    if text.isprintable():
+        return text
+    # a line end, and joiners that are part of Persian words and of emoji
+    plain = (c.isprintable() or c in "\n\u200c\u200d" for c in text)
+    codes = (
+        c if ok else c.encode("unicode_escape").decode() for c, ok in zip(text, plain, strict=True)
+    )
+    return "".join(codes)

@@ -79,3 +79,22 @@ def end_group(process: subprocess.Popen[bytes], grace_s: float = 0.0) -> None:
         with suppress(subprocess.TimeoutExpired):
             process.wait(timeout=wait_s)
     process.wait()
+
+
+def end_marked(mark: str) -> None:
+    """Kill all processes that were started with a mark in their environment, whatever session they lead; on Linux only.
+
+    Args:
+        mark: `NAME=value`, of which nobody else has the value.
+    """
+    word = mark.encode()
+    for _ in range(5):  # one may have started another meanwhile
+        found = 0
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):
+                if word in path.read_bytes().split(b"\0"):
+                    os.kill(int(path.parent.name), signal.SIGKILL)
+                    found += 1
+        if not found:
+            return
+        time.sleep(0.02)

@@ -1,6 +1,7 @@
 """The page takes clicks from this machine, through its own address only."""
 
 import json
+import socket
 import urllib.error
 import urllib.request
 
@@ -45,12 +46,14 @@ def test_the_page_shows_the_picture_and_asks_for_each_object_in_order(page):
 def test_clicks_are_checked_at_once_and_kept_in_order(page):
     wrong = post(page, u=5.0, v=90.0)
     garbled = post(page, u="left")
+    endless = post(page, u=float("inf"), v=float("nan"))
     red = post(page, u=30.0, v=30.5)
     blue = post(page, u=60.0, v=70.0)
     late = post(page, u=60.0, v=70.0)
 
     assert "on the table or the background" in wrong["error"]
     assert "two numbers" in garbled["error"]
+    assert "error" in endless
     assert (red["done"], blue["done"]) == (False, True)
     assert "error" in late
     assert page.wait(1.0) == ((30.0, 30.5), (60.0, 70.0))
@@ -68,6 +71,15 @@ def test_strangers_get_nothing(page):
             fetched(address, body, host)
         assert error.value.code in (404, 413)
     assert page.clicks == []
+
+
+def test_a_length_that_is_no_plain_number_is_refused(page):
+    port, path = page.address.split(":")[2].split("/", 1)
+    asked = f"POST /{path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Length: ²\r\n\r\n"
+
+    with socket.create_connection(("127.0.0.1", int(port)), timeout=10) as connection:
+        connection.sendall(asked.encode())
+        assert b" 413 " in connection.recv(1000)
 
 
 def test_nobody_clicks(page):

@@ -155,3 +155,8 @@ def test_lerobots_own_rollout_sees_by_tracking_from_a_click(
     assert len(seen) > 3
     overlaps = [(a & b).sum() / (a | b).sum() for a, b in seen]
     assert np.mean(overlaps) > 0.9
+
+
+def test_a_gpu_that_is_not_there_is_one_sentence_before_a_robot_is_asked(capsys):
+    assert run(["deploy", "nowhere", "--robot.type=v2p_twin", "--device=mps"]) == 2
+    assert "--device mps is not on this machine; it has cpu" in capsys.readouterr().err

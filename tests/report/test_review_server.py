@@ -1,6 +1,7 @@
 """The served page takes requests from itself only, and says in a sentence what cannot be done."""
 
 import json
+import socket
 import urllib.error
 import urllib.request
 
@@ -120,6 +121,40 @@ def test_nothing_is_there_without_the_token(server, clips):
         assert fetched(f"http://127.0.0.1:{port}/{path}")[0] == 404
     assert fetched(f"http://127.0.0.1:{port}/wrong/mark/lift", {"phrase": "cup"})[0] == 404
     assert clips.told == []
+
+
+@pytest.mark.parametrize("hint", [[], [1], "box", 3, True])
+def test_a_hint_of_another_type_is_refused(server, clips, hint):
+    said = json.loads(fetched(server.address + "mark/lift", {"phrase": "cup", "hint": hint})[2])
+
+    assert said["error"].startswith("a hint is an object")
+    assert clips.told == []
+
+
+def test_a_judgement_of_another_type_is_refused(server, clips):
+    said = json.loads(fetched(server.address + "judge/lift", {"judgement": ["right"]})[2])
+
+    assert said["error"].startswith("a judgement is a word")
+    assert clips.told == []
+
+
+@pytest.mark.parametrize("length", ["²", "٣", "-1", "1e3", "9" * 5000, ""])
+def test_a_length_that_is_no_plain_number_is_refused(server, clips, length):
+    port, path = server.address.split(":")[2].split("/", 1)
+    asked = f"POST /{path}mark/lift HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Length: {length}\r\n\r\n"
+
+    with socket.create_connection(("127.0.0.1", int(port)), timeout=10) as connection:
+        connection.sendall(asked.encode())
+        answer = connection.recv(1000)
+
+    assert answer.startswith(b"HTTP/1.1 413")
+    assert clips.told == []
+
+
+def test_a_part_of_a_film_that_begins_beyond_all_numbers_is_none(server):
+    status, _, body = fetched(server.address + "film/lift/", Range="bytes=" + "9" * 5000 + "-")
+
+    assert (status, len(body)) == (200, 200)
 
 
 def test_a_body_that_is_too_long_or_no_object_is_refused(server, clips):

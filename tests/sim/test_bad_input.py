@@ -104,6 +104,7 @@ MISSING_VERTEX = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 .1\nf 1 2 9\nf 1 2 4\nf 1
     ("text", "reason", "says"),
     [
         (NAN_VERTEX, "mesh_not_finite", "1 of 4 vertices"),
+        (NAN_VERTEX.replace("nan", "1e308"), "mesh_not_finite", "1 of 4 vertices"),
         (POINT, "flat_mesh", "encloses nothing"),
         (LINE, "flat_mesh", "encloses nothing"),
         (SLANTED_SHEET, "flat_mesh", "encloses nothing"),
@@ -111,7 +112,7 @@ MISSING_VERTEX = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 .1\nf 1 2 9\nf 1 2 4\nf 1
         ("", "mesh_unreadable", "no faces"),
         ("hello\x00 world", "mesh_unreadable", "no faces"),
     ],
-    ids=["NaN", "point", "line", "slanted sheet", "missing vertex", "empty", "text"],
+    ids=["NaN", "far away", "point", "line", "slanted sheet", "missing vertex", "empty", "text"],
 )
 def test_a_hopeless_mesh_is_refused_by_object_and_file(world_of, text, reason, says):
     with pytest.raises(ItemRejectedError, match=r"'thing' in .*thing\.obj") as caught:

@@ -303,6 +303,23 @@ ANSWERS = {
         {"reward": "for i in range(33):\n    parts['a' + str(i)] = reward"},
         "more than 32 components",
     ),
+    "success without numbers": ({"success": LATER + "success = success.to('meta')"}, "device of the states"),
+    "a reward without numbers": ({"reward": LATER + "reward = reward.to('meta')"}, "device of the states"),
+    "a component without numbers": ({"reward": LATER + "parts['height'] = reward.to('meta')"}, "device of"),
+    "an observation without numbers": (
+        {"observe": "states['more'] = states['cube_pos']\n" + LATER + "states['more'] = states['more'].to('meta')\n"
+         "keys.append('more')", "size": "93"},
+        "device of the states",
+    ),
+    "a success of named rows": (
+        {"success": LATER + "success = torch.ones(len(success), names=['env']) > 0"},
+        "must be a plain tensor",
+    ),
+    "a wide observation": (
+        {"observe": "states['more'] = torch.zeros(6, 5000)\nkeys.append('more')", "size": "5090"},
+        "5090 numbers; at most 4096",
+    ),
+    "poses without numbers": ({"reset": "return {'cube': torch.ones(6, 7).to('meta')}"}, "a plain tensor"),
     "a size that is no number": ({"size": "'90'"}, "a whole number"),
     "poses of no object": ({"reset": "return {}"}, "a pose per object: cube"),
     "poses of other objects": ({"reset": "return {'can': torch.zeros(6, 7)}"}, "a pose per object: cube"),
@@ -316,6 +333,7 @@ ANSWERS = {
 }  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore:Named tensors")
 @pytest.mark.parametrize(("bodies", "words"), ANSWERS.values(), ids=ANSWERS)
 def test_an_answer_that_may_not_be_ends_with_a_sentence_whenever_it_comes(
     bodies: dict[str, str], words: str, make_env: Callable[..., BatchEnv]

@@ -80,6 +80,7 @@ BUILTINS = {
     "super with arguments": "super(Lift, self).compute_success(states)",
     "super as a value": "y = super()",
     "super's attribute": "y = super().scene_info",
+    "the base class made anew": "super().__init__(states, 1)",
     "super's private method": "super().__setattr__('envs', 1)",
     "input": "y = input()",
     "breakpoint": "breakpoint()",

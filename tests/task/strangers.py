@@ -563,6 +563,15 @@ def _robot_link(folder: Path) -> None:
     linked(ROBOT, OUTSIDE)(folder)
 
 
+@case("robot's picture of a billion pixels")
+def _robot_picture_bomb(folder: Path) -> None:
+    side = (30_000).to_bytes(4)
+    head = b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4) + b"IHDR" + side + side + bytes(9)
+    (folder / "robot").mkdir(exist_ok=True)
+    (folder / "robot/a.png").write_bytes(head)
+    with_robot(_arm("", '<asset><texture name="t" type="2d" file="a.png"/></asset>'))(folder)
+
+
 @case("robot's mesh links outside")
 def _robot_mesh_link(folder: Path) -> None:
     with_robot(_arm("", '<asset><mesh file="a.stl"/></asset>'))(folder)

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from v2p_data.task.confine import confine, leave_the_network
+from v2p_data.task.smoke_child import in_a_fork
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 MEGABYTE = 2**20
@@ -199,3 +200,20 @@ def test_a_folder_of_its_own_is_no_way_to_others(canary, tmp_path_factory):
 
     assert canary.read_text() == "alive"
     assert list(canary.parent.iterdir()) == [canary]
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (signal.SIGFPE, "divides whole numbers in a way that the processor refuses"),
+        (signal.SIGSEGV, "makes torch crash"),
+        (signal.SIGKILL, "may need too much memory"),
+    ],
+)
+def test_what_ended_a_trial_is_called_by_its_name(number, said):
+    def crash(_source, _request):
+        signal.signal(number, signal.SIG_DFL) if number != signal.SIGKILL else None
+        os.kill(os.getpid(), number)
+        return {}
+
+    assert said in in_a_fork("", {"seconds_each": 20}, crash)["error"]

@@ -24,6 +24,7 @@ from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.sim.gym_env import V2PEnv
 from v2p_data.task import time_limit, trial
 from v2p_data.task.audit import Audit
+from v2p_data.task.robot_files import robot_files
 from v2p_data.task.schema import AuditEntry, RobotEntry, TaskFile
 from v2p_data.task.smoke import smoke_run_all
 from v2p_data.task.task import TaskBundle
@@ -273,3 +274,21 @@ def test_a_folder_with_a_link_is_not_copied(good: Path, tmp_path: Path):
     assert not (tmp_path / "copy").exists()
     copy_folder(source, tmp_path / "copy", ignore=shutil.ignore_patterns("notes.txt"))
     assert (tmp_path / "copy/task.py").is_file()
+
+
+@pytest.mark.parametrize(
+    ("sides", "said"), [((30_000, 30_000), "largest of 900"), ((4_000, 4_000), "80 million")]
+)
+def test_pictures_of_an_arm_are_counted_before_they_are_decoded(tmp_path, sides, said):
+    head = (
+        b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4) + b"IHDR" + b"".join(s.to_bytes(4) for s in sides)
+    )
+    count = 1 if sides[0] > 4096 else 5
+    for k in range(count):
+        (tmp_path / f"{k}.png").write_bytes(head + bytes(9))
+    names = "".join(f'<texture name="t{k}" type="2d" file="{k}.png"/>' for k in range(count))
+    main = tmp_path / "arm.xml"
+    main.write_text(f"<mujoco><asset>{names}</asset><worldbody/></mujoco>")
+
+    with pytest.raises(V2PError, match=f"pictures of .*{said}"):
+        robot_files(main)

@@ -14,6 +14,7 @@ from typing import Any
 
 import av
 import numpy as np
+import odd_captions
 from av.stream import Disposition
 
 Fill = Callable[[Path], object]
@@ -150,6 +151,8 @@ def odd_folders() -> Iterator[tuple[str, Fill]]:
     yield from _odd_bytes()
     for name, content in _odd_captions().items():
         yield f"captions_{name}", _with_json("captions.json", content)
+    for name, (file, content) in odd_captions.REFUSED.items():
+        yield f"captions_{name}", lambda folder, f=file, c=content: _refused(folder, f, c)
     for name, content in _odd_labels().items():
         yield f"labels_{name}", _with_json("labels.json", content)
     for name, hint in _odd_boxes().items():
@@ -160,6 +163,11 @@ def odd_folders() -> Iterator[tuple[str, Fill]]:
         }
         yield f"boxes_{name}", _with_json("captions.json", {PLAIN: entry})
     yield from _odd_names()
+
+
+def _refused(folder: Path, file: str, content: bytes) -> None:
+    (folder / PLAIN).touch()  # never opened
+    (folder / file).write_bytes(content)
 
 
 def _with_json(file: str, content: Any) -> Fill:

@@ -4,13 +4,17 @@ import json
 import unicodedata
 
 import pytest
+from odd_captions import PLAIN, READ, REFUSED
+from pydantic import TypeAdapter
 
 from v2p_data.errors import V2PError
+from v2p_data.scene.schema import Words
 from v2p_data.video.captions import (
     find_videos,
     read_footage,
     unique_items,
 )
+from v2p_data.video.checked import words
 from v2p_data.video.hints import check_hints
 from v2p_data.video.save_hints import merge_captions, write_captions
 
@@ -398,3 +402,58 @@ def test_points_in_fractions_are_refused(folder):
 
     with pytest.raises(V2PError, match="look like fractions"):
         find_videos(folder)
+
+
+@pytest.mark.parametrize(("file", "content"), REFUSED.values(), ids=REFUSED)
+def test_a_caption_file_that_cannot_be_read_is_refused_in_one_sentence(tmp_path, file, content):
+    (tmp_path / PLAIN).write_bytes(b"x")
+    (tmp_path / file).write_bytes(content)
+
+    with pytest.raises(V2PError) as error:
+        read_footage(tmp_path)
+
+    said = str(error.value)
+    assert said.startswith(str(tmp_path / file))
+    assert said.isprintable()
+    assert len(said) < 600
+
+
+@pytest.mark.parametrize(("file", "content", "caption"), READ.values(), ids=READ)
+def test_a_caption_file_as_people_write_it_gives_what_a_scene_may_hold(
+    tmp_path, file, content, caption
+):
+    (tmp_path / PLAIN).write_bytes(b"x")
+    (tmp_path / file).write_bytes(content)
+
+    footage = read_footage(tmp_path)
+
+    (video,) = footage.videos
+    assert video.caption == caption
+    assert footage.notes == ()
+    for text in (video.caption, *video.objects):
+        assert TypeAdapter(Words).validate_python(text) == text
+
+
+def test_every_character_that_a_caption_keeps_may_stand_in_a_scene():
+    kept = TypeAdapter(Words)
+
+    codes = [*range(0x2100), *range(0x2100, 0x110000, 499)]
+    for start in range(0, len(codes), 500):
+        letters = "".join(f"a{chr(k)}b" for k in codes[start : start + 500])
+        kept.validate_python(words(letters, "a caption"))
+
+
+def test_the_object_has_the_word_where_the_table_says_otherwise(folder):
+    write(folder, "b.mp4,Lifting cup up\na.MOV,Lifting can up\n", "captions.csv")
+    write(folder, {"b.mp4": "Lifting red box up"})
+
+    assert [v.caption for v in find_videos(folder)][:2] == ["Lifting can up", "Lifting red box up"]
+
+
+def test_hints_for_a_video_of_the_table_keep_its_caption(folder):
+    write(folder, "b.mp4,Lifting cup up\n", "captions.csv")
+
+    merged(folder, {"b.mp4": {"hints": {"cup": {"name": "mug"}}}})
+
+    video = find_videos(folder)[1]
+    assert (video.caption, video.hints["cup"]["name"]) == ("Lifting cup up", "mug")

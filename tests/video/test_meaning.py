@@ -1,6 +1,9 @@
 """Captions and what they ask for, written out by hand."""
 
+import itertools
+
 import pytest
+from posted_captions import JUDGED_ON, SEEN_LATER, TRIED_ON
 
 from v2p_data.video.meaning import parse_caption
 
@@ -118,3 +121,31 @@ def test_an_object_whose_name_holds_a_preposition_stays_whole():
 
     assert (meaning.kind, meaning.manipulated) == ("push_next_to", "box on wheels")
     assert meaning.others == (("cup", "reference"),)
+
+
+@pytest.mark.parametrize(
+    ("language", "posted", "said"), [*TRIED_ON, *JUDGED_ON, *SEEN_LATER], ids=itertools.count()
+)
+def test_a_caption_as_people_post_it_is_read_like_its_own_words(language, posted, said):
+    assert parse_caption(posted) == parse_caption(said)
+
+
+def test_objects_that_somebody_listed_are_found_where_remarks_would_be():
+    meaning = parse_caption("Pushing 4k camera next to #1 mug (pov)", ("4k camera", "#1 mug"))
+
+    assert (meaning.manipulated, meaning.others) == ("4k camera", (("#1 mug", "reference"),))
+
+
+@pytest.mark.parametrize(
+    ("caption", "phrases"),
+    [
+        ("Lifting box no. 5 up", ("box no 5",)),
+        ("Pushing book with phone", ("book", "phone")),
+        ("Lifting up a can of Dr.Pepper", ("can of dr pepper",)),
+        ("Pick up the cup. Place it on the red plate.", ("cup", "red plate")),
+        ("Pushing watch next to sound box", ("watch", "sound box")),
+        ("Lifting §3 up", ("3",)),
+    ],
+)
+def test_words_that_look_like_remarks_stay_objects(caption, phrases):
+    assert parse_caption(caption).phrases == phrases

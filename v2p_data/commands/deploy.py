@@ -55,6 +55,9 @@ def deploy_command(argv: list[str]) -> int:
         from v2p_data.deployment.recording import check_free
 
         check_free(args.record)
+    from v2p_data.commands.run import check_device
+
+    check_device(args.device)
     if args.repo_id.count("/") != 1:
         raise V2PError(f"--repo-id is USER/NAME, such as me/run_1; got '{args.repo_id}'")
     with connected(robot_words) as robot:

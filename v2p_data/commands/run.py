@@ -59,7 +59,7 @@ class How:
             raise V2PError(
                 f"--workers is at least 0 and --threads at least 1, got {self.workers} and {self.threads}"
             )
-        _check_device(self.device)
+        check_device(self.device)
         workers = self.workers or os.cpu_count() or 1
         return Runtime(root=root, workers=workers, num_threads=self.threads, device=self.device)
 
@@ -574,7 +574,7 @@ def _flag(argv: Sequence[str], flag: str) -> str | None:
     return None
 
 
-def _check_device(name: str) -> None:
+def check_device(name: str) -> None:
     """Refuse a device that this machine lacks.
 
     Raises:

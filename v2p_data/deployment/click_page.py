@@ -5,6 +5,7 @@ It listens on 127.0.0.1 only, at an address with a random token; other paths and
 
 import base64
 import json
+import re
 import secrets
 import threading
 from collections.abc import Callable, Sequence
@@ -99,7 +100,7 @@ class ClickPage:
                 mask = self.mask_at(pixel)
             except V2PError as error:
                 return {"error": str(error)}
-            except (ValueError, TypeError, KeyError, RecursionError):
+            except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
                 return {"error": "a click has two numbers, u and v"}
             rim = mask & ~(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
             self.picture[rim] = MARK
@@ -125,7 +126,7 @@ def _handler(page: ClickPage) -> type[BaseHTTPRequestHandler]:
             if not self._is_ours():
                 return
             length = self.headers.get("Content-Length", "")
-            if not length.isdigit() or int(length) > LONGEST_BODY:
+            if not re.fullmatch(r"[0-9]{1,9}", length) or int(length) > LONGEST_BODY:
                 self.send_error(413)
                 return
             said = page.clicked(self.rfile.read(int(length)))

@@ -165,8 +165,14 @@ class ReviewServer:
         try:
             said = as_dict(json.loads(body))
             if found[1] == "judge":
-                return self.session.judge(found[2], said.get("judgement"))
-            return self.session.mark(found[2], str(said.get("phrase", "")), said.get("hint"))
+                judgement = said.get("judgement")
+                if not isinstance(judgement, str | None):
+                    return {"error": "a judgement is a word, or null where it is taken back"}
+                return self.session.judge(found[2], judgement)
+            hint = said.get("hint")
+            if hint is not None and not isinstance(hint, dict):
+                return {"error": "a hint is an object, or null where nothing is marked"}
+            return self.session.mark(found[2], str(said.get("phrase", "")), hint)
         except V2PError as error:
             return {"error": str(error)}
         except (ValueError, RecursionError) as error:
@@ -203,7 +209,7 @@ def _handler(server: ReviewServer) -> type[BaseHTTPRequestHandler]:
             if path is None:
                 return
             length = self.headers.get("Content-Length", "")
-            if not length.isdigit() or int(length) > LONGEST_BODY:
+            if not re.fullmatch(r"[0-9]{1,9}", length) or int(length) > LONGEST_BODY:
                 self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
             elif not server.is_own_page(self.headers):
                 self._refuse(HTTPStatus.FORBIDDEN)
@@ -232,7 +238,9 @@ def _handler(server: ReviewServer) -> type[BaseHTTPRequestHandler]:
                 self._refuse(HTTPStatus.NOT_FOUND)
                 return
             size = path.stat().st_size
-            asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
+            asked = re.fullmatch(
+                r"bytes=([0-9]{1,15})-([0-9]{0,15})", self.headers.get("Range", "")
+            )
             first = int(asked[1]) if asked else 0
             last = min(size - 1, int(asked[2])) if asked and asked[2] else size - 1
             if asked and first > last:

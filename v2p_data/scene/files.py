@@ -16,6 +16,23 @@ MAX_FILES = 5_000
 """Of a folder that is copied."""
 
 
+def user_cache(variable: str) -> Path:
+    """Return `v2p` in the user's cache folder.
+
+    Args:
+        variable: of the environment, that could have named another folder.
+
+    Raises:
+        V2PError: this user has no home.
+    """
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "v2p"
+    except RuntimeError as error:
+        raise V2PError(
+            f"this user has no home folder to keep files in; set {variable} to a folder"
+        ) from error
+
+
 def is_plain_path(text: str) -> bool:
     """Return whether a text is a relative path that stays below where it starts, with `/` between its parts."""
     parts = text.split("/")

@@ -20,6 +20,7 @@ from pydantic import (
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.files import is_plain_path, own_file, read_own
+from v2p_data.video.checked import is_shown
 
 Role = Literal["manipulated", "reference", "tool", "container", "cover"]
 Shape = Literal["box", "cylinder", "sphere", "mesh"]
@@ -40,7 +41,7 @@ ERRORS_SHOWN = 3
 
 
 def _printable(text: str) -> str:
-    if not all(c.isprintable() or c == "\n" for c in text):
+    if not all(is_shown(c) or c == "\n" for c in text):
         raise ValueError("holds characters that cannot be shown")
     return text
 

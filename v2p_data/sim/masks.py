@@ -166,7 +166,9 @@ class MaskRenderer:
             except _NoGLError as error:
                 self._no_gl = str(error)
         if self._pictures is None:
-            raise V2PError(f"{complaint} ({self._no_gl}); {GL_HINT}")
+            asked = os.environ.get("MUJOCO_GL")
+            unset = f"unset MUJOCO_GL, which asks for '{asked}', or " if asked else ""
+            raise V2PError(f"{complaint} ({self._no_gl}); {unset}{GL_HINT}")
         return self._pictures
 
 

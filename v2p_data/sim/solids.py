@@ -25,6 +25,8 @@ FINE_FACES = 50_000
 """Meshes with more faces are thinned before they are split, and not mended."""
 FINE_VERTICES = 20_000
 HULL_DIRECTIONS = 1_000
+MAX_COORDINATE = 1e9
+"""In the file's unit; squares of more overflow on the way."""
 FLAT_RATIO = 1e-3
 """Thinnest over widest extent, along the mesh's own principal axes, below which it has no volume."""
 
@@ -150,11 +152,11 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
             f"{where} has faces of vertex {faces.max() + 1}, but only {len(vertices)} vertices; export it again",
             float(faces.max() + 1),
         )
-    bad = int((~np.isfinite(vertices)).any(1).sum())
+    bad = int((~(np.abs(vertices) < MAX_COORDINATE)).any(1).sum())
     if bad:
         raise ItemRejectedError(
             "mesh_not_finite",
-            f"{bad} of {len(vertices)} vertices of the {where} are no finite numbers; export it again",
+            f"{bad} of {len(vertices)} vertices of the {where} are no numbers below {MAX_COORDINATE:g}; export it again",
             float(bad),
         )
     widths = _principal_widths(vertices[np.unique(faces)])

@@ -26,6 +26,8 @@ Show = Callable[[], States]
 """Gives fresh copies of the states, in memory that nothing is judged by."""
 
 MAX_COMPONENTS = 32
+MAX_OBSERVATION = 4096
+"""Numbers of one world; the robot's own are 90. More would fill the memory of training, not teach it."""
 COMPONENT_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,39}")
 """A component's name becomes a column of a table and text of a page."""
 ASKED_TWICE_ONCE_IN = 500
@@ -179,6 +181,10 @@ class GuardedTask:
                     raise TaskOutputError(
                         f"the reset pose of {name} must be a tensor of shape ({n}, 7), not {shape}"
                     )
+                if pose.is_meta or pose.has_names():
+                    raise TaskOutputError(
+                        f"the reset pose of {name} must be a plain tensor with numbers in it"
+                    )
                 if not pose.is_floating_point() or not bool(pose.isfinite().all()):
                     raise TaskOutputError(f"the reset pose of {name} is not finite")
                 if bool(((pose[:, 3:].norm(dim=1) - 1).abs() > UNIT_TOLERANCE).any()):
@@ -251,8 +257,8 @@ class GuardedTask:
                     "compute_reward must return the reward and a dict of its components"
                 )
             reward, parts = result
-            check_tensor("the reward", reward, watch.num_envs, kind=torch.float32)
-            self._check_parts(parts, watch.num_envs)
+            check_tensor("the reward", reward, watch.num_envs, watch.device, kind=torch.float32)
+            self._check_parts(parts, watch)
         return Answers(observation=observation, success=success, reward=reward, components=parts)
 
     def _keys(self, watch: "_Watch") -> list[str]:
@@ -263,16 +269,17 @@ class GuardedTask:
         for key in keys:
             if key not in watch.states:
                 raise TaskOutputError(f"observation key '{shown(key, 60)}' is not in states")
-            check_tensor(f"observation '{key}'", watch.states[key], watch.num_envs, max_dim=2)
+            what = f"observation '{shown(key, 60)}'"
+            check_tensor(what, watch.states[key], watch.num_envs, watch.device, max_dim=2)
         return keys
 
     def _success(self, watch: "_Watch") -> torch.Tensor:
         success = self._task.compute_success(watch.states)
         watch.check("compute_success")
-        check_tensor("compute_success", success, watch.num_envs, kind=torch.bool)
+        check_tensor("compute_success", success, watch.num_envs, watch.device, kind=torch.bool)
         return success
 
-    def _check_parts(self, parts: dict[Any, Any], num_envs: int) -> None:
+    def _check_parts(self, parts: dict[Any, Any], watch: "_Watch") -> None:
         names = tuple(parts)
         if names != self._component_names:
             if len(names) > MAX_COMPONENTS:
@@ -289,7 +296,7 @@ class GuardedTask:
                 )
             self._component_names = names
         for name, part in parts.items():
-            check_tensor(f"reward component '{name}'", part, num_envs)
+            check_tensor(f"reward component '{name}'", part, watch.num_envs, watch.device)
 
     @staticmethod
     def _draw_until_twice() -> int:
@@ -307,9 +314,15 @@ class GuardedTask:
 
 
 def check_tensor(
-    what: str, value: Any, n: int, *, kind: torch.dtype | None = None, max_dim: int = 1
+    what: str,
+    value: Any,
+    n: int,
+    device: torch.device,
+    *,
+    kind: torch.dtype | None = None,
+    max_dim: int = 1,
 ) -> None:
-    """Demand a tensor with a row per environment.
+    """Demand a plain tensor with a row per environment, on the device of the states.
 
     Raises:
         TaskOutputError: it is not.
@@ -324,6 +337,14 @@ def check_tensor(
         raise TaskOutputError(f"{what} must be of type {kind}, not {value.dtype}")
     if value.is_complex():
         raise TaskOutputError(f"{what} must be of real numbers, not {value.dtype}")
+    if value.device != device:
+        raise TaskOutputError(
+            f"{what} must be on the device of the states, {device}, not {value.device}"
+        )
+    if value.has_names() or value.layout != torch.strided:
+        raise TaskOutputError(
+            f"{what} must be a plain tensor, without named dimensions and not sparse"
+        )
 
 
 def demand_equal(first: Answers, second: Answers) -> None:
@@ -347,6 +368,10 @@ def _observation(keys: list[str], states: States) -> torch.Tensor:
     if not keys:
         raise TaskOutputError("compute_observation_key must return at least one key")
     parts = [c if c.ndim == 2 else c[:, None] for c in (states[key] for key in keys)]
+    if (width := sum(part.shape[1] for part in parts)) > MAX_OBSERVATION:
+        raise TaskOutputError(
+            f"the observation has {width} numbers; at most {MAX_OBSERVATION} are taken"
+        )
     joined = parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
     return joined.float()
 
@@ -357,13 +382,14 @@ class _Watch:
     Task code writes into a tensor by torch operations only.
     """
 
-    __slots__ = ("_counts", "_given", "num_envs", "states")
+    __slots__ = ("_counts", "_given", "device", "num_envs", "states")
 
     def __init__(self, states: States) -> None:
         self.states = states
         self._given = dict(states)
         self._counts = [_count(value) for value in self._given.values()]
-        self.num_envs = len(next(iter(states.values())))
+        first = next(iter(states.values()))
+        self.num_envs, self.device = len(first), first.device
 
     def check(self, method: str) -> None:
         """Demand that none of the states has changed.

@@ -26,6 +26,9 @@ GRID_ATTRIBUTES = frozenset(
 )
 MAX_GRID = 4096
 """Of pixels and cells along one side."""
+MAX_PICTURE_PIXELS = MAX_GRID**2
+MAX_ALL_PIXELS = 4 * MAX_PICTURE_PIXELS
+"""Of all pictures together; decoded they take three bytes each."""
 MULTIPLYING = frozenset(
     {
         "replicate",
@@ -99,7 +102,22 @@ def robot_files(main: Path, root: Path | None = None) -> list[Path]:
             f"{max(sizes) / 1e6:.0f} MB; at most {MAX_FILES} files, {MAX_FILE_BYTES / 1e6:.0f} MB each and "
             f"{MAX_TOTAL_BYTES / 1e6:.0f} MB together are read"
         )
+    pixels = [_pixels(path) for path in files if path.suffix.lower() == ".png"]
+    if max(pixels, default=0) > MAX_PICTURE_PIXELS or sum(pixels) > MAX_ALL_PIXELS:
+        raise V2PError(
+            f"robot file {main} has pictures of {sum(pixels) / 1e6:.0f} million pixels, the largest of "
+            f"{max(pixels) / 1e6:.0f} million; at most {MAX_PICTURE_PIXELS / 1e6:.0f} million each and "
+            f"{MAX_ALL_PIXELS / 1e6:.0f} million together are decoded: make them smaller"
+        )
     return list(files)
+
+
+def _pixels(path: Path) -> int:
+    """Return how many pixels a PNG says that it has, which its first chunk must; 0 for what is none."""
+    with path.open("rb") as stream:
+        head = stream.read(24)
+    is_png = head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR"
+    return int.from_bytes(head[16:20]) * int.from_bytes(head[20:24]) if is_png else 0
 
 
 def copy_robot(main: Path, into: Path) -> Path:

@@ -33,6 +33,13 @@ SLOW_S = 1.0
 SCALED = ("_pos", "_size", "_width")
 """How the names of states in metres end."""
 
+_FAULTS: dict[int, str] = {
+    signal.SIGFPE: "it divides whole numbers in a way that the processor refuses (SIGFPE); use floats",
+    signal.SIGSEGV: "it makes torch crash (SIGSEGV); write it with other operations",
+    signal.SIGILL: "it makes torch crash (SIGILL); write it with other operations",
+}
+"""What ends a process at once and is no lack of memory, which is SIGKILL's and SIGABRT's."""
+
 _HARMLESS = """
 scene_info = {}
 class Warm(Task):
@@ -269,6 +276,8 @@ def in_a_fork(
     except (ValueError, RecursionError):
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
             return _failed(f"it took more than {seconds:g} s of computing")
+        if os.WIFSIGNALED(status) and os.WTERMSIG(status) in _FAULTS:
+            return _failed(_FAULTS[os.WTERMSIG(status)])
         return _failed("its process ended before it had answered; it may need too much memory")
 
 

@@ -1,14 +1,17 @@
 """Puts a new reward into a task without touching the rest: whoever writes rewards cannot move the goal.
 
-Of the new code, `reward_function` is taken with the functions and constants that it uses. What has a name that the task
-uses for something else is renamed, and constants that could be changed in place are copied, so that nothing which the
-task's success, reset and observations read is replaced or shared.
+Of the new code, `reward_function` is taken with the functions and constants that it uses, each as a statement of its own
+that binds one name. What has a name that the task uses for something else is renamed, and what could be changed in place
+is copied, so that nothing which the task's success, reset and observations read is replaced or shared.
 """
 
 import ast
+from collections.abc import Iterator
+from copy import deepcopy
 
 from v2p_data.errors import V2PError
-from v2p_data.task.reader.check import checked_tree
+from v2p_data.task.reader.check import check_amount, checked_tree
+from v2p_data.task.reader.refusal import TaskCodeError
 
 REWARD = "reward_function"
 
@@ -29,12 +32,8 @@ def with_reward(parent: str, answer: str) -> str:
         V2PError: the parent's success, reset or observations call its reward, so that they would change with it.
     """
     old = checked_tree(parent)
-    try:
-        new = ast.parse(answer)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
-        raise SpliceError(f"Your code is not Python{line}: {error}. Answer again.") from error
-    there, offered = _definitions(old), _definitions(new)
+    offered = _definitions(_answered(answer))
+    there = _definitions(old)
     if not isinstance(offered.get(REWARD), ast.FunctionDef):
         raise SpliceError(f"`{REWARD}` must be a function at module level. Answer again.")
     _demand_independent(old, there)
@@ -46,17 +45,17 @@ def with_reward(parent: str, answer: str) -> str:
     if not own:
         raise SpliceError("This is the reward that was there before. Write another one.")
     own |= {REWARD} | {n for n in wanted if _is_mutable(both[n])}
-    taken = {n.id for n in ast.walk(old) if isinstance(n, ast.Name)} | set(there)
-    taken |= {n.name for n in old.body if isinstance(n, ast.ClassDef)}
+    while more := {n for n in wanted if _reachable(both[n], both) & own} - own:
+        own |= more
+    taken = {n.id for n in ast.walk(old) if isinstance(n, ast.Name)}
+    taken |= {name for node in old.body for name in _bound(node)}
     names: dict[str, str] = {}
     for name in sorted(own - {REWARD}):
         if name in taken:
             names[name] = _free(f"reward_{name}", taken | wanted | set(names.values()))
+    renamed = _Renamed(names)
     parts = [
-        ast.unparse(_Renamed(names).visit(node)) if names else _source(text, node)
-        for tree, text in ((new, answer), (old, parent))
-        for node in tree.body
-        if _defined(node) in own and (tree is new or _defined(node) not in offered)
+        ast.unparse(renamed.visit(deepcopy(node))) for name, node in both.items() if name in own
     ]
     made = _joined(parent, old, parts)
     try:
@@ -66,6 +65,32 @@ def with_reward(parent: str, answer: str) -> str:
     if not is_kept:
         raise SpliceError("Your reward changes other parts of the task. Use names of your own.")
     return made
+
+
+def _answered(answer: str) -> ast.Module:
+    """Return an answer's tree.
+
+    Raises:
+        SpliceError: it does not parse, or binds names in another way than by functions and plain constants.
+    """
+    try:
+        tree = ast.parse(answer)
+        check_amount(tree)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
+        raise SpliceError(f"Your code is not Python{line}: {error}. Answer again.") from error
+    except TaskCodeError as error:
+        raise SpliceError(f"Your code is too large: {error}. Answer again.") from error
+    for node in tree.body:
+        is_left_out = isinstance(node, ast.Import | ast.ImportFrom | ast.ClassDef) or (
+            isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        )
+        if not is_left_out and not any(_definitions_in(node)):
+            raise SpliceError(
+                f"Line {node.lineno} of your code may change what else the task reads ({type(node).__name__}). Write only "
+                "functions without `global`, and constants as NAME = value."
+            )
+    return tree
 
 
 def reward_part(code: str) -> str:
@@ -80,16 +105,22 @@ def reward_source(code: str) -> str:
     tree = ast.parse(code)
     there = _definitions(tree)
     used = _reachable(there[REWARD], there) | {REWARD}
-    return "\n\n\n".join(_source(code, node) for node in tree.body if _defined(node) in used)
+    return "\n\n\n".join(_source(code, node) for node in tree.body if set(_bound(node)) & used)
 
 
 def rest_part(code: str) -> str:
-    """Return a normal form of everything but the reward: success, reset, observations, and what they use."""
+    """Return a normal form of everything but the reward: success, reset, observations, and all that binds what they use."""
     tree = ast.parse(code)
-    there = _definitions(tree)
     methods = [n for n in _class_body(tree) if getattr(n, "name", "") != "compute_reward"]
-    used = sorted(set().union(*(_reachable(n, there) for n in methods)))
-    return "\n".join(ast.dump(n) for n in [*methods, *(there[name] for name in used)])
+    kept: list[ast.stmt] = []
+    ahead = [n for n in tree.body if not isinstance(n, ast.ClassDef)]
+    more = methods
+    while more:
+        used = {n.id for part in more for n in ast.walk(part) if isinstance(n, ast.Name)}
+        more = [n for n in ahead if not _bound(n) or _bound(n) & used]
+        ahead = [n for n in ahead if n not in more]
+        kept += more
+    return "\n".join(ast.dump(n) for n in [*methods, *(n for n in tree.body if n in kept)])
 
 
 def _class_body(tree: ast.Module) -> list[ast.stmt]:
@@ -97,15 +128,39 @@ def _class_body(tree: ast.Module) -> list[ast.stmt]:
 
 
 def _definitions(tree: ast.Module) -> dict[str, ast.stmt]:
-    return {name: node for node in tree.body if (name := _defined(node))}
+    """Return the functions and constants of a module by name, the last one where there are several."""
+    return {name: node for part in tree.body for name, node in _definitions_in(part)}
 
 
-def _defined(node: ast.stmt) -> str:
-    if isinstance(node, ast.FunctionDef):
-        return node.name
-    if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-        return node.targets[0].id
-    return ""
+def _definitions_in(node: ast.stmt) -> Iterator[tuple[str, ast.stmt]]:
+    """Yield what a statement defines as statements of one name each; nothing where it does anything else besides."""
+    match node:
+        case ast.FunctionDef(name=name) if _bound(node) == {name}:
+            yield name, node
+        case ast.Assign() | ast.AnnAssign(value=ast.expr()):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [t for t in targets if isinstance(t, ast.Name)]
+            if len(names) == len(targets) and _bound(node) == {t.id for t in names}:
+                for name in names:
+                    alone = ast.Assign(targets=[name], value=node.value)  # pyright: ignore[reportArgumentType]
+                    yield name.id, ast.copy_location(alone, node)
+
+
+def _bound(node: ast.stmt) -> set[str]:
+    """Return the names of the module that a statement binds or deletes, in whatever way."""
+    within = list(ast.walk(node))
+    found = {name for n in within if isinstance(n, ast.Global) for name in n.names}
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        found.add(node.name)
+        heads = [n for n in ast.iter_child_nodes(node) if n not in node.body]
+        within = [n for head in heads for n in ast.walk(head)]
+    for n in within:
+        match n:
+            case ast.Name(ctx=ast.Store() | ast.Del()):
+                found.add(n.id)
+            case ast.alias():
+                found.add(n.asname or n.name)
+    return found
 
 
 def _reachable(node: ast.AST, there: dict[str, ast.stmt]) -> set[str]:
@@ -134,9 +189,14 @@ def _demand_independent(old: ast.Module, there: dict[str, ast.stmt]) -> None:
 
 
 def _is_mutable(node: ast.stmt) -> bool:
-    return isinstance(node, ast.Assign) and any(
-        isinstance(n, ast.List | ast.Dict) for n in ast.walk(node.value)
-    )
+    """Return whether a definition keeps a list or dict from call to call, parameters' defaults included."""
+    kept: list[ast.expr] = []
+    match node:
+        case ast.Assign(value=value):
+            kept = [value]
+        case ast.FunctionDef(args=ast.arguments(defaults=defaults)):
+            kept = defaults
+    return any(isinstance(n, ast.List | ast.Dict) for part in kept for n in ast.walk(part))
 
 
 def _same(a: ast.stmt, b: ast.stmt) -> bool:
@@ -194,7 +254,7 @@ def _joined(parent: str, old: ast.Module, parts: list[str]) -> str:
     put = "\n\n\n".join(parts).split("\n")
     cuts: list[tuple[int, int, list[str]]] = []
     for node in old.body:
-        if _defined(node) == REWARD:
+        if REWARD in _bound(node):
             cuts.append((_first_line(node), int(node.end_lineno or node.lineno), put))
             put = []
     for node in _class_body(old):

@@ -131,10 +131,10 @@ def limited(what: str) -> Iterator[None]:
 
 
 def guard_calls(kind: type) -> None:
-    """Let every call of a task class's methods end in time, with a result or a `V2PError`."""
+    """Let every call of a task class's methods, inherited ones too, end in time, with a result or a `V2PError`."""
     for name in METHODS:
-        if name in vars(kind):
-            setattr(kind, name, _guarded(name, vars(kind)[name]))
+        if hasattr(kind, name):
+            setattr(kind, name, _guarded(name, getattr(kind, name)))
 
 
 def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:

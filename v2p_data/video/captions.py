@@ -1,7 +1,7 @@
 """Which videos a folder holds, and what a person said about each.
 
-A caption comes from `captions.json` beside the videos, else from a label file of Something-Something-v2 in the
-same folder (`labels.py`), else from the file's own name:
+A caption comes from `captions.json` beside the videos, else from a table `captions.csv` (file,caption), else from a label
+file of Something-Something-v2 in the same folder (`labels.py`), else from the file's own name:
 
     {"lift.mp4": "Lifting red box up",
      "push.mp4": {"caption": "Pushing blue box next to can", "objects": ["blue box", "can"],
@@ -11,6 +11,8 @@ A hint marks one object: `box`, `click`, `stroke` or `points` in one `frame`, `s
 caption's words do not say it. A hint called `table` marks the table itself.
 """
 
+import csv
+import io
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
@@ -20,7 +22,7 @@ from typing import Any
 
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.json_files import read_json
-from v2p_data.video.checked import check_keys, listed, same_name, type_of, words
+from v2p_data.video.checked import check_keys, listed, same_name, shortened, type_of, words
 from v2p_data.video.clip import Hint
 from v2p_data.video.hints import TABLE, boxes_as_read, read_hint
 from v2p_data.video.labels import Labels, read_labels
@@ -34,6 +36,8 @@ VIDEO_SUFFIXES = (
 )
 """In small letters or capitals."""
 CAPTIONS_FILE = "captions.json"
+CAPTIONS_TABLE = "captions.csv"
+MAX_TABLE_BYTES = 20_000_000
 NO_CAPTION = "moving object"
 """What stands for a caption where nobody gave one and the file's name tells nothing."""
 
@@ -125,18 +129,32 @@ def written_captions(folder: Path, names: Sequence[str]) -> dict[str, Any]:
     Raises:
         V2PError: no JSON object, or it names a file that is not there or names one twice.
     """
-    path = folder / CAPTIONS_FILE
-    if not path.is_file():
-        return {}
-    data = read_json(path)
-    if not isinstance(data, dict):
-        raise V2PError(f"{path} must hold an object, file name -> caption, not a {type_of(data)}")
+    return {name: entry for name, (entry, _) in _written(folder, names).items()}
+
+
+def _written(folder: Path, names: Sequence[str]) -> dict[str, tuple[Any, Path]]:
+    """Return each entry with the file that it is from; of two entries for a video that of `captions.json`."""
+    written: dict[str, tuple[Any, Path]] = {}
+    for file, read in ((CAPTIONS_TABLE, _read_table), (CAPTIONS_FILE, read_json)):
+        path = folder / file
+        if path.is_file():
+            data = read(path)
+            if not isinstance(data, dict):
+                raise V2PError(
+                    f"{path} must hold an object, file name -> caption, not a {type_of(data)}"
+                )
+            for name, entry in _of_the_folder(data, path, names).items():
+                written[name] = entry, path
+    return written
+
+
+def _of_the_folder(data: dict[str, Any], path: Path, names: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for said_name, entry in data.items():
         name = same_name(said_name, names)
         if name is None:
             raise V2PError(
-                f"{path} has a caption for '{said_name}', which is not in the folder; "
+                f"{path} has a caption for '{shortened(said_name)}', which is not in the folder; "
                 f"rename or remove the entry.{did_you_mean(said_name, names)}"
             )
         if name in found:
@@ -145,6 +163,49 @@ def written_captions(folder: Path, names: Sequence[str]) -> dict[str, Any]:
             )
         found[name] = entry
     return found
+
+
+def _read_table(path: Path) -> dict[str, str]:
+    """Return the captions of a table of two columns, with a row of titles or without one."""
+    try:
+        if path.stat().st_size > MAX_TABLE_BYTES:
+            raise V2PError(f"{path} has more than {MAX_TABLE_BYTES // 10**6} MB; split the folder")
+        text = path.read_bytes().decode("utf-8-sig")
+        is_text = "\0" not in text  # UTF-16 of English words decodes
+    except OSError as error:
+        raise V2PError(f"{path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError:
+        text, is_text = "", False
+    if not is_text:
+        raise V2PError(
+            f"{path} is not UTF-8 text; save it as UTF-8 ('CSV UTF-8' in a table program)"
+        )
+    between = next((c for c in text if c in ",;\t"), ",")
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=between, strict=True)
+    try:
+        read = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
+    except csv.Error as error:
+        raise V2PError(
+            f"{path}, line {rows.line_num}, is no row of a table ({error}); is a quotation mark left open?"
+        ) from error
+    table = [(line, cells) for line, cells in read if any(cells)]
+    if table and _are_titles(table[0][1]):
+        del table[0]
+    found: dict[str, str] = {}
+    for line, cells in table:
+        if len(cells) != 2:
+            raise V2PError(
+                f"{path}, line {line}, has {len(cells)} cells, not two, file{between}caption; put a caption that holds "
+                f"'{between}' between quotation marks"
+            )
+        if cells[0] in found:
+            raise V2PError(f"{path} has two entries for '{shortened(cells[0])}'; remove one")
+        found[cells[0]] = cells[1]
+    return found
+
+
+def _are_titles(cells: list[str]) -> bool:
+    return not cells[0].lower().endswith(VIDEO_SUFFIXES) and cells[-1].lower() == "caption"
 
 
 def unique_items(stems: list[str]) -> list[str]:
@@ -180,10 +241,9 @@ def _item(item: str, path: Path, said: _Said) -> VideoItem:
 
 
 def _read_captions(folder: Path, names: list[str]) -> dict[str, _Said]:
-    where = folder / CAPTIONS_FILE
-    written = written_captions(folder, names)
     return {
-        name: checked_entry(entry, f"{where}, entry '{name}'") for name, entry in written.items()
+        name: checked_entry(entry, f"{path}, entry '{name}'")
+        for name, (entry, path) in _written(folder, names).items()
     }
 
 
@@ -229,7 +289,11 @@ def _passed_over(entries: list[Path], labels: Labels) -> list[str]:
     names: list[str] = []
     for path in entries:
         name = path.name
-        if name.startswith((".", CAPTIONS_FILE)) or name in labels.files or _is_video(path):
+        if (
+            name.startswith((".", CAPTIONS_FILE, CAPTIONS_TABLE))
+            or name in labels.files
+            or _is_video(path)
+        ):
             continue
         if not path.is_dir():
             names.append(name)

@@ -1,6 +1,7 @@
 """Checks of JSON that people wrote: the sentence names the place of what is wrong."""
 
 import json
+import re
 import unicodedata
 from collections.abc import Iterable
 from typing import Any
@@ -9,6 +10,18 @@ from v2p_data.errors import V2PError, did_you_mean
 
 MAX_WORDS = 2000
 """Letters; what is longer is no caption and no name."""
+
+_JOINERS = "\u200c\u200d"
+"""Without width, but part of how Persian, Hindi and many emoji are written."""
+_UNSEEN = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0d\uffa0\U000e0000-\U000e0fff]"
+)
+"""Letters and marks that Unicode lets everybody leave out (Default_Ignorable), where Python calls them printable."""
+
+
+def is_shown(char: str) -> bool:
+    """Return whether a reader sees a character, or a joiner of those beside it: the one rule for texts of people."""
+    return (char.isprintable() and not _UNSEEN.match(char)) or char in _JOINERS
 
 
 def check_keys(data: dict[str, Any], known: tuple[str, ...], where: str) -> None:
@@ -19,7 +32,9 @@ def check_keys(data: dict[str, Any], known: tuple[str, ...], where: str) -> None
 
 
 def words(value: Any, what: str) -> str:
-    """Return a text in composed Unicode (NFC), with single spaces and no control characters.
+    """Return a text in composed Unicode (NFC), with single spaces and nothing that is not shown.
+
+    A joiner stays between two letters or emoji.
 
     Raises:
         V2PError: it is no text, empty, or as long as a page.
@@ -28,12 +43,19 @@ def words(value: Any, what: str) -> str:
         raise V2PError(f"{what} must be text, not a {type_of(value)}")
     if len(value) > MAX_WORDS:
         raise V2PError(f"{what} is {len(value)} letters long; at most {MAX_WORDS} are read")
-    # control characters, and halves of characters, which no file could be written with
-    shown = (" " if unicodedata.category(c) in ("Cc", "Cs") else c for c in value)
-    text = " ".join(unicodedata.normalize("NFC", "".join(shown)).split())
+    # marks without width go; control characters, and halves of characters, part words
+    seen = (c if is_shown(c) else "" if _is_mark(c) else " " for c in value)
+    text = " ".join(unicodedata.normalize("NFC", "".join(seen)).split())
+    text = re.sub(
+        rf"(?<!\S)[{_JOINERS}]+|[{_JOINERS}]+(?!\S)|(?<=[{_JOINERS}])[{_JOINERS}]+", "", text
+    )
     if not any(c.isalnum() for c in text):
         raise V2PError(f"{what} is empty; say in words what happens or what it is")
     return text
+
+
+def _is_mark(char: str) -> bool:
+    return unicodedata.category(char) == "Cf" or _UNSEEN.match(char) is not None
 
 
 def numbers(value: Any, count: int, what: str) -> list[float]:

@@ -1,6 +1,6 @@
 """What a caption asks for: the kind of task, which object is manipulated, and what the others are for.
 
-A caption is read in three steps. It is cut into clauses at its verbs; each clause is cut at its prepositions
+A caption is read in three steps, without what people post around it (`chatter`). It is cut into clauses at its verbs; each clause is cut at its prepositions
 ("Pushing plate | from left to right | next to brown box"); and `TaskKind.phrases` says what a verb with a
 preposition means. The first preposition in the order of `_RANK` that the table knows decides, so a direction
 outranks a neighbour, and a neighbour outranks a tool. The last clause with a known kind wins: it tells how the
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from v2p_data.kinds import KINDS, Kind
+from v2p_data.video.chatter import told
 
 Role = Literal["reference", "tool", "container", "cover"]
 
@@ -146,10 +147,11 @@ def parse_caption(caption: str, objects: tuple[str, ...] = ()) -> Meaning:
         objects: phrases for the objects, if they are known; those that the caption does not name become
             references, and the first stands in where the caption names nothing that moves.
     """
-    text = _normal(caption)
-    for index in sorted(range(len(objects)), key=lambda i: -len(objects[i])):
-        words = re.escape(_normal(objects[index]))
-        text = re.sub(rf"(?<!\w){words}(?!\w)", f"§{index}", text)
+    sentences = told(_marked(caption.replace("§", " ").lower(), objects))
+    sentences = [_marked(_normal(sentence), objects) for sentence in sentences]
+    # where something is done in one of them, the others are talk
+    text = ", ".join([s for s in sentences if _has_verb(s)] or sentences[:1])
+    is_negated = re.search(_NEGATIONS, text)
     text = re.sub(r"\bsome(?:thing|one)(?: else)?\b", _ANYTHING[0], text)
     first, *rest = text.split(_ANYTHING[0])
     text = _ANYTHING[0].join([first, _ANYTHING[1].join(rest)]) if rest else text
@@ -171,9 +173,17 @@ def parse_caption(caption: str, objects: tuple[str, ...] = ()) -> Meaning:
         revealed = re.search(r"reveal\w* (.*?)(?: behind| under\w*)?$", outcome.group(0))
         if revealed:
             others = [*others, (_phrase(revealed.group(1)), "reference")]
-    if re.search(_NEGATIONS, _normal(caption)):
+    if is_negated:
         kind = "generic"
     return _named(kind, moved, others, objects)
+
+
+def _marked(text: str, objects: tuple[str, ...]) -> str:
+    """Return a text with §0, §1 in place of the objects' names, longer names first."""
+    for index in sorted(range(len(objects)), key=lambda i: -len(objects[i])):
+        words = re.escape(_normal(objects[index]))
+        text = re.sub(rf"(?<![\w§]){words}(?!\w)", f"§{index}", text)
+    return text
 
 
 def _normal(text: str) -> str:
@@ -192,6 +202,10 @@ _CUT = re.compile(rf"(?:,| and| then|, and| and then|, then) (?=(?:{_ANY_VERB})\
 _PREPOSITION = re.compile(
     "|".join(rf"(?P<{name}>(?<!\w)(?:{p})(?!\w))" for name, p in _PREPOSITIONS.items())
 )
+
+
+def _has_verb(text: str) -> bool:
+    return any(v.fullmatch(word) for word in text.split() for v in _VERB.values())
 
 
 def _clauses(text: str) -> list[tuple[str, str, str]]:

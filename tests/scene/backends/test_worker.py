@@ -144,6 +144,32 @@ def test_a_hanging_worker_is_killed_with_all_that_it_started(worker, tmp_path):
     assert not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] == "Z"
 
 
+def test_what_a_worker_started_in_a_session_of_its_own_is_killed_with_it(worker, tmp_path):
+    command = worker(
+        f"""
+        import subprocess
+        child = subprocess.Popen(["sleep", "600"], start_new_session=True)
+        Path({str(tmp_path)!r}, "child").write_text(str(child.pid))
+        sys.exit(1)
+        """
+    )
+
+    refusal(command, depth_request())
+
+    state = Path(f"/proc/{int((tmp_path / 'child').read_text())}/stat")
+    assert not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] == "Z"
+
+
+def test_a_workers_words_give_a_terminal_no_orders(worker):
+    words = "\x1b[2Jone\r\ntwo\x9b"
+    last = refusal(worker(f"sys.exit({words!r})"), depth_request())
+    body = f"(out / 'result.json').write_text(json.dumps({{'message': {words!r}}}))\nsys.exit(3)"
+    said = refusal(worker(body), depth_request())
+
+    assert last.endswith("it last said: \\x1b[2Jone two\\x9b")
+    assert said.endswith("refuses the item: \\x1b[2Jone two\\x9b")
+
+
 def test_a_crashing_workers_last_words_are_in_the_error(worker):
     said = refusal(worker("raise MemoryError('CUDA out of memory')"), depth_request())
 
@@ -237,6 +263,14 @@ METRIC = {"metric": True}
         ("depth", 1, METRIC, npz(depth_m=np.inf * GOOD), "finite"),
         ("depth", 1, METRIC, npz(depth_m=GOOD, fov_rad=np.array([np.nan])), "1 NaN"),
         ("depth", 1, METRIC, npz(depth_m=np.array([{}], object)), "Python objects"),
+        ("depth", 1, METRIC, npz(depth_m=GOOD.astype(np.longdouble)), "got float128"),
+        (
+            "depth",
+            1,
+            METRIC,
+            npz(depth_m=GOOD, more=GOOD),
+            "an array 'more' that nobody asked for",
+        ),
         ("depth", 1, METRIC, b"PK garbage", "as npz"),
         ("depth", 1, METRIC, npz(depth_m=GOOD)[:-40], "as npz"),
         ("depth", 1, METRIC, claims_a_terabyte(), "cut off"),

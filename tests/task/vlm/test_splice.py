@@ -21,6 +21,7 @@ from factory.tasks.task import Task
 
 scene_info = {"task_class_name": "Up", "objects": ["block"]}
 LIMITS = {"up": 0.02}
+HEIGHT: float = 0.01
 SCALES = [1.0, 2.0]
 
 
@@ -38,7 +39,7 @@ class Up(Task):
         return super().get_observation_space() + 1
 
     def compute_success(self, states):
-        least = max(LIMITS["up"], 0.01)
+        least = max(limits()["up"], HEIGHT) * scale()[0]
         return height(states) > least
 
     def compute_reward(self, actions, states):
@@ -57,6 +58,14 @@ def reward_function(actions, states):
 
 def height(states):
     return states["block_pos"][:, 2] - states["block_start_pos"][:, 2]
+
+
+def limits():
+    return LIMITS
+
+
+def scale(given=[1.0]):
+    return given
 '''
 
 REWARD = '''
@@ -114,8 +123,38 @@ ATTACKS = {
         "    r = states['rise'] * 2\n"
         "    return r, {'new': r}\n"
     ),
-    "a whole file": PARENT.replace("max(LIMITS", "min(-9, LIMITS").replace(
+    "a whole file": PARENT.replace("max(limits()", "min(-9, limits()").replace(
         "r = height(states)", "r = -height(states)"
+    ),
+    "an assignment to two names": reward(
+        "states['rise'] * weight", "\nweight = LIMITS = {'up': -10.0}\n"
+    ).replace("* weight", "* weight['up']"),
+    "an assignment to two names, the goal's first": reward(
+        "states['rise'] * weight", "\nHEIGHT = weight = -9.0\n"
+    ),
+    "annotated, on the line of another": reward(
+        "states['rise'] * weight", "\nweight = 2.0; HEIGHT: float = -9.0\n"
+    ),
+    "a line that ends where editors show none": reward(
+        "states['rise'] * weight", "\nweight = 2.0\rHEIGHT = -9.0\n"
+    ),
+    "an import under the goal's name": reward("-states['rise']", "\nimport math as HEIGHT\n"),
+    "a class under the goal's name": reward(
+        "-states['rise']", "\nclass HEIGHT:\n    global LIMITS\n    LIMITS = {'up': -9}\n"
+    ),
+    "changing a constant that a helper hands out": (
+        "def reward_function(actions, states):\n"
+        "    same = limits()\n"
+        "    same['up'] = -10.0\n"
+        "    r = states['rise'] * 2\n"
+        "    return r, {'new': r}\n"
+    ),
+    "changing a helper's default in place": (
+        "def reward_function(actions, states):\n"
+        "    same = scale()\n"
+        "    same[0] = -10.0\n"
+        "    r = states['rise'] * 2\n"
+        "    return r, {'new': r}\n"
     ),
     "helpers that call each other": reward(
         "outer(states)",
@@ -147,7 +186,7 @@ def test_the_reward_does_what_its_writer_said(moments):
     assert torch.allclose(said_by(nested, moments)[2], moments["eef_pos"][:, 2] + 1)
 
 
-def test_what_is_not_reward_keeps_every_line_and_the_reward_its_comments():
+def test_what_is_not_reward_keeps_every_line_and_the_reward_its_docstring():
     made = with_reward(PARENT, ATTACKS["plain"])
 
     before, after = (
@@ -155,7 +194,7 @@ def test_what_is_not_reward_keeps_every_line_and_the_reward_its_comments():
         made.split("    def compute_reward")[0],
     )
     assert after == before
-    assert "# with a reason" in made
+    assert '"""Thoughts."""' in made
     assert "The old one" not in made
     assert "return reward_function(actions, states)" in made
 
@@ -174,6 +213,45 @@ def test_the_same_reward_in_other_words_is_sent_back():
 
     with pytest.raises(SpliceError, match="was there before"):
         with_reward(GRASP_A_BLOCK, same)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        "HEIGHT += -9.0",
+        "weight = (HEIGHT := -9.0)",
+        "weight, HEIGHT = 1.0, -9.0",
+        "del HEIGHT",
+        "LIMITS['up'] = -9.0",
+        "LIMITS.update({'up': -9.0})",
+        "for HEIGHT in [-9.0]:\n    weight = 1.0",
+        "if 1:\n    HEIGHT = -9.0",
+        "with f() as HEIGHT:\n    pass",
+        "def shifted():\n    global HEIGHT\n    HEIGHT = -9.0",
+        "def shifted(x=(HEIGHT := -9.0)):\n    return x",
+        "@(HEIGHT := max)\ndef shifted(x):\n    return x",
+        "async def HEIGHT():\n    pass",
+        "type HEIGHT = int",
+        "weight = 1.0; LIMITS['up'] = -9.0",
+    ],
+)
+def test_an_answer_that_binds_names_in_another_way_is_sent_back(more):
+    line = REWARD.count("\n") + 1 + more.startswith("@")
+
+    with pytest.raises(SpliceError, match=f"Line {line} of your code may change what else"):
+        with_reward(PARENT, reward("-states['rise']", more + "\n"))
+
+
+def test_two_names_of_one_constant_become_two_constants_and_only_what_is_used_is_taken():
+    made = with_reward(PARENT, ATTACKS["an assignment to two names, the goal's first"])
+
+    assert "\nweight = -9.0\n" in made
+    assert made.count("HEIGHT") == PARENT.count("HEIGHT")
+
+
+def test_an_answer_of_endless_sums_is_sent_back():
+    with pytest.raises(SpliceError, match=r"not Python|too large"):
+        with_reward(PARENT, reward(" + ".join(["1.0"] * 3000)))
 
 
 @pytest.mark.parametrize(

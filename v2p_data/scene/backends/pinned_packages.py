@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from v2p_data.errors import V2PError
+from v2p_data.scene.files import user_cache
 
 _TIMEOUT_S = 1200
 
@@ -20,8 +21,8 @@ def cache_folder(name: str, requirements: Path) -> Path:
         name: start of the folder's name; the digest of the pins follows.
         requirements: file with one pin per package, each with its hashes.
     """
-    shared = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    cache = Path(os.environ.get("V2P_CACHE") or shared / "v2p")
+    named = os.environ.get("V2P_CACHE")
+    cache = Path(named) if named else user_cache("V2P_CACHE")
     return cache / f"{name}-{hashlib.sha256(requirements.read_bytes()).hexdigest()[:8]}"
 
 

@@ -9,6 +9,7 @@ a worker is a program you chose to run.
 
 import json
 import os
+import secrets
 import shlex
 import shutil
 import stat
@@ -28,7 +29,7 @@ from jaxtyping import Shaped
 from trimesh.exchange.obj import load_obj
 
 from v2p_data.errors import ItemRejectedError, V2PError
-from v2p_data.processes import end_group, ending_with_us
+from v2p_data.processes import end_group, end_marked, ending_with_us
 
 SCHEMA, VERSION = "v2p-worker", 1
 EXIT_REFUSED = 3
@@ -175,8 +176,8 @@ def run_worker(
 ) -> WorkerResult:
     """Return the checked answer of `command --request DIR --result DIR`.
 
-    The worker's whole process group is killed at the time limit, at the size limit, and when this call ends for any
-    other reason.
+    All that the worker started is killed at the time limit, at the size limit, and when this call ends for any other
+    reason, on Linux also what it put into a session of its own.
 
     Raises:
         V2PError: the request does not keep the contract, the command cannot be started, it fails, runs too long, writes
@@ -205,8 +206,9 @@ def run_worker(
                     timeout_s, max_bytes)  # fmt: skip
         if code == EXIT_REFUSED:
             said = _read_json(answer / "result.json").get("message") or "it gave no reason"
+            said = " ".join(str(said)[:500].split())
             raise ItemRejectedError(
-                "worker_refused", f"worker '{words[0]}' refuses the item: {str(said)[:500]}"
+                "worker_refused", f"worker '{words[0]}' refuses the item: {said}"
             )
         if code != 0:
             how = f"was ended by signal {-code}" if code < 0 else f"failed with exit code {code}"
@@ -217,6 +219,8 @@ def run_worker(
 def _run(words: list[str], answer: Path, log: Path, timeout_s: float, max_bytes: int) -> int:
     # Our own interpreter's settings would lead another environment's Python astray.
     env = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
+    mark = f"V2P_WORKER={secrets.token_hex(8)}"
+    env |= dict([mark.split("=")])
     if shutil.which(words[0]) is None:
         raise V2PError(
             f"worker '{words[0]}' cannot be started: there is no such program; check its command line"
@@ -244,6 +248,7 @@ def _run(words: list[str], answer: Path, log: Path, timeout_s: float, max_bytes:
                     )
         finally:
             end_group(process, grace_s=1.0)
+            end_marked(mark)
 
 
 def _write_request(request: WorkerRequest, folder: Path) -> None:
@@ -318,6 +323,11 @@ def _read_npz(path: Path, wanted: set[str], max_bytes: int) -> dict[str, np.ndar
             members = {m.filename.removesuffix(".npy"): m for m in archive.infolist()}
             if sum(m.file_size for m in members.values()) > max_bytes:
                 raise V2PError(f"the arrays of the worker's {path.name} exceed {max_bytes} bytes")
+            if unknown := sorted(set(members) - wanted):
+                raise V2PError(
+                    f"the worker's {path.name} has an array {unknown[0][:60]!r} that nobody asked for; "
+                    f"known: {', '.join(sorted(wanted))}"
+                )
             for name in wanted & set(members):
                 with archive.open(members[name]) as file:
                     version = np.lib.format.read_magic(file)
@@ -410,7 +420,8 @@ def _check_arrays(
             continue
         array = arrays[name]
         kinds = {"uint8": "u", "bool": "b", "int": "iu", "float": "f"}[want.dtype]
-        right = array.dtype.kind in kinds and (want.dtype != "uint8" or array.dtype.itemsize == 1)
+        most_bytes = 1 if want.dtype == "uint8" else 8
+        right = array.dtype.kind in kinds and array.dtype.itemsize <= most_bytes
         right = right and array.ndim == len(want.dims)
         for dim, size in zip(want.dims, array.shape, strict=False):
             right = right and size == (
@@ -492,4 +503,4 @@ def _bytes_in(folder: Path, *files: Path) -> int:
 def _tail(log: Path) -> str:
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - _TAIL))
-        return file.read().decode(errors="replace").strip() or "nothing"
+        return " ".join(file.read().decode(errors="replace").split()) or "nothing"

@@ -118,6 +118,8 @@ class Bodies:
                 self.here.refuse(
                     f"super() may only call {', '.join(sorted(allowed.TASK_METHODS))}, not '{method}'"
                 )
+            if method == "__init__" and self.names.function != method:
+                self.here.refuse("super().__init__ may only be called in __init__, once for all")
         elif not isinstance(node.func, ast.Name | ast.Attribute):
             self.here.refuse("only functions and methods with a name may be called")
 

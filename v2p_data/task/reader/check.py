@@ -39,7 +39,7 @@ def checked_tree(source: str) -> ast.Module:
             f"it cannot be parsed ({type(error).__name__}: {error}); nest less deeply"
         ) from error
     _refuse_text(source_text.foreign_name(source))
-    _check_amount(tree)
+    check_amount(tree)
     read_program(tree)
     return tree
 
@@ -49,8 +49,12 @@ def _refuse_text(found: tuple[str, int] | None) -> None:
         raise TaskCodeError(*found)
 
 
-def _check_amount(tree: ast.Module) -> None:
-    """Bound nodes, depth and the length of names, without recursion."""
+def check_amount(tree: ast.Module) -> None:
+    """Bound nodes, depth and the length of names, without recursion.
+
+    Raises:
+        TaskCodeError: there is more of them than is allowed.
+    """
     count, level = 0, [tree]
     line = 1
     for _ in range(allowed.MAX_DEPTH):

@@ -28,6 +28,8 @@ class Names:
         self.local: set[str] = set()
         """Parameters and variables of the function being read."""
         self.in_class = False
+        self.function = ""
+        """Name of the function being read."""
 
     def demand_free(self, name: str) -> None:
         """Refuse a name that may not be given."""

@@ -142,6 +142,7 @@ class _Program:
         self.here.move_to(node)
         for default in a.defaults:
             self.values.read_literal(default)
+        self.names.function = node.name
         self._read_parameters(node, is_static)
         self._collect_local_names(node)
         body = node.body
