@@ -1,6 +1,7 @@
 """What a user gets for bad input: one sentence, exit code 2, and nothing made before is harmed."""
 
 import json
+import re
 import shlex
 import shutil
 import subprocess
@@ -29,6 +30,7 @@ def test_help_names_every_command_and_is_there_at_once():
         time.monotonic() - started < 5
     )  # 0.03 s on a quiet machine; this only bans heavy imports
     assert all(word in shown.stdout for word in ("generate", "train", "eval", "push", "demo"))
+    assert re.search(r"\n  3 +made, but not all", shown.stdout)
 
 
 def test_help_imports_no_heavy_library():

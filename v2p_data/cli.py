@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.errors import NOT_ALL, NOTHING, V2PError, did_you_mean
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "generate": (
@@ -55,9 +55,18 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
 }
 """The same for commands of two words; a folder of the second word's name is given as `./review`."""
 
+EXIT_CODES = {
+    0: "made; videos that were rejected are listed, with reasons",
+    1: "a check found something wrong (verify, status --check)",
+    NOTHING: "not made, or not begun; one sentence says why",
+    NOT_ALL: "made, but not all: something failed or is damaged, and the same command goes on with it",
+    130: "stopped by Ctrl-C",
+}
+"""Exit code -> what it means."""
+
 
 def main() -> None:
-    """Run the command line; bad input ends with one sentence and exit code 2."""
+    """Run the command line; bad input ends with one sentence and an exit code of `EXIT_CODES`."""
     # Read when torch is loaded, here and in worker processes. Threads that wait by spinning made training on two cores
     # ten times slower beside another job.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -86,7 +95,7 @@ def run(argv: Sequence[str]) -> int:
     except V2PError as error:
         known = name in COMMANDS or name in SUBCOMMANDS
         print(f"v2p {name}: {error}" if known else f"v2p: {error}", file=sys.stderr)
-        return 2
+        return NOTHING
     except KeyboardInterrupt:
         print(
             f"\nv2p {name}: stopped; what was finished is kept, the same command goes on from there",
@@ -186,6 +195,9 @@ def _help() -> str:
             "A folder of ordinary videos becomes simulated tasks, experts, a LeRobot dataset and a policy.",
             "",
             *lines,
+            "",
+            "Exit codes:",
+            *(f"  {code:<{width}}  {words}" for code, words in EXIT_CODES.items()),
             "",
             "Start with:  v2p generate VIDEOS --out DIR --repo-id USER/NAME",
             "More on one: v2p COMMAND --help",

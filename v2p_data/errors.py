@@ -4,6 +4,11 @@ import difflib
 from collections.abc import Iterable
 from typing import Any, Literal
 
+NOTHING = 2
+"""Exit code: what was asked for was not made."""
+NOT_ALL = 3
+"""Exit code: it was made, but something of it failed."""
+
 
 class V2PError(Exception):
     """Bad input or a bad setting: one clear sentence for the user, exit code 2."""

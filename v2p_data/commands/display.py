@@ -3,12 +3,13 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from v2p_data.errors import NOT_ALL, NOTHING
 from v2p_data.pipeline.runner import Outcome, Stage
 from v2p_data.pipeline.workers import Event
 
@@ -129,6 +130,20 @@ def outcomes_json(
         }
         for o in outcomes.values()
     ]
+
+
+def exit_code(outcomes: Iterable[Outcome], *, is_made: bool) -> int:
+    """Return the exit code of a command that makes things.
+
+    A rejection is an answer, which running again would not change; a failure is none.
+
+    Args:
+        outcomes: of all that the command was to make.
+        is_made: there is something of what was asked for.
+    """
+    if not is_made:
+        return NOTHING
+    return NOT_ALL if any(o.status == "failed" for o in outcomes) else 0
 
 
 def tally(outcomes: Sequence[Outcome], stage: str) -> Counter[str]:
