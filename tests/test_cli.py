@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from v2p_data.cli import run
+from v2p_data.commands import display
 from v2p_data.commands.run import _settings_in
 
 SAMPLES = Path(__file__).parents[1] / "datasets" / "sample_videos"
@@ -47,6 +48,21 @@ def test_reading_a_command_s_options_does_not_wait_for_what_trains():
         "assert not {'torchrl', 'tensordict', 'lerobot', 'transformers'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_what_takes_long_says_how_far_it_is(capsys, monkeypatch):
+    monkeypatch.setattr(display, "PLAIN_EVERY_S", 0.02)
+
+    with display.telling("drop") as progress:
+        time.sleep(0.1)
+        progress(0.25, "comparing every frame")
+        time.sleep(0.1)
+    said = capsys.readouterr().err.splitlines()
+    time.sleep(0.05)
+
+    assert said[0] == "drop: at work, 0 s so far"
+    assert said[-1] == "drop: 25% comparing every frame, 0 s so far"
+    assert capsys.readouterr().err == ""
 
 
 @pytest.fixture

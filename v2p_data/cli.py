@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from v2p_data.errors import NOT_ALL, NOTHING, V2PError, did_you_mean
+from v2p_data.errors import NOT_ALL, NOTHING, NotAllError, V2PError, did_you_mean
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "generate": (
@@ -95,7 +95,7 @@ def run(argv: Sequence[str]) -> int:
     except V2PError as error:
         known = name in COMMANDS or name in SUBCOMMANDS
         print(f"v2p {name}: {error}" if known else f"v2p: {error}", file=sys.stderr)
-        return NOTHING
+        return NOT_ALL if isinstance(error, NotAllError) else NOTHING
     except KeyboardInterrupt:
         print(
             f"\nv2p {name}: stopped; what was finished is kept, the same command goes on from there",

@@ -110,6 +110,14 @@ def test_a_damaged_file_of_one_item_leaves_a_dataset_of_the_others_and_3(
     assert list(datasets(place / "run").values()) == [["cup"]]
 
 
+def test_a_dataset_without_its_page_leaves_3(capsys, place: Path):
+    (place / "run" / "report.html.tmp").symlink_to("/dev/full")
+
+    assert generate(place / "videos", place / "run") == 3
+
+    assert "no space is left on the disk" in capsys.readouterr().err
+
+
 def test_a_failed_item_beside_whole_ones_leaves_3(place: Path):
     (place / "videos" / "broken.mp4").write_bytes(b"x")
 

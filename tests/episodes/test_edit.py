@@ -285,6 +285,17 @@ def test_nothing_is_overwritten(packed: Path, more: Path, tmp_path: Path):
         drop(packed, [LIFT], tmp_path / "both")
 
 
+def test_nothing_is_written_into_a_source(packed: Path, more: Path):
+    before = sorted(packed.rglob("*"))
+
+    with pytest.raises(V2PError, match=r"--out .* lies in .*, which is to stay as it is"):
+        drop(packed, [LIFT], packed / "inside")
+    with pytest.raises(V2PError, match="lies in"):
+        merge([more, packed], "user/both", packed / "v2p" / ".." / "inside")
+
+    assert sorted(packed.rglob("*")) == before
+
+
 def test_an_unknown_task_is_named_with_the_known_ones(packed: Path, tmp_path: Path):
     with pytest.raises(V2PError, match=f"no task 'lift the toy'.*Known: {LIFT}, {PUSH}, toy"):
         drop(packed, ["lift the toy"], tmp_path / "out")

@@ -19,9 +19,10 @@ from v2p_data.commands.display import (
     outcome_table,
     outcomes_json,
     tally,
+    telling,
 )
 from v2p_data.episodes.repo_id import check_repo_id, is_repo_id
-from v2p_data.errors import V2PError
+from v2p_data.errors import NotAllError, V2PError
 from v2p_data.judging import PROGRAMS, Contestant, contestant
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, stored_outcome
@@ -158,7 +159,7 @@ def generate_command(argv: list[str]) -> int:
         dataset, code = generate(
             args.videos, root, args.repo_id, args.engine, args.how.runtime(root)
         )
-        page = write_page(root)
+        page = _page(root)
     if dataset is None:
         raise V2PError(f"no video came as far as episodes, so there is no dataset; see {page}")
     counts = _record(dataset).counts
@@ -175,7 +176,7 @@ def train_command(argv: list[str]) -> int:
     root = _run_folder(args.out or args.dataset.resolve().parent.parent)
     with only_run_in(root):
         policy = train(args.dataset, root, args.engine, args.how.runtime(root))
-        page = write_page(root)
+        page = _page(root)
     counts = _record(policy.parent).counts
     _say(
         f"Made {policy}",
@@ -204,7 +205,7 @@ def distill_command(argv: list[str]) -> int:
         outcomes = _run([packed], _all_threads(args.how.runtime(root)))
         for part in (stage, packed):
             _demand(outcomes[(part.name, part.folder_name)])
-        page = write_page(root)
+        page = _page(root)
     counts = _record(stage.folder(root)).counts
     recovered = ", ".join(f"{share:.0%}" for share in counts["recovered"])
     _say(
@@ -223,7 +224,7 @@ def eval_command(argv: list[str]) -> int:
     unseen = {name: path for folder in args.tasks for name, path in task_folders(folder).items()}
     with only_run_in(root):
         outcome, rows = evaluate(who, unseen, root, args.engine, args.how.runtime(root))
-        page = write_page(root)
+        page = _page(root)
     goes_on = {
         "policy": f"v2p push {shlex.quote(str(args.policy))} --repo-id USER/NAME",
         "expert": f"v2p eval {PROGRAMS} --tasks TASKS   (the same judge on scripted programs)",
@@ -256,11 +257,11 @@ def demo_command(argv: list[str]) -> int:
     with only_run_in(root):
         dataset, code = generate(samples, root, "v2p/demo", cfg, runtime)
         if dataset is None:
-            raise V2PError(f"no sample clip came as far as episodes; see {write_page(root)}")
+            raise V2PError(f"no sample clip came as far as episodes; see {_page(root)}")
         policy = train(dataset, root, cfg, runtime)
         unseen, code_of_unseen = _unseen_tasks(samples / "unseen", root, cfg, runtime)
         _, rows = evaluate(contestant(policy), unseen, root, cfg, runtime)
-        page = write_page(root)
+        page = _page(root)
     _say(
         f"Made {page}",
         "\n".join(rate_lines(rows)),
@@ -479,7 +480,7 @@ def _up_to(
     with only_run_in(root):
         stages = [stage_of(video, args.engine) for video in _videos(args.videos)]
         outcomes = _run(stages, args.how.runtime(root))
-        page = write_page(root)
+        page = _page(root)
     print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
     counts = tally(list(outcomes.values()), name)
     rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
@@ -554,6 +555,19 @@ def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:
             f"cannot write {path} ({error.strerror}); what was made is kept: remove what is there and run again"
         ) from error
     return outcomes
+
+
+def _page(root: Path) -> Path:
+    """Write the run's page.
+
+    Raises:
+        NotAllError: it cannot be written; all else is there.
+    """
+    with telling("report"):
+        try:
+            return write_page(root)
+        except V2PError as error:
+            raise NotAllError(str(error)) from error
 
 
 def _demand(outcome: Outcome) -> None:

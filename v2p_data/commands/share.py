@@ -50,11 +50,13 @@ class Explain:
 
 def verify_command(argv: list[str]) -> int:
     """Return 0 where all is well, 1 where there are problems; what cannot be read is an error (2)."""
+    from v2p_data.commands.display import telling
     from v2p_data.episodes.verify import verify
     from v2p_data.pipeline.artifact import write_json_atomically
 
     args = parse(Verify, argv, "verify")
-    report = verify(args.dataset)
+    with telling("verify") as progress:
+        report = verify(args.dataset, on_progress=progress)
     if args.json is not None:
         write_json_atomically(args.json, report.as_json())
     print("\n".join([*report.lines(), report.summary()]))  # noqa: T201
