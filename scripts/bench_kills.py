@@ -55,7 +55,7 @@ TOLD = (
     ".workers.lock",
     "events.out.*",
     "*.log",
-    "checked.json",
+    ".checked/*/*",
 )
 """Files in which times and places stand, of which the product compares none, or only a checksum."""
 REPO = "user/killed"
