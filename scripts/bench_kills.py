@@ -57,6 +57,7 @@ TOLD = (
     "*.log",
     ".checked/*/*",
     "curve.csv",  # seconds
+    "dataset/*/meta/v2p.json",  # when it was packed
 )
 """Files in which times and places stand, of which the product compares none, or only a checksum."""
 REPO = "user/killed"
