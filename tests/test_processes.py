@@ -73,6 +73,24 @@ def test_a_child_whose_parent_is_gone_already_ends_at_once():
     assert (done.returncode, done.stdout) == (-signal.SIGKILL, b"")
 
 
+@pytest.mark.parametrize("module", ["v2p_data.task.smoke_child", "v2p_data.reward.worker"])
+def test_a_process_of_ours_whose_parent_is_gone_ends_before_it_imports(module):
+    """What it would import takes seconds, in which the parent may end; then another takes the parent's place."""
+    code = f"from v2p_data.processes import own_python; print(own_python({module!r})[-1])"
+    of_another = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    begun = time.monotonic()
+
+    done = subprocess.run(
+        [sys.executable, "-I", "-X", "importtime", "-c", of_another.stdout.decode()],
+        capture_output=True, check=False,
+    )  # fmt: skip
+
+    assert done.returncode == -signal.SIGKILL
+    assert b"v2p_data.processes" in done.stderr
+    assert b"torch" not in done.stderr
+    assert time.monotonic() - begun < WAIT_S
+
+
 def test_another_program_ends_with_the_process_that_started_it(tmp_path):
     note = f"from pathlib import Path; import os; Path({str(tmp_path / 'pid')!r}).write_text(f'{{os.getpid()}}\\n')"
     parent_code = textwrap.dedent(f"""

@@ -5,7 +5,6 @@ Only light modules are imported here, so that `v2p --help` answers at once; each
 
 import contextlib
 import difflib
-import errno
 import io
 import logging
 import os
@@ -15,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.errors import NOT_ALL, NOTHING, NotAllError, V2PError, did_you_mean, write_refusal
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "generate": (
@@ -55,21 +54,18 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "reward show": ("reward", "what a search tried, with curves, analysis and differences"),
 }
 """The same for commands of two words; a folder of the second word's name is given as `./review`."""
-_WHAT_TO_DO = {
-    errno.EACCES: "choose a folder that you may write, or ask for the right to",
-    errno.EPERM: "choose a folder that you may write, or ask for the right to",
-    errno.EROFS: "choose a folder on a disk that can be written",
-    errno.ENOSPC: "make room, or choose a folder on another disk; what was finished is kept",
-    errno.EDQUOT: "make room, or choose a folder on another disk; what was finished is kept",
-    errno.EFBIG: "raise the limit on file sizes (ulimit -f); what was finished is kept",
-    errno.EMFILE: "raise the limit on open files (ulimit -n); what was finished is kept",
-    errno.ENAMETOOLONG: "choose a shorter path",
+EXIT_CODES = {
+    0: "made; videos that were rejected are listed, with reasons",
+    1: "a check found something wrong (verify, status --check)",
+    NOTHING: "not made, or not begun; one sentence says why",
+    NOT_ALL: "made, but not all: something failed or is damaged, and the same command goes on with it",
+    130: "stopped by Ctrl-C",
 }
-"""What no command can mend by itself, wherever it is met."""
+"""Exit code -> what it means."""
 
 
 def main() -> None:
-    """Run the command line; bad input ends with one sentence and exit code 2."""
+    """Run the command line; bad input ends with one sentence and an exit code of `EXIT_CODES`."""
     # Read when torch is loaded, here and in worker processes. Threads that wait by spinning made training on two cores
     # ten times slower beside another job.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -98,16 +94,12 @@ def run(argv: Sequence[str]) -> int:
     except V2PError as error:
         known = name in COMMANDS or name in SUBCOMMANDS
         print(f"v2p {name}: {error}" if known else f"v2p: {error}", file=sys.stderr)
-        return 2
+        return NOT_ALL if isinstance(error, NotAllError) else NOTHING
     except OSError as error:
-        if error.errno not in _WHAT_TO_DO or isinstance(error, BrokenPipeError):
+        if (refusal := write_refusal(error)) is None:
             raise
-        where = error.filename or "a file"
-        print(
-            f"v2p {name}: {where} cannot be used: {error.strerror}; {_WHAT_TO_DO[error.errno]}",
-            file=sys.stderr,
-        )
-        return 2
+        print(f"v2p {name}: {error.filename or 'a file'}: {refusal}", file=sys.stderr)
+        return NOTHING
     except KeyboardInterrupt:
         print(
             f"\nv2p {name}: stopped; what was finished is kept, the same command goes on from there",
@@ -207,6 +199,9 @@ def _help() -> str:
             "A folder of ordinary videos becomes simulated tasks, experts, a LeRobot dataset and a policy.",
             "",
             *lines,
+            "",
+            "Exit codes:",
+            *(f"  {code:<{width}}  {words}" for code, words in EXIT_CODES.items()),
             "",
             "Start with:  v2p generate VIDEOS --out DIR --repo-id USER/NAME",
             "More on one: v2p COMMAND --help",

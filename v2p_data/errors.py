@@ -1,8 +1,26 @@
 """The errors a user can do something about. Anything else is a bug and keeps its traceback."""
 
 import difflib
+import errno
+import re
 from collections.abc import Iterable
 from typing import Any, Literal
+
+NOTHING = 2
+"""Exit code: what was asked for was not made."""
+NOT_ALL = 3
+"""Exit code: it was made, but something of it failed."""
+_REFUSALS = {
+    errno.ENOSPC: "no space is left on the disk; free some",
+    errno.EDQUOT: "the disk quota is used up; free some space",
+    errno.EFBIG: "a file may not grow that large here; raise the limit (ulimit -f)",
+    errno.EROFS: "the file system is read-only; make it writable or choose another place",
+    errno.EACCES: "there is no permission to write; change it or choose another place",
+    errno.EPERM: "writing is not permitted; change that or choose another place",
+    errno.EMFILE: "too many files are open; raise the limit (ulimit -n)",
+    errno.ENAMETOOLONG: "the path is too long; choose a shorter one",
+}
+"""What no command can mend by itself -> what it is and what helps."""
 
 
 class V2PError(Exception):
@@ -14,6 +32,10 @@ class V2PError(Exception):
 
     def __init__(self, sentence: str) -> None:
         super().__init__(_shown(sentence))
+
+
+class NotAllError(V2PError):
+    """What was asked for is made, and something beside it is not: exit code 3."""
 
 
 class ItemRejectedError(V2PError):
@@ -50,6 +72,16 @@ class UnusableError(V2PError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.reason, self.detail)
+
+
+def write_refusal(error: BaseException) -> str | None:
+    """Return why nothing could be written and what helps, where that is what an error says.
+
+    FFmpeg's errors have an errno and are no OSError; the writers of weights and tables say it in words only.
+    """
+    if re.search(r"No space left|StorageFull", str(error)):
+        return _REFUSALS[errno.ENOSPC]
+    return _REFUSALS.get(getattr(error, "errno", None) or 0)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

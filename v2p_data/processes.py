@@ -17,26 +17,29 @@ _PR_SET_PDEATHSIG = 1
 
 
 def own_python(module: str, function: str = "main") -> list[str]:
-    """Return the command that runs a function of one of our modules in a Python that ignores the user's settings of Python."""
+    """Return the command that runs a function of one of our modules in a Python that ignores the user's settings of Python.
+
+    It ends when this process does, however that went, from before it imports the module.
+    """
     root = str(Path(__file__).parents[1])
     code = (
-        f"import sys; sys.path.insert(0, {root!r}); from {module} import {function}; {function}()"
+        f"import sys; sys.path.insert(0, {root!r}); from {__name__} import end_with_parent; "
+        f"end_with_parent({os.getpid()}); from {module} import {function}; {function}()"
     )
     return [sys.executable, "-I", "-c", code]
 
 
 def ending_with_us(command: list[str]) -> list[str]:
     """Return a command that runs another program, and ends when this process does, however that went."""
-    return [*own_python(__name__, become_program.__name__), str(os.getpid()), *command]
+    return [*own_python(__name__, become_program.__name__), *command]
 
 
 def become_program() -> None:
-    """Be the program that the command line names after the parent's process id."""
-    end_with_parent(int(sys.argv[1]))
+    """Be the program that the command line names."""
     try:
-        os.execvp(sys.argv[2], sys.argv[2:])
+        os.execvp(sys.argv[1], sys.argv[1:])
     except OSError as error:
-        sys.exit(f"{sys.argv[2]} cannot be started: {error.strerror}")
+        sys.exit(f"{sys.argv[1]} cannot be started: {error.strerror}")
 
 
 def end_with_parent(parent_pid: int) -> None:

@@ -153,6 +153,24 @@ def test_a_robot_that_falls_silent_is_told_to_hold(blind_robot, restarted, stead
     assert held[1] - held[0] > 0.3  # once by the watchdog in time, once at the end
 
 
+def test_a_policy_that_ponders_too_long_is_named_and_not_the_robot(blind_robot, restarted, steady):
+    class Pondering(steady):
+        def act(self, labels, state):
+            if blind_robot.arm.steps == 5:
+                time.sleep(0.7)
+            return super().act(labels, state)
+
+    limits = LimitsConfig(max_silence_ms=400.0)
+    outcome = run_of(
+        restarted(blind_robot), Pondering(0, 0, 0, 0, 0, 0, 0), seconds=5.0, limits=limits
+    ).go()
+
+    assert outcome.ending == "slow"
+    assert outcome.sentence.startswith("the policy took more than 400 ms in one step")
+    assert "look after" not in outcome.sentence
+    assert blind_robot.arm.steps == 5  # what it decided so late is not done
+
+
 def test_a_policy_that_breaks_leaves_the_arm_at_rest(blind_robot, restarted, steady):
     class Broken(steady):
         def act(self, labels, state):

@@ -21,6 +21,7 @@ from v2p_data.pipeline.runner import (
     Outcome,
     Runtime,
     Stage,
+    blocked_by,
     in_order,
     make_stage,
     stored_outcome,
@@ -130,15 +131,14 @@ def made(
     """Make what is missing in this process: workers would import LeRobot anew."""
     outcomes: dict[tuple[str, str], Outcome] = {}
     for stage in in_order(stages):
-        needs = [outcomes[(s.name, s.folder_name)] for s in stage.inputs.values()]
-        bad = next((o for o in needs if not o.is_usable), None)
-        if bad is not None:
+        outcome = stored_outcome(stage, runtime.root)
+        bad = blocked_by(stage, outcomes)
+        if outcome is None and bad is not None:
             outcome = Outcome(
                 stage=stage.name, item=stage.item, status="blocked",
                 folder=stage.folder(runtime.root), detail=f"needs {bad.stage} of {bad.item}",
             )  # fmt: skip
-        else:
-            outcome = stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
+        outcome = outcome or make_stage(stage, runtime)
         outcomes[(stage.name, stage.folder_name)] = outcome
     return outcomes
 

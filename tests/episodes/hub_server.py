@@ -18,7 +18,7 @@ from urllib.parse import unquote, urlsplit
 
 TOKEN = "hf_right_token"
 NAMESPACE = "user"
-CUT = 0
+CUT, LOST = 0, 1
 LFS_SUFFIXES = (".mp4", ".parquet", ".safetensors")
 
 
@@ -31,6 +31,9 @@ class Repo:
     commits: dict[str, dict[str, bytes]] = field(default_factory=dict)
     head: str = ""
     tags: dict[str, str] = field(default_factory=dict)
+    private: bool = False
+    gated: str | bool = False
+    """`auto` or `manual` where people ask for access."""
 
     def commit(self) -> str:
         listing = sorted(
@@ -57,7 +60,10 @@ class Hub:
     faults: dict[str, int] = field(default_factory=dict)
     """Requests whose address holds the key get this answer."""
     passing_faults: list[tuple[str, int]] = field(default_factory=list)
-    """The same, each for one request only; `CUT` is no answer but half a request read and the line cut."""
+    """The same, each for one request only, whose method may stand before the address.
+
+    `CUT` is no answer but half a request read and the line cut; with `LOST` the request is obeyed before the line is cut.
+    """
 
     def count(self, start: str, part: str = "") -> int:
         """Return how many requests there were of this kind."""
@@ -87,7 +93,10 @@ def running_hub() -> Generator[Hub]:
 
 class _Handler(BaseHTTPRequestHandler):
     state: Hub
+    is_lost = False
+    """The answer to this request."""
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # else every answer waits 40 ms for an acknowledgement
 
     def log_message(self, format: str, *args: object) -> None:
         pass
@@ -112,7 +121,8 @@ class _Handler(BaseHTTPRequestHandler):
         path = unquote(urlsplit(self.path).path)
         hub.requests.append(f"{method} {path}")
         size = int(self.headers.get("Content-Length") or 0)
-        fault = next((f for f in hub.passing_faults if f[0] in path), None)
+        fault = next((f for f in hub.passing_faults if f[0] in f"{method} {path}"), None)
+        self.is_lost = fault is not None and fault[1] == LOST
         if fault is not None:
             hub.passing_faults.remove(fault)
             if fault[1] == CUT:
@@ -121,7 +131,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.connection.shutdown(socket.SHUT_RDWR)
                 return None
         body = self.rfile.read(size)
-        if fault is not None:
+        if fault is not None and not self.is_lost:
             return self._json(fault[1], {"error": "told to answer so"}, {"Retry-After": "0"})
         for part, status in hub.faults.items():
             if part in path:
@@ -164,7 +174,7 @@ class _Handler(BaseHTTPRequestHandler):
             return self._json(403, {"error": f"You don't have the rights to create under {owner}"})
         if key in self.state.repos:
             return self._json(409, {"error": "You already created this repo", "url": url})
-        self.state.repos[key] = Repo()
+        self.state.repos[key] = Repo(private=asked.get("visibility") == "private")
         self.state.repos[key].commit()
         return self._json(200, {"url": url, "name": f"{owner}/{name}", "id": f"{owner}/{name}"})
 
@@ -213,8 +223,8 @@ class _Handler(BaseHTTPRequestHandler):
             return self._json(404, {"error": "no revision"}, {"X-Error-Code": "RevisionNotFound"})
         if verb in ("", "revision"):
             siblings = [{"rfilename": path} for path in repo.commits[commit]]
-            return self._json(200, {"id": repo_id, "sha": commit, "siblings": siblings, "tags": [],
-                                    "private": False, "downloads": 0, "likes": 0})  # fmt: skip
+            return self._json(200, {"id": repo_id, "sha": commit, "siblings": siblings, "tags": [], "downloads": 0, "likes": 0,
+                                    "private": repo.private, "gated": repo.gated})  # fmt: skip
         if verb == "tree":
             return self._json(
                 200, [self._tree_entry(repo, p, d) for p, d in repo.commits[commit].items()]
@@ -282,6 +292,10 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def _send(self, status: int, data: bytes, headers: dict[str, str]) -> None:
+        if self.is_lost:
+            self.close_connection = True
+            self.connection.shutdown(socket.SHUT_RDWR)
+            return
         self.send_response(status)
         for name, value in headers.items():
             self.send_header(name, value)

@@ -3,6 +3,7 @@
 import json
 import resource
 import shutil
+import tempfile
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
@@ -283,6 +284,30 @@ def test_nothing_is_overwritten(packed: Path, more: Path, tmp_path: Path):
         merge([packed, more], "user/both", tmp_path / "both")
     with pytest.raises(V2PError, match="exists already; nothing is overwritten"):
         drop(packed, [LIFT], tmp_path / "both")
+
+
+def test_a_dataset_is_written_to_another_file_system(staged: list[Path], packed: Path):
+    """Where temporary files lie elsewhere, nothing can be renamed from there into its place."""
+    memory = Path("/dev/shm")
+    if not memory.is_dir() or memory.stat().st_dev == packed.stat().st_dev:
+        pytest.skip("this machine has no second file system")
+    with tempfile.TemporaryDirectory(dir=memory) as place:
+        pack(staged, "user/toys", Path(place) / "packed")
+        drop(Path(place) / "packed", [PUSH], Path(place) / "less")
+
+        assert_holds(Path(place) / "packed", staged)
+        assert_holds(Path(place) / "less", staged[::2])
+
+
+def test_nothing_is_written_into_a_source(packed: Path, more: Path):
+    before = sorted(packed.rglob("*"))
+
+    with pytest.raises(V2PError, match=r"--out .* lies in .*, which is to stay as it is"):
+        drop(packed, [LIFT], packed / "inside")
+    with pytest.raises(V2PError, match="lies in"):
+        merge([more, packed], "user/both", packed / "v2p" / ".." / "inside")
+
+    assert sorted(packed.rglob("*")) == before
 
 
 def test_an_unknown_task_is_named_with_the_known_ones(packed: Path, tmp_path: Path):

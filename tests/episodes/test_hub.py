@@ -1,14 +1,17 @@
 """What goes wrong with a push is said in one sentence, and the token never."""
 
+import contextlib
+import copy
 import json
 import logging
 import socket
 from pathlib import Path
 
 import pytest
-from hub_server import CUT, TOKEN, Hub, Repo
+from hub_server import CUT, LOST, TOKEN, Hub, Repo
 
-from v2p_data.episodes.hub import push_dataset, push_policy
+from v2p_data.cli import run
+from v2p_data.episodes.hub import Pushed, push_dataset, push_envhub, push_policy
 from v2p_data.errors import V2PError
 
 
@@ -139,6 +142,115 @@ def test_an_upload_cut_in_the_middle_is_resumed_by_the_next_command(dataset: Pat
 
     assert online.count("PUT /lfs/") == 1
     assert online.repos["datasets/user/toys"].tags == {"v3.0": pushed.commit}
+
+
+@pytest.mark.parametrize("how", [CUT, LOST])
+def test_whichever_request_breaks_off_the_version_that_loads_is_a_whole_one(
+    tmp_path: Path, online: Hub, monkeypatch: pytest.MonkeyPatch, how: int
+):
+    """Before it was obeyed and after; once without further tries, and twice with them: then the push goes on."""
+    monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda s: None)
+    old, new = tmp_path / "old", tmp_path / "new"
+    for root, name in ((old, "a"), (new, "b")):
+        (root / "meta").mkdir(parents=True)
+        (root / "meta/info.json").write_text(json.dumps({"codebase_version": "v3.0", "of": name}))
+        (root / f"{name}.mp4").write_bytes(name.encode() * 5000)
+        (root / "data").mkdir()
+        (root / f"data/{name}.txt").write_text(name)
+
+    def versions() -> list[dict[str, bytes] | None]:
+        """Return what loads by the tag and what lies on the branch."""
+        repo = online.repos["datasets/user/toys"]
+        return [repo.commits[repo.tags["v3.0"]] if "v3.0" in repo.tags else None, repo.files]
+
+    push_dataset(old, "user/toys")
+    before = copy.deepcopy((online.repos, online.blobs))
+    old_files = dict(online.repos["datasets/user/toys"].files)
+
+    def break_off(request: str, times: int) -> None:
+        online.repos, online.blobs = copy.deepcopy(before)
+        online.passing_faults = [(request, how)] * times
+
+    online.requests.clear()
+    push_dataset(new, "user/toys")
+    asked = [r for r in dict.fromkeys(online.requests) if "agent-harnesses" not in r]
+    new_files = dict(online.repos["datasets/user/toys"].files)
+    assert len(asked) >= 8
+
+    for request in asked:
+        break_off(request, times=1)
+        # The library itself tries some requests again.
+        with contextlib.suppress(V2PError):
+            push_dataset(new, "user/toys", waits_s=())
+        assert all(v in (old_files, new_files, None) for v in versions()), request
+        break_off(request, times=2)
+        push_dataset(new, "user/toys", waits_s=(0.0, 0.0))
+        assert online.passing_faults == [], request
+        assert versions() == [new_files, new_files], request
+
+
+def test_a_hub_without_xet_storage_gets_large_files_the_older_way(
+    dataset: Path, online: Hub, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    pytest.importorskip("hf_xet")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_DISABLE_XET", False)
+    (dataset / "a.mp4").write_bytes(b"a" * 5000)
+
+    push_dataset(dataset, "user/toys", waits_s=())
+
+    assert online.count("GET", "xet-write-token") == 1
+    assert online.repos["datasets/user/toys"].files["a.mp4"] == b"a" * 5000
+    assert "Xet storage answered 404" in caplog.text
+
+
+def push_any(kind: str, folder: Path, *, private: bool) -> Pushed:
+    """Push a small thing of each kind."""
+    files = {
+        "dataset": {"meta/info.json": '{"codebase_version": "v3.0"}'},
+        "policy": {"config.json": '{"type": "act"}', "model.safetensors": "weights"},
+        "envhub": {"env.py": ""},
+    }[kind]
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    push = {"dataset": push_dataset, "policy": push_policy, "envhub": push_envhub}[kind]
+    return push(folder, "user/toys", private=private)
+
+
+@pytest.mark.parametrize("gated", [False, "auto", "manual"])
+@pytest.mark.parametrize("kind", ["dataset", "policy", "envhub"])
+def test_nothing_private_goes_to_a_repository_that_others_see(
+    tmp_path: Path, online: Hub, kind: str, gated: str | bool
+):
+    key = f"{'datasets' if kind == 'dataset' else 'models'}/user/toys"
+    repo = online.repos[key] = Repo(gated=gated)
+    repo.commit()
+
+    with pytest.raises(V2PError, match=f"exists and is {'gated' if gated else 'public'}") as told:
+        push_any(kind, tmp_path, private=True)
+
+    assert "/user/toys/settings" in str(told.value)
+    assert (repo.files, repo.tags, online.blobs, repo.private) == ({}, {}, {}, False)
+    assert online.count("POST", "preupload") == 0
+
+
+@pytest.mark.parametrize("kind", ["dataset", "policy", "envhub"])
+def test_what_is_private_stays_so_and_is_told(tmp_path: Path, online: Hub, kind: str):
+    assert push_any(kind, tmp_path, private=True).visibility == "private"
+
+    assert push_any(kind, tmp_path, private=False).visibility == "private"
+    assert all(repo.private for repo in online.repos.values())
+
+
+def test_the_command_says_that_a_repository_is_not_public(
+    capsys: pytest.CaptureFixture[str], dataset: Path, online: Hub
+):
+    repo = online.repos["datasets/user/toys"] = Repo(gated="auto")
+    repo.commit()
+
+    assert run(["push", str(dataset), "--repo-id", "user/toys"]) == 0
+
+    assert "user/toys, which is gated and stays so\n" in capsys.readouterr().out
 
 
 def test_patience_ends(dataset: Path, online: Hub):

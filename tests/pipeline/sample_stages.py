@@ -1,6 +1,7 @@
 """Stages small enough to read at a glance; a module of its own because workers must be able to import it."""
 
 import os
+import shutil
 import signal
 from dataclasses import dataclass
 
@@ -21,6 +22,12 @@ def make_text(config, inputs, out, runtime):
         raise RuntimeError("boom")
     if config.trouble == "crash":
         os.kill(os.getpid(), signal.SIGSEGV)
+    if config.trouble == "full":
+        raise RuntimeError("writer: No space left on device (os error 28)")
+    if config.trouble == "big":
+        (out / "big").write_bytes(bytes(5000))
+    if config.trouble == "deleted":
+        shutil.rmtree(out)
     before = "".join((folder / "text").read_text() for folder in inputs.values())
     (out / "text").write_text(before + config.text)
     return {"letters": len(before + config.text)}

@@ -1,3 +1,4 @@
+import resource
 import subprocess
 import sys
 import textwrap
@@ -53,6 +54,31 @@ def test_one_bad_item_blocks_only_what_needs_it(tmp_path, trouble):
     assert by_item["good", "two"].status == "made"
     assert by_item["bad", "one"].status == ("rejected" if trouble == "reject" else "failed")
     assert by_item["bad", "two"].status == "blocked"
+
+
+def test_a_place_that_takes_nothing_more_is_named_by_workers_too(tmp_path):
+    said = {
+        "big": "a file may not grow that large here",
+        "full": "no space is left on the disk",
+        "deleted": "was deleted while it was being filled",
+        "raise": "boom",  # whose traceback cannot be written either
+    }
+    stages = [
+        Stage(name="one", item=trouble, config=Recipe(trouble=trouble), make=make_text)
+        for trouble in said
+    ]
+    (tmp_path / "logs").mkdir()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        outcomes = run_stages(stages, Runtime(root=tmp_path), lambda event: None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    for outcome in outcomes.values():
+        assert outcome.status == "failed"
+        assert said[outcome.item] in outcome.detail
+        assert str(tmp_path) in outcome.detail or outcome.item == "raise"
 
 
 def test_a_rejection_is_remembered_and_a_failure_is_tried_again(tmp_path):

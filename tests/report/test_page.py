@@ -5,6 +5,7 @@ from html.parser import HTMLParser
 
 import pytest
 
+from v2p_data.errors import V2PError
 from v2p_data.report.media import PageConfig
 from v2p_data.report.page import NO_BREAK, duration, percent, write_page
 from v2p_data.report.reading import rate_of
@@ -330,6 +331,21 @@ def test_the_page_can_go_elsewhere_and_is_written_whole(run, tmp_path):
     assert out.read_text().endswith("</html>")
     assert not (run.root / "report.html").exists()
     assert [p.name for p in tmp_path.glob("*.tmp")] == []
+
+
+def test_a_page_that_finds_no_room_ends_in_a_sentence_and_leaves_the_old_one(run):
+    run.scene("lift_mug")
+    write_page(run.root)
+    before = (run.root / "report.html").read_text()
+    # Where it is written first, the kernel answers that no space is left.
+    (run.root / "report.html.tmp").symlink_to("/dev/full")
+
+    with pytest.raises(
+        V2PError, match=r"report\.html: no space is left on the disk.*'v2p report "
+    ):
+        write_page(run.root)
+
+    assert (run.root / "report.html").read_text() == before
 
 
 @pytest.mark.parametrize(

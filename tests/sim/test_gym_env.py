@@ -95,6 +95,13 @@ def test_the_same_seed_gives_the_same_episode_and_another_seed_another(env):
     assert not np.array_equal(once[0]["agent_pos"], other[0]["agent_pos"])
 
 
+def test_options_of_a_reset_and_a_window_are_refused(env, tmp_path):
+    with pytest.raises(V2PError, match="no options, got height_m"):
+        env.reset(options={"height_m": 0.1})
+    with pytest.raises(V2PError, match="render_mode is 'rgb_array' or None, got 'human'"):
+        V2PEnv(str(tmp_path), render_mode="human")
+
+
 def test_the_policy_sees_robot_and_cube_as_greys(env):
     observation, _ = env.reset(seed=0)
 

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from v2p_data.errors import V2PError
 from v2p_data.sim import vector_env
 
 CODE = """
@@ -59,6 +60,29 @@ def test_a_seed_repeats_the_same_worlds(env):
 
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
+
+
+def test_each_world_starts_as_its_seed_in_a_list_says(env):
+    first, _ = env.reset(seed=[5, 6, 5])
+    again, _ = env.reset(seed=[7, 6, 5])
+
+    np.testing.assert_array_equal(first[0], first[2])
+    assert not np.array_equal(first[0], first[1])
+    np.testing.assert_array_equal(first[1:], again[1:])
+    assert not np.array_equal(first[0], again[0])
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"seed": [5, 6]}, "one for each of the 3 worlds"),
+        ({"seed": [5, None, 6]}, "one for each of the 3 worlds"),
+        ({"options": {"reset_mask": np.ones(3, bool)}}, "no options, got reset_mask"),
+    ],
+)
+def test_what_a_reset_would_not_heed_is_refused(env, asked, words):
+    with pytest.raises(V2PError, match=words):
+        env.reset(**asked)
 
 
 def test_the_step_after_an_end_starts_the_next_episode_and_ignores_its_action(env):

@@ -24,12 +24,15 @@ MEGABYTE = 2**20
 def in_a_child(attempt: Callable[[], object], **limits) -> str:
     """Return how a forked process that confines itself ends: 'done', the name of an error, or of a signal."""
     read_end, write_end = os.pipe()
-    pid = os.fork()
+    parent_pid, pid = os.getpid(), os.fork()
     if pid == 0:
         try:
             os.close(read_end)
             leave_the_network()
-            confine(**{"seconds": 5.0, "memory_bytes": 256 * MEGABYTE} | limits)
+            confine(
+                **{"parent_pid": parent_pid, "seconds": 5.0, "memory_bytes": 256 * MEGABYTE}
+                | limits
+            )
             try:
                 attempt()
                 os.write(write_end, b"done")
@@ -183,8 +186,10 @@ def test_a_process_with_a_folder_writes_there_and_nowhere_else(canary, tmp_path_
 def test_a_folder_of_its_own_is_no_way_to_others(canary, tmp_path_factory):
     held = []
     read_end, write_end = os.pipe()
+    parent_pid = os.getpid()
     if os.fork() == 0:
-        os.write(write_end, ",".join(confine(5.0, None, open_files=9)).encode())
+        held = confine(5.0, None, parent_pid=parent_pid, open_files=9)
+        os.write(write_end, ",".join(held).encode())
         os._exit(0)
     os.close(write_end)
     held = os.read(read_end, 1000).decode().split(",")

@@ -1,18 +1,23 @@
 """What a person sees while stages run: bars with the time left in a terminal, plain lines elsewhere."""
 
 import sys
+import threading
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, TextIO
 
+import rich.progress
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TaskID, TextColumn, TimeRemainingColumn
 
-from v2p_data.pipeline.runner import Outcome, Stage
+from v2p_data.errors import NOT_ALL, NOTHING
+from v2p_data.pipeline.runner import Outcome, Progress, Stage
 from v2p_data.pipeline.workers import Event
 
 PLAIN_EVERY_S = 15.0
+"""Nobody waits longer for a word."""
 STAGE_ORDER = (
     *("scene", "task", "reward", "expert", "episodes"),
     *("dataset", "distillation", "policy", "evaluation"),
@@ -28,7 +33,7 @@ class Display:
         self.bars: dict[str, TaskID] = {}
         self.started: dict[str, float] = {}
         self.spoken: dict[str, float] = {}
-        self.progress = Progress(
+        self.progress = rich.progress.Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
             TextColumn("{task.percentage:>3.0f} %"),
@@ -84,6 +89,28 @@ class Display:
             print(line, file=self.stream, flush=True)
 
 
+@contextmanager
+def telling(what: str) -> Generator[Progress]:
+    """Say on stderr every now and then how far something is; give what is to be told of its steps."""
+    now, done, began = ["at work"], threading.Event(), time.monotonic()
+
+    def heard(share: float, words: str) -> None:
+        now[0] = f"{share:.0%} {words}"
+
+    def say() -> None:
+        while not done.wait(PLAIN_EVERY_S):
+            seconds = time.monotonic() - began
+            print(f"{what}: {now[0]}, {seconds:.0f} s so far", file=sys.stderr, flush=True)  # noqa: T201
+
+    teller = threading.Thread(target=say, daemon=True)
+    teller.start()
+    try:
+        yield heard
+    finally:
+        done.set()
+        teller.join()
+
+
 def describe(outcome: Outcome) -> str:
     """Return an outcome in words."""
     if outcome.status == "made":
@@ -129,6 +156,20 @@ def outcomes_json(
         }
         for o in outcomes.values()
     ]
+
+
+def exit_code(outcomes: Iterable[Outcome], *, is_made: bool) -> int:
+    """Return the exit code of a command that makes things.
+
+    A rejection is an answer, which running again would not change; a failure is none.
+
+    Args:
+        outcomes: of all that the command was to make.
+        is_made: there is something of what was asked for.
+    """
+    if not is_made:
+        return NOTHING
+    return NOT_ALL if any(o.status == "failed" for o in outcomes) else 0
 
 
 def tally(outcomes: Sequence[Outcome], stage: str) -> Counter[str]:

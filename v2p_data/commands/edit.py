@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from v2p_data.cli import parse
+from v2p_data.commands.display import telling
 from v2p_data.episodes.repo_id import check_repo_id
 
 if TYPE_CHECKING:
@@ -40,9 +41,11 @@ def merge_command(argv: list[str]) -> int:
 
     args = parse(Merge, argv, "merge")
     check_repo_id(args.repo_id)
-    for dataset in args.datasets:
-        _demand_sound(dataset)
-    return _tell(merge(args.datasets, args.repo_id, args.out))
+    with telling("merge") as progress:
+        for dataset in args.datasets:
+            _demand_sound(dataset)
+        made = merge(args.datasets, args.repo_id, args.out, on_progress=progress)
+    return _tell(made)
 
 
 def drop_command(argv: list[str]) -> int:
@@ -51,8 +54,10 @@ def drop_command(argv: list[str]) -> int:
     args = parse(Drop, argv, "drop")
     if args.repo_id is not None:
         check_repo_id(args.repo_id)
-    _demand_sound(args.dataset)
-    return _tell(drop(args.dataset, args.tasks, args.out, args.repo_id))
+    with telling("drop") as progress:
+        _demand_sound(args.dataset)
+        made = drop(args.dataset, args.tasks, args.out, args.repo_id, on_progress=progress)
+    return _tell(made)
 
 
 def _demand_sound(dataset: Path) -> None:

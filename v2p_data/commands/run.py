@@ -12,12 +12,20 @@ from typing import Annotated, Any
 import tyro
 
 from v2p_data.cli import parse
-from v2p_data.commands.display import Display, describe, outcome_table, outcomes_json, tally
+from v2p_data.commands.display import (
+    Display,
+    describe,
+    exit_code,
+    outcome_table,
+    outcomes_json,
+    tally,
+    telling,
+)
 from v2p_data.episodes.repo_id import check_repo_id, is_repo_id
-from v2p_data.errors import V2PError
+from v2p_data.errors import NotAllError, V2PError
 from v2p_data.judging import PROGRAMS, Contestant, contestant
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
-from v2p_data.pipeline.runner import Outcome, Runtime, Stage
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, stored_outcome
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Key, only_run_in, run_stages
 from v2p_data.policy_training import sources_of
@@ -148,8 +156,10 @@ def generate_command(argv: list[str]) -> int:
     root = _run_folder(args.out)
     check_repo_id(args.repo_id)
     with only_run_in(root):
-        dataset = generate(args.videos, root, args.repo_id, args.engine, args.how.runtime(root))
-        page = write_page(root)
+        dataset, code = generate(
+            args.videos, root, args.repo_id, args.engine, args.how.runtime(root)
+        )
+        page = _page(root)
     if dataset is None:
         raise V2PError(f"no video came as far as episodes, so there is no dataset; see {page}")
     counts = _record(dataset).counts
@@ -158,7 +168,7 @@ def generate_command(argv: list[str]) -> int:
         f"{counts['episodes']} episodes, {counts['frames']} frames; page: {page}",
         shlex.join(["v2p", "train", str(dataset), *_settings_in(argv, args.videos)]),
     )
-    return 0
+    return code
 
 
 def train_command(argv: list[str]) -> int:
@@ -166,7 +176,7 @@ def train_command(argv: list[str]) -> int:
     root = _run_folder(args.out or args.dataset.resolve().parent.parent)
     with only_run_in(root):
         policy = train(args.dataset, root, args.engine, args.how.runtime(root))
-        page = write_page(root)
+        page = _page(root)
     counts = _record(policy.parent).counts
     _say(
         f"Made {policy}",
@@ -195,7 +205,7 @@ def distill_command(argv: list[str]) -> int:
         outcomes = _run([packed], _all_threads(args.how.runtime(root)))
         for part in (stage, packed):
             _demand(outcomes[(part.name, part.folder_name)])
-        page = write_page(root)
+        page = _page(root)
     counts = _record(stage.folder(root)).counts
     recovered = ", ".join(f"{share:.0%}" for share in counts["recovered"])
     _say(
@@ -214,7 +224,7 @@ def eval_command(argv: list[str]) -> int:
     unseen = {name: path for folder in args.tasks for name, path in task_folders(folder).items()}
     with only_run_in(root):
         outcome, rows = evaluate(who, unseen, root, args.engine, args.how.runtime(root))
-        page = write_page(root)
+        page = _page(root)
     goes_on = {
         "policy": f"v2p push {shlex.quote(str(args.policy))} --repo-id USER/NAME",
         "expert": f"v2p eval {PROGRAMS} --tasks TASKS   (the same judge on scripted programs)",
@@ -245,19 +255,19 @@ def demo_command(argv: list[str]) -> int:
         flush=True,
     )
     with only_run_in(root):
-        dataset = generate(samples, root, "v2p/demo", cfg, runtime)
+        dataset, code = generate(samples, root, "v2p/demo", cfg, runtime)
         if dataset is None:
-            raise V2PError(f"no sample clip came as far as episodes; see {write_page(root)}")
+            raise V2PError(f"no sample clip came as far as episodes; see {_page(root)}")
         policy = train(dataset, root, cfg, runtime)
-        unseen = _unseen_tasks(samples / "unseen", root, cfg, runtime)
+        unseen, code_of_unseen = _unseen_tasks(samples / "unseen", root, cfg, runtime)
         _, rows = evaluate(contestant(policy), unseen, root, cfg, runtime)
-        page = write_page(root)
+        page = _page(root)
     _say(
         f"Made {page}",
         "\n".join(rate_lines(rows)),
         f"v2p generate YOUR_VIDEOS --out outputs/mine --repo-id USER/NAME   (dataset: {dataset})",
     )
-    return 0
+    return max(code, code_of_unseen)
 
 
 # --- what they share -----------------------------------------------------------------------------------------
@@ -265,20 +275,27 @@ def demo_command(argv: list[str]) -> int:
 
 def generate(
     videos: Path, root: Path, repo_id: str, cfg: EngineConfig, runtime: Runtime
-) -> Path | None:
-    """Run the chain on every video and pack what came through; return the dataset, if there is one."""
+) -> tuple[Path | None, int]:
+    """Run the chain on every video and pack what came through; return the dataset, if there is one, and the exit code.
+
+    A new dataset takes those whose scene, task and expert are still as they were made.
+    """
     _fetch_learned(cfg)
     chains = [chain(video, cfg) for video in _videos(videos)]
     outcomes = _run(chains, runtime)
     good = [c for c in chains if outcomes[(c.name, c.folder_name)].is_usable]
     good = [c for c in good if _record(c.folder(root)).counts.get("episodes", 0)]
     print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
+    if good and stored_outcome(dataset_stage(good, repo_id), root) is None:
+        usable = {key for key, outcome in outcomes.items() if outcome.is_usable}
+        good = [c for c in good if all((s.name, s.folder_name) in usable for s in in_order([c]))]
+    code = exit_code(outcomes.values(), is_made=bool(good))
     if not good:
-        return None
+        return None, code
     packed = dataset_stage(good, repo_id)
     outcome = _run([packed], runtime)[(packed.name, packed.folder_name)]
     _demand(outcome)
-    return outcome.folder
+    return outcome.folder, code
 
 
 def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Path:
@@ -447,10 +464,11 @@ def _item_name(folder: Path) -> str:
 
 def _unseen_tasks(
     videos: Path, root: Path, cfg: EngineConfig, runtime: Runtime
-) -> dict[str, Path]:
+) -> tuple[dict[str, Path], int]:
     stages = [task_stage(scene_stage(video, cfg), cfg) for video in _videos(videos)]
     outcomes = _run(stages, runtime)
-    return {s.item: s.folder(root) for s in stages if outcomes[(s.name, s.folder_name)].is_usable}
+    usable = [s for s in stages if outcomes[(s.name, s.folder_name)].is_usable]
+    return {s.item: s.folder(root) for s in usable}, exit_code(outcomes.values(), is_made=True)
 
 
 def _up_to(
@@ -462,7 +480,7 @@ def _up_to(
     with only_run_in(root):
         stages = [stage_of(video, args.engine) for video in _videos(args.videos)]
         outcomes = _run(stages, args.how.runtime(root))
-        page = write_page(root)
+        page = _page(root)
     print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
     counts = tally(list(outcomes.values()), name)
     rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
@@ -479,7 +497,7 @@ def _up_to(
         f"{counts['usable']} of {len(stages)} videos{f' ({rest})' if rest else ''}; page: {page}",
         goes_on,
     )
-    return 0 if counts["usable"] else 2
+    return exit_code(outcomes.values(), is_made=bool(counts["usable"]))
 
 
 def _settings_in(argv: Sequence[str], source: Path) -> list[str]:
@@ -537,6 +555,19 @@ def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:
             f"cannot write {path} ({error.strerror}); what was made is kept: remove what is there and run again"
         ) from error
     return outcomes
+
+
+def _page(root: Path) -> Path:
+    """Write the run's page.
+
+    Raises:
+        NotAllError: it cannot be written; all else is there.
+    """
+    with telling("report"):
+        try:
+            return write_page(root)
+        except V2PError as error:
+            raise NotAllError(str(error)) from error
 
 
 def _demand(outcome: Outcome) -> None:

@@ -3,11 +3,15 @@
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from v2p_data.cli import parse
 from v2p_data.errors import V2PError
+
+if TYPE_CHECKING:
+    from v2p_data.episodes.hub import Pushed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +29,7 @@ class Push:
     repo_id: str
     """Where to: USER/NAME. The token comes from the environment variable HF_TOKEN."""
     private: bool = False
-    """Make the repository private."""
+    """Make a new repository private; one that exists and is not private is refused."""
     envhub: bool = False
     """Push the tasks as an environment that LeRobot loads by its name."""
     tag: str | None = None
@@ -46,11 +50,13 @@ class Explain:
 
 def verify_command(argv: list[str]) -> int:
     """Return 0 where all is well, 1 where there are problems; what cannot be read is an error (2)."""
+    from v2p_data.commands.display import telling
     from v2p_data.episodes.verify import verify
     from v2p_data.pipeline.artifact import write_json_atomically
 
     args = parse(Verify, argv, "verify")
-    report = verify(args.dataset)
+    with telling("verify") as progress:
+        report = verify(args.dataset, on_progress=progress)
     if args.json is not None:
         write_json_atomically(args.json, report.as_json())
     print("\n".join([*report.lines(), report.summary()]))  # noqa: T201
@@ -59,12 +65,14 @@ def verify_command(argv: list[str]) -> int:
 
 def push_command(argv: list[str]) -> int:
     args = parse(Push, argv, "push")
-    url, then = _pushed(args)
-    print(f"Pushed to {url}\nNext: {then}")  # noqa: T201
+    pushed, then = _pushed(args)
+    kept = pushed.visibility != ("private" if args.private else "public")
+    note = f", which is {pushed.visibility} and stays so" if kept else ""
+    print(f"Pushed to {pushed.url}{note}\nNext: {then}")  # noqa: T201
     return 0
 
 
-def _pushed(args: Push) -> tuple[str, str]:
+def _pushed(args: Push) -> tuple["Pushed", str]:
     from v2p_data.episodes.hub import push_dataset, push_envhub, push_policy
     from v2p_data.episodes.repo_id import check_repo_id
     from v2p_data.stages import demand_whole_part
@@ -76,15 +84,15 @@ def _pushed(args: Push) -> tuple[str, str]:
         with tempfile.TemporaryDirectory() as folder:
             made = write_envhub(args.path, args.repo_id, Path(folder) / "envhub")
             pushed = push_envhub(made.folder, args.repo_id, private=args.private, tag=args.tag)
-        return pushed.url, f"make_env('{args.repo_id}', trust_remote_code=True)"
+        return pushed, f"make_env('{args.repo_id}', trust_remote_code=True)"
     if (args.path / "meta" / "info.json").is_file():
         demand_whole_part(args.path.resolve())
         pushed = push_dataset(args.path, args.repo_id, private=args.private, tag=args.tag)
-        return pushed.url, f"LeRobotDataset('{args.repo_id}')"
+        return pushed, f"LeRobotDataset('{args.repo_id}')"
     if (args.path / "model.safetensors").is_file():
         demand_whole_part(args.path.resolve())
         pushed = push_policy(args.path, args.repo_id, private=args.private, tag=args.tag)
-        return pushed.url, f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS"  # fmt: skip
+        return pushed, f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS"  # fmt: skip
     raise V2PError(
         f"{args.path} is neither a LeRobot dataset (meta/info.json) nor a policy (model.safetensors); tasks are pushed "
         "with --envhub"

@@ -7,7 +7,7 @@ from pathlib import Path
 import tyro
 
 from v2p_data.cli import parse
-from v2p_data.commands.display import STAGE_ORDER
+from v2p_data.commands.display import STAGE_ORDER, telling
 from v2p_data.errors import UnusableError, V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import RECORD_FILE, read_record
@@ -53,7 +53,8 @@ def status_command(argv: list[str]) -> int:
 def report_command(argv: list[str]) -> int:
     from v2p_data.report.page import write_page
 
-    page = write_page(_run(parse(Shown, argv, "report").run))
+    with telling("report"):
+        page = write_page(_run(parse(Shown, argv, "report").run))
     print(f"Made {page}, {page.stat().st_size / 1e6:.1f} MB\nNext: open it in a browser")  # noqa: T201
     return 0
 

@@ -24,6 +24,8 @@ REHEARSALS = 8
 WINDOW = 20
 """Steps whose mean decides whether the rate holds during the run."""
 
+FASTER = "stop other programs, use a GPU (--device cuda) or a smaller policy"
+
 Ending = Literal[
     "time", "done", "limit", "lost", "silence", "robot", "slow", "interrupted", "policy"
 ]
@@ -96,6 +98,8 @@ class Run:
         self.rig, self.sight, self.policy, self.guard, self.cfg = rig, sight, policy, guard, cfg
         self.recorder, self.is_done, self.on_step = recorder, is_done, on_step
         self._is_started = False
+        self._works_on = ""
+        """What this side does at the moment; nothing while the robot is awaited."""
 
     def go(self) -> Outcome:
         """Run to the end; the robot holds its position afterwards.
@@ -106,8 +110,15 @@ class Run:
         self.rehearse()
         outcome = Outcome(ending="time", sentence="")
         silence = self.guard.cfg.max_silence_ms
-        # Whoever cannot be told to hold while a reading is awaited stands still by itself: a simulator.
-        bite = self._hold if self.rig.can_hold else lambda: None
+        late = ""
+
+        def bite() -> None:
+            nonlocal late
+            late = self._works_on
+            # Whoever cannot be told to hold while a reading is awaited stands still by itself: a simulator.
+            if self.rig.can_hold:
+                self._hold()
+
         with Watchdog(silence, bite) as watchdog:
             try:
                 self._steps(outcome, watchdog)
@@ -122,7 +133,10 @@ class Run:
             except BaseException:
                 self._hold()  # a bug of ours, or the policy's: it is shown, with the arm at rest
                 raise
-            if watchdog.has_bitten:
+            if watchdog.has_bitten and late:
+                outcome.ending = "slow"
+                outcome.sentence = f"{late} took more than {silence:g} ms in one step, so no reading was asked for; {FASTER}"
+            elif watchdog.has_bitten:
                 outcome.ending = "silence"
                 outcome.sentence = (
                     f"no reading came for {silence:g} ms; look after the robot and its connection"
@@ -165,9 +179,12 @@ class Run:
             reading = self.rig.read()
             watchdog.heard()
             self.guard.look(reading)
+            self._works_on = "finding the objects"
             seen = self._see(reading)
             self._check_seen(seen, step)
+            self._works_on = "the policy"
             limited = self.guard.limit(self._decide(seen, reading), reading)
+            self._works_on = ""
             if watchdog.has_bitten:
                 return
             done = limited.action if self.cfg.dry_run else self.rig.act(limited.action)
@@ -229,6 +246,6 @@ class _StopRunError(Exception):
 
 def _too_slow(seconds: float, consequence: str) -> str:
     return (
-        f"20 Hz cannot be kept: a step takes {1000 * seconds:.0f} ms ({1 / seconds:.1f} Hz) and {consequence}; stop other"
-        " programs, use a GPU (--device cuda) or a smaller policy, or go on slower with --slow"
+        f"20 Hz cannot be kept: a step takes {1000 * seconds:.0f} ms ({1 / seconds:.1f} Hz) and {consequence}; {FASTER}, or go on slower"
+        " with --slow"
     )

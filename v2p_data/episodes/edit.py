@@ -102,7 +102,7 @@ def merge(
         _check_alike(sources[0], other)
     _check_doubles(sources)
     sources = _in_one_wording(sources)
-    with _in_place(out) as partial:
+    with _in_place(out, roots) as partial:
         on_progress(0.0, "starting LeRobot")
         with _tables(sources, partial) as folders:
             _aggregate(sources, folders, repo_id, partial)
@@ -141,7 +141,7 @@ def drop(
     kept = [k for k in range(len(source.lengths)) if k not in gone]
     if not kept:
         raise V2PError(f"{root} would be left without an episode; delete the folder instead")
-    with _in_place(out) as partial:
+    with _in_place(out, [root]) as partial:
         on_progress(0.0, "starting LeRobot")
         notes = write_without(root, kept, partial)
         about = _about_without(source, kept, list(tasks), repo_id, partial)
@@ -445,8 +445,13 @@ def _about_without(
 
 
 @contextmanager
-def _in_place(out: Path) -> Iterator[Path]:
+def _in_place(out: Path, sources: Sequence[Path]) -> Iterator[Path]:
     """Give a folder to work in that becomes `out` when `_finish` renames it, and is removed otherwise."""
+    for source in sources:
+        if out.resolve().is_relative_to(source.resolve()):
+            raise V2PError(
+                f"--out {out} lies in {source}, which is to stay as it is; choose a folder outside of it"
+            )
     if out.exists():
         raise V2PError(f"{out} exists already; nothing is overwritten, choose another --out")
     partial = out.with_name(out.name + ".partial")

@@ -4,6 +4,9 @@ The calls are those of LeRobot's `push_to_hub` but for its dataset card: ours is
 commit, and so nothing asks huggingface.co to check it when `HF_ENDPOINT` names another server. The token is
 read from the environment only; it is never stored, logged or shown, and files that hold one are not sent.
 
+What exists keeps its visibility: `private` is for a new repository, and one that is public is refused then, before a
+file is sent.
+
 A lost connection, a 429 and a fault of the server are waited out, longer each time; large files that have
 arrived are not sent again (the Hub knows them by their digest). The tag that LeRobot loads moves after the last
 file has arrived, so nobody loads half a version.
@@ -13,10 +16,11 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from v2p_data.episodes.about import CARRIED_TASKS
 from v2p_data.episodes.card import CARD_FILE, LICENSE, write_card, write_text
@@ -51,6 +55,8 @@ WAITS_S = (2.0, 5.0, 15.0, 45.0)
 """Before each further try; the Hub's limits are counted per five minutes."""
 LONGEST_WAIT_S = 300.0
 WORTH_ANOTHER_TRY = (408, 429, 500, 502, 503, 504)
+NO_XET = re.compile(r"HTTP status client error \((\d+).*/xet-")
+"""What the library says of a Hub that has no such storage, or none for this repository: in words only."""
 SECRET = re.compile(
     rb"\bhf_[A-Za-z0-9]{30,}\b|\bsk-[A-Za-z0-9_-]{30,}\b|\bgh[pousr]_[A-Za-z0-9]{36,}\b"
 )
@@ -67,6 +73,8 @@ class Pushed:
     repo_id: str
     url: str
     commit: str
+    visibility: str = "public"
+    """As the Hub says after the push: public, gated or private."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,9 +262,27 @@ def _push(upload: _Upload) -> Pushed:
 
     api = HfApi(endpoint=endpoint, token=token)
     repo_id, repo_type = upload.repo_id, upload.repo_type
+    url = f"{endpoint}/{'datasets/' if repo_type == 'dataset' else ''}{repo_id}"
+
+    def send_files() -> Any:
+        return api.upload_folder(
+            repo_id=repo_id,
+            repo_type=repo_type,
+            folder_path=upload.folder,
+            ignore_patterns=NOT_UPLOADED,
+            delete_patterns=list(upload.replaces) or None,
+            commit_message=f"Upload {repo_type} with v2p",
+        )
 
     def send() -> Pushed:
         api.create_repo(repo_id, repo_type=repo_type, private=upload.private, exist_ok=True)
+        info = api.repo_info(repo_id, repo_type=repo_type)
+        visibility = "private" if info.private else "gated" if info.gated else "public"
+        if upload.private and not info.private:
+            raise V2PError(
+                f"'{repo_id}' exists and is {visibility}, so what is pushed there can be seen; nothing was sent. Make it "
+                f"private at {url}/settings, or choose another --repo-id"
+            )
         there = set(api.list_repo_files(repo_id, repo_type=repo_type)) - {
             ".gitattributes",
             CARD_FILE,
@@ -266,26 +292,40 @@ def _push(upload: _Upload) -> Pushed:
                 f"the name '{repo_id}' is taken: that repository holds something else ({sorted(there)[0]}, no "
                 f"{upload.marker}); choose another --repo-id"
             )
-        commit = api.upload_folder(
-            repo_id=repo_id,
-            repo_type=repo_type,
-            folder_path=upload.folder,
-            ignore_patterns=NOT_UPLOADED,
-            delete_patterns=list(upload.replaces) or None,
-            commit_message=f"Upload {repo_type} with v2p",
-        )
+        try:
+            commit = send_files()
+        except ConnectionError as error:
+            if (found := NO_XET.search(str(error))) is None:
+                raise
+            logger.warning(
+                "the Hub's Xet storage answered %s; files are sent the older way, as HF_HUB_DISABLE_XET=1 asks for",
+                found[1],
+            )
+            with _without_xet():
+                commit = send_files()
         for tag in upload.tags:
             try:
                 api.delete_tag(repo_id, tag=tag, repo_type=repo_type)
             except RevisionNotFoundError:
                 logger.debug("%s had no tag %s yet", repo_id, tag)
             api.create_tag(repo_id, tag=tag, repo_type=repo_type, exist_ok=True)
-        kind = "datasets/" if repo_type == "dataset" else ""
-        return Pushed(repo_id=repo_id, url=f"{endpoint}/{kind}{repo_id}", commit=commit.oid)
+        return Pushed(repo_id=repo_id, url=url, commit=commit.oid, visibility=visibility)
 
     return _explained(
         lambda: _patiently(send, upload.waits_s), f"push '{repo_id}'", endpoint, token
     )
+
+
+@contextmanager
+def _without_xet() -> Generator[None]:
+    """Have the library send files by LFS: it reads its variable at import, and the switch at each upload."""
+    from huggingface_hub import constants
+
+    before, constants.HF_HUB_DISABLE_XET = constants.HF_HUB_DISABLE_XET, True
+    try:
+        yield
+    finally:
+        constants.HF_HUB_DISABLE_XET = before
 
 
 def _endpoint() -> str:

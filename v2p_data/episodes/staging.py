@@ -5,7 +5,6 @@ a temporary name, flushed and renamed, so a kill loses only the episode in hand.
 content alone.
 """
 
-import errno
 import hashlib
 import json
 import os
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from v2p_data.errors import V2PError
+from v2p_data.errors import V2PError, write_refusal
 
 EPISODES_FOLDER = "episodes"
 SCHEMA = 1
@@ -27,14 +26,6 @@ ARRAYS = ("labels", "state", "action", "success")
 INTERVENTION = "intervention"
 """The array that only handovers have."""
 MASK_CAMERA, RGB_CAMERA = "mask", "rgb"
-_REFUSALS = {
-    errno.ENOSPC: "the disk is full; free some space",
-    errno.EDQUOT: "the disk quota is used up; free some space",
-    errno.EFBIG: "a file may not grow that large here; raise the limit (ulimit -f)",
-    errno.EROFS: "the file system is read-only; make it writable or choose another place",
-    errno.EACCES: "there is no permission to write; change it or choose another place",
-    errno.EPERM: "writing is not permitted; change that or choose another place",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,8 +222,8 @@ def refusals_told(doing: str, where: Path) -> Iterator[None]:
         yield
     except V2PError:
         raise
-    except Exception as error:  # FFmpeg's errors have an errno and are no OSError
-        reason = _REFUSALS.get(getattr(error, "errno", None) or 0)
+    except Exception as error:
+        reason = write_refusal(error)
         if reason is None:
             raise
         raise V2PError(

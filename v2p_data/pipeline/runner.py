@@ -3,6 +3,7 @@
 Jobs run in worker processes, so that a crash in a decoder or a simulator is that job's own result.
 """
 
+import contextlib
 import logging
 import shutil
 import time
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from v2p_data.errors import ItemRejectedError, UnusableError, V2PError
+from v2p_data.errors import ItemRejectedError, UnusableError, V2PError, write_refusal
 from v2p_data.pipeline.artifact import (
     RECORD_FILE,
     TRACEBACK_FILE,
@@ -152,11 +153,41 @@ def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
     """
     folder = stage.folder(runtime.root)
     partial = folder.with_name(folder.name + ".partial")
-    if partial.exists() and not stage.resumes:
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True, exist_ok=True)
-    inputs = {name: source.folder(runtime.root) for name, source in stage.inputs.items()}
     started = time.monotonic()
+    is_begun = False
+    try:
+        if partial.exists() and not stage.resumes:
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True, exist_ok=True)
+        is_begun = True
+        return _made(stage, runtime, partial, folder, started)
+    except Exception as error:  # noqa: BLE001 - whatever a stage raises is its own result
+        reason, detail = _why(error, partial)
+        if is_begun and not partial.exists() and not folder.exists():
+            reason = "error"
+            detail = f"{partial} was deleted while it was being filled; run the same command again"
+        return Outcome(
+            stage=stage.name, item=stage.item, status="failed", folder=folder,
+            seconds=time.monotonic() - started, reason=reason, detail=detail,
+        )  # fmt: skip
+
+
+def _why(error: Exception, partial: Path) -> tuple[str, str]:
+    """Return the reason and the sentence of a failure; what is no sentence leaves its traceback in the folder."""
+    if isinstance(error, V2PError):
+        return error.reason if isinstance(error, UnusableError) else "error", str(error)
+    if (refusal := write_refusal(error)) is not None:
+        return "error", f"cannot write {partial}: {refusal}, and run the same command again"
+    logger.exception("making %s failed", partial)
+    said = str(error)
+    with contextlib.suppress(OSError):
+        (partial / TRACEBACK_FILE).write_text(traceback.format_exc())
+        said += f" (traceback in {partial / TRACEBACK_FILE})"
+    return type(error).__name__, said
+
+
+def _made(stage: Stage, runtime: Runtime, partial: Path, folder: Path, started: float) -> Outcome:
+    inputs = {name: source.folder(runtime.root) for name, source in stage.inputs.items()}
     rejected: dict[str, Any] | None = None
     counts: dict[str, Any] = {}
     status: Status = "made"
@@ -168,20 +199,6 @@ def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
     except ItemRejectedError as error:
         rejected = rejection(error)
         status, reason, detail = "rejected", error.reason, error.detail
-    except V2PError as error:
-        return Outcome(
-            stage=stage.name, item=stage.item, status="failed", folder=folder,
-            seconds=time.monotonic() - started,
-            reason=error.reason if isinstance(error, UnusableError) else "error", detail=str(error),
-        )  # fmt: skip
-    except Exception as error:
-        (partial / TRACEBACK_FILE).write_text(traceback.format_exc())
-        logger.exception("%s of %s failed", stage.name, stage.item)
-        return Outcome(
-            stage=stage.name, item=stage.item, status="failed", folder=folder,
-            seconds=time.monotonic() - started, reason=type(error).__name__,
-            detail=f"{error} (traceback in {partial / TRACEBACK_FILE})",
-        )  # fmt: skip
     seconds = time.monotonic() - started
     (partial / TRACEBACK_FILE).unlink(missing_ok=True)  # of an earlier try
     files = list_files(partial)

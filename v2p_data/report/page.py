@@ -6,6 +6,7 @@ content policy in its head forbids the browser to load anything that is not insi
 
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from v2p_data.errors import V2PError, write_refusal
 from v2p_data.report.chart import Line, line_chart
 from v2p_data.report.evaluations import EvaluationRow, evaluation_rows
 from v2p_data.report.items import ItemView, item_view
@@ -51,13 +53,24 @@ def write_page(root: Path, out: Path | None = None, cfg: PageConfig | None = Non
     """Write a run's page and return its path, `root/report.html` unless told otherwise.
 
     Works on any run, also one that is half finished: what is missing is said to be missing.
+
+    Raises:
+        V2PError: the place cannot be written to, or memory does not suffice.
     """
     path = out or root / PAGE_FILE
-    html = render_page(root, cfg or PageConfig())
     temporary = path.with_name(path.name + ".tmp")
-    # File names may hold bytes that are no text; they must not keep the page from being written.
-    temporary.write_bytes(html.encode("utf-8", "replace"))
-    temporary.replace(path)
+    try:
+        html = render_page(root, cfg or PageConfig())
+        # File names may hold bytes that are no text; they must not keep the page from being written.
+        temporary.write_bytes(html.encode("utf-8", "replace"))
+        temporary.replace(path)
+    except (OSError, MemoryError) as error:
+        with suppress(OSError):  # half a page takes room that may be what is missing
+            temporary.unlink()
+        why = write_refusal(error) or str(error) or "memory does not suffice"
+        raise V2PError(
+            f"cannot write the page {path}: {why}, then run 'v2p report {shlex.quote(str(root))}'; what the run made is kept"
+        ) from error
     return path
 
 

@@ -73,7 +73,6 @@ LEAST_WAY_M = 0.01
 
 def main() -> None:
     """Answer requests until the input ends or the parent does."""
-    end_with_parent(os.getppid())  # a parent that ended before this closed the input
     leave_the_network()
     torch.set_num_threads(1)
     # Loads what tensordict loads late, once for all jobs: three seconds.
@@ -127,6 +126,7 @@ def _in_child(folder: Path, parent_pid: int) -> int:
     confine(
         None,
         int(request["memory_mb"]) * 1024**2,
+        parent_pid=parent_pid,
         file_bytes=FILE_BYTES,
         open_files=OPEN_FILES,
         processes=THREADS,

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from v2p_data.processes import ending_with_us
 from v2p_data.task.cache import cache_folder
 
 VERSION = 1
@@ -92,7 +93,7 @@ def _split(
         try:
             # One thread: the parts must not depend on the number of cores.
             done = subprocess.run(
-                command,
+                ending_with_us(command),
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
                 capture_output=True,
                 timeout=cfg.time_limit_s,

@@ -43,6 +43,19 @@ def stream_seed(seed: int) -> int:
     return _next_seed(np_random(seed)[0])
 
 
+def demand_no_options(options: dict[str, Any] | None) -> None:
+    """Raise where `reset` is given options: none would be heeded.
+
+    Raises:
+        V2PError: names them.
+    """
+    if options:
+        raise V2PError(
+            f"reset takes a seed and no options, got {', '.join(map(str, options))}; what can be set is given when the "
+            "environment is made"
+        )
+
+
 class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
     """A single world of one task.
 
@@ -55,7 +68,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         horizon_scale: an episode lasts at most this multiple of the task's own horizon.
 
     Raises:
-        V2PError: the folder holds no task.
+        V2PError: the folder holds no task, or there is no such render mode.
         ItemRejectedError: the task cannot be simulated.
     """
 
@@ -72,6 +85,8 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         camera_fovy_deg: float = 0.0,
         horizon_scale: float = POLICY_HORIZON_SCALE,
     ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise V2PError(f"render_mode is 'rgb_array' or None, got {render_mode!r}")
         bundle = TaskBundle.load(Path(task_folder))
         self.render_mode = render_mode
         self.task = bundle.title
@@ -104,7 +119,12 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; with a seed, always the same one."""
+        """Start an episode; with a seed, always the same one.
+
+        Raises:
+            V2PError: there are options.
+        """
+        demand_no_options(options)
         super().reset(seed=seed)
         self._world.seed(_next_seed(self.np_random))
         self._world.reset(np.array([0]))

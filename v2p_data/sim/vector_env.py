@@ -22,7 +22,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float, Float32
 
+from v2p_data.errors import V2PError
 from v2p_data.sim.batch_env import ACT_DIM, BatchEnv, SimConfig
+from v2p_data.sim.gym_env import demand_no_options
 from v2p_data.task.task import TaskBundle, told_of
 
 ENV_ID = "v2p/States-v0"
@@ -67,12 +69,25 @@ class V2PVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seed: int | list[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Float32[np.ndarray, "env obs"], dict[str, Any]]:
-        """Start new episodes everywhere; with a seed (of a list the first counts), always the same ones."""
-        del options
-        first = seed[0] if isinstance(seed, list) else seed
-        if first is not None:
-            self.worlds.seed(first)
-        self.worlds.reset(np.arange(self.num_envs))
+        """Start new episodes everywhere; with a seed, or a list of one a world, always the same ones.
+
+        Raises:
+            V2PError: the list has not one seed a world, or there are options.
+        """
+        demand_no_options(options)
+        worlds = np.arange(self.num_envs)
+        if isinstance(seed, list):
+            seeds = [one for one in seed if one is not None]
+            if len(seeds) != self.num_envs:
+                raise V2PError(
+                    f"a list of seeds needs one for each of the {self.num_envs} worlds, got {seed}"
+                )
+            self.worlds.seed(seeds[0])  # of the episodes that come after these
+            self.worlds.reset_seeded(worlds, seeds)
+        else:
+            if seed is not None:
+                self.worlds.seed(seed)
+            self.worlds.reset(worlds)
         self._over[:] = False
         return self.worlds.observe(), self._info(self._over)
 

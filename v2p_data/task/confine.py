@@ -37,6 +37,7 @@ def confine(
     seconds: float | None,
     memory_bytes: int | None,
     *,
+    parent_pid: int,
     file_bytes: int = 0,
     open_files: int = 0,
     processes: int = 0,
@@ -50,6 +51,7 @@ def confine(
     Args:
         seconds: of computing from now on, over all threads; None: no limit. The wall clock is the parent's business.
         memory_bytes: of address space on top of what is mapped now; None: no limit (CUDA maps far more than it uses).
+        parent_pid: the process that this one ends with, as it was before this one was forked.
         file_bytes: largest size of a file written.
         open_files: how many files may be open at once; 0: none can be opened any more.
         processes: how many more processes and threads may be started; 0: none.
@@ -91,7 +93,7 @@ def confine(
         held.append("nobody")
     if kernel_rules.drop_capabilities():
         held.append("capabilities")
-    end_with_parent(os.getppid())  # becoming nobody made the kernel forget it
+    end_with_parent(parent_pid)  # becoming nobody makes the kernel forget an earlier call
     if kernel_rules.refuse_calls(may_start_processes=processes > 0):
         held.append("seccomp")
     return tuple(held)

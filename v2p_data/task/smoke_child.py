@@ -16,7 +16,6 @@ from typing import Any
 
 import torch
 
-from v2p_data.processes import end_with_parent
 from v2p_data.task.confine import confine, leave_the_network
 from v2p_data.task.guarded import Answers, GuardedTask, TaskOutputError, demand_equal
 from v2p_data.task.reader.refusal import TaskCodeError
@@ -83,7 +82,6 @@ class FakePlacer:
 
 def main() -> None:
     """Answer one request from stdin on stdout."""
-    end_with_parent(os.getppid())
     request: dict[str, Any] = json.load(sys.stdin)
     leave_the_network()
     torch.set_num_threads(1)
@@ -253,12 +251,12 @@ def in_a_fork(
     """
     read_end, write_end = os.pipe()
     seconds = float(request["seconds_each"])
-    pid = os.fork()
+    parent_pid, pid = os.getpid(), os.fork()
     if pid == 0:
         os.close(read_end)
         code = 1
         try:
-            confine(seconds, MEMORY_BYTES)
+            confine(seconds, MEMORY_BYTES, parent_pid=parent_pid)
             _send(write_end, (answer_to or answer)(source, request))
             code = 0
         finally:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from v2p_data.errors import V2PError
+from v2p_data.processes import ending_with_us
 from v2p_data.scene.files import user_cache
 
 _TIMEOUT_S = 1200
@@ -54,7 +55,12 @@ def call_installer(words: list[str], *, thing: str, needs: str) -> None:
     }
     try:
         done = subprocess.run(
-            words, capture_output=True, text=True, timeout=_TIMEOUT_S, env=env, check=False
+            ending_with_us(words),
+            capture_output=True,
+            text=True,
+            timeout=_TIMEOUT_S,
+            env=env,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise V2PError(f"{thing} cannot be set up: {words[0]}: {error}") from error
