@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class Merge:
     datasets: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of LeRobot v3 datasets, two or more; their episodes stay in this order."""
+    """Folders of LeRobot v3 datasets; their episodes stay in this order. One is copied, with exact statistics."""
     out: Path
     """Where the new dataset shall lie; must not exist."""
     repo_id: str

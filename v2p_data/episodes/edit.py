@@ -87,7 +87,7 @@ def merge(
     *,
     on_progress: Progress = lambda share, words: None,
 ) -> Edited:
-    """Write the episodes of several LeRobot v3 datasets, in this order, as one at `out`.
+    """Write the episodes of several LeRobot v3 datasets, in this order, as one at `out`; of one as a copy with exact statistics.
 
     Where one of them has handovers, demonstrations of ours get the column `intervention` too, true throughout.
 
@@ -95,8 +95,8 @@ def merge(
         V2PError: there is something at `out`, one is no sound dataset, or they do not go together.
     """
     check_repo_id(repo_id)
-    if len(roots) < 2:
-        raise V2PError("merging needs two datasets at least")
+    if not roots:
+        raise V2PError("there is no dataset to merge; name one at least")
     sources = _all_with_column([_read(root) for root in roots])
     for other in sources[1:]:
         _check_alike(sources[0], other)

@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from v2p_data.episodes.cut import write_stats
 from v2p_data.episodes.episode_stats import number_stats
 from v2p_data.episodes.features import (
     ACTION_KEY,
@@ -170,7 +171,7 @@ def _write(
 ) -> list[dict[str, Any]]:
     """Write everything but our own metadata; return what is told of each episode there."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-    from lerobot.datasets.io_utils import write_info, write_stats
+    from lerobot.datasets.io_utils import write_info
 
     first = shards[0].episodes[0]
     has_handovers = any(e.is_handover for shard in shards for e in shard.episodes)
@@ -221,8 +222,7 @@ def _write(
         data.close()
         meta.finalize()
     write_info(meta.info, root)
-    # LeRobot's sum goes through a set, whose order changes from run to run.
-    write_stats({key: meta.stats[key] for key in meta.features if key in meta.stats}, root)
+    write_stats(root)
     return described
 
 
