@@ -1,7 +1,7 @@
 """Damage files and folders of every kind that the engine reads, and look at what its commands answer.
 
-Three corpora of the tests are tried whole or in a random part: task folders as strangers may make them
-(`tests/task/strangers.py`), odd videos, captions, labels and boxes (`tests/video/odd_files.py`), and harms to each kind
+Four corpora of the tests are tried whole or in a random part: task folders and datasets as strangers may make them
+(`tests/task/strangers.py`, `tests/episodes/strange_datasets.py`), odd videos, captions, labels and boxes (`tests/video/odd_files.py`), and harms to each kind
 of file of a finished run (`tests/pipeline/damage.py`). Every case runs in a process of its own with a time limit.
 
     python scripts/fuzz_artefacts.py --run outputs/demo --harms 200 --seed 1
@@ -50,14 +50,19 @@ def main() -> None:
         "--run", type=Path, default=ROOT / "outputs" / "demo", help="a finished run"
     )
     parser.add_argument("--harms", type=int, default=200, help="harms to the run's files, drawn")
-    parser.add_argument("--parts", nargs="*", default=["tasks", "videos", "run"])
+    parser.add_argument("--parts", nargs="*", default=["tasks", "datasets", "videos", "run"])
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    for folder in ("task", "video", "pipeline"):
+    for folder in ("task", "episodes", "video", "pipeline"):
         sys.path.insert(0, str(ROOT / "tests" / folder))
     outcomes: dict[str, Counter[str]] = {}
     violations: list[str] = []
-    parts = {"tasks": _tasks, "videos": _videos, "run": lambda: _harms(args)}
+    parts = {
+        "tasks": _tasks,
+        "datasets": _datasets,
+        "videos": _videos,
+        "run": lambda: _harms(args),
+    }
     for part in args.parts:
         outcomes[part] = Counter()
         for name, case in parts[part]():
@@ -121,6 +126,23 @@ def _tasks() -> Iterator[tuple[str, Case]]:
 
     for name, spoil in strangers.CASES.items():
         yield name, case(spoil)
+
+
+def _datasets() -> Iterator[tuple[str, Case]]:
+    import strange_datasets  # pyright: ignore[reportMissingImports]
+
+    def case(spoil: Callable[[Path], object]) -> Case:
+        def verified(folder: Path) -> str:
+            spoiled = Path(shutil.copytree(good, folder / "spoiled"))
+            spoil(spoiled)
+            return {1: "noticed", 2: "refused"}.get(cli.run(["verify", str(spoiled)]), "violation: accepted")  # fmt: skip
+
+        return verified
+
+    with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as folder:
+        good = strange_datasets.good_dataset(Path(folder))
+        for name, spoil in (strange_datasets.REFUSED | strange_datasets.FOUND).items():
+            yield name, case(spoil)
 
 
 def _videos() -> Iterator[tuple[str, Case]]:

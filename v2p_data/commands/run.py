@@ -283,7 +283,10 @@ def generate(
 
 def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Path:
     """Train a policy on a finished dataset and return its folder."""
+    from v2p_data.episodes.intake import demand_bounded
+
     record = _dataset_record(dataset)
+    demand_bounded(dataset)
     sources = sources_of(dataset.resolve(), root)
     if not sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
         print(  # noqa: T201

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.episodes.features import METADATA_FILE, METADATA_SCHEMA
+from v2p_data.episodes.intake import MAX_JSON_BYTES
 from v2p_data.episodes.tables import Found
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
@@ -29,7 +30,7 @@ def read_about(root: Path) -> dict[str, Any] | None:
     path = root / METADATA_FILE
     if not path.exists(follow_symlinks=False):
         return None
-    about = json_or_none(path, max_bytes=None)
+    about = json_or_none(path, max_bytes=MAX_JSON_BYTES[METADATA_FILE])
     if not isinstance(about, dict):
         raise V2PError(f"{path} is damaged: it is no JSON object; {_remedy(root)}")
     schema = about.get("schema", METADATA_SCHEMA)
@@ -41,7 +42,7 @@ def read_about(root: Path) -> dict[str, Any] | None:
     wrong = _wrong(about, _KINDS)
     if wrong is None:
         for k, entry in enumerate(about["episodes"]):
-            wrong = _wrong(entry, _KINDS_OF_ENTRY)
+            wrong = _wrong(entry, _KINDS_OF_ENTRY) or _no_label(entry["labels"])
             if wrong is not None:
                 wrong = f"{wrong} of episode {k}"
                 break
@@ -103,6 +104,11 @@ def _wrong(data: Any, kinds: Mapping[str, type]) -> str | None:
         if not isinstance(value, kind) or isinstance(value, bool):
             return f"'{key}'"
     return None
+
+
+def _no_label(labels: dict[str, Any]) -> str | None:
+    """Return the first key of `labels` that is none, None where all are: masks hold bytes."""
+    return next((f"label {k[:20]!r}" for k in labels if not (k.isdecimal() and len(k) < 4)), None)
 
 
 def _remedy(root: Path) -> str:

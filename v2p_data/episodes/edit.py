@@ -23,6 +23,7 @@ from v2p_data.episodes.card import write_card
 from v2p_data.episodes.cut import write_episodes, write_stats, write_without
 from v2p_data.episodes.features import INTERVENTION_KEY, METADATA_FILE
 from v2p_data.episodes.handovers import about_with_sources, info_with_column, write_with_column
+from v2p_data.episodes.intake import demand_bounded
 from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.episodes.tables import (
     BOOKKEEPING,
@@ -150,6 +151,7 @@ def drop(
 
 def _read(root: Path) -> _Source:
     info = read_info(root)
+    demand_bounded(root)
     problems = layout_problems(root, info)
     if problems:
         first = problems[0]

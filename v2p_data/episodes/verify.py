@@ -14,6 +14,7 @@ from typing import Any
 from v2p_data.episodes.about import CARRIED_TASKS, about_problems, read_about
 from v2p_data.episodes.features import INTERVENTION_KEY, METADATA_FILE
 from v2p_data.episodes.frames import Checks, Said
+from v2p_data.episodes.intake import demand_bounded
 from v2p_data.episodes.reading import Rows, same
 from v2p_data.episodes.staging import Episode
 from v2p_data.episodes.tables import (
@@ -92,9 +93,10 @@ def verify(
         on_progress: told the share that is done and a few words.
 
     Raises:
-        V2PError: there is no LeRobot v3 dataset at `root`.
+        V2PError: there is no LeRobot v3 dataset at `root`, or none that can be read in bounded memory.
     """
     info = read_info(root)
+    demand_bounded(root)
     said = Said()
     said.problems += [*_changed_files(root), *layout_problems(root, info)]
     about = _about(root, said)
