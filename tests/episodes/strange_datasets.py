@@ -172,7 +172,7 @@ REFUSED: dict[str, Spoil] = {
             "{video_key:>3000000000}.mp4", "../{video_key}/{file_index:03d}.mp4", "{video_key[0]}", ["a"],
             "{file_index:999999999d}",
         ),
-        "features": ({}, [], None, "x"),
+        "features": ([], None, "x"),
         "features/action": (None, [], "float32"),
         "features/action/dtype": (["float32"], None, 32, "FLOAT32", "f" * 1000),
         "features/action/shape": ([-1], [0], [10**12], [100_000, 100_000], "7", None, [1] * 9, [7.5]),
@@ -231,6 +231,7 @@ REFUSED: dict[str, Spoil] = {
 """No command reads these."""
 
 FOUND: dict[str, Spoil] = {
+    "no columns said": value(INFO, "features", {}),
     "a million episodes said": value(INFO, "total_episodes", 1_000_000),
     "a hundred million frames said": value(INFO, "total_frames", 100_000_000),
     "stats.json of noise": content(STATS, b"\xff\xfe" * 100),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -21,14 +21,18 @@ class Merge:
     """Where the new dataset shall lie; must not exist."""
     repo_id: str
     """USER/NAME, under which it will be pushed."""
+    original: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """The dataset of v2p that LeRobot's tools made some of these from: what they left out is taken from it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drop:
     dataset: tyro.conf.Positional[Path]
     """Folder of a LeRobot v3 dataset, which stays as it is."""
-    tasks: tuple[str, ...]
+    tasks: tuple[str, ...] = ()
     """Instructions, or names of the videos that tasks were made from."""
+    episodes: tuple[int, ...] = ()
+    """Numbers of episodes, from 0."""
     out: Path
     """Where the new dataset shall lie; must not exist."""
     repo_id: str | None = None
@@ -37,31 +41,24 @@ class Drop:
 
 def merge_command(argv: list[str]) -> int:
     from v2p_data.episodes.edit import merge
+    from v2p_data.episodes.edited import demand_sound
 
     args = parse(Merge, argv, "merge")
     check_repo_id(args.repo_id)
-    for dataset in args.datasets:
-        _demand_sound(dataset)
-    return _tell(merge(args.datasets, args.repo_id, args.out))
+    for dataset in (*args.datasets, *([args.original] if args.original else [])):
+        demand_sound(dataset)
+    return _tell(merge(args.datasets, args.repo_id, args.out, original=args.original))
 
 
 def drop_command(argv: list[str]) -> int:
     from v2p_data.episodes.edit import drop
+    from v2p_data.episodes.edited import demand_sound
 
     args = parse(Drop, argv, "drop")
     if args.repo_id is not None:
         check_repo_id(args.repo_id)
-    _demand_sound(args.dataset)
-    return _tell(drop(args.dataset, args.tasks, args.out, args.repo_id))
-
-
-def _demand_sound(dataset: Path) -> None:
-    """Raise if a dataset of ours is not as it was made."""
-    from v2p_data.episodes.about import read_about
-    from v2p_data.pipeline.artifact import demand_whole
-
-    demand_whole(dataset)
-    read_about(dataset)
+    demand_sound(args.dataset)
+    return _tell(drop(args.dataset, args.tasks, args.out, args.repo_id, episodes=args.episodes))
 
 
 def _tell(made: "Edited") -> int:

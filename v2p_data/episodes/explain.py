@@ -131,7 +131,7 @@ def _edit(edit: dict[str, Any]) -> str:
         return "merged from " + ", ".join(
             f"{s['repo_id']} ({s['episodes']} episodes)" for s in edit["sources"]
         )
-    return f"{edit['episodes']} episodes dropped from {edit['source']}: {'; '.join(edit['tasks'])}"
+    return f"{edit['episodes']} episodes dropped from {edit['source']}: {'; '.join([*edit['tasks'], *map(str, edit.get('numbers', []))])}"
 
 
 def _task(

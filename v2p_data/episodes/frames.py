@@ -96,7 +96,10 @@ class Checks:
     def skipped(self) -> Iterator[str]:
         """Yield what does not apply to this dataset."""
         if not self.is_ours:
-            yield f"palette, labels and provenance: there is no {METADATA_FILE}, so it is not ours"
+            words = "so it is not ours"
+            if self.has_our_actions:
+                words = "which another tool left out; 'v2p merge DATASET --from ORIGINAL --out NEW --repo-id USER/NAME' brings it back"
+            yield f"palette, labels and provenance: there is no {METADATA_FILE}, {words}"
         if not self.has_our_actions:
             yield "action bounds: the action is not named as ours, and LeRobot states no bounds"
         if SUCCESS_KEY not in self.features:

@@ -92,7 +92,7 @@ class InfoFile(_Open):
     codebase_version: Line
     fps: Annotated[float, Ge(1), Le(1_000)]
     features: Annotated[
-        dict[Annotated[str, AfterValidator(_column_name)], FeatureEntry], Len(1, 1_000)
+        dict[Annotated[str, AfterValidator(_column_name)], FeatureEntry], Len(0, 1_000)
     ]
     total_episodes: Count
     total_frames: Count

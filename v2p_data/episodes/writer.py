@@ -5,6 +5,7 @@ dataset grows in `<root>.partial`, is checked, and is renamed into place at the 
 finished. The same episodes give the same bytes, after any number of kills, with any number of threads.
 """
 
+import json
 import logging
 import os
 import shutil
@@ -18,11 +19,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from v2p_data.episodes.cut import write_stats
+from v2p_data.episodes.edited import number_digest
 from v2p_data.episodes.episode_stats import number_stats
 from v2p_data.episodes.features import (
     ACTION_KEY,
     ACTION_NAMES,
     DEMONSTRATION,
+    EPISODE_COLUMN,
     FPS,
     HANDOVER,
     INTERVENTION_KEY,
@@ -215,8 +218,9 @@ def _write(
                         f"{key}/from_timestamp": begin / FPS,
                         f"{key}/to_timestamp": (begin + episode.num_frames) / FPS,
                     }
-                data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
                 described.append(_describe(episode, has_handovers=has_handovers))
+                where[EPISODE_COLUMN] = json.dumps(described[-1])
+                data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
                 frame += episode.num_frames
     finally:
         data.close()
@@ -327,6 +331,7 @@ def _describe(episode: Episode, *, has_handovers: bool) -> dict[str, Any]:
         "labels": {str(k): name for k, name in label_names(episode.objects).items()},
         "success": bool(np.any(episode.success)),
         "referee": episode.referee,
+        "numbers": number_digest((episode.state, episode.action)),
         "params": episode.params,
         **(source if has_handovers else {}),
     }
