@@ -237,6 +237,8 @@ def test_where_nothing_tells_who_acted_a_merge_is_refused(
 ):
     foreign = Path(shutil.copytree(packed, tmp_path / "foreign"))
     (foreign / "meta/v2p.json").unlink()
+    for path in foreign.glob("meta/episodes/*/*.parquet"):
+        pq.write_table(pq.read_table(path).drop_columns("v2p"), path)
 
     with pytest.raises(V2PError, match=r"has the column intervention and .*foreign has not"):
         merge([mixed, foreign], "user/all", tmp_path / "all")
