@@ -235,6 +235,8 @@ def test_a_merge_of_demonstrations_is_equal_to_packing_them_with_the_column(
 def test_where_nothing_tells_who_acted_a_merge_is_refused(
     packed: Path, mixed: Path, tmp_path: Path
 ):
+    import pyarrow.parquet as pq
+
     foreign = Path(shutil.copytree(packed, tmp_path / "foreign"))
     (foreign / "meta/v2p.json").unlink()
     for path in foreign.glob("meta/episodes/*/*.parquet"):
