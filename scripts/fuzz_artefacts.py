@@ -1,8 +1,9 @@
 """Damage files and folders of every kind that the engine reads, and look at what its commands answer.
 
-Four corpora of the tests are tried whole or in a random part: task folders as strangers may make them
-(`tests/task/strangers.py`), policies and decoded caches (`tests/policies/spoiled.py`), odd videos, captions, labels and
-boxes (`tests/video/odd_files.py`), and harms to each kind of file of a finished run (`tests/pipeline/damage.py`). Every case runs in a process of its own with a time limit.
+Corpora of the tests are tried whole or in a random part: task folders, datasets, policies and decoded caches as strangers
+may make them (`tests/task/strangers.py`, `tests/episodes/strange_datasets.py`, `tests/policies/spoiled.py`), odd videos,
+captions, labels and boxes (`tests/video/odd_files.py`), and harms to each kind of file of a finished run
+(`tests/pipeline/damage.py`). Every case runs in a process of its own with a time limit.
 
     python scripts/fuzz_artefacts.py --run outputs/demo --harms 200 --seed 1
 
@@ -51,16 +52,19 @@ def main() -> None:
     )
     parser.add_argument("--harms", type=int, default=200, help="harms to the run's files, drawn")
     parser.add_argument(
-        "--parts", nargs="*", default=["tasks", "policies", "caches", "videos", "run"]
+        "--parts",
+        nargs="*",
+        default=["tasks", "datasets", "policies", "caches", "videos", "run"],
     )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    for folder in ("task", "policies", "video", "pipeline"):
+    for folder in ("task", "episodes", "policies", "video", "pipeline"):
         sys.path.insert(0, str(ROOT / "tests" / folder))
     outcomes: dict[str, Counter[str]] = {}
     violations: list[str] = []
     parts = {
         "tasks": _tasks,
+        "datasets": _datasets,
         "policies": _policies,
         "caches": _caches,
         "videos": _videos,
@@ -186,6 +190,23 @@ def _caches() -> Iterator[tuple[str, Case]]:
             spoiled.MASK
         ]
         for name, spoil in spoiled.CACHES.items():
+            yield name, case(spoil)
+
+
+def _datasets() -> Iterator[tuple[str, Case]]:
+    import strange_datasets  # pyright: ignore[reportMissingImports]
+
+    def case(spoil: Callable[[Path], object]) -> Case:
+        def verified(folder: Path) -> str:
+            spoiled = Path(shutil.copytree(good, folder / "spoiled"))
+            spoil(spoiled)
+            return {1: "noticed", 2: "refused"}.get(cli.run(["verify", str(spoiled)]), "violation: accepted")  # fmt: skip
+
+        return verified
+
+    with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as folder:
+        good = strange_datasets.good_dataset(Path(folder))
+        for name, spoil in (strange_datasets.REFUSED | strange_datasets.FOUND).items():
             yield name, case(spoil)
 
 

@@ -14,6 +14,7 @@ from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
+from v2p_data.pipeline.contents import memory_of
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import from_values
 from v2p_data.policy_config import PolicyConfig
@@ -64,8 +65,14 @@ def recorded_under(source: Source) -> EpisodesConfig:
 
 
 def demand_whole_sources(dataset: Path, sources: Sequence[Source], root: Path) -> None:
-    """Raise if a dataset, or what is behind it, is not as it was made: see `demand_whole`."""
-    for folder in (dataset, *(f for s in sources for f in (s.task, s.expert, s.episodes))):
+    """Raise if a dataset, or what is behind it, is not as it was made: see `demand_whole` and `demand_sound`."""
+    from v2p_data.episodes.edited import demand_sound
+
+    if sources:
+        demand_whole(dataset, root)
+    else:  # perhaps edited since
+        demand_sound(dataset, memory_of(dataset, root))
+    for folder in (f for s in sources for f in (s.task, s.expert, s.episodes)):
         demand_whole(folder, root)
 
 

@@ -17,7 +17,7 @@ from hub_server import TOKEN, Hub
 from v2p_data.episodes import shards, writer
 from v2p_data.episodes.card import dataset_card, write_card
 from v2p_data.episodes.episode_stats import rgb_stats
-from v2p_data.episodes.features import features
+from v2p_data.episodes.features import EPISODE_COLUMN, features
 from v2p_data.episodes.staging import Episode, Heading
 from v2p_data.episodes.stream import encode_rgb
 from v2p_data.episodes.verify import verify
@@ -143,7 +143,7 @@ def test_tables_and_metadata_are_what_lerobots_writer_makes(
         pq.read_table(r / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
         for r in (packed, root)
     )
-    assert set(ours) == set(theirs)
+    assert set(ours) == {*theirs, EPISODE_COLUMN}
     for name, values in theirs.items():
         if name.startswith("stats/"):  # LeRobot adds up pixels in 32 bits
             assert np.allclose(np.array(ours[name]), np.array(values), rtol=1e-4, atol=1e-6), name

@@ -100,6 +100,42 @@ def test_a_merged_dataset_holds_every_pixel_of_both(
     assert sorted(p.name for p in merged.parent.iterdir()) == ["both"]
 
 
+def test_the_quantiles_are_those_of_all_rows(
+    packed: Path, merged: Path, staged: list[Path], more_staged: list[Path], tmp_path: Path
+):
+    """The first percentile of 101 rows or fewer lies between the two smallest."""
+    less = drop(merged, [PUSH], tmp_path / "less").root
+    both = [*staged, *more_staged]
+
+    for root, paths in ((packed, staged), (merged, both), (less, [both[k] for k in (0, 2, 4)])):
+        stats = json.loads((root / "meta/stats.json").read_text())
+        for key in ("state", "action"):
+            rows = np.sort(np.concatenate([getattr(Episode.load(p), key) for p in paths]), axis=0)
+            said = stats["action" if key == "action" else "observation.state"]
+            middle = len(rows) // 2, (len(rows) - 1) // 2
+            assert (rows[0] <= said["q01"]).all()
+            assert (said["q01"] <= rows[1]).all()
+            assert np.allclose(said["q50"], rows[list(middle)].mean(0))
+            assert (rows[-2] <= said["q99"]).all()
+            assert (said["q99"] <= rows[-1]).all()
+            assert said["count"] == [len(rows)]
+
+
+def test_averages_of_the_episodes_quantiles_are_told_and_made_right(packed: Path, tmp_path: Path):
+    from lerobot.datasets.dataset_tools import recompute_stats
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = Path(shutil.copytree(packed, tmp_path / "copy"))
+    recompute_stats(LeRobotDataset("user/toys", root=root))
+
+    told = [p for p in verify(root).problems if p.check == "quantiles"]
+    made = merge([root], "user/toys", tmp_path / "right")
+
+    assert len(told) == 2
+    assert all("rows lie outside of q01 to q99" in p.detail for p in told)
+    assert verify(made.root).is_good
+
+
 def test_provenance_of_both_is_kept(merged: Path):
     told = about(merged)
 
@@ -171,7 +207,9 @@ def test_an_item_that_is_no_plain_name_is_refused(packed: Path, tmp_path: Path, 
     told["episodes"][0]["item"] = item
     (root / "meta/v2p.json").write_text(json.dumps(told))
 
-    with pytest.raises(V2PError, match=r"v2p\.json has an episode of the item"):
+    with pytest.raises(
+        V2PError, match=r"v2p\.json (has an episode of the item|is damaged: .item. of episode 0)"
+    ):
         drop(root, [PUSH], tmp_path / "less")
 
 

@@ -235,8 +235,12 @@ def test_a_merge_of_demonstrations_is_equal_to_packing_them_with_the_column(
 def test_where_nothing_tells_who_acted_a_merge_is_refused(
     packed: Path, mixed: Path, tmp_path: Path
 ):
+    import pyarrow.parquet as pq
+
     foreign = Path(shutil.copytree(packed, tmp_path / "foreign"))
     (foreign / "meta/v2p.json").unlink()
+    for path in foreign.glob("meta/episodes/*/*.parquet"):
+        pq.write_table(pq.read_table(path).drop_columns("v2p"), path)
 
     with pytest.raises(V2PError, match=r"has the column intervention and .*foreign has not"):
         merge([mixed, foreign], "user/all", tmp_path / "all")

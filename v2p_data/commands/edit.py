@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -17,19 +17,23 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class Merge:
     datasets: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of LeRobot v3 datasets, two or more; their episodes stay in this order."""
+    """Folders of LeRobot v3 datasets; their episodes stay in this order. One is copied, with exact statistics."""
     out: Path
     """Where the new dataset shall lie; must not exist."""
     repo_id: str
     """USER/NAME, under which it will be pushed."""
+    original: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """The dataset of v2p that LeRobot's tools made some of these from: what they left out is taken from it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drop:
     dataset: tyro.conf.Positional[Path]
     """Folder of a LeRobot v3 dataset, which stays as it is."""
-    tasks: tuple[str, ...]
+    tasks: tuple[str, ...] = ()
     """Instructions, or names of the videos that tasks were made from."""
+    episodes: tuple[int, ...] = ()
+    """Numbers of episodes, from 0."""
     out: Path
     """Where the new dataset shall lie; must not exist."""
     repo_id: str | None = None
@@ -38,35 +42,33 @@ class Drop:
 
 def merge_command(argv: list[str]) -> int:
     from v2p_data.episodes.edit import merge
+    from v2p_data.episodes.edited import demand_sound
 
     args = parse(Merge, argv, "merge")
     check_repo_id(args.repo_id)
     with telling("merge") as progress:
-        for dataset in args.datasets:
-            _demand_sound(dataset)
-        made = merge(args.datasets, args.repo_id, args.out, on_progress=progress)
+        for dataset in (*args.datasets, *([args.original] if args.original else [])):
+            demand_sound(dataset)
+        made = merge(
+            args.datasets, args.repo_id, args.out, original=args.original, on_progress=progress
+        )
     return _tell(made)
 
 
 def drop_command(argv: list[str]) -> int:
     from v2p_data.episodes.edit import drop
+    from v2p_data.episodes.edited import demand_sound
 
     args = parse(Drop, argv, "drop")
     if args.repo_id is not None:
         check_repo_id(args.repo_id)
     with telling("drop") as progress:
-        _demand_sound(args.dataset)
-        made = drop(args.dataset, args.tasks, args.out, args.repo_id, on_progress=progress)
+        demand_sound(args.dataset)
+        made = drop(
+            args.dataset, args.tasks, args.out, args.repo_id,
+            episodes=args.episodes, on_progress=progress,
+        )  # fmt: skip
     return _tell(made)
-
-
-def _demand_sound(dataset: Path) -> None:
-    """Raise if a dataset of ours is not as it was made."""
-    from v2p_data.episodes.about import read_about
-    from v2p_data.pipeline.artifact import demand_whole
-
-    demand_whole(dataset)
-    read_about(dataset)
 
 
 def _tell(made: "Edited") -> int:

@@ -25,6 +25,8 @@ from v2p_data.episodes.repo_id import check_repo_id, is_repo_id
 from v2p_data.errors import NotAllError, V2PError
 from v2p_data.judging import PROGRAMS, Contestant, contestant
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
+from v2p_data.pipeline.contents import list_files, memory_of
+from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, stored_outcome
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Key, only_run_in, run_stages
@@ -300,8 +302,8 @@ def generate(
 
 def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Path:
     """Train a policy on a finished dataset and return its folder."""
-    record = _dataset_record(dataset)
-    sources = sources_of(dataset.resolve(), root)
+    record, is_as_made = _record_to_train(dataset, root)
+    sources = sources_of(dataset.resolve(), root) if is_as_made else []
     if not sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
         print(  # noqa: T201
             f"the experts of {dataset} are not in {root}, so the policy clones its demonstrations only",
@@ -403,6 +405,38 @@ def _dataset_record(dataset: Path) -> Record:
             " 'lerobot-train --policy.type=v2p_bc --dataset.root=...'"
         )
     return record
+
+
+def _record_to_train(dataset: Path, root: Path) -> tuple[Record, bool]:
+    """Return the record of a dataset of this engine, and whether it is as it was made.
+
+    One that was merged, cut or edited since gets a record by its content.
+
+    Raises:
+        V2PError: it is none, or damaged.
+    """
+    if not (dataset / "meta/info.json").exists():
+        return _dataset_record(dataset), True  # which says what is wrong
+    from v2p_data.episodes.about import read_about
+    from v2p_data.episodes.edited import demand_sound, is_like_ours
+
+    record = read_record(dataset)
+    changed = demand_sound(dataset, memory_of(dataset, root))
+    if record is not None and not changed.edited:
+        return _dataset_record(dataset), True
+    about = read_about(dataset)
+    if about is None and is_like_ours(dataset):
+        raise V2PError(
+            f"{dataset} has our columns, but what v2p knew of its episodes was left out by another tool; bring it back with "
+            f"'v2p merge {shlex.quote(str(dataset))} --from ORIGINAL --out NEW --repo-id USER/NAME' and train on NEW"
+        )
+    if about is None:
+        return _dataset_record(dataset), True
+    listed = {name: mark.sha256 for name, mark in list_files(dataset).items()}
+    return Record(
+        stage="dataset", item=dataset.resolve().name, version=0, fingerprint=fingerprint(listed)[:8],
+        recipe={}, inputs={}, seconds=0.0, counts={"repo_id": about["repo_id"]},
+    ), False  # fmt: skip
 
 
 def task_folders(folder: Path) -> dict[str, Path]:

@@ -1,13 +1,31 @@
 """`meta/v2p.json` of a dataset, read with suspicion: what this engine says of each episode and of how it was made."""
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from v2p_data.episodes.features import METADATA_FILE, METADATA_SCHEMA
-from v2p_data.episodes.tables import Found
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from v2p_data.episodes.features import (
+    ACTION_KEY,
+    EPISODE_COLUMN,
+    METADATA_FILE,
+    METADATA_SCHEMA,
+    STATE_KEY,
+)
+from v2p_data.episodes.intake import MAX_JSON_BYTES
+from v2p_data.episodes.tables import (
+    EPISODES_GLOB,
+    READING_ERRORS,
+    Found,
+    episodes_of,
+    read_info,
+)
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
+from v2p_data.sim.masks import PALETTE
 
 CARRIED_TASKS = Path("v2p/tasks")
 """Of a dataset: the tasks that its episodes were made in, a folder each."""
@@ -21,15 +39,18 @@ _KINDS_OF_ENTRY: dict[str, type] = {
 
 
 def read_about(root: Path) -> dict[str, Any] | None:
-    """Return a dataset's `meta/v2p.json`, None where there is none.
+    """Return a dataset's `meta/v2p.json`, or what the table of episodes holds of it, None where there is neither.
 
     Raises:
         V2PError: it is damaged, or a newer version wrote it.
     """
     path = root / METADATA_FILE
     if not path.exists(follow_symlinks=False):
-        return None
-    about = json_or_none(path, max_bytes=None)
+        about = _from_table(root)
+        if about is None:
+            return None
+    else:
+        about = json_or_none(path, max_bytes=MAX_JSON_BYTES[METADATA_FILE])
     if not isinstance(about, dict):
         raise V2PError(f"{path} is damaged: it is no JSON object; {_remedy(root)}")
     schema = about.get("schema", METADATA_SCHEMA)
@@ -41,7 +62,7 @@ def read_about(root: Path) -> dict[str, Any] | None:
     wrong = _wrong(about, _KINDS)
     if wrong is None:
         for k, entry in enumerate(about["episodes"]):
-            wrong = _wrong(entry, _KINDS_OF_ENTRY)
+            wrong = _wrong(entry, _KINDS_OF_ENTRY) or _no_label(entry["labels"])
             if wrong is not None:
                 wrong = f"{wrong} of episode {k}"
                 break
@@ -50,6 +71,47 @@ def read_about(root: Path) -> dict[str, Any] | None:
             f"{path} is damaged: {wrong} is missing or of another kind; {_remedy(root)}"
         )
     return about
+
+
+def as_in_table(about: dict[str, Any], episodes: pa.Table) -> dict[str, Any]:
+    """Return `about` with the instructions and lengths of the table of episodes, which LeRobot's tools change."""
+    told = zip(
+        about["episodes"],
+        episodes.column("tasks").to_pylist(),
+        episodes.column("length").to_pylist(),
+        strict=True,
+    )
+    return about | {
+        "episodes": [e | {"task": "; ".join(tasks), "length": n} for e, tasks, n in told]
+    }
+
+
+def _from_table(root: Path) -> dict[str, Any] | None:
+    """Return what the table of episodes tells, None where it has no such column or not of every episode."""
+    files = sorted(root.glob(EPISODES_GLOB))
+    try:
+        if not files or any(EPISODE_COLUMN not in pq.read_schema(path).names for path in files):
+            return None
+        episodes, names = episodes_of(root), read_info(root)["features"]
+        entries = [
+            json.loads(text) for text in episodes.column(EPISODE_COLUMN).to_pylist() if text
+        ]
+    except READING_ERRORS:
+        return None
+    if len(entries) != len(episodes) or not all(isinstance(e, dict) for e in entries):
+        return None
+    return as_in_table(
+        {
+            "schema": METADATA_SCHEMA,
+            "repo_id": f"local/{root.resolve().name}",
+            "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
+            "state": names.get(STATE_KEY, {}).get("names"),
+            "action": names.get(ACTION_KEY, {}).get("names"),
+            "episodes": entries,
+            "provenance": {},
+        },
+        episodes,
+    )
 
 
 def about_problems(
@@ -103,6 +165,11 @@ def _wrong(data: Any, kinds: Mapping[str, type]) -> str | None:
         if not isinstance(value, kind) or isinstance(value, bool):
             return f"'{key}'"
     return None
+
+
+def _no_label(labels: dict[str, Any]) -> str | None:
+    """Return the first key of `labels` that is none, None where all are: masks hold bytes."""
+    return next((f"label {k[:20]!r}" for k in labels if not (k.isdecimal() and len(k) < 4)), None)
 
 
 def _remedy(root: Path) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from v2p_data.episodes.episode_stats import rows_stats
 from v2p_data.episodes.tables import (
     DATA_PATH,
     INFO_FILE,
@@ -60,7 +61,6 @@ def write_without(root: Path, kept: Sequence[int], out: Path) -> list[str]:
     columns |= _shifted_stats(episodes, columns, rows)
     write_episodes(out, replaced(episodes, columns))
     pq.write_table(tasks, out / TASKS_FILE)
-    write_stats(out)
     info |= {
         "total_episodes": len(episodes),
         "total_frames": int(column(episodes, "length").sum()),
@@ -70,6 +70,7 @@ def write_without(root: Path, kept: Sequence[int], out: Path) -> list[str]:
         "video_path": VIDEO_PATH if camera_keys(info, "video") else None,
     }
     (out / INFO_FILE).write_text(json.dumps(info, indent=4, ensure_ascii=False))
+    write_stats(out)
     return notes
 
 
@@ -84,19 +85,26 @@ def write_episodes(out: Path, episodes: pa.Table) -> None:
 
 
 def write_stats(out: Path) -> None:
-    """Write `meta/stats.json` from the statistics of the episodes."""
+    """Write `meta/stats.json`: of numbers from all rows, of pictures LeRobot's sum over the episodes.
+
+    LeRobot looks at a sample of an episode's pictures. Their mean and deviation add up; their quantiles are averages.
+    """
     from lerobot.datasets.compute_stats import aggregate_stats
 
+    info = read_info(out)
     episodes = episodes_of(out, with_stats=True)
-    names = [n for n in episodes.column_names if n.startswith("stats/")]
+    cameras = camera_keys(info)
+    names = [n for n in episodes.column_names if n.startswith(tuple(f"stats/{c}/" for c in cameras))]  # fmt: skip
     per_episode: list[dict[str, dict[str, np.ndarray]]] = [{} for _ in range(len(episodes))]
     for name in names:
         feature, stat = name.removeprefix("stats/").rsplit("/", 1)
         for k, value in enumerate(episodes.column(name).to_pylist()):
             per_episode[k].setdefault(feature, {})[stat] = np.asarray(value)
-    found = aggregate_stats(per_episode)
+    found = aggregate_stats(per_episode) | dict(rows_stats(out, info["features"]))
     plain = {
-        f: {s: np.asarray(v).tolist() for s, v in stats.items()} for f, stats in found.items()
+        f: {s: np.asarray(v).tolist() for s, v in found[f].items()}
+        for f in info["features"]
+        if f in found
     }
     (out / STATS_FILE).write_text(json.dumps(plain, indent=4))
 

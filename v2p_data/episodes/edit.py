@@ -6,7 +6,7 @@ put into one file that no player can read), the numbers of its own metadata file
 overwritten, and every pixel of the result is compared with where it came from.
 """
 
-import hashlib
+import json
 import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -15,18 +15,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow.parquet as pq
+import pyarrow as pa
 
+from v2p_data.episodes.about import as_in_table, read_about
 from v2p_data.episodes.alike import common_features, first_difference, write_retold
 from v2p_data.episodes.card import write_card
 from v2p_data.episodes.cut import write_episodes, write_stats, write_without
-from v2p_data.episodes.features import INTERVENTION_KEY, METADATA_FILE
+from v2p_data.episodes.edited import is_like_ours, number_digests
+from v2p_data.episodes.features import EPISODE_COLUMN, INTERVENTION_KEY, METADATA_FILE
 from v2p_data.episodes.handovers import about_with_sources, info_with_column, write_with_column
+from v2p_data.episodes.intake import demand_bounded
 from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.episodes.tables import (
-    BOOKKEEPING,
-    DATA_GLOB,
     DATA_PATH,
     VIDEO_PATH,
     camera_keys,
@@ -34,11 +34,9 @@ from v2p_data.episodes.tables import (
     episodes_of,
     layout_problems,
     read_info,
-    row_spans,
 )
 from v2p_data.episodes.verify import frames_differ
 from v2p_data.errors import V2PError, did_you_mean
-from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.scene.files import copy_folder, is_plain_path
 
@@ -72,6 +70,8 @@ class _Source:
     digests: list[str] = field(repr=False)
     lacks_column: bool = False
     """`info` and `about` tell of a column that is to be written yet: who acted."""
+    tasks_root: Path | None = None
+    """Where the carried tasks lie, if not in `root`."""
     is_retold: bool = False
     """`info` says in other words than its file what the columns are."""
 
@@ -85,19 +85,31 @@ def merge(
     repo_id: str,
     out: Path,
     *,
+    original: Path | None = None,
     on_progress: Progress = lambda share, words: None,
 ) -> Edited:
-    """Write the episodes of several LeRobot v3 datasets, in this order, as one at `out`.
+    """Write the episodes of several LeRobot v3 datasets, in this order, as one at `out`; of one as a copy with exact statistics.
 
     Where one of them has handovers, demonstrations of ours get the column `intervention` too, true throughout.
+
+    Args:
+        roots: folders of the datasets.
+        repo_id: `user/name`.
+        out: where it shall lie; must not exist.
+        original: the dataset of ours that LeRobot's tools made some of these from; what they left out is taken from it.
+        on_progress: told the share that is done and a few words.
 
     Raises:
         V2PError: there is something at `out`, one is no sound dataset, or they do not go together.
     """
     check_repo_id(repo_id)
-    if len(roots) < 2:
-        raise V2PError("merging needs two datasets at least")
-    sources = _all_with_column([_read(root) for root in roots])
+    if not roots:
+        raise V2PError("there is no dataset to merge; name one at least")
+    read = [_read(root) for root in roots]
+    if original is not None:
+        whole = _read(original)
+        read = [_restored(source, whole) for source in read]
+    sources = _all_with_column(read)
     for other in sources[1:]:
         _check_alike(sources[0], other)
     _check_doubles(sources)
@@ -120,15 +132,17 @@ def drop(
     out: Path,
     repo_id: str | None = None,
     *,
+    episodes: Sequence[int] = (),
     on_progress: Progress = lambda share, words: None,
 ) -> Edited:
-    """Write the dataset at `root` without the episodes of some tasks at `out`.
+    """Write the dataset at `root` without the episodes of some tasks, and without some by number, at `out`.
 
     Args:
         root: any LeRobot v3 dataset.
         tasks: instructions, or (in datasets of ours) items, the names of the videos they were made from.
         out: where it shall lie; must not exist.
         repo_id: `user/name`; the old one by default.
+        episodes: numbers of episodes, from 0.
         on_progress: told the share that is done and a few words.
 
     Raises:
@@ -137,19 +151,26 @@ def drop(
     source = _read(root)
     repo_id = repo_id or source.repo_id
     check_repo_id(repo_id)
-    gone = _episodes_of_tasks(source, tasks)
+    if unknown := [k for k in episodes if not 0 <= k < len(source.lengths)]:
+        raise V2PError(
+            f"{root} has no episode {unknown[0]}; they are numbered 0 to {len(source.lengths) - 1}"
+        )
+    gone = set(episodes)
+    if tasks or not episodes:
+        gone |= _episodes_of_tasks(source, tasks)
     kept = [k for k in range(len(source.lengths)) if k not in gone]
     if not kept:
         raise V2PError(f"{root} would be left without an episode; delete the folder instead")
     with _in_place(out, [root]) as partial:
         on_progress(0.0, "starting LeRobot")
         notes = write_without(root, kept, partial)
-        about = _about_without(source, kept, list(tasks), repo_id, partial)
+        about = _about_without(source, kept, list(tasks), sorted(set(episodes)), repo_id, partial)
         return _finish(partial, out, repo_id, about, [(root, kept)], on_progress, notes)
 
 
 def _read(root: Path) -> _Source:
     info = read_info(root)
+    demand_bounded(root)
     problems = layout_problems(root, info)
     if problems:
         first = problems[0]
@@ -157,12 +178,13 @@ def _read(root: Path) -> _Source:
             f"{root} is not sound ({first.where}: {first.detail}); 'v2p verify {root}' tells everything"
         )
     episodes = episodes_of(root)
-    about = json_or_none(root / METADATA_FILE, max_bytes=None)
+    about = read_about(root)
     lengths = [int(n) for n in column(episodes, "length")]
     if about is not None and len(about["episodes"]) != len(lengths):
         raise V2PError(
             f"{root / METADATA_FILE} tells of {len(about['episodes'])} episodes, there are {len(lengths)}"
         )
+    about = about and as_in_table(about, episodes)
     for entry in about["episodes"] if about is not None else ():
         if (
             not isinstance(item := entry.get("item"), str)
@@ -179,24 +201,30 @@ def _read(root: Path) -> _Source:
         about=about,
         lengths=lengths,
         tasks_of_episodes=[list(t) for t in episodes.column("tasks").to_pylist()],
-        digests=_digests(root, info, len(lengths)),
+        digests=number_digests(root, info, len(lengths)),
     )
 
 
-def _digests(root: Path, info: dict[str, Any], count: int) -> list[str]:
-    """Return a digest of each episode's numbers; empty where there are none to tell episodes apart by."""
-    keys = [
-        k for k, f in info["features"].items() if f["dtype"].startswith("float") and k not in BOOKKEEPING
-    ]  # fmt: skip
-    found = [hashlib.sha256() for _ in range(count)]
-    for path in sorted(root.glob(DATA_GLOB)) if keys else []:
-        table = pq.read_table(path, columns=[*keys, "episode_index"])
-        spans = row_spans(column(table, "episode_index"))
-        for key in keys:
-            values = np.asarray(table.column(key).to_pylist(), np.float64)
-            for number, (first, count) in spans.items():
-                found[number].update(values[first : first + count].tobytes())
-    return [d.hexdigest() if keys else "" for d in found]
+def _restored(source: _Source, original: _Source) -> _Source:
+    """Return a source with what our own file says of its episodes in the dataset that it was made from."""
+    if source.about is not None and (source.root / METADATA_FILE).is_file():
+        return source
+    if original.about is None:
+        raise V2PError(
+            f"{original.root} holds no {METADATA_FILE} itself; give the dataset that v2p made with --from"
+        )
+    numbers = {digest: k for k, digest in enumerate(original.digests) if digest}
+    unknown = [k for k, digest in enumerate(source.digests) if digest not in numbers]
+    if unknown:
+        raise V2PError(
+            f"episode {unknown[0]} of {source.root} is none of {original.root} by its states and actions "
+            f"({len(unknown)} of {len(source.digests)} are not); give the dataset that it was made from with --from"
+        )
+    entries = [original.about["episodes"][numbers[digest]] for digest in source.digests]
+    about = original.about | {"episodes": entries}
+    return replace(
+        source, about=as_in_table(about, episodes_of(source.root)), tasks_root=original.root
+    )
 
 
 def _check_alike(a: _Source, b: _Source) -> None:
@@ -214,6 +242,12 @@ def _check_alike(a: _Source, b: _Source) -> None:
             VIDEO_PATH,
         ):
             raise V2PError(f"{source.root} names its files otherwise than LeRobot 0.6 does")
+    for source in (a, b) if (a.about is None) != (b.about is None) else ():
+        if source.about is None and is_like_ours(source.root):
+            raise V2PError(
+                f"{source.root} has our columns, but what v2p knew of its episodes was left out by another tool; name the "
+                "dataset that it was made from with --from"
+            )
     differ("'made by v2p'", a.about is not None, b.about is not None)
     if a.about is not None and b.about is not None:
         for name in AGREEING:
@@ -341,7 +375,7 @@ def _merged_about(sources: list[_Source], repo_id: str, partial: Path) -> dict[s
     edits: list[dict[str, Any]] = []
     for source, about in zip(sources, abouts, strict=True):
         provenance = about.get("provenance", {})
-        names = _copied_tasks(source.root, partial)
+        names = _copied_tasks(source.tasks_root or source.root, partial)
         keys: dict[str, str] = {}
         for item, history in provenance.get("items", {}).items():
             name = _free(str(names.get(item, item)), lambda n, h=history: histories.get(n, h) == h)
@@ -409,7 +443,9 @@ def _episodes_of_tasks(source: _Source, tasks: Sequence[str]) -> set[int]:
     ]  # fmt: skip
     known = sorted(set().union(*names))
     if not tasks:
-        raise V2PError(f"say which tasks to drop with --tasks; there are: {'; '.join(known)}")
+        raise V2PError(
+            f"say which tasks to drop with --tasks, or which --episodes; there are: {'; '.join(known)}"
+        )
     for task in tasks:
         if task not in known:
             raise V2PError(f"{source.root} has no task '{task}'.{did_you_mean(task, known)}")
@@ -417,7 +453,12 @@ def _episodes_of_tasks(source: _Source, tasks: Sequence[str]) -> set[int]:
 
 
 def _about_without(
-    source: _Source, kept: list[int], tasks: list[str], repo_id: str, partial: Path
+    source: _Source,
+    kept: list[int],
+    tasks: list[str],
+    numbers: list[int],
+    repo_id: str,
+    partial: Path,
 ) -> dict[str, Any] | None:
     if source.about is None:
         return None
@@ -431,6 +472,7 @@ def _about_without(
         "operation": "drop",
         "source": source.repo_id,
         "tasks": tasks,
+        "numbers": numbers,
         "episodes": len(source.lengths) - len(kept),
     }
     return source.about | {
@@ -480,6 +522,11 @@ def _finish(
 ) -> Edited:
     if about is not None:
         write_json_atomically(partial / METADATA_FILE, about)
+        table = episodes_of(partial, with_stats=True)
+        if EPISODE_COLUMN in table.column_names:
+            table = table.drop_columns(EPISODE_COLUMN)
+        told = pa.array([json.dumps(entry) for entry in about["episodes"]])
+        write_episodes(partial, table.append_column(EPISODE_COLUMN, told))
     on_progress(0.5, "comparing every frame")
     problems = layout_problems(partial, read_info(partial))
     said = f"{problems[0].where}: {problems[0].detail}" if problems else frames_differ(partial, sources)  # fmt: skip

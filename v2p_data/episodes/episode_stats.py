@@ -1,22 +1,33 @@
-"""Statistics of an episode, as LeRobot computes them, without looking at every pixel five times.
+"""Statistics of an episode, as LeRobot computes them, without looking at every pixel five times, and of all rows.
+
+LeRobot averages the quantiles of episodes, and most rows may lie outside of such averages; those of all rows are taken here.
 
 LeRobot makes a histogram of all pixels' values, which takes most of the time of its `save_episode`. Pictures
 of bytes hold 256 values at most, so counting them once gives the same histogram. Mean and deviation are exact here;
 LeRobot sums millions of numbers in 32 bits.
 """
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from jaxtyping import Float, UInt8
 
+from v2p_data.episodes.tables import DATA_GLOB
 from v2p_data.sim.masks import PALETTE
 
 Stats = dict[str, np.ndarray]
 VALUES = 256
 BINS = 5000
 """Of LeRobot's histograms (`RunningQuantileStats`)."""
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+"""Names and shares of the quantiles that LeRobot keeps."""
+NUMBERS = ("float", "int", "uint", "bool")
+"""What the names of the types begin with that have statistics."""
 _GREYS = np.asarray(PALETTE)
 
 
@@ -25,6 +36,34 @@ def number_stats(columns: dict[str, Any], features: dict[str, Any]) -> dict[str,
     from lerobot.datasets.compute_stats import compute_episode_stats
 
     return compute_episode_stats(columns, features)
+
+
+def rows_stats(root: Path, features: dict[str, Any]) -> Iterator[tuple[str, Stats]]:
+    """Yield the exact statistics of every column of numbers, from all rows of a dataset, one column after the other."""
+    files = sorted(root.glob(DATA_GLOB))
+    for key, feature in features.items():
+        if str(feature["dtype"]).startswith(NUMBERS):
+            parts = [_values(pq.read_table(path, columns=[key]).column(key)) for path in files]
+            found = exact_stats(np.concatenate(parts))
+            shape = feature["shape"] if len(feature["shape"]) > 1 else [-1]
+            yield key, {n: v if n == "count" else v.reshape(shape) for n, v in found.items()}
+
+
+def exact_stats(values: Float[np.ndarray, "row entry"]) -> Stats:
+    """Return minimum, maximum, mean, deviation, quantiles and count of some rows."""
+    found = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
+    quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
+    return (
+        found | {"count": np.array([len(values)])} | dict(zip(QUANTILES, quantiles, strict=True))
+    )
+
+
+def _values(column: pa.ChunkedArray) -> Float[np.ndarray, "row entry"]:
+    rows, flat = len(column), column.combine_chunks()
+    while isinstance(flat, pa.ExtensionArray | pa.FixedSizeListArray | pa.ListArray):
+        flat = flat.storage if isinstance(flat, pa.ExtensionArray) else flat.flatten()
+    values = np.asarray(flat.to_numpy(zero_copy_only=False), np.float64)
+    return values.reshape(rows, -1) if rows else values.reshape(0, 1)
 
 
 def mask_stats(labels: UInt8[np.ndarray, "time h w"]) -> Stats:
@@ -60,8 +99,6 @@ def _counted(images: np.ndarray) -> Float[np.ndarray, "256"]:
 
 
 def _picture_stats(counts: Float[np.ndarray, "3 256"], num_frames: int) -> Stats:
-    from lerobot.datasets.compute_stats import DEFAULT_QUANTILES
-
     values = np.arange(VALUES, dtype=np.float64)
     total = counts.sum(1)
     mean = counts @ values / total
@@ -73,8 +110,8 @@ def _picture_stats(counts: Float[np.ndarray, "3 256"], num_frames: int) -> Stats
         "mean": mean,
         "std": np.sqrt(np.maximum(counts @ values**2 / total - mean**2, 0)),
     }
-    for q in DEFAULT_QUANTILES:
-        found[f"q{int(q * 100):02d}"] = np.array(
+    for name, q in QUANTILES.items():
+        found[name] = np.array(
             [_quantile(c, a, b, q) for c, a, b in zip(counts, low, high, strict=True)]
         )
     return {name: (v / 255).reshape(3, 1, 1) for name, v in found.items()} | {

@@ -14,6 +14,7 @@ from typing import Any
 from v2p_data.episodes.about import CARRIED_TASKS, read_about
 from v2p_data.episodes.features import METADATA_FILE
 from v2p_data.episodes.handovers import who_acted
+from v2p_data.episodes.intake import demand_bounded
 from v2p_data.episodes.tables import (
     INFO_FILE,
     READING_ERRORS,
@@ -49,6 +50,8 @@ def explain(path: Path, episode: int | None = None) -> list[str]:
         V2PError: there is neither at `path`, or no such episode.
     """
     if (path / INFO_FILE).is_file():
+        read_info(path)
+        demand_bounded(path)
         with damage_told(path):
             return _episode(path, episode) if episode is not None else _dataset(path)
     if read_record(path) is None:
@@ -128,7 +131,7 @@ def _edit(edit: dict[str, Any]) -> str:
         return "merged from " + ", ".join(
             f"{s['repo_id']} ({s['episodes']} episodes)" for s in edit["sources"]
         )
-    return f"{edit['episodes']} episodes dropped from {edit['source']}: {'; '.join(edit['tasks'])}"
+    return f"{edit['episodes']} episodes dropped from {edit['source']}: {'; '.join([*edit['tasks'], *map(str, edit.get('numbers', []))])}"
 
 
 def _task(
@@ -244,6 +247,7 @@ def _told(path: Path) -> dict[str, Any]:
     """Return what sets one dataset, or one result, apart from another, as one tree."""
     if (path / INFO_FILE).is_file():
         info = read_info(path)
+        demand_bounded(path)
         told: dict[str, Any] = {
             "info": {
                 k: v for k, v in info.items() if k not in ("splits", "data_path", "video_path")

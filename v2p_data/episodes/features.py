@@ -19,6 +19,8 @@ KEY_OF_CAMERA = {"mask": MASK_KEY, "rgb": RGB_KEY}
 DEMONSTRATION, HANDOVER = "demonstration", "handover"
 """Where an episode is from, in `METADATA_FILE` of datasets with handovers."""
 METADATA_FILE = "meta/v2p.json"
+EPISODE_COLUMN = "v2p"
+"""Of the table of episodes: the episode's entry in `METADATA_FILE` as JSON. LeRobot's tools leave the file out more often."""
 METADATA_SCHEMA = 1
 """Palette, provenance and drawn parameters; LeRobot ignores it and uploads it."""
 

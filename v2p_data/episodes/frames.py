@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from v2p_data.episodes.episode_stats import QUANTILES
 from v2p_data.episodes.features import (
     ACTION_KEY,
     ACTION_NAMES,
@@ -29,6 +30,8 @@ from v2p_data.sim.masks import PALETTE, rgb_to_labels
 TIME_TOLERANCE_S = 1e-4
 STATS_TOLERANCE = 1e-4
 VARIANCE_TOLERANCE = 1e-6
+QUANTILE_TOLERANCE = 0.005
+"""Share of rows by which a quantile may be off, and share of the range: LeRobot estimates it from 5,000 bins."""
 PICTURE_MEAN_TOLERANCE = 0.1
 """Of the brightness range; LeRobot takes a picture's statistics from a sample of frames."""
 FROZEN_SHARE, FROZEN_FRAMES = 0.5, 10
@@ -93,7 +96,10 @@ class Checks:
     def skipped(self) -> Iterator[str]:
         """Yield what does not apply to this dataset."""
         if not self.is_ours:
-            yield f"palette, labels and provenance: there is no {METADATA_FILE}, so it is not ours"
+            words = "so it is not ours"
+            if self.has_our_actions:
+                words = "which another tool left out; 'v2p merge DATASET --from ORIGINAL --out NEW --repo-id USER/NAME' brings it back"
+            yield f"palette, labels and provenance: there is no {METADATA_FILE}, {words}"
         if not self.has_our_actions:
             yield "action bounds: the action is not named as ours, and LeRobot states no bounds"
         if SUCCESS_KEY not in self.features:
@@ -131,6 +137,9 @@ class Checks:
                     is_near |= np.abs(said**2 - true**2).max() <= VARIANCE_TOLERANCE * largest**2
                 if not is_near:
                     tell("statistics", STATS_FILE, f"{name} of {key} is not that of the data")
+            if wrong := wrong_quantiles(values, stats[key]):
+                tell = self.said.add if self.is_ours and key not in BOOKKEEPING else self.said.note
+                tell("quantiles", STATS_FILE, f"{', '.join(wrong)} of {key} are not those of all rows" + _left_out(values, stats[key]))  # fmt: skip
         for key in self.cameras:
             if key not in self.depths and self.brightness[key]:
                 self._picture_statistics(key, stats.get(key))
@@ -149,6 +158,31 @@ class Checks:
             self.said.add("statistics", STATS_FILE, f"those of {key} are no brightness in [0, 1] in order")  # fmt: skip
         elif abs(float(mean.mean()) - true) > PICTURE_MEAN_TOLERANCE:
             self.said.add("statistics", STATS_FILE, f"mean of {key} is {mean.mean():.3f}, the pictures' is {true:.3f}")  # fmt: skip
+
+
+def wrong_quantiles(values: np.ndarray, said: dict[str, Any]) -> list[str]:
+    """Return the names of the quantiles that are not those of `values` `(row, entry)`; what is not said is not wrong."""
+    slack = QUANTILE_TOLERANCE + 1 / len(values)
+    near = QUANTILE_TOLERANCE * np.ptp(values, axis=0) + STATS_TOLERANCE * np.abs(values).max(0)
+    wrong: list[str] = []
+    for name, share in QUANTILES.items():
+        if name in said:
+            at = np.asarray(said[name], np.float64).reshape(-1)
+            is_right = at.shape == near.shape and bool(
+                ((values < at - near).mean(0) <= share + slack).all()
+                and ((values <= at + near).mean(0) >= share - slack).all()
+            )  # fmt: skip
+            wrong += [] if is_right else [name]
+    return wrong
+
+
+def _left_out(values: np.ndarray, said: dict[str, Any]) -> str:
+    """Return in words how many rows lie outside of the range that policies take for that of 98 %."""
+    ends = [np.asarray(said.get(name, []), np.float64).reshape(-1) for name in ("q01", "q99")]
+    if any(end.shape != values[0].shape for end in ends):
+        return ""
+    share = ((values < ends[0]) | (values > ends[1])).mean(0).max()
+    return f": {share:.0%} of an entry's rows lie outside of q01 to q99, where 2 % should; LeRobot averages episodes, 'v2p merge' writes them anew"
 
 
 class EpisodeCheck:

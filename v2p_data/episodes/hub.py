@@ -25,6 +25,7 @@ from typing import Any, Literal
 from v2p_data.episodes.about import CARRIED_TASKS
 from v2p_data.episodes.card import CARD_FILE, LICENSE, write_card, write_text
 from v2p_data.episodes.features import METADATA_FILE
+from v2p_data.episodes.intake import demand_bounded
 from v2p_data.episodes.repo_id import check_repo_id
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
@@ -118,6 +119,7 @@ def push_dataset(
     if not isinstance(info, dict):
         raise V2PError(f"{info_path} is damaged: it is no JSON object; nothing was pushed")
     version = str(info.get("codebase_version", ""))
+    demand_bounded(root)
     if (root / METADATA_FILE).is_file():
         _remove_places(root)
         write_card(root, repo_id)

@@ -6,7 +6,7 @@ read here first, and what does not fit together is named by file.
 
 import itertools
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from v2p_data.episodes.intake import INFO_FILE, STATS_FILE, check_info
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 
-INFO_FILE = "meta/info.json"
-STATS_FILE = "meta/stats.json"
 TASKS_FILE = "meta/tasks.parquet"
 EPISODES_GLOB = "meta/episodes/*/*.parquet"
 DATA_GLOB = "data/*/*.parquet"
@@ -43,7 +42,7 @@ def read_info(root: Path) -> dict[str, Any]:
     """Return `meta/info.json`.
 
     Raises:
-        V2PError: there is no LeRobot v3 dataset at `root`.
+        V2PError: there is no LeRobot v3 dataset at `root`, or the file says what it may not.
     """
     info = json_or_none(root / INFO_FILE)
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
@@ -57,6 +56,7 @@ def read_info(root: Path) -> dict[str, Any]:
             f"{root} is a LeRobot dataset of version '{version}'; only v3 can be read, "
             "convert it with LeRobot's own converter"
         )
+    check_info(root)
     return info
 
 
@@ -121,16 +121,24 @@ def _layout_problems(root: Path, info: dict[str, Any]) -> list[Found]:
     found = list(_missing_parts(root, info, episodes))
     if found:
         return found
-    return [
+    found = [
         *_counts(root, info, episodes),
         *_episode_order(episodes),
         *_rows(root, info, episodes),
         *_video_times(info, episodes),
     ]
+    return found or list(_video_sizes(root, info))
 
 
-STOPPING = ("missing_file", "unreadable_file", "missing_column", "missing_rows")
-"""After these LeRobot is not asked: it would look for the rest on the Hub."""
+STOPPING = (
+    "missing_file",
+    "unreadable_file",
+    "missing_column",
+    "missing_rows",
+    "counts",
+    "video_size",
+)
+"""After these LeRobot is not asked: it would look for the rest on the Hub, or make room for what is not there."""
 
 
 def _missing(root: Path, info: dict[str, Any]) -> Iterator[Found]:
@@ -327,6 +335,23 @@ def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
                 yield Found(
                     check="video_times", where=f"episode {b}",
                     detail=f"{key}: begins in the video before episode {a} ends there",
+                )  # fmt: skip
+
+
+def _video_sizes(root: Path, info: dict[str, Any]) -> Iterator[Found]:
+    """Yield videos of other pictures than the dataset says; what no player opens is left to LeRobot."""
+    from lerobot.datasets.video_utils import av  # LeRobot's module is this room's door to video
+
+    for key in camera_keys(info, "video"):
+        said = tuple(info["features"][key]["shape"])
+        for path in sorted(root.glob(f"videos/{key}/*/*.mp4")):
+            size = said[:2]
+            with suppress(av.FFmpegError, LookupError, ValueError), av.open(str(path)) as video:
+                size = video.streams.video[0].height, video.streams.video[0].width
+            if size not in (said[:2], said[1:]):
+                yield Found(
+                    check="video_size", where=_name(root, path),
+                    detail=f"has pictures of {size[1]} x {size[0]} px, {INFO_FILE} says {said}",
                 )  # fmt: skip
 
 

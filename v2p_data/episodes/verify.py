@@ -6,14 +6,17 @@ v3 dataset is welcome: what holds for all is checked, what holds for ours only i
 the report says what was left out and why.
 """
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from v2p_data.episodes.about import CARRIED_TASKS, about_problems, read_about
+from v2p_data.episodes.about import CARRIED_TASKS, about_problems, as_in_table, read_about
+from v2p_data.episodes.edited import changed_files
 from v2p_data.episodes.features import INTERVENTION_KEY, METADATA_FILE
 from v2p_data.episodes.frames import Checks, Said
+from v2p_data.episodes.intake import demand_bounded
 from v2p_data.episodes.reading import Rows, same
 from v2p_data.episodes.staging import Episode
 from v2p_data.episodes.tables import (
@@ -24,8 +27,7 @@ from v2p_data.episodes.tables import (
     read_info,
 )
 from v2p_data.errors import UnusableError, V2PError
-from v2p_data.pipeline.artifact import RECORD_FILE, read_record
-from v2p_data.pipeline.contents import damages
+from v2p_data.pipeline.artifact import RECORD_FILE
 
 Problem = Found
 SHOWN_PROBLEMS = 5
@@ -59,23 +61,34 @@ class VerifyReport:
         if self.is_good:
             same = ", all equal to what was recorded" if self.is_compared else ""
             return f"{read}: no problem found{same}"
-        shown = "; ".join(f"{p.where}: {p.detail}" for p in self.problems[:SHOWN_PROBLEMS])
-        more = len(self.problems) - SHOWN_PROBLEMS
+        kinds = list(_kinds(self.problems))
+        shown = "; ".join(f"{where}: {p.detail}" for p, where in kinds[:SHOWN_PROBLEMS])
+        more = len(kinds) - SHOWN_PROBLEMS
         return f"{read}: {len(self.problems)} problems: {shown}" + (
-            f"; and {more} more" if more > 0 else ""
+            f"; and {more} more kinds" if more > 0 else ""
         )
 
     def lines(self) -> list[str]:
-        """Return it for people, a line each."""
+        """Return it for people, a line for each kind."""
         return [
-            *(f"problem  {p.check:<16} {p.where}: {p.detail}" for p in self.problems),
-            *(f"note     {p.check:<16} {p.where}: {p.detail}" for p in self.notes),
+            *(f"problem  {p.check:<16} {where}: {p.detail}" for p, where in _kinds(self.problems)),
+            *(f"note     {p.check:<16} {where}: {p.detail}" for p, where in _kinds(self.notes)),
             *(f"skipped  {words}" for words in self.skipped),
         ]
 
     def as_json(self) -> dict[str, Any]:
         """Return it for JSON."""
         return asdict(self) | {"root": str(self.root), "is_good": self.is_good}
+
+
+def _kinds(found: Sequence[Found]) -> Iterator[tuple[Found, str]]:
+    """Yield the first finding of each kind, and where it is; of a kind are those that differ in their numbers only."""
+    kinds: dict[tuple[str, ...], list[Found]] = {}
+    for one in found:
+        words = (re.sub(r"\d+", "#", words) for words in (one.where, one.detail))
+        kinds.setdefault((one.check, *words), []).append(one)
+    for first, *more in kinds.values():
+        yield first, f"{first.where} and {len(more)} more like it" if more else first.where
 
 
 def verify(
@@ -92,17 +105,23 @@ def verify(
         on_progress: told the share that is done and a few words.
 
     Raises:
-        V2PError: there is no LeRobot v3 dataset at `root`.
+        V2PError: there is no LeRobot v3 dataset at `root`, or none that can be read in bounded memory.
     """
     info = read_info(root)
+    demand_bounded(root)
     said = Said()
-    said.problems += [*_changed_files(root), *layout_problems(root, info)]
+    said.problems += [*_changed_files(root, said), *layout_problems(root, info)]
     about = _about(root, said)
     checks = Checks(info=info, about=about, said=said)
     if any(p.check in STOPPING for p in said.problems):
         return _report(root, checks, 0, 0, is_compared=False)
     if about is not None:
         table = episodes_of(root)
+        if said.notes and len(table) == len(about["episodes"]):  # edited
+            told, about = about, as_in_table(about, table)
+            pairs = zip(told["episodes"], about["episodes"], strict=True)
+            if renamed := sum(a["task"] != b["task"] for a, b in pairs):
+                said.note("edited", "meta/episodes", f"{renamed} of {len(table)} episodes have another instruction than when they were packed")  # fmt: skip
         tasks, lengths = (table.column(name).to_pylist() for name in ("tasks", "length"))
         said.problems += about_problems(root, about, tasks, lengths)
     leftovers = sorted(p.name for p in [root / "images", *root.glob("tmp*")] if p.exists())
@@ -113,14 +132,16 @@ def verify(
     return _read(root, checks, repo_id, staged, on_progress)
 
 
-def _changed_files(root: Path) -> Iterator[Found]:
+def _changed_files(root: Path, said: Said) -> Iterator[Found]:
     """Yield what is not as the record of a dataset of ours lists it; others have no record."""
     try:
-        record = read_record(root)
+        changed = changed_files(root)
     except UnusableError as error:
         yield Found(check="record", where=RECORD_FILE, detail=error.detail)
         return
-    for damage in damages(root, (record.files if record else None) or {}):
+    if changed.edited:
+        said.note("edited", ", ".join(changed.edited), "changed since packing, as LeRobot's tools change them")  # fmt: skip
+    for damage in changed.damaged:
         where = damage.path.relative_to(root).as_posix()
         yield Found(check="changed_file", where=where, detail=f"{damage.what}, says {RECORD_FILE}")
 
@@ -132,10 +153,13 @@ def _about(root: Path, said: Said) -> dict[str, Any] | None:
     except V2PError as error:
         said.add("unreadable_about", METADATA_FILE, str(error))
         return None
-    if about is None and (root / CARRIED_TASKS).is_dir():
-        said.add(
-            "missing_file", METADATA_FILE, "is missing, and the dataset carries tasks of ours"
-        )
+    if not (root / METADATA_FILE).is_file():
+        if (root / CARRIED_TASKS).is_dir():
+            said.add(
+                "missing_file", METADATA_FILE, "is missing, and the dataset carries tasks of ours"
+            )
+        elif about is not None:
+            said.note("edited", METADATA_FILE, "was left out by LeRobot's tools; meta/episodes holds what it said of each episode")  # fmt: skip
     return about
 
 

@@ -5,6 +5,7 @@ dataset grows in `<root>.partial`, is checked, and is renamed into place at the 
 finished. The same episodes give the same bytes, after any number of kills, with any number of threads.
 """
 
+import json
 import logging
 import os
 import shutil
@@ -17,11 +18,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from v2p_data.episodes.cut import write_stats
+from v2p_data.episodes.edited import number_digest
 from v2p_data.episodes.episode_stats import number_stats
 from v2p_data.episodes.features import (
     ACTION_KEY,
     ACTION_NAMES,
     DEMONSTRATION,
+    EPISODE_COLUMN,
     FPS,
     HANDOVER,
     INTERVENTION_KEY,
@@ -170,7 +174,7 @@ def _write(
 ) -> list[dict[str, Any]]:
     """Write everything but our own metadata; return what is told of each episode there."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-    from lerobot.datasets.io_utils import write_info, write_stats
+    from lerobot.datasets.io_utils import write_info
 
     first = shards[0].episodes[0]
     has_handovers = any(e.is_handover for shard in shards for e in shard.episodes)
@@ -214,15 +218,15 @@ def _write(
                         f"{key}/from_timestamp": begin / FPS,
                         f"{key}/to_timestamp": (begin + episode.num_frames) / FPS,
                     }
-                data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
                 described.append(_describe(episode, has_handovers=has_handovers))
+                where[EPISODE_COLUMN] = json.dumps(described[-1])
+                data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
                 frame += episode.num_frames
     finally:
         data.close()
         meta.finalize()
     write_info(meta.info, root)
-    # LeRobot's sum goes through a set, whose order changes from run to run.
-    write_stats({key: meta.stats[key] for key in meta.features if key in meta.stats}, root)
+    write_stats(root)
     return described
 
 
@@ -327,6 +331,7 @@ def _describe(episode: Episode, *, has_handovers: bool) -> dict[str, Any]:
         "labels": {str(k): name for k, name in label_names(episode.objects).items()},
         "success": bool(np.any(episode.success)),
         "referee": episode.referee,
+        "numbers": number_digest((episode.state, episode.action)),
         "params": episode.params,
         **(source if has_handovers else {}),
     }

@@ -70,6 +70,8 @@ def read_record(folder: Path) -> Record | None:
         UnusableError: it is not as it was written, or a newer version wrote it.
     """
     path = folder / RECORD_FILE
+    if path.exists() and not path.is_file():
+        raise damaged(folder, f"{path} is no file")  # reading a pipe never ends
     try:
         data = json.loads(path.read_text())
     except (FileNotFoundError, NotADirectoryError):
