@@ -141,7 +141,7 @@ def make_distilled_dataset(
     """Write demonstrations and handover episodes as one LeRobot dataset and compare every frame with what was drawn."""
     from v2p_data.distillation.rounds import handover_episodes
     from v2p_data.episodes.collect import staged_episodes
-    from v2p_data.stages import pack_and_verify
+    from v2p_data.episodes.packing import pack_and_verify
 
     for source in sources:
         demand_whole(source.task, runtime.root)

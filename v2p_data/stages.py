@@ -26,7 +26,6 @@ from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.solved import find_solved, solved_digests
-from v2p_data.json_files import read_object
 from v2p_data.judging import PROGRAMS, Contestant, judge_task, own_reset_rate, play_of, row_of
 from v2p_data.pipeline.artifact import (
     Record,
@@ -37,7 +36,6 @@ from v2p_data.pipeline.artifact import (
 )
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
-from v2p_data.pipeline.shareable import without_places
 from v2p_data.policy_config import PolicyConfig
 from v2p_data.policy_training import (
     POLICY_FOLDER,
@@ -51,7 +49,7 @@ from v2p_data.scene.config import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.arms import RobotConfig, robot_to_json
 from v2p_data.task.generate import TaskConfig
-from v2p_data.task.task import CODE_FILE, TASK_FILE
+from v2p_data.task.task import CODE_FILE, REWARD_SEARCH_FOLDER
 from v2p_data.task.vlm_config import VlmConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
@@ -69,7 +67,6 @@ SOLVED_POOL_FOLDER = "pool"
 EVALUATION_FILE = "evaluation.json"
 VIDEOS_FOLDER, SHEET_FILE = "videos", "sheet.png"
 """Of an evaluation: a folder per task with a few films and a contact sheet."""
-REWARD_SEARCH_FOLDER = "search"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -446,6 +443,7 @@ def make_dataset(
 ) -> dict[str, Any]:
     """Write the dataset, reopen it with LeRobot and compare every frame with what was drawn."""
     from v2p_data.episodes.collect import staged_episodes
+    from v2p_data.episodes.packing import pack_and_verify
 
     for task in tasks.values():
         demand_whole(task.folder(runtime.root), runtime.root)
@@ -460,69 +458,6 @@ def make_dataset(
         },
         tasks={item: stage.folder(runtime.root) for item, stage in tasks.items()},
     )
-
-
-def pack_and_verify(
-    staged: Sequence[Path],
-    repo_id: str,
-    out: Path,
-    runtime: Runtime,
-    *,
-    provenance: Mapping[str, Any],
-    tasks: Mapping[str, Path],
-) -> dict[str, Any]:
-    """Write staged episodes as a LeRobot dataset into `out`, with their tasks and a card, and no place of this machine.
-
-    Raises:
-        V2PError: there is nothing to pack, or the dataset differs from the episodes when it is read again.
-    """
-    from v2p_data.episodes.card import write_card
-    from v2p_data.episodes.verify import verify
-    from v2p_data.episodes.writer import pack
-
-    if not staged:
-        raise V2PError("no task gave a successful episode, so there is nothing to pack")
-    root = out / "packed"
-    pack(
-        staged,
-        repo_id,
-        root,
-        provenance=without_places(dict(provenance)),
-        num_threads=runtime.num_threads,
-        on_progress=lambda share, words: runtime.progress(0.7 * share, words),
-    )
-    copy_tasks(tasks, root)
-    runtime.progress(0.75, "comparing every frame")
-    report = verify(root, staged=staged)
-    if not report.is_good:
-        raise V2PError(f"the packed dataset differs from the episodes: {report.summary()}")
-    write_card(root, repo_id)
-    for path in list(root.iterdir()):
-        path.rename(out / path.name)
-    root.rmdir()
-    return {
-        "episodes": report.num_episodes,
-        "frames": report.num_frames,
-        "repo_id": repo_id,
-    }
-
-
-def copy_tasks(tasks: Mapping[str, Path], dataset: Path) -> None:
-    """Put tasks, by item, into the dataset that was made in them, without a place of this machine."""
-    from v2p_data.scene.files import copy_folder
-
-    for item, folder in tasks.items():
-        copy_folder(
-            folder,
-            dataset / ROOT_OF_TASKS / item,
-            ignore=shutil.ignore_patterns(
-                "record.json", "samples", "overlay*", REWARD_SEARCH_FOLDER
-            ),
-        )
-        described = dataset / ROOT_OF_TASKS / item / TASK_FILE
-        task = read_object(described, "make the task anew")
-        if (shareable := without_places(task)) != task:
-            described.write_text(json.dumps(shareable, indent=1))
 
 
 def _history(folder: Path, root: Path) -> dict[str, Any]:

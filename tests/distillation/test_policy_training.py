@@ -13,7 +13,6 @@ from toy_run import ENGINE, REPO_ID, contents, dataset_of, made, record_of
 from policies.bc import trainer
 from policies.bc.student import Student
 from policies.bc.trainer import TrainerConfig
-from v2p_data import stages
 from v2p_data.distillation import rounds
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.rounds import handover_episodes
@@ -232,7 +231,7 @@ def test_a_packing_that_was_killed_ends_in_the_same_dataset(distilled: Path, roo
 
     shutil.copytree(distilled / "distillation", root / "distillation")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stages, "copy_tasks", kill)
+        patch.setattr(packing, "copy_tasks", kill)
         assert packed(root).reason == "Killed"
 
     again, expected = packed(root), packed(distilled)

@@ -15,10 +15,11 @@ from toy_run import ENGINE, ITEM, dataset_of, made, make_expert, make_task, reco
 from v2p_data.cli import run
 from v2p_data.commands import run as commands
 from v2p_data.episodes.hub import fetch_policy
+from v2p_data.episodes.packing import copy_tasks
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import provenance
 from v2p_data.pipeline.runner import Runtime, Stage
-from v2p_data.stages import copy_tasks, dataset_stage, episodes_stage
+from v2p_data.stages import dataset_stage, episodes_stage
 
 MAKER = "ann_of_green_gables"
 QUICK = (

@@ -14,11 +14,19 @@ from v2p_data.cli import run
 from v2p_data.episodes.hub import Pushed, push_dataset, push_envhub, push_policy
 from v2p_data.errors import V2PError
 
+INFO = {
+    "codebase_version": "v3.0",
+    "fps": 20,
+    "features": {},
+    "total_episodes": 0,
+    "total_frames": 0,
+}
+
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> Path:
     (tmp_path / "dataset/meta").mkdir(parents=True)
-    (tmp_path / "dataset/meta/info.json").write_text(json.dumps({"codebase_version": "v3.0"}))
+    (tmp_path / "dataset/meta/info.json").write_text(json.dumps(INFO))
     return tmp_path / "dataset"
 
 
@@ -153,7 +161,7 @@ def test_whichever_request_breaks_off_the_version_that_loads_is_a_whole_one(
     old, new = tmp_path / "old", tmp_path / "new"
     for root, name in ((old, "a"), (new, "b")):
         (root / "meta").mkdir(parents=True)
-        (root / "meta/info.json").write_text(json.dumps({"codebase_version": "v3.0", "of": name}))
+        (root / "meta/info.json").write_text(json.dumps({**INFO, "of": name}))
         (root / f"{name}.mp4").write_bytes(name.encode() * 5000)
         (root / "data").mkdir()
         (root / f"data/{name}.txt").write_text(name)
@@ -206,7 +214,7 @@ def test_a_hub_without_xet_storage_gets_large_files_the_older_way(
 def push_any(kind: str, folder: Path, *, private: bool) -> Pushed:
     """Push a small thing of each kind."""
     files = {
-        "dataset": {"meta/info.json": '{"codebase_version": "v3.0"}'},
+        "dataset": {"meta/info.json": json.dumps(INFO)},
         "policy": {"config.json": '{"type": "act"}', "model.safetensors": "weights"},
         "envhub": {"env.py": ""},
     }[kind]

@@ -28,10 +28,10 @@ from v2p_data.reward.methods import in_place_of_reward, save_bundle
 from v2p_data.reward.reflect import proposals
 from v2p_data.reward.search import search_reward
 from v2p_data.reward.worker import run_job
-from v2p_data.stages import REWARD_SEARCH_FOLDER, EngineConfig, chain
+from v2p_data.stages import EngineConfig, chain
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.splice import rest_part, reward_part, with_reward
-from v2p_data.task.task import TaskBundle
+from v2p_data.task.task import REWARD_SEARCH_FOLDER, TaskBundle
 from v2p_data.video.captions import VideoItem
 
 TESTS = Path(__file__).parents[1]

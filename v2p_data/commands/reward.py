@@ -25,9 +25,9 @@ from v2p_data.reward.config import Limits, RewardConfig
 from v2p_data.reward.feedback import Feedback
 from v2p_data.reward.methods import reward_text, writes_success
 from v2p_data.reward.search import SEARCH_FILE, How, search_reward
-from v2p_data.stages import REWARD_SEARCH_FOLDER, reward_stage, scene_stage, task_stage
+from v2p_data.stages import reward_stage, scene_stage, task_stage
 from v2p_data.task.generate import AUDIT_FILE
-from v2p_data.task.task import TaskBundle
+from v2p_data.task.task import REWARD_SEARCH_FOLDER, TaskBundle
 
 BARS = "▁▂▃▄▅▆▇█"
 CURVE_WIDTH = 40

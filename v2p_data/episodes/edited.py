@@ -28,6 +28,7 @@ from v2p_data.episodes.tables import (
     row_spans,
     tasks_of,
 )
+from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import read_record
 from v2p_data.pipeline.contents import Damage, damages, demand_no
@@ -80,7 +81,11 @@ def demand_sound(root: Path, memory: Path | None = None) -> Changed:
     Raises:
         V2PError: says what is wrong where, and what to do.
     """
-    read_info(root)
+    try:
+        read_info(root)
+    except V2PError:
+        demand_no(list(changed_files(root, memory).damaged), root)
+        raise
     demand_bounded(root)
     changed = changed_files(root, memory)
     demand_no(list(changed.damaged), root)

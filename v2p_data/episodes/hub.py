@@ -15,6 +15,7 @@ file has arrived, so nobody loads half a version.
 import logging
 import os
 import re
+import shutil
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -151,7 +152,7 @@ def push_policy(
         V2PError: no policy, links in it, no token, or the Hub refuses; says what to do.
     """
     check_repo_id(repo_id)
-    demand_plain_files(folder)
+    demand_plain_files(folder, shutil.ignore_patterns("*.tmp"))  # which is not sent
     missing = [name for name in POLICY_FILES if not (folder / name).is_file()]
     if missing:
         raise V2PError(

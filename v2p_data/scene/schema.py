@@ -19,8 +19,8 @@ from pydantic import (
 )
 
 from v2p_data.errors import V2PError
+from v2p_data.letters import is_shown
 from v2p_data.scene.files import is_plain_path, own_file, read_own
-from v2p_data.video.checked import is_shown
 
 Role = Literal["manipulated", "reference", "tool", "container", "cover"]
 Shape = Literal["box", "cylinder", "sphere", "mesh"]

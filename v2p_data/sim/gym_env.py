@@ -44,14 +44,15 @@ def stream_seed(seed: int) -> int:
 
 
 def demand_no_options(options: dict[str, Any] | None) -> None:
-    """Raise where `reset` is given options: none would be heeded.
+    """Raise where `reset` is given options: none would be heeded. LeRobot's own tell that a rollout begins.
 
     Raises:
         V2PError: names them.
     """
-    if options:
+    unheeded = [str(name) for name in options or () if not str(name).startswith("lerobot_")]
+    if unheeded:
         raise V2PError(
-            f"reset takes a seed and no options, got {', '.join(map(str, options))}; what can be set is given when the "
+            f"reset takes a seed and no options, got {', '.join(unheeded)}; what can be set is given when the "
             "environment is made"
         )
 

@@ -12,6 +12,8 @@ from xml.parsers import expat
 
 from v2p_data.errors import V2PError
 
+ROBOT_FOLDER = "robot"
+"""Of a task folder: copies of another arm's files."""
 MAX_XML_BYTES = 4_000_000
 MAX_FILE_BYTES = 64_000_000
 MAX_TOTAL_BYTES = 256_000_000

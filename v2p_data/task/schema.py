@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Discriminator, Field, StringConstraints, Ta
 
 from v2p_data.scene.files import is_plain_path, read_own
 from v2p_data.scene.schema import FileModel, Name, Place, Slug, Words, parsed
-from v2p_data.task.task import ROBOT_FOLDER
+from v2p_data.task.robot_files import ROBOT_FOLDER
 
 MAX_TASK_BYTES = 1_000_000
 MAX_CODE_BYTES = 200_000

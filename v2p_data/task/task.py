@@ -26,8 +26,8 @@ from v2p_data.scene.scene import SCENE_FILE, Scene, SceneObject
 TASK_FILE = "task.json"
 CODE_FILE = "task.py"
 SCENE_FOLDER = "scene"
-ROBOT_FOLDER = "robot"
-"""Copies of another arm's files."""
+REWARD_SEARCH_FOLDER = "search"
+"""What was tried to find the reward, where it was searched."""
 BASE_OBSERVATION_DIM = 90
 """Length of `states['base_observation']`, the same for every task so that experts can warm-start each other."""
 
@@ -168,7 +168,7 @@ class TaskBundle:
         Raises:
             V2PError: the scene's folder holds links, or the robot is not described as it should be.
         """
-        from v2p_data.task.robot_files import copy_robot
+        from v2p_data.task.robot_files import ROBOT_FOLDER, copy_robot
 
         copy_folder(
             self.scene.folder,
@@ -250,7 +250,7 @@ def told_of(folder: Path) -> Iterator[None]:
 
 def _own_robot(folder: Path, path: str) -> Path:
     """Return a task's own robot file; all that it names must be plain files in the task's folder."""
-    from v2p_data.task.robot_files import MAX_FILE_BYTES, robot_files
+    from v2p_data.task.robot_files import MAX_FILE_BYTES, ROBOT_FOLDER, robot_files
 
     main = own_file(folder, path, MAX_FILE_BYTES)
     root = Path(os.path.abspath(folder))  # noqa: PTH100 - links are looked for below

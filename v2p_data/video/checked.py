@@ -7,21 +7,10 @@ from collections.abc import Iterable
 from typing import Any
 
 from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.letters import JOINERS, UNSEEN, is_shown
 
 MAX_WORDS = 2000
 """Letters; what is longer is no caption and no name."""
-
-_JOINERS = "\u200c\u200d"
-"""Without width, but part of how Persian, Hindi and many emoji are written."""
-_UNSEEN = re.compile(
-    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0d\uffa0\U000e0000-\U000e0fff]"
-)
-"""Letters and marks that Unicode lets everybody leave out (Default_Ignorable), where Python calls them printable."""
-
-
-def is_shown(char: str) -> bool:
-    """Return whether a reader sees a character, or a joiner of those beside it: the one rule for texts of people."""
-    return (char.isprintable() and not _UNSEEN.match(char)) or char in _JOINERS
 
 
 def check_keys(data: dict[str, Any], known: tuple[str, ...], where: str) -> None:
@@ -47,7 +36,7 @@ def words(value: Any, what: str) -> str:
     seen = (c if is_shown(c) else "" if _is_mark(c) else " " for c in value)
     text = " ".join(unicodedata.normalize("NFC", "".join(seen)).split())
     text = re.sub(
-        rf"(?<!\S)[{_JOINERS}]+|[{_JOINERS}]+(?!\S)|(?<=[{_JOINERS}])[{_JOINERS}]+", "", text
+        rf"(?<!\S)[{JOINERS}]+|[{JOINERS}]+(?!\S)|(?<=[{JOINERS}])[{JOINERS}]+", "", text
     )
     if not any(c.isalnum() for c in text):
         raise V2PError(f"{what} is empty; say in words what happens or what it is")
@@ -55,7 +44,7 @@ def words(value: Any, what: str) -> str:
 
 
 def _is_mark(char: str) -> bool:
-    return unicodedata.category(char) == "Cf" or _UNSEEN.match(char) is not None
+    return unicodedata.category(char) == "Cf" or UNSEEN.match(char) is not None
 
 
 def numbers(value: Any, count: int, what: str) -> list[float]:
