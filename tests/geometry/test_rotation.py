@@ -141,6 +141,17 @@ def test_pointing_down_is_a_rotation_vector_about_the_tool_axis():
     np.testing.assert_allclose(out, np.stack([0 * yaw, 0 * yaw, -yaw]), atol=1e-12)
 
 
+@pytest.mark.parametrize("past_pi", [-1e-3, -1e-9, 1e-9, 1e-3])
+def test_a_rotation_vector_near_pi_is_that_of_scipy_whatever_the_quaternions_sign(past_pi):
+    quat = rotation.quats_pointing_down(np.array([np.pi + past_pi, -np.pi - past_pi]))
+    down = Rotation.from_quat((0, 1, 0, 0), scalar_first=True)
+
+    out = rotation.rotvec_from_down(quat)
+
+    np.testing.assert_allclose(out.T, (down.inv() * scipy_of(quat)).as_rotvec(), atol=1e-12)
+    np.testing.assert_array_equal(rotation.rotvec_from_down(-quat), out)
+
+
 def test_a_yaw_is_a_rotation_vector_about_z():
     yaw = rng_for(0, "yaws").uniform(-3, 3, N)
 

@@ -440,3 +440,38 @@ def test_the_robots_file_and_settings_are_part_of_the_tasks_recipe(
     assert recipe(replace(six, path=copy)) == before
     copy.write_text(ARM.replace("0.4", "0.5"))
     assert recipe(replace(six, path=copy)) != before
+
+
+BALL = '<body name="ball" pos="0.5 0 0.5"><freejoint/><geom name="ball" size="0.03"/></body>'
+DRAWER = '<body name="drawer" pos="1 0 0.3"><joint type="slide"/><geom size="0.05"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("scenery", "after"),
+    [
+        ('<geom type="plane" size="2 2 .1"/><light pos="0 0 3"/><camera name="view"/>', ""),
+        (BALL, '<contact><pair geom1="ball" geom2="palm"/></contact>'),
+        (DRAWER, '<option gravity="0 0 0"/>'),
+    ],
+    ids=["floor, light, camera", "free ball that is to touch", "drawer"],
+)
+@pytest.mark.filterwarnings("ignore:Attach conflict")
+def test_scenery_in_a_robots_file_touches_nothing_and_moves_no_joint_of_the_arm(
+    scenery: str, after: str, six: RobotConfig, world_of: Callable[..., World]
+):
+    plain = world_of(six)
+    assert six.path is not None
+    text = ARM.replace("<worldbody>", "<worldbody>" + scenery).replace("</mujoco>", after)
+    six.path.write_text(text + "</mujoco>")
+
+    world = world_of(six)
+
+    def colliding(model: mujoco.MjModel) -> set[str]:
+        return {model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i]}
+
+    assert colliding(world.model) == colliding(plain.model)
+    assert (world.model.npair, world.model.nu) == (0, plain.model.nu)
+    assert world.model.opt.gravity.tolist() == plain.model.opt.gravity.tolist()
+    names = [[w.model.joint(i).name for i in range(w.model.njnt)] for w in (plain, world)]
+    assert [n for n in names[1] if n in names[0]] == names[0]
+    assert world.robot.arm.stop == world.robot.fingers.start

@@ -14,6 +14,7 @@ from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.sim.batch_env import BatchEnv
 from v2p_data.sim.robot import COARSE
+from v2p_data.sim.solids import _is_closed, read_mesh, solids_of
 from v2p_data.sim.task_check import check_reward, check_task
 from v2p_data.sim.world import build_world
 from v2p_data.task.task import Task, TaskBundle
@@ -93,8 +94,76 @@ def test_a_mesh_in_millimetres_is_brought_to_the_objects_size_with_a_warning(
     np.testing.assert_allclose(np.ptp(world.objects[0].hull, axis=0), SIZE, rtol=1e-6)
 
 
+CUBE = trimesh.creation.box(extents=SIZE)
+
+
+def two_cubes(first: int, second: int) -> np.ndarray:
+    """Return the faces of two cubes, each with its vertices in the order given by a step of 1 or -1."""
+    return np.concatenate([CUBE.faces[:, ::first], CUBE.faces[:, ::second] + 8])
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [(1, 1), (-1, 1), (1, -1), (-1, -1)], ids=["++", "-+", "+-", "--"]
+)
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_pieces_of_a_mesh_that_are_inside_out_weigh_what_they_weigh_outside_out(
+    tmp_path, first, second, share
+):
+    small = CUBE.vertices * share + [0.05 + 0.03 * share, 0, 0]
+    path = tmp_path / "thing.obj"
+    path.write_text(obj_text(np.concatenate([CUBE.vertices, small]), two_cubes(first, second)))
+
+    mended = read_mesh(path, "thing")
+
+    assert _is_closed(mended, path, "thing")
+    # 6 cm a side, and `share` of that
+    assert mended.volume == pytest.approx(0.06**3 * (1 + share**3), rel=1e-6)
+
+
+@pytest.mark.parametrize("way", [1, -1], ids=["outside out", "inside out"])
+def test_a_closed_cavity_stays_a_cavity(tmp_path, way):
+    path = tmp_path / "thing.obj"
+    vertices = np.concatenate([CUBE.vertices, 0.5 * CUBE.vertices])
+    path.write_text(obj_text(vertices, two_cubes(way, -way)))
+    mesh = read_mesh(path, "thing")
+
+    assert _is_closed(mesh, path, "thing")
+    assert mesh.volume == pytest.approx(0.06**3 * (1 - 0.5**3), rel=1e-6)
+
+
+STRAY = np.array([[0.2, 0, 0], [0.21, 0, 0], [0.2, 0.01, 0]])
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [
+        np.concatenate([CUBE.faces, CUBE.faces]),
+        np.concatenate([CUBE.faces, CUBE.faces[:5, ::-1]]),
+        np.concatenate([CUBE.faces, [[0, 0, 1], [1, 1, 1]]]),
+        np.concatenate([CUBE.faces, [[8, 9, 10]]]),
+    ],
+    ids=["twice", "some on both sides", "without area", "a stray triangle"],
+)
+def test_faces_that_enclose_nothing_do_not_change_a_mesh(tmp_path, caplog, faces):
+    path = tmp_path / "thing.obj"
+    path.write_text(obj_text(np.concatenate([CUBE.vertices, STRAY]), faces))
+
+    solids = solids_of(path, "thing", SIZE)
+
+    assert "hull is used" not in caplog.text
+    assert solids.body.volume == pytest.approx(0.06**3, rel=1e-6)
+
+
+def test_a_sheet_of_a_fifth_of_a_millimetre_is_thickened(world_of, caplog):
+    world = world_of(trimesh.creation.box(extents=(0.08, 0.05, 0.0002)), (0.08, 0.05, 0.0006))
+
+    assert "thickened to 10 mm" in caplog.text
+    assert np.ptp(world.objects[0].hull, axis=0) == pytest.approx((0.08, 0.05, 0.01))
+
+
 NAN_VERTEX = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv nan 0 0.1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n"
 POINT = "v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n"
+TRIANGLE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n"
 LINE = "v 0 0 0\nv 0.1 0.1 0.1\nv 0.2 0.2 0.2\nf 1 2 3\n"
 SLANTED_SHEET = "v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n"
 MISSING_VERTEX = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 .1\nf 1 2 9\nf 1 2 4\nf 1 2 3\n"
@@ -107,12 +176,23 @@ MISSING_VERTEX = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 .1\nf 1 2 9\nf 1 2 4\nf 1
         (NAN_VERTEX.replace("nan", "1e308"), "mesh_not_finite", "1 of 4 vertices"),
         (POINT, "flat_mesh", "encloses nothing"),
         (LINE, "flat_mesh", "encloses nothing"),
+        (TRIANGLE, "flat_mesh", "encloses nothing"),
         (SLANTED_SHEET, "flat_mesh", "encloses nothing"),
         (MISSING_VERTEX, "mesh_unreadable", "thing.obj"),
         ("", "mesh_unreadable", "no faces"),
         ("hello\x00 world", "mesh_unreadable", "no faces"),
     ],
-    ids=["NaN", "far away", "point", "line", "slanted sheet", "missing vertex", "empty", "text"],
+    ids=[
+        "NaN",
+        "far away",
+        "point",
+        "line",
+        "triangle",
+        "slanted sheet",
+        "missing vertex",
+        "empty",
+        "text",
+    ],
 )
 def test_a_hopeless_mesh_is_refused_by_object_and_file(world_of, text, reason, says):
     with pytest.raises(ItemRejectedError, match=r"'thing' in .*thing\.obj") as caught:

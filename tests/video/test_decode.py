@@ -2,6 +2,7 @@
 
 import struct
 from fractions import Fraction
+from typing import Any
 
 import av
 import numpy as np
@@ -374,20 +375,113 @@ def test_a_long_clip_holds_its_frames_and_nothing_more(film):
     assert np.abs(shown - clip.source_frame).max() <= 2
 
 
-def test_a_picture_that_changes_its_size_keeps_that_of_its_beginning(film, tmp_path):
-    path = tmp_path / "joined.mp4"
-    parts = [
-        film(f"{i}.ts", flat(value, 10, height, width))
-        for i, (value, height, width) in enumerate(
-            [(60, 96, 128), (120, 192, 256), (180, 120, 64)]
-        )
-    ]
+def joined(film, tmp_path, *films):
+    """Return transport streams one after the other in one file: each begins at time 0 again."""
+    path = tmp_path / "joined.ts"
+    parts = [film(f"{i}.ts", frames) for i, frames in enumerate(films)]
     path.write_bytes(b"".join(part.read_bytes() for part in parts))
+    return path
+
+
+def test_a_picture_that_changes_its_size_keeps_that_of_its_beginning(film, tmp_path):
+    path = joined(film, tmp_path, flat(60), flat(120, 10, 192, 256), flat(180, 10, 72, 96))
 
     clip = read_clip(item(path))
 
-    assert clip.frames.shape[1:3] == (96, 128)
-    assert [clip.frames[i].mean().round(-1) for i in (0, -1)] == [60, 180]
+    assert clip.frames.shape == (30, 96, 128, 3)
+    assert clip.fps == pytest.approx(30)
+    assert [clip.frames[i].mean().round(-1) for i in (0, 15, -1)] == [60, 120, 180]
+
+
+def test_a_picture_that_changes_its_shape_is_cut_there(film, tmp_path):
+    path = joined(film, tmp_path, flat(60), flat(120, 10, 128, 96))
+
+    # ten pictures at 30 per second come before
+    with pytest.raises(
+        ItemRejectedError, match=r"joined\.ts .* at 0\.33 s, from 128 x 96 to 96"
+    ) as error:
+        read_clip(item(path))
+
+    assert (error.value.reason, error.value.value) == ("picture_turns", pytest.approx(1 / 3))
+
+
+def test_a_picture_that_is_turned_on_the_way_is_cut_there(film, tmp_path):
+    path = tmp_path / "turned.ts"
+    # ITU-T H.264, D.1.27: not cancelled, no flips, 90 of 360 degrees as 0x4000 of 0x10000, once, no extension
+    bits = "0" + "00" + f"{0x4000:016b}" + "1" + "0" + "1000"
+    turn = b"\0\0\1\6\x2f\3" + int(bits, 2).to_bytes(3) + b"\x80"
+    with (
+        av.open(str(film("plain.ts", options={"bf": "0"}))) as plain,
+        av.open(str(path), "w") as out,
+    ):
+        stream = out.add_stream_from_template(plain.streams.video[0])
+        for i, packet in enumerate(p for p in plain.demux(video=0) if p.size):
+            new = av.Packet((turn if i >= 10 else b"") + bytes(packet))
+            new.stream, new.pts, new.dts = stream, packet.pts, packet.dts
+            new.time_base, new.is_keyframe = packet.time_base, packet.is_keyframe
+            out.mux(new)
+
+    assert reason_for(path) == "picture_turns"
+
+
+STEPS = [40 * i for i in range(40)]
+
+
+def set_times(path, times_ms):
+    """Write the times of an FLV's pictures (Video File Format 10.1, E.4.1), which libav's writer would refuse."""
+    data, at, times = bytearray(path.read_bytes()), 13, iter(times_ms)
+    while at < len(data):
+        kind, size = data[at], int.from_bytes(data[at + 1 : at + 4])
+        if kind == 9 and (time_ms := next(times, None)) is not None:
+            data[at + 4 : at + 7] = time_ms.to_bytes(3)
+        at += 11 + size + 4
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("times_ms", "jump"),
+    [
+        (STEPS[:20] + [t + 60_000 for t in STEPS[20:]], 60),
+        ([t + 100_000 * (i == 20) for i, t in enumerate(STEPS)], 100),
+        (STEPS[:20] + STEPS[:20], 0),
+        (STEPS[:10] + STEPS[:30], 0),
+        (STEPS[:20] + [STEPS[19]] * 20, 0),
+        ([t - 400 * (i >= 20) for i, t in enumerate(STEPS)], 0),
+        ([t - 40 * (i % 2) for i, t in enumerate(STEPS)], 0),
+    ],
+    ids=["a minute on", "one far off", "from 0", "early from 0", "stands", "back", "twice each"],
+)  # fmt: skip
+def test_pictures_follow_one_another_where_the_clock_does_not(film, times_ms, jump):
+    path = set_times(film("clock.flv", squares(40, 96, 256), codec="flv", fps=25), times_ms)
+
+    clip = read_clip(item(path))
+
+    assert clip.source_frame.tolist() == list(range(40))
+    assert clip.fps == pytest.approx(25, rel=0.03)
+    assert [f"by {jump} s in all" in w for w in clip.warnings] == [True] * (jump > 0)
+
+
+@pytest.mark.parametrize("name", ["a.mkv", "a.webm", "a.mp4", "a.ts"])
+def test_a_film_whose_clock_begins_late_is_no_long_film(film, name):
+    codec = "libvpx" if name.endswith("webm") else "libx264"
+    path = film(name, codec=codec, pts_ms=[3_600_000 + 40 * i for i in range(20)])
+
+    clip = read_clip(item(path))
+
+    assert (len(clip.frames), clip.warnings) == (20, ())
+    assert clip.fps == pytest.approx(25, rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.ts", "a.flv"])
+def test_a_film_without_a_picture_has_a_reason(tmp_path, name):
+    path = tmp_path / name
+    with av.open(str(path), "w") as out:
+        stream: Any = out.add_stream("mpeg4" if name != "a.flv" else "flv", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        out.start_encoding()
+
+    assert reason_for(path) in ("no_video_stream", "unreadable", "too_few_frames", "empty_file")
 
 
 def test_hints_follow_scaling_and_sampling(film):

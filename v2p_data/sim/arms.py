@@ -386,8 +386,8 @@ def _span(addresses: list[int], what: str) -> slice:
 
 
 def _strip(spec: Any, cfg: RobotConfig) -> None:
-    """Remove what drives, measures or couples the fingers in the file; the world brings its own."""
-    for elements in (spec.actuators, spec.sensors, spec.keys):
+    """Remove what drives, measures, pairs for contact or couples the fingers; the world brings its own."""
+    for elements in (spec.actuators, spec.sensors, spec.keys, spec.pairs):
         for element in list(elements):
             spec.delete(element)
     for equality in list(spec.equalities):

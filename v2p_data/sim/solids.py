@@ -77,12 +77,13 @@ def solids_of(
     """
     cfg = cfg or ConvexConfig()
     mesh = read_mesh(path, name)
+    is_closed = _is_closed(mesh, path, name)
     low, high = mesh.bounds
     _tell_scale(path, name, high - low, np.asarray(size_m))
     outer = np.asarray(mesh.vertices, float)
     outer = outer[_extreme(outer)] if len(outer) > FINE_VERTICES else outer
     found = [_hull(outer, cfg.hull_vertices)]
-    if _is_closed(mesh, path, name):
+    if is_closed:
         ratio = trimesh.convex.convex_hull(outer).volume / _volume(mesh)
         if ratio > cfg.concave_above:
             if len(ready) > 1:
@@ -175,21 +176,58 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
 def _is_closed(mesh: trimesh.Trimesh, path: Path, name: str) -> bool:
     """Mend holes and normals in place where that is simple, and return whether the mesh encloses a volume."""
     where = f"mesh of '{name}' in {path}"
+    is_fine = len(mesh.faces) > FINE_FACES
+    if not mesh.is_watertight and not is_fine:
+        a, b, c = mesh.faces.T
+        mesh.update_faces(mesh.unique_faces() & (a != b) & (b != c) & (c != a))
     if not mesh.is_watertight:
         open_edges = len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1))
-        if len(mesh.faces) <= FINE_FACES:
+        if not is_fine:
             mesh.fill_holes()
         if not mesh.is_watertight:
             logger.warning("%s has holes (%d open edges): its hull is used", where, open_edges)
             return False
         logger.warning("%s had small holes (%d open edges), which are closed", where, open_edges)
-    if not mesh.is_winding_consistent and len(mesh.faces) <= FINE_FACES:
+    if not mesh.is_winding_consistent and not is_fine:
         trimesh.repair.fix_normals(mesh, multibody=True)
         logger.warning("%s had faces turned inwards, which are turned around", where)
-    if _volume(mesh) < 0:
+    if mesh.is_winding_consistent and not is_fine:
+        _mend_components(mesh, where)
+    elif _volume(mesh) < 0:
         mesh.invert()
         logger.warning("%s is inside out and is turned around", where)
     return bool(mesh.is_winding_consistent and _volume(mesh) > 0)
+
+
+def _mend_components(mesh: trimesh.Trimesh, where: str) -> None:
+    """Drop closed surfaces that enclose nothing, and turn outwards those that are inside out.
+
+    A surface within another one is its cavity, or a solid in it, and is turned with it.
+    """
+    labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    corners = np.asarray(mesh.vertices, float)[mesh.faces]
+    corners = corners - corners.mean((0, 1))
+    a, b, c = corners.swapaxes(0, 1)
+    volumes = np.bincount(labels, np.einsum("nk,nk->n", a, np.cross(b, c)) / 6)
+    order = np.argsort(-np.abs(volumes), kind="stable")
+    boxes = {
+        k: (corners[labels == k].min((0, 1)), corners[labels == k].max((0, 1))) for k in order
+    }
+    is_turned = np.zeros(len(volumes), bool)
+    for at, k in enumerate(order):
+        low, high = boxes[k]
+        around = [
+            j for j in order[:at] if (boxes[j][0] <= low).all() and (high <= boxes[j][1]).all()
+        ]
+        is_turned[k] = is_turned[around[-1]] if around else volumes[k] < 0
+    is_empty = np.abs(volumes) <= FLAT_RATIO**2 * np.abs(volumes).max()
+    if (is_turned & ~is_empty).any():
+        mesh.faces = np.where(is_turned[labels][:, None], mesh.faces[:, ::-1], mesh.faces)
+        logger.warning("%s is inside out and is turned around", where)
+    if is_empty.any():
+        mesh.update_faces(~is_empty[labels])
+        mesh.remove_unreferenced_vertices()
+        logger.warning("%s has %d flat pieces, which are left out", where, is_empty.sum())
 
 
 def _tell_scale(

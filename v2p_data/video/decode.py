@@ -43,6 +43,10 @@ _TRUNCATED = 0.8
 """Below this share of the promised frames a file counts as cut off."""
 _UNEVEN = 1.5
 """A gap longer than this many usual gaps makes a file one with varying frame rate."""
+_JUMP_S = 10.0
+"""No picture of a motion stays for longer: the clock jumped."""
+_OTHER_SHAPE = 1.1
+"""Width over height changes by less where a stream only changes its size, in whole blocks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +94,7 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
 
     Raises:
         ItemRejectedError: `empty_file`, `unreadable`, `truncated`, `no_video_stream`, `odd_angle`, `too_few_frames`,
-            `too_small`, `too_large`, `too_long` or `too_slow`; `bad_hint` where a hint marks what the video does not have.
+            `picture_turns`, `too_small`, `too_large`, `too_long` or `too_slow`; `bad_hint` where a hint marks what the video does not have.
     """
     film = _decode(item.path, cfg)
     total = film.seen
@@ -103,6 +107,11 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
         warnings.append(f"{detail}; the rest of the motion is missing")
     elif film.broken and total >= cfg.min_frames:
         warnings.append(f"{name} has {film.broken} damaged places; frames there may be missing")
+    if film.jumps:
+        warnings.append(
+            f"the clock of {name} jumps in {film.jumps} places, by {film.jumped_s:.0f} s in all; its pictures are "
+            "taken to follow one another"
+        )
     if total < cfg.min_frames:
         if film.broken:
             raise ItemRejectedError(
@@ -170,6 +179,9 @@ class _Film:
     """When each kept picture is shown, from the first one."""
     duration_s: float = 0.0
     """From the first frame to the last."""
+    jumps: int = 0
+    jumped_s: float = 0.0
+    """What the file's clock skipped; left out of the times."""
     shown_px: tuple[int, int] = (0, 0)
 
     @property
@@ -179,7 +191,7 @@ class _Film:
         A last picture may be shown for long, and the rate may vary, so neither is enough by itself.
         """
         few = self.seen < _TRUNCATED * self.promise.frames
-        early = self.duration_s < _TRUNCATED * self.promise.seconds
+        early = self.duration_s + self.jumped_s < _TRUNCATED * self.promise.seconds
         return few and (early or not self.promise.seconds)
 
     def keep(self, pixels: UInt8[np.ndarray, "h w 3"], time_s: float, most: int) -> None:
@@ -265,6 +277,7 @@ def _film_of(container: "av.container.InputContainer", path: Path, cfg: VideoCon
         if picture is None:
             picture = _Picture.of(path, frame, stream, cfg)
             film.shown_px = picture.shown_px
+        picture.check_shape(path, frame, seen_s)
         if film.times_s and seen_s - film.times_s[-1] < 0.75 * step:
             del frame
             continue
@@ -292,8 +305,8 @@ def _timed_frames(
 ) -> Iterator[tuple[float, VideoFrame]]:
     """Yield every frame with its time from the first; count them, and the packets that fail, in `film`."""
     deadline = time.thread_time() + cfg.max_decode_s
-    first: float | None = None
-    last = -1.0
+    start: float | None = None
+    last, gap = 0.0, 1 / rate
     for packet in _packets(container, stream, film):
         if time.thread_time() > deadline:
             raise ItemRejectedError(
@@ -311,11 +324,19 @@ def _timed_frames(
             frame = frames.pop(0)
             if not isinstance(frame, VideoFrame) or is_before_start(container, frame):
                 continue
-            shown = frame.time
-            if shown is None or (first is not None and shown - first <= last):
-                shown = (first or 0.0) + last + 1 / rate if film.seen else 0.0
-            first = shown if first is None else first
-            last = shown - first
+            if start is None:
+                start = frame.time or 0.0
+            else:
+                shown = last if frame.time is None else frame.time - start
+                if shown <= last:  # no time, the same one again, or an earlier one
+                    last += gap
+                elif shown - last > _JUMP_S + gap:
+                    film.jumps += 1
+                    film.jumped_s += shown - last - gap
+                    start += shown - last - gap
+                    last += gap
+                else:  # a jump makes the container's mean rate too low
+                    last, gap = shown, min(1 / rate, shown - last)
             film.seen += 1
             film.duration_s = last
             yield last, frame
@@ -341,6 +362,7 @@ def _packets(
 class _Picture:
     """How the frames of one file become pictures of one size."""
 
+    stored_px: tuple[int, int]
     width_px: int
     height_px: int
     orientation: Orientation
@@ -357,11 +379,27 @@ class _Picture:
         orientation = orientation_of(frame, path)
         shown = round(width), round(height)
         return _Picture(
+            stored_px=(frame.width, frame.height),
             width_px=max(2, 2 * round(width * scale / 2)),
             height_px=max(2, 2 * round(height * scale / 2)),
             orientation=orientation,
             shown_px=(shown[1], shown[0]) if orientation.swaps_axes else shown,
         )
+
+    def check_shape(self, path: Path, frame: VideoFrame, time_s: float) -> None:
+        """Refuse a frame that would be stretched, or shown turned in another way than the first one."""
+        width, height = self.stored_px
+        change = (frame.width * height) / (frame.height * width)
+        if (
+            not 1 / _OTHER_SHAPE < change < _OTHER_SHAPE
+            or orientation_of(frame, path) != self.orientation
+        ):
+            raise ItemRejectedError(
+                "picture_turns",
+                f"{path.name} changes the shape or the turn of its picture at {time_s:.2f} s, from {width} x {height} "
+                f"to {frame.width} x {frame.height} px as stored; cut it there",
+                time_s,
+            )
 
     def rgb(self, frame: VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
         """Return the frame as a player shows it; what is transparent is white."""

@@ -82,13 +82,16 @@ def promise_of(
 ) -> Promise:
     """Return how much of the film there should be, as its edit list cuts it; sound may last longer."""
     seconds = 0.0
+    # Matroska notes when a film ends, whenever it begins
+    late_s = max(0.0, float((film.start_time or 0) * (film.time_base or 0)))
+    late_s = late_s if "matroska" in container.format.name else 0.0
     if film.duration and film.time_base:
         # Fragmented files: frames before time zero are not shown, but the container still counts them.
         seconds = float((film.duration + min(0, film.start_time or 0)) * film.time_base)
     if seconds <= 0:
-        seconds = _tagged_s(film.metadata)
+        seconds = _tagged_s(film.metadata) - late_s
     if seconds <= 0 and len(container.streams) == 1:
-        seconds = (container.duration or 0) / av.time_base
+        seconds = (container.duration or 0) / av.time_base - late_s
     frames = round(seconds * rate)
     if film.frames:  # those that an edit list leaves out are counted too
         frames = min(max(1, frames), film.frames) if seconds > 0 else film.frames
