@@ -40,6 +40,7 @@ def ran(words: list[str], where: Path, **variables: str) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.timeout(500)
 def test_the_notebook_runs_on_a_run_of_one_clip(tmp_path: Path):

@@ -128,6 +128,7 @@ def test_a_click_beside_the_object_is_refused_and_changes_nothing(home, click):
     assert (home / "videos" / "captions.json").read_bytes() == before
 
 
+@pytest.mark.long
 def test_what_somebody_writes_into_the_captions_meanwhile_stays(home, click):
     path = home / "videos" / "captions.json"
     with session_of(home) as session:

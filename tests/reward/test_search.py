@@ -239,6 +239,7 @@ def test_the_benchmark_trains_what_halving_stopped_to_the_end(
     assert re.fullmatch(r"success_lost: -?\d\.\d{3}", lines[-1])
 
 
+@pytest.mark.long
 def test_the_benchmark_spends_a_searchs_steps_on_its_first_round_and_judges_all_on_the_same_episodes(
     bundle: TaskBundle, jobs: Jobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

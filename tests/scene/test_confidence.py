@@ -47,6 +47,7 @@ def test_a_caption_that_names_another_colour_than_what_moves_is_turned_away(draw
     assert caught.value.reason in ("object_not_found", "low_confidence")
 
 
+@pytest.mark.long
 def test_without_the_gate_the_same_clip_goes_through(draw):
     clip = draw(caption="Pushing red mug from right to left", objects=("red mug",))
 

@@ -113,6 +113,7 @@ def test_a_camera_that_travels_is_turned_away(draw):
     assert caught.value.value > 3
 
 
+@pytest.mark.long
 def test_a_camera_that_sways_shows_the_same_as_one_that_stands(draw, pushed):
     swayed = rebuild(draw(shake_px=14.0, hints={"blue box": {"size_m": list(SIZE_M)}}))
 
@@ -164,6 +165,7 @@ def test_a_box_around_the_object_leads_to_the_same_place(draw, pushed):
     assert both.sum() / (hinted.masks[0] | pushed.objects[0].masks[0]).sum() > 0.8
 
 
+@pytest.mark.long
 def test_a_box_around_the_object_on_its_way_leads_to_the_same_place(draw, pushed):
     own = pushed.objects[0]
     frame = min(own.masks, key=lambda i: abs(i - 18))

@@ -202,6 +202,7 @@ def test_a_hopeless_mesh_is_refused_by_object_and_file(world_of, text, reason, s
     assert says in caught.value.detail
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_mesh_of_a_million_faces_takes_seconds(world_of):
     sphere = trimesh.creation.icosphere(subdivisions=8, radius=0.03)  # 1.3 million

@@ -111,6 +111,7 @@ def test_only_what_tells_a_place_is_a_mark(prepared, hint, is_mark):
     assert has_marks(replace(prepared.clip, hints={"blue box": hint})) == is_mark
 
 
+@pytest.mark.long
 def test_a_sure_scene_is_searched_once(prepared, monkeypatch):
     searched = []
     original = steps._grounded
@@ -121,6 +122,7 @@ def test_a_sure_scene_is_searched_once(prepared, monkeypatch):
     assert len(searched) == 1
 
 
+@pytest.mark.long
 def test_the_surer_scene_of_both_is_kept(prepared, monkeypatch):
     values = iter([0.4, 0.4, 0.6, 0.6])
     monkeypatch.setattr(steps, "confidence_of", lambda _cues: next(values))
