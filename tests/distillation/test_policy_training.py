@@ -16,6 +16,7 @@ from policies.bc.trainer import TrainerConfig
 from v2p_data.distillation import rounds
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.rounds import handover_episodes
+from v2p_data.episodes import packing
 from v2p_data.episodes.collect import staged_episodes
 from v2p_data.episodes.verify import verify
 from v2p_data.pipeline.artifact import write_record

@@ -252,7 +252,7 @@ def demo_command(argv: list[str]) -> int:
     cfg = load_settings(settings, EngineConfig)
     runtime = args.how.runtime(root)
     print(  # noqa: T201
-        "v2p demo: three clips become tasks, experts, a dataset, a policy and a page; about 15 minutes on two"
+        "v2p demo: three clips become tasks, experts, a dataset, a policy and a page; 10 to 15 minutes on two"
         f" cores.\nEverything goes to {root}; running again keeps what is done.",
         flush=True,
     )
