@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable
 from typing import Any, Literal
 
+from v2p_data.letters import JOINERS
+
 NOTHING = 2
 """Exit code: what was asked for was not made."""
 NOT_ALL = 3
@@ -95,8 +97,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def _shown(text: str) -> str:
     if text.isprintable():
         return text
-    # a line end, and joiners that are part of Persian words and of emoji
-    plain = (c.isprintable() or c in "\n\u200c\u200d" for c in text)
+    plain = (c.isprintable() or c == "\n" or c in JOINERS for c in text)
     codes = (
         c if ok else c.encode("unicode_escape").decode() for c, ok in zip(text, plain, strict=True)
     )

@@ -167,7 +167,7 @@ def test_whichever_request_breaks_off_the_version_that_loads_is_a_whole_one(
         (root / f"data/{name}.txt").write_text(name)
 
     def versions() -> list[dict[str, bytes] | None]:
-        """Return what loads by the tag and what lies on the branch."""
+        """Return the files under the tag `v3.0`, None without that tag, and the files on the branch."""
         repo = online.repos["datasets/user/toys"]
         return [repo.commits[repo.tags["v3.0"]] if "v3.0" in repo.tags else None, repo.files]
 

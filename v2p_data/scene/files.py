@@ -117,7 +117,9 @@ def copy_folder(
 def demand_plain_files(
     source: Path, ignore: Callable[[str, list[str]], Iterable[str]] | None = None
 ) -> None:
-    """Demand that what lies in a folder may go elsewhere; the arguments are those of `copy_folder`.
+    """Demand that a folder holds plain files only, so that it may be copied or sent.
+
+    The arguments mean the same as in `copy_folder`.
 
     Raises:
         V2PError: it holds links, special files, or too many files.
