@@ -23,8 +23,8 @@ from v2p_data.episodes.collect import judge_expert
 from v2p_data.reward.candidate import LAST_POLICY
 from v2p_data.reward.worker import ppo_config
 from v2p_data.seeds import seed_for
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.benchmark import load_benchmark
 
 

@@ -29,8 +29,8 @@ from v2p_data.deployment.sight import Seen, Sight
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.segment import points_inside
 from v2p_data.scene.frames.mask_ops import iou
-from v2p_data.sim.gym_env import CONTROL_HZ
-from v2p_data.sim.masks import FIRST_OBJECT, ROBOT, rgb_to_labels
+from v2p_data.sim.render.masks import FIRST_OBJECT, ROBOT, rgb_to_labels
+from v2p_data.sim.wrappers.gym_env import CONTROL_HZ
 from v2p_data.task.task import TaskBundle
 
 PATIENCE_MS = 60_000.0

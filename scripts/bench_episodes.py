@@ -41,7 +41,7 @@ import tyro
 from jaxtyping import Float32
 
 from v2p_data.episodes.collect import EpisodesConfig, collect
-from v2p_data.episodes.features import (
+from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     FPS,
     MASK_KEY,
@@ -50,20 +50,20 @@ from v2p_data.episodes.features import (
     SUCCESS_KEY,
     features,
 )
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.rollouts import Rollouts, roll_out
 from v2p_data.episodes.staging import Episode, staged_episodes
-from v2p_data.episodes.writer import pack
 from v2p_data.seeds import rng_for, seed_for
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.masks import (
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.model.world import CAMERA, build_world
+from v2p_data.sim.render.masks import (
     BACKGROUND,
     PALETTE,
     MaskRenderer,
     geom_labels,
     labels_to_rgb,
 )
-from v2p_data.sim.robot import FINE
-from v2p_data.sim.world import CAMERA, build_world
+from v2p_data.sim.robot.robot import FINE
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 

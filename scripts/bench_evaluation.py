@@ -23,7 +23,7 @@ import tyro
 
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.sim.masks import PALETTE
+from v2p_data.sim.render.masks import PALETTE
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 

@@ -178,12 +178,12 @@ def all_phases() -> dict[str, Phase]:
     import lerobot.datasets.lerobot_dataset  # noqa: F401
 
     from bench_episodes import lift
-    from v2p_data.episodes import shards
     from v2p_data.episodes.collect import EpisodesConfig, collect
-    from v2p_data.episodes.edit import merge
-    from v2p_data.episodes.hub import push_dataset
+    from v2p_data.episodes.dataset import shards
+    from v2p_data.episodes.dataset.edit import merge
+    from v2p_data.episodes.dataset.writer import pack
+    from v2p_data.episodes.hub.hub import push_dataset
     from v2p_data.episodes.staging import staged_episodes
-    from v2p_data.episodes.writer import pack
     from v2p_data.task.benchmark import load_benchmark
 
     shards.SHARD_FRAMES = SHARD_FRAMES
@@ -235,7 +235,7 @@ def toy_phases() -> dict[str, Phase]:
     from v2p_data.evaluation import batch
     from v2p_data.pipeline.runner import Runtime
     from v2p_data.pipeline.workers import only_run_in, run_stages
-    from v2p_data.sim import verdict
+    from v2p_data.sim.env import verdict
     from v2p_data.stages import dataset_stage
 
     quick = ("--policy.preset=small", "--policy.batch-size=8", "--policy.steps=30")

@@ -38,10 +38,10 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
-from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot
-from v2p_data.sim.masks import BACKGROUND, GL_HINT, MaskRenderer, geom_labels
-from v2p_data.sim.world import CAMERA, World
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
+from v2p_data.sim.model.world import CAMERA, World
+from v2p_data.sim.render.masks import BACKGROUND, GL_HINT, MaskRenderer, geom_labels
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples

@@ -23,12 +23,12 @@ from jaxtyping import Bool, Float
 from v2p_data.experts.teacher import Teacher
 from v2p_data.kinds import KINDS
 from v2p_data.seeds import rng_for, seed_for
-from v2p_data.sim import task_code
-from v2p_data.sim.batch_env import HELD_STEPS, BatchEnv, SimConfig
-from v2p_data.sim.verdict import Course
+from v2p_data.sim.env import task_code
+from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv, SimConfig
+from v2p_data.sim.env.verdict import Course
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.generate import TaskConfig, generate_task
-from v2p_data.task.sandbox import class_name
+from v2p_data.task.sandbox.sandbox import class_name
 from v2p_data.task.task import TaskBundle
 
 NOISES = (0.0, 0.3, 0.6, 1.0)

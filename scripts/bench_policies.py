@@ -17,12 +17,12 @@ from typing import Any
 
 from policies.evaluation.rate import Rate, wilson
 from studies.results import append_result, results_in
-from v2p_data.judging import contestant
+from v2p_data.evaluation.judging import contestant
 from v2p_data.pipeline.artifact import Record, read_record
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import run_stages
-from v2p_data.policy_training import sources_of
+from v2p_data.policy.training import sources_of
 from v2p_data.stages import (
     POLICY_FOLDER,
     EngineConfig,

@@ -52,8 +52,8 @@ from policies.ppo.policy import EXPERT_FILE, Expert
 from policies.ppo.train import LAST_FOLDER, train_expert
 from v2p_data.experts.teacher import Teacher
 from v2p_data.seeds import seed_for, torch_rng_for
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.benchmark import load_benchmark
 
 Act = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]

@@ -48,7 +48,7 @@ from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.jobs import REQUEST_FILE, Job, Jobs
 from v2p_data.reward.search import Found, How, search_reward
 from v2p_data.seeds import seed_for
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 

@@ -42,8 +42,8 @@ from policies.ppo.train import LAST_FOLDER, train_expert
 from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for, torch_rng_for
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
 

@@ -33,8 +33,8 @@ from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, learn
 from v2p_data.experts.teacher import Teacher
 from v2p_data.report.sheet import write_contact_sheet
 from v2p_data.seeds import seed_for
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.robot import FINE
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.robot.robot import FINE
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.task import TaskBundle
 

@@ -20,7 +20,7 @@ from v2p_data.deployment.view import allowing_for_place
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.judging import Contestant, contestant, play_of
+from v2p_data.evaluation.judging import Contestant, contestant, play_of
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.judge import TwinJudged, judge_in_twin, true_labels
 from v2p_data.twin.parameters import TwinParameters, changed

@@ -28,8 +28,8 @@ from policies.ppo.evaluate import evaluate
 from policies.ppo.policy import Expert
 from policies.ppo.train import train_expert
 from v2p_data.errors import V2PError
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.benchmark import load_benchmark
 
 
@@ -53,7 +53,7 @@ class Settings:
 
 def speed(num_envs: int, settings: Settings) -> tuple[float, float]:
     """Return control steps per second of the environment and of its physics alone."""
-    from v2p_data.sim.warp_env import WarpBatchEnv
+    from v2p_data.sim.env.warp_env import WarpBatchEnv
 
     env = WarpBatchEnv(
         load_benchmark("lift_up"), num_envs=num_envs, seed=settings.seed, device=settings.device
@@ -81,7 +81,7 @@ def speed(num_envs: int, settings: Settings) -> tuple[float, float]:
 
 def learn(settings: Settings) -> None:
     """Train lifting and print steps, seconds and success in fresh episodes at the fine time step."""
-    from v2p_data.sim.warp_env import WarpBatchEnv
+    from v2p_data.sim.env.warp_env import WarpBatchEnv
 
     bundle, n = load_benchmark("lift_up"), settings.learn_worlds
     env = WarpBatchEnv(bundle, num_envs=n, seed=settings.seed, device=settings.device)

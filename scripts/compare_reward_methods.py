@@ -29,9 +29,9 @@ from v2p_data.reward.jobs import Jobs
 from v2p_data.reward.programs import ProgramPolicy
 from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward
 from v2p_data.seeds import seed_for
-from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.verdict import Course
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.verdict import Course
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 

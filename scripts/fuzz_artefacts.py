@@ -120,7 +120,7 @@ def _try(case: Case, folder: Path, answer: Connection) -> None:
 def _tasks() -> Iterator[tuple[str, Case]]:
     import strangers  # pyright: ignore[reportMissingImports]
 
-    from v2p_data.sim.gym_env import V2PEnv
+    from v2p_data.sim.wrappers.gym_env import V2PEnv
 
     def case(spoil: Callable[[Path], None]) -> Case:
         def opened(folder: Path) -> str:
@@ -139,7 +139,7 @@ def _policies() -> Iterator[tuple[str, Case]]:
     import spoiled  # pyright: ignore[reportMissingImports]
     import torch
 
-    from v2p_data.judging import contestant, play_of
+    from v2p_data.evaluation.judging import contestant, play_of
 
     def case(spoil: Callable[[Path], None]) -> Case:
         def opened(folder: Path) -> str:

@@ -28,13 +28,13 @@ from typing import Any
 import torch
 
 from v2p_data.seeds import rng_for
-from v2p_data.task import smoke_child
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
-from v2p_data.task.confine import leave_the_network
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.reader.refusal import TaskCodeError
-from v2p_data.task.sandbox import CODE_NAME
-from v2p_data.task.smoke import trial_request
+from v2p_data.task.sandbox import smoke_child
+from v2p_data.task.sandbox.confine import leave_the_network
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.reader.refusal import TaskCodeError
+from v2p_data.task.sandbox.sandbox import CODE_NAME
+from v2p_data.task.sandbox.smoke import trial_request
 from v2p_data.task.templates.write import write_samples
 
 ROOT = Path(__file__).parents[1]

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from v2p_data.episodes.staging import Episode, staged_episodes
-from v2p_data.sim.masks import labels_to_rgb
+from v2p_data.sim.render.masks import labels_to_rgb
 
 HEIGHT_PX = 220
 ITEMS = ("lift_red_box", "push_blue_box_left", "tip_green_carton")

@@ -30,7 +30,7 @@ from v2p_data.distillation.rounds import Lesson, distill
 from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.pipeline.artifact import read_record
-from v2p_data.policy_training import ACTION_LIMIT, StudentActor, recorded_under, sources_of
+from v2p_data.policy.training import ACTION_LIMIT, StudentActor, recorded_under, sources_of
 from v2p_data.seeds import seed_for
 from v2p_data.task.task import TaskBundle
 

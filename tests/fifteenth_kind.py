@@ -14,11 +14,11 @@ from v2p_data import kinds
 from v2p_data.experts import teacher
 from v2p_data.experts.primitives import Moment
 from v2p_data.kinds import TaskKind
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.verdict import Course
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.env.verdict import Course
 from v2p_data.task import referee
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.sandbox import class_name
+from v2p_data.task.sandbox.sandbox import class_name
 from v2p_data.task.templates import carrying, recipes
 from v2p_data.task.templates.draft import Draft, Measured
 from v2p_data.task.templates.variants import Variant

@@ -1,6 +1,7 @@
 """The arrows of the house: a room imports only rooms below it."""
 
 import ast
+import functools
 from pathlib import Path
 
 import pytest
@@ -22,13 +23,11 @@ BELOW: dict[str, set[str]] = {
     "task": {"scene", "video", "geometry", "seeds", "kinds"},
     # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
     "sim": {"task", "scene", "geometry", "seeds", "kinds"},
-    # A policy of LeRobot's as files; opening it is for `policies.evaluation`.
-    "checkpoint": {"scene"},
     # It trains policies, as the reward search does: the two rooms below the top that know `policies`.
     "experts": {"sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
     "episodes": {"sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
     "distillation": {"episodes", "sim", "task", "pipeline", "seeds", "kinds"},
-    # Loading a LeRobot policy is for `policies.evaluation`; here a policy is whatever has `reset` and `act`.
+    # A policy is whatever has `reset` and `act`; `judging` alone knows how one is loaded.
     "evaluation": {
         "experts",
         "sim",
@@ -54,7 +53,6 @@ BELOW: dict[str, set[str]] = {
     "reward": {"experts", "task", "sim", "scene", "pipeline", "seeds", "kinds"},
     # It sees the arm that policies were trained with, and what a robot is; never the twin's inside.
     "deployment": {
-        "checkpoint",
         "twin",
         "evaluation",
         "episodes",
@@ -65,34 +63,62 @@ BELOW: dict[str, set[str]] = {
         "pipeline",
         "seeds",
     },
+    "policy": {
+        *("deployment", "distillation", "evaluation", "episodes"),
+        *("scene", "task", "pipeline", "seeds"),
+    },
     "report": {"episodes", "sim", "task", "scene", "video", "geometry", "pipeline"},
 }
-SCENE_BELOW: dict[str, set[str]] = {
-    # The artefact, which other rooms of the house read.
-    "files": set(),
-    "schema": {"files"},
-    "scene": {"schema"},
-    # Learned models know pictures and numbers, nothing of ours.
-    "backends": {"files"},
-    "config": {"backends"},
-    "scale": {"schema"},
-    # A working clip holds the model that is asked about its frames.
-    "frames": {"scale", "backends"},
-    "data_types": {"frames", "scale", "schema"},
-    "grounding": {"data_types", "frames", "scale", "backends", "schema"},
-    "shapes": {"data_types", "frames", "scale", "backends"},
-    "fitting": {
-        *("shapes", "grounding", "data_types", "frames", "scale"),
-        *("backends", "config", "schema"),
+INSIDE: dict[str, dict[str, set[str]]] = {
+    "scene": {
+        # The artefact, which other rooms of the house read.
+        "files": set(),
+        "schema": {"files"},
+        "scene": {"schema"},
+        # Learned models know pictures and numbers, nothing of ours.
+        "backends": {"files"},
+        "config": {"backends"},
+        "scale": {"schema"},
+        # A working clip holds the model that is asked about its frames.
+        "frames": {"scale", "backends"},
+        "data_types": {"frames", "scale", "schema"},
+        "grounding": {"data_types", "frames", "scale", "backends", "schema"},
+        "shapes": {"data_types", "frames", "scale", "backends"},
+        "fitting": {
+            *("shapes", "grounding", "data_types", "frames", "scale"),
+            *("backends", "config", "schema"),
+        },
+    },
+    "sim": {
+        "robot": set(),
+        "model": {"robot"},
+        "env": {"model", "robot"},
+        "render": {"env", "model", "robot"},
+    },
+    "task": {
+        "robot_files": set(),
+        "cache": set(),
+        "schema": {"robot_files"},
+        "task": {"schema", "robot_files"},
+        "likeness": {"task"},
+        "sandbox": {"task", "cache"},
+        "templates": {"sandbox"},
+        "audit": {"templates", "sandbox", "task"},
+        "llm": {"audit", "templates", "sandbox", "likeness", "task"},
+    },
+    "reward": {"code": set(), "trajectories": set(), "feedback": {"trajectories"}},
+    "episodes": {
+        "staging": set(),
+        "dataset": {"staging"},
+        "rollouts": {"dataset"},
+        "hub": {"dataset"},
     },
 }
-"""The rooms of `scene`. What is not named here stands above them all: the order of the steps, and what is written."""
-TOP = {
-    *("stages", "policy_training", "policy_config", "craft_data"),
-    *("judging", "cli", "commands"),
-}
+"""The order inside a room. What is not named here stands above all that is."""
+TOP = {"stages", "craft_data", "cli", "commands"}
 
 
+@functools.cache
 def imported_modules(path: Path) -> set[str]:
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
@@ -120,16 +146,16 @@ def test_a_room_imports_only_rooms_below_it(path):
     assert ours - BELOW[room] - LEAVES - {room} == set()
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "v2p_data/scene").rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT))
-)
-def test_a_room_of_scene_imports_only_rooms_below_it(path):
-    room = path.relative_to(ROOT / "v2p_data/scene").parts[0].removesuffix(".py")
-    if room not in SCENE_BELOW:
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_inside_a_room_too_arrows_point_down(path):
+    room, *inner = path.relative_to(ROOT / "v2p_data").parts
+    below = INSIDE.get(room, {})
+    part = inner[0].removesuffix(".py") if inner else ""
+    if part not in below:
         return
-    ours = {n.split(".")[2] for n in imported_modules(path) if n.startswith("v2p_data.scene.")}
+    ours = {n.split(".")[2] for n in imported_modules(path) if n.startswith(f"v2p_data.{room}.")}
 
-    assert ours - SCENE_BELOW[room] - {room} == set()
+    assert ours - below[part] - {part} == set()
 
 
 def test_no_module_imports_itself_over_others():
@@ -171,13 +197,13 @@ def test_the_engine_knows_policies_only_at_the_top():
     }
 
     # `report` reads the one type of a success rate.
-    assert users <= TOP | {"experts", "reward", "report"}
+    assert users <= TOP | {"experts", "reward", "report", "evaluation", "policy"}
 
 
 def test_one_heavy_library_has_one_file():
     homes = {
         "av": {"v2p_data/video", "v2p_data/scene", "v2p_data/report"},
-        "openai": {"v2p_data/task"},
+        "openai": {"v2p_data/task/llm"},
     }
     for library, allowed in homes.items():
         users = {
@@ -190,3 +216,11 @@ def test_one_heavy_library_has_one_file():
 
 def test_no_package_of_ours_hides_hugging_faces_datasets():
     assert not (ROOT / "datasets" / "__init__.py").exists()
+
+
+def test_the_code_map_names_every_room():
+    text = (ROOT / "docs/code_map.md").read_text()
+    rooms = {p.parent.name for p in (ROOT / "v2p_data").rglob("__init__.py")} - {"v2p_data"}
+    elsewhere = (ROOT / "docs/scene_rooms.md").read_text()
+
+    assert {room for room in rooms if f"{room}/" not in text + elsewhere} == set()

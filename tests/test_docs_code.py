@@ -32,7 +32,7 @@ class Around:
 A_TOY = """
 import numpy as np
 from toy_task import PushTask, bundle as toy
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 
 bundle, world = toy(), 1
 env = BatchEnv(bundle, num_envs=2, seed=3, num_threads=1, task=PushTask)
@@ -98,7 +98,7 @@ def blocks() -> list[tuple[str, str]]:
 def needs_opengl() -> None:
     from toy_task import bundle
 
-    from v2p_data.sim.masks import MaskRenderer
+    from v2p_data.sim.render.masks import MaskRenderer
 
     with MaskRenderer(bundle(), 64) as renderer:
         try:

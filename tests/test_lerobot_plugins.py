@@ -414,8 +414,8 @@ def test_a_twin_without_a_task_or_with_an_unknown_number_says_so(task_folder, tm
 def test_targets_move_by_the_action_scale_and_stay_on_their_leashes():
     from scipy.spatial.transform import Rotation
 
-    from v2p_data.sim.batch_env import SimConfig
-    from v2p_data.sim.targets import DOWN, ToolPose, next_target
+    from v2p_data.sim.env.batch_env import SimConfig
+    from v2p_data.sim.env.targets import DOWN, ToolPose, next_target
 
     measured = ToolPose(pos=np.array([0.5, 0.0, 0.2]), rotation=DOWN, opening=1.0)
 

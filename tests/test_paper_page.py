@@ -108,6 +108,6 @@ def test_a_figure_is_told_from_a_name_that_holds_digits():
 
 def test_a_member_a_constant_and_a_setting_are_names():
     assert {"wilson", "Rate.value"} <= names_in("policies/evaluation/rate.py")
-    assert "PAPER_EPOCHS" in names_in("v2p_data/policy_config.py")
+    assert "PAPER_EPOCHS" in names_in("v2p_data/policy/config.py")
     assert "policy.preset" in names_in("configs/paper.yaml")
     assert "Rate.colour" not in names_in("policies/evaluation/rate.py")

@@ -13,12 +13,12 @@ from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
 from results_table import ROOT
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.experts.config import ExpertConfig
-from v2p_data.policy_config import PAPER_BATCH_SIZE, PAPER_EPOCHS
+from v2p_data.policy.config import PAPER_BATCH_SIZE, PAPER_EPOCHS
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.programs import EVERY_STEPS
 from v2p_data.scene.backends.config import SegmentConfig
-from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import SimConfig
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.task.benchmark import benchmark_names
 from v2p_data.task.generate import TaskConfig
 
@@ -49,7 +49,7 @@ QUOTES = [
     ("v2p_data/task/task.py", "the paper gives {recipe/horizon} steps"),
     ("v2p_data/task/schema.py", "the paper's episodes have {recipe/horizon} steps"),
     ("v2p_data/episodes/collect.py", "the paper's policies learn from {recipe/trajectories}"),
-    ("v2p_data/policy_config.py", "{recipe/epochs} epochs of batch {recipe/batch}"),
+    ("v2p_data/policy/config.py", "{recipe/epochs} epochs of batch {recipe/batch}"),
     ("configs/paper.yaml", "{recipe/epochs} epochs of batch {recipe/batch}"),
 ]  # fmt: skip
 """Sentences of code and settings that quote the paper."""

@@ -12,7 +12,8 @@ from v2p_data.pipeline.fingerprint import file_digest
 PACKAGE = Path(__file__).parent
 SCENE_DATA = ("*.tsv", "*.json", "*.safetensors")
 """Nouns, how likely a thing is meant, and the networks; they lie in the rooms of `scene`."""
-PROMPTS = ("prompts.py", "example_refinements.py", "example_tasks.py", "vlm_writer.py")
+PROMPTS = ("prompts.py", "example_refinements.py", "example_tasks.py", "writer.py")
+"""Of `task/llm`."""
 
 
 def scene_data() -> dict[str, str]:
@@ -30,7 +31,7 @@ def task_data(*, asks_model: bool) -> dict[str, str]:
 
 def prompt_data() -> dict[str, str]:
     """Return the digest of each file with what a model is told."""
-    return _digests(PACKAGE / "task" / name for name in PROMPTS)
+    return _digests(PACKAGE / "task/llm" / name for name in PROMPTS)
 
 
 def _digests(paths: Iterable[Path]) -> dict[str, str]:

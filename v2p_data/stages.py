@@ -20,13 +20,20 @@ from typing import TYPE_CHECKING, Any
 from policies.evaluation.rate import wilson
 from v2p_data.craft_data import scene_data, task_data
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.about import CARRIED_TASKS
 from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.dataset.about import CARRIED_TASKS
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.evaluation.judging import (
+    PROGRAMS,
+    Contestant,
+    judge_task,
+    own_reset_rate,
+    play_of,
+    row_of,
+)
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.solved import find_solved, solved_digests
-from v2p_data.judging import PROGRAMS, Contestant, judge_task, own_reset_rate, play_of, row_of
 from v2p_data.pipeline.artifact import (
     Record,
     demand_whole,
@@ -36,8 +43,8 @@ from v2p_data.pipeline.artifact import (
 )
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
-from v2p_data.policy_config import PolicyConfig
-from v2p_data.policy_training import (
+from v2p_data.policy.config import PolicyConfig
+from v2p_data.policy.training import (
     POLICY_FOLDER,
     Source,
     make_distillation,
@@ -47,10 +54,10 @@ from v2p_data.policy_training import (
 from v2p_data.reward.config import RewardConfig
 from v2p_data.scene.config import SceneConfig
 from v2p_data.seeds import rng_for, seed_for
-from v2p_data.sim.arms import RobotConfig, robot_to_json
+from v2p_data.sim.robot.arms import RobotConfig, robot_to_json
 from v2p_data.task.generate import TaskConfig
+from v2p_data.task.llm.config import VlmConfig
 from v2p_data.task.task import CODE_FILE, REWARD_SEARCH_FOLDER
-from v2p_data.task.vlm_config import VlmConfig
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig
 
@@ -197,7 +204,7 @@ def make_task(
 ) -> dict[str, Any]:
     """Write eight task codes, audit them, keep the best. What a model answers is kept for all tasks of the run."""
     from v2p_data.scene.scene import Scene
-    from v2p_data.sim.task_check import check_task
+    from v2p_data.sim.env.task_check import check_task
     from v2p_data.task.generate import generate_task
 
     scene = Scene.load(inputs["scene"])
@@ -266,8 +273,8 @@ def make_reward(
     seed = seed_for(cfg.seed, "reward", bundle.title)
     writer = None
     if vlm is not None:
-        from v2p_data.task.vlm import VlmClient
-        from v2p_data.task.vlm_writer import ModelWriter
+        from v2p_data.task.llm.client import VlmClient
+        from v2p_data.task.llm.writer import ModelWriter
 
         client = VlmClient(told(vlm, cfg.config), out / "calls", seed)
         writer = ModelWriter(client=client, pools=(runtime.root / SOLVED_POOL_FOLDER,))
@@ -328,8 +335,8 @@ def make_expert(
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.experts.learning import Worlds, learn
     from v2p_data.report.sheet import write_contact_sheet
-    from v2p_data.sim.task_check import check_reward, check_task
-    from v2p_data.task.pool import add_solved
+    from v2p_data.sim.env.task_check import check_reward, check_task
+    from v2p_data.task.llm.pool import add_solved
     from v2p_data.task.task import TaskBundle
 
     expert_cfg: ExpertConfig = cfg.config
@@ -443,7 +450,7 @@ def make_dataset(
 ) -> dict[str, Any]:
     """Write the dataset, reopen it with LeRobot and compare every frame with what was drawn."""
     from v2p_data.episodes.collect import staged_episodes
-    from v2p_data.episodes.packing import pack_and_verify
+    from v2p_data.episodes.dataset.packing import pack_and_verify
 
     for task in tasks.values():
         demand_whole(task.folder(runtime.root), runtime.root)

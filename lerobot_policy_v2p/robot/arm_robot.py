@@ -10,7 +10,7 @@ from lerobot.robots import Robot
 
 from lerobot_policy_v2p.robot.config_arm import ArmRobotConfig
 from v2p_data.deployment.robot import MASK_NAME
-from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
+from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.twin.interface import RGB_NAME, RGB_PX
 

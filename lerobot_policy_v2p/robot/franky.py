@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.errors import V2PError
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.masks import labels_to_rgb
-from v2p_data.sim.targets import ToolPose, next_target
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.env.targets import ToolPose, next_target
+from v2p_data.sim.render.masks import labels_to_rgb
 
 GRIPPER_TOLERANCE = 0.05
 """The real gripper takes a new command when the wanted opening has changed by this share of its width."""

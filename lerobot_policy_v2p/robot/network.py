@@ -12,8 +12,8 @@ from v2p_data.deployment.protocol import Driver, Sample
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.targets import ToolPose, next_target
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.env.targets import ToolPose, next_target
 from v2p_data.twin.interface import RGB_PX
 
 

@@ -13,7 +13,7 @@ from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.geometry.camera import CV_FROM_GL, Camera, intrinsics
 from v2p_data.geometry.pose import matrix_from_quat, transform
-from v2p_data.sim.gym_env import V2PEnv
+from v2p_data.sim.wrappers.gym_env import V2PEnv
 from v2p_data.task.task import TaskBundle
 
 logger = logging.getLogger("lerobot_policy_v2p.robot.v2p_franka")

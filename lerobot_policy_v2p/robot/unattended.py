@@ -15,7 +15,7 @@ from v2p_data.deployment.limits import Guard
 from v2p_data.deployment.robot import ActionScale, Rig
 from v2p_data.deployment.sight import LOST_AFTER, Sight, clicks_from
 from v2p_data.errors import V2PError
-from v2p_data.sim.masks import labels_to_rgb
+from v2p_data.sim.render.masks import labels_to_rgb
 from v2p_data.twin.interface import RGB_NAME
 
 logger = logging.getLogger(__name__)

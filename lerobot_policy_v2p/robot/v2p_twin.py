@@ -17,7 +17,7 @@ from lerobot_policy_v2p.robot.unattended import Unattended, check_policy_of
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.deployment.view import allowing_for_place
 from v2p_data.geometry.camera import Camera
-from v2p_data.sim.masks import labels_to_rgb
+from v2p_data.sim.render.masks import labels_to_rgb
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.arm import TwinArm
 from v2p_data.twin.judge import true_labels

@@ -36,7 +36,7 @@ def load_policy(folder: Path, env_config: Any, device: str | None = None) -> Loa
     """Read a checkpoint of any policy type LeRobot knows, checked against the environment's features.
 
     It runs on `device`, by default where its settings say. Whoever made the checkpoint is trusted: LeRobot runs what its
-    processors name, unless the engine has looked at them before (`v2p_data.checkpoint`).
+    processors name, unless the engine has looked at them before (`v2p_data.evaluation.checkpoint`).
 
     Raises:
         UnsuitablePolicyError: its weights are not those of the network in its settings.

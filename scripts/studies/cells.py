@@ -18,15 +18,15 @@ import numpy as np
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.judging import UNSEEN_PX, Play, contestant, play_of
+from v2p_data.evaluation.judging import UNSEEN_PX, Play, contestant, play_of
 from v2p_data.pipeline.artifact import Record, provenance, read_record
 from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 from v2p_data.pipeline.workers import run_stages
-from v2p_data.policy_training import POLICY_FOLDER, sources_of
+from v2p_data.policy.training import POLICY_FOLDER, sources_of
 from v2p_data.reward.programs import ProgramPolicy
 from v2p_data.seeds import rng_for, seed_for
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.stages import (
     Seeded,
     dataset_stage,

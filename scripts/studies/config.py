@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from v2p_data.policy_config import PolicyConfig
+from v2p_data.policy.config import PolicyConfig
 from v2p_data.stages import EngineConfig
 
 Arm = Literal["videos", "fixed_total", "toys", "bc", "bc_cop", "paper", "cop"]

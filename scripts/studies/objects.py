@@ -26,7 +26,7 @@ from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
-from v2p_data.sim.solids import read_mesh
+from v2p_data.sim.model.solids import read_mesh
 from v2p_data.stages import EngineConfig, expert_stage, scene_stage, task_stage
 from v2p_data.video.captions import CAPTIONS_FILE, VideoItem, find_videos
 from v2p_data.video.meaning import parse_caption

@@ -16,14 +16,14 @@ from v2p_data.deployment.view import allowing_for_place
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.judging import contestant, play_of
+from v2p_data.evaluation.judging import contestant, play_of
 from v2p_data.pipeline.artifact import Record, provenance, read_record
 from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.pipeline.workers import run_stages
-from v2p_data.policy_training import POLICY_FOLDER, sources_of
-from v2p_data.sim import randomize
-from v2p_data.sim.randomize import RandomizationConfig
+from v2p_data.policy.training import POLICY_FOLDER, sources_of
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.randomize import RandomizationConfig
 from v2p_data.stages import EngineConfig, dataset_stage, episodes_stage, policy_stage
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.judge import judge_in_twin

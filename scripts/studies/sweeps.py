@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from v2p_data.deployment.view import allowing_for_place
 from v2p_data.seeds import rng_for
-from v2p_data.sim.masks import BACKGROUND, FIRST_OBJECT, ROBOT
+from v2p_data.sim.render.masks import BACKGROUND, FIRST_OBJECT, ROBOT
 from v2p_data.twin.arm import TwinArm
 from v2p_data.twin.parameters import TwinParameters, changed, nominal
 

@@ -144,7 +144,7 @@ def steady() -> type[Steady]:
 def clicked(robot: Any, label: int = 2) -> tuple[float, float]:
     """Return the middle of an object, as a person would click it."""
     from v2p_data.scene.backends.segment import points_inside
-    from v2p_data.sim.masks import rgb_to_labels
+    from v2p_data.sim.render.masks import rgb_to_labels
 
     u, v = points_inside(rgb_to_labels(robot.arm.mask()) == label, 1)[0]
     return float(u), float(v)

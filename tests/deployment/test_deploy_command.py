@@ -120,7 +120,7 @@ def test_lerobots_own_rollout_sees_by_tracking_from_a_click(
 
     from lerobot_policy_v2p.robot.simulated import SimulatedArm
     from lerobot_policy_v2p.robot.v2p_franka import V2PFranka
-    from v2p_data.sim.masks import rgb_to_labels
+    from v2p_data.sim.render.masks import rgb_to_labels
 
     seen = []
     observe = V2PFranka.get_observation

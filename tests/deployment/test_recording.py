@@ -8,7 +8,7 @@ from v2p_data.deployment.loop import LoopConfig, Run
 from v2p_data.deployment.recording import Recorder
 from v2p_data.deployment.sight import Sight
 from v2p_data.errors import V2PError
-from v2p_data.sim.masks import labels_to_rgb
+from v2p_data.sim.render.masks import labels_to_rgb
 
 
 def test_lerobot_reads_back_masks_pictures_states_and_the_actions_that_passed_the_limits(

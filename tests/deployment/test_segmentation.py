@@ -10,7 +10,7 @@ from v2p_data.deployment.segmentation import ColourTracker
 from v2p_data.deployment.sight import LOST_AFTER, Sight, clicks_from
 from v2p_data.errors import V2PError
 from v2p_data.scene.frames.mask_ops import iou
-from v2p_data.sim.masks import rgb_to_labels
+from v2p_data.sim.render.masks import rgb_to_labels
 
 
 @pytest.fixture(scope="module")

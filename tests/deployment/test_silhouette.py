@@ -7,7 +7,7 @@ import numpy as np
 from v2p_data.deployment.robot import fingers_m
 from v2p_data.deployment.silhouette import Silhouette
 from v2p_data.scene.frames.mask_ops import iou
-from v2p_data.sim.masks import ROBOT, rgb_to_labels
+from v2p_data.sim.render.masks import ROBOT, rgb_to_labels
 
 
 def drawn(robot, camera):

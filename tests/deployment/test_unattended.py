@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from v2p_data.deployment.limits import LimitsConfig
-from v2p_data.episodes.features import ACTION_NAMES
+from v2p_data.episodes.dataset.features import ACTION_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.scene.frames.mask_ops import iou
-from v2p_data.sim.masks import rgb_to_labels
+from v2p_data.sim.render.masks import rgb_to_labels
 
 pytestmark = pytest.mark.slow
 

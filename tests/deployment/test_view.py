@@ -12,8 +12,8 @@ from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.frames.mask_ops import iou
-from v2p_data.sim.camera import training_camera
-from v2p_data.sim.masks import FIRST_OBJECT, ROBOT
+from v2p_data.sim.render.camera import training_camera
+from v2p_data.sim.render.masks import FIRST_OBJECT, ROBOT
 
 SIZE_PX = 256
 HOME = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4])

@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "episodes"))
 import toy_run
 
 from v2p_data.episodes import rollouts
-from v2p_data.sim import verdict
+from v2p_data.sim.env import verdict
 
 
 @pytest.fixture

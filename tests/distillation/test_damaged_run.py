@@ -11,7 +11,7 @@ from toy_run import ITEM, REPO_ID, bundle, dataset_of, last_stage, made, record_
 
 from v2p_data.cli import run
 from v2p_data.commands import run as commands
-from v2p_data.episodes.verify import verify
+from v2p_data.episodes.dataset.verify import verify
 from v2p_data.pipeline.artifact import write_record
 from v2p_data.pipeline.contents import list_files
 from v2p_data.pipeline.runner import Runtime, Stage

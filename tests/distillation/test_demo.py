@@ -15,7 +15,7 @@ from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
 from v2p_data.cli import run
 from v2p_data.commands import run as commands
 from v2p_data.pipeline.settings import load_settings
-from v2p_data.policy_config import PolicyConfig
+from v2p_data.policy.config import PolicyConfig
 from v2p_data.stages import EngineConfig
 
 ROOT = Path(__file__).parents[2]

@@ -9,10 +9,10 @@ import pytest
 from toy_run import DISTILLATION, ENGINE, dataset_of, made, record_of
 
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.judging import contestant
+from v2p_data.evaluation.judging import contestant
 from v2p_data.pipeline.runner import Runtime
-from v2p_data.policy_config import PolicyConfig
-from v2p_data.policy_training import POLICY_FOLDER, sources_of
+from v2p_data.policy.config import PolicyConfig
+from v2p_data.policy.training import POLICY_FOLDER, sources_of
 from v2p_data.stages import EVALUATION_FILE, ROOT_OF_TASKS, evaluation_stage, policy_stage
 
 LEARNING = replace(

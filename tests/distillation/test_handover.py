@@ -8,9 +8,9 @@ from toy_task import act
 from v2p_data.distillation import handover
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.handover import Handovers, hand_over
-from v2p_data.sim import verdict
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.observation import PROGRESS_COLUMN
+from v2p_data.sim.env import verdict
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.env.observation import PROGRESS_COLUMN
 
 CFG = DistillationConfig(worlds=5, takeover=(0.1, 0.5))
 

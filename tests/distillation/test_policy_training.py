@@ -16,13 +16,13 @@ from policies.bc.trainer import TrainerConfig
 from v2p_data.distillation import rounds
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.rounds import handover_episodes
-from v2p_data.episodes import packing
 from v2p_data.episodes.collect import staged_episodes
-from v2p_data.episodes.verify import verify
+from v2p_data.episodes.dataset import packing
+from v2p_data.episodes.dataset.verify import verify
 from v2p_data.pipeline.artifact import write_record
 from v2p_data.pipeline.runner import Outcome, Runtime
-from v2p_data.policy_config import PolicyConfig
-from v2p_data.policy_training import POLICY_FOLDER, recorded_under, sources_of
+from v2p_data.policy.config import PolicyConfig
+from v2p_data.policy.training import POLICY_FOLDER, recorded_under, sources_of
 from v2p_data.stages import (
     ROOT_OF_TASKS,
     distillation_stage,
@@ -111,7 +111,7 @@ def distilled(finished: Path, tmp_path_factory) -> Path:
     """A run folder up to its policy; do not write into it."""
     root = Path(shutil.copytree(finished, tmp_path_factory.mktemp("distilled") / "run"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("v2p_data.sim.verdict.referee_verdict", toy_run.agree)
+        patch.setattr("v2p_data.sim.env.verdict.referee_verdict", toy_run.agree)
         outcomes = make(root)
     assert all(o.status == "made" for o in outcomes.values()), [
         o.detail for o in outcomes.values()

@@ -18,7 +18,7 @@ from v2p_data.episodes.mask_noise import MaskNoiseConfig
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
-from v2p_data.sim import verdict
+from v2p_data.sim.env import verdict
 
 
 class Killed(Exception):  # noqa: N818 - it stands for a kill

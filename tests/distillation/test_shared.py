@@ -14,8 +14,8 @@ from toy_run import ENGINE, ITEM, dataset_of, made, make_expert, make_task, reco
 
 from v2p_data.cli import run
 from v2p_data.commands import run as commands
-from v2p_data.episodes.hub import fetch_policy
-from v2p_data.episodes.packing import copy_tasks
+from v2p_data.episodes.dataset.packing import copy_tasks
+from v2p_data.episodes.hub.hub import fetch_policy
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import provenance
 from v2p_data.pipeline.runner import Runtime, Stage
@@ -36,7 +36,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     from toy_run import agree
 
     from v2p_data.episodes import rollouts
-    from v2p_data.sim import verdict
+    from v2p_data.sim.env import verdict
 
     root = tmp_path_factory.mktemp(MAKER) / "my runs" / "run"
     with pytest.MonkeyPatch.context() as patch:

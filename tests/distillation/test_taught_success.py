@@ -18,7 +18,7 @@ from v2p_data.reward.candidate import DONE_FILE, TRAIN_FOLDER
 from v2p_data.reward.jobs import HEARTBEAT_FILE
 from v2p_data.reward.worker import teach
 from v2p_data.seeds import seed_for
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import load_benchmark
 
 PASSING = toy_run.CODE.replace(

@@ -26,7 +26,7 @@ from v2p_data.pipeline.runner import (
     make_stage,
     stored_outcome,
 )
-from v2p_data.policy_config import PolicyConfig
+from v2p_data.policy.config import PolicyConfig
 from v2p_data.stages import EngineConfig, dataset_stage, episodes_stage
 from v2p_data.task.task import TaskBundle
 
@@ -71,7 +71,7 @@ def make_agreeing(
 ) -> Any:
     """Make a stage in a worker process, where the referee must be told anew to agree."""
     from v2p_data.episodes import rollouts
-    from v2p_data.sim import verdict
+    from v2p_data.sim.env import verdict
 
     verdict.referee_verdict = rollouts.referee_verdict = agree
     return make(cfg, inputs, out, how)

@@ -56,7 +56,7 @@ def staged(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 @pytest.fixture(scope="session")
 def packed(tmp_path_factory: pytest.TempPathFactory, staged: list[Path]) -> Path:
     """A dataset of three episodes. Importing LeRobot takes most of its time; do not write into it."""
-    from v2p_data.episodes.writer import pack
+    from v2p_data.episodes.dataset.writer import pack
 
     root = tmp_path_factory.mktemp("dataset") / "toys"
     pack(staged, "user/toys", root, provenance={"commit": "abc", "packages": {"lerobot": "0.6.1"}})

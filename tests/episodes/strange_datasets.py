@@ -15,8 +15,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
-from v2p_data.episodes.writer import pack
 from v2p_data.seeds import rng_for
 
 Spoil = Callable[[Path], object]

@@ -19,7 +19,7 @@ from v2p_data.episodes.rollouts import InWorlds
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.artifact import read_rejects
-from v2p_data.sim.batch_env import HELD_STEPS, SimConfig
+from v2p_data.sim.env.batch_env import HELD_STEPS, SimConfig
 
 SMALL = EpisodesConfig(num_episodes=5, batch_worlds=6, max_batches=3, size_px=48)
 

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 from hub_server import TOKEN, Hub
 
-from v2p_data.episodes import shards, writer
-from v2p_data.episodes.card import dataset_card, write_card
-from v2p_data.episodes.episode_stats import rgb_stats
-from v2p_data.episodes.features import EPISODE_COLUMN, features
+from v2p_data.episodes.dataset import shards, writer
+from v2p_data.episodes.dataset.card import dataset_card, write_card
+from v2p_data.episodes.dataset.episode_stats import rgb_stats
+from v2p_data.episodes.dataset.features import EPISODE_COLUMN, features
+from v2p_data.episodes.dataset.stream import encode_rgb
+from v2p_data.episodes.dataset.verify import verify
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode, Heading
-from v2p_data.episodes.stream import encode_rgb
-from v2p_data.episodes.verify import verify
-from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
-from v2p_data.sim.masks import PALETTE, labels_to_rgb
+from v2p_data.sim.render.masks import PALETTE, labels_to_rgb
 
 pytestmark = pytest.mark.slow
 
@@ -396,7 +396,7 @@ def test_the_card_of_an_older_dataset_names_its_seven_numbers(packed: Path):
 PUSH_AND_LOAD = """
 import sys
 from pathlib import Path
-from v2p_data.episodes.hub import push_dataset, push_policy
+from v2p_data.episodes.hub.hub import push_dataset, push_policy
 
 root, policy = Path(sys.argv[1]), Path(sys.argv[2])
 push_dataset(root, "user/toys")

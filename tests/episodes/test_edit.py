@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from v2p_data.episodes.about import CARRIED_TASKS, TASK_PARTS
-from v2p_data.episodes.edit import drop, merge
+from v2p_data.episodes.dataset.about import CARRIED_TASKS, TASK_PARTS
+from v2p_data.episodes.dataset.edit import drop, merge
+from v2p_data.episodes.dataset.verify import verify
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
-from v2p_data.episodes.verify import verify
-from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
-from v2p_data.sim.masks import PALETTE
+from v2p_data.sim.render.masks import PALETTE
 
 pytestmark = pytest.mark.slow
 LIFT, PUSH = "lift the toy up", "push the toy to the left"

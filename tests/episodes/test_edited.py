@@ -8,11 +8,11 @@ import pytest
 
 from v2p_data.cli import run
 from v2p_data.commands.run import _record_to_train
-from v2p_data.episodes.about import CARRIED_TASKS, TASK_PARTS, read_about
-from v2p_data.episodes.edited import changed_files
+from v2p_data.episodes.dataset.about import CARRIED_TASKS, TASK_PARTS, read_about
+from v2p_data.episodes.dataset.edited import changed_files
+from v2p_data.episodes.dataset.verify import verify
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
-from v2p_data.episodes.verify import verify
-from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import Record, write_record
 from v2p_data.pipeline.contents import list_files

@@ -13,8 +13,8 @@ import pytest
 from hub_server import TOKEN, Hub
 from toy_task import bundle
 
-from v2p_data.episodes.envhub import engine_modules, write_envhub
-from v2p_data.episodes.hub import push_envhub
+from v2p_data.episodes.hub.envhub import engine_modules, write_envhub
+from v2p_data.episodes.hub.hub import push_envhub
 from v2p_data.errors import V2PError
 
 CODE = """
@@ -101,7 +101,7 @@ def test_the_repository_holds_all_that_lerobot_asks_for(run_folder: Path, tmp_pa
 def test_the_engine_comes_without_what_running_a_task_does_not_take():
     modules = engine_modules()
 
-    assert {"v2p_data.sim.gym_env", "v2p_data.task.sandbox"} <= set(modules)
+    assert {"v2p_data.sim.wrappers.gym_env", "v2p_data.task.sandbox.sandbox"} <= set(modules)
     assert not [m for m in modules if m.startswith(("v2p_data.episodes", "v2p_data.video"))]
 
 

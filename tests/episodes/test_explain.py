@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from v2p_data.cli import run
-from v2p_data.episodes.explain import Difference, differences, explain
+from v2p_data.episodes.dataset.explain import Difference, differences, explain
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import Record, write_record
 

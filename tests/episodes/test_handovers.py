@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from v2p_data.episodes.card import write_card
-from v2p_data.episodes.edit import drop, merge
-from v2p_data.episodes.explain import explain
-from v2p_data.episodes.features import features
+from v2p_data.episodes.dataset.card import write_card
+from v2p_data.episodes.dataset.edit import drop, merge
+from v2p_data.episodes.dataset.explain import explain
+from v2p_data.episodes.dataset.features import features
+from v2p_data.episodes.dataset.verify import verify
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode, Heading
-from v2p_data.episodes.verify import verify
-from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
 
 NUM_FRAMES, TAKEN_OVER_AT = 12, 5

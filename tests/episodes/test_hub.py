@@ -11,7 +11,7 @@ import pytest
 from hub_server import CUT, LOST, TOKEN, Hub, Repo
 
 from v2p_data.cli import run
-from v2p_data.episodes.hub import Pushed, push_dataset, push_envhub, push_policy
+from v2p_data.episodes.hub.hub import Pushed, push_dataset, push_envhub, push_policy
 from v2p_data.errors import V2PError
 
 INFO = {

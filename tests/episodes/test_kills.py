@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from toy_task import collect_toys
 
-from v2p_data.episodes import shards
 from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.dataset import shards
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode, staged_episodes
-from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
 
 SMALL = EpisodesConfig(num_episodes=4, batch_worlds=3, max_batches=4, size_px=48)

@@ -9,14 +9,14 @@ import pytest
 from toy_task import PushTask, act, agree, bundle, collect_toys
 
 from v2p_data.episodes.collect import CutConfig, EpisodesConfig, roll_out
+from v2p_data.episodes.dataset.stream import decode_rgb
 from v2p_data.episodes.mask_noise import Fault, MaskNoiseConfig, apply_faults
 from v2p_data.episodes.staging import Episode, staged_episodes
-from v2p_data.episodes.stream import decode_rgb
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.furnish import DistractorConfig, LookConfig, furnish
-from v2p_data.sim.masks import MaskRenderer
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.render.appearance import DistractorConfig, LookConfig, furnish
+from v2p_data.sim.render.masks import MaskRenderer
 
 PLAIN = EpisodesConfig(num_episodes=2, batch_worlds=3, max_batches=2, size_px=64)
 SOME = DistractorConfig(count=(3, 5), size_m=(0.05, 0.1))

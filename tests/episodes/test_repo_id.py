@@ -6,7 +6,7 @@ import pytest
 from huggingface_hub.utils import HFValidationError, validate_repo_id
 
 from v2p_data.cli import run
-from v2p_data.episodes.repo_id import check_repo_id, is_repo_id
+from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from v2p_data.cli import run
-from v2p_data.episodes.verify import verify
+from v2p_data.episodes.dataset.verify import verify
 
 sys.path.insert(0, str(Path(__file__).parent))
 import strange_datasets

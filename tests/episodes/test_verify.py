@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from v2p_data.cli import run
+from v2p_data.episodes.dataset.stream import encode_rgb
+from v2p_data.episodes.dataset.tables import read_info
+from v2p_data.episodes.dataset.verify import verify
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
-from v2p_data.episodes.stream import encode_rgb
-from v2p_data.episodes.tables import read_info
-from v2p_data.episodes.verify import verify
-from v2p_data.episodes.writer import pack
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from v2p_data.sim.masks import PALETTE, labels_to_rgb
+from v2p_data.sim.render.masks import PALETTE, labels_to_rgb
 
 pytestmark = pytest.mark.slow
 

@@ -11,12 +11,12 @@ from v2p_data.errors import V2PError
 from v2p_data.evaluation.actors import ExpertActor, ProgramActor
 from v2p_data.evaluation.batch import NEVER, Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.judging import own_reset_rate
+from v2p_data.evaluation.judging import own_reset_rate
 from v2p_data.pipeline.runner import Runtime
-from v2p_data.sim.batch_env import HELD_STEPS, BatchEnv
-from v2p_data.sim.observation import PROGRESS_COLUMN
+from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv
+from v2p_data.sim.env.observation import PROGRESS_COLUMN
+from v2p_data.task.audit.resets import has_own_reset
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.reset_audit import has_own_reset
 from v2p_data.task.task import Task, TaskBundle
 
 SIZE_PX = 32

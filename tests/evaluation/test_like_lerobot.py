@@ -7,7 +7,7 @@ import pytest
 
 from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.sim.masks import PALETTE
+from v2p_data.sim.render.masks import PALETTE
 from v2p_data.task.task import TaskBundle
 
 EPISODES = 6

@@ -15,7 +15,7 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, keep_better, learn, success_of
 from v2p_data.experts.record import Comparison, Judged, Learned
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 

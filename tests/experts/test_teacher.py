@@ -8,7 +8,7 @@ import torch
 
 from v2p_data.experts.teacher import GOOD_ENOUGH, Teacher, programs_for
 from v2p_data.kinds import KINDS
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.task import Task
 

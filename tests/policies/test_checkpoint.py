@@ -13,10 +13,16 @@ import pytest
 import spoiled
 import torch
 
-from v2p_data.checkpoint import CONFIG_FILE, ConfigFile, StepName, Type, check_checkpoint
 from v2p_data.cli import run
 from v2p_data.errors import V2PError
-from v2p_data.judging import contestant, play_of
+from v2p_data.evaluation.checkpoint import (
+    CONFIG_FILE,
+    ConfigFile,
+    StepName,
+    Type,
+    check_checkpoint,
+)
+from v2p_data.evaluation.judging import contestant, play_of
 
 TINY: dict[str, dict[str, Any]] = {
     "act": {

@@ -20,9 +20,9 @@ from v2p_data.report.sheet import (
     write_contact_sheet,
 )
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.masks import MaskRenderer
-from v2p_data.sim.robot import FINE
-from v2p_data.sim.world import World, build_world
+from v2p_data.sim.model.world import World, build_world
+from v2p_data.sim.render.masks import MaskRenderer
+from v2p_data.sim.robot.robot import FINE
 
 CFG = SheetConfig(thumbnail_px=40, label_px=60, gap_px=4, moments=3, successes=2, failures=1)
 

@@ -14,7 +14,7 @@ from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.methods import load_candidate, prepare, reward_text, save_bundle
 from v2p_data.reward.worker import closeness, fault_of
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.splice import rest_part, reward_part
+from v2p_data.task.sandbox.splice import rest_part, reward_part
 from v2p_data.task.task import TaskBundle
 
 

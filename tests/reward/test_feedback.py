@@ -10,8 +10,8 @@ from v2p_data.errors import V2PError
 from v2p_data.reward.feedback import Feedback, Trajectories, feedback_of, ranking
 from v2p_data.reward.record import record_trajectories
 from v2p_data.reward.trajectories import HELD_STEPS
-from v2p_data.sim import batch_env
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env import batch_env
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
 

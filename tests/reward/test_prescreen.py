@@ -6,7 +6,7 @@ import pytest
 from v2p_data.reward.prescreen import PrescreenConfig, prescreen, stored_moments
 from v2p_data.reward.redesign import transplanted
 from v2p_data.reward.trajectories import Trajectories
-from v2p_data.task.probes import at_rest
+from v2p_data.task.sandbox.probes import at_rest
 from v2p_data.task.templates.write import write_samples
 
 EPISODES = 20

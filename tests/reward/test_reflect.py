@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from v2p_data.reward import redesign, rules
-from v2p_data.reward.expressions import times
+from v2p_data.reward.code.expressions import times
+from v2p_data.reward.code.function_body import UnreadableError
+from v2p_data.reward.code.parts import Reward
+from v2p_data.reward.code.slopes import kernels_of
 from v2p_data.reward.feedback import Trajectories, feedback_of
-from v2p_data.reward.function_body import UnreadableError
-from v2p_data.reward.kernels import kernels_of
 from v2p_data.reward.reflect import proposals, reflect
-from v2p_data.reward.reward_code import Reward
-from v2p_data.task.probes import random_states
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.sandbox import class_name, load_task
-from v2p_data.task.smoke_child import FakePlacer
+from v2p_data.task.sandbox.probes import random_states
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.sandbox import class_name, load_task
+from v2p_data.task.sandbox.smoke_child import FakePlacer
 from v2p_data.task.task import TaskBundle
 
 STEPS, EPISODES = 40, 16

@@ -30,7 +30,7 @@ from v2p_data.reward.search import search_reward
 from v2p_data.reward.worker import run_job
 from v2p_data.stages import EngineConfig, chain
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.splice import rest_part, reward_part, with_reward
+from v2p_data.task.sandbox.splice import rest_part, reward_part, with_reward
 from v2p_data.task.task import REWARD_SEARCH_FOLDER, TaskBundle
 from v2p_data.video.captions import VideoItem
 

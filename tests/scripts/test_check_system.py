@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from v2p_data.episodes import shards
+from v2p_data.episodes.dataset import shards
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
-from v2p_data.episodes.writer import pack
 from v2p_data.seeds import rng_for
 
 pytestmark = [
@@ -82,7 +82,7 @@ main()
 def test_lerobot_streams_every_frame_of_joined_shards_and_reports_in_an_activated_shell(
     lent: Path, dataset: Path
 ):
-    from v2p_data.sim.masks import PALETTE
+    from v2p_data.sim.render.masks import PALETTE
 
     done = subprocess.run(
         ["bash", "-c", 'source "$0/bin/activate"; exec "$@"', str(lent), sys.executable, "-c", READ, str(dataset)],

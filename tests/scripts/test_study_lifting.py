@@ -26,7 +26,7 @@ from v2p_data.pipeline.runner import (
 )
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Event
-from v2p_data.policy_config import PolicyConfig
+from v2p_data.policy.config import PolicyConfig
 from v2p_data.stages import EngineConfig
 from v2p_data.task.generate import TaskConfig
 

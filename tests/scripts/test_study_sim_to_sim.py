@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.masks import BACKGROUND, FIRST_OBJECT, ROBOT
+from v2p_data.sim.render.masks import BACKGROUND, FIRST_OBJECT, ROBOT
 from v2p_data.twin.parameters import nominal
 
 

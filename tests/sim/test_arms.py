@@ -15,11 +15,18 @@ from scipy.spatial.transform import Rotation
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Stage
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.arms import RobotConfig, robot_from_json, robot_to_json
-from v2p_data.sim.batch_env import BatchEnv, SimConfig, without_randomization
-from v2p_data.sim.masks import FIRST_OBJECT, ROBOT, MaskRenderer
-from v2p_data.sim.robot import COARSE, FINE, HOME_QPOS, ServoConfig, robot_body_xml, tool_state
-from v2p_data.sim.world import World, build_world
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, without_randomization
+from v2p_data.sim.model.world import World, build_world
+from v2p_data.sim.render.masks import FIRST_OBJECT, ROBOT, MaskRenderer
+from v2p_data.sim.robot.arms import RobotConfig, robot_from_json, robot_to_json
+from v2p_data.sim.robot.robot import (
+    COARSE,
+    FINE,
+    HOME_QPOS,
+    ServoConfig,
+    robot_body_xml,
+    tool_state,
+)
 from v2p_data.stages import EngineConfig, SimulatorConfig, task_stage
 from v2p_data.task.task import Task, TaskBundle
 

@@ -12,11 +12,11 @@ import trimesh
 
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.robot import COARSE
-from v2p_data.sim.solids import _is_closed, read_mesh, solids_of
-from v2p_data.sim.task_check import check_reward, check_task
-from v2p_data.sim.world import build_world
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.env.task_check import check_reward, check_task
+from v2p_data.sim.model.solids import _is_closed, read_mesh, solids_of
+from v2p_data.sim.model.world import build_world
+from v2p_data.sim.robot.robot import COARSE
 from v2p_data.task.task import Task, TaskBundle
 
 SIZE = (0.06, 0.06, 0.06)
@@ -216,7 +216,7 @@ def test_a_mesh_of_a_million_faces_takes_seconds(world_of):
 
 
 def test_a_file_too_large_to_be_read_is_refused_unread(world_of, ball, monkeypatch):
-    monkeypatch.setattr("v2p_data.sim.solids.MAX_MESH_MB", 0.001)
+    monkeypatch.setattr("v2p_data.sim.model.solids.MAX_MESH_MB", 0.001)
 
     with pytest.raises(ItemRejectedError, match="decimate") as caught:
         world_of(ball)

@@ -9,19 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.scene import SceneObject
-from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import (
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import (
     HELD_STEPS,
     BatchEnv,
     SimConfig,
     Snapshot,
     without_randomization,
 )
-from v2p_data.sim.masks import FIRST_OBJECT, MaskRenderer
-from v2p_data.sim.randomize import RandomizationConfig
-from v2p_data.sim.robot import FINGER_TRAVEL_M
-from v2p_data.sim.world import CAMERA
-from v2p_data.task.reader.refusal import TaskCodeError
+from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.model.world import CAMERA
+from v2p_data.sim.render.masks import FIRST_OBJECT, MaskRenderer
+from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
+from v2p_data.task.sandbox.reader.refusal import TaskCodeError
 from v2p_data.task.task import BASE_OBSERVATION_DIM, OBJECT_STATES, ROBOT_STATES, Task, TaskBundle
 
 CALM = without_randomization(SimConfig(fine=True))

@@ -10,14 +10,15 @@ from mujoco.batch import Batch
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
-from v2p_data.sim import convex, randomize
-from v2p_data.sim.batch_env import Snapshot
-from v2p_data.sim.convex import ConvexConfig
-from v2p_data.sim.masks import FIRST_OBJECT, MaskRenderer
-from v2p_data.sim.randomize import Randomizer
-from v2p_data.sim.robot import COARSE
-from v2p_data.sim.solids import solids_of
-from v2p_data.sim.world import CAMERA, MESH_SCALES, build_world
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import Snapshot
+from v2p_data.sim.env.randomize import Randomizer
+from v2p_data.sim.model import convex
+from v2p_data.sim.model.convex import ConvexConfig
+from v2p_data.sim.model.solids import solids_of
+from v2p_data.sim.model.world import CAMERA, MESH_SCALES, build_world
+from v2p_data.sim.render.masks import FIRST_OBJECT, MaskRenderer
+from v2p_data.sim.robot.robot import COARSE
 from v2p_data.task.cache import cache_folder
 
 SIZE = (0.08, 0.08, 0.04)

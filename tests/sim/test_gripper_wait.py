@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from v2p_data.sim.gripper_wait import GripperWait, GripperWaitConfig
+from v2p_data.sim.robot.gripper_wait import GripperWait, GripperWaitConfig
 
 LIFT = np.array([0, 0, 1.0, 0, 0, 0, 0.5])
 

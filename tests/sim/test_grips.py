@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from v2p_data.sim.grips import GRIPS_UP_TO_M, grip_features, turn_to_grip
+from v2p_data.sim.robot.grips import GRIPS_UP_TO_M, grip_features, turn_to_grip
 
 RNG_SEED = 7
 BAR = (0.12, 0.03, 0.05)

@@ -10,9 +10,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from v2p_data.errors import V2PError
-from v2p_data.sim import gym_env
-from v2p_data.sim.gym_env import V2PEnv
-from v2p_data.sim.masks import rgb_to_labels
+from v2p_data.sim.render.masks import rgb_to_labels
+from v2p_data.sim.wrappers import gym_env
+from v2p_data.sim.wrappers.gym_env import V2PEnv
 
 LIFT = """
 from factory.tasks.task import Task
@@ -216,7 +216,7 @@ def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(wri
 @pytest.mark.slow
 def test_environments_can_be_sent_to_processes_of_their_own(write_task, tmp_path):
     """Starting those processes takes a minute of imports, so only what is sent to them is tried."""
-    from v2p_data.sim.lerobot_env import environment_maker
+    from v2p_data.sim.wrappers.lerobot_env import environment_maker
 
     sent = cloudpickle.dumps(environment_maker(write_task(tmp_path / "lift"), {"size_px": 64}))
 
@@ -228,7 +228,7 @@ def test_environments_can_be_sent_to_processes_of_their_own(write_task, tmp_path
 
 @pytest.mark.slow
 def test_a_folder_without_tasks_is_refused_with_the_way_out(tmp_path):
-    from v2p_data.sim.lerobot_env import V2PEnvConfig
+    from v2p_data.sim.wrappers.lerobot_env import V2PEnvConfig
 
     with pytest.raises(V2PError, match="v2p task"):
         V2PEnvConfig(tasks=str(tmp_path)).create_envs(1)

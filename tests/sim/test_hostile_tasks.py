@@ -11,9 +11,9 @@ import torch
 from v2p_data.episodes.rollouts import CutConfig, roll_out
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.scene import SceneObject
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.task import guarded
-from v2p_data.task.guarded import StatesChangedError, TaskOutputError
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.task.sandbox.guarded import StatesChangedError, TaskOutputError
+from v2p_data.task.sandbox.sandbox import guarded
 from v2p_data.task.task import TaskBundle
 
 NUM_WORLDS = 6

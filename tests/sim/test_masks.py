@@ -11,15 +11,15 @@ import trimesh
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.masks import (
+from v2p_data.sim.model.world import World, build_world
+from v2p_data.sim.render.masks import (
     PALETTE,
     MaskRenderer,
     label_names,
     labels_to_rgb,
     rgb_to_labels,
 )
-from v2p_data.sim.robot import FINE, HOME_QPOS
-from v2p_data.sim.world import World, build_world
+from v2p_data.sim.robot.robot import FINE, HOME_QPOS
 
 SIZE_PX = 256
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from v2p_data.sim import observation
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env import observation
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import BASE_OBSERVATION_DIM
 

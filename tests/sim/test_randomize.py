@@ -11,16 +11,16 @@ from mujoco.batch import Batch
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
-from v2p_data.sim import randomize
-from v2p_data.sim.randomize import (
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.randomize import (
     OBJECT_HIGH_M,
     OBJECT_LOW_M,
     PUSH_ROOM_M,
     RandomizationConfig,
     Randomizer,
 )
-from v2p_data.sim.robot import FINE, FINGER_TRAVEL_M, QUAT_DOWN, ServoConfig
-from v2p_data.sim.world import build_world
+from v2p_data.sim.model.world import build_world
+from v2p_data.sim.robot.robot import FINE, FINGER_TRAVEL_M, QUAT_DOWN, ServoConfig
 
 NUM_ENVS = 48
 

@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from v2p_data.sim.robot import (
+from v2p_data.sim.robot.robot import (
     COARSE,
     FINE,
     HOME_QPOS,

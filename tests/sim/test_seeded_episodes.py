@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.gym_env import V2PEnv, stream_seed
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.wrappers.gym_env import V2PEnv, stream_seed
 from v2p_data.task.task import TaskBundle
 
 LIFT = """

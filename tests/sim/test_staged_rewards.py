@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.benchmark import load_benchmark
 
 OPEN_M = 0.085

@@ -8,9 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.robot import COARSE, FINGER_TRAVEL_M, tool_state
-from v2p_data.sim.states import Observed, StateBlock
-from v2p_data.sim.tensor_states import (
+from v2p_data.sim.env.states import Observed, StateBlock
+from v2p_data.sim.env.tensor_states import (
     SeenTensors,
     base_observation,
     moved_position,
@@ -19,7 +18,8 @@ from v2p_data.sim.tensor_states import (
     object_block,
     robot_block,
 )
-from v2p_data.sim.world import build_world
+from v2p_data.sim.model.world import build_world
+from v2p_data.sim.robot.robot import COARSE, FINGER_TRAVEL_M, tool_state
 
 N = 64
 

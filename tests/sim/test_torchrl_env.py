@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.task import Task, TaskBundle
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
-from v2p_data.sim import vector_env
+from v2p_data.sim.wrappers import vector_env
 
 CODE = """
 from factory.tasks.task import Task

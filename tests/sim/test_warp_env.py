@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.scene import SceneObject
-from v2p_data.sim import randomize
-from v2p_data.sim.backends import make_batch_env
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.backends import make_batch_env
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.task import Task, TaskBundle
 
 try:
-    from v2p_data.sim.warp_env import WarpBatchEnv
+    from v2p_data.sim.env.warp_env import WarpBatchEnv
 except V2PError:
     WarpBatchEnv = None
 
@@ -102,7 +102,7 @@ def test_without_mujoco_warp_one_sentence_names_the_extra(
     make_bundle: Callable[..., TaskBundle], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
-    for name in ("v2p_data.sim.warp_env", "v2p_data.sim.warp_physics"):
+    for name in ("v2p_data.sim.env.warp_env", "v2p_data.sim.env.warp_physics"):
         monkeypatch.delitem(sys.modules, name, raising=False)
 
     with pytest.raises(V2PError, match="install the extra 'gpu'"):
@@ -438,7 +438,7 @@ def test_torchrl_and_checkpoints_take_it_as_they_take_the_cpus(make_pair: Callab
     from tensordict import TensorDict
     from torchrl.envs.utils import check_env_specs
 
-    from v2p_data.sim.torchrl_env import TorchRLEnv
+    from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 
     gpu, _ = make_pair(horizon=6, randomization=randomize.training())
     env = TorchRLEnv(gpu)

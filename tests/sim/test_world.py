@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.robot import COARSE, FINE, TARGET_HIGH_M, TARGET_LOW_M
-from v2p_data.sim.world import CAMERA, build_world, hollow_parts
+from v2p_data.sim.model.world import CAMERA, build_world, hollow_parts
+from v2p_data.sim.robot.robot import COARSE, FINE, TARGET_HIGH_M, TARGET_LOW_M
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.zbuffer import FRAMES_AT_ONCE, Views, ZBuffer
+from v2p_data.sim.render.zbuffer import FRAMES_AT_ONCE, Views, ZBuffer
 
 HEIGHT, WIDTH = 96, 144
 FOVY_DEG = 50.0

@@ -19,7 +19,7 @@ import trimesh
 
 from v2p_data.geometry.camera import Camera, intrinsics, look_at
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.task.sandbox import class_name
+from v2p_data.task.sandbox.sandbox import class_name
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
 

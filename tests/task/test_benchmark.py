@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.benchmark import FOLDER, benchmark_names, load_benchmark
-from v2p_data.task.reader.check import check_code
+from v2p_data.task.sandbox.reader.check import check_code
 
 PAPER_KINDS = {
     "cover", "drop_in_front_of", "insert", "lift_up", "push_left", "push_next_to", "push_right",

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from v2p_data.task.confine import confine, leave_the_network
-from v2p_data.task.smoke_child import in_a_fork
+from v2p_data.task.sandbox.confine import confine, leave_the_network
+from v2p_data.task.sandbox.smoke_child import in_a_fork
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 MEGABYTE = 2**20

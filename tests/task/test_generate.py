@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.task.audit import audit
-from v2p_data.task.audit_probes import build_probes
+from v2p_data.task.audit.audit import audit
+from v2p_data.task.audit.moments import build_probes
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.generate import TaskConfig, generate_task
-from v2p_data.task.probes import rest_height
-from v2p_data.task.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.sandbox.probes import rest_height
+from v2p_data.task.sandbox.smoke import SmokeResult, smoke_run_all
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
 

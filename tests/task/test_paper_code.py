@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 import torch
 
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.task.probes import at_rest
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.sandbox import load_task
-from v2p_data.task.smoke import smoke_run_all
-from v2p_data.task.smoke_child import FakePlacer
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.task.sandbox.probes import at_rest
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.sandbox import load_task
+from v2p_data.task.sandbox.smoke import smoke_run_all
+from v2p_data.task.sandbox.smoke_child import FakePlacer
 from v2p_data.task.task import OBJECT_STATES, ROBOT_STATES, TaskBundle
 
 FIGURE_7 = '''

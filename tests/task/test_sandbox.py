@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.reader.refusal import TaskCodeError
-from v2p_data.task.sandbox import load_task
-from v2p_data.task.smoke import _results
-from v2p_data.task.smoke_child import FakePlacer
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.reader.refusal import TaskCodeError
+from v2p_data.task.sandbox.sandbox import load_task
+from v2p_data.task.sandbox.smoke import _results
+from v2p_data.task.sandbox.smoke_child import FakePlacer
 
 sys.path.insert(0, str(Path(__file__).parent))
 from escapes import program

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.reader.refusal import TaskCodeError
-from v2p_data.task.smoke import smoke_run_all
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.reader.refusal import TaskCodeError
+from v2p_data.task.sandbox.smoke import smoke_run_all
 
 sys.path.insert(0, str(Path(__file__).parent))
 from escapes import CONTAINED, REFUSED, program

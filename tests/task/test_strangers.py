@@ -19,16 +19,21 @@ from v2p_data.errors import V2PError
 from v2p_data.scene.files import copy_folder, is_plain_path, own_file
 from v2p_data.scene.scene import SCHEMA, Scene, SceneObject
 from v2p_data.scene.schema import ObjectEntry, SceneFile
-from v2p_data.sim.arms import RobotConfig
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.sim.gym_env import V2PEnv
-from v2p_data.task import time_limit, trial
-from v2p_data.task.audit import Audit
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.robot.arms import RobotConfig
+from v2p_data.sim.wrappers.gym_env import V2PEnv
+from v2p_data.task.audit.audit import Audit
 from v2p_data.task.robot_files import robot_files
+from v2p_data.task.sandbox import time_limit, trial
+from v2p_data.task.sandbox.smoke import smoke_run_all
+from v2p_data.task.sandbox.time_limit import (
+    TaskCallError,
+    TaskCodeTooSlowError,
+    guard_calls,
+    limited,
+)
 from v2p_data.task.schema import AuditEntry, RobotEntry, TaskFile
-from v2p_data.task.smoke import smoke_run_all
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.time_limit import TaskCallError, TaskCodeTooSlowError, guard_calls, limited
 
 sys.path.insert(0, str(Path(__file__).parent))
 import strangers

@@ -1,8 +1,8 @@
 import pytest
 
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.sandbox import class_name
-from v2p_data.task.smoke import smoke_run_all
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.sandbox import class_name
+from v2p_data.task.sandbox.smoke import smoke_run_all
 from v2p_data.task.task import BASE_OBSERVATION_DIM
 from v2p_data.task.templates.draft import Measured
 from v2p_data.task.templates.variants import NUM_VARIANTS

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.experts.teacher import Teacher
-from v2p_data.sim.gym_env import stream_seed
-from v2p_data.sim.robot import HOME_QPOS, tool_state
-from v2p_data.sim.targets import DOWN, ToolPose
+from v2p_data.sim.env.targets import DOWN, ToolPose
+from v2p_data.sim.robot.robot import HOME_QPOS, tool_state
+from v2p_data.sim.wrappers.gym_env import stream_seed
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.twin.arm import TwinArm
 from v2p_data.twin.camera import RAW_PX, Optics

@@ -242,7 +242,7 @@ def loaded_policy(folder: Path, task: str, device: str) -> Any:
         V2PError: LeRobot cannot load it, or it needs to be told the task.
     """
     from policies.evaluation.actor import UnsuitablePolicyError, load_actor
-    from v2p_data.sim.masks import PALETTE
+    from v2p_data.sim.render.masks import PALETTE
 
     try:
         actor = load_actor(folder, greys=PALETTE, task=task, device=device)

@@ -8,10 +8,10 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.commands.display import telling
-from v2p_data.episodes.repo_id import check_repo_id
+from v2p_data.episodes.dataset.repo_id import check_repo_id
 
 if TYPE_CHECKING:
-    from v2p_data.episodes.edit import Edited
+    from v2p_data.episodes.dataset.edit import Edited
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +41,8 @@ class Drop:
 
 
 def merge_command(argv: list[str]) -> int:
-    from v2p_data.episodes.edit import merge
-    from v2p_data.episodes.edited import demand_sound
+    from v2p_data.episodes.dataset.edit import merge
+    from v2p_data.episodes.dataset.edited import demand_sound
 
     args = parse(Merge, argv, "merge")
     check_repo_id(args.repo_id)
@@ -56,8 +56,8 @@ def merge_command(argv: list[str]) -> int:
 
 
 def drop_command(argv: list[str]) -> int:
-    from v2p_data.episodes.edit import drop
-    from v2p_data.episodes.edited import demand_sound
+    from v2p_data.episodes.dataset.edit import drop
+    from v2p_data.episodes.dataset.edited import demand_sound
 
     args = parse(Drop, argv, "drop")
     if args.repo_id is not None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from v2p_data.cli import parse
-from v2p_data.episodes.hub import fetch_model
+from v2p_data.episodes.hub.hub import fetch_model
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends import hands_setup, mobile_sam_setup
 from v2p_data.scene.config import SceneConfig

@@ -21,16 +21,16 @@ from v2p_data.commands.display import (
     tally,
     telling,
 )
-from v2p_data.episodes.repo_id import check_repo_id, is_repo_id
+from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.errors import NotAllError, V2PError
-from v2p_data.judging import PROGRAMS, Contestant, contestant
+from v2p_data.evaluation.judging import PROGRAMS, Contestant, contestant
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
 from v2p_data.pipeline.contents import list_files, memory_of
 from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, stored_outcome
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Key, only_run_in, run_stages
-from v2p_data.policy_training import sources_of
+from v2p_data.policy.training import sources_of
 from v2p_data.report.page import write_page
 from v2p_data.stages import (
     EVALUATION_FILE,
@@ -356,7 +356,7 @@ def _contestant(policy: Path) -> Contestant:
     if policy.exists() or not is_repo_id(repo_id):
         demand_whole_part(policy.resolve())
         return contestant(policy)
-    from v2p_data.episodes.hub import fetch_policy
+    from v2p_data.episodes.hub.hub import fetch_policy
 
     try:
         return replace(contestant(fetch_policy(repo_id)), repo_id=repo_id)
@@ -417,8 +417,8 @@ def _record_to_train(dataset: Path, root: Path) -> tuple[Record, bool]:
     """
     if not (dataset / "meta/info.json").exists():
         return _dataset_record(dataset), True  # which says what is wrong
-    from v2p_data.episodes.about import read_about
-    from v2p_data.episodes.edited import demand_sound, is_like_ours
+    from v2p_data.episodes.dataset.about import read_about
+    from v2p_data.episodes.dataset.edited import demand_sound, is_like_ours
 
     record = read_record(dataset)
     changed = demand_sound(dataset, memory_of(dataset, root))

@@ -11,7 +11,7 @@ from v2p_data.cli import parse
 from v2p_data.errors import V2PError
 
 if TYPE_CHECKING:
-    from v2p_data.episodes.hub import Pushed
+    from v2p_data.episodes.hub.hub import Pushed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class Explain:
 def verify_command(argv: list[str]) -> int:
     """Return 0 where all is well, 1 where there are problems; what cannot be read is an error (2)."""
     from v2p_data.commands.display import telling
-    from v2p_data.episodes.verify import verify
+    from v2p_data.episodes.dataset.verify import verify
     from v2p_data.pipeline.artifact import write_json_atomically
 
     args = parse(Verify, argv, "verify")
@@ -73,13 +73,13 @@ def push_command(argv: list[str]) -> int:
 
 
 def _pushed(args: Push) -> tuple["Pushed", str]:
-    from v2p_data.episodes.hub import push_dataset, push_envhub, push_policy
-    from v2p_data.episodes.repo_id import check_repo_id
+    from v2p_data.episodes.dataset.repo_id import check_repo_id
+    from v2p_data.episodes.hub.hub import push_dataset, push_envhub, push_policy
     from v2p_data.stages import demand_whole_part
 
     check_repo_id(args.repo_id)
     if args.envhub:
-        from v2p_data.episodes.envhub import write_envhub
+        from v2p_data.episodes.hub.envhub import write_envhub
 
         with tempfile.TemporaryDirectory() as folder:
             made = write_envhub(args.path, args.repo_id, Path(folder) / "envhub")
@@ -100,7 +100,7 @@ def _pushed(args: Push) -> tuple["Pushed", str]:
 
 
 def explain_command(argv: list[str]) -> int:
-    from v2p_data.episodes.explain import differences, explain, told_as_json
+    from v2p_data.episodes.dataset.explain import differences, explain, told_as_json
     from v2p_data.pipeline.artifact import demand_whole, write_json_atomically
 
     args = parse(Explain, argv, "explain")

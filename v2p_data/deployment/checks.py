@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from v2p_data.checkpoint import PROCESSOR_FILES, Checkpoint, check_checkpoint
 from v2p_data.deployment.facts import Facts, read_facts
 from v2p_data.deployment.limits import STEP_S
 from v2p_data.deployment.robot import ActionScale
-from v2p_data.episodes.features import (
+from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     ACTION_NAMES,
     MASK_KEY,
@@ -22,7 +21,8 @@ from v2p_data.episodes.features import (
     STATE_NAMES,
 )
 from v2p_data.errors import V2PError
-from v2p_data.sim.masks import PALETTE
+from v2p_data.evaluation.checkpoint import PROCESSOR_FILES, Checkpoint, check_checkpoint
+from v2p_data.sim.render.masks import PALETTE
 
 HZ = round(1 / STEP_S)
 STATISTICS = {

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 from annotated_types import Gt
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from v2p_data.episodes.features import ACTION_KEY, METADATA_FILE, STATE_KEY
+from v2p_data.episodes.dataset.features import ACTION_KEY, METADATA_FILE, STATE_KEY
 from v2p_data.errors import V2PError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import read_record, write_json_atomically
-from v2p_data.sim.batch_env import SimConfig
+from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.task.task import TASK_FILE
 
 FACTS_FILE = "v2p.json"

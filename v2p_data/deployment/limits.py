@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.deployment.robot import ActionScale, Reading
 from v2p_data.errors import V2PError
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.gripper_wait import GripperWait
-from v2p_data.sim.robot import QUAT_DOWN, TARGET_HIGH_M, TARGET_LOW_M
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.robot.gripper_wait import GripperWait
+from v2p_data.sim.robot.robot import QUAT_DOWN, TARGET_HIGH_M, TARGET_LOW_M
 
 STEP_S = 0.05
 DOWN = Rotation.from_quat(QUAT_DOWN, scalar_first=True)

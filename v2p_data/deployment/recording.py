@@ -13,9 +13,9 @@ import numpy as np
 
 from v2p_data.deployment.robot import Reading
 from v2p_data.deployment.sight import Seen
-from v2p_data.episodes import stream
+from v2p_data.episodes.dataset import stream
+from v2p_data.episodes.dataset.writer import Packed, pack
 from v2p_data.episodes.staging import MASK_CAMERA, RGB_CAMERA, Episode, refusals_told
-from v2p_data.episodes.writer import Packed, pack
 from v2p_data.errors import V2PError
 
 FEWEST_FRAMES = 2

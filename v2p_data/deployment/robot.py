@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from v2p_data.episodes.features import ACTION_NAMES, STATE_NAMES
+from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.masks import rgb_to_labels
-from v2p_data.sim.robot import FINGER_TRAVEL_M
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.render.masks import rgb_to_labels
+from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.twin.interface import RGB_NAME, RobotWithCamera
 
 MASK_NAME = "mask"

@@ -17,7 +17,7 @@ from v2p_data.deployment.silhouette import Silhouette
 from v2p_data.deployment.view import view_for
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
-from v2p_data.sim.masks import BACKGROUND, FIRST_OBJECT, PALETTE, ROBOT
+from v2p_data.sim.render.masks import BACKGROUND, FIRST_OBJECT, PALETTE, ROBOT
 
 MAX_OBJECTS = len(PALETTE) - FIRST_OBJECT
 LOST_AFTER = 20

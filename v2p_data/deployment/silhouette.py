@@ -6,7 +6,9 @@ Only what a real arm reports is used. The picture tells what of the mask an obje
 # pyright: reportAttributeAccessIssue=false
 # mujoco's classes come from a compiled module that declares none of them.
 
-from v2p_data.sim.masks import ROBOT  # before MuJoCo: the room imports it whatever MUJOCO_GL says
+from v2p_data.sim.render.masks import (
+    ROBOT,  # before MuJoCo: the room imports it whatever MUJOCO_GL says
+)
 
 # isort: split
 import mujoco
@@ -14,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from v2p_data.geometry.camera import CV_FROM_GL, Camera
-from v2p_data.sim.robot import FINE, NUM_ARM_JOINTS, ServoConfig, robot_body_xml
-from v2p_data.sim.zbuffer import Views, ZBuffer
+from v2p_data.sim.render.zbuffer import Views, ZBuffer
+from v2p_data.sim.robot.robot import FINE, NUM_ARM_JOINTS, ServoConfig, robot_body_xml
 
 NEAR_M = 0.01
 

@@ -16,9 +16,9 @@ from v2p_data.deployment.silhouette import Silhouette
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera, between_centres
 from v2p_data.geometry.pose import inverse
-from v2p_data.sim.camera import training_camera
-from v2p_data.sim.masks import BACKGROUND, FIRST_OBJECT, ROBOT
-from v2p_data.sim.robot import FINGER_TRAVEL_M
+from v2p_data.sim.render.camera import training_camera
+from v2p_data.sim.render.masks import BACKGROUND, FIRST_OBJECT, ROBOT
+from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.twin.arm import TwinArm
 
 PLANE_M = 0.03

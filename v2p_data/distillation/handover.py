@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.rollouts import CutConfig, EpisodeEnds
 from v2p_data.seeds import rng_for
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.masks import MaskRenderer
-from v2p_data.sim.randomize import RandomizationConfig
-from v2p_data.sim.verdict import Course
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.render.masks import MaskRenderer
 from v2p_data.task.task import TaskBundle
 
 ExpertAct = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]

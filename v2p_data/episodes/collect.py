@@ -33,10 +33,10 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import REJECTS_FILE, write_json_atomically, write_rejects
 from v2p_data.seeds import seed_for
-from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.furnish import DistractorConfig, LookConfig
-from v2p_data.sim.randomize import RandomizationConfig
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.render.appearance import DistractorConfig, LookConfig
 from v2p_data.task.task import Task, TaskBundle
 
 logger = logging.getLogger(__name__)

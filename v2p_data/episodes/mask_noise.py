@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from v2p_data.episodes.features import FPS
-from v2p_data.sim.masks import BACKGROUND
+from v2p_data.episodes.dataset.features import FPS
+from v2p_data.sim.render.masks import BACKGROUND
 
 Kind = Literal["erode", "dilate", "drop", "swap"]
 REFERENCE_PX = 256

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from v2p_data.episodes.features import FPS
-from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot, StepResult
-from v2p_data.sim.verdict import Course, referee_verdict
+from v2p_data.episodes.dataset.features import FPS
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot, StepResult
+from v2p_data.sim.env.verdict import Course, referee_verdict
 from v2p_data.task.task import Task, TaskBundle
 
 Act = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]

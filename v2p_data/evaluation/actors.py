@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, UInt8
 from v2p_data.errors import V2PError
 from v2p_data.experts.teacher import Teacher
 from v2p_data.seeds import seed_for
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 
 TRIAL_WORLDS = 64
 """Episodes in which each scripted program is tried before one is chosen."""

@@ -19,12 +19,12 @@ from v2p_data.errors import V2PError
 from v2p_data.evaluation.actors import Actor, WorldActor
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import failure_kinds
-from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import BatchEnv, SimConfig, Snapshot
-from v2p_data.sim.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW, stream_seed
-from v2p_data.sim.masks import MaskRenderer
-from v2p_data.sim.randomize import RandomizationConfig
-from v2p_data.sim.verdict import Course
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
+from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.render.masks import MaskRenderer
+from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW, stream_seed
 from v2p_data.task.task import Task, TaskBundle
 
 NEVER = -1

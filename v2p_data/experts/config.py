@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from policies.ppo.config import ImitationConfig, PPOConfig
-from v2p_data.sim.backends import Backend
+from v2p_data.sim.env.backends import Backend
 
 
 @dataclass(frozen=True, kw_only=True)

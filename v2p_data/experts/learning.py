@@ -28,9 +28,9 @@ from v2p_data.experts.record import Comparison, Judged, Learned
 from v2p_data.experts.solved import Solved, rank_solved
 from v2p_data.experts.teacher import Teacher, Trial, play
 from v2p_data.seeds import seed_for
-from v2p_data.sim.backends import make_batch_env
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.torchrl_env import TorchRLEnv
+from v2p_data.sim.env.backends import make_batch_env
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.task import TaskBundle
 
 logger = logging.getLogger(__name__)

@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Bool, Float
 
 from v2p_data.geometry.rotation import matrices
-from v2p_data.sim.grips import turn_to_grip
-from v2p_data.sim.observation import value_of
-from v2p_data.sim.robot import FINGERTIP_BELOW_TCP_M, TARGET_HIGH_M, TARGET_LOW_M
-from v2p_data.sim.world import ObjectModel
+from v2p_data.sim.env.observation import value_of
+from v2p_data.sim.model.world import ObjectModel
+from v2p_data.sim.robot.grips import turn_to_grip
+from v2p_data.sim.robot.robot import FINGERTIP_BELOW_TCP_M, TARGET_HIGH_M, TARGET_LOW_M
 
 Points = Float[np.ndarray, "env 3"]
 Plane = Float[np.ndarray, "env 2"]

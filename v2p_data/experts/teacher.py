@@ -28,8 +28,8 @@ from v2p_data.experts.primitives import (
     swing,
 )
 from v2p_data.kinds import KINDS
-from v2p_data.sim.batch_env import BatchEnv
-from v2p_data.task.probes import first_pose
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.task.sandbox.probes import first_pose
 
 logger = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from v2p_data.report.media import write_film
 from v2p_data.report.sheet import Judged, draw_rollout
-from v2p_data.sim.masks import MaskRenderer
-from v2p_data.sim.world import World
+from v2p_data.sim.model.world import World
+from v2p_data.sim.render.masks import MaskRenderer
 from v2p_data.task.task import TaskBundle
 
 SUCCESS, FAILURE = "success", "failure"

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from policies.evaluation.rate import Rate
-from v2p_data.episodes.features import ACTION_NAMES, FPS
+from v2p_data.episodes.dataset.features import ACTION_NAMES, FPS
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
@@ -236,7 +236,7 @@ def _add_episodes(view: ItemView, result: Result, cfg: PageConfig, budget: Media
 
 
 def _episode_view(episode: Episode, cfg: PageConfig, budget: MediaBudget) -> EpisodeView:
-    from v2p_data.sim.masks import label_names, labels_to_rgb
+    from v2p_data.sim.render.masks import label_names, labels_to_rgb
 
     names = label_names(episode.objects)
     greys = labels_to_rgb(np.arange(len(names), dtype=np.uint8)[None])[0, :, 0]

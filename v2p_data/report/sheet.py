@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.masks import MaskRenderer, Moment, labels_to_rgb
-from v2p_data.sim.world import World
+from v2p_data.sim.model.world import World
+from v2p_data.sim.render.masks import MaskRenderer, Moment, labels_to_rgb
 from v2p_data.task.task import TaskBundle
 
 GROUND, INK, GOOD, BAD = (250, 249, 246), (40, 44, 50), (26, 112, 66), (176, 50, 42)

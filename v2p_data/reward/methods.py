@@ -21,12 +21,12 @@ import numpy as np
 from v2p_data.reward.config import RewardConfig
 from v2p_data.scene.files import copy_folder
 from v2p_data.scene.scene import SCENE_FILE, Scene, SceneObject
-from v2p_data.task.sandbox import class_name
-from v2p_data.task.splice import REWARD, reward_part, with_reward
+from v2p_data.task.llm.config import VlmConfig
+from v2p_data.task.sandbox.sandbox import class_name
+from v2p_data.task.sandbox.splice import REWARD, reward_part, with_reward
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.variants import NUM_VARIANTS
 from v2p_data.task.templates.write import write_samples
-from v2p_data.task.vlm_config import VlmConfig
 
 UNSEEN_SIZE_M = (0.06, 0.06, 0.06)
 """What a writer supposes who has seen nothing."""

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from v2p_data.reward.feedback import ranking
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.scene.scene import Scene
-from v2p_data.task.reward_check import reward_fault
-from v2p_data.task.smoke import smoke_run_all
+from v2p_data.task.audit.rewards import reward_fault
+from v2p_data.task.sandbox.smoke import smoke_run_all
 
 
 @dataclass(frozen=True, kw_only=True)

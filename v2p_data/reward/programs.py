@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from v2p_data.experts.teacher import Teacher
 from v2p_data.kinds import KINDS
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 
 EVERY_STEPS = 50
 """The paper's number."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from v2p_data.reward.trajectories import Trajectories
-from v2p_data.sim.batch_env import BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.task import OBJECT_STATES, ROBOT_STATES
 
 NUM_MOMENTS = 25

@@ -12,15 +12,15 @@ from typing import override
 import numpy as np
 
 from v2p_data.kinds import KINDS
-from v2p_data.reward.expressions import names_in, number, stored_names
-from v2p_data.reward.function_body import (
+from v2p_data.reward.code.expressions import names_in, number, stored_names
+from v2p_data.reward.code.function_body import (
     FUNCTION,
     Replacer,
     UnreadableError,
     function_of,
     rows_of,
 )
-from v2p_data.reward.soften import conditions, softened
+from v2p_data.reward.code.soften import conditions, softened
 from v2p_data.scene.scene import Scene
 from v2p_data.task.templates.reward_text import paid_lines
 from v2p_data.task.templates.variants import VARIANTS

@@ -13,16 +13,16 @@ import numpy as np
 
 from v2p_data.errors import V2PError
 from v2p_data.reward import redesign, rules
+from v2p_data.reward.code.function_body import UnreadableError, function_of
+from v2p_data.reward.code.parts import Reward
+from v2p_data.reward.code.slopes import kernels_of
 from v2p_data.reward.feedback import Feedback
-from v2p_data.reward.function_body import UnreadableError, function_of
-from v2p_data.reward.kernels import kernels_of
-from v2p_data.reward.reward_code import Reward
 from v2p_data.seeds import rng_for
-from v2p_data.task.probes import random_states
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.reader.refusal import TaskCodeError
-from v2p_data.task.smoke import SmokeResult, smoke_run_all
-from v2p_data.task.splice import reward_part
+from v2p_data.task.sandbox.probes import random_states
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.reader.refusal import TaskCodeError
+from v2p_data.task.sandbox.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.sandbox.splice import reward_part
 from v2p_data.task.task import TaskBundle
 
 PROBES = 64

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 from v2p_data.kinds import KINDS
 from v2p_data.reward import redesign
-from v2p_data.reward.expressions import split_constant
+from v2p_data.reward.code.expressions import split_constant
+from v2p_data.reward.code.parts import Reward
+from v2p_data.reward.code.slopes import centring_factor, kernels_of, simple_kind
+from v2p_data.reward.code.soften import gates_softened
+from v2p_data.reward.code.terms import Part
 from v2p_data.reward.feedback import ComponentFeedback, Feedback
-from v2p_data.reward.kernels import centring_factor, kernels_of, simple_kind
-from v2p_data.reward.reward_code import Reward
-from v2p_data.reward.soften import gates_softened
-from v2p_data.reward.summands import Part
 from v2p_data.scene.scene import Scene
 from v2p_data.task.task import FULL_REWARD
 

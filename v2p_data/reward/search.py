@@ -36,9 +36,9 @@ from v2p_data.reward.candidate import (
     Fault,
     Training,
 )
+from v2p_data.reward.code.function_body import UnreadableError
 from v2p_data.reward.config import Limits, RewardConfig
 from v2p_data.reward.feedback import Feedback
-from v2p_data.reward.function_body import UnreadableError
 from v2p_data.reward.jobs import Job, Jobs
 from v2p_data.reward.methods import (
     Prepared,
@@ -51,14 +51,14 @@ from v2p_data.reward.prescreen import PrescreenConfig, prescreen, stored_moments
 from v2p_data.reward.reflect import reflect
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.seeds import rng_for, seed_for
-from v2p_data.task.probes import random_states
-from v2p_data.task.reward_check import reward_fault
-from v2p_data.task.sandbox import class_name
-from v2p_data.task.smoke import smoke_run_all
-from v2p_data.task.splice import SpliceError, reward_part
+from v2p_data.task.audit.rewards import reward_fault
+from v2p_data.task.llm.client import UnusableAnswersError
+from v2p_data.task.sandbox.probes import random_states
+from v2p_data.task.sandbox.sandbox import class_name
+from v2p_data.task.sandbox.smoke import smoke_run_all
+from v2p_data.task.sandbox.splice import SpliceError, reward_part
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.variants import NUM_VARIANTS
-from v2p_data.task.vlm import UnusableAnswersError
 
 logger = logging.getLogger(__name__)
 

@@ -54,9 +54,9 @@ from v2p_data.reward.record import record_trajectories
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.scene.scene import SceneObject
 from v2p_data.seeds import seed_for
-from v2p_data.sim.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.torchrl_env import TorchRLEnv
-from v2p_data.task.confine import confine, leave_the_network
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
+from v2p_data.task.sandbox.confine import confine, leave_the_network
 
 POLL_S = 0.05
 FILE_BYTES = 2 * 1024**3

@@ -16,7 +16,7 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.kinds import KINDS, kind_named
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.generate import TaskConfig
-from v2p_data.task.sandbox import class_name
+from v2p_data.task.sandbox.sandbox import class_name
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
 

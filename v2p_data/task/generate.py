@@ -15,15 +15,15 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
-from v2p_data.task.audit import Audit, audit
-from v2p_data.task.audit_probes import build_probes
-from v2p_data.task.calls import Call
-from v2p_data.task.sandbox import class_name
-from v2p_data.task.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.audit.audit import Audit, audit
+from v2p_data.task.audit.moments import build_probes
+from v2p_data.task.llm.calls import Call
+from v2p_data.task.llm.config import VlmConfig
+from v2p_data.task.sandbox.sandbox import class_name
+from v2p_data.task.sandbox.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.sandbox.trial import note_passed
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
-from v2p_data.task.trial import note_passed
-from v2p_data.task.vlm_config import VlmConfig
 
 AUDIT_FILE = "audit.json"
 SAMPLES_FOLDER = "samples"
@@ -207,10 +207,10 @@ def _by_model(
     pool: Path | None,
 ) -> GeneratedTask:
     """Let a model write the samples and choose among those that the audit accepts."""
-    from v2p_data.task import vlm_writer
-    from v2p_data.task.pool import examples_for, read_pool
-    from v2p_data.task.prompts import audit_table
-    from v2p_data.task.vlm import VlmClient
+    from v2p_data.task.llm import writer as vlm_writer
+    from v2p_data.task.llm.client import VlmClient
+    from v2p_data.task.llm.pool import examples_for, read_pool
+    from v2p_data.task.llm.prompts import audit_table
 
     def objections(written: Sequence[tuple[str, SmokeResult]]) -> list[str]:
         audits = [s.audit for s in judged(written)]

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from v2p_data.sim.batch_env import SimConfig
-from v2p_data.sim.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW
-from v2p_data.sim.robot import FINGER_TRAVEL_M
-from v2p_data.sim.targets import ToolPose, next_target
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.env.targets import ToolPose, next_target
+from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
+from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.control import tool_pose
 from v2p_data.twin.interface import RGB_PX

@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.geometry.pose import transform
-from v2p_data.sim.camera import training_camera
-from v2p_data.sim.masks import MaskRenderer
-from v2p_data.sim.world import World
+from v2p_data.sim.model.world import World
+from v2p_data.sim.render.camera import training_camera
+from v2p_data.sim.render.masks import MaskRenderer
 from v2p_data.twin.interface import RGB_PX
 from v2p_data.twin.parameters import TwinParameters, episode_rng
 

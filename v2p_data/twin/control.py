@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from v2p_data.sim.robot import FINGER_TRAVEL_M, JOINT_RANGES_RAD, NUM_ARM_JOINTS, tool_state
-from v2p_data.sim.targets import ToolPose
+from v2p_data.sim.env.targets import ToolPose
+from v2p_data.sim.robot.robot import FINGER_TRAVEL_M, JOINT_RANGES_RAD, NUM_ARM_JOINTS, tool_state
 from v2p_data.twin.parameters import TwinParameters
 from v2p_data.twin.world import TIMESTEP_S, TORQUE_LIMIT_NM, nominal_arm
 

@@ -22,7 +22,7 @@ from v2p_data.evaluation.actors import Actor, WorldActor
 from v2p_data.evaluation.batch import NEVER
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import failure_kinds
-from v2p_data.sim.gripper_wait import GripperWait
+from v2p_data.sim.robot.gripper_wait import GripperWait
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.arm import TwinArm
 from v2p_data.twin.parameters import TwinParameters

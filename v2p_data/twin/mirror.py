@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from v2p_data.errors import V2PError
-from v2p_data.sim import randomize
-from v2p_data.sim.batch_env import BatchEnv, Followed, SimConfig, StepResult, robot_of
-from v2p_data.sim.gym_env import stream_seed
-from v2p_data.sim.robot import FINGER_TRAVEL_M
-from v2p_data.sim.targets import ToolPose
-from v2p_data.sim.verdict import Course
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import BatchEnv, Followed, SimConfig, StepResult, robot_of
+from v2p_data.sim.env.targets import ToolPose
+from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
+from v2p_data.sim.wrappers.gym_env import stream_seed
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.world import TwinWorld
 

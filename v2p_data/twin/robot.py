@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from v2p_data.geometry.camera import Camera
-from v2p_data.sim.robot import FINGER_TRAVEL_M, NUM_ARM_JOINTS
-from v2p_data.sim.targets import ToolPose
+from v2p_data.sim.env.targets import ToolPose
+from v2p_data.sim.robot.robot import FINGER_TRAVEL_M, NUM_ARM_JOINTS
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.camera import Optics, TwinCamera
 from v2p_data.twin.control import ArmController, Gripper, reported_opening, tool_pose

@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera, mujoco_xyaxes
 from v2p_data.scene.scene import Scene
-from v2p_data.sim.robot import (
+from v2p_data.sim.model.world import CAMERA, ObjectModel, World, build_world
+from v2p_data.sim.robot.robot import (
     FINE,
     FINGER_TRAVEL_M,
     NUM_ARM_JOINTS,
@@ -29,7 +30,6 @@ from v2p_data.sim.robot import (
     ServoConfig,
     robot_body_xml,
 )
-from v2p_data.sim.world import CAMERA, ObjectModel, World, build_world
 from v2p_data.twin.parameters import TwinParameters
 
 TIMESTEP_S = 0.002

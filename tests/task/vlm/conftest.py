@@ -8,8 +8,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from v2p_data.task.vlm import VlmClient
-from v2p_data.task.vlm_config import VlmConfig
+from v2p_data.task.llm.client import VlmClient
+from v2p_data.task.llm.config import VlmConfig
 
 SECRET = "sk-test-0123456789abcdef"
 

@@ -2,11 +2,11 @@ import pytest
 
 from v2p_data.errors import V2PError
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.example_tasks import BASIC_EXAMPLES, GRASP_A_BLOCK
-from v2p_data.task.pool import add_solved, examples_for, read_pool
-from v2p_data.task.prompts import fault_message, rules, system_message
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.reader.refusal import TaskCodeError
+from v2p_data.task.llm.example_tasks import BASIC_EXAMPLES, GRASP_A_BLOCK
+from v2p_data.task.llm.pool import add_solved, examples_for, read_pool
+from v2p_data.task.llm.prompts import fault_message, rules, system_message
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.reader.refusal import TaskCodeError
 from v2p_data.task.task import OBJECT_STATES, ROBOT_STATES, TaskBundle
 
 BODY = 'is_still = torch.norm(states["block_vel_linear"], dim=-1) < 0.15'

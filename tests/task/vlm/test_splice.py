@@ -7,12 +7,12 @@ import torch
 
 from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
-from v2p_data.task.example_tasks import GRASP_A_BLOCK, block_scene
-from v2p_data.task.probes import random_states
-from v2p_data.task.reader.check import check_code
-from v2p_data.task.sandbox import load_task
-from v2p_data.task.smoke_child import FakePlacer
-from v2p_data.task.splice import SpliceError, reward_part, with_reward
+from v2p_data.task.llm.example_tasks import GRASP_A_BLOCK, block_scene
+from v2p_data.task.sandbox.probes import random_states
+from v2p_data.task.sandbox.reader.check import check_code
+from v2p_data.task.sandbox.sandbox import load_task
+from v2p_data.task.sandbox.smoke_child import FakePlacer
+from v2p_data.task.sandbox.splice import SpliceError, reward_part, with_reward
 from v2p_data.task.templates.write import write_samples
 
 PARENT = '''

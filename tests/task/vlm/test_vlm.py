@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
-from v2p_data.task.pictures import scene_pictures
-from v2p_data.task.vlm import BudgetError, FaultyAnswerError, VlmClient
-from v2p_data.task.vlm_config import VlmConfig
+from v2p_data.task.llm.client import BudgetError, FaultyAnswerError, VlmClient
+from v2p_data.task.llm.config import VlmConfig
+from v2p_data.task.llm.pictures import scene_pictures
 
 HELLO = [{"role": "user", "content": "hello"}]
 

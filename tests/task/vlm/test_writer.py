@@ -6,18 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from v2p_data.task.audit import Audit, Check
+from v2p_data.task.audit.audit import Audit, Check
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.example_refinements import REFINEMENTS
-from v2p_data.task.example_tasks import GRASP_A_BLOCK, REACH_A_BLOCK, block_scene
 from v2p_data.task.generate import TaskConfig, generate_task
-from v2p_data.task.pool import add_solved, examples_for
-from v2p_data.task.smoke import SmokeResult
-from v2p_data.task.splice import rest_part, reward_part, reward_source
+from v2p_data.task.llm.client import BudgetError, UnusableAnswersError, VlmClient
+from v2p_data.task.llm.example_refinements import REFINEMENTS
+from v2p_data.task.llm.example_tasks import GRASP_A_BLOCK, REACH_A_BLOCK, block_scene
+from v2p_data.task.llm.pool import add_solved, examples_for
+from v2p_data.task.llm.writer import ModelWriter, pick_sample, write_samples
+from v2p_data.task.sandbox.smoke import SmokeResult
+from v2p_data.task.sandbox.splice import rest_part, reward_part, reward_source
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples as write_by_template
-from v2p_data.task.vlm import BudgetError, UnusableAnswersError, VlmClient
-from v2p_data.task.vlm_writer import ModelWriter, pick_sample, write_samples
 
 pytestmark = pytest.mark.slow
 

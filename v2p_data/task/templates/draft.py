@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.kinds import Kind
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.task.probes import first_pose
+from v2p_data.task.sandbox.probes import first_pose
 
 
 @dataclass(frozen=True, kw_only=True)

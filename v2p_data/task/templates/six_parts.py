@@ -5,7 +5,7 @@ import re
 
 from v2p_data.kinds import Kind
 from v2p_data.scene.scene import Scene
-from v2p_data.task.probes import first_pose
+from v2p_data.task.sandbox.probes import first_pose
 from v2p_data.task.templates.draft import Draft, Measured
 from v2p_data.task.templates.helper_functions import plain, with_helpers
 from v2p_data.task.templates.reward_text import docstring_lines, reward_lines

@@ -1,0 +1,1 @@
+"""A LeRobot dataset on disk: written, verified, explained, merged and cut."""

@@ -1,0 +1,291 @@
+"""The dataset card: what is in a dataset and how it was made, for people and for the Hub's search."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from v2p_data.episodes.dataset.about import read_about
+from v2p_data.episodes.dataset.features import (
+    ACTION_NAMES,
+    INTERVENTION_KEY,
+    MASK_KEY,
+    METADATA_FILE,
+    STATE_NAMES,
+)
+from v2p_data.episodes.dataset.handovers import who_acted
+from v2p_data.episodes.dataset.sheet import SHEET_FILE, write_sheet
+from v2p_data.episodes.dataset.tables import damage_told, read_info
+from v2p_data.errors import V2PError
+
+CARD_FILE = "README.md"
+TAGS = ("LeRobot", "robotics", "segmentation", "simulation", "mujoco", "video2policy")
+LICENSE = "apache-2.0"
+SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+"""The Hub's words for how many episodes there are."""
+STATE_UNITS = (
+    *("m", "m", "m", "rad", "rad", "rad", "0 closed to 1 open"),
+    *("m, target minus tool", "m", "m", "0 closed to 1 open"),
+)
+ACTION_UNITS = (
+    *("x 0.03 m",) * 3,
+    *("x 0.2 rad",) * 3,
+    "x 0.012 m of finger travel, + closes",
+)
+
+
+def write_card(root: Path, repo_id: str) -> Path:
+    """Write `README.md` into a dataset that `writer.pack` made, and return it.
+
+    Raises:
+        V2PError: the dataset was not made by this engine.
+    """
+    about, info = read_about(root), read_info(root)
+    if about is None:
+        raise V2PError(
+            f"{root} was not written by v2p ({METADATA_FILE} is missing); its card must be written by hand"
+        )
+    has_sheet = _drawn(root, info, about)
+    path = root / CARD_FILE
+    with damage_told(root):
+        card = dataset_card(about, info, repo_id, has_sheet=has_sheet)
+    write_text(path, card)
+    return path
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write it beside its place and rename it, so that an older one stays where this fails.
+
+    Raises:
+        V2PError: the folder cannot be written to.
+    """
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        temporary.write_text(text)
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise V2PError(
+            f"cannot write {path} ({error.strerror}); make room or make the folder writable, and run the same "
+            "command again"
+        ) from error
+
+
+def _drawn(root: Path, info: dict[str, Any], about: dict[str, Any]) -> bool:
+    try:
+        return (root / SHEET_FILE).is_file() or write_sheet(root, info, about)
+    except OSError as error:
+        raise V2PError(
+            f"cannot write {root / SHEET_FILE} ({error.strerror}); make room or make the folder writable"
+        ) from error
+
+
+def dataset_card(
+    about: dict[str, Any], info: dict[str, Any], repo_id: str, *, has_sheet: bool = False
+) -> str:
+    """Return the card's Markdown with its YAML head."""
+    episodes: list[dict[str, Any]] = about["episodes"]
+    seconds = info["total_frames"] / info["fps"]
+    sections = [
+        _head(len(episodes)),
+        f"# {repo_id}",
+        "Demonstrations of a simulated Franka-like arm, made from ordinary videos: each video was rebuilt as a "
+        "simulated task, an expert learned the task, and its successful episodes were recorded under "
+        f"randomisation. {len(episodes)} episodes, {info['total_frames']} frames, {seconds:.0f} s at "
+        f"{info['fps']} frames a second.",
+        *([f"![Moments of one episode of each task]({SHEET_FILE})"] if has_sheet else []),
+        "```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
+        f'dataset = LeRobotDataset("{repo_id}")\n```',
+        "## Tasks",
+        _tasks(episodes),
+        "## What a frame holds",
+        _frame(info),
+        *(["## Who acted", _who_acted(episodes)] if INTERVENTION_KEY in info["features"] else []),
+        "## Masks",
+        _palette(about, episodes),
+        "## Randomisation",
+        _randomisation(episodes),
+        "## Results",
+        _results(about, episodes),
+        "## How it was made",
+        _making(about),
+        "## Limits",
+        "Everything is simulated, and sizes, masses and frictions of the objects are estimates from one video "
+        "each. Only episodes that succeeded by the task's own measure and by an independent one are included.",
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _head(num_episodes: int) -> str:
+    tags = "\n".join(f"- {tag}" for tag in TAGS)
+    size = next((s for n, s in SIZES if num_episodes < n), "n>1M")
+    return (
+        f"---\nlicense: {LICENSE}\nlanguage:\n- en\nsize_categories:\n- {size}\ntask_categories:\n- robotics\ntags:\n{tags}\n"
+        "configs:\n- config_name: default\n  data_files: data/*/*.parquet\n---"
+    )
+
+
+def _tasks(episodes: list[dict[str, Any]]) -> str:
+    count = Counter((e["item"], e["task"]) for e in episodes)
+    frames: Counter[tuple[str, str]] = Counter()
+    for e in episodes:
+        frames[e["item"], e["task"]] += e["length"]
+    lines = ["| task | made from | episodes | frames |", "|---|---|---|---|"]
+    lines += [
+        f"| {_cell(task)} | {_cell(item)} | {number} | {frames[item, task]} |"
+        for (item, task), number in count.items()
+    ]
+    return "\n".join(lines)
+
+
+def _frame(info: dict[str, Any]) -> str:
+    lines = ["| column | shape | meaning |", "|---|---|---|"]
+    for key, feature in info["features"].items():
+        if key == MASK_KEY:
+            meaning = "segmentation mask as grey video, lossless"
+        elif key.startswith("observation.images"):
+            meaning = "picture of the same camera at the same moment"
+        elif key == "observation.state":
+            # Datasets of earlier versions have the first seven.
+            shown = len(feature["names"])
+            meaning = _named(STATE_NAMES[:shown], STATE_UNITS[:shown])
+        elif key == "action":
+            meaning = "each in [-1, 1]: " + _named(ACTION_NAMES, ACTION_UNITS)
+        elif key == "next.success":
+            meaning = "the task's success has held for 0.25 s by the end of this action"
+        elif key == INTERVENTION_KEY:
+            meaning = "true where the expert acted, false where a student did"
+        else:
+            continue
+        lines.append(f"| `{key}` | {list(feature['shape'])} | {meaning} |")
+    return "\n".join(lines)
+
+
+def _who_acted(episodes: list[dict[str, Any]]) -> str:
+    acted = who_acted(episodes)
+    return "\n".join(
+        [
+            "| episodes | number | frames in which the expert acted | frames in which a student acted |",
+            "|---|---|---|---|",
+            f"| demonstrations | {acted.num_demonstrations} | {acted.demonstration_frames} | 0 |",
+            f"| handovers | {acted.num_handovers} | {acted.taken_over_frames} | {acted.student_frames} |",
+            "",
+            "In a handover a student policy acts and the expert takes over. `action` is the expert's in every frame: "
+            "where a student acted, it is what the expert would have done there, not what was done. LeRobot's own "
+            f"recordings hold the policy's action there. `{INTERVENTION_KEY}` is true throughout in demonstrations; "
+            "`source` in `meta/v2p.json` tells the two kinds of episode apart.",
+        ]
+    )
+
+
+def _palette(about: dict[str, Any], episodes: list[dict[str, Any]]) -> str:
+    names: dict[str, list[str]] = {}
+    for e in episodes:
+        for label, name in e["labels"].items():
+            if name not in names.setdefault(label, []):
+                names[label].append(name)
+    lines = ["| label | grey (R = G = B) | meaning |", "|---|---|---|"]
+    lines += [
+        f"| {label} | {about['palette'][label]} | {_cell(', '.join(found))} |"
+        for label, found in sorted(names.items(), key=lambda pair: int(pair[0]))
+    ]
+    lines.append("")
+    lines.append(
+        "Every decoded pixel is one of these greys exactly; `meta/v2p.json` names the objects per episode."
+    )
+    return "\n".join(lines)
+
+
+def _randomisation(episodes: list[dict[str, Any]]) -> str:
+    """Return the ranges that the drawn values span, by name."""
+    spans: dict[str, list[float]] = {}
+    for e in episodes:
+        for name, value in _numbers(e["params"]):
+            spans.setdefault(name, []).append(value)
+    if not spans:
+        return "None was recorded."
+    lines = ["| drawn per episode | lowest | highest |", "|---|---|---|"]
+    lines += [
+        f"| {_cell(name)} | {min(values):.4g} | {max(values):.4g} |"
+        for name, values in sorted(spans.items())
+    ]
+    return "\n".join(lines)
+
+
+def _numbers(value: Any, name: str = "") -> list[tuple[str, float]]:
+    if isinstance(value, bool):
+        return []
+    if isinstance(value, int | float):
+        return [(name, float(value))]
+    if isinstance(value, dict):
+        return [pair for k, v in value.items() for pair in _numbers(v, f"{name} {k}".strip())]
+    if isinstance(value, list):
+        return [pair for k, v in enumerate(value) for pair in _numbers(v, f"{name}[{k}]")]
+    return []
+
+
+def _results(about: dict[str, Any], episodes: list[dict[str, Any]]) -> str:
+    """Return per task how often its expert succeeded, and what became of the episodes."""
+    items: dict[str, Any] = about.get("provenance", {}).get("items", {})
+    lines = [
+        "| made from | expert made by | expert succeeds | episodes tried | succeeded | left out, by reason |",
+        "|---|---|---|---|---|---|",
+    ]
+    known = len(lines)
+    for key in dict.fromkeys(e.get("history", e["item"]) for e in episodes):
+        counts = items.get(key, {}).get("counts") or {}
+        expert = items.get(key, {}).get("inputs", {}).get("expert", {}).get("counts", {})
+        rate = expert.get("success")
+        shown = (
+            f"{rate['rate']:.0%} [{rate['low']:.0%}, {rate['high']:.0%}]"
+            if isinstance(rate, dict) and {"rate", "low", "high"} <= set(rate)
+            else "not recorded"
+        )
+        if not counts and not expert:
+            continue
+        made_by = _cell((expert.get("learning") or {}).get("made_by") or "not recorded")
+        rejected = ", ".join(
+            f"{n} {reason}" for reason, n in (counts.get("rejected") or {}).items()
+        )
+        tried, share = counts.get("rollouts", "-"), counts.get("success")
+        won = f"{share:.1%}" if isinstance(share, float | int) else "-"
+        lines.append(
+            f"| {_cell(key)} | {made_by} | {shown} | {tried} | {won} | {_cell(rejected) or 'none'} |"
+        )
+    if len(lines) == known:
+        return "No rates were recorded with this dataset."
+    lines.append("")
+    lines.append(
+        "An expert succeeds where the task's own measure and an independent one agree, at the simulator's fine time "
+        "step under the randomisation above; the interval is Wilson's at 95 %."
+    )
+    return "\n".join(lines)
+
+
+def _making(about: dict[str, Any]) -> str:
+    provenance = about["provenance"]
+    packages = ", ".join(f"{k} {v}" for k, v in sorted(provenance.get("packages", {}).items()))
+    lines = [
+        "`v2p generate VIDEOS`: video, scene, task code, expert, episodes, dataset. Recipes, seeds and "
+        "counts of every stage are in `meta/v2p.json`.",
+    ]
+    for edit in provenance.get("edits", []):
+        if edit["operation"] == "merge":
+            parts = ", ".join(
+                f"{p['repo_id']} ({p['episodes']} episodes)" for p in edit["sources"]
+            )
+            lines.append(f"Put together by `v2p merge` from {parts}.")
+        else:
+            lines.append(f"`v2p drop` took {edit['episodes']} episodes out of {edit['source']}: {'; '.join(edit['tasks'])}.")  # fmt: skip
+    if provenance.get("commit"):
+        lines.append(f"Commit {provenance['commit']}.")
+    if packages:
+        lines.append(f"Versions: {packages}.")
+    return "\n".join(lines)
+
+
+def _named(names: tuple[str, ...], units: tuple[str, ...]) -> str:
+    return ", ".join(f"{name} ({unit})" for name, unit in zip(names, units, strict=True))
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")

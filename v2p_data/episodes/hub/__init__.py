@@ -1,0 +1,1 @@
+"""Datasets, policies and environments are pushed to the Hugging Face Hub."""

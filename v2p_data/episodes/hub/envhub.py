@@ -1,0 +1,271 @@
+"""Reconstructed tasks as a repository that LeRobot loads by its name (EnvHub).
+
+The repository holds `env.py` with `make_env(n_envs, use_async_envs)`, the tasks with their scenes and code, a
+model in MJCF of each, and as much of this engine's source as running them takes, so that nothing of ours
+must be installed. LeRobot fetches `env.py` alone; it fetches the rest, at the same commit.
+"""
+
+import ast
+import importlib.metadata
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2p_data.episodes.dataset.about import CARRIED_TASKS
+from v2p_data.episodes.dataset.card import LICENSE
+from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
+from v2p_data.episodes.dataset.repo_id import check_repo_id
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import demand_whole
+from v2p_data.scene.files import own_file
+from v2p_data.sim.model.world import build_world
+from v2p_data.sim.robot.robot import FINE
+from v2p_data.task.sandbox.trial import demand_trial
+from v2p_data.task.task import TASK_FILE, TaskBundle, told_of
+
+PACKAGE = "v2p_data"
+SOURCE = Path(__file__).parents[2]
+ENTRY = f"{PACKAGE}.sim.lerobot_env"
+"""What `env.py` imports; everything that it needs comes along."""
+PLACES = (Path(), CARRIED_TASKS, Path("task"))
+"""Where a folder of tasks, a dataset and a run keep theirs."""
+MAX_FILE_BYTES = 200_000_000
+EXACT = ("mujoco", "lerobot")
+"""Other versions of these make other physics, or load otherwise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvHub:
+    """A folder ready to be pushed."""
+
+    folder: Path
+    repo_id: str
+    tasks: tuple[str, ...]
+
+
+def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
+    """Write the tasks of `source` as an EnvHub repository at `out`.
+
+    Args:
+        source: a task, a folder of tasks, a run, or a dataset that carries its tasks.
+        repo_id: `user/name`, under which it will be pushed.
+        out: must not exist.
+
+    Raises:
+        V2PError: there is something at `out`, no task in `source`, or a task that cannot be given away.
+    """
+    check_repo_id(repo_id)
+    if out.exists():
+        raise V2PError(f"{out} exists already; choose another place")
+    folders = _tasks_in(source)
+    demand_whole(source, below=f"{CARRIED_TASKS.as_posix()}/")
+    for folder in folders.values():
+        demand_whole(folder)
+    partial = out.with_name(out.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    rows: list[str] = []
+    for name, folder in folders.items():
+        bundle = TaskBundle.load(folder)
+        if bundle.robot.get("path"):
+            raise V2PError(
+                f"task '{name}' is for the arm in {bundle.robot['path']}, a file that may not be yours to give away; "
+                "only tasks of the built-in arm can be shared"
+            )
+        with told_of(folder):
+            demand_trial(bundle)
+            world = build_world(bundle.scene, FINE)
+        _copy_task(bundle, partial / "tasks" / name)
+        (partial / "mjcf").mkdir(exist_ok=True)
+        (partial / "mjcf" / f"{name}.xml").write_text(world.xml)
+        rows.append(f"| {len(rows)} | {bundle.description} | `{name}` | {bundle.policy_steps()} |")
+    modules = engine_modules()
+    for module in modules:
+        path = _path_of(module)
+        into = partial / path.relative_to(SOURCE.parent)
+        into.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, into)
+    (partial / "env.py").write_text(ENV_PY.replace("REPO_ID", repo_id))
+    (partial / "requirements.txt").write_text("\n".join(requirements(modules)) + "\n")
+    (partial / "README.md").write_text(_card(repo_id, rows))
+    partial.rename(out)
+    return EnvHub(folder=out, repo_id=repo_id, tasks=tuple(folders))
+
+
+def _copy_task(bundle: TaskBundle, into: Path) -> None:
+    """Copy what belongs to a task and nothing else that lies in its folder; a link to outside is refused."""
+    for name in bundle.files():
+        (into / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(own_file(bundle.folder, name, MAX_FILE_BYTES), into / name)
+
+
+def engine_modules() -> list[str]:
+    """Return the modules of this engine that running a task takes."""
+    found: set[str] = set()
+    wanted = [ENTRY]
+    while wanted:
+        module = wanted.pop()
+        if module in found:
+            continue
+        found.add(module)
+        parts = module.split(".")
+        wanted += [".".join(parts[:n]) for n in range(1, len(parts))]
+        wanted += [name for name in _imported(_path_of(module)) if name.split(".")[0] == PACKAGE]
+    return sorted(found)
+
+
+def requirements(modules: list[str]) -> list[str]:
+    """Return the distributions that these modules import, with the versions they run with here."""
+    tops = {name.split(".")[0] for m in modules for name in _imported(_path_of(m))}
+    homes = importlib.metadata.packages_distributions()
+    names = {
+        top if top in homes[top] else homes[top][0]
+        for top in tops - {PACKAGE} - sys.stdlib_module_names
+        if top in homes
+    }
+    lines = []
+    for name in sorted(names, key=str.lower):
+        version = importlib.metadata.version(name).split("+")[0]
+        lines.append(f"{name}{'==' if name in EXACT else '>='}{version}")
+    return lines
+
+
+def _imported(path: Path) -> set[str]:
+    """Return the modules that a file imports, inside functions too."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            names.add(node.module)
+            within = {f"{node.module}.{alias.name}" for alias in node.names}
+            names |= {n for n in within if n.startswith(PACKAGE) and _is_module(n)}
+        elif isinstance(node, ast.Constant) and str(node.value).endswith("_child.py"):
+            # A script of its own, started beside the module that names it.
+            child = path.with_name(str(node.value))
+            names.add(".".join(child.relative_to(SOURCE.parent).with_suffix("").parts))
+    return names
+
+
+def _is_module(name: str) -> bool:
+    path = SOURCE.parent / name.replace(".", "/")
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def _path_of(module: str) -> Path:
+    path = SOURCE.parent / module.replace(".", "/")
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _tasks_in(source: Path) -> dict[str, Path]:
+    if (source / TASK_FILE).is_file():
+        return {source.resolve().name: source}
+    for place in PLACES:
+        found = [
+            path.parent
+            for path in sorted((source / place).glob(f"*/{TASK_FILE}"))
+            if path.parent.suffix != ".partial"
+        ]
+        if found:
+            return {path.name: path for path in found}
+    raise V2PError(
+        f"no task in '{source}': give a task, a run folder, or a dataset that carries its tasks"
+    )
+
+
+def _card(repo_id: str, rows: list[str]) -> str:
+    tasks = "\n".join(["| number | task | folder | steps |", "|---|---|---|---|", *rows])
+    state, action = (", ".join(f"`{n}`" for n in names) for names in (STATE_NAMES, ACTION_NAMES))
+    return f"""---
+library_name: lerobot
+license: {LICENSE}
+tags:
+- lerobot
+- envhub
+- robotics
+- simulation
+- mujoco
+- video2policy
+---
+
+# {repo_id}
+
+Tabletop tasks in MuJoCo, each rebuilt from an ordinary video, for a Franka-like arm with a gripper.
+
+```
+pip install -r requirements.txt
+```
+
+```python
+from lerobot.envs.factory import make_env
+
+envs = make_env("{repo_id}", n_envs=4, use_async_envs=False, trust_remote_code=True)
+env = envs["v2p"][0]
+observation, info = env.reset(seed=0)
+```
+
+This runs the Python code of this repository; read it first, and name a commit (`{repo_id}@COMMIT`) to keep it as it is.
+
+## Tasks
+
+{tasks}
+
+Episodes begin under the randomisation that the demonstrations were recorded under, and a seed repeats one
+exactly. `info["is_success"]` is true where the task's own success has held for 0.25 s and an independent
+function agrees.
+
+## What is seen and done
+
+| | |
+|---|---|
+| `pixels/mask` | 256 x 256 x 3 uint8: segmentation mask, a grey (R = G = B) per label: 0 background, 64 robot, 128 manipulated object, then 192, 255, 31, 95, 158, 222 |
+| `agent_pos` | {state} |
+| action | each in [-1, 1], 20 Hz: {action} |
+
+## What is in here
+
+`env.py` is what LeRobot calls. `tasks/` holds task code and scenes (sizes, masses and frictions are estimates from
+one video each), `mjcf/` a model of each task for any program that reads MJCF, `v2p_data/` the source that runs them.
+"""
+
+
+ENV_PY = '''"""Simulated tabletop tasks for LeRobot: `make_env("REPO_ID", trust_remote_code=True)`.
+
+LeRobot fetches this file; it fetches the tasks and the code that runs them, of the same commit.
+"""
+
+import sys
+from pathlib import Path
+
+TASKS = "tasks"
+
+
+def make_env(n_envs=1, use_async_envs=False, cfg=None):
+    """Return {"v2p": {number of the task: vector of n_envs environments}}."""
+    folder = _whole_repository()
+    if "v2p_data" not in sys.modules:
+        sys.path.insert(0, str(folder))
+    from v2p_data.sim.wrappers.lerobot_env import V2PEnvConfig
+
+    named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg", "horizon_scale")
+    given = {name: getattr(cfg, name) for name in named if hasattr(cfg, name)}
+    return V2PEnvConfig(tasks=str(folder / TASKS), **given).create_envs(n_envs, use_async_envs)
+
+
+def _whole_repository():
+    # Not resolved: in the Hub's cache the file is a link, and its folder is named after the commit.
+    here = Path(__file__).absolute().parent
+    if (here / TASKS).is_dir():
+        return here
+    from huggingface_hub import snapshot_download
+
+    is_cache = here.parent.name == "snapshots"
+    return Path(
+        snapshot_download(
+            "REPO_ID",
+            revision=here.name if is_cache else None,
+            cache_dir=here.parents[2] if is_cache else None,
+        )
+    )
+'''

@@ -1,0 +1,317 @@
+"""A dataset becomes a policy: distillation in rounds, where there are experts, and a last training on all frames.
+
+The student of the distillation is the LeRobot policy itself, so the last training goes on from its weights.
+"""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from v2p_data.distillation.config import DistillationConfig
+from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.errors import V2PError
+from v2p_data.evaluation.checkpoint import check_checkpoint
+from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
+from v2p_data.pipeline.contents import memory_of
+from v2p_data.pipeline.runner import Runtime
+from v2p_data.pipeline.settings import from_values
+from v2p_data.policy.config import PolicyConfig
+from v2p_data.seeds import seed_for
+
+if TYPE_CHECKING:
+    from policies.bc.student import Student
+
+CACHE_FOLDER = "cache"
+"""Of a run: decoded pictures of its datasets, as networks take them. Safe to delete."""
+POLICY_FOLDER = "policy"
+ACTION_LIMIT = 1.0
+"""The simulator clips every entry of an action to this."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where one task of a dataset came from, in its run folder."""
+
+    item: str
+    task: Path
+    expert: Path
+    episodes: Path
+
+
+def sources_of(dataset: Path, root: Path) -> list[Source]:
+    """Return the tasks and experts behind a dataset of `v2p generate`; empty where they are not in the run folder."""
+    record = read_record(dataset)
+    found: list[Source] = []
+    for item, folder in (record.inputs if record else {}).items():
+        episodes = root / "episodes" / folder
+        of_episodes = read_record(episodes)
+        if of_episodes is None or not {"task", "expert"} <= of_episodes.inputs.keys():
+            return []
+        task = next(root.glob(f"*/{of_episodes.inputs['task']}"), None)
+        expert = root / "expert" / of_episodes.inputs["expert"]
+        if task is None or read_record(expert) is None:
+            return []
+        found.append(Source(item=item, task=task, expert=expert, episodes=episodes))
+    return found
+
+
+def recorded_under(source: Source) -> EpisodesConfig:
+    """Return the settings that a task's demonstrations were recorded with."""
+    record = read_record(source.episodes)
+    assert record is not None
+    return from_values(EpisodesConfig, record.recipe["config"]["config"], str(source.episodes))
+
+
+def demand_whole_sources(dataset: Path, sources: Sequence[Source], root: Path) -> None:
+    """Raise if a dataset, or what is behind it, is not as it was made: see `demand_whole` and `demand_sound`."""
+    from v2p_data.episodes.dataset.edited import demand_sound
+
+    if sources:
+        demand_whole(dataset, root)
+    else:  # perhaps edited since
+        demand_sound(dataset, memory_of(dataset, root))
+    for folder in (f for s in sources for f in (s.task, s.expert, s.episodes)):
+        demand_whole(folder, root)
+
+
+def make_distillation(
+    cfg: Any,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    dataset: Path,
+    repo_id: str,
+    sources: Sequence[Source],
+) -> dict[str, Any]:
+    """Let a student act, the expert label and take over, and train on, in rounds."""
+    from policies.bc.trainer import TrainerConfig
+    from policies.ppo.policy import Expert
+    from v2p_data.distillation.rounds import Lesson, demand_masks, distill
+    from v2p_data.task.task import TaskBundle
+
+    del inputs
+    demand_whole_sources(dataset, sources, runtime.root)
+    recipe: DistillationConfig = cfg.config["distillation"]
+    policy: PolicyConfig = cfg.config["policy"]
+    episodes = recorded_under(sources[0])
+    demand_masks(episodes)
+    seed = seed_for(cfg.seed, "distillation")
+    runtime.progress(0.0, "reading the demonstrations")
+    with bad_data_told():
+        student = new_student(dataset, repo_id, policy, seed, runtime)
+        last: dict[str, Any] = {}
+
+        def train(steps: int, folder: Path, seed: int, progress: Any) -> None:
+            trained = student.train(
+                TrainerConfig(steps=steps, batch_size=policy.batch_size),
+                folder,
+                seed=seed,
+                on_progress=progress,
+            )
+            last.update(asdict(trained))
+
+        distilled = distill(
+            {
+                s.item: Lesson(bundle=TaskBundle.load(s.task), expert=Expert.load(s.expert).act)
+                for s in sources
+            },
+            student,
+            train,
+            recipe,
+            episodes,
+            out,
+            seed,
+            num_threads=runtime.num_threads,
+            on_progress=runtime.progress,
+        )
+    return distilled.counts() | {"samples_per_s": round(last.get("samples_per_s", 0.0), 1)}
+
+
+def make_distilled_dataset(
+    cfg: dict[str, Any],
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    sources: Sequence[Source],
+) -> dict[str, Any]:
+    """Write demonstrations and handover episodes as one LeRobot dataset and compare every frame with what was drawn."""
+    from v2p_data.distillation.rounds import handover_episodes
+    from v2p_data.episodes.collect import staged_episodes
+    from v2p_data.episodes.dataset.packing import pack_and_verify
+
+    for source in sources:
+        demand_whole(source.task, runtime.root)
+        demand_whole(source.episodes, runtime.root)
+    demonstrations = [path for source in sources for path in staged_episodes(source.episodes)]
+    return pack_and_verify(
+        [*demonstrations, *handover_episodes(inputs["distillation"])],
+        cfg["repo_id"],
+        out,
+        runtime,
+        provenance=provenance(),
+        tasks={source.item: source.task for source in sources},
+    )
+
+
+def make_policy(
+    cfg: Any,
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    dataset: Path,
+    repo_id: str,
+    sources: Sequence[Source],
+) -> dict[str, Any]:
+    """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
+    from policies.bc.trainer import TrainerConfig, write_train_config
+    from v2p_data.deployment.facts import write_facts
+    from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
+
+    demand_whole_sources(dataset, sources, runtime.root)
+    policy: PolicyConfig = cfg.config.resolved
+    seed = seed_for(cfg.seed, "policy")
+    distilled = inputs.get("distillation")
+    runtime.progress(0.0, "reading the frames")
+    with bad_data_told():
+        student = new_student(
+            dataset, repo_id, policy, seed, runtime,
+            start_from=distilled / STUDENT_FOLDER if distilled else None,
+        )  # fmt: skip
+        handovers = handover_episodes(distilled) if distilled else []
+        # A task's at once: each call copies the whole table.
+        for _, paths in itertools.groupby(handovers, key=lambda path: path.parent):
+            take_in(student, list(paths))
+        steps = policy.num_steps(len(student.table))
+        recipe = TrainerConfig(
+            steps=steps, batch_size=policy.batch_size, checkpoints=policy.checkpoints
+        )
+        trained = student.train(
+            recipe,
+            out,
+            seed=seed % 2**63,
+            judge=checkpoint_judge(student, sources, policy.judge_episodes, seed, runtime)
+            if policy.checkpoints > 1 and sources
+            else None,
+            on_progress=runtime.progress,
+        )
+    student.save(out / POLICY_FOLDER)
+    # As seen from the run folder: the file is pushed, and a place names its maker.
+    is_own = dataset.is_relative_to(runtime.root.resolve())
+    place = dataset.relative_to(runtime.root.resolve()) if is_own else Path(dataset.name)
+    write_train_config(out / POLICY_FOLDER, student.policy, place, repo_id, recipe, seed)
+    write_facts(out / POLICY_FOLDER, dataset)
+    return {
+        "steps": steps,
+        "samples": steps * policy.batch_size,
+        "frames": len(student.table),
+        "final_loss": trained.final_loss,
+        "samples_per_s": round(trained.samples_per_s, 1),
+        "loader_share": round(trained.loader_share, 4),
+        "judged": [list(pair) for pair in trained.judged],
+        "policy": POLICY_FOLDER,
+    }
+
+
+def new_student(
+    dataset: Path,
+    repo_id: str,
+    policy: PolicyConfig,
+    seed: int,
+    runtime: Runtime,
+    *,
+    start_from: Path | None = None,
+) -> "Student":
+    """Return a student that knows the demonstrations; `start_from` is a policy to go on from."""
+    from policies.bc.configuration_v2p_bc import V2PBCConfig
+    from policies.bc.student import Student
+
+    if start_from is not None:
+        check_checkpoint(start_from)
+    try:
+        network = V2PBCConfig(**policy.network(), num_labels=_num_labels(dataset), device="cpu")
+    except ValueError as error:
+        raise V2PError(f"no such network can be made: {error}") from error
+    return Student.of_dataset(
+        dataset,
+        repo_id,
+        network,
+        runtime.root / CACHE_FOLDER / dataset.name,
+        seed=seed % 2**63,
+        device=runtime.device,
+        start_from=start_from,
+        num_threads=runtime.num_threads,
+        action_limit=ACTION_LIMIT,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudentActor:
+    """A student as `evaluation.batch.judge` wants it: told its task once."""
+
+    student: "Student"
+    task: str
+    """In words."""
+
+    def reset(self, n: int) -> None:
+        """Start episodes in `n` worlds."""
+        del n
+        self.student.reset(self.task)
+
+    def act(self, labels: Any, state: Any) -> Any:
+        """Return the worlds' next actions."""
+        return self.student.act(labels, state)
+
+
+def checkpoint_judge(
+    student: "Student", sources: Sequence[Source], episodes: int, seed: int, runtime: Runtime
+) -> Callable[[Any], float]:
+    """Return what gives a policy's mean success rate over tasks, on seeds that no evaluation uses."""
+    from v2p_data.evaluation.batch import judge
+    from v2p_data.evaluation.config import EvaluationConfig
+    from v2p_data.task.task import TaskBundle
+
+    bundles = {source.item: TaskBundle.load(source.task) for source in sources}
+    cfg = EvaluationConfig(episodes=episodes, worlds=episodes, at_end=False)
+
+    def rate(policy: Any) -> float:
+        judged = [
+            judge(
+                bundle,
+                StudentActor(
+                    student=replace(student, policy=policy.eval()), task=bundle.description
+                ),
+                episodes=episodes,
+                first_seed=seed_for(seed, "checkpoints", item) % 2**31,
+                cfg=cfg,
+                num_threads=runtime.num_threads,
+            )
+            for item, bundle in bundles.items()
+        ]
+        return sum(float(j.successes.mean()) for j in judged) / len(judged)
+
+    return rate
+
+
+def _num_labels(dataset: Path) -> int | None:
+    """Return how many labels occur in a dataset of ours, the background included; None where it is not known."""
+    from v2p_data.episodes.dataset.about import read_about
+
+    about = read_about(dataset)
+    return max((1 + int(label) for e in (about or {}).get("episodes", ()) for label in e["labels"]), default=None)  # fmt: skip
+
+
+class bad_data_told:  # noqa: N801 - used as a context manager
+    """Turns complaints about a dataset or a training into errors of ours, one sentence each."""
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        from policies.bc.frames import DatasetError
+
+        if isinstance(error, DatasetError):
+            raise V2PError(str(error)) from error

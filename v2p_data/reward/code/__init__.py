@@ -1,0 +1,1 @@
+"""Reward code is read and rewritten: its components, terms, slopes and conditions."""

@@ -1,0 +1,538 @@
+"""What differs from world to world and from episode to episode: sizes, masses, friction, servo gains, delay, poses, view.
+
+Every value drawn is kept per world (`Randomizer.drawn`), so that an episode can say what it was recorded
+under. Values are written into the batch's per-simulation model fields; nothing is recompiled.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from v2p_data.errors import ItemRejectedError
+from v2p_data.geometry.rotation import product, quats_about_z
+from v2p_data.kinds import KINDS, TaskKind
+from v2p_data.scene.scene import FLOOR_MAX_M, Scene
+from v2p_data.sim.model.world import (
+    CAMERA,
+    CAMERA_FOVY_DEG,
+    MESH_SCALES,
+    WALL_MAX_M,
+    ObjectModel,
+    World,
+    cover_of,
+)
+
+WORKSPACE_CENTRE_M = (0.5, 0.0)
+OBJECT_LOW_M = (0.37, -0.28)
+OBJECT_HIGH_M = (0.66, 0.28)
+"""Objects' centres lie in this part of the table, which the gripper reaches pointing down."""
+PUSH_ROOM_M = 0.15
+"""Free way that push tasks get on the side they push to."""
+BEYOND_LOW_M = (0.90, -0.12)
+BEYOND_HIGH_M = (1.0, 0.12)
+"""Where a container stands that things are thrown into: beyond the gripper's reach (0.72 m)."""
+PLACEMENT_TRIES = 100
+START_BANK = 256
+PREPARED = 128
+"""Draws made at once: a few worlds start anew at most steps, and drawing for a few costs as much as for many."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizationConfig:
+    """Ranges of what is drawn at each reset. Pairs are (lowest, highest) factors or values."""
+
+    size_scale: tuple[float, float] = (0.9, 1.1)
+    """Per axis, independently; one factor for both axes of round things, one for all of a mesh."""
+    mass_scale: tuple[float, float] = (0.6, 1.6)
+    friction_scale: tuple[float, float] = (0.8, 1.2)
+    object_pos_m: float = 0.10
+    """Objects are shifted together by up to this much along x and y."""
+    layout_distance_scale: tuple[float, float] = (0.85, 1.2)
+    """Of the distance between manipulated and reference object."""
+    layout_angle_rad: float = 0.35
+    """The direction from manipulated to reference object turns by up to this much."""
+    yaw_rad: float = float(np.pi)
+    """Each object turns about the vertical by up to this much."""
+    arm_pos_m: tuple[float, float, float] = (0.09, 0.12, 0.05)
+    """The tool starts within this distance of its home position, per axis."""
+    arm_yaw_rad: float = 0.4
+    action_noise: float = 0.02
+    """Standard deviation added to actions in [-1, 1] before they are carried out."""
+    delay_s: tuple[float, float] = (0.010, 0.020)
+    """From command to servo, constant during an episode."""
+    servo_gain_scale: tuple[float, float] = (0.9, 1.1)
+    """Of stiffness and of damping, drawn one by one for all servos; the tool lags by damping / stiffness."""
+    camera_pos_m: float = 0.0
+    """The camera is shifted by up to this much, per axis. 0 is the fixed camera that policies of earlier datasets know;
+    a policy that shall stand a moved camera is recorded, and then evaluated, with more."""
+    camera_angle_rad: float = 0.0
+    """The camera is turned by up to this much about each of its own axes."""
+    camera_fovy_deg: float = 0.0
+    """The camera's vertical field of view changes by up to this much."""
+
+    def __post_init__(self) -> None:
+        for low, high in (
+            self.size_scale,
+            self.mass_scale,
+            self.friction_scale,
+            self.layout_distance_scale,
+            self.servo_gain_scale,
+        ):
+            if not 0 < low <= high:
+                raise ValueError(f"need 0 < lowest <= highest, got {low} and {high}")
+        if not 0 <= self.delay_s[0] <= self.delay_s[1] <= 0.02:
+            raise ValueError(f"delays of 0 to 20 ms can be simulated, got {self.delay_s} s")
+        moved = (self.camera_pos_m, self.camera_angle_rad, self.camera_fovy_deg)
+        if min(moved) < 0 or self.camera_fovy_deg >= CAMERA_FOVY_DEG:
+            raise ValueError(
+                f"camera_pos_m, camera_angle_rad and camera_fovy_deg must be 0 or more, the last below "
+                f"{CAMERA_FOVY_DEG}, got {moved}"
+            )
+
+
+def training() -> RandomizationConfig:
+    """Return what experts train under: the same as is recorded, so that they are at home there."""
+    return RandomizationConfig()
+
+
+def recording() -> RandomizationConfig:
+    """Return what episodes are recorded under (the paper's list)."""
+    return RandomizationConfig()
+
+
+def none() -> RandomizationConfig:
+    """Return the video's layout about the workspace centre, true sizes, no noise and no delay."""
+    one = (1.0, 1.0)
+    return RandomizationConfig(
+        size_scale=one,
+        mass_scale=one,
+        friction_scale=one,
+        object_pos_m=0.0,
+        layout_distance_scale=one,
+        layout_angle_rad=0.0,
+        yaw_rad=0.0,
+        arm_pos_m=(0.0, 0.0, 0.0),
+        arm_yaw_rad=0.0,
+        action_noise=0.0,
+        delay_s=(0.0, 0.0),
+        servo_gain_scale=one,
+    )
+
+
+@runtime_checkable
+class PerWorldFields(Protocol):
+    """Who keeps the model's fields per world: `mujoco.batch.Batch`, or a host copy of a GPU's."""
+
+    @property
+    def nsim(self) -> int: ...
+
+    def expand(self, name: str, /) -> np.ndarray:
+        """Return a model field with a leading axis of worlds, to be written to."""
+        ...
+
+
+class Randomizer:
+    """Draws values for worlds and writes them into a batch.
+
+    Args:
+        world: the model.
+        batch: the simulations; the fields that vary are expanded here, once.
+        cfg: the ranges.
+        rng: fills the bank of start poses; later draws get their own generator.
+
+    Attributes:
+        size_m: full extents, `(env, object, 3)`.
+        mass_kg, friction: `(env, object)`.
+        delay_s: `(env,)`.
+        servo_gain: factors of the servos' stiffness and damping, `(env, 2)`.
+        camera_pos, camera_quat, camera_fovy_deg: of the camera `view`, `(env, 3)`, `(env, 4)`, `(env,)`.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        batch: PerWorldFields,
+        cfg: RandomizationConfig,
+        rng: np.random.Generator,
+    ) -> None:
+        self.world = world
+        self.cfg = cfg
+        n, objects = batch.nsim, world.objects
+        self.size_m = np.tile(np.array([o.size_m for o in objects]), (n, 1, 1))
+        self.mass_kg = np.tile(np.array([o.mass_kg for o in objects]), (n, 1))
+        self.friction = np.tile(np.array([o.friction for o in objects]), (n, 1))
+        self.delay_s = np.zeros(n)
+        self.servo_gain = np.ones((n, 2))
+        view = world.model.camera(CAMERA)
+        self.camera_pos = np.tile(view.pos, (n, 1))
+        self.camera_quat = np.tile(view.quat, (n, 1))
+        self.camera_fovy_deg = np.full(n, float(view.fovy[0]))
+        self._view = (
+            self.camera_pos[0].copy(),
+            self.camera_quat[0].copy(),
+            self.camera_fovy_deg[0],
+        )
+        self._height_above_table = np.zeros((n, len(objects)))
+        self._radius = np.zeros((n, len(objects)))
+        self._fields = {
+            name: batch.expand(name)
+            for name in [
+                "geom_size",
+                "geom_pos",
+                "geom_rbound",
+                "geom_aabb",
+                "geom_friction",
+                "geom_dataid",
+                "bvh_aabb",
+                "body_mass",
+                "body_inertia",
+                "body_ipos",
+                "body_subtreemass",
+                "body_invweight0",
+                "dof_invweight0",
+                "dof_M0",
+                "actuator_delay",
+                "actuator_gainprm",
+                "actuator_biasprm",
+            ]
+        }
+        self._base = {name: array[0].copy() for name, array in self._fields.items()}
+        self._rest = [
+            Rotation.from_quat(o.rest_quat, scalar_first=True).as_matrix() for o in objects
+        ]
+        self.start_tool_pos, self.start_yaw, self.start_qpos = self._start_bank(rng)
+        self._live = {**self._fields, **self.per_world_arrays()}
+        self._prepared = {
+            name: np.repeat(array[:1], PREPARED, axis=0) for name, array in self._live.items()
+        }
+        self._num_used = np.array([PREPARED])
+
+    def draw(self, ids: Int[np.ndarray, "n"], rng: np.random.Generator) -> None:
+        """Draw sizes, masses, friction, delay, servo gains and cameras for the worlds `ids`."""
+        n = len(ids)
+        if n > PREPARED:
+            self._draw_into(self._live, ids, rng)
+            return
+        if self._num_used[0] + n > PREPARED:
+            self._draw_into(self._prepared, np.arange(PREPARED), rng)
+            self._num_used[0] = 0
+        rows = slice(int(self._num_used[0]), int(self._num_used[0]) + n)
+        self._num_used[0] += n
+        for name, array in self._live.items():
+            array[ids] = self._prepared[name][rows]
+
+    def forget_prepared(self) -> None:
+        """Let the next draw come from the generator it is given, whatever was prepared with another one."""
+        self._num_used[0] = PREPARED
+
+    def _draw_into(
+        self, into: dict[str, np.ndarray], rows: np.ndarray, rng: np.random.Generator
+    ) -> None:
+        cfg, n = self.cfg, len(rows)
+        for k, obj in enumerate(self.world.objects):
+            scale = rng.uniform(*cfg.size_scale, (n, 3))
+            mesh_idx = np.full(n, MESH_SCALES.index(1.0))
+            if obj.is_round:
+                scale[:, 1] = scale[:, 0]
+            elif obj.kind == "sphere":
+                scale[:] = scale[:, :1]
+            elif obj.kind == "mesh":
+                library = np.asarray(MESH_SCALES)
+                mesh_idx = np.abs(library - scale[:, :1]).argmin(1)
+                scale = np.repeat(library[mesh_idx, None], 3, axis=1)
+            mass = obj.mass_kg * rng.uniform(*cfg.mass_scale, n)
+            friction = obj.friction * rng.uniform(*cfg.friction_scale, n)
+            self._write(into, rows, k, obj, scale, mass, friction, mesh_idx)
+        into["delay_s"][rows] = rng.uniform(*cfg.delay_s, n)
+        into["actuator_delay"][rows] = into["delay_s"][rows, None]
+        gain = into["servo_gain"][rows] = rng.uniform(*cfg.servo_gain_scale, (n, 2))
+        # A servo's force is gain[0] * control + bias[1] * position + bias[2] * speed.
+        for name, first, factor in (
+            ("actuator_gainprm", 0, gain[:, :1]),
+            ("actuator_biasprm", 1, gain[:, :1]),
+            ("actuator_biasprm", 2, gain[:, 1:]),
+        ):
+            into[name][rows, :, first] = self._base[name][:, first] * factor
+        shift = rng.uniform(-1.0, 1.0, (n, 7))  # in any case: a moved camera changes nothing else
+        pos, quat, fovy_deg = self._view
+        into["camera_pos"][rows] = pos + cfg.camera_pos_m * shift[:, :3]
+        into["camera_fovy_deg"][rows] = fovy_deg + cfg.camera_fovy_deg * shift[:, 6]
+        if cfg.camera_angle_rad:
+            turn = Rotation.from_rotvec(cfg.camera_angle_rad * shift[:, 3:6])
+            turned = Rotation.from_quat(quat, scalar_first=True) * turn
+            into["camera_quat"][rows] = turned.as_quat(scalar_first=True)
+
+    def place(
+        self, ids: Int[np.ndarray, "n"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "n object 7"]:
+        """Return poses of all objects at rest on the table, apart from each other and within reach.
+
+        The layout follows the video: reference objects keep their direction from the manipulated one, at a
+        distance that fits. Push tasks leave `PUSH_ROOM_M` free on the side they push to.
+
+        Raises:
+            ItemRejectedError: the objects do not fit on the table together.
+        """
+        cfg, n = self.cfg, len(ids)
+        count = len(self.world.objects)
+        radius = self._radius[ids]
+        offsets = scene_offsets(self.world.scene)
+        kind = KINDS[self.world.scene.kind]
+        low, high = _placement_boxes(kind, count)
+        centre = np.array([WORKSPACE_CENTRE_M[0], (low[0, 1] + high[0, 1]) / 2])
+        pair = self._cover_pair()
+        if pair is not None:
+            self._check_covered_fits(ids, *pair)
+            pair = pair if kind.starts_over else None  # else they start apart
+        xy = np.zeros((n, count, 2))
+        todo = np.arange(n)
+        for attempt in range(PLACEMENT_TRIES):
+            m = len(todo)
+            loosen = 1.0 + 2.0 * attempt / PLACEMENT_TRIES if attempt >= 10 else 1.0
+            spot = np.zeros((m, count, 2))
+            r = radius[todo]
+            for k in range(1, count):
+                offset = offsets[k]
+                distance = np.linalg.norm(offset) * rng.uniform(*cfg.layout_distance_scale, m)
+                angle = np.arctan2(offset[1], offset[0]) + loosen * rng.uniform(
+                    -cfg.layout_angle_rad, cfg.layout_angle_rad, m
+                )
+                nearest = r[:, 0] + r[:, k] + 0.02
+                distance = np.clip(distance, nearest, np.maximum(nearest, 0.28))
+                if pair is not None and k == max(pair):
+                    distance = np.zeros(m)
+                spot[:, k] = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            shift = rng.uniform(-cfg.object_pos_m, cfg.object_pos_m, (m, 2)) * min(loosen, 1.5)
+            middle = (spot.max(1) + spot.min(1)) / 2 if count > 1 else np.zeros((m, 2))
+            spot += (centre + shift - middle)[:, None]
+            # The whole group moves back into the box where it can.
+            over = np.maximum(spot - high, 0).max(1) - np.maximum(low - spot, 0).max(1)
+            spot -= over[:, None]
+            if kind.other_starts == "beyond_reach" and count > 1:
+                spot[:, 0] = centre + shift
+                spot[:, 1:] = rng.uniform(BEYOND_LOW_M, BEYOND_HIGH_M, (m, 1, 2))
+            inside = ((spot >= low - 1e-9) & (spot <= high + 1e-9)).all((1, 2))
+            apart = np.ones(m, bool)
+            for a in range(count):
+                for b in range(a + 1, count):
+                    if pair in {(a, b), (b, a)}:
+                        continue
+                    gap = np.linalg.norm(spot[:, a] - spot[:, b], axis=1) - r[:, a] - r[:, b]
+                    apart &= gap > 0.005
+            good = inside & apart
+            xy[todo[good]] = spot[good]
+            todo = todo[~good]
+            if not len(todo):
+                break
+        if len(todo):
+            names = ", ".join(o.name for o in self.world.objects)
+            raise ItemRejectedError(
+                "no_room",
+                f"{names} do not fit on the table of scene '{self.world.scene.title}' within the robot's reach "
+                f"without touching, in {PLACEMENT_TRIES} tries",
+                float(len(todo)),
+            )
+        return self._poses(ids, xy, rng)
+
+    def start_arm(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "n joint"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+        """Return joint angles, tool positions and yaws of `count` start poses."""
+        k = rng.integers(0, len(self.start_qpos), count)
+        return self.start_qpos[k], self.start_tool_pos[k], self.start_yaw[k]
+
+    def fields(self) -> dict[str, np.ndarray]:
+        """Return the model fields that differ between worlds; live arrays."""
+        return self._fields
+
+    def drawn_arrays(self) -> dict[str, np.ndarray]:
+        """Return all drawn values, what follows from them, and what is drawn already; live arrays."""
+        prepared = {f"prepared_{name}": array for name, array in self._prepared.items()}
+        return {**self.per_world_arrays(), **prepared, "num_used": self._num_used}
+
+    def per_world_arrays(self) -> dict[str, np.ndarray]:
+        """Return drawn values and what follows from them, each with a row per world; live arrays."""
+        return {
+            "size_m": self.size_m,
+            "mass_kg": self.mass_kg,
+            "friction": self.friction,
+            "delay_s": self.delay_s,
+            "servo_gain": self.servo_gain,
+            "camera_pos": self.camera_pos,
+            "camera_quat": self.camera_quat,
+            "camera_fovy_deg": self.camera_fovy_deg,
+            "height_above_table": self._height_above_table,
+            "radius": self._radius,
+        }
+
+    def drawn(self, env: int) -> dict[str, object]:
+        """Return the values world `env` has now, for JSON."""
+        objects = {
+            o.name: {
+                "size_m": np.round(self.size_m[env, k], 5).tolist(),
+                "mass_kg": round(float(self.mass_kg[env, k]), 5),
+                "friction": round(float(self.friction[env, k]), 4),
+            }
+            for k, o in enumerate(self.world.objects)
+        }
+        return {
+            "objects": objects,
+            "action_delay_ms": round(float(self.delay_s[env]) * 1e3, 3),
+            "action_noise": self.cfg.action_noise,
+            "servo_stiffness_scale": round(float(self.servo_gain[env, 0]), 4),
+            "servo_damping_scale": round(float(self.servo_gain[env, 1]), 4),
+            "camera": {
+                "pos_m": np.round(self.camera_pos[env], 5).tolist(),
+                "quat_wxyz": np.round(self.camera_quat[env], 6).tolist(),
+                "fovy_deg": round(float(self.camera_fovy_deg[env]), 4),
+            },
+        }
+
+    def _poses(self, ids: np.ndarray, xy: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        n, cfg = len(ids), self.cfg
+        poses = np.zeros((n, len(self.world.objects), 7))
+        poses[:, :, :2] = xy
+        poses[:, :, 2] = self._height_above_table[ids] + 5e-4
+        for k, obj in enumerate(self.world.objects):
+            yaw = rng.uniform(-cfg.yaw_rad, cfg.yaw_rad, n)
+            rest = np.tile(np.array([obj.rest_quat]).T, n)
+            poses[:, k, 3:] = product(quats_about_z(yaw), rest).T
+        return poses
+
+    def _cover_pair(self) -> tuple[int, int] | None:
+        """Return cover and what it covers, in tasks about covering."""
+        scene = self.world.scene
+        cover = cover_of(scene)
+        if not KINDS[scene.kind].has_cover or cover is None:
+            return None
+        return cover, 1 if cover == 0 else 0
+
+    def _check_covered_fits(self, ids: np.ndarray, cover: int, covered: int) -> None:
+        obj = self.world.objects[cover]
+        size = self.size_m[ids, cover]
+        room = size[:, :2].min(1) / 2 - WALL_MAX_M
+        too_big = self._radius[ids, covered] - room
+        too_tall = 2 * self._height_above_table[ids, covered] - (size[:, 2] - FLOOR_MAX_M)
+        excess = float(np.maximum(too_big, too_tall).max())
+        if excess > 0:
+            raise ItemRejectedError(
+                "does_not_fit_under_cover",
+                f"'{self.world.objects[covered].name}' does not fit under '{obj.name}' in scene "
+                f"'{self.world.scene.title}': {excess * 1000:.0f} mm too large",
+                excess,
+            )
+
+    def _write(
+        self,
+        into: dict[str, np.ndarray],
+        ids: np.ndarray,
+        k: int,
+        obj: ObjectModel,
+        scale: np.ndarray,
+        mass: np.ndarray,
+        friction: np.ndarray,
+        mesh_idx: np.ndarray,
+    ) -> None:
+        f, base, model = into, self._base, self.world.model
+        geoms = np.asarray(obj.geom_ids)
+        rows = ids[:, None]
+        g = scale[
+            :, None, :
+        ]  # also along turned geoms' own axes: those belong to round things, where x = y
+        f["geom_size"][rows, geoms] = base["geom_size"][geoms] * self._size_scale(obj, scale)
+        f["geom_pos"][rows, geoms] = base["geom_pos"][geoms] * g
+        f["geom_aabb"][rows, geoms] = base["geom_aabb"][geoms] * np.tile(g, (1, 1, 2))
+        if obj.kind == "sphere":
+            f["geom_rbound"][rows, geoms] = base["geom_rbound"][geoms] * scale[:, :1]
+        else:
+            # The radius about the geom's centre of the box that bounds it.
+            aabb = f["geom_aabb"][rows, geoms]
+            f["geom_rbound"][rows, geoms] = np.linalg.norm(
+                np.abs(aabb[..., :3]) + aabb[..., 3:], axis=2
+            )
+        f["geom_friction"][rows, geoms, 0] = friction[:, None]
+        if obj.kind == "mesh":
+            f["geom_dataid"][rows, geoms] = np.asarray(obj.mesh_ids).T[mesh_idx]
+        start, count = model.body_bvhadr[obj.body_id], model.body_bvhnum[obj.body_id]
+        nodes = np.arange(start, start + count)
+        f["bvh_aabb"][rows, nodes] = base["bvh_aabb"][nodes] * np.tile(g, (1, 1, 2))
+        body, dofs = obj.body_id, np.arange(obj.dof_adr, obj.dof_adr + 6)
+        ratio = mass / base["body_mass"][body]
+        second = base["body_inertia"][body].sum() / 2 - base["body_inertia"][body]  # of x, y, z
+        if obj.kind == "mesh":  # its inertia has axes of its own, but is scaled uniformly
+            inertia = base["body_inertia"][body] * scale[:, :1] ** 2
+        else:
+            stretched = second * scale**2
+            inertia = stretched.sum(1, keepdims=True) - stretched
+        inertia = inertia * ratio[:, None]
+        f["body_mass"][ids, body] = mass
+        f["body_subtreemass"][ids, body] = mass
+        f["body_inertia"][ids, body] = inertia
+        f["body_ipos"][ids, body] = base["body_ipos"][body] * scale
+        turn = (1 / inertia).mean(1) / (1 / base["body_inertia"][body]).mean()
+        f["body_invweight0"][ids, body, 0] = base["body_invweight0"][body, 0] / ratio
+        f["body_invweight0"][ids, body, 1] = base["body_invweight0"][body, 1] * turn
+        f["dof_invweight0"][rows, dofs[:3]] = base["dof_invweight0"][dofs[:3]] / ratio[:, None]
+        f["dof_invweight0"][rows, dofs[3:]] = base["dof_invweight0"][dofs[3:]] * turn[:, None]
+        if model.body_simple[body]:
+            # MuJoCo takes a simple body's inertia from here; else a heavier one would fall faster.
+            f["dof_M0"][rows, dofs[:3]] = mass[:, None]
+            f["dof_M0"][rows, dofs[3:]] = inertia
+        f["size_m"][ids, k] = np.asarray(obj.size_m) * scale
+        f["mass_kg"][ids, k] = mass
+        f["friction"][ids, k] = friction
+        corners = obj.hull * g @ self._rest[k].T
+        f["height_above_table"][ids, k] = -corners[:, :, 2].min(1)
+        f["radius"][ids, k] = np.linalg.norm(corners[:, :, :2], axis=2).max(1)
+
+    def _size_scale(self, obj: ObjectModel, scale: np.ndarray) -> np.ndarray:
+        """Return factors of `geom_size`, whose meaning depends on the geom's type."""
+        if obj.kind == "cylinder":
+            return scale[:, None, [0, 2, 2]]
+        if (
+            obj.kind == "round_hollow"
+        ):  # first the floor, a cylinder (radius, half height); then boxes
+            factors = np.repeat(scale[:, None, :], len(obj.geom_ids), axis=1)
+            factors[:, 0] = scale[:, [0, 2, 2]]
+            return factors
+        return scale[:, None, :]
+
+    def _start_bank(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return tool positions, yaws and joint angles of arm poses above the tallest object."""
+        tallest = max(
+            float(np.ptp(o.hull @ self._rest[k].T, axis=0)[2])
+            for k, o in enumerate(self.world.objects)
+        )
+        reach = np.asarray(self.cfg.arm_pos_m)
+        lowest = max(0.195, tallest * self.cfg.size_scale[1] + 0.05 + reach[2])
+        home = np.array([0.51, 0.0, min(lowest, 0.42)])
+        pos = home + rng.uniform(-1, 1, (START_BANK, 3)) * reach
+        yaw = rng.uniform(-self.cfg.arm_yaw_rad, self.cfg.arm_yaw_rad, START_BANK)
+        return pos, yaw, self.world.robot.qpos_for(pos, yaw)
+
+
+def scene_offsets(scene: Scene) -> Float[np.ndarray, "object 2"]:
+    """Return where each object stood at first in the video, relative to the manipulated one [m]."""
+    first = np.array([o.first_pose[:2] if o.poses_world else np.zeros(2) for o in scene.objects])
+    offsets = first - first[0]
+    for k in range(1, len(offsets)):
+        if np.linalg.norm(offsets[k]) < 1e-3:
+            offsets[k] = (0.15, 0.0)
+    return offsets
+
+
+def _placement_boxes(kind: TaskKind, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return per object the lowest and highest x and y of its centre [m]."""
+    low, high = np.tile(OBJECT_LOW_M, (count, 1)), np.tile(OBJECT_HIGH_M, (count, 1))
+    if kind.side > 0:
+        high[:, 1] -= PUSH_ROOM_M
+    elif kind.side < 0:
+        low[:, 1] += PUSH_ROOM_M
+    elif kind.other_starts == "beyond_reach":
+        low[1:], high[1:] = BEYOND_LOW_M, BEYOND_HIGH_M
+    elif kind.other_starts == "far_side":
+        low[1:, 0] += 0.1  # what is in front of it must be within reach, too
+    return low, high

@@ -1,0 +1,74 @@
+"""The independent referee on episodes that a `BatchEnv` is running: what happened so far, and is it success?"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.task.referee import ObjectTrack, Trajectory, referee_success
+from v2p_data.task.task import TaskBundle
+
+
+def referee_verdict(
+    bundle: TaskBundle, course: Mapping[str, np.ndarray]
+) -> Bool[np.ndarray, "env"]:
+    """Return what the referee says of episodes, given per key of `states` an array `(time, env, ...)`."""
+    objects = {
+        obj.name: ObjectTrack(
+            pos=course[f"{obj.name}_pos"].astype(float),
+            quat_wxyz=course[f"{obj.name}_quat"].astype(float),
+            size_m=course[f"{obj.name}_size"][0].astype(float),
+            # "any pad" and "both pads" stand for the two pads: all rules ask for one or the other.
+            touched=np.stack(
+                [course[f"{obj.name}_{key}"] > 0 for key in ("touched", "grasped")], axis=-1
+            ),
+        )
+        for obj in bundle.scene.objects
+    }
+    trajectory = Trajectory(objects=objects, eef_pos=course["eef_pos"].astype(float))
+    return referee_success(bundle.kind, bundle.scene, trajectory)
+
+
+class Course:
+    """What the referee looks at, of all worlds of an environment, which start and end together."""
+
+    def __init__(self, env: BatchEnv) -> None:
+        self._env = env
+        self._keys = ["eef_pos"] + [
+            f"{name}_{key}"
+            for name in env.object_names
+            for key in ("pos", "quat", "size", "touched", "grasped")
+        ]
+        self._moments: list[dict[str, np.ndarray]] = []
+
+    def restart(self) -> None:
+        """Forget everything and note the start of new episodes; call after a reset."""
+        self._moments = []
+        self.note()
+
+    def note(self) -> None:
+        """Note the present moment; call after each step."""
+        states = self._env.states()
+        self._moments.append({key: states[key].numpy().astype(float) for key in self._keys})
+
+    def __len__(self) -> int:
+        """Return the number of moments so far."""
+        return len(self._moments)
+
+    def of(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> dict[str, np.ndarray]:
+        """Return the course of some worlds up to now, per key an array `(time, world, ...)`."""
+        return {key: np.stack([m[key][worlds] for m in self._moments]) for key in self._keys}
+
+    def as_cut(self, end: Int[np.ndarray, "env"]) -> dict[str, np.ndarray]:
+        """Return the course in which each world stands still from the step `end` on."""
+        time = np.minimum(np.arange(len(self))[:, None], end[None])
+        return {key: array[time, np.arange(len(end))] for key, array in self.of().items()}
+
+    def verdict(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> Bool[np.ndarray, "n"]:
+        """Return what the referee says of the episodes of some worlds so far."""
+        return referee_verdict(self._env.bundle, self.of(worlds))
+
+    def verdict_as_cut(self, end: Int[np.ndarray, "env"]) -> Bool[np.ndarray, "env"]:
+        """Return what the referee says of episodes of `end` steps each; see `as_cut`."""
+        return referee_verdict(self._env.bundle, self.as_cut(end))

@@ -1,0 +1,312 @@
+"""Segmentation masks of saved moments, from the camera `view`.
+
+A label image is uint8: 0 background and table, 1 robot, 2 the manipulated object, 3.. the others in scene
+order. A z-buffer on all cores draws it (`zbuffer`); OpenGL (EGL, also in software) and rays draw the same but for
+a few border pixels, slower. Pictures for people need OpenGL. As video, labels become greys: with R = G = B the
+chroma is constant, so 4:2:0 loses nothing, and each grey below survives the way through limited-range luma unchanged.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco's classes come from a compiled module that declares none of them.
+
+import copy
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import mujoco
+import numpy as np
+from jaxtyping import UInt8
+from mujoco.batch import Batch
+
+from v2p_data.errors import V2PError
+from v2p_data.sim.model.world import CAMERA, World, build_world
+from v2p_data.sim.robot.arms import robot_from_json
+from v2p_data.sim.robot.robot import FINE
+from v2p_data.task.task import TaskBundle
+
+PALETTE = (0, 64, 128, 192, 255, 31, 95, 158, 222)
+"""Grey level of each label."""
+BACKGROUND, ROBOT, FIRST_OBJECT = 0, 1, 2
+GL_HINT = "install it with 'apt-get install libegl1 libgl1-mesa-dri'"
+
+_GREYS = np.asarray(PALETTE, np.uint8)
+_LABELS = np.abs(np.arange(256)[:, None] - np.asarray(PALETTE)[None]).argmin(1).astype(np.uint8)
+
+Backend = Literal["auto", "zbuffer", "gl", "rays"]
+
+
+def labels_to_rgb(labels: UInt8[np.ndarray, "*batch h w"]) -> UInt8[np.ndarray, "*batch h w 3"]:
+    """Return labels as greys, R = G = B."""
+    if labels.size and labels.max() >= len(PALETTE):
+        raise ValueError(f"label {labels.max()} has no grey; labels go up to {len(PALETTE) - 1}")
+    return np.repeat(_GREYS[labels][..., None], 3, axis=-1)
+
+
+def rgb_to_labels(rgb: UInt8[np.ndarray, "*batch h w 3"]) -> UInt8[np.ndarray, "*batch h w"]:
+    """Return the label whose grey is nearest to the red channel."""
+    return _LABELS[rgb[..., 0]]
+
+
+def label_names(objects: tuple[str, ...]) -> dict[int, str]:
+    """Return the meaning of each label in a scene with these objects."""
+    return {BACKGROUND: "background", ROBOT: "robot"} | {
+        FIRST_OBJECT + k: name for k, name in enumerate(objects)
+    }
+
+
+def geom_labels(world: World) -> UInt8[np.ndarray, "geom"]:
+    """Return the label of every geom.
+
+    Raises:
+        V2PError: the scene has more objects than there are greys.
+    """
+    if len(world.objects) + FIRST_OBJECT > len(PALETTE):
+        raise V2PError(
+            f"scene '{world.scene.title}' has {len(world.objects)} objects; "
+            f"masks tell at most {len(PALETTE) - FIRST_OBJECT} apart"
+        )
+    labels = np.full(world.model.ngeom, ROBOT, np.uint8)
+    labels[world.model.geom("table").id] = BACKGROUND
+    for k, obj in enumerate(world.objects):
+        labels[list(obj.geom_ids)] = FIRST_OBJECT + k
+    return labels
+
+
+@runtime_checkable
+class Moment(Protocol):
+    """Saved states of a batch of worlds, enough to draw them (`batch_env.Snapshot`)."""
+
+    def write(self, model: mujoco.MjModel, data: mujoco.MjData, index: int) -> None:
+        """Put world `index` into a model and its data and compute positions, ready to be drawn."""
+        ...
+
+
+class MaskRenderer:
+    """Draws saved moments on a private copy of the model.
+
+    Args:
+        source: the task, or its world where it is built already.
+        size_px: width and height of the image, or (height, width).
+        backend: what draws the masks; `auto` is `zbuffer`.
+        num_threads: for the z-buffer, 0 for all cores; changes no result.
+
+    Raises:
+        V2PError: `gl` was asked for and there is none.
+    """
+
+    def __init__(
+        self,
+        source: TaskBundle | World,
+        size_px: int | tuple[int, int] = 256,
+        *,
+        backend: Backend = "auto",
+        num_threads: int = 0,
+    ) -> None:
+        world = source if isinstance(source, World) else _world_of(source)
+        self.size_px = size_px
+        self.backend: Backend = "zbuffer" if backend == "auto" else backend
+        self.labels = geom_labels(world)
+        self._model = world.model
+        self._shape = (size_px, size_px) if isinstance(size_px, int) else size_px
+        self._num_threads = num_threads
+        self._painter: _Painter | None = None
+        self._pictures: _GLPainter | None = None
+        self._no_gl = ""
+        if self.backend == "gl":
+            self._painter = self._gl("OpenGL cannot draw here")
+
+    def draw(self, snapshot: Moment, index: int) -> UInt8[np.ndarray, "h w"]:
+        """Return the label image of world `index` of the snapshot."""
+        return self.draw_many([(snapshot, index)])[0]
+
+    def draw_many(self, moments: Sequence[tuple[Moment, int]]) -> UInt8[np.ndarray, "n h w"]:
+        """Return the label images of worlds of snapshots; several at once keep all cores busy."""
+        if (
+            self._painter is None
+        ):  # late, because whoever wants pictures only needs nothing compiled
+            if self.backend == "rays":
+                self._painter = _RayPainter(self._model, self.labels, self._shape)
+            else:
+                self._painter = _ZPainter(self._model, self.labels, self._shape, self._num_threads)
+        return self._painter.draw(moments)
+
+    def draw_rgb(self, snapshot: Moment, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Return a picture for people.
+
+        Raises:
+            V2PError: there is no OpenGL, or rays were asked for, which give masks only.
+        """
+        if self.backend == "rays":
+            raise V2PError("rays give masks only; pictures need OpenGL")
+        return self._gl("pictures need OpenGL and there is none").rgb(snapshot, index)
+
+    def close(self) -> None:
+        """Free the graphics memory."""
+        if self._pictures is not None:
+            self._pictures.close()
+        self._painter = self._pictures = None
+
+    def __enter__(self) -> "MaskRenderer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _gl(self, complaint: str) -> "_GLPainter":
+        """Return what draws by OpenGL, made at the first call.
+
+        Raises:
+            V2PError: there is no OpenGL.
+        """
+        if self._pictures is None and not self._no_gl:
+            try:
+                self._pictures = _GLPainter(self._model, self.labels, self._shape)
+            except _NoGLError as error:
+                self._no_gl = str(error)
+        if self._pictures is None:
+            asked = os.environ.get("MUJOCO_GL")
+            unset = f"unset MUJOCO_GL, which asks for '{asked}', or " if asked else ""
+            raise V2PError(f"{complaint} ({self._no_gl}); {unset}{GL_HINT}")
+        return self._pictures
+
+
+def _world_of(bundle: TaskBundle) -> World:
+    return build_world(bundle.scene, FINE, robot=robot_from_json(bundle.robot))
+
+
+class _NoGLError(Exception):
+    pass
+
+
+class _Painter(Protocol):
+    def draw(self, moments: Sequence[tuple[Moment, int]]) -> np.ndarray: ...
+
+
+class _ZPainter:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        labels: np.ndarray,
+        shape: tuple[int, int],
+        num_threads: int,
+    ) -> None:
+        from v2p_data.sim.render.zbuffer import Views, ZBuffer  # numba takes half a second to load
+
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        self.camera = self.model.camera(CAMERA).id
+        self.views = Views
+        self.zbuffer = ZBuffer(self.model, labels, *shape, num_threads=num_threads)
+
+    def draw(self, moments: Sequence[tuple[Moment, int]]) -> np.ndarray:
+        views = self.views.empty(self.model, len(moments))
+        for k, (snapshot, index) in enumerate(moments):
+            snapshot.write(self.model, self.data, index)
+            views.note(k, self.model, self.data, self.camera)
+        return self.zbuffer.draw(views)
+
+
+class _GLPainter:
+    def __init__(self, model: mujoco.MjModel, labels: np.ndarray, shape: tuple[int, int]) -> None:
+        self.height_px, self.width_px = shape
+        self.labels = np.append(
+            labels, np.uint8(BACKGROUND)
+        )  # the last, -1, is what no geom shows
+        self.model = copy.copy(model)
+        self.model.vis.global_.offheight, self.model.vis.global_.offwidth = shape
+        self.model.vis.quality.offsamples = 0  # blended borders would be labels that nothing has
+        self.data = mujoco.MjData(self.model)
+        self.context = _gl_context(self.width_px, self.height_px)
+        self.context.make_current()
+        self.drawer = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.drawer)
+        self.scene = mujoco.MjvScene(self.model, maxgeom=2 * self.model.ngeom + 50)
+        self.option = mujoco.MjvOption()
+        self.camera = mujoco.MjvCamera()
+        self.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self.camera.fixedcamid = self.model.camera(CAMERA).id
+        self.rect = mujoco.MjrRect(0, 0, self.width_px, self.height_px)
+
+    def draw(self, moments: Sequence[tuple[Moment, int]]) -> np.ndarray:
+        images = [self.labels[self._geoms(snapshot, index)] for snapshot, index in moments]
+        return np.array(images, np.uint8).reshape(-1, self.height_px, self.width_px)
+
+    def _geoms(self, snapshot: Moment, index: int) -> np.ndarray:
+        codes = self._pixels(snapshot, index, segmentation=True).astype(np.int32)
+        shown = codes[..., 0] + (codes[..., 1] << 8) + (codes[..., 2] << 16)
+        is_geom = int(mujoco.mjtObj.mjOBJ_GEOM)
+        ids = np.full(self.scene.ngeom + 1, -1, np.int32)
+        for k in range(self.scene.ngeom):
+            geom = self.scene.geoms[k]
+            if geom.objtype == is_geom:
+                ids[geom.segid + 1] = geom.objid
+        return ids[shown]
+
+    def rgb(self, snapshot: Moment, index: int) -> np.ndarray:
+        return self._pixels(snapshot, index, segmentation=False)
+
+    def _pixels(self, snapshot: Moment, index: int, *, segmentation: bool) -> np.ndarray:
+        self.context.make_current()
+        snapshot.write(self.model, self.data, index)
+        mujoco.mjv_updateScene(
+            self.model, self.data, self.option, None, self.camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value, self.scene,
+        )  # fmt: skip
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = segmentation
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = segmentation
+        mujoco.mjr_render(self.rect, self.scene, self.drawer)
+        pixels = np.empty((self.height_px, self.width_px, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self.rect, self.drawer)
+        return pixels[::-1].copy()
+
+    def close(self) -> None:
+        self.context.make_current()
+        self.drawer.free()
+        self.context.free()
+
+
+class _RayPainter:
+    def __init__(self, model: mujoco.MjModel, labels: np.ndarray, shape: tuple[int, int]) -> None:
+        self.labels = np.append(labels, np.uint8(BACKGROUND))  # the last, -1, is what hits nothing
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        self.batch = Batch(self.model, 1, 1)
+        self.qpos = self.batch.bind("qpos")
+        self.camera = self.model.camera(CAMERA).id
+        self.height_px, self.width_px = shape
+        rows, columns = np.mgrid[0 : self.height_px, 0 : self.width_px] + 0.5
+        across = columns - self.width_px / 2
+        down = rows - self.height_px / 2
+        self.pixels = np.stack([across, -down], axis=-1).reshape(-1, 2)
+
+    def draw(self, moments: Sequence[tuple[Moment, int]]) -> np.ndarray:
+        images = [self.labels[self._geoms(snapshot, index)] for snapshot, index in moments]
+        return np.array(images, np.uint8).reshape(-1, self.height_px, self.width_px)
+
+    def _geoms(self, snapshot: Moment, index: int) -> np.ndarray:
+        snapshot.write(self.model, self.data, index)
+        self.batch.set_models(self.model)
+        self.qpos[0] = self.data.qpos
+        fovy_rad = np.radians(self.model.cam_fovy[self.camera])
+        focal_px = self.height_px / 2 / np.tan(fovy_rad / 2)
+        beams = np.concatenate([self.pixels / focal_px, -np.ones((len(self.pixels), 1))], axis=1)
+        R_world_cam = self.data.cam_xmat[self.camera].reshape(3, 3)
+        _, geoms = self.batch.ray(self.data.cam_xpos[self.camera], beams @ R_world_cam.T)
+        return np.asarray(geoms[0]).reshape(self.height_px, self.width_px)
+
+
+def _gl_context(width_px: int, height_px: int) -> Any:
+    """Return an OpenGL context, by EGL on Linux unless MUJOCO_GL asks for something else.
+
+    MuJoCo itself would look for a window where MUJOCO_GL is unset.
+    """
+    try:
+        if sys.platform == "linux" and os.environ.get("MUJOCO_GL", "egl").lower() in {"egl", ""}:
+            from mujoco.egl import GLContext
+        else:
+            from mujoco.rendering.classic.gl_context import GLContext
+        return GLContext(width_px, height_px)
+    except (ImportError, AttributeError, OSError, RuntimeError) as error:
+        raise _NoGLError(f"{type(error).__name__}: {error}") from error

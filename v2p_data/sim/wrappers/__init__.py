@@ -1,0 +1,1 @@
+"""Tasks as environments that others know: Gymnasium, its vector environments, TorchRL, LeRobot."""

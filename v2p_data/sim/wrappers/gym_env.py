@@ -1,0 +1,197 @@
+"""One task as a Gymnasium environment, `v2p/Task-v0`: what a policy sees, does, and is judged by.
+
+| | |
+|---|---|
+| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `agent_pos`: 11 float32, see `BatchEnv.robot_state` |
+| Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz |
+| Reward | the task's training reward |
+| Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
+| End | terminated: success, or the simulation broke down; truncated: twice the task's horizon (`horizon_scale`) |
+| Info | `is_success`: the task's own success has held for 0.25 s and the independent referee agrees |
+
+The simulation runs at the fine time step: what the coarse one calls a success can be an object pressed
+through the table.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
+from jaxtyping import Float, UInt8
+
+from v2p_data.errors import V2PError
+from v2p_data.sim.env import randomize
+from v2p_data.sim.env.batch_env import ACT_DIM, BatchEnv, SimConfig, Snapshot
+from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.model.world import World
+from v2p_data.sim.render.masks import MaskRenderer, labels_to_rgb
+from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
+
+ENV_ID = "v2p/Task-v0"
+CONTROL_HZ = 20
+STATE_LOW = (-1.5, -1.5, -0.5, -np.pi, -np.pi, -np.pi, 0.0, -1.0, -1.0, -1.0, 0.0)
+STATE_HIGH = (1.5, 1.5, 1.5, np.pi, np.pi, np.pi, 1.0, 1.0, 1.0, 1.0, 1.0)
+"""Bounds of `BatchEnv.robot_state`."""
+
+
+def stream_seed(seed: int) -> int:
+    """Return what `V2PEnv.reset(seed=seed)` seeds its world with, for `BatchEnv.reset_seeded`."""
+    return _next_seed(np_random(seed)[0])
+
+
+def demand_no_options(options: dict[str, Any] | None) -> None:
+    """Raise where `reset` is given options: none would be heeded. LeRobot's own tell that a rollout begins.
+
+    Raises:
+        V2PError: names them.
+    """
+    unheeded = [str(name) for name in options or () if not str(name).startswith("lerobot_")]
+    if unheeded:
+        raise V2PError(
+            f"reset takes a seed and no options, got {', '.join(unheeded)}; what can be set is given when the "
+            "environment is made"
+        )
+
+
+class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
+    """A single world of one task.
+
+    Args:
+        task_folder: folder with `task.json`, as `v2p task` writes it.
+        size_px: width and height of the mask.
+        render_mode: `rgb_array`, or None.
+        camera_pos_m, camera_angle_rad, camera_fovy_deg: how far the camera is moved at each reset, as in
+            `RandomizationConfig`; a policy is evaluated under what its dataset was recorded under.
+        horizon_scale: an episode lasts at most this multiple of the task's own horizon.
+
+    Raises:
+        V2PError: the folder holds no task, or there is no such render mode.
+        ItemRejectedError: the task cannot be simulated.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 - Gymnasium's attribute
+
+    def __init__(
+        self,
+        task_folder: str,
+        size_px: int = 256,
+        render_mode: str | None = "rgb_array",
+        *,
+        camera_pos_m: float = 0.0,
+        camera_angle_rad: float = 0.0,
+        camera_fovy_deg: float = 0.0,
+        horizon_scale: float = POLICY_HORIZON_SCALE,
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise V2PError(f"render_mode is 'rgb_array' or None, got {render_mode!r}")
+        bundle = TaskBundle.load(Path(task_folder))
+        self.render_mode = render_mode
+        self.task = bundle.title
+        self.task_description = bundle.description
+        self._max_episode_steps = bundle.policy_steps(horizon_scale)
+        self._num_steps = 0
+        randomization = replace(
+            randomize.recording(),
+            camera_pos_m=camera_pos_m,
+            camera_angle_rad=camera_angle_rad,
+            camera_fovy_deg=camera_fovy_deg,
+        )
+        sim = SimConfig(fine=True, randomization=randomization)
+        with told_of(bundle.folder):
+            self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
+        self._course = Course(self._world)
+        self._masks = MaskRenderer(self._world.world, size_px)
+        self.observation_space = spaces.Dict(
+            {
+                "pixels": spaces.Dict(
+                    {"mask": spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)}
+                ),
+                "agent_pos": spaces.Box(
+                    np.array(STATE_LOW, np.float32), np.array(STATE_HIGH, np.float32)
+                ),
+            }
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (ACT_DIM,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode; with a seed, always the same one.
+
+        Raises:
+            V2PError: there are options.
+        """
+        demand_no_options(options)
+        super().reset(seed=seed)
+        self._world.seed(_next_seed(self.np_random))
+        self._world.reset(np.array([0]))
+        self._num_steps = 0
+        self._course.restart()
+        return self._observe(), {"is_success": False}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Carry out one action; it is clipped to [-1, 1]."""
+        result = self._world.step(np.asarray(action, float)[None])
+        self._course.note()
+        self._num_steps += 1
+        broke = bool(result.terminated[0])
+        success = not broke and bool(result.held[0]) and bool(self._course.verdict()[0])
+        terminated = success or broke
+        return (
+            self._observe(),
+            float(result.reward[0]),
+            terminated,
+            self._num_steps >= self._max_episode_steps and not terminated,
+            {"is_success": success},
+        )
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return a picture for people; the mask where there is no OpenGL."""
+        if self.render_mode is None:
+            return None
+        snapshot = self._world.snapshot(np.array([0]))
+        try:
+            return self._masks.draw_rgb(snapshot, 0)
+        except V2PError:  # no OpenGL
+            return labels_to_rgb(self._masks.draw(snapshot, 0))
+
+    @property
+    def world(self) -> World:
+        """The compiled model."""
+        return self._world.world
+
+    def moment(self) -> Snapshot:
+        """Return the world as it is now: its joints, its camera, all that is needed to draw it."""
+        return self._world.snapshot(np.array([0]))
+
+    def picture(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the camera's colour picture.
+
+        Raises:
+            V2PError: there is no OpenGL.
+        """
+        return self._masks.draw_rgb(self.moment(), 0)
+
+    def contact_torques(self) -> Float[np.ndarray, "joint"]:
+        """Return the torques that contacts put on the arm's joints at the last time step [N m]."""
+        return self._world.contact_torques()[0]
+
+    def close(self) -> None:
+        """Free the graphics memory."""
+        self._masks.close()
+
+    def _observe(self) -> dict[str, Any]:
+        labels = self._masks.draw(self._world.snapshot(np.array([0])), 0)
+        state = np.clip(self._world.robot_state()[0], STATE_LOW, STATE_HIGH).astype(np.float32)
+        return {"pixels": {"mask": labels_to_rgb(labels)}, "agent_pos": state}
+
+
+def _next_seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**62))
+
+
+gym.register(id=ENV_ID, entry_point=V2PEnv)  # pyright: ignore[reportArgumentType]

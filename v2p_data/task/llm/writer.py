@@ -1,0 +1,384 @@
+"""A model writes task codes until enough of them run, chooses among them, and writes rewards for a task that exists.
+
+Whatever it writes is tried in the sandbox before anybody sees it, and goes back to it with the error and the line where it
+does not run. Nothing it says overrules the audit: it chooses among codes that the audit finds acceptable.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from v2p_data.scene.scene import Scene
+from v2p_data.task.audit.audit import Audit
+from v2p_data.task.llm.answers import choice_in, reward_code_in, task_code_in
+from v2p_data.task.llm.client import FaultyAnswerError, UnusableAnswersError, VlmClient
+from v2p_data.task.llm.example_refinements import REFINEMENTS
+from v2p_data.task.llm.example_tasks import Example
+from v2p_data.task.llm.pictures import Picture, scene_pictures
+from v2p_data.task.llm.pool import examples_for, read_pool
+from v2p_data.task.llm.prompts import (
+    Message,
+    better_reward_question,
+    fault_message,
+    first_reward_question,
+    objection_message,
+    pick_message,
+    scene_message,
+    system_message,
+)
+from v2p_data.task.sandbox.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.sandbox.splice import SpliceError, reward_part, reward_source, with_reward
+from v2p_data.task.task import TaskBundle
+from v2p_data.task.templates.variants import VARIANTS
+
+logger = logging.getLogger(__name__)
+
+TryAll = Callable[[list[str]], list[SmokeResult]]
+"""Runs task codes in the sandbox, one result each."""
+Written = tuple[str, SmokeResult]
+Objections = Callable[[Sequence[Written]], list[str]]
+"""Says of each code what an audit has against it; empty where it is acceptable."""
+MAX_OBJECTIONS = 1
+"""Times all samples go back with their audits where none is acceptable."""
+STRONGER = "Try a stronger model, or --task.vlm.max-regenerations"
+IDEAS = tuple(v.idea for v in VARIANTS if not v.is_naive)
+"""For variety among samples: what each reward may be like."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenSamples:
+    """What the model wrote, in the order of the samples."""
+
+    first: tuple[Written, ...] = field(repr=False)
+    """Each sample's first answer: what there is without sending anything back."""
+    final: tuple[Written, ...] = field(repr=False)
+    """After regeneration."""
+    answers: int
+    """Codes that were asked for, with those that were sent back."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pick:
+    """Which sample was chosen, by whom, and why."""
+
+    index: int
+    by: str
+    """`vlm` or `audit`."""
+    reasons: dict[str, str]
+
+    def as_dict(self) -> dict[str, object]:
+        """Return it for JSON."""
+        return {"by": self.by, "reasons": self.reasons}
+
+
+@dataclass(kw_only=True)
+class _Draft:
+    """One sample on its way: the conversation about it and where it stands."""
+
+    talk: list[Message]
+    code: str = ""
+    result: SmokeResult = field(
+        default_factory=lambda: SmokeResult(runnable=False, error="no code was written")
+    )
+
+
+# --- task codes ----------------------------------------------------------------------------------------------
+
+
+def write_samples(
+    client: VlmClient,
+    scene: Scene,
+    count: int,
+    examples: Sequence[Example],
+    try_all: TryAll,
+    objections: Objections,
+) -> WrittenSamples:
+    """Return `count` task codes for a scene, sent back with their errors until they run, a bounded number of times.
+
+    Where all run and none is acceptable, they go back once with what the audit has against them.
+
+    Args:
+        client: the model.
+        scene: what was understood of the video.
+        count: how many.
+        examples: solved tasks to show.
+        try_all: the sandbox.
+        objections: the audit.
+
+    Raises:
+        BudgetError: the budget is used up.
+        V2PError: the server cannot be asked.
+    """
+    cfg = client.cfg
+    system = system_message([o.name for o in scene.objects], examples)
+    pictures = _pictures(client, scene)
+    drafts = [
+        _Draft(
+            talk=[
+                system,
+                scene_message(
+                    scene,
+                    pictures,
+                    tracking=cfg.tracking,
+                    shapes=cfg.tells_shapes,
+                    end=_end(i, count),
+                ),
+            ]
+        )
+        for i in range(count)
+    ]
+    first: list[Written] = []
+    answers = rounds = 0
+    for turn in range(cfg.max_regenerations + 1):
+        open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
+        # The audit speaks of the video.
+        if not open_ones and rounds < MAX_OBJECTIONS and cfg.tells_shapes:
+            rounds += 1
+            faults = objections([(d.code, d.result) for d in drafts])
+            if all(faults):
+                for draft, fault in zip(drafts, faults, strict=True):
+                    draft.talk = [*draft.talk, objection_message(fault)]
+                open_ones = list(range(count))
+        if not open_ones:
+            break
+        purpose = f"task {scene.title}, turn {turn}, sample "
+        _ask_all(client, {f"{purpose}{i}": drafts[i] for i in open_ones}, task_code_in, try_all)
+        answers += len(open_ones)
+        if turn == 0:
+            first = [(d.code, d.result) for d in drafts]
+    final = tuple((d.code, d.result) for d in drafts)
+    broken = sum(not r.runnable for _, r in final)
+    if broken:
+        logger.warning(
+            "%d of %d samples for '%s' still do not run after %d regenerations",
+            broken, count, scene.title, cfg.max_regenerations,
+        )  # fmt: skip
+    return WrittenSamples(first=tuple(first), final=final, answers=answers)
+
+
+def _pictures(client: VlmClient, scene: Scene) -> list[Picture]:
+    cfg = client.cfg
+    return scene_pictures(scene, cfg.image_side_px, cfg.sheet_frames) if cfg.images else []
+
+
+def _end(index: int, count: int) -> str:
+    idea = IDEAS[index % len(IDEAS)]
+    return (
+        f"This is sample {index + 1} of {count}. So that the samples differ, let this one's reward follow this idea if it suits "
+        f"the task: {idea}"
+    )
+
+
+def _ask_all(
+    client: VlmClient,
+    drafts: dict[str, _Draft],
+    read: Callable[[str], str],
+    try_all: TryAll,
+) -> None:
+    """Ask for each draft's code at the same time, try them all, and add what is wrong to their conversations."""
+
+    def asked(item: tuple[str, _Draft]) -> None:
+        purpose, draft = item
+        try:
+            draft.code, draft.talk = client.ask(draft.talk, purpose, read)
+            draft.result = SmokeResult(runnable=True)
+        except FaultyAnswerError as fault:
+            draft.result = SmokeResult(runnable=False, error=f"no usable answer: {fault}")
+
+    with ThreadPoolExecutor(max_workers=client.cfg.parallel) as threads:
+        list(threads.map(asked, drafts.items()))
+    written = [d for d in drafts.values() if d.result.runnable]
+    for draft, result in zip(written, try_all([d.code for d in written]), strict=True):
+        draft.result = result
+        if not result.runnable:
+            draft.talk = [*draft.talk, fault_message(result.error, draft.code)]
+
+
+# --- the pick ------------------------------------------------------------------------------------------------
+
+
+def pick_sample(
+    client: VlmClient,
+    scene: Scene,
+    samples: Sequence[tuple[str, Audit]],
+    *,
+    audits_pick: int,
+) -> Pick:
+    """Return the model's choice among the acceptable samples; the audit's where there is nothing to choose, or no answer.
+
+    Args:
+        client: the model.
+        scene: what was understood of the video.
+        samples: codes and their audits; those that are not acceptable are not shown.
+        audits_pick: index of the acceptable sample that the audit alone would take.
+
+    Raises:
+        BudgetError: the budget is used up.
+        V2PError: the server cannot be asked.
+    """
+    candidates = {i: s for i, s in enumerate(samples) if s[1].is_acceptable}
+    if client.cfg.pick == "audit":
+        return Pick(
+            index=audits_pick, by="audit", reasons={"why": "the settings leave it to the audit"}
+        )
+    if len(candidates) == 1:
+        return Pick(
+            index=audits_pick, by="audit", reasons={"why": "no other sample is acceptable"}
+        )
+    cfg = client.cfg
+    question = pick_message(scene, candidates, tracking=cfg.tracking, shapes=cfg.tells_shapes)
+    allowed = list(candidates)
+    try:
+        (index, reasons), _ = client.ask(
+            [question],
+            f"pick for {scene.title}",
+            lambda text: choice_in(text, allowed),
+        )
+    except FaultyAnswerError as fault:
+        words = f"the model gave no usable choice, so the audit's was taken; the last answer's fault: {fault}"
+        logger.warning("%s: %s", scene.title, words)
+        return Pick(index=audits_pick, by="audit", reasons={"why": words})
+    return Pick(index=index, by="vlm", reasons=reasons)
+
+
+# --- rewards -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelWriter:
+    """A model as the writer of a reward search: it sees what its settings let it see.
+
+    Every code that it gives has run in the sandbox on the task's scene.
+    """
+
+    client: VlmClient
+    pools: tuple[Path, ...] = ()
+    """Of solved tasks, whose rewards are shown as good ones."""
+
+    def task_code(self, bundle: TaskBundle) -> str:
+        """Return one code for a task, its first thought: neither picked nor audited.
+
+        Raises:
+            BudgetError: the budget is used up.
+            UnusableAnswersError: no answer runs.
+            V2PError: the server cannot be asked.
+        """
+        scene = bundle.scene
+        made = write_samples(
+            self.client,
+            scene,
+            1,
+            self._examples(bundle),
+            lambda codes: smoke_run_all(codes, scene),
+            lambda written: [""] * len(written),
+        )
+        ((code, result),) = made.final
+        if not result.runnable:
+            raise UnusableAnswersError(
+                f"no code for '{bundle.title}' could be used; the last one's fault: {result.error}. {STRONGER}"
+            )
+        return code
+
+    def first_rewards(self, bundle: TaskBundle, count: int) -> list[str]:
+        """Return the task's code with up to `count` other rewards, before anything was trained.
+
+        Raises:
+            BudgetError: the budget is used up.
+            UnusableAnswersError: no answer could be used.
+            V2PError: the server cannot be asked.
+        """
+        return self._rewards(
+            bundle, bundle.code, first_reward_question(bundle.code), count, "first reward"
+        )
+
+    def better_rewards(
+        self, bundle: TaskBundle, code: str, feedback_text: str, count: int
+    ) -> list[str]:
+        """Return `code` with up to `count` better rewards; everything else is the same, so success cannot move.
+
+        They differ from `code` and from each other.
+
+        Args:
+            bundle: the task, for its scene and its words.
+            code: the task code that was trained with.
+            feedback_text: what the training showed, component by component.
+            count: how many.
+
+        Raises:
+            BudgetError: the budget is used up.
+            UnusableAnswersError: no answer could be used.
+            V2PError: the code's success depends on its reward, or the server cannot be asked.
+        """
+        question = better_reward_question(code, feedback_text)
+        return self._rewards(bundle, code, question, count, "better reward")
+
+    def _examples(self, bundle: TaskBundle) -> list[Example]:
+        cfg = self.client.cfg
+        pools = [*self.pools, *([cfg.pool] if cfg.pool else [])]
+        return examples_for(bundle.scene, read_pool(*pools), cfg.num_examples)
+
+    def _rewards(
+        self, bundle: TaskBundle, parent: str, question: str, count: int, what: str
+    ) -> list[str]:
+        client, scene = self.client, bundle.scene
+        system = system_message(
+            [o.name for o in scene.objects],
+            [replace(e, code=reward_source(e.code)) for e in self._examples(bundle)],
+            REFINEMENTS,
+        )
+        pictures = _pictures(client, scene)
+        drafts = [
+            _Draft(
+                talk=[
+                    system,
+                    scene_message(
+                        scene,
+                        pictures,
+                        tracking=client.cfg.tracking,
+                        shapes=client.cfg.tells_shapes,
+                        then=question,
+                        end=_end(i, count),
+                    ),
+                ]
+            )
+            for i in range(count)
+        ]
+
+        def read(text: str) -> str:
+            try:
+                return with_reward(parent, reward_code_in(text))
+            except SpliceError as fault:
+                raise FaultyAnswerError(str(fault)) from fault
+
+        for turn in range(client.cfg.max_regenerations + 1):
+            open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
+            if not open_ones:
+                break
+            purpose = f"{what} for {bundle.title}, turn {turn}, sample "
+            _ask_all(
+                client, {f"{purpose}{i}": drafts[i] for i in open_ones}, read,
+                lambda codes: smoke_run_all(codes, scene),
+            )  # fmt: skip
+            _send_back_twins(drafts)
+        made = [d.code for d in drafts if d.result.runnable]
+        if not made:
+            raise UnusableAnswersError(
+                f"no {what} for '{bundle.title}' could be used; the last one's fault: {drafts[-1].result.error}. "
+                f"{STRONGER}"
+            )
+        return made
+
+
+def _send_back_twins(drafts: list[_Draft]) -> None:
+    """Mark rewards that an earlier sample has too as not done."""
+    seen: set[str] = set()
+    for draft in drafts:
+        if draft.result.runnable:
+            part = reward_part(draft.code)
+            if part in seen:
+                fault = "another sample has the same reward; write a different one"
+                draft.result = SmokeResult(runnable=False, error=fault)
+                draft.talk = [*draft.talk, {"role": "user", "content": f"{fault.capitalize()}."}]
+            seen.add(part)
