@@ -1,7 +1,7 @@
-"""The README's table of results, made from `docs/results.json`: counts stand there, rates and intervals are computed.
+"""Tables of results, made from `docs/results.json`: counts stand there, rates and intervals are computed.
 
 python scripts/results_table.py            # prints the table
-python scripts/results_table.py --write    # puts it into README.md
+python scripts/results_table.py --write    # all results into docs/results.md, the headlines into README.md
 """
 
 import argparse
@@ -15,8 +15,7 @@ from policies.evaluation.rate import wilson
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results.json"
 README = ROOT / "README.md"
-NAME = "results"
-"""Of the table's marks in the README."""
+PAGE = ROOT / "docs" / "results.md"
 
 
 def table(results: list[dict[str, Any]]) -> str:
@@ -31,15 +30,38 @@ def table(results: list[dict[str, Any]]) -> str:
     ]
     before = ""
     for result in results:
-        rate = wilson(result["successes"], result["trials"])
-        shown = f"{100 * rate.value:.0f} % ({100 * rate.low:.0f}-{100 * rate.high:.0f})"
         about = "" if result["about"] == before else f"**{result['about']}**"
         before = result["about"]
         command = f"`{result['command']}`" if result["command"] else "judged by others"
         rows.append(
-            f"| {about} | {result['what']} | {shown} | {result['trials']} {result['unit']} | {result['seeds']} | {command} |"
+            f"| {about} | {result['what']} | {_rate(result)} | {result['trials']} {result['unit']} | {result['seeds']} | {command} |"
         )
     return "\n".join(rows)
+
+
+def headlines(results: list[dict[str, Any]]) -> str:
+    """Return what the README shows first: the results that have a `headline`."""
+    rows = ["| | success, 95 % interval | of |", "|---|---|---|"]
+    rows += [
+        f"| {result['headline']} | {_rate(result)} | {result['trials']} {result['unit']} |"
+        for result in results
+        if "headline" in result
+    ]
+    return "\n".join(rows)
+
+
+def _rate(result: dict[str, Any]) -> str:
+    rate = wilson(result["successes"], result["trials"])
+    return f"{100 * rate.value:.0f} % ({100 * rate.low:.0f}-{100 * rate.high:.0f})"
+
+
+def written_pages() -> dict[Path, str]:
+    """Return README and page of results with their tables as `docs/results.json` has them."""
+    results = json.loads(RESULTS.read_text())["results"]
+    return {
+        PAGE: with_block(PAGE.read_text(), "results", table(results)),
+        README: with_block(README.read_text(), "headline", headlines(results)),
+    }
 
 
 def with_block(page: str, name: str, block: str) -> str:
@@ -57,17 +79,17 @@ def with_block(page: str, name: str, block: str) -> str:
 
 
 def main() -> None:
-    """Print the table, or write it into the README."""
+    """Print the table, or write it into the pages."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--write", action="store_true", help="put it into README.md")
-    rows = table(json.loads(RESULTS.read_text())["results"])
+    parser.add_argument("--write", action="store_true", help="write docs/results.md and README.md")
     if not parser.parse_args().write:
-        print(rows)
+        print(table(json.loads(RESULTS.read_text())["results"]))
         return
     try:
-        README.write_text(with_block(README.read_text(), NAME, rows))
+        for page, text in written_pages().items():
+            page.write_text(text)
     except ValueError as error:
-        print(f"error: {README.name}: {error}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
 
 

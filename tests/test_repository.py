@@ -39,6 +39,12 @@ def test_the_readme_shows_its_two_commands():
     assert {"make demo", "make test"} <= set(shown_commands("README.md"))
 
 
+def test_the_readme_has_at_most_a_thousand_words_beside_its_code():
+    prose = re.sub(r"```.*?```", "", (ROOT / "README.md").read_text(), flags=re.S)
+
+    assert len(prose.split()) <= 1000
+
+
 def test_every_v2p_command_in_the_readme_exists():
     ours = [shlex.split(line) for line in shown_commands("README.md") if line.startswith("v2p ")]
 
