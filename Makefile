@@ -29,6 +29,7 @@ check: $(STAMP)
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/codespell $$(git ls-files '*.py' '*.md' '*.toml' '*.yaml')
+	@$(PY) scripts/count_statements.py
 	@$(VENV)/bin/pyright --pythonpath $(PY)
 
 format: $(STAMP)
