@@ -6,6 +6,29 @@ from pathlib import Path
 
 import pytest
 import torch
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).parents[1]
+UNCHECKED = {
+    "v2p_data.geometry.raster",
+    "v2p_data.scene.fitting.cuboid_network",
+    "v2p_data.scene.fitting.shape_fit",
+    "v2p_data.scene.fitting.silhouette",
+}
+"""Called twenty thousand times a clip: checking their arguments takes as long as the reconstruction."""
+
+
+def _modules_of(folder: Path) -> list[str]:
+    files = (p for p in folder.rglob("*.py") if p.stem != "__init__")
+    return [".".join(p.relative_to(folder.parent).with_suffix("").parts) for p in files]
+
+
+# Shapes and types of arguments are checked in every module that is imported from here on.
+_PACKAGES = (ROOT / "v2p_data", ROOT / "policies", ROOT / "scripts/drawn_clips")
+install_import_hook(
+    [name for package in _PACKAGES for name in _modules_of(package) if name not in UNCHECKED],
+    "beartype.beartype",
+)
 
 # What a user has set up on this machine, such as the model that finds hands, changes no test.
 os.environ["V2P_CACHE"] = str(Path(__file__).parent / "no_cache")
