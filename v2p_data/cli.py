@@ -32,6 +32,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "expert": ("run", "up to the trained experts"),
     "episodes": ("run", "up to the episodes, without packing them"),
     "verify": ("share", "reopen a dataset with LeRobot and check every frame"),
+    "replay": (
+        "share",
+        "play a dataset's episodes again from seeds and actions: does the same come back?",
+    ),
     "explain": ("share", "where a dataset, an episode or a result comes from, or how two differ"),
     "merge": ("edit", "several datasets become one"),
     "drop": ("edit", "a dataset without some of its tasks"),

@@ -23,6 +23,18 @@ class Verify:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Replay:
+    dataset: tyro.conf.Positional[Path]
+    """Folder of a dataset that v2p made, with the tasks in it."""
+    episodes: int | None = None
+    """Replay the first so many; all by default."""
+    threads: int = 1
+    """For physics; changes no result."""
+    json: Path | None = None
+    """Write what came back as JSON to this file, too."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Push:
     path: tyro.conf.Positional[Path]
     """Folder of a dataset or of a policy; with --envhub of a task, of tasks, of a run, or of a dataset with its tasks."""
@@ -61,6 +73,26 @@ def verify_command(argv: list[str]) -> int:
         write_json_atomically(args.json, report.as_json())
     print("\n".join([*report.lines(), report.summary()]))  # noqa: T201
     return 0 if report.is_good else 1
+
+
+def replay_command(argv: list[str]) -> int:
+    """Return 0 where every episode came back, 1 where one did not."""
+    from v2p_data.commands.display import telling
+    from v2p_data.episodes.replay import replay
+    from v2p_data.pipeline.artifact import write_json_atomically
+
+    args = parse(Replay, argv, "replay")
+    with telling("replay") as progress:
+        report = replay(
+            args.dataset,
+            num_episodes=args.episodes,
+            num_threads=args.threads,
+            on_progress=progress,
+        )
+    if args.json is not None:
+        write_json_atomically(args.json, report.as_json())
+    print("\n".join(report.lines()))  # noqa: T201
+    return 0 if report.is_same else 1
 
 
 def push_command(argv: list[str]) -> int:
