@@ -3,12 +3,13 @@
 Corpora of the tests are tried whole or in a random part: task folders, datasets, policies and decoded caches as strangers
 may make them (`tests/task/strangers.py`, `tests/episodes/strange_datasets.py`, `tests/policies/spoiled.py`), odd videos,
 captions, labels and boxes (`tests/video/odd_files.py`), and harms to each kind of file of a finished run
-(`tests/pipeline/damage.py`). Every case runs in a process of its own with a time limit.
+(`tests/pipeline/damage.py`). Every case runs in a process of its own, whose time and memory are measured.
 
     python scripts/fuzz_artefacts.py --run outputs/demo --harms 200 --seed 1
 
 A case is good if it ends in one sentence and exit code 2, is listed as damaged, or is rightly accepted. Ends with exit
-code 1 if any case ends in a traceback, hangs, or a listed file changes unnoticed.
+code 1 if any case ends in a traceback, takes more than 60 s or 4 GB, or a listed file changes unnoticed. The longest and the
+largest case of each part are printed.
 """
 
 import argparse
@@ -17,9 +18,11 @@ import io
 import json
 import multiprocessing
 import os
+import resource
 import shutil
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
@@ -31,8 +34,9 @@ from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 
 ROOT = Path(__file__).parents[1]
-LIMIT_S = 120.0
-"""Of a case, in which imports may be the longest part on a busy machine."""
+LIMIT_S = 60.0
+LIMIT_BYTES = 4 * 10**9
+"""Of the memory that a case holds at its worst, in its process or in one that it starts."""
 READERS = {
     "dataset": ("verify", "{folder}"),
     "policy": ("eval", "{folder}/policy", "--evaluation.episodes=1"),
@@ -61,6 +65,8 @@ def main() -> None:
     for folder in ("task", "episodes", "policies", "video", "pipeline"):
         sys.path.insert(0, str(ROOT / "tests" / folder))
     outcomes: dict[str, Counter[str]] = {}
+    longest: dict[str, tuple[float, str]] = {}
+    largest: dict[str, tuple[float, str]] = {}
     violations: list[str] = []
     parts = {
         "tasks": _tasks,
@@ -73,36 +79,56 @@ def main() -> None:
     for part in args.parts:
         outcomes[part] = Counter()
         for name, case in parts[part]():
-            outcome = _in_a_process(case)
+            outcome, seconds, peak_bytes = _in_a_process(case)
             outcomes[part][outcome.split(":")[0]] += 1
+            longest[part] = max(longest.get(part, (0.0, "")), (round(seconds, 1), name))
+            largest[part] = max(largest.get(part, (0.0, "")), (round(peak_bytes / 1e9, 2), name))
             if outcome.startswith("violation"):
                 violations.append(f"{part}, {name}: {outcome}")
                 print(violations[-1], file=sys.stderr, flush=True)
-    print(json.dumps({"outcomes": outcomes, "violations": violations}))
+    print(
+        json.dumps(
+            {
+                "outcomes": outcomes,
+                "longest_s": longest,
+                "largest_gb": largest,
+                "violations": violations,
+            }
+        )
+    )
     sys.exit(1 if violations else 0)
 
 
-def _in_a_process(case: Case) -> str:
-    """Return the case's outcome; an exception, a crash or a hang is a violation."""
+def _in_a_process(case: Case) -> tuple[str, float, int]:
+    """Return the case's outcome, its seconds and its peak of memory [bytes].
+
+    An exception, a crash, a hang and too much memory are violations. What crashes or hangs tells no memory: 0.
+    """
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
+    outcome, peak_bytes = f"violation: it took more than {LIMIT_S:g} s", 0
     with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as folder:
+        begin = time.monotonic()
         process = context.Process(target=_try, args=(case, Path(folder), there))
         process.start()
         there.close()
-        outcome = "violation: it took too long"
         if here.poll(LIMIT_S):
             try:
-                outcome = here.recv()
+                outcome, peak_bytes = here.recv()
             except EOFError:
                 outcome = "violation: its process ended"
+        seconds = time.monotonic() - begin
         process.kill()
         process.join()
-    return outcome
+    if peak_bytes > LIMIT_BYTES:
+        outcome = f"violation: it took {peak_bytes / 1e9:.1f} GB; {outcome}"
+    return outcome, seconds, peak_bytes
 
 
 def _try(case: Case, folder: Path, answer: Connection) -> None:
     os.environ["V2P_CACHE_DIR"] = str(folder / "cache")
+    # far above what counts as too much, so that it is measured and the machine lives on
+    resource.setrlimit(resource.RLIMIT_DATA, (2 * LIMIT_BYTES, 2 * LIMIT_BYTES))
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             outcome = case(folder)
@@ -111,7 +137,8 @@ def _try(case: Case, folder: Path, answer: Connection) -> None:
         outcome = "refused" if len(words) > 20 and "\n" not in words else f"violation: {words!r}"
     except BaseException as error:  # noqa: BLE001 - what is looked for
         outcome = f"violation: {type(error).__name__}: {str(error)[:200]}"
-    answer.send(outcome)
+    peaks = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    answer.send((outcome, max(1024 * peak.ru_maxrss for peak in peaks)))
 
 
 # --- the corpora ---------------------------------------------------------------------------------------------
