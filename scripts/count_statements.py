@@ -33,7 +33,9 @@ def main() -> None:
         over |= count > limit
         print(f"{package}: {count:,} of {limit:,} statements")
     if over:
-        sys.exit("error: a package is larger than pyproject.toml allows; make it smaller, or raise the number with a reason")
+        sys.exit(
+            "error: a package is larger than pyproject.toml allows; make it smaller, or raise the number with a reason"
+        )
 
 
 if __name__ == "__main__":

@@ -3,20 +3,23 @@
 Corpora of the tests are tried whole or in a random part: task folders, datasets, policies and decoded caches as strangers
 may make them (`tests/task/strangers.py`, `tests/episodes/strange_datasets.py`, `tests/policies/spoiled.py`), odd videos,
 captions, labels and boxes (`tests/video/odd_files.py`), and harms to each kind of file of a finished run
-(`tests/pipeline/damage.py`). Every case runs in a process of its own with a time limit.
+(`tests/pipeline/damage.py`). Every case runs in a process of its own, whose time and memory are measured.
 
     python scripts/fuzz_artefacts.py --run outputs/demo --harms 200 --seed 1
 
 A case is good if it ends in one sentence and exit code 2, is listed as damaged, or is rightly accepted. Ends with exit
-code 1 if any case ends in a traceback, hangs, or a listed file changes unnoticed.
+code 1 if any case ends in a traceback, hangs, takes more than 60 s or 4 GB, or a listed file changes unnoticed. The longest and the
+largest case of each part are printed.
 """
 
 import argparse
 import contextlib
+import importlib
 import io
 import json
 import multiprocessing
 import os
+import resource
 import shutil
 import sys
 import tempfile
@@ -31,8 +34,12 @@ from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 
 ROOT = Path(__file__).parents[1]
-LIMIT_S = 120.0
-"""Of a case, in which imports may be the longest part on a busy machine."""
+LIMIT_S = 60.0
+"""Of processor time, so that it does not matter what else the machine does."""
+HANG_S = 5 * LIMIT_S
+"""By the clock."""
+LIMIT_BYTES = 4 * 10**9
+"""Of the memory that a case holds at its worst, in its process or in one that it starts."""
 READERS = {
     "dataset": ("verify", "{folder}"),
     "policy": ("eval", "{folder}/policy", "--evaluation.episodes=1"),
@@ -40,6 +47,14 @@ READERS = {
     "distillation": ("train", "{dataset}", "--config", str(ROOT / "configs" / "demo.yaml")),
 }
 """Stage -> a command that reads its folder and refuses a damaged one before anything is made."""
+IMPORTED = (
+    "lerobot.datasets.lerobot_dataset",
+    "lerobot.policies.factory",
+    "v2p_data.evaluation.judging",
+    "v2p_data.report.page",
+    "v2p_data.stages",
+)
+"""What cases need, imported once instead of in each process."""
 Case = Callable[[Path], str]
 """Given an empty folder, tries and returns what became of it; raises on what may not be."""
 
@@ -60,7 +75,11 @@ def main() -> None:
     args = parser.parse_args()
     for folder in ("task", "episodes", "policies", "video", "pipeline"):
         sys.path.insert(0, str(ROOT / "tests" / folder))
+    for name in IMPORTED:
+        importlib.import_module(name)
     outcomes: dict[str, Counter[str]] = {}
+    longest: dict[str, tuple[float, str]] = {}
+    largest: dict[str, tuple[float, str]] = {}
     violations: list[str] = []
     parts = {
         "tasks": _tasks,
@@ -73,36 +92,54 @@ def main() -> None:
     for part in args.parts:
         outcomes[part] = Counter()
         for name, case in parts[part]():
-            outcome = _in_a_process(case)
+            outcome, seconds, peak_bytes = _in_a_process(case)
             outcomes[part][outcome.split(":")[0]] += 1
+            longest[part] = max(longest.get(part, (0.0, "")), (round(seconds, 1), name))
+            largest[part] = max(largest.get(part, (0.0, "")), (round(peak_bytes / 1e9, 2), name))
             if outcome.startswith("violation"):
                 violations.append(f"{part}, {name}: {outcome}")
                 print(violations[-1], file=sys.stderr, flush=True)
-    print(json.dumps({"outcomes": outcomes, "violations": violations}))
+    print(
+        json.dumps(
+            {
+                "outcomes": outcomes,
+                "longest_s": longest,
+                "largest_gb": largest,
+                "violations": violations,
+            }
+        )
+    )
     sys.exit(1 if violations else 0)
 
 
-def _in_a_process(case: Case) -> str:
-    """Return the case's outcome; an exception, a crash or a hang is a violation."""
+def _in_a_process(case: Case) -> tuple[str, float, int]:
+    """Return the case's outcome, its processor time [s] and its peak of memory [bytes].
+
+    An exception, a crash, a hang, and too much time or memory are violations. What crashes or hangs tells neither: 0.
+    """
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
+    outcome, seconds, peak_bytes = f"violation: it hung for {HANG_S:g} s", 0.0, 0
     with tempfile.TemporaryDirectory(prefix="v2p-fuzz-") as folder:
         process = context.Process(target=_try, args=(case, Path(folder), there))
         process.start()
         there.close()
-        outcome = "violation: it took too long"
-        if here.poll(LIMIT_S):
+        if here.poll(HANG_S):
             try:
-                outcome = here.recv()
+                outcome, seconds, peak_bytes = here.recv()
             except EOFError:
                 outcome = "violation: its process ended"
         process.kill()
         process.join()
-    return outcome
+    if peak_bytes > LIMIT_BYTES or seconds > LIMIT_S:
+        outcome = f"violation: it took {peak_bytes / 1e9:.1f} GB and {seconds:.0f} s; {outcome}"
+    return outcome, seconds, peak_bytes
 
 
 def _try(case: Case, folder: Path, answer: Connection) -> None:
     os.environ["V2P_CACHE_DIR"] = str(folder / "cache")
+    # far above what counts as too much, so that it is measured and the machine lives on
+    resource.setrlimit(resource.RLIMIT_DATA, (2 * LIMIT_BYTES, 2 * LIMIT_BYTES))
     try:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             outcome = case(folder)
@@ -111,7 +148,9 @@ def _try(case: Case, folder: Path, answer: Connection) -> None:
         outcome = "refused" if len(words) > 20 and "\n" not in words else f"violation: {words!r}"
     except BaseException as error:  # noqa: BLE001 - what is looked for
         outcome = f"violation: {type(error).__name__}: {str(error)[:200]}"
-    answer.send(outcome)
+    both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    seconds = sum(used.ru_utime + used.ru_stime for used in both)
+    answer.send((outcome, seconds, max(1024 * used.ru_maxrss for used in both)))
 
 
 # --- the corpora ---------------------------------------------------------------------------------------------

@@ -2,18 +2,24 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from v2p_data.cli import run
 from v2p_data.commands.run import _record_to_train
 from v2p_data.episodes.dataset.about import CARRIED_TASKS, TASK_PARTS, read_about
+from v2p_data.episodes.dataset.edit import drop, merge
 from v2p_data.episodes.dataset.edited import changed_files
+from v2p_data.episodes.dataset.tables import read_info
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
+from v2p_data.geometry.rotation import quats_pointing_down, rotvec_from_down
 from v2p_data.pipeline.artifact import Record, write_record
 from v2p_data.pipeline.contents import list_files
 
@@ -128,6 +134,107 @@ def test_what_a_deletion_left_out_comes_back_from_the_original(
         == 2
     )
     assert "--from" in capsys.readouterr().err
+
+
+def test_the_parts_of_a_split_come_back_from_the_original(made: Path, tmp_path: Path):
+    from lerobot.datasets.dataset_tools import split_dataset
+
+    split_dataset(opened(made), {"train": [0, 2], "val": [1]}, output_dir=tmp_path / "split")
+
+    few, whole = tmp_path / "split/train", tmp_path / "whole"
+    with pytest.raises(V2PError, match="--from ORIGINAL"):
+        _record_to_train(few, tmp_path)
+    merge([few], "user/whole", whole, original=made)
+    assert ids(whole) == ["toy_00000", "toy_00002"]
+    assert verify(whole).is_good
+
+
+@pytest.mark.parametrize("gone", ["observation.images.mask", "observation.state"])
+def test_a_dataset_with_a_column_less_is_ours_and_comes_back_from_the_original(
+    gone: str, made: Path, tmp_path: Path
+):
+    from lerobot.datasets.dataset_tools import remove_feature
+
+    less, whole, few = (tmp_path / name for name in ("less", "whole", "few"))
+    remove_feature(opened(made), gone, output_dir=less, repo_id="user/less")
+
+    report = verify(less)
+    assert report.is_ours
+    assert report.is_good, report.summary()
+    merge([less], "user/whole", whole, original=made)
+    drop(less, [], few, episodes=[0])
+    assert (ids(whole), ids(few)) == ([f"toy_{k:05d}" for k in range(3)], ids(whole)[1:])
+    assert (whole / CARRIED_TASKS / "toy" / TASK_PARTS[0]).is_file()
+    assert verify(whole).is_good
+    assert gone not in read_info(whole)["features"]
+
+
+def test_a_dataset_with_a_column_more_comes_back_from_the_original(made: Path, tmp_path: Path):
+    from lerobot.datasets.dataset_tools import add_features
+
+    more, whole = tmp_path / "more", tmp_path / "whole"
+    rewards = np.arange(36, dtype=np.float32)[:, None]
+    column = {"dtype": "float32", "shape": (1,), "names": None}
+    add_features(opened(made), {"reward": (rewards, column)}, output_dir=more, repo_id="user/more")
+
+    found = [(p.check, p.detail) for p in verify(more).problems]
+    assert found == [("statistics", "has nothing on reward")]  # LeRobot writes none
+    merge([more], "user/whole", whole, original=made)
+    assert ids(whole) == ids(made)
+    assert verify(whole).is_good
+    np.testing.assert_array_equal([float(row["reward"]) for row in opened(whole)], rewards[:, 0])
+
+
+def test_lerobots_look_at_a_dataset_changes_nothing_and_its_pictures_are_videos_already(
+    made: Path, tmp_path: Path
+):
+    from lerobot.datasets.dataset_tools import convert_image_to_video_dataset
+    from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig, InfoConfig, handle_info
+
+    before = list_files(made)
+    handle_info(EditDatasetConfig(operation=InfoConfig(show_features=True), root=str(made), repo_id="user/toys"))  # fmt: skip
+    with pytest.raises(ValueError, match="image datasets only"):
+        convert_image_to_video_dataset(opened(made), output_dir=tmp_path / "video")
+
+    assert list_files(made) == before
+
+
+def test_a_turn_past_pi_and_its_flipped_rotation_vector_are_no_damage(
+    tmp_path: Path, make_episode
+):
+    from lerobot.datasets.dataset_tools import delete_episodes
+
+    yaw = np.pi + np.linspace(
+        -0.05, 0.05, 12
+    )  # halfway the vector's sign changes, as its angle is at most pi
+    episodes = []
+    for k, sign in enumerate((1, -1)):  # the same turn, by quaternions of either sign
+        episode = make_episode(k)
+        turns = rotvec_from_down(sign * quats_pointing_down(yaw + k / 1000)).T
+        assert np.abs(np.diff(turns[:, 2])).max() > 6
+        state = episode.state.copy()
+        state[:, 3:6] = turns
+        episodes.append(replace(episode, state=state))
+    staged = [episode.save(tmp_path / "staged") for episode in episodes]
+    made, few, whole, less = (tmp_path / name for name in ("made", "few", "whole", "less"))
+    pack(staged, "user/turns", made)
+
+    delete_episodes(opened(made), [0], output_dir=few, repo_id="user/few")
+    merge([few], "user/whole", whole, original=made)
+    drop(made, [], less, episodes=[0])
+
+    assert verify(made, staged).is_good
+    for root in (whole, less):
+        assert verify(root).is_good
+        rows = opened(root)
+        states = np.stack([row["observation.state"].numpy() for row in rows])
+        np.testing.assert_array_equal(states, episodes[1].state)
+        actions = np.stack([row["action"].numpy() for row in rows])
+        np.testing.assert_array_equal(actions, episodes[1].action)
+        steps = (
+            Rotation.from_rotvec(states[1:, 3:6]) * Rotation.from_rotvec(states[:-1, 3:6]).inv()
+        )
+        np.testing.assert_allclose(steps.magnitude(), 0.1 / 11, atol=1e-5)
 
 
 def test_episodes_are_dropped_by_their_numbers(made: Path, tmp_path: Path, staged: list[Path]):

@@ -458,9 +458,27 @@ DRAWER = '<body name="drawer" pos="1 0 0.3"><joint type="slide"/><geom size="0.0
     [
         ('<geom type="plane" size="2 2 .1"/><light pos="0 0 3"/><camera name="view"/>', ""),
         (BALL, '<contact><pair geom1="ball" geom2="palm"/></contact>'),
-        (DRAWER, '<option gravity="0 0 0"/>'),
+        (DRAWER, '<option gravity="0 0 0"><flag contact="disable" equality="disable"/></option>'),
+        (
+            BALL + DRAWER,
+            '<equality><weld body1="ball" body2="drawer"/><weld body1="hand" active="false"/></equality>',
+        ),
+        ("", '<contact><exclude body1="world" body2="hand"/></contact>'),
+        (BALL, '<sensor><touch site="grip"/></sensor><keyframe><key name="first"/></keyframe>'),
+        (
+            "",
+            '<tendon><fixed stiffness="1e4"><joint joint="slide_left" coef="1"/></fixed></tendon>',
+        ),
     ],
-    ids=["floor, light, camera", "free ball that is to touch", "drawer"],
+    ids=[
+        "floor, light, camera",
+        "free ball that is to touch",
+        "drawer",
+        "scenery in one piece",
+        "nothing that may not touch",
+        "sensors, keyframes",
+        "a spring at a finger",
+    ],
 )
 @pytest.mark.filterwarnings("ignore:Attach conflict")
 def test_scenery_in_a_robots_file_touches_nothing_and_moves_no_joint_of_the_arm(
@@ -477,8 +495,53 @@ def test_scenery_in_a_robots_file_touches_nothing_and_moves_no_joint_of_the_arm(
         return {model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i]}
 
     assert colliding(world.model) == colliding(plain.model)
-    assert (world.model.npair, world.model.nu) == (0, plain.model.nu)
+    for count in ("npair", "nu", "nexclude", "nsensor", "nkey", "ntendon"):
+        assert getattr(world.model, count) == getattr(plain.model, count), count
     assert world.model.opt.gravity.tolist() == plain.model.opt.gravity.tolist()
+    assert world.model.opt.disableflags == plain.model.opt.disableflags
     names = [[w.model.joint(i).name for i in range(w.model.njnt)] for w in (plain, world)]
     assert [n for n in names[1] if n in names[0]] == names[0]
     assert world.robot.arm.stop == world.robot.fingers.start
+
+
+@pytest.mark.parametrize(
+    ("held", "constraint"),
+    [
+        ("hand", '<weld body1="hand"/>'),
+        ("hand", '<weld body1="ball" body2="hand"/>'),
+        ("hand", '<weld site1="grip" site2="top"/>'),
+        ("left", '<weld body1="right" body2="left"/>'),
+        ("upper", '<connect body1="upper" anchor="0 0 0"/>'),
+        ("pan", '<joint joint1="pan"/>'),
+        ("elbow", '<joint joint1="elbow" joint2="drawer"/>'),
+        ("a tendon", '<tendon tendon1="rope"/>'),
+    ],
+)
+def test_a_robot_file_that_holds_its_arm_is_refused(
+    held: str, constraint: str, six: RobotConfig, world_of: Callable[..., World]
+):
+    assert six.path is not None
+    drawer = DRAWER.replace("<joint", '<joint name="drawer"')
+    ball = BALL.replace("</body>", '<site name="top"/></body>')
+    rope = '<tendon><fixed name="rope"><joint joint="pan" coef="1"/></fixed></tendon>'
+    text = ARM.replace("<worldbody>", "<worldbody>" + ball + drawer)
+    six.path.write_text(
+        text.replace("</mujoco>", f"{rope}<equality>{constraint}</equality></mujoco>")
+    )
+
+    with pytest.raises(V2PError, match=f"holds '{held}'") as caught:
+        world_of(six)
+
+    assert "\n" not in str(caught.value)
+
+
+def test_a_robot_file_cannot_name_an_object_of_the_scene(
+    six: RobotConfig, world_of: Callable[..., World]
+):
+    assert six.path is not None
+    cube = world_of(six).model.body(world_of(six).model.nbody - 1).name
+    glue = f'<equality><weld body1="hand" body2="{cube}"/></equality></mujoco>'
+    six.path.write_text(ARM.replace("</mujoco>", glue))
+
+    with pytest.raises(V2PError, match=f"unknown element '{cube}'"):
+        world_of(six)

@@ -1,10 +1,13 @@
 """Every container that we promise to read, and what becomes of files that are no good."""
 
+import contextlib
 import struct
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
 import av
+import av.filter
 import numpy as np
 import pytest
 from odd_files import (
@@ -422,6 +425,43 @@ def test_a_picture_that_is_turned_on_the_way_is_cut_there(film, tmp_path):
             out.mux(new)
 
     assert reason_for(path) == "picture_turns"
+
+
+def interlaced(frames):
+    """Return pictures whose every second row is that of the next one."""
+    is_odd = np.arange(len(frames[0]))[:, None, None] % 2 == 1
+    return [np.where(is_odd, b, a) for a, b in pairwise(frames)]
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mpeg2video", "ffv1"])
+def test_an_interlaced_film_is_refused_and_the_advised_filter_helps(film, codec):
+    path = film("camcorder.mkv", interlaced(squares(24)), codec=codec, fps=25)
+
+    with pytest.raises(ItemRejectedError, match=r"camcorder\.mkv is .*-vf bwdif") as error:
+        read_clip(item(path))
+
+    assert (error.value.reason, error.value.detail.count("\n")) == ("interlaced", 0)
+    graph: Any = av.filter.Graph()
+    whole = []
+    with av.open(str(path)) as container:
+        source = graph.add_buffer(template=container.streams.video[0])
+        graph.link_nodes(source, graph.add("bwdif"), graph.add("buffersink")).configure()
+        for frame in [*container.decode(video=0), None]:
+            graph.push(frame)
+            with contextlib.suppress(EOFError, BlockingIOError):
+                while True:
+                    whole.append(graph.pull().to_ndarray(format="rgb24"))
+    assert len(read_clip(item(film("whole.mp4", whole))).frames) >= 40
+
+
+@pytest.mark.parametrize("rows", [1, 2], ids=["one row", "two rows"])
+def test_a_striped_thing_that_moves_is_not_taken_for_interlaced(film, rows):
+    frames = squares(24)
+    for i, pixels in enumerate(frames):
+        stripes = pixels[32:64, 4 * i % 96 : 4 * i % 96 + 32]
+        stripes[np.arange(32) // rows % 2 == 0] = (60, 10, 10)
+
+    assert len(read_clip(item(film("stripes.mkv", frames, codec="ffv1"))).frames) == 24
 
 
 STEPS = [40 * i for i in range(40)]

@@ -217,14 +217,18 @@ def _restored(source: _Source, original: _Source) -> _Source:
         raise V2PError(
             f"{original.root} holds no {METADATA_FILE} itself; give the dataset that v2p made with --from"
         )
-    numbers = {digest: k for k, digest in enumerate(original.digests) if digest}
-    unknown = [k for k, digest in enumerate(source.digests) if digest not in numbers]
+    both = {k: f for k, f in source.info["features"].items() if k in original.info["features"]}
+    known, digests = (
+        number_digests(s.root, {"features": both}, len(s.lengths)) for s in (original, source)
+    )
+    numbers = {digest: k for k, digest in enumerate(known) if digest}
+    unknown = [k for k, digest in enumerate(digests) if digest not in numbers]
     if unknown:
         raise V2PError(
             f"episode {unknown[0]} of {source.root} is none of {original.root} by its states and actions "
-            f"({len(unknown)} of {len(source.digests)} are not); give the dataset that it was made from with --from"
+            f"({len(unknown)} of {len(digests)} are not); give the dataset that it was made from with --from"
         )
-    entries = [original.about["episodes"][numbers[digest]] for digest in source.digests]
+    entries = [original.about["episodes"][numbers[digest]] for digest in digests]
     about = original.about | {"episodes": entries}
     return replace(
         source, about=as_in_table(about, episodes_of(source.root)), tasks_root=original.root

@@ -1,7 +1,7 @@
 """Any MJCF arm in the built-in one's place: its file, the names of its tool and fingers, and what follows from them.
 
-The file gives bodies, joints and geoms. Its actuators, sensors and keyframes are left out: the arm is driven by the
-same Cartesian servos as the built-in one, on a site at its tool centre point. Gravity is compensated, and only its last three
+The file gives bodies, joints and geoms. Its actuators, tendons, sensors, keyframes and contact excludes are left out, and
+constraints that hold the arm are refused: the arm is driven by the same Cartesian servos as the built-in one, on a site at its tool centre point. Gravity is compensated, and only its last three
 links and the gripper collide, with objects and the table, as of the built-in arm. In the model its names begin with `robot/`.
 """
 
@@ -166,6 +166,7 @@ def read_arm(cfg: RobotConfig, physics: PhysicsConfig, servo: ServoConfig) -> Ar
     joints = [int(j) for b in chain for j in _joints_of(model, b)]
     names = tuple(model.joint(j).name for j in joints)
     _check_joints(cfg, model, joints, fingers)
+    _check_free(cfg, model, chain, joints, fingers)
     travel = float(min(model.jnt_range[j, 1] for j in fingers))
     kind = "geom" if cfg.pads[0] in _names(model, "geom") else "body"
     for pad in cfg.pads:
@@ -361,6 +362,33 @@ def _check_joints(
             )
 
 
+def _check_free(
+    cfg: RobotConfig,
+    model: mujoco.MjModel,
+    chain: list[int],
+    joints: list[int],
+    fingers: list[int],
+) -> None:
+    """Refuse equality constraints that hold arm or fingers; `_strip` leaves out those that couple the fingers' joints."""
+    bodies = {*chain, *(int(model.jnt_bodyid[j]) for j in fingers)}
+    for k in np.flatnonzero(model.eq_active0):
+        ends = {int(e) for e in (model.eq_obj1id[k], model.eq_obj2id[k]) if e >= 0}
+        kind = mujoco.mjtEq(model.eq_type[k]).name.removeprefix("mjEQ_").lower()
+        if kind == "joint":
+            held = [model.joint(j).name for j in ends & set(joints) if not ends & set(fingers)]
+        elif kind in ("weld", "connect"):
+            if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
+                ends = {int(model.site_bodyid[site]) for site in ends}
+            held = [model.body(b).name for b in ends & bodies]
+        else:
+            held = ["a tendon"]
+        if held:
+            raise V2PError(
+                f"robot file {cfg.path} holds '{held[0]}' by an equality constraint (<{kind}>); arm and fingers must be free "
+                "to move: take it out, or make one body of what never comes apart"
+            )
+
+
 def _names(model: mujoco.MjModel, kind: str) -> list[str]:
     count = {"site": model.nsite, "body": model.nbody, "joint": model.njnt, "geom": model.ngeom}
     return [getattr(model, kind)(i).name for i in range(count[kind])]
@@ -386,13 +414,20 @@ def _span(addresses: list[int], what: str) -> slice:
 
 
 def _strip(spec: Any, cfg: RobotConfig) -> None:
-    """Remove what drives, measures, pairs for contact or couples the fingers; the world brings its own."""
-    for elements in (spec.actuators, spec.sensors, spec.keys, spec.pairs):
+    """Remove what drives, measures, pairs for contact or not, or couples the fingers; the world brings its own."""
+    for equality in list(spec.equalities):
+        if not equality.active or {equality.name1, equality.name2} & set(cfg.fingers):
+            spec.delete(equality)
+    for elements in (
+        spec.actuators,
+        spec.sensors,
+        spec.keys,
+        spec.pairs,
+        spec.excludes,
+        spec.tendons,
+    ):
         for element in list(elements):
             spec.delete(element)
-    for equality in list(spec.equalities):
-        if {equality.name1, equality.name2} & set(cfg.fingers):
-            spec.delete(equality)
 
 
 def _prepare(spec: Any, cfg: RobotConfig, joints: tuple[str, ...], servo: ServoConfig) -> None:
