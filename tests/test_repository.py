@@ -77,7 +77,7 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
         "generate": run.Generate, "train": run.Train, "eval": run.Evaluate, "demo": run.Demo,
         "distill": run.Distill, "deploy": deploy.Deploy,
         "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
-        "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify,
+        "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify, "replay": share.Replay,
         "status": show.Status, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.Review, "scene models": models.Models, "scene hands": hands.Hands,
         "scene outlines": outlines.Outlines,
         "reward": run.FromVideos, "task show": task.ShowTask, "reward search": reward.Search,
