@@ -56,6 +56,44 @@ def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
     return [(upright, 0.0), (lying, cost), (on_side, cost)]
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Fitting:
+    """A shape under an outline, with the numbers that are searched for."""
+
+    silhouette: Silhouette
+    noun: Noun
+    posed: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    """Size and pose `T_world_obj` for these numbers."""
+    outline: Callable[[np.ndarray], np.ndarray]
+    """Points on the shape's outline in its own frame, for this size."""
+    held: Callable[[np.ndarray, np.ndarray], float]
+    """What these numbers and this pose cost, whatever is seen."""
+
+    def place(self, v: np.ndarray) -> np.ndarray:
+        """Return the outline's points in the world."""
+        size, T = self.posed(v)
+        return _moved(self.outline(size), T)
+
+    def cost(self, v: np.ndarray) -> float:
+        size, T = self.posed(v)
+        appearance = self.silhouette.appearance_cost(self.noun.form, size, T)
+        iou = self.silhouette.iou(_moved(self.outline(size), T), _HIDDEN_WEIGHT)
+        return 1 - iou + self.held(v, T) + appearance
+
+    def best(self, starts: list[np.ndarray], step: np.ndarray, kept: int = 2) -> Fit:
+        """Return the fit that a search from these numbers ends in."""
+        v = search(self.cost, starts, step, kept)
+        size, T = self.posed(v)
+        points = _moved(outline_points(self.noun.form, three(size), self.noun.taper), T)
+        return Fit(
+            size=three(size),
+            T_world_obj=T,
+            iou=self.silhouette.iou(points),
+            visible=self.silhouette.visible(points),
+            cost=self.cost(v),
+        )
+
+
 def fit_shape(
     silhouette: Silhouette, noun: Noun, rest: Float[np.ndarray, "3 3"], *, thorough: bool = True
 ) -> Fit:
@@ -64,54 +102,36 @@ def fit_shape(
     spread = max(0.1, noun.spread * 0.8)
     scale0, ground = _start(silhouette, prior)
     free = {"box": [0, 1, 2], "cylinder": [0, 2], "sphere": [0]}[noun.form]
+    unit = outline_points(noun.form, (1.0, 1.0, 1.0), noun.taper)
+    reach = scale0 * prior.max()
 
-    def size_of(v: np.ndarray) -> np.ndarray:
+    def posed(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         logs = np.zeros(3)
         logs[free] = v[3:]
         if noun.form != "box":
             logs[1] = logs[0]
         if noun.form == "sphere":
             logs[2] = logs[0]
-        return prior * scale0 * np.exp(logs)
+        size = prior * scale0 * np.exp(logs)
+        return size, _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
 
-    unit = outline_points(noun.form, (1.0, 1.0, 1.0), noun.taper)
-
-    def posed(v: np.ndarray, size: np.ndarray) -> np.ndarray:
-        return _resting(ground + v[:2] * scale0 * prior.max(), v[2], rest, size)
-
-    def outline(size: np.ndarray, T: np.ndarray) -> np.ndarray:
-        return (unit * size) @ T[:3, :3].T + T[:3, 3]
-
-    def place(v: np.ndarray) -> np.ndarray:
-        size = size_of(v)
-        return outline(size, posed(v, size))
-
-    def cost(v: np.ndarray) -> float:
-        size = size_of(v)
-        T = posed(v, size)
+    def held(v: np.ndarray, T: np.ndarray) -> float:
         off = (v[3:] - v[3:].mean()) / spread
-        appearance = silhouette.appearance_cost(noun.form, size, T)
-        held = _PRIOR_WEIGHT * float((off**2).sum())
-        return 1 - silhouette.iou(outline(size, T), _HIDDEN_WEIGHT) + held + appearance
+        return _PRIOR_WEIGHT * float((off**2).sum())
 
-    turns = _yaw_starts(noun, rest, thorough)
+    fitting = _Fitting(
+        silhouette=silhouette, noun=noun, posed=posed, outline=lambda size: unit * size, held=held
+    )
     starts = [
         _aligned(
-            silhouette,
-            np.array([0.0, 0.0, yaw, *np.full(len(free), grow)]),
-            place,
-            scale0 * prior.max(),
+            silhouette, np.array([0.0, 0.0, yaw, *np.full(len(free), grow)]), fitting.place, reach
         )
-        for yaw in turns
+        for yaw in _yaw_starts(noun, rest, thorough)
         for grow in ((0.0, 0.25) if thorough else (0.1,))
     ]
-    steps = np.array([0.25, 0.25, 0.3, *[0.25] * len(free)])
+    step = np.array([0.25, 0.25, 0.3, *[0.25] * len(free)])
     # Outlines of a box at two yaws are nearly as good as each other.
-    best = search(cost, starts, steps, kept=4 if thorough and noun.form == "box" else 2)
-    size = size_of(best)
-    T = posed(best, size)
-    points = outline_points(noun.form, tuple(size), noun.taper) @ T[:3, :3].T + T[:3, 3]
-    return _fitted(silhouette, points, three(size), T, cost(best))
+    return fitting.best(starts, step, kept=4 if thorough and noun.form == "box" else 2)
 
 
 def fit_pose(
@@ -129,45 +149,37 @@ def fit_pose(
     `yaw_near` holds the yaw where the outline does not decide it; `within` holds the place.
     """
     extents = np.array(size)
-    points0 = outline_points(noun.form, size, noun.taper)
+    reach = float(extents.max())
+    points = outline_points(noun.form, size, noun.taper)
     _, ground = _start(silhouette, extents)
 
-    def place(v: np.ndarray) -> np.ndarray:
-        T = _resting(ground + v[:2] * extents.max(), v[2], rest, extents)
+    def posed(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        T = _resting(ground + v[:2] * reach, v[2], rest, extents)
         T[2, 3] += support
-        return T
+        return extents, T
 
-    def cost(v: np.ndarray) -> float:
-        T = place(v)
-        held = 0.0
+    def held(v: np.ndarray, T: np.ndarray) -> float:
+        cost = 0.0
         if yaw_near is not None:
-            held = 0.01 * (1 - np.cos(2 * (v[2] - yaw_near)))
+            cost = 0.01 * (1 - np.cos(2 * (v[2] - yaw_near)))
         if within is not None:
             outside = float(np.linalg.norm(T[:2, 3] - within.xy)) - within.radius
-            held += max(0.0, outside) / max(within.radius, 0.5 * float(extents.max()))
-        appearance = silhouette.appearance_cost(noun.form, extents, T)
-        outline = points0 @ T[:3, :3].T + T[:3, 3]
-        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + held + appearance
+            cost += max(0.0, outside) / max(within.radius, 0.5 * reach)
+        return cost
 
+    fitting = _Fitting(
+        silhouette=silhouette, noun=noun, posed=posed, outline=lambda _: points, held=held
+    )
     turns = _yaw_starts(noun, rest, thorough=True)
     if yaw_near is not None:
         turns = [*turns, yaw_near]
-
-    def outline(v: np.ndarray) -> np.ndarray:
-        T = place(v)
-        return points0 @ T[:3, :3].T + T[:3, 3]
-
     starts = [
-        _aligned(silhouette, np.array([0.0, 0.0, yaw]), outline, float(extents.max()))
-        for yaw in turns
+        _aligned(silhouette, np.array([0.0, 0.0, yaw]), fitting.place, reach) for yaw in turns
     ]
     if within is not None:
         there = (within.xy - ground) / extents.max()
         starts += [np.array([*there, yaw]) for yaw in turns[:1]]
-    best = search(cost, starts, np.array([0.15, 0.15, 0.3]))
-    T = place(best)
-    points = points0 @ T[:3, :3].T + T[:3, 3]
-    return _fitted(silhouette, points, size, T, cost(best))
+    return fitting.best(starts, np.array([0.15, 0.15, 0.3]))
 
 
 def fit_lifted(
@@ -180,48 +192,33 @@ def fit_lifted(
 
     One view does not show the depth of something in mid-air; lifted straight up is the assumption.
     """
-    points0 = outline_points(noun.form, size, noun.taper)
-    reach = max(size)
+    extents, reach = np.array(size), max(size)
+    points = outline_points(noun.form, size, noun.taper)
     x, y, w, h = silhouette.box
     start = on_wall(silhouette.camera, np.array([x + w / 2, y + h / 2]), T_first[0, 3])
     yaw0 = Rotation.from_matrix(T_first[:3, :3])
 
-    def place(v: np.ndarray) -> np.ndarray:
+    def posed(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         turned = (Rotation.from_rotvec([0, 0, v[2]]) * yaw0).as_matrix()
         height = max(start[2] + v[1] * reach, lowest(size, noun.form, turned))
-        return transform(turned, np.array([T_first[0, 3], start[1] + v[0] * reach, height]))
+        place = np.array([T_first[0, 3], start[1] + v[0] * reach, height])
+        return extents, transform(turned, place)
 
-    def cost(v: np.ndarray) -> float:
-        T = place(v)
-        appearance = silhouette.appearance_cost(noun.form, size, T)
-        outline = points0 @ T[:3, :3].T + T[:3, 3]
-        turned = 0.01 * (1 - np.cos(v[2]))
-        return 1 - silhouette.iou(outline, _HIDDEN_WEIGHT) + turned + appearance
-
-    best = search(
-        cost,
-        [np.zeros(3), np.array([0, 0, 0.5]), np.array([0, 0, -0.5])],
-        np.array([0.2, 0.2, 0.2]),
+    fitting = _Fitting(
+        silhouette=silhouette,
+        noun=noun,
+        posed=posed,
+        outline=lambda _: points,
+        held=lambda v, T: 0.01 * (1 - np.cos(v[2])),
     )
-    T = place(best)
-    points = points0 @ T[:3, :3].T + T[:3, 3]
-    return _fitted(silhouette, points, size, T, cost(best))
+    starts = [np.zeros(3), np.array([0, 0, 0.5]), np.array([0, 0, -0.5])]
+    return fitting.best(starts, np.array([0.2, 0.2, 0.2]))
 
 
-def _fitted(
-    silhouette: Silhouette,
-    points: Float[np.ndarray, "n 3"],
-    size: tuple[float, float, float],
-    T_world_obj: Float[np.ndarray, "4 4"],
-    cost: float,
-) -> Fit:
-    return Fit(
-        size=size,
-        T_world_obj=T_world_obj,
-        iou=silhouette.iou(points),
-        visible=silhouette.visible(points),
-        cost=cost,
-    )
+def _moved(
+    points: Float[np.ndarray, "n 3"], T: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "n 3"]:
+    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def three(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
