@@ -31,7 +31,7 @@ from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 
@@ -125,15 +125,15 @@ def judge(bundle: TaskBundle, act: Act | None, episodes: int, seed: int) -> int:
     sim = SimConfig(fine=True, randomization=randomize.recording())
     env = BatchEnv(bundle, sim, num_envs=episodes, seed=seed, num_threads=1)
     programs = ProgramPolicy(env)
-    course = Course(env)
+    referee = RefereeRecord(env)
     env.reset(np.arange(episodes))
     programs.restart()
-    course.restart()
+    referee.restart()
     obs = env.observe()
     for _ in range(env.horizon):
         obs = env.step(programs.act() if act is None else act(obs)).obs
-        course.note()
-    return int(course.verdict().sum())
+        referee.note()
+    return int(referee.verdict().sum())
 
 
 def _key(result: dict[str, Any]) -> tuple[str, str, int]:

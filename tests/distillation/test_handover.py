@@ -110,7 +110,7 @@ def test_the_number_of_threads_changes_nothing(agreeing_referee, seed: int):
 
 def test_what_the_referee_denies_is_no_success(monkeypatch: pytest.MonkeyPatch):
     odd = np.arange(5) % 2 == 1
-    monkeypatch.setattr(verdict, "referee_verdict", lambda bundle, course: odd)
+    monkeypatch.setattr(verdict, "referee_verdict", lambda bundle, history: odd)
 
     found = run()
 

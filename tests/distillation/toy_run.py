@@ -62,8 +62,8 @@ def bundle() -> TaskBundle:
     return replace(toy_task.bundle(), code=CODE, class_name="Push")
 
 
-def agree(_: object, course: Mapping[str, np.ndarray]) -> np.ndarray:
-    return np.ones(course["eef_pos"].shape[1], bool)
+def agree(_: object, history: Mapping[str, np.ndarray]) -> np.ndarray:
+    return np.ones(history["eef_pos"].shape[1], bool)
 
 
 def make_agreeing(

@@ -17,7 +17,7 @@ from v2p_data.episodes.rollouts import CutConfig, EpisodeEnds
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.randomize import RandomizationConfig
-from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.render.masks import MaskRenderer
 from v2p_data.task.task import TaskBundle
 
@@ -99,8 +99,8 @@ def hand_over(
     earliest, latest = (round(share * env.horizon) for share in cfg.takeover)
     takeover = rng_for(seed, "takeover").integers(earliest, latest + 1, n)
     params = tuple(env.episode_params(k) for k in range(n))
-    course = Course(env)
-    course.restart()
+    referee = RefereeRecord(env)
+    referee.restart()
     student.reset(bundle.description)
     obs = env.observe()
     labels = np.zeros((n, size_px, size_px), np.uint8)
@@ -123,7 +123,7 @@ def hand_over(
             actions.append(label)
             result = env.step(action)
             obs = result.obs
-            course.note()
+            referee.note()
             ends.note(t, result)
             if ends.all_over(t):
                 break
@@ -136,7 +136,7 @@ def hand_over(
         num_frames=ends.num_frames,
         held_at=ends.held_at,
         task_successes=ends.successes,
-        referee=course.verdict_as_cut(ends.num_frames) & ends.successes,
+        referee=referee.verdict_as_cut(ends.num_frames) & ends.successes,
         broke=ends.broke,
         params=params,
     )

@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float32, Int
 
 from v2p_data.episodes.dataset.features import FPS
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot, StepResult
-from v2p_data.sim.env.verdict import Course, referee_verdict
+from v2p_data.sim.env.verdict import RefereeRecord, referee_verdict
 from v2p_data.task.task import Task, TaskBundle
 
 Act = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
 Referee = Callable[[TaskBundle, Mapping[str, np.ndarray]], Bool[np.ndarray, "env"]]
-"""Given a task and `Course.as_cut`, tells which episodes succeeded."""
+"""Given a task and `RefereeRecord.history_as_cut`, tells which episodes succeeded."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,8 @@ def roll_out(
     acts = act.begin(env) if isinstance(act, InWorlds) else act
     obs = env.observe()
     states, actions, successes, snapshots = [], [], [], []
-    course = Course(env)
-    course.restart()
+    record = RefereeRecord(env)
+    record.restart()
     ends = EpisodeEnds(num_worlds, env.horizon, cut)
     for t in range(env.horizon):
         states.append(env.robot_state())
@@ -162,13 +162,13 @@ def roll_out(
         obs = result.obs
         actions.append(action)
         successes.append(result.success)
-        course.note()
+        record.note()
         ends.note(t, result)
         if ends.all_over(t):
             break
     held = ends.successes
     judge = referee or referee_verdict
-    verdict = judge(bundle, course.as_cut(ends.num_frames)) & held if held.any() else held
+    verdict = judge(bundle, record.history_as_cut(ends.num_frames)) & held if held.any() else held
     return Rollouts(
         seed=seed,
         state=np.stack(states),

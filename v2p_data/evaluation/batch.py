@@ -22,7 +22,7 @@ from v2p_data.evaluation.failures import failure_kinds
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.randomize import RandomizationConfig
-from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.render.masks import MaskRenderer
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW, stream_seed
 from v2p_data.task.task import Task, TaskBundle
@@ -203,8 +203,8 @@ def _play(
 ) -> _Played:
     """Play one episode in every world, from where the worlds are."""
     n = env.num_envs
-    course = Course(env)
-    course.restart()
+    referee = RefereeRecord(env)
+    referee.restart()
     film = _Film(env, steps) if is_shown else None
     success_step = np.full(n, NEVER)
     broke, over, last = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
@@ -213,7 +213,7 @@ def _play(
         moving = np.flatnonzero(~over)
         with watch.on("physics"):
             result = env.step(action, None if len(moving) == n else moving)
-            course.note()
+            referee.note()
             if film is not None:
                 film.note()
         gone = result.terminated & ~over
@@ -223,7 +223,7 @@ def _play(
         asked = np.flatnonzero(is_asked)
         if len(asked):
             with watch.on("referee"):
-                agreed = asked[course.verdict(asked)]
+                agreed = asked[referee.verdict(asked)]
             success_step[agreed[success_step[agreed] == NEVER]] = t
             if t + 1 == steps:
                 last[agreed] = True
@@ -234,9 +234,11 @@ def _play(
             break
     failed = np.flatnonzero(success_step == NEVER)
     failures = np.full(n, "", dtype=object)
-    failures[failed] = failure_kinds(env.bundle, course.of(failed), broke[failed])
+    failures[failed] = failure_kinds(env.bundle, referee.history(failed), broke[failed])
     succeeded = success_step != NEVER
-    end = np.where(succeeded, np.minimum(success_step + 2 + TAIL_STEPS, len(course)), len(course))
+    end = np.where(
+        succeeded, np.minimum(success_step + 2 + TAIL_STEPS, len(referee)), len(referee)
+    )
     shown = None
     if film is not None:
         shown = Shown(successes=succeeded, num_frames=end, snapshots=film.snapshots())

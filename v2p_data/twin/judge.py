@@ -130,7 +130,7 @@ def play(
                 break
     failure = ""
     if success_step == NEVER:
-        failure = failure_kinds(bundle, arm.mirror.course.of(), np.array([broke]))[0]
+        failure = failure_kinds(bundle, arm.mirror.referee.history(), np.array([broke]))[0]
     return Played(
         seed=seed,
         success_step=success_step,
