@@ -18,6 +18,7 @@ from v2p_data.episodes.mask_noise import MaskNoiseConfig
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.play import StateActor
 from v2p_data.sim.env import verdict
 
 
@@ -27,7 +28,7 @@ class Killed(Exception):  # noqa: N818 - it stands for a kill
 
 def run(out: Path, pupil: Pupil | None = None, *, train=None, episodes=EPISODES, num_threads=1, cfg=DISTILLATION):  # fmt: skip
     pupil = pupil or Pupil()
-    lessons = {"toy": Lesson(bundle=toy_run.bundle(), expert=act)}
+    lessons = {"toy": Lesson(bundle=toy_run.bundle(), expert=StateActor(act))}
     return distill(
         lessons, pupil, train or pupil.train, cfg, episodes, out, 7, num_threads=num_threads
     )  # fmt: skip

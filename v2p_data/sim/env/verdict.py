@@ -31,7 +31,11 @@ def referee_verdict(
 
 
 class RefereeRecord:
-    """What the referee is shown of all worlds of an environment, from the start of their episodes."""
+    """What the referee is shown of all worlds of an environment, from the start of their episodes.
+
+    Args:
+        env: the worlds; their present moment is noted as the start.
+    """
 
     def __init__(self, env: BatchEnv) -> None:
         self._env = env
@@ -40,15 +44,15 @@ class RefereeRecord:
             for name in env.object_names
             for key in ("pos", "quat", "size", "touched", "grasped")
         ]
-        self._moments: list[dict[str, np.ndarray]] = []
+        self.restart()
 
     def restart(self) -> None:
         """Forget everything and note the start of new episodes; call after a reset."""
-        self._moments = []
+        self._moments: list[dict[str, np.ndarray]] = []
         self.note()
 
-    def note(self) -> None:
-        """Note the present moment; call after each step."""
+    def note(self, _: object = None) -> None:
+        """Note the present moment; call after each step, or let `play` call it."""
         states = self._env.states()
         self._moments.append({key: states[key].numpy().astype(float) for key in self._keys})
 
@@ -68,7 +72,3 @@ class RefereeRecord:
     def verdict(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> Bool[np.ndarray, "n"]:
         """Return what the referee says of the episodes of some worlds so far."""
         return referee_verdict(self._env.bundle, self.history(worlds))
-
-    def verdict_as_cut(self, end: Int[np.ndarray, "env"]) -> Bool[np.ndarray, "env"]:
-        """Return what the referee says of episodes of `end` steps each; see `history_as_cut`."""
-        return referee_verdict(self._env.bundle, self.history_as_cut(end))
