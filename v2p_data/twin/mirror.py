@@ -98,10 +98,6 @@ class Mirror:
         self.referee.note()
         return result
 
-    def verdict(self) -> bool:
-        """Return whether the independent referee calls the episode so far a success."""
-        return bool(self.referee.verdict()[0])
-
 
 def _followed(truth: Truth, target: ToolPose) -> Followed:
     quat = target.rotation.as_quat(scalar_first=True)
