@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -101,6 +101,7 @@ class View:
         self._labels[seen] = self._renderer.draw_many([(snapshot, k) for k in range(len(seen))])
 
 
+@runtime_checkable
 class Actor(Protocol):
     """Who acts in all worlds at a time."""
 
@@ -113,6 +114,7 @@ class Actor(Protocol):
         ...
 
 
+@runtime_checkable
 class Policy(Protocol):
     """A policy that is told its task: `n` label pictures and robot states at a time are all that it sees."""
 
