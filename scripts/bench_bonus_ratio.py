@@ -20,6 +20,7 @@ from policies.ppo.policy import Expert
 from policies.ppo.train import train_expert
 from studies.results import append_result, commit, results_in
 from v2p_data.episodes.collect import judge_expert
+from v2p_data.play import StateActor
 from v2p_data.reward.candidate import LAST_POLICY
 from v2p_data.reward.worker import ppo_config
 from v2p_data.seeds import seed_for
@@ -81,7 +82,7 @@ def measured(task: str, ratio: float, seed: int, settings: Settings) -> dict[str
         cpu = time.process_time() - cpu
         judged = judge_expert(
             bundle,
-            Expert.load(folder / LAST_POLICY).act,
+            StateActor(Expert.load(folder / LAST_POLICY).act),
             episodes=settings.episodes,
             seed=seed_for(seed, "bonus ratio judge", task),
         )

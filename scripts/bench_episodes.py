@@ -53,6 +53,7 @@ from v2p_data.episodes.dataset.features import (
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.rollouts import Rollouts, roll_out
 from v2p_data.episodes.staging import Episode, staged_episodes
+from v2p_data.play import StateActor
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.model.world import CAMERA, build_world
@@ -135,7 +136,9 @@ def compare(cfg: BenchConfig) -> None:
         place = Path(folder)
         warm_up(bundle, place / "warm", cfg)
         started = time.perf_counter()
-        collected = collect(bundle, lift, recipe, place / "ours", SEED, num_threads=cfg.threads)
+        collected = collect(
+            bundle, StateActor(lift), recipe, place / "ours", SEED, num_threads=cfg.threads
+        )
         staged_s = time.perf_counter() - started
         staged = staged_episodes(place / "ours")
         pack(staged, "bench/ours", place / "dataset", num_threads=cfg.threads)
@@ -176,7 +179,7 @@ def compare(cfg: BenchConfig) -> None:
 def warm_up(bundle: TaskBundle, place: Path, cfg: BenchConfig) -> None:
     """Import, compile and open everything that both ways need, on two episodes."""
     small = EpisodesConfig(num_episodes=2, batch_worlds=4, max_batches=4, size_px=64)
-    collect(bundle, lift, small, place, 0)
+    collect(bundle, StateActor(lift), small, place, 0)
     staged = staged_episodes(place)
     pack(staged, "bench/warm", place / "dataset")
     lerobots_way(bundle, small, staged, place / "lerobot", None, seed=0)
@@ -244,7 +247,7 @@ def batches(bundle: TaskBundle, recipe: EpisodesConfig, seed: int) -> Iterator[R
     for number in range(recipe.max_batches):
         yield roll_out(
             bundle,
-            lift,
+            StateActor(lift),
             SimConfig(fine=True, randomization=recipe.randomization),
             num_worlds=recipe.batch_worlds,
             seed=seed_for(seed, "batch", number),

@@ -23,6 +23,7 @@ import tyro
 
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.play import VisionActor
 from v2p_data.sim.render.masks import PALETTE
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
@@ -69,7 +70,7 @@ def _compare(cfg: BenchConfig, task: Path, policy: Path) -> None:
     def judged(episodes: int) -> Judged:
         return judge(
             bundle,
-            actor,
+            VisionActor(actor),
             episodes=episodes,
             first_seed=cfg.first_seed,
             cfg=EvaluationConfig(worlds=episodes, at_end=False),

@@ -184,6 +184,7 @@ def all_phases() -> dict[str, Phase]:
     from v2p_data.episodes.dataset.writer import pack
     from v2p_data.episodes.hub.hub import push_dataset
     from v2p_data.episodes.staging import staged_episodes
+    from v2p_data.play import StateActor
     from v2p_data.task.benchmark import load_benchmark
 
     shards.SHARD_FRAMES = SHARD_FRAMES
@@ -196,7 +197,7 @@ def all_phases() -> dict[str, Phase]:
         return action
 
     def collecting(place: Path) -> None:
-        collect(bundle, sometimes, recipe, place / "collected", SEED, num_threads=1)
+        collect(bundle, StateActor(sometimes), recipe, place / "collected", SEED, num_threads=1)
 
     def packing(place: Path) -> None:
         if not (place / "packed").exists():

@@ -25,7 +25,7 @@ from v2p_data.kinds import KINDS
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.env import task_code
 from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv, SimConfig
-from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.sandbox.sandbox import class_name
@@ -105,7 +105,7 @@ def _played(
 ) -> tuple[list[dict[str, torch.Tensor]], Bool[np.ndarray, "env"]]:
     """Play one episode in every world; return the last moments, and what the referee says."""
     n, horizon = env.num_envs, env.horizon
-    teacher, course = Teacher(env), Course(env)
+    teacher, referee = Teacher(env), RefereeRecord(env)
     names = list(teacher.programs)
     meant = [k for k, name in enumerate(names) if name.startswith(_meant(env.bundle))]
     program = np.where(
@@ -115,7 +115,7 @@ def _played(
     is_idle = rng.random(n) < IDLE_SHARE
     stop = np.where(rng.random(n) < STOPPED_SHARE, rng.uniform(0.3, 1.0, n), np.inf) * horizon
     env.reset(np.arange(n))
-    course.restart()
+    referee.restart()
     last: list[dict[str, torch.Tensor]] = []
     for step in range(horizon):
         moment = teacher.moment()
@@ -127,10 +127,10 @@ def _played(
             action = action + noise[:, None] * rng.normal(size=action.shape)
         action[is_idle | (step > stop)] = 0.0
         env.step(action)
-        course.note()
+        referee.note()
         if step >= horizon - HELD_STEPS:
             last.append({key: value.clone() for key, value in env.states().items()})
-    return last, course.verdict()
+    return last, referee.verdict()
 
 
 def _meant(bundle: TaskBundle) -> tuple[str, ...]:

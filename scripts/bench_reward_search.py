@@ -36,7 +36,8 @@ from policies.evaluation.rate import Rate, wilson
 from policies.ppo.policy import Expert
 from studies.results import Row, append_result, letters_of, results_in
 from v2p_data.episodes.collect import judge_expert
-from v2p_data.experts.teacher import play
+from v2p_data.experts.teacher import try_out
+from v2p_data.play import StateActor
 from v2p_data.reward.candidate import (
     LAST_POLICY,
     TRAIN_FOLDER,
@@ -216,7 +217,7 @@ def compare_rounds(
         policy, spent = policies[arm]
         judged = judge_expert(
             bundle,
-            Expert.load(policy).act,
+            StateActor(Expert.load(policy).act),
             episodes=settings.episodes,
             seed=seed_for(seed, "later rounds", bundle.title),
         )
@@ -313,7 +314,7 @@ def _request(candidate: Candidate) -> dict[str, Any]:
 
 def _rate(worlds: BatchEnv, candidate: Candidate) -> Rate:
     worlds.seed(0)
-    at_end = play(worlds, Expert.load(candidate.policy_folder()).act).at_end
+    at_end = try_out(worlds, StateActor(Expert.load(candidate.policy_folder()).act)).at_end
     return wilson(int(at_end.sum()), len(at_end))
 
 

@@ -13,7 +13,6 @@ import os
 import shutil
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +26,13 @@ from policies.ppo.curve import CURVE_FILE, read_rows
 from policies.ppo.policy import Expert
 from studies.results import append_result, commit, results_in
 from v2p_data.episodes.collect import judge_expert
-from v2p_data.episodes.rollouts import Act, InWorlds, Rollouts
+from v2p_data.episodes.rollouts import Rollouts
+from v2p_data.evaluation.actors import ProgramActor
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, learn
-from v2p_data.experts.teacher import Teacher
+from v2p_data.play import Actor, StateActor
 from v2p_data.report.sheet import write_contact_sheet
 from v2p_data.seeds import seed_for
-from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.sim.robot.robot import FINE
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.task import TaskBundle
@@ -102,19 +101,19 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
     )
     learned = learn(worlds, cfg, folder)
     wall, cpu = time.monotonic() - started, time.process_time() - cpu
-    actors: dict[str, Act | InWorlds] = {"expert": Expert.load(folder).act}
+    actors: dict[str, Actor] = {"expert": StateActor(Expert.load(folder).act)}
     if learned.teacher:
-        actors["taught"] = Expert.load(folder / TAUGHT_FOLDER).act
-        actors["program"] = InWorlds(partial(_program, learned.teacher))
+        actors["taught"] = StateActor(Expert.load(folder / TAUGHT_FOLDER).act)
+        actors["program"] = ProgramActor(seed, learned.teacher)
     judged = {
         who: judge_expert(
             bundle,
-            act,
+            actor,
             episodes=args.episodes,
             seed=seed_for(seed, "benchmark-judge", task),
             num_threads=args.threads,
         )
-        for who, act in actors.items()
+        for who, actor in actors.items()
     }
     write_contact_sheet(bundle, judged["expert"], folder / "sheet.png")
     result = {
@@ -134,12 +133,6 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
     append_result(args.out, result)
     rates = {who: f"{r.successes.mean():.2f}" for who, r in judged.items()}
     print(task, seed, rates, learned.made_by, f"{cpu:.0f} CPU s", flush=True)
-
-
-def _program(name: str, env: BatchEnv) -> Act:
-    teacher = Teacher(env)
-    teacher.name = name
-    return lambda obs: teacher.act()
 
 
 def _judged(rollouts: Rollouts) -> dict[str, Any]:

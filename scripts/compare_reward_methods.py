@@ -14,7 +14,6 @@ import json
 import shutil
 import time
 from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ import numpy as np
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
 from studies.results import append_result, results_in
+from v2p_data.play import Actor, StateActor, View, play
 from v2p_data.reward.candidate import DONE_FILE
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.jobs import Jobs
@@ -31,14 +31,13 @@ from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 
 METHODS = ("v2p", "eureka", "robogen", "code_as_policy")
 TAUGHT_ROUNDS = {"lift_up": 2, "uncover": 2, "throw_into": 8}
 """Rounds of imitation that leave something to be learned."""
-Act = Callable[[np.ndarray], np.ndarray]
 
 
 def main() -> None:
@@ -74,7 +73,7 @@ def _one(task: str, method: str, seed: int, args: argparse.Namespace, jobs: Jobs
     found: dict[str, Any] = {}
     judge_seed = seed_for(seed, "method-judge", task)
     if method == "code_as_policy":
-        successes = judge(bundle, None, args.episodes, judge_seed)
+        successes = judge(bundle, ProgramPolicy(), args.episodes, judge_seed)
     else:
         cfg = RewardConfig(
             method=method,
@@ -103,7 +102,9 @@ def _one(task: str, method: str, seed: int, args: argparse.Namespace, jobs: Jobs
             jobs=jobs,
         )
         found = result.as_dict()
-        successes = judge(bundle, Expert.load(result.policy).act, args.episodes, judge_seed)
+        successes = judge(
+            bundle, StateActor(Expert.load(result.policy).act), args.episodes, judge_seed
+        )
     row = {
         "task": task,
         "method": method,
@@ -117,23 +118,17 @@ def _one(task: str, method: str, seed: int, args: argparse.Namespace, jobs: Jobs
     print(json.dumps({k: v for k, v in row.items() if k != "found"}), flush=True)
 
 
-def judge(bundle: TaskBundle, act: Act | None, episodes: int, seed: int) -> int:
-    """Return how many fresh episodes the referee calls a success; without `act`, programs play.
+def judge(bundle: TaskBundle, actor: Actor, episodes: int, seed: int) -> int:
+    """Return how many fresh episodes the referee calls a success.
 
     Sources of randomness are those of recorded episodes.
     """
     sim = SimConfig(fine=True, randomization=randomize.recording())
     env = BatchEnv(bundle, sim, num_envs=episodes, seed=seed, num_threads=1)
-    programs = ProgramPolicy(env)
-    course = Course(env)
     env.reset(np.arange(episodes))
-    programs.restart()
-    course.restart()
-    obs = env.observe()
-    for _ in range(env.horizon):
-        obs = env.step(programs.act() if act is None else act(obs)).obs
-        course.note()
-    return int(course.verdict().sum())
+    record = RefereeRecord(env)
+    play(View(env), actor, [record.note])
+    return int(record.verdict().sum())
 
 
 def _key(result: dict[str, Any]) -> tuple[str, str, int]:

@@ -30,7 +30,8 @@ from v2p_data.distillation.rounds import Lesson, distill
 from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.pipeline.artifact import read_record
-from v2p_data.policy.training import ACTION_LIMIT, StudentActor, recorded_under, sources_of
+from v2p_data.play import StateActor, VisionActor
+from v2p_data.policy.training import ACTION_LIMIT, recorded_under, sources_of
 from v2p_data.seeds import seed_for
 from v2p_data.task.task import TaskBundle
 
@@ -138,7 +139,7 @@ def _one(name: str, seed: int, args: argparse.Namespace) -> None:
 
     if variant.rounds:
         distill(
-            {s.item: Lesson(bundle=bundles[s.item], expert=Expert.load(s.expert).act) for s in sources},
+            {s.item: Lesson(bundle=bundles[s.item], expert=StateActor(Expert.load(s.expert).act)) for s in sources},
             student,
             train,
             DistillationConfig(
@@ -185,7 +186,7 @@ def _judged(student: Student, bundle: TaskBundle, seed: int, args: argparse.Name
     """Judge the student on fresh episodes of a task."""
     judged = judge(
         bundle,
-        StudentActor(student=student, task=bundle.description),
+        VisionActor(student.for_task(bundle.description)),
         episodes=args.episodes,
         first_seed=seed_for(seed, "study-judge", bundle.title) % 2**31,
         cfg=EvaluationConfig(episodes=args.episodes),

@@ -15,7 +15,7 @@ from v2p_data.experts import teacher
 from v2p_data.experts.primitives import Moment
 from v2p_data.kinds import TaskKind
 from v2p_data.sim.env.batch_env import BatchEnv
-from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.task import referee
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.sandbox.sandbox import class_name
@@ -75,18 +75,18 @@ def main() -> None:
     env = BatchEnv(bundle, num_envs=8, seed=1, num_threads=1)
     player = teacher.Teacher(env)
     best = player.choose(env)
-    course = Course(env)
+    record = RefereeRecord(env)
     env.reset(np.arange(8))
-    course.restart()
+    record.restart()
     for _ in range(env.horizon):
         env.step(player.act())
-        course.note()
+        record.note()
     said = {
         "kind": read.kind,
         "is_mirrored": "front = torch.ones_like" in code,
         "program": best.name,
         "task_success": best.success,
-        "referee_success": float(course.verdict().mean()),
+        "referee_success": float(record.verdict().mean()),
     }
     json.dump(said, sys.stdout)
 

@@ -24,12 +24,14 @@ BELOW: dict[str, set[str]] = {
     # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
     "sim": {"task", "scene", "geometry", "seeds", "kinds"},
     # It trains policies, as the reward search does: the two rooms below the top that know `policies`.
-    "experts": {"sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
-    "episodes": {"sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
-    "distillation": {"episodes", "sim", "task", "pipeline", "seeds", "kinds"},
+    "experts": {"play", "sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
+    "play": {"sim"},
+    "episodes": {"play", "sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
+    "distillation": {"episodes", "play", "sim", "task", "pipeline", "seeds", "kinds"},
     # A policy is whatever has `reset` and `act`; `judging` alone knows how one is loaded.
     "evaluation": {
         "experts",
+        "play",
         "sim",
         "task",
         "scene",
@@ -42,6 +44,7 @@ BELOW: dict[str, set[str]] = {
     "twin": {
         "experts",
         "evaluation",
+        "play",
         "episodes",
         "sim",
         "task",
@@ -50,10 +53,11 @@ BELOW: dict[str, set[str]] = {
         "seeds",
         "kinds",
     },
-    "reward": {"experts", "task", "sim", "scene", "pipeline", "seeds", "kinds"},
+    "reward": {"experts", "play", "task", "sim", "scene", "pipeline", "seeds", "kinds"},
     # It sees the arm that policies were trained with, and what a robot is; never the twin's inside.
     "deployment": {
         "twin",
+        "play",
         "evaluation",
         "episodes",
         "sim",
@@ -64,7 +68,7 @@ BELOW: dict[str, set[str]] = {
         "seeds",
     },
     "policy": {
-        *("deployment", "distillation", "evaluation", "episodes"),
+        *("deployment", "distillation", "evaluation", "episodes", "play"),
         *("scene", "task", "pipeline", "seeds"),
     },
     "report": {"episodes", "sim", "task", "scene", "video", "geometry", "pipeline"},

@@ -334,6 +334,7 @@ def make_expert(
     from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import judge_expert
     from v2p_data.experts.learning import Worlds, learn
+    from v2p_data.play import StateActor
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.env.task_check import check_reward, check_task
     from v2p_data.task.llm.pool import add_solved
@@ -361,7 +362,7 @@ def make_expert(
     runtime.progress(0.95, "judging at the fine step")
     judged = judge_expert(
         bundle,
-        expert.act,
+        StateActor(expert.act),
         episodes=expert_cfg.eval_episodes,
         seed=seed_for(cfg.seed, "expert-evaluation", bundle.title),
         num_threads=runtime.num_threads,
@@ -410,12 +411,13 @@ def make_episodes(
     """Stage successful episodes one by one; list the failed ones."""
     from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import collect
+    from v2p_data.play import StateActor
     from v2p_data.task.task import TaskBundle
 
     bundle = TaskBundle.load(inputs["task"])
     collected = collect(
         bundle,
-        Expert.load(inputs["expert"]).act,
+        StateActor(Expert.load(inputs["expert"]).act),
         cfg.config,
         out,
         seed=seed_for(cfg.seed, "episodes", bundle.title),

@@ -5,7 +5,7 @@ It knows arrays only: label images, robot states, actions. Who simulates and who
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,9 +84,13 @@ class Student:
 
     # -- acting
 
-    def reset(self, task: str) -> None:
-        """Start episodes of a task, given in words, in all worlds."""
-        self.task = task
+    def for_task(self, words: str) -> "Student":
+        """Return the same student, told a task."""
+        return replace(self, task=words)
+
+    def reset(self, n: int) -> None:
+        """Forget the last episodes; `n` new ones begin."""
+        del n
         self.policy.reset()
 
     @torch.inference_mode()

@@ -26,7 +26,6 @@ from v2p_data.pipeline.workers import run_stages
 from v2p_data.policy.training import POLICY_FOLDER, sources_of
 from v2p_data.reward.programs import ProgramPolicy
 from v2p_data.seeds import rng_for, seed_for
-from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.stages import (
     Seeded,
     dataset_stage,
@@ -427,22 +426,9 @@ def _why(stage: Stage, outcomes: Mapping[str, Outcome]) -> str:
 # --- Code-as-Policies ------------------------------------------------------------------------------------------
 
 
-class ProgramsActor:
-    """Code-as-Policies as in `v2p_data.reward.programs`, for a judge."""
-
-    def begin(self, env: BatchEnv) -> None:
-        """Episodes begin in all worlds."""
-        self._programs = ProgramPolicy(env)
-
-    def act_in(self, env: BatchEnv) -> Any:
-        """Return the programs' actions."""
-        del env  # the programs' own
-        return self._programs.act()
-
-
 def _programs(bundle: TaskBundle) -> tuple[Any, int]:
     del bundle
-    return ProgramsActor(), UNSEEN_PX
+    return ProgramPolicy(), UNSEEN_PX
 
 
 def make_program_episodes(
@@ -450,12 +436,11 @@ def make_program_episodes(
 ) -> dict[str, Any]:
     """Collect demonstrations of Code-as-Policies, as an expert's are collected."""
     from v2p_data.episodes.collect import collect
-    from v2p_data.episodes.rollouts import InWorlds
 
     bundle = TaskBundle.load(inputs["task"])
     collected = collect(
         bundle,
-        InWorlds(_program_act),
+        ProgramPolicy(),
         cfg.config,
         out,
         seed=seed_for(cfg.seed, "episodes", bundle.title),
@@ -463,8 +448,3 @@ def make_program_episodes(
         on_progress=runtime.progress,
     )
     return collected.counts()
-
-
-def _program_act(env: BatchEnv) -> Any:
-    programs = ProgramPolicy(env)
-    return lambda obs: programs.act()

@@ -111,7 +111,8 @@ def distilled(finished: Path, tmp_path_factory) -> Path:
     """A run folder up to its policy; do not write into it."""
     root = Path(shutil.copytree(finished, tmp_path_factory.mktemp("distilled") / "run"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("v2p_data.sim.env.verdict.referee_verdict", toy_run.agree)
+        for module in ("sim.env.verdict", "episodes.rollouts"):
+            patch.setattr(f"v2p_data.{module}.referee_verdict", toy_run.agree)
         outcomes = make(root)
     assert all(o.status == "made" for o in outcomes.values()), [
         o.detail for o in outcomes.values()

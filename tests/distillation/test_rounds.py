@@ -14,11 +14,12 @@ from toy_task import act
 
 from v2p_data.distillation import rounds
 from v2p_data.distillation.rounds import Lesson, distill, handover_episodes, take_in
+from v2p_data.episodes import rollouts
 from v2p_data.episodes.mask_noise import MaskNoiseConfig
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
-from v2p_data.sim.env import verdict
+from v2p_data.play import StateActor
 
 
 class Killed(Exception):  # noqa: N818 - it stands for a kill
@@ -27,7 +28,7 @@ class Killed(Exception):  # noqa: N818 - it stands for a kill
 
 def run(out: Path, pupil: Pupil | None = None, *, train=None, episodes=EPISODES, num_threads=1, cfg=DISTILLATION):  # fmt: skip
     pupil = pupil or Pupil()
-    lessons = {"toy": Lesson(bundle=toy_run.bundle(), expert=act)}
+    lessons = {"toy": Lesson(bundle=toy_run.bundle(), expert=StateActor(act))}
     return distill(
         lessons, pupil, train or pupil.train, cfg, episodes, out, 7, num_threads=num_threads
     )  # fmt: skip
@@ -38,7 +39,7 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What an undisturbed distillation leaves; do not write into it."""
     out = tmp_path_factory.mktemp("calm")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verdict, "referee_verdict", toy_run.agree)
+        patch.setattr(rollouts, "referee_verdict", toy_run.agree)
         told = run(out)
     (out / "told.json").write_text(json.dumps(told.counts()))
     return out
@@ -87,12 +88,15 @@ def test_episodes_of_a_batch_are_as_many_as_succeeded(calm: Path):
 
 
 def test_what_the_referee_denies_is_not_staged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(verdict, "referee_verdict", lambda b, c: np.arange(3) == 1)
+    monkeypatch.setattr(rollouts, "referee_verdict", lambda b, c: np.arange(3) == 1)
 
-    told = run(tmp_path, cfg=replace(DISTILLATION, rounds=1))
+    pupil = Pupil()
+
+    told = run(tmp_path, pupil, cfg=replace(DISTILLATION, rounds=1))
 
     assert {int(path.stem[-5:]) % 3 for path in told.paths} <= {1}
     assert told.num_rollouts == 6
+    assert {*pupil.tasks} == {"push the cube to the left"}
 
 
 def test_the_number_of_threads_changes_no_byte(agreeing_referee, calm: Path, tmp_path: Path):

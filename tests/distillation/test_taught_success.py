@@ -12,7 +12,8 @@ import toy_run
 from policies.ppo.config import ImitationConfig
 from policies.ppo.policy import Expert
 from v2p_data.experts.learning import success_of
-from v2p_data.experts.teacher import play
+from v2p_data.experts.teacher import try_out
+from v2p_data.play import StateActor
 from v2p_data.reward import worker
 from v2p_data.reward.candidate import DONE_FILE, TRAIN_FOLDER
 from v2p_data.reward.jobs import HEARTBEAT_FILE
@@ -37,7 +38,7 @@ def test_a_success_that_is_lost_again_counts():
     )
     expert = toy_run.expert()
 
-    played = play(env, expert.act)
+    played = try_out(env, StateActor(expert.act))
 
     assert played.once.all()
     assert not played.at_end.any()

@@ -62,8 +62,8 @@ def bundle() -> TaskBundle:
     return replace(toy_task.bundle(), code=CODE, class_name="Push")
 
 
-def agree(_: object, course: Mapping[str, np.ndarray]) -> np.ndarray:
-    return np.ones(course["eef_pos"].shape[1], bool)
+def agree(_: object, history: Mapping[str, np.ndarray]) -> np.ndarray:
+    return np.ones(history["eef_pos"].shape[1], bool)
 
 
 def make_agreeing(
@@ -168,8 +168,12 @@ class Pupil:
     tasks: list[str] = field(default_factory=list)
     num_acts: int = 0
 
-    def reset(self, task: str) -> None:
-        self.tasks.append(task)
+    def for_task(self, words: str) -> "Pupil":
+        self.tasks.append(words)
+        return self
+
+    def reset(self, n: int) -> None:
+        pass
 
     def act(self, labels: np.ndarray, state: np.ndarray) -> np.ndarray:
         self.num_acts += 1

@@ -15,10 +15,10 @@ from v2p_data.episodes.collect import (
     roll_out,
     staged_episodes,
 )
-from v2p_data.episodes.rollouts import InWorlds
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.artifact import read_rejects
+from v2p_data.play import StateActor
 from v2p_data.sim.env.batch_env import HELD_STEPS, SimConfig
 
 SMALL = EpisodesConfig(num_episodes=5, batch_worlds=6, max_batches=3, size_px=48)
@@ -27,7 +27,7 @@ SMALL = EpisodesConfig(num_episodes=5, batch_worlds=6, max_batches=3, size_px=48
 @pytest.fixture(scope="module")
 def rollouts():
     return roll_out(
-        bundle(), act, SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
+        bundle(), StateActor(act), SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
         task=PushTask, referee=agree,
     )  # fmt: skip
 
@@ -43,15 +43,15 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_who_acts_in_the_worlds_themselves_is_given_them_and_asked_at_every_step(rollouts):
+def test_who_acts_is_given_the_worlds_at_the_start_and_asked_at_every_step(rollouts):
     given = []
 
-    def begin(env):
-        given.append(env.num_envs)
-        return act
+    class Acting(StateActor):
+        def reset(self, worlds):
+            given.append(worlds.num_envs)
 
     same = roll_out(
-        bundle(), InWorlds(begin), SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
+        bundle(), Acting(act), SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
         task=PushTask, referee=agree,
     )  # fmt: skip
 
@@ -96,7 +96,7 @@ def test_the_referee_sees_each_world_stand_still_after_its_cut():
         return np.ones(6, bool)
 
     rollouts = roll_out(
-        bundle(), act, SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
+        bundle(), StateActor(act), SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
         task=PushTask, referee=watch,
     )  # fmt: skip
     world = int(rollouts.num_frames.argmin())
@@ -109,7 +109,7 @@ def test_the_referee_sees_each_world_stand_still_after_its_cut():
 
 def test_what_the_referee_denies_is_no_success():
     judged = judge_expert(
-        bundle(), act, episodes=6, seed=4, task=PushTask,
+        bundle(), StateActor(act), episodes=6, seed=4, task=PushTask,
         referee=lambda _, trajectory: np.arange(6) % 2 == 0,
     )  # fmt: skip
 
@@ -121,7 +121,7 @@ def test_what_the_referee_denies_is_no_success():
 
 def test_the_independent_referee_is_asked_unless_another_is_given():
     """Without a push the cube stays where it is: the task's success is wrong, and the referee says so."""
-    judged = judge_expert(bundle(), act, episodes=6, seed=4, task=PushTask)
+    judged = judge_expert(bundle(), StateActor(act), episodes=6, seed=4, task=PushTask)
 
     assert judged.task_successes.any()
     assert not judged.referee.any()
@@ -197,7 +197,7 @@ def test_a_task_that_is_never_done_is_rejected(tmp_path: Path):
 
     with pytest.raises(ItemRejectedError, match="0 of 2 episodes succeeded") as caught:
         collect(
-            bundle(), act, cfg, tmp_path, 0, task=PushTask,
+            bundle(), StateActor(act), cfg, tmp_path, 0, task=PushTask,
             referee=lambda _, trajectory: np.zeros(2, bool),
         )  # fmt: skip
 

@@ -13,6 +13,7 @@ from v2p_data.episodes.dataset.stream import decode_rgb
 from v2p_data.episodes.mask_noise import Fault, MaskNoiseConfig, apply_faults
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError
+from v2p_data.play import StateActor
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig, furnish
@@ -35,7 +36,7 @@ def plain(tmp_path_factory) -> list[Episode]:
 @pytest.fixture(scope="module")
 def rollouts():
     return roll_out(
-        bundle(), act, SimConfig(fine=True), num_worlds=3, seed=4, cut=CutConfig(),
+        bundle(), StateActor(act), SimConfig(fine=True), num_worlds=3, seed=4, cut=CutConfig(),
         task=PushTask, referee=agree,
     )  # fmt: skip
 

@@ -8,6 +8,7 @@ import torch
 
 from v2p_data.episodes.collect import Collected, EpisodesConfig, collect
 from v2p_data.geometry.camera import Camera
+from v2p_data.play import StateActor
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.task import Task, TaskBundle
 
@@ -56,5 +57,12 @@ def agree(_: object, trajectory: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def collect_toys(out: Path, cfg: EpisodesConfig, num_threads: int = 1) -> Collected:
     return collect(
-        bundle(), act, cfg, out, 11, num_threads=num_threads, task=PushTask, referee=agree
+        bundle(),
+        StateActor(act),
+        cfg,
+        out,
+        11,
+        num_threads=num_threads,
+        task=PushTask,
+        referee=agree,
     )

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
-from v2p_data.evaluation.actors import ExpertActor, ProgramActor
+from v2p_data.evaluation.actors import ProgramActor
 from v2p_data.evaluation.batch import NEVER, Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.judging import own_reset_rate
 from v2p_data.pipeline.runner import Runtime
+from v2p_data.play import StateActor, View, VisionActor
 from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv
 from v2p_data.sim.env.observation import PROGRESS_COLUMN
 from v2p_data.task.audit.resets import has_own_reset
@@ -87,14 +88,18 @@ def test_an_evaluation_may_begin_where_the_environment_says_and_shows_both_rates
 
     def first_places(bundle: TaskBundle, reset: Literal["task", "base"]) -> np.ndarray:
         how = replace(cfg, reset=reset)
-        played = judge(bundle, Drive(), episodes=4, first_seed=3, cfg=how, size_px=SIZE_PX)
+        played = judge(
+            bundle, VisionActor(Drive()), episodes=4, first_seed=3, cfg=how, size_px=SIZE_PX
+        )
         return played.shown.snapshots[0].qpos[:, -7:-4]
 
     assert np.array_equal(first_places(own, "base"), first_places(found, "task"))
     assert np.abs(first_places(own, "task")[:, 1] - 0.2).max() < 0.01
     assert (has_own_reset(own.code), has_own_reset(found.code)) == (True, False)
     both = [
-        own_reset_rate(lambda _: (Drive(), SIZE_PX), b, cfg, 3, Runtime(root=tmp_path))
+        own_reset_rate(
+            lambda _: (VisionActor(Drive()), SIZE_PX), b, cfg, 3, Runtime(root=tmp_path)
+        )
         for b in (own, found)
     ]
     assert both[0] is not None
@@ -103,8 +108,8 @@ def test_an_evaluation_may_begin_where_the_environment_says_and_shows_both_rates
 
 
 def test_success_is_lost_again_at_the_end_and_counts_once(bundle):
-    result = judged(bundle, Drive(up=14))
-    stays = judged(bundle, Drive())
+    result = judged(bundle, VisionActor(Drive(up=14)))
+    stays = judged(bundle, VisionActor(Drive()))
 
     assert result.horizon_steps == 24
     assert result.successes.all()
@@ -118,7 +123,10 @@ def test_success_is_lost_again_at_the_end_and_counts_once(bundle):
 
 
 def test_worlds_at_a_time_change_no_episode(bundle):
-    together, in_turn = judged(bundle, Drive()), judged(bundle, Drive(), worlds=2)
+    together, in_turn = (
+        judged(bundle, VisionActor(Drive())),
+        judged(bundle, VisionActor(Drive()), worlds=2),
+    )
 
     np.testing.assert_array_equal(together.success_step, in_turn.success_step)
     assert len(in_turn.shown.successes) == 2
@@ -126,7 +134,7 @@ def test_worlds_at_a_time_change_no_episode(bundle):
 
 def test_without_at_end_an_episode_is_over_with_its_success_and_its_picture_stays(bundle):
     drive = Drive()
-    result = judged(bundle, drive, at_end=False)
+    result = judged(bundle, VisionActor(drive), at_end=False)
 
     first, last = sorted(set(result.success_step))[:1][0], result.success_step.max()
     assert result.at_end is None
@@ -140,7 +148,7 @@ def test_without_at_end_an_episode_is_over_with_its_success_and_its_picture_stay
 
 
 def test_without_success_episodes_last_to_the_horizon_and_say_what_went_wrong(bundle):
-    result = judged(bundle, Drive(up=0), horizon_scale=1.0)
+    result = judged(bundle, VisionActor(Drive(up=0)), horizon_scale=1.0)
 
     assert result.horizon_steps == 12
     assert (result.success_step == NEVER).all()
@@ -151,14 +159,14 @@ def test_without_success_episodes_last_to_the_horizon_and_say_what_went_wrong(bu
 
 def test_a_simulation_that_breaks_ends_its_episode_as_a_failure(bundle):
     class Breaks:
-        def begin(self, env: BatchEnv) -> None:
+        def reset(self, worlds: BatchEnv) -> None:
             self.steps = 0
 
-        def act_in(self, env: BatchEnv) -> np.ndarray:
+        def act(self, view: View) -> np.ndarray:
             self.steps += 1
             if self.steps == 2:
-                env._qvel[1] = np.nan
-            action = np.zeros((env.num_envs, 7))
+                view.worlds._qvel[1] = np.nan
+            action = np.zeros((view.worlds.num_envs, 7))
             action[:, 2] = 0.5
             return action
 
@@ -175,7 +183,7 @@ def test_an_expert_is_never_told_that_more_than_its_time_has_passed(bundle):
         seen.append(obs[:, PROGRESS_COLUMN].max())
         return np.zeros((len(obs), 7), np.float32)
 
-    judged(bundle, ExpertActor(act, obs_dim=90))
+    judged(bundle, StateActor(act, obs_dim=90))
 
     assert len(seen) == 24
     np.testing.assert_allclose(seen[:13], np.arange(13) / 12, rtol=1e-6)
@@ -184,7 +192,7 @@ def test_an_expert_is_never_told_that_more_than_its_time_has_passed(bundle):
 
 def test_another_tasks_expert_is_turned_away(bundle):
     with pytest.raises(V2PError, match="length 93, and task 'lift_up' makes ones of length 90"):
-        judged(bundle, ExpertActor(lambda obs: obs[:, :7], obs_dim=93))
+        judged(bundle, StateActor(lambda obs: obs[:, :7], obs_dim=93))
 
 
 def test_actions_that_are_no_numbers_are_turned_away(bundle):
@@ -193,7 +201,7 @@ def test_actions_that_are_no_numbers_are_turned_away(bundle):
             return np.full((len(state), 7), np.nan, np.float32)
 
     with pytest.raises(V2PError, match="in world 0 of task 'lift_up' is not finite"):
-        judged(bundle, Odd())
+        judged(bundle, VisionActor(Odd()))
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""What went wrong, told from courses made by hand: 40 moments (2 s), one thing, one other thing, one tool."""
+"""What went wrong, told from motions made by hand: 40 moments (2 s), one thing, one other thing, one tool."""
 
 from dataclasses import replace
 
@@ -20,9 +20,9 @@ class Story:
         self.bundle: TaskBundle = replace(load_benchmark("insert"), kind=kind)
         names = [o.name for o in self.bundle.scene.objects]
         self.thing, self.other = names[:2]
-        self.course = {"eef_pos": np.linspace([0.4, 0, 0.2], [0.6, 0, 0.2], TIME)[:, None]}
+        self.history = {"eef_pos": np.linspace([0.4, 0, 0.2], [0.6, 0, 0.2], TIME)[:, None]}
         for name, x in ((self.thing, 0.4), (self.other, 0.7)):
-            self.course |= {
+            self.history |= {
                 f"{name}_pos": np.tile([x, 0.0, 0.02], (TIME, 1, 1)),
                 f"{name}_quat": np.tile(UPRIGHT, (TIME, 1, 1)),
                 f"{name}_size": np.full((TIME, 1, 3), 0.04),
@@ -31,27 +31,27 @@ class Story:
             }
 
     def touched(self, name: str, *when: int) -> "Story":
-        self.course[f"{name}_touched"][slice(*when)] = 1
+        self.history[f"{name}_touched"][slice(*when)] = 1
         return self
 
     def held(self, *when: int) -> "Story":
-        self.course[f"{self.thing}_grasped"][slice(*when)] = 1
+        self.history[f"{self.thing}_grasped"][slice(*when)] = 1
         return self.touched(self.thing, *when)
 
     def thing_at(self, x: float, *when: int) -> "Story":
-        self.course[f"{self.thing}_pos"][slice(*when), :, 0] = x
+        self.history[f"{self.thing}_pos"][slice(*when), :, 0] = x
         return self
 
     def tool_stands(self, *when: int) -> "Story":
-        self.course["eef_pos"][slice(*when)] = self.course["eef_pos"][when[0]]
+        self.history["eef_pos"][slice(*when)] = self.history["eef_pos"][when[0]]
         return self
 
     def falls(self, when: int) -> "Story":
-        self.course[f"{self.thing}_quat"][when:] = ON_ITS_SIDE
+        self.history[f"{self.thing}_quat"][when:] = ON_ITS_SIDE
         return self
 
     def ends(self, *, broke: bool = False) -> str:
-        return failure_kinds(self.bundle, self.course, np.array([broke]))[0]
+        return failure_kinds(self.bundle, self.history, np.array([broke]))[0]
 
 
 def test_what_no_pad_touched_was_never_reached():
@@ -105,6 +105,6 @@ def test_what_should_stay_upright_toppled_and_what_should_not_did_not():
 
 def test_a_broken_simulation_is_named_and_not_looked_at():
     story = Story("push_left")
-    story.course[f"{story.thing}_quat"][:] = np.nan
+    story.history[f"{story.thing}_quat"][:] = np.nan
 
     assert story.ends(broke=True) == "simulation_broke"

@@ -7,6 +7,7 @@ import pytest
 
 from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.play import VisionActor
 from v2p_data.sim.render.masks import PALETTE
 from v2p_data.task.task import TaskBundle
 
@@ -77,7 +78,7 @@ def test_the_same_seeds_give_the_same_actions_and_the_same_successes(
 
     judged = judge(
         bundle,
-        actor,
+        VisionActor(actor),
         episodes=EPISODES,
         first_seed=FIRST_SEED,
         cfg=EvaluationConfig(worlds=EPISODES, at_end=at_end),

@@ -42,12 +42,12 @@ def worlds(seed: int, n: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_world_is_acted_in_as_if_it_were_the_only_one(dataset: Path, tmp_path: Path):
-    pupil = student(dataset, tmp_path)
-    pupil.reset("push the box")
+    pupil = student(dataset, tmp_path).for_task("push the box")
+    pupil.reset(3)
     together = np.stack([pupil.act(*worlds(k)) for k in range(3)])
 
     for world in range(3):
-        pupil.reset("push the box")
+        pupil.reset(1)
         alone = [pupil.act(*(a[world : world + 1] for a in worlds(k))) for k in range(3)]
         np.testing.assert_allclose(together[:, world], np.concatenate(alone), atol=1e-6)
     assert (np.abs(together) <= 1).all()

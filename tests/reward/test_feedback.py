@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
+from v2p_data.play import StateActor
 from v2p_data.reward.feedback import Feedback, Trajectories, feedback_of, ranking
 from v2p_data.reward.record import record_trajectories
 from v2p_data.reward.trajectories import HELD_STEPS
@@ -195,7 +196,9 @@ def test_recorded_states_are_those_that_the_reward_was_paid_for(scenes):
     )  # fmt: skip
     env = BatchEnv(bundle, SimConfig(), num_envs=4, seed=0, num_threads=1)
 
-    recorded = record_trajectories(env, lambda obs: np.full((len(obs), 7), 0.5), num_moments=5)
+    recorded = record_trajectories(
+        env, StateActor(lambda obs: np.full((len(obs), 7), 0.5)), num_moments=5
+    )
 
     assert recorded.moments.tolist() == [0, 3, 6, 8, 11]
     # The effort is -0.005 |a|^2 with |a|^2 = 7 / 4; the reach follows from the states that were kept.

@@ -10,6 +10,7 @@ import torch
 
 from v2p_data.episodes.rollouts import CutConfig, roll_out
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.play import StateActor
 from v2p_data.scene.scene import SceneObject
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.sandbox.guarded import StatesChangedError, TaskOutputError
@@ -117,7 +118,7 @@ def test_no_idle_robot_gets_an_episode_that_counts(
     with contextlib.suppress(StatesChangedError, ItemRejectedError):
         counted = roll_out(
             bundle,
-            lambda obs: np.zeros((len(obs), 7), np.float32),
+            StateActor(lambda obs: np.zeros((len(obs), 7), np.float32)),
             SimConfig(),
             num_worlds=NUM_WORLDS,
             seed=0,

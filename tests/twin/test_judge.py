@@ -10,6 +10,7 @@ from v2p_data.evaluation.batch import NEVER
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import NEVER_REACHED
 from v2p_data.experts.teacher import Teacher
+from v2p_data.play import VisionActor
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.twin.judge import judge_in_twin
 
@@ -49,18 +50,18 @@ class Idle:
 class Lifter:
     """The scripted lift, which sees the truth."""
 
-    def begin(self, env) -> None:
-        self.teacher = Teacher(env)
+    def reset(self, worlds) -> None:
+        self.teacher = Teacher(worlds)
         self.teacher.name = "lift"
 
-    def act_in(self, env) -> np.ndarray:
-        del env
+    def act(self, view) -> np.ndarray:
+        del view
         return self.teacher.act()
 
 
 def test_a_policy_sees_labels_and_the_datasets_state_and_idling_reaches_nothing(folders):
     idle = Idle()
-    judged = judge_in_twin(folders[1], lambda _: (idle, 64), seeds=[3], cfg=ONCE)
+    judged = judge_in_twin(folders[1], lambda _: (VisionActor(idle), 64), seeds=[3], cfg=ONCE)
 
     assert judged.success_step.tolist() == [NEVER]
     assert judged.episodes[0].failure == NEVER_REACHED
@@ -85,7 +86,7 @@ def test_an_actor_that_does_not_suit_the_twin_is_told_so(folders):
         def act(self, labels, state):
             return np.full((1, 7), np.nan, np.float32)
 
-    with pytest.raises(V2PError, match="7 finite numbers"):
-        judge_in_twin(folders[1], lambda _: (Odd(), 64), seeds=[0], cfg=ONCE)
+    with pytest.raises(V2PError, match="in world 0 of task 'lift_up' is not finite"):
+        judge_in_twin(folders[1], lambda _: (VisionActor(Odd()), 64), seeds=[0], cfg=ONCE)
     with pytest.raises(V2PError, match="square"):
-        judge_in_twin(folders[1], lambda _: (Odd(), (64, 80)), seeds=[0], cfg=ONCE)
+        judge_in_twin(folders[1], lambda _: (VisionActor(Odd()), (64, 80)), seeds=[0], cfg=ONCE)

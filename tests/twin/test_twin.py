@@ -254,11 +254,11 @@ def test_a_scripted_grasp_lifts_and_the_referee_sees_it(arm):
     arm.reset(0)
     held, deepest = [], 0.0
     for _ in range(60):
-        held.append(arm.act(teacher.act()[0]).is_held)
+        held.append(arm.act(teacher.act()[0]).held[0])
         deepest = max(deepest, arm.robot.truth().deepest_m)
 
     assert held[-1]
-    assert arm.mirror.verdict()
+    assert arm.mirror.referee.verdict()[0]
     assert not held[0]
     assert deepest < 0.003
 
@@ -267,8 +267,8 @@ def test_the_referee_denies_an_episode_in_which_nothing_happens(arm):
     arm.reset(0)
     outcomes = [arm.act(np.zeros(7)) for _ in range(8)]
 
-    assert not any(o.is_held or o.is_broken for o in outcomes)
-    assert not arm.mirror.verdict()
+    assert not any(o.held[0] or o.terminated[0] for o in outcomes)
+    assert not arm.mirror.referee.verdict()[0]
 
 
 def test_a_seed_repeats_its_episode(arm):

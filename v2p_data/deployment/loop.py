@@ -17,7 +17,7 @@ from v2p_data.deployment.recording import Recorder
 from v2p_data.deployment.robot import Reading, Rig
 from v2p_data.deployment.sight import LOST_AFTER, Seen, Sight
 from v2p_data.errors import V2PError
-from v2p_data.evaluation.actors import Actor
+from v2p_data.play import Policy
 
 REHEARSALS = 8
 """Steps without motion by which the rate is measured beforehand; the first two, which compile, do not count."""
@@ -87,7 +87,7 @@ class Run:
         self,
         rig: Rig,
         sight: Sight | None,
-        policy: Actor,
+        policy: Policy,
         guard: Guard,
         cfg: LoopConfig,
         *,

@@ -5,67 +5,73 @@ with what the expert would do there, so `action` is the expert's throughout, als
 episodes that end in success are kept: the expert's labels in hopeless states teach nothing.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Float32, Int, UInt8
 
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.rollouts import CutConfig, EpisodeEnds
+from v2p_data.episodes.rollouts import CutConfig, Rollouts, record_rollouts
+from v2p_data.play import Actor, View
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.randomize import RandomizationConfig
-from v2p_data.sim.env.verdict import Course
-from v2p_data.sim.render.masks import MaskRenderer
 from v2p_data.task.task import TaskBundle
-
-ExpertAct = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
-
-
-@runtime_checkable
-class ActingStudent(Protocol):
-    """A policy that sees masks and the robot's state."""
-
-    def reset(self, task: str) -> None:
-        """Start episodes of a task, given in words, in all worlds."""
-        ...
-
-    def act(
-        self, labels: UInt8[np.ndarray, "env h w"], state: Float32[np.ndarray, "env 11"]
-    ) -> Float32[np.ndarray, "env 7"]:
-        """Return the worlds' next actions."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
-class Handovers:
-    """One batch of handover episodes. Row `t` precedes action `t`."""
+class Handovers(Rollouts):
+    """One batch of handover episodes. Row `t` precedes action `t`; `action` is the expert's, in every frame."""
 
-    seed: int
     labels: UInt8[np.ndarray, "time env h w"]
-    state: Float32[np.ndarray, "time env 11"]
-    action: Float32[np.ndarray, "time env 7"]
-    """The expert's, in every frame."""
     taken_over_at: Int[np.ndarray, "env"]
     """First row in which the expert acts."""
-    num_frames: Int[np.ndarray, "env"]
-    held_at: Int[np.ndarray, "env"]
-    task_successes: Bool[np.ndarray, "env"]
-    referee: Bool[np.ndarray, "env"]
-    broke: Bool[np.ndarray, "env"]
-    params: tuple[dict[str, Any], ...]
 
-    @property
-    def successes(self) -> Bool[np.ndarray, "env"]:
-        return self.task_successes & self.referee
+
+class Handover:
+    """An actor that begins and an expert that takes over, each world at a step of its own.
+
+    Args:
+        student: acts before the takeover; not asked once no world is its own.
+        expert: acts from it on.
+        takeover: first control step of the expert, per world.
+        pictures: room for what is seen before each action.
+
+    Attributes:
+        answers: what the expert would do, at each action.
+    """
+
+    def __init__(
+        self,
+        student: Actor,
+        expert: Actor,
+        takeover: Int[np.ndarray, "env"],
+        pictures: UInt8[np.ndarray, "time env h w"],
+    ) -> None:
+        self._student, self._expert, self._takeover = student, expert, takeover
+        self._pictures = pictures
+        self.answers: list[Float32[np.ndarray, "env 7"]] = []
+
+    def reset(self, worlds: BatchEnv) -> None:
+        """Tell both that episodes begin."""
+        self._student.reset(worlds)
+        self._expert.reset(worlds)
+
+    def act(self, view: View) -> Float32[np.ndarray, "env 7"]:
+        """Return the actions of whoever acts in each world."""
+        self._pictures[view.t] = view.labels
+        answer = np.clip(self._expert.act(view), -1.0, 1.0).astype(np.float32)
+        self.answers.append(answer)
+        is_students = (view.t < self._takeover) & view.going
+        if not is_students.any():
+            return answer
+        return np.where(is_students[:, None], self._student.act(view), answer)
 
 
 def hand_over(
     bundle: TaskBundle,
-    expert: ExpertAct,
-    student: ActingStudent,
+    expert: Actor,
+    student: Actor,
     cfg: DistillationConfig,
     *,
     seed: int,
@@ -87,56 +93,22 @@ def hand_over(
         cut: where an episode ends.
         num_threads: for physics and masks; changes no result.
     """
-    n = cfg.worlds
     env = BatchEnv(
         bundle,
         SimConfig(fine=True, randomization=randomization),
-        num_envs=n,
+        num_envs=cfg.worlds,
         seed=seed,
         num_threads=num_threads,
     )
-    horizon = round(cfg.time_scale * env.horizon)
     earliest, latest = (round(share * env.horizon) for share in cfg.takeover)
-    takeover = rng_for(seed, "takeover").integers(earliest, latest + 1, n)
-    params = tuple(env.episode_params(k) for k in range(n))
-    course = Course(env)
-    course.restart()
-    student.reset(bundle.description)
-    obs = env.observe()
-    labels = np.zeros((n, size_px, size_px), np.uint8)
-    pictures = np.empty((horizon, *labels.shape), np.uint8)
-    states, actions = [], []
-    ends = EpisodeEnds(n, horizon, cut)
-    with MaskRenderer(env.world, size_px, num_threads=num_threads) as renderer:
-        for t in range(horizon):
-            is_going = t < ends.num_frames
-            going = np.flatnonzero(is_going)
-            snapshot = env.snapshot(going)
-            labels[going] = renderer.draw_many([(snapshot, k) for k in range(len(going))])
-            state = env.robot_state()
-            label = np.clip(np.asarray(expert(obs), np.float32), -1.0, 1.0)
-            action = label
-            if (is_students := (t < takeover) & is_going).any():
-                action = np.where(is_students[:, None], student.act(labels, state), label)
-            pictures[t] = labels
-            states.append(state)
-            actions.append(label)
-            result = env.step(action)
-            obs = result.obs
-            course.note()
-            ends.note(t, result)
-            if ends.all_over(t):
-                break
+    takeover = rng_for(seed, "takeover").integers(earliest, latest + 1, cfg.worlds)
+    horizon = round(cfg.time_scale * env.horizon)
+    pictures = np.empty((horizon, cfg.worlds, size_px, size_px), np.uint8)
+    actor = Handover(student, expert, takeover, pictures)
+    view = View(env, size_px, num_threads)
+    recorded = record_rollouts(view, actor, cut, seed=seed, horizon=horizon)
     return Handovers(
-        seed=seed,
-        labels=pictures[: len(states)],
-        state=np.stack(states),
-        action=np.stack(actions),
+        **vars(recorded) | {"action": np.stack(actor.answers)},
+        labels=pictures[: len(actor.answers)],
         taken_over_at=takeover,
-        num_frames=ends.num_frames,
-        held_at=ends.held_at,
-        task_successes=ends.successes,
-        referee=course.verdict_as_cut(ends.num_frames) & ends.successes,
-        broke=ends.broke,
-        params=params,
     )

@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.distillation.handover import ActingStudent, ExpertAct, Handovers, hand_over
+from v2p_data.distillation.handover import Handovers, hand_over
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
 from v2p_data.episodes.staging import Episode, refusals_told, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.play import Actor, Policy, VisionActor
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.task.task import TaskBundle
 
@@ -36,8 +37,12 @@ Progress = Callable[[float, str], None]
 
 
 @runtime_checkable
-class LearningStudent(ActingStudent, Protocol):
-    """A student that takes episodes in, and is kept in folders."""
+class LearningStudent(Protocol):
+    """A student that acts, takes episodes in, and is kept in folders."""
+
+    def for_task(self, words: str) -> Policy:
+        """Return the student, told a task."""
+        ...
 
     def add(
         self,
@@ -68,7 +73,7 @@ class Lesson:
     """One task and who can do it."""
 
     bundle: TaskBundle
-    expert: ExpertAct
+    expert: Actor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,7 +231,7 @@ def _distill(
 
 def _collect(
     lesson: Lesson,
-    student: ActingStudent,
+    student: LearningStudent,
     cfg: DistillationConfig,
     episodes: EpisodesConfig,
     folder: Path,
@@ -246,7 +251,7 @@ def _collect(
             handovers = hand_over(
                 lesson.bundle,
                 lesson.expert,
-                student,
+                VisionActor(student.for_task(lesson.bundle.description)),
                 cfg,
                 seed=seed_for(seed, "batch", batch),
                 size_px=episodes.size_px,

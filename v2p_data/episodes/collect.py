@@ -21,7 +21,7 @@ import numpy as np
 
 from v2p_data.episodes.mask_noise import MaskNoiseConfig
 from v2p_data.episodes.pictures import Artist, Render
-from v2p_data.episodes.rollouts import Act, CutConfig, InWorlds, Referee, Rollouts, roll_out
+from v2p_data.episodes.rollouts import CutConfig, Referee, Rollouts, roll_out
 from v2p_data.episodes.staging import (
     EPISODES_FOLDER,
     Episode,
@@ -32,6 +32,7 @@ from v2p_data.episodes.staging import (
 from v2p_data.errors import ItemRejectedError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import REJECTS_FILE, write_json_atomically, write_rejects
+from v2p_data.play import Actor
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import SimConfig
@@ -110,7 +111,7 @@ class Collected:
 
 def collect(
     bundle: TaskBundle,
-    act: Act | InWorlds,
+    actor: Actor,
     cfg: EpisodesConfig,
     out: Path,
     seed: int,
@@ -124,7 +125,7 @@ def collect(
 
     Args:
         bundle: the task.
-        act: the deterministic expert, or whoever acts in the worlds themselves.
+        actor: the deterministic expert.
         cfg: how many, and under what.
         out: `episodes/<id>.npz`, `failed/<batch>.npz`, `rejected.jsonl` and `batches/` are written here.
         seed: decides everything that is drawn.
@@ -138,12 +139,12 @@ def collect(
         V2PError: the disk is full, or `out` cannot be written to; what was staged is kept.
     """
     with refusals_told("collecting episodes", out):
-        return _collect(bundle, act, cfg, out, seed, num_threads, on_progress, task, referee)
+        return _collect(bundle, actor, cfg, out, seed, num_threads, on_progress, task, referee)
 
 
 def _collect(
     bundle: TaskBundle,
-    act: Act | InWorlds,
+    actor: Actor,
     cfg: EpisodesConfig,
     out: Path,
     seed: int,
@@ -170,7 +171,7 @@ def _collect(
             )
             rollouts = roll_out(
                 bundle,
-                act,
+                actor,
                 SimConfig(fine=True, randomization=cfg.randomization),
                 num_worlds=cfg.batch_worlds,
                 seed=seed_for(seed, "batch", number),
@@ -187,7 +188,7 @@ def _collect(
 
 def judge_expert(
     bundle: TaskBundle,
-    act: Act | InWorlds,
+    actor: Actor,
     *,
     episodes: int,
     seed: int,
@@ -199,7 +200,7 @@ def judge_expert(
     """Return `episodes` fresh episodes at the fine time step under recording conditions, judged."""
     return roll_out(
         bundle,
-        act,
+        actor,
         SimConfig(fine=True, randomization=randomization or randomize.recording()),
         num_worlds=episodes,
         seed=seed,

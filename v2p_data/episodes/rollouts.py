@@ -12,20 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 
 from v2p_data.episodes.dataset.features import FPS
-from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot, StepResult
-from v2p_data.sim.env.verdict import Course, referee_verdict
+from v2p_data.play import Actor, Film, View, play
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
+from v2p_data.sim.env.verdict import RefereeRecord, referee_verdict
 from v2p_data.task.task import Task, TaskBundle
 
-Act = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
 Referee = Callable[[TaskBundle, Mapping[str, np.ndarray]], Bool[np.ndarray, "env"]]
-"""Given a task and `Course.as_cut`, tells which episodes succeeded."""
-
-
-@dataclass(frozen=True)
-class InWorlds:
-    """Who sees more than observations: given the worlds of a batch, returns how to act in them."""
-
-    begin: Callable[[BatchEnv], Act]
+"""Given a task and `RefereeRecord.history_as_cut`, tells which episodes succeeded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +83,7 @@ class Rollouts:
 
 
 class EpisodeEnds:
-    """Where the episodes of a batch of worlds end: soon after success has held, at a breakdown, or when time is up.
+    """Stop rule of demonstrations: soon after success has held, at a breakdown, or when time is up.
 
     Args:
         num_worlds: number of worlds.
@@ -110,8 +103,9 @@ class EpisodeEnds:
         self.broke = np.zeros(num_worlds, bool)
         self._held = np.zeros(num_worlds, bool)
 
-    def note(self, t: int, result: StepResult) -> None:
-        """Take into account what action `t` led to."""
+    def __call__(self, view: View) -> Bool[np.ndarray, "env"]:
+        """Take into account what the last action led to; return which episodes are over."""
+        t, result = view.t - 1, view.result
         now = result.held & ~self._held & ~self.broke
         self.num_frames[now] = np.clip(
             t + 1 + self.cut.tail_steps, self.cut.min_frames, self.horizon
@@ -121,10 +115,7 @@ class EpisodeEnds:
         gone = result.terminated & ~self.broke & (t < self.num_frames)
         self.num_frames[gone] = t + 1
         self.broke |= gone
-
-    def all_over(self, t: int) -> bool:
-        """Tell whether action `t` was the last one that belongs to an episode."""
-        return bool((t + 1 >= self.num_frames).all())
+        return view.t >= self.num_frames
 
     @property
     def successes(self) -> Bool[np.ndarray, "env"]:
@@ -134,7 +125,7 @@ class EpisodeEnds:
 
 def roll_out(
     bundle: TaskBundle,
-    act: Act | InWorlds,
+    actor: Actor,
     sim: SimConfig,
     *,
     num_worlds: int,
@@ -146,39 +137,53 @@ def roll_out(
 ) -> Rollouts:
     """Run one episode in every world until each has succeeded or its time is up."""
     env = BatchEnv(bundle, sim, num_envs=num_worlds, seed=seed, num_threads=num_threads, task=task)
-    everyone = np.arange(num_worlds)
-    params = tuple(env.episode_params(k) for k in range(num_worlds))
-    acts = act.begin(env) if isinstance(act, InWorlds) else act
-    obs = env.observe()
-    states, actions, successes, snapshots = [], [], [], []
-    course = Course(env)
-    course.restart()
-    ends = EpisodeEnds(num_worlds, env.horizon, cut)
-    for t in range(env.horizon):
-        states.append(env.robot_state())
-        snapshots.append(env.snapshot(everyone))
-        action = np.clip(np.asarray(acts(obs), np.float32), -1.0, 1.0)
-        result = env.step(action)
-        obs = result.obs
-        actions.append(action)
-        successes.append(result.success)
-        course.note()
-        ends.note(t, result)
-        if ends.all_over(t):
-            break
+    return record_rollouts(View(env), actor, cut, seed=seed, referee=referee)
+
+
+def record_rollouts(
+    view: View,
+    actor: Actor,
+    cut: CutConfig,
+    *,
+    seed: int,
+    horizon: int | None = None,
+    referee: Referee | None = None,
+) -> Rollouts:
+    """Run one episode in every world that is seen, from where the worlds are.
+
+    Args:
+        view: of worlds whose episodes begin.
+        actor: who acts.
+        cut: where an episode ends.
+        seed: of the worlds, written down.
+        horizon: longest episode, in control steps; by default the task's.
+        referee: the independent judge, instead of `task.referee`.
+    """
+    env, count = view.worlds, view.worlds.num_envs
+    params = tuple(env.episode_params(k) for k in range(count))
+    film, record = Film(env), RefereeRecord(env)
+    ends = EpisodeEnds(count, horizon or env.horizon, cut)
+    states, actions, successes = [view.state], [], []
+
+    def note(view: View) -> None:
+        states.append(view.state)
+        actions.append(view.action.astype(np.float32))
+        successes.append(view.result.success)
+
+    play(view, actor, [note, film.note, record.note], ends, ends.horizon)
     held = ends.successes
     judge = referee or referee_verdict
-    verdict = judge(bundle, course.as_cut(ends.num_frames)) & held if held.any() else held
+    history = record.history_as_cut(ends.num_frames)
     return Rollouts(
         seed=seed,
-        state=np.stack(states),
+        state=np.stack(states[:-1]),
         action=np.stack(actions),
         success=np.stack(successes),
-        snapshots=tuple(snapshots),
+        snapshots=film.snapshots()[:-1],
         num_frames=ends.num_frames,
         held_at=ends.held_at,
         task_successes=held,
-        referee=verdict,
+        referee=judge(env.bundle, history) & held if held.any() else held,
         broke=ends.broke,
         params=params,
     )

@@ -7,24 +7,21 @@ its end. A world whose episode is over costs no physics and no pictures. What a 
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
-from v2p_data.errors import V2PError
-from v2p_data.evaluation.actors import Actor, WorldActor
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import failure_kinds
+from v2p_data.play import Actor, Film, Stopwatch, View, play
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.randomize import RandomizationConfig
-from v2p_data.sim.env.verdict import Course
-from v2p_data.sim.render.masks import MaskRenderer
-from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW, stream_seed
+from v2p_data.sim.env.verdict import RefereeRecord
+from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, stream_seed
 from v2p_data.task.task import Task, TaskBundle
 
 NEVER = -1
@@ -99,7 +96,7 @@ class Judged:
 
 def judge(
     bundle: TaskBundle,
-    actor: Actor | WorldActor,
+    actor: Actor,
     *,
     episodes: int,
     first_seed: int,
@@ -127,226 +124,98 @@ def judge(
     Raises:
         V2PError: the actor's actions are not finite or have another shape.
     """
-    watch = _Watch()
+    start, watch = time.perf_counter(), Stopwatch()
     sim = SimConfig(fine=True, randomization=randomization or randomize.recording())
     steps = bundle.policy_steps(cfg.horizon_scale)
-    parts: list[_Played] = []
-    with watch.on("all"):
-        for start in range(0, episodes, cfg.worlds):
-            count = min(cfg.worlds, episodes - start)
-            with watch.on("physics"):
-                env = BatchEnv(
-                    bundle,
-                    sim,
-                    num_envs=count,
-                    seed=0,
-                    num_threads=num_threads,
-                    task=task,
-                    base_reset=cfg.reset == "base",
-                )
-                seeds = [stream_seed(first_seed + start + k) for k in range(count)]
-                env.reset_seeded(np.arange(count), seeds)
-            player = (
-                _Sighted(actor, env, size_px, num_threads, watch)
-                if isinstance(actor, Actor)
-                else _Knowing(actor, env, watch)
+    parts: list[tuple[np.ndarray, ...]] = []
+    failures: list[str] = []
+    shown: Shown | None = None
+    for first in range(0, episodes, cfg.worlds):
+        count = min(cfg.worlds, episodes - first)
+        with watch.on("physics"):
+            env = BatchEnv(
+                bundle,
+                sim,
+                num_envs=count,
+                seed=0,
+                num_threads=num_threads,
+                task=task,
+                base_reset=cfg.reset == "base",
             )
-            with player:
-                parts.append(
-                    _play(
-                        env,
-                        player,
-                        steps,
-                        at_end=cfg.at_end,
-                        is_shown=start == 0,
-                        watch=watch,
-                        on_step=lambda t, s=start, n=count: on_progress(
-                            (s + n * t / steps) / episodes
-                        ),
-                    )
-                )
-    shown = parts[0].shown
+            seeds = [stream_seed(first_seed + first + k) for k in range(count)]
+            env.reset_seeded(np.arange(count), seeds)
+            view, film = View(env, size_px, num_threads, watch), Film(env)
+            record = RefereeRecord(env)
+            verdicts = Verdicts(record, count, steps, at_end=cfg.at_end)
+
+        def note(view: View, begun: int = first) -> None:
+            on_progress((begun + len(view.going) * view.t / steps) / episodes)
+
+        play(view, actor, [record.note, note, *([] if shown else [film.note])], verdicts, steps)
+        if shown is None:
+            once, every = verdicts.success_step, len(record)
+            soon = np.where(once == NEVER, every, np.minimum(once + 2 + TAIL_STEPS, every))
+            shown = Shown(successes=once != NEVER, num_frames=soon, snapshots=film.snapshots())
+        parts.append((verdicts.success_step, verdicts.at_end, verdicts.broke))
+        failures += verdicts.failures(bundle)
     assert shown is not None
+    success_step, at_end, broke = (np.concatenate(part) for part in zip(*parts, strict=True))
+    watch.seconds["all"] = time.perf_counter() - start
     return Judged(
         first_seed=first_seed,
         horizon_steps=steps,
-        success_step=np.concatenate([p.success_step for p in parts]),
-        at_end=np.concatenate([p.at_end for p in parts]) if cfg.at_end else None,
-        broke=np.concatenate([p.broke for p in parts]),
-        failures=tuple(kind for p in parts for kind in p.failures),
+        success_step=success_step,
+        at_end=at_end if cfg.at_end else None,
+        broke=broke,
+        failures=tuple(failures),
         seconds=watch.seconds,
         shown=shown,
     )
 
 
-# --- one batch -----------------------------------------------------------------------------------------------
+class Verdicts:
+    """Stop rule of evaluations: over at a breakdown, and without `at_end` at the first success.
 
+    An episode succeeds once the task's own success has held and the referee agrees. It may go on, and is asked again
+    at its last step.
 
-@dataclass(frozen=True, kw_only=True)
-class _Played:
-    success_step: Int[np.ndarray, "env"]
-    at_end: Bool[np.ndarray, "env"]
-    broke: Bool[np.ndarray, "env"]
-    failures: tuple[str, ...]
-    shown: Shown | None
+    Args:
+        record: what the referee is shown of the worlds; noted before each question.
+        num_worlds: number of worlds.
+        steps: that an episode lasts at most.
+        at_end: go on after a success.
 
-
-def _play(
-    env: BatchEnv,
-    player: "_Sighted | _Knowing",
-    steps: int,
-    *,
-    at_end: bool,
-    is_shown: bool,
-    watch: "_Watch",
-    on_step: Callable[[int], None],
-) -> _Played:
-    """Play one episode in every world, from where the worlds are."""
-    n = env.num_envs
-    course = Course(env)
-    course.restart()
-    film = _Film(env, steps) if is_shown else None
-    success_step = np.full(n, NEVER)
-    broke, over, last = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
-    for t in range(steps):
-        action = player.act(over)
-        moving = np.flatnonzero(~over)
-        with watch.on("physics"):
-            result = env.step(action, None if len(moving) == n else moving)
-            course.note()
-            if film is not None:
-                film.note()
-        gone = result.terminated & ~over
-        broke |= gone
-        over |= gone
-        is_asked = result.held & ~over & ((success_step == NEVER) | (t + 1 == steps))
-        asked = np.flatnonzero(is_asked)
-        if len(asked):
-            with watch.on("referee"):
-                agreed = asked[course.verdict(asked)]
-            success_step[agreed[success_step[agreed] == NEVER]] = t
-            if t + 1 == steps:
-                last[agreed] = True
-            if not at_end:
-                over[agreed] = True
-        on_step(t + 1)
-        if over.all():
-            break
-    failed = np.flatnonzero(success_step == NEVER)
-    failures = np.full(n, "", dtype=object)
-    failures[failed] = failure_kinds(env.bundle, course.of(failed), broke[failed])
-    succeeded = success_step != NEVER
-    end = np.where(succeeded, np.minimum(success_step + 2 + TAIL_STEPS, len(course)), len(course))
-    shown = None
-    if film is not None:
-        shown = Shown(successes=succeeded, num_frames=end, snapshots=film.snapshots())
-    return _Played(
-        success_step=success_step,
-        at_end=last,
-        broke=broke,
-        failures=tuple(str(kind) for kind in failures),
-        shown=shown,
-    )
-
-
-class _Film:
-    """Where everything was at each moment; sizes and cameras stay as they were at the start."""
-
-    def __init__(self, env: BatchEnv, steps: int) -> None:
-        self._env, self._everyone = env, np.arange(env.num_envs)
-        self._start = env.snapshot(self._everyone)
-        self._moments = [(self._start.qpos, self._start.qvel)]
-
-    def note(self) -> None:
-        now = self._env.motion()
-        self._moments.append(now)
-
-    def snapshots(self) -> list[Snapshot]:
-        return [replace(self._start, qpos=qpos, qvel=qvel) for qpos, qvel in self._moments]
-
-
-# --- who acts ------------------------------------------------------------------------------------------------
-
-
-class _Sighted:
-    """Shows a policy the worlds: pictures and robot states of those that go on, the last ones of those that are over."""
+    Attributes:
+        success_step: the control step that led to the first success, from 0; `NEVER` where there was none.
+        at_end: success at the last step.
+        broke: where the simulation broke down.
+    """
 
     def __init__(
-        self,
-        actor: Actor,
-        env: BatchEnv,
-        size_px: int | tuple[int, int],
-        num_threads: int,
-        watch: "_Watch",
+        self, record: RefereeRecord, num_worlds: int, steps: int, *, at_end: bool
     ) -> None:
-        self._actor, self._env, self._watch = actor, env, watch
-        shape = (size_px, size_px) if isinstance(size_px, int) else size_px
-        self._renderer = MaskRenderer(env.world, size_px, num_threads=num_threads)
-        self._labels = np.zeros((env.num_envs, *shape), np.uint8)
-        self._state = np.zeros((env.num_envs, len(STATE_LOW)), np.float32)
-        with watch.on("network"):
-            actor.reset(env.num_envs)
+        self._record, self._steps, self._goes_on = record, steps, at_end
+        self.success_step = np.full(num_worlds, NEVER)
+        self.at_end, self.broke = np.zeros(num_worlds, bool), np.zeros(num_worlds, bool)
 
-    def act(self, over: Bool[np.ndarray, "env"]) -> Float[np.ndarray, "env 7"]:
-        seen = np.flatnonzero(~over)
-        with self._watch.on("masks"):
-            snapshot = self._env.snapshot(seen)
-            self._labels[seen] = self._renderer.draw_many(
-                [(snapshot, k) for k in range(len(seen))]
-            )
-            self._state[seen] = np.clip(self._env.robot_state()[seen], STATE_LOW, STATE_HIGH)
-        with self._watch.on("network"):
-            return _checked(self._actor.act(self._labels, self._state), self._env)
+    def __call__(self, view: View) -> Bool[np.ndarray, "env"]:
+        """Ask the referee where there is something to ask; return which episodes are over."""
+        is_last = view.t == self._steps
+        over = view.result.terminated & view.going
+        self.broke |= over
+        is_asked = view.result.held & view.going & ~over
+        asked = np.flatnonzero(is_asked & ((self.success_step == NEVER) | is_last))
+        if len(asked):
+            with view.watch.on("referee"):
+                agreed = asked[self._record.verdict(asked)]
+            self.success_step[agreed[self.success_step[agreed] == NEVER]] = view.t - 1
+            self.at_end[agreed] = is_last
+            over[agreed] |= not self._goes_on
+        return over
 
-    def __enter__(self) -> "_Sighted":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._renderer.close()
-
-
-class _Knowing:
-    """Lets someone act who sees the simulator's states."""
-
-    def __init__(self, actor: WorldActor, env: BatchEnv, watch: "_Watch") -> None:
-        self._actor, self._env, self._watch = actor, env, watch
-        with watch.on("network"):
-            actor.begin(env)
-
-    def act(self, over: Bool[np.ndarray, "env"]) -> Float[np.ndarray, "env 7"]:
-        with self._watch.on("network"):
-            action = np.where(over[:, None], 0.0, self._actor.act_in(self._env))
-            return _checked(action, self._env)
-
-    def __enter__(self) -> "_Knowing":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
-def _checked(action: Float[np.ndarray, "env 7"], env: BatchEnv) -> Float[np.ndarray, "env 7"]:
-    wanted = (env.num_envs, env.act_dim)
-    if action.shape != wanted:
-        raise V2PError(
-            f"the policy's actions have the shape {action.shape}; the simulator needs {wanted}"
-        )
-    if not np.isfinite(action).all():
-        world = int(np.flatnonzero(~np.isfinite(action).all(1))[0])
-        raise V2PError(
-            f"the policy's action in world {world} of task '{env.bundle.title}' is not finite: {action[world].tolist()}"
-        )
-    return action
-
-
-@dataclass(kw_only=True)
-class _Watch:
-    """Adds up wall time by name."""
-
-    seconds: dict[str, float] = field(default_factory=dict[str, float])
-
-    @contextmanager
-    def on(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+    def failures(self, bundle: TaskBundle) -> tuple[str, ...]:
+        """Return the kind of failure of each episode, empty where it succeeded once."""
+        failed = np.flatnonzero(self.success_step == NEVER)
+        kinds = np.full(len(self.broke), "", dtype=object)
+        kinds[failed] = failure_kinds(bundle, self._record.history(failed), self.broke[failed])
+        return tuple(str(kind) for kind in kinds)

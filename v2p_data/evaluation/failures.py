@@ -1,4 +1,4 @@
-"""What went wrong in a failed episode, told from the courses of tool and objects.
+"""What went wrong in a failed episode, told from the motions of tool and objects.
 
 The first of these that is true is the episode's kind of failure:
 
@@ -47,18 +47,20 @@ STILL_STEPS = 20
 STILL_M = 0.01
 """A tool that stays within a box of this diagonal stands still."""
 
-Course = Mapping[str, np.ndarray]
+History = Mapping[str, np.ndarray]
 """Per key of the task interface's `states` an array `(time, env, ...)`, the moment after the reset first."""
 
 
 def failure_kinds(
-    bundle: TaskBundle, course: Course, broke: Bool[np.ndarray, "env"]
+    bundle: TaskBundle, history: History, broke: Bool[np.ndarray, "env"]
 ) -> tuple[str, ...]:
     """Return the kind of failure of each of these episodes, which all failed and are of the same length."""
     kinds = np.full(len(broke), SIMULATION_BROKE, dtype=object)
     sound = np.flatnonzero(~broke)
     if len(sound):
-        case = _Case(bundle=bundle, course={key: value[:, sound] for key, value in course.items()})
+        case = _Case(
+            bundle=bundle, history={key: value[:, sound] for key, value in history.items()}
+        )
         kinds[sound] = _kinds_of_sound(case)
     return tuple(str(kind) for kind in kinds)
 
@@ -68,7 +70,7 @@ class _Case:
     """Failed episodes of one task, of simulations that did not break."""
 
     bundle: TaskBundle
-    course: Course
+    history: History
 
     @property
     def thing(self) -> str:
@@ -80,7 +82,7 @@ class _Case:
         return others[0].name if others else None
 
     def of(self, name: str, what: str) -> np.ndarray:
-        return self.course[f"{name}_{what}"]
+        return self.history[f"{name}_{what}"]
 
     def first_touched(self) -> str:
         """Return the name of the object that the gripper has to touch."""
@@ -109,13 +111,13 @@ class _Case:
         return np.linalg.norm(between, axis=-1) - sizes[0] - sizes[1]
 
     def stands_still(self) -> Bool[np.ndarray, "env"]:
-        last = self.course["eef_pos"][-STILL_STEPS - 1 :]
+        last = self.history["eef_pos"][-STILL_STEPS - 1 :]
         return np.linalg.norm(np.ptp(last, axis=0), axis=-1) < STILL_M
 
 
 def _kinds_of_sound(case: _Case) -> np.ndarray:
     kind = KINDS[case.bundle.kind]
-    never = np.zeros(case.course["eef_pos"].shape[1], bool)
+    never = np.zeros(case.history["eef_pos"].shape[1], bool)
     touched = (case.of(case.first_touched(), "touched") > 0).any(0)
     leans = case.leaned_rad() > TOPPLED_RAD if kind.stays_upright else never
     last_held = case.last_held()

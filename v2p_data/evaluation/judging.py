@@ -16,6 +16,7 @@ from v2p_data.evaluation.checkpoint import WEIGHTS_FILE, check_checkpoint
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
+from v2p_data.play import Actor, StateActor, VisionActor
 from v2p_data.seeds import seed_for
 from v2p_data.task.audit.resets import has_own_reset
 from v2p_data.task.task import TaskBundle
@@ -26,7 +27,7 @@ EXPERT_FILE, EXPERT_WEIGHTS_FILE = "expert.json", "weights.safetensors"
 UNSEEN_PX = 256
 """Size of pictures that nobody looks at."""
 Kind = Literal["policy", "expert", "programs"]
-Play = Callable[[TaskBundle], tuple[Any, int | tuple[int, int]]]
+Play = Callable[[TaskBundle], tuple[Actor, int | tuple[int, int]]]
 """From a task to who acts in it, and the size of the pictures that it sees [px]."""
 
 
@@ -138,18 +139,17 @@ def _policy(folder: Path, device: str) -> Play:
         actor = load_actor(folder, greys=PALETTE, device=device)
     except UnsuitablePolicyError as error:
         raise V2PError(str(error)) from error
-    return lambda bundle: (actor.for_task(bundle.description), actor.size_px)
+    return lambda bundle: (VisionActor(actor.for_task(bundle.description)), actor.size_px)
 
 
 def _expert(folder: Path) -> Play:
     from policies.ppo.policy import Expert
-    from v2p_data.evaluation.actors import ExpertActor
 
     try:
         expert = Expert.load(folder)
     except ValueError as error:
         raise V2PError(str(error)) from error
-    return lambda bundle: (ExpertActor(expert.act, expert.model.obs_dim), UNSEEN_PX)
+    return lambda bundle: (StateActor(expert.act, expert.model.obs_dim), UNSEEN_PX)
 
 
 def _programs(seed: int) -> Play:

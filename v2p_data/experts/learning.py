@@ -26,7 +26,8 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.record import Comparison, Judged, Learned
 from v2p_data.experts.solved import Solved, rank_solved
-from v2p_data.experts.teacher import Teacher, Trial, play
+from v2p_data.experts.teacher import Teacher, Trial, try_out
+from v2p_data.play import StateActor
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env.backends import make_batch_env
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
@@ -237,12 +238,12 @@ def keep_better(
         seen.append(obs.copy())
         return before.act(obs)
 
-    of_taught = play(env, watched, seed)
+    of_taught = try_out(env, StateActor(watched), seed)
     candidates = (
         (Expert.load(out), improved.actor_updates),
         (Expert.load(out / LAST_FOLDER), improved.last_actor_updates),
     )
-    played = [play(env, expert.act, seed) for expert, _ in candidates]
+    played = [try_out(env, StateActor(expert.act), seed) for expert, _ in candidates]
     chosen = int(np.argmax([p.score for p in played]))
     (after, updates), of_ppo = candidates[chosen], played[chosen]
     both = of_taught.once & of_ppo.once
@@ -299,4 +300,4 @@ def success_of(env: BatchEnv, expert: Expert) -> float:
 
     That is what episodes are recorded for, and what success means wherever two policies are compared.
     """
-    return float(play(env, expert.act).once.mean())
+    return float(try_out(env, StateActor(expert.act)).once.mean())

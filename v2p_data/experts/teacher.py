@@ -28,13 +28,13 @@ from v2p_data.experts.primitives import (
     swing,
 )
 from v2p_data.kinds import KINDS
+from v2p_data.play import Actor, StateActor, View, play
 from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.sandbox.probes import first_pose
 
 logger = logging.getLogger(__name__)
 
 Program = Callable[[Moment], Actions]
-Act = Callable[[Float[np.ndarray, "env obs"]], Float[np.ndarray, "env 7"]]
 
 LIFT, PUSH_AS, CARRY_AS, TIP = "lift", "push as in the video", "carry as in the video", "tip over"
 """Names of the programs that need no second object."""
@@ -104,7 +104,7 @@ class Teacher:
 
     def play(self) -> float:
         """Play one episode in every world and return the share whose success was held at the end."""
-        return float(play(self.env, lambda _: self.act()).at_end.mean())
+        return float(try_out(self.env, StateActor(lambda _: self.act())).at_end.mean())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,18 +129,19 @@ class Played:
         return float(np.mean([score(*pair) for pair in zip(self.once * 1.0, waited, strict=True)]))
 
 
-def play(env: BatchEnv, act: Act, seed: int | None = None) -> Played:
-    """Play one episode in every world; policies that are given the same seed play the same episodes."""
+def try_out(env: BatchEnv, actor: Actor, seed: int | None = None) -> Played:
+    """Play one episode in every world; who is given the same seed plays the same episodes."""
     if seed is not None:
         env.seed(seed)
     env.reset(np.arange(env.num_envs))
-    obs, at_end = env.observe(), np.zeros(env.num_envs, bool)
     steps = np.full(env.num_envs, env.horizon + 1)
-    for step in range(1, env.horizon + 1):
-        result = env.step(act(obs))
-        obs, at_end = result.obs, result.held
-        steps = np.where(at_end, np.minimum(steps, step), steps)
-    return Played(at_end=at_end, steps=steps, horizon=env.horizon)
+
+    def note(view: View) -> None:
+        np.minimum(steps, view.t, out=steps, where=view.result.held)
+
+    view = View(env)
+    play(view, actor, [note])
+    return Played(at_end=view.result.held, steps=steps, horizon=env.horizon)
 
 
 def programs_for(env: BatchEnv) -> dict[str, Program]:

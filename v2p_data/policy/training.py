@@ -90,6 +90,7 @@ def make_distillation(
     from policies.bc.trainer import TrainerConfig
     from policies.ppo.policy import Expert
     from v2p_data.distillation.rounds import Lesson, demand_masks, distill
+    from v2p_data.play import StateActor
     from v2p_data.task.task import TaskBundle
 
     del inputs
@@ -115,7 +116,9 @@ def make_distillation(
 
         distilled = distill(
             {
-                s.item: Lesson(bundle=TaskBundle.load(s.task), expert=Expert.load(s.expert).act)
+                s.item: Lesson(
+                    bundle=TaskBundle.load(s.task), expert=StateActor(Expert.load(s.expert).act)
+                )
                 for s in sources
             },
             student,
@@ -249,30 +252,13 @@ def new_student(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class StudentActor:
-    """A student as `evaluation.batch.judge` wants it: told its task once."""
-
-    student: "Student"
-    task: str
-    """In words."""
-
-    def reset(self, n: int) -> None:
-        """Start episodes in `n` worlds."""
-        del n
-        self.student.reset(self.task)
-
-    def act(self, labels: Any, state: Any) -> Any:
-        """Return the worlds' next actions."""
-        return self.student.act(labels, state)
-
-
 def checkpoint_judge(
     student: "Student", sources: Sequence[Source], episodes: int, seed: int, runtime: Runtime
 ) -> Callable[[Any], float]:
     """Return what gives a policy's mean success rate over tasks, on seeds that no evaluation uses."""
     from v2p_data.evaluation.batch import judge
     from v2p_data.evaluation.config import EvaluationConfig
+    from v2p_data.play import VisionActor
     from v2p_data.task.task import TaskBundle
 
     bundles = {source.item: TaskBundle.load(source.task) for source in sources}
@@ -282,9 +268,7 @@ def checkpoint_judge(
         judged = [
             judge(
                 bundle,
-                StudentActor(
-                    student=replace(student, policy=policy.eval()), task=bundle.description
-                ),
+                VisionActor(replace(student, policy=policy.eval(), task=bundle.description)),
                 episodes=episodes,
                 first_seed=seed_for(seed, "checkpoints", item) % 2**31,
                 cfg=cfg,

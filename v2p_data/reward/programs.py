@@ -7,10 +7,11 @@ between the program sees the robot and the objects at every step, as the paper's
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from v2p_data.experts.teacher import Teacher
 from v2p_data.kinds import KINDS
+from v2p_data.play import View
 from v2p_data.sim.env.batch_env import BatchEnv
 
 EVERY_STEPS = 50
@@ -20,32 +21,25 @@ MOVED_M = 0.01
 
 
 class ProgramPolicy:
-    """Programs for the worlds of an environment, whose episodes start together.
+    """An actor: programs for worlds whose episodes start together."""
 
-    Args:
-        env: the worlds; `restart` is to be called after each reset.
-    """
-
-    def __init__(self, env: BatchEnv) -> None:
-        self.env = env
-        self.teacher = Teacher(env)
-        meant = KINDS[env.bundle.kind].programs
-        self.names = sorted(self.teacher.programs, key=lambda name: not name.startswith(meant))
-        self.restart()
-
-    def restart(self) -> None:
+    def reset(self, worlds: BatchEnv) -> None:
         """Begin new episodes with the program that the caption names."""
+        self.env, self.teacher = worlds, Teacher(worlds)
+        meant = KINDS[worlds.bundle.kind].programs
+        self.names = sorted(self.teacher.programs, key=lambda name: not name.startswith(meant))
         self.step = 0
-        self.chosen = np.zeros(self.env.num_envs, np.int64)
+        self.chosen = np.zeros(worlds.num_envs, np.int64)
         self.seen = self._object_pos()
 
-    def act(self) -> Float[np.ndarray, "env 7"]:
-        """Return the programs' actions for the worlds as they are."""
+    def act(self, view: View) -> Float32[np.ndarray, "env 7"]:
+        """Return the programs' actions for the worlds as they are, as precise as they are recorded."""
+        del view  # the teacher's own
         if self.step and self.step % EVERY_STEPS == 0:
             self._choose()
         self.step += 1
         moment = self.teacher.moment()
-        actions = np.zeros((self.env.num_envs, self.env.act_dim))
+        actions = np.zeros((self.env.num_envs, self.env.act_dim), np.float32)
         for k in np.unique(self.chosen):
             rows = self.chosen == k
             actions[rows] = self.teacher.programs[self.names[k]](moment)[rows]

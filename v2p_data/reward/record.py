@@ -1,10 +1,8 @@
 """Plays one episode per world and writes down what a reward must answer for."""
 
-from collections.abc import Callable
-
 import numpy as np
-from jaxtyping import Float, Float32
 
+from v2p_data.play import Actor, View, play
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.task import OBJECT_STATES, ROBOT_STATES
@@ -12,11 +10,9 @@ from v2p_data.task.task import OBJECT_STATES, ROBOT_STATES
 NUM_MOMENTS = 25
 """Moments of each episode whose states are kept, evenly spread over the horizon."""
 
-Act = Callable[[Float32[np.ndarray, "env obs"]], Float[np.ndarray, "env 7"]]
-
 
 def record_trajectories(
-    env: BatchEnv, act: Act, *, num_moments: int = NUM_MOMENTS
+    env: BatchEnv, actor: Actor, *, num_moments: int = NUM_MOMENTS
 ) -> Trajectories:
     """Play one episode in every world and return what was paid, and the states of some moments.
 
@@ -24,7 +20,7 @@ def record_trajectories(
 
     Args:
         env: the worlds; they are reset first and left as they are at the end.
-        act: observations to actions, e.g. `Expert.act`.
+        actor: who acts.
         num_moments: how many moments' states are kept; all if the horizon is shorter, none for 0.
     """
     n, horizon = env.num_envs, env.horizon
@@ -39,12 +35,10 @@ def record_trajectories(
     states: dict[str, list[np.ndarray]] = {key: [] for key in keys}
     actions: list[np.ndarray] = []
     env.reset(np.arange(n))
-    obs = env.observe()
-    for step in range(horizon):
-        action = np.asarray(act(obs))
-        result = env.step(action)
-        obs = result.obs
-        length = np.where(result.terminated, np.minimum(length, step), length)
+
+    def note(view: View) -> None:
+        step, result = view.t - 1, view.result
+        np.minimum(length, step, out=length, where=result.terminated)
         goes_on = length > step
         for name, row in components.items():
             row[step] = np.where(goes_on, result.components[name], np.nan)
@@ -55,7 +49,9 @@ def record_trajectories(
             for key in keys:
                 # A copy, finite also where a world broke down: those rows are beyond the episode's end.
                 states[key].append(np.nan_to_num(now[key].numpy().astype(np.float32)))
-            actions.append(np.clip(action, -1, 1).astype(np.float32))
+            actions.append(view.action.astype(np.float32))
+
+    play(View(env), actor, [note])
     return Trajectories(
         components=components,
         reward=reward,

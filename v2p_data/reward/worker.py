@@ -35,6 +35,7 @@ from v2p_data.experts.learning import Worlds, success_of
 from v2p_data.experts.learning import teach as teach_policy
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.play import StateActor
 from v2p_data.processes import end_with_parent
 from v2p_data.reward.candidate import (
     DONE_FILE,
@@ -207,7 +208,7 @@ def train(request: dict[str, Any], folder: Path) -> None:
         )
         expert = Expert.load(folder / TRAIN_FOLDER / LAST_POLICY)
         judge.seed(seed_for(int(request["eval_seed"]), "mark", mark))
-        trajectories = record_trajectories(judge, expert.act)
+        trajectories = record_trajectories(judge, StateActor(expert.act))
         _beat(folder)
         evaluations = [
             *evaluations[: mark - 1],

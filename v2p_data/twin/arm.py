@@ -4,12 +4,12 @@ The same `next_target` that drives a real arm moves the target; the state comes 
 50 ms. A success is one where the task's own success has held for 0.25 s and the independent referee agrees.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.env.batch_env import SimConfig, StepResult
 from v2p_data.sim.env.targets import ToolPose, next_target
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW
@@ -18,16 +18,6 @@ from v2p_data.twin.control import tool_pose
 from v2p_data.twin.interface import RGB_PX
 from v2p_data.twin.parameters import TwinParameters
 from v2p_data.twin.robot import Measured, TwinRobot
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """What one action led to; for judges only."""
-
-    is_held: bool
-    """The task's own success has held for 0.25 s."""
-    is_broken: bool
-    """The simulation broke down."""
 
 
 class TwinArm:
@@ -78,16 +68,16 @@ class TwinArm:
         """
         return self.robot.picture()
 
-    def act(self, action: Float[np.ndarray, "7"]) -> Outcome:
-        """Carry out one action in [-1, 1], then measure."""
+    def act(self, action: Float[np.ndarray, "7"]) -> StepResult:
+        """Carry out one action in [-1, 1], then measure; return what the mirror says of it, for judges only."""
         self.target = next_target(self.target, self.tool, action, self.cfg, FINGER_TRAVEL_M)
         self.robot.command(self.target)
         self.robot.step(1 / CONTROL_HZ)
         self._measure()
         truth = self.robot.truth()
         result = self.mirror.follow(truth, self.target, np.asarray(action, float))
-        is_broken = truth.is_broken or bool(result.terminated[0])
-        return Outcome(is_held=bool(result.held[0]) and not is_broken, is_broken=is_broken)
+        broke = result.terminated | truth.is_broken
+        return replace(result, held=result.held & ~broke, terminated=broke)
 
     def close(self) -> None:
         """Free the graphics memory."""

@@ -15,19 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.evaluation.actors import Actor, WorldActor
-from v2p_data.evaluation.batch import NEVER
+from v2p_data.evaluation.batch import NEVER, Verdicts
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.evaluation.failures import failure_kinds
+from v2p_data.play import Actor, View, play
+from v2p_data.sim.env.batch_env import StepResult
 from v2p_data.sim.robot.gripper_wait import GripperWait
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.arm import TwinArm
 from v2p_data.twin.parameters import TwinParameters
 
-Load = Callable[[TaskBundle], tuple[Actor | WorldActor, int | tuple[int, int]]]
+Load = Callable[[TaskBundle], tuple[Actor, int | tuple[int, int]]]
 """From a task to who acts in it, and the size of the pictures that it sees [px]."""
 
 
@@ -81,64 +81,38 @@ class TwinJudged:
         return dict(sorted(counts.items()))
 
 
-def play(
-    arm: TwinArm,
-    actor: Actor | WorldActor,
-    seed: int,
-    steps: int,
-    *,
-    at_end: bool,
-    labels: Callable[[], UInt8[np.ndarray, "h w"]] | None = None,
-    waits: bool = False,
-) -> Played:
-    """Play one episode of at most `steps` control steps; without `at_end` it is over with its first success.
+class TwinView(View):
+    """What can be seen of an episode in the twin: the robot's own readings, and labels that its camera gives.
 
     Args:
-        arm: the twin.
-        actor: who acts.
-        seed: of the episode.
-        steps: the most.
-        at_end: go on after a success.
-        labels: what a policy sees; by default the true labels of the twin's camera.
+        arm: the twin, at the start of an episode.
+        look: gives the label image of now.
         waits: the arm waits while the gripper travels.
-
-    Raises:
-        V2PError: an action is not finite or has another shape.
     """
-    start = time.perf_counter()
-    bundle = arm.mirror.bundle
-    labels = labels or true_labels(arm)
-    arm.reset(seed)
-    if isinstance(actor, Actor):
-        actor.reset(1)
-    else:
-        actor.begin(arm.mirror.env)
-    wait = GripperWait() if waits else None
-    success_step, last, broke = NEVER, False, False
-    for t in range(steps):
-        action = _action(actor, arm, labels)
-        if wait is not None:
-            action = wait.held(action, arm.tool.opening, arm.target.opening)
-        outcome = arm.act(action)
-        broke = outcome.is_broken
-        if broke:
-            break
-        if outcome.is_held and (success_step == NEVER or t + 1 == steps) and arm.mirror.verdict():
-            success_step = t if success_step == NEVER else success_step
-            last = t + 1 == steps
-            if not at_end:
-                break
-    failure = ""
-    if success_step == NEVER:
-        failure = failure_kinds(bundle, arm.mirror.course.of(), np.array([broke]))[0]
-    return Played(
-        seed=seed,
-        success_step=success_step,
-        at_end=last,
-        broke=broke,
-        failure=failure,
-        seconds=time.perf_counter() - start,
-    )
+
+    def __init__(
+        self, arm: TwinArm, look: Callable[[], UInt8[np.ndarray, "h w"]], *, waits: bool
+    ) -> None:
+        super().__init__(arm.mirror.env)
+        self._arm, self._look = arm, look
+        self._wait = GripperWait() if waits else None
+
+    @property
+    def state(self) -> Float32[np.ndarray, "1 11"]:
+        """The robot's state, from joint readings."""
+        return self._arm.state()[None]
+
+    @property
+    def labels(self) -> UInt8[np.ndarray, "1 h w"]:
+        """The label picture."""
+        return self._look()[None]
+
+    def step(self, action: Float[np.ndarray, "1 7"]) -> StepResult:
+        """Let the twin carry out an action; return what the mirror says of it."""
+        arm, wanted = self._arm, action[0].astype(float)
+        if self._wait is not None:
+            wanted = self._wait.held(wanted, arm.tool.opening, arm.target.opening)
+        return arm.act(wanted)
 
 
 def judge_in_twin(
@@ -206,10 +180,21 @@ class _Table:
         self.waits = waits
 
     def play(self, seed: int) -> Played:
-        return play(
-            self.arm, self.actor, seed, self.steps, at_end=self.cfg.at_end, labels=self.labels,
-            waits=self.waits,
-        )  # fmt: skip
+        start = time.perf_counter()
+        self.arm.reset(seed)
+        mirror, at_end = self.arm.mirror, self.cfg.at_end
+        verdicts = Verdicts(mirror.referee, 1, self.steps, at_end=at_end)
+        play(
+            TwinView(self.arm, self.labels, waits=self.waits), self.actor, (), verdicts, self.steps
+        )
+        return Played(
+            seed=seed,
+            success_step=int(verdicts.success_step[0]),
+            at_end=bool(verdicts.at_end[0]),
+            broke=bool(verdicts.broke[0]),
+            failure=verdicts.failures(mirror.bundle)[0],
+            seconds=time.perf_counter() - start,
+        )
 
 
 _table: _Table | None = None
@@ -227,19 +212,3 @@ def _sit_down(*settings: Any) -> None:
 def _play_here(seed: int) -> Played:
     assert _table is not None, "the initializer comes first"
     return _table.play(seed)
-
-
-def _action(
-    actor: Actor | WorldActor, arm: TwinArm, labels: Callable[[], UInt8[np.ndarray, "h w"]]
-) -> Float[np.ndarray, "7"]:
-    if isinstance(actor, Actor):
-        actions = actor.act(labels()[None], arm.state()[None])
-    else:
-        actions = actor.act_in(arm.mirror.env)
-    action = np.asarray(actions, float)
-    if action.shape != (1, 7) or not np.isfinite(action).all():
-        raise V2PError(
-            f"the actor's action in task '{arm.mirror.bundle.title}' must be 7 finite numbers for one world, got"
-            f" {np.array2string(action, precision=3)}"
-        )
-    return action[0]

@@ -1,7 +1,7 @@
 """The training simulator as a mirror of the twin: it draws the starts, and judges what really happened.
 
 No physics runs in it. After each control step the twin's truth is written into one of its worlds, so that experts see
-the states they know, the task's own success is asked, and the independent referee sees the course of the episode.
+the states they know, the task's own success is asked, and the independent referee sees what happened.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from v2p_data.errors import V2PError
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import BatchEnv, Followed, SimConfig, StepResult, robot_of
 from v2p_data.sim.env.targets import ToolPose
-from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.sim.wrappers.gym_env import stream_seed
 from v2p_data.task.task import TaskBundle
@@ -71,7 +71,7 @@ class Mirror:
             )
         self.bundle = bundle
         self.env = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
-        self.course = Course(self.env)
+        self.referee = RefereeRecord(self.env)
 
     def start(self, seed: int) -> Start:
         """Return how the episode of `V2PEnv.reset(seed=seed)` begins."""
@@ -90,17 +90,13 @@ class Mirror:
         """Take over the first moment of an episode."""
         self.env.randomizer.size_m[0] = world.size_m
         self.env.begin_following(_followed(truth, target))
-        self.course.restart()
+        self.referee.restart()
 
     def follow(self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]) -> StepResult:
         """Take over the moment that an action led to, and say what the task's own success says of it."""
         result = self.env.follow(_followed(truth, target), action[None])
-        self.course.note()
+        self.referee.note()
         return result
-
-    def verdict(self) -> bool:
-        """Return whether the independent referee calls the episode so far a success."""
-        return bool(self.course.verdict()[0])
 
 
 def _followed(truth: Truth, target: ToolPose) -> Followed:

@@ -11,27 +11,31 @@ from v2p_data.task.task import TaskBundle
 
 
 def referee_verdict(
-    bundle: TaskBundle, course: Mapping[str, np.ndarray]
+    bundle: TaskBundle, history: Mapping[str, np.ndarray]
 ) -> Bool[np.ndarray, "env"]:
     """Return what the referee says of episodes, given per key of `states` an array `(time, env, ...)`."""
     objects = {
         obj.name: ObjectTrack(
-            pos=course[f"{obj.name}_pos"].astype(float),
-            quat_wxyz=course[f"{obj.name}_quat"].astype(float),
-            size_m=course[f"{obj.name}_size"][0].astype(float),
+            pos=history[f"{obj.name}_pos"].astype(float),
+            quat_wxyz=history[f"{obj.name}_quat"].astype(float),
+            size_m=history[f"{obj.name}_size"][0].astype(float),
             # "any pad" and "both pads" stand for the two pads: all rules ask for one or the other.
             touched=np.stack(
-                [course[f"{obj.name}_{key}"] > 0 for key in ("touched", "grasped")], axis=-1
+                [history[f"{obj.name}_{key}"] > 0 for key in ("touched", "grasped")], axis=-1
             ),
         )
         for obj in bundle.scene.objects
     }
-    trajectory = Trajectory(objects=objects, eef_pos=course["eef_pos"].astype(float))
+    trajectory = Trajectory(objects=objects, eef_pos=history["eef_pos"].astype(float))
     return referee_success(bundle.kind, bundle.scene, trajectory)
 
 
-class Course:
-    """What the referee looks at, of all worlds of an environment, which start and end together."""
+class RefereeRecord:
+    """What the referee is shown of all worlds of an environment, from the start of their episodes.
+
+    Args:
+        env: the worlds; their present moment is noted as the start.
+    """
 
     def __init__(self, env: BatchEnv) -> None:
         self._env = env
@@ -40,15 +44,15 @@ class Course:
             for name in env.object_names
             for key in ("pos", "quat", "size", "touched", "grasped")
         ]
-        self._moments: list[dict[str, np.ndarray]] = []
+        self.restart()
 
     def restart(self) -> None:
         """Forget everything and note the start of new episodes; call after a reset."""
-        self._moments = []
+        self._moments: list[dict[str, np.ndarray]] = []
         self.note()
 
-    def note(self) -> None:
-        """Note the present moment; call after each step."""
+    def note(self, _: object = None) -> None:
+        """Note the present moment; call after each step, or let `play` call it."""
         states = self._env.states()
         self._moments.append({key: states[key].numpy().astype(float) for key in self._keys})
 
@@ -56,19 +60,15 @@ class Course:
         """Return the number of moments so far."""
         return len(self._moments)
 
-    def of(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> dict[str, np.ndarray]:
-        """Return the course of some worlds up to now, per key an array `(time, world, ...)`."""
+    def history(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> dict[str, np.ndarray]:
+        """Return the states of some worlds up to now, per key an array `(time, world, ...)`."""
         return {key: np.stack([m[key][worlds] for m in self._moments]) for key in self._keys}
 
-    def as_cut(self, end: Int[np.ndarray, "env"]) -> dict[str, np.ndarray]:
-        """Return the course in which each world stands still from the step `end` on."""
+    def history_as_cut(self, end: Int[np.ndarray, "env"]) -> dict[str, np.ndarray]:
+        """Return the history in which each world stands still from the step `end` on."""
         time = np.minimum(np.arange(len(self))[:, None], end[None])
-        return {key: array[time, np.arange(len(end))] for key, array in self.of().items()}
+        return {key: array[time, np.arange(len(end))] for key, array in self.history().items()}
 
     def verdict(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> Bool[np.ndarray, "n"]:
         """Return what the referee says of the episodes of some worlds so far."""
-        return referee_verdict(self._env.bundle, self.of(worlds))
-
-    def verdict_as_cut(self, end: Int[np.ndarray, "env"]) -> Bool[np.ndarray, "env"]:
-        """Return what the referee says of episodes of `end` steps each; see `as_cut`."""
-        return referee_verdict(self._env.bundle, self.as_cut(end))
+        return referee_verdict(self._env.bundle, self.history(worlds))

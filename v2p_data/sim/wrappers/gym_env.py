@@ -26,7 +26,7 @@ from jaxtyping import Float, UInt8
 from v2p_data.errors import V2PError
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import ACT_DIM, BatchEnv, SimConfig, Snapshot
-from v2p_data.sim.env.verdict import Course
+from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.model.world import World
 from v2p_data.sim.render.masks import MaskRenderer, labels_to_rgb
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
@@ -103,7 +103,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         sim = SimConfig(fine=True, randomization=randomization)
         with told_of(bundle.folder):
             self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
-        self._course = Course(self._world)
+        self._referee = RefereeRecord(self._world)
         self._masks = MaskRenderer(self._world.world, size_px)
         self.observation_space = spaces.Dict(
             {
@@ -130,16 +130,16 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         self._world.seed(_next_seed(self.np_random))
         self._world.reset(np.array([0]))
         self._num_steps = 0
-        self._course.restart()
+        self._referee.restart()
         return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Carry out one action; it is clipped to [-1, 1]."""
         result = self._world.step(np.asarray(action, float)[None])
-        self._course.note()
+        self._referee.note()
         self._num_steps += 1
         broke = bool(result.terminated[0])
-        success = not broke and bool(result.held[0]) and bool(self._course.verdict()[0])
+        success = not broke and bool(result.held[0]) and bool(self._referee.verdict()[0])
         terminated = success or broke
         return (
             self._observe(),
