@@ -28,10 +28,11 @@ from v2p_data.episodes.dataset.features import (
 )
 from v2p_data.episodes.dataset.intake import demand_bounded
 from v2p_data.episodes.dataset.tables import DATA_GLOB, column, damage_told, read_info, row_spans
-from v2p_data.episodes.rollouts import InWorlds, Rollouts, roll_out
+from v2p_data.episodes.rollouts import Rollouts, roll_out
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.settings import from_values
-from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.play import StateActor
+from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.task.task import TaskBundle
 
 SAME = 1e-9
@@ -198,17 +199,13 @@ def _played(
     num_threads: int,
 ) -> Rollouts:
     """Return the whole batch, with the recorded actions in the worlds that have some."""
-
-    def begin(env: BatchEnv) -> Callable[[np.ndarray], np.ndarray]:
-        actions = np.zeros((env.horizon, cfg.batch_worlds, 7), np.float32)
-        for e in episodes:
-            actions[: len(e.action), e.world % cfg.batch_worlds] = e.action
-        rows = iter(actions)
-        return lambda obs: next(rows)
-
+    actions = np.zeros((bundle.horizon_steps, cfg.batch_worlds, 7), np.float32)
+    for e in episodes:
+        actions[: len(e.action), e.world % cfg.batch_worlds] = e.action
+    rows = iter(actions)
     return roll_out(
         bundle,
-        InWorlds(begin),
+        StateActor(lambda obs: next(rows)),
         SimConfig(fine=True, randomization=cfg.randomization),
         num_worlds=cfg.batch_worlds,
         seed=seed,
