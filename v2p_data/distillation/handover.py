@@ -6,6 +6,7 @@ episodes that end in success are kept: the expert's labels in hopeless states te
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int, UInt8
@@ -107,8 +108,9 @@ def hand_over(
     actor = Handover(student, expert, takeover, pictures)
     view = View(env, size_px, num_threads)
     recorded = record_rollouts(view, actor, cut, seed=seed, horizon=horizon)
+    columns: dict[str, Any] = vars(recorded) | {"action": np.stack(actor.answers)}
     return Handovers(
-        **vars(recorded) | {"action": np.stack(actor.answers)},
+        **columns,
         labels=pictures[: len(actor.answers)],
         taken_over_at=takeover,
     )
