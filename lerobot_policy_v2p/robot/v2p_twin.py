@@ -96,7 +96,7 @@ class V2PTwin(ArmRobot[TwinArm]):
         clipped = np.clip(wanted, -1.0, 1.0)
         outcome = arm.act(clipped)
         self._steps += 1
-        if outcome.is_held and not self._has_succeeded and arm.mirror.verdict():
+        if outcome.held[0] and not self._has_succeeded and arm.mirror.referee.verdict()[0]:
             self._has_succeeded = True
             title = arm.mirror.bundle.title
             logger.info("task '%s' succeeded in the twin after %d steps", title, self._steps)
