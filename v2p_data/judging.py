@@ -14,6 +14,7 @@ from v2p_data.checkpoint import WEIGHTS_FILE, check_checkpoint
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.experts.labeller import PROGRAM_FILE, program_in
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.seeds import seed_for
@@ -47,7 +48,12 @@ class Contestant:
             case "policy":
                 return {"policy": file_digest(self.folder / WEIGHTS_FILE)}
             case "expert":
-                return {"expert": file_digest(self.folder / EXPERT_WEIGHTS_FILE)}
+                is_program = (self.folder / PROGRAM_FILE).is_file()
+                return {
+                    "expert": file_digest(
+                        self.folder / (PROGRAM_FILE if is_program else EXPERT_WEIGHTS_FILE)
+                    )
+                }
             case "programs":
                 return {"programs": ""}
 
@@ -63,7 +69,8 @@ def contestant(path: Path) -> Contestant:
     if os.path.lexists(path / WEIGHTS_FILE):
         check_checkpoint(path)
         return Contestant(kind="policy", folder=path.resolve())
-    if (path / EXPERT_FILE).is_file() and (path / EXPERT_WEIGHTS_FILE).is_file():
+    is_network = (path / EXPERT_FILE).is_file() and (path / EXPERT_WEIGHTS_FILE).is_file()
+    if is_network or (path / PROGRAM_FILE).is_file():
         return Contestant(kind="expert", folder=path.resolve())
     raise V2PError(
         f"{path} holds no {WEIGHTS_FILE}: it is no LeRobot policy. It holds no {EXPERT_FILE} either: it is no expert;"
@@ -143,8 +150,10 @@ def _policy(folder: Path, device: str) -> Play:
 
 def _expert(folder: Path) -> Play:
     from policies.ppo.policy import Expert
-    from v2p_data.evaluation.actors import ExpertActor
+    from v2p_data.evaluation.actors import ExpertActor, ProgramActor
 
+    if (name := program_in(folder)) is not None:
+        return lambda bundle: (ProgramActor(0, name), UNSEEN_PX)
     try:
         expert = Expert.load(folder)
     except ValueError as error:

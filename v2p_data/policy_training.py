@@ -88,8 +88,9 @@ def make_distillation(
 ) -> dict[str, Any]:
     """Let a student act, the expert label and take over, and train on, in rounds."""
     from policies.bc.trainer import TrainerConfig
-    from policies.ppo.policy import Expert
     from v2p_data.distillation.rounds import Lesson, demand_masks, distill
+    from v2p_data.episodes.rollouts import InWorlds
+    from v2p_data.experts.labeller import labeller_of
     from v2p_data.task.task import TaskBundle
 
     del inputs
@@ -115,7 +116,9 @@ def make_distillation(
 
         distilled = distill(
             {
-                s.item: Lesson(bundle=TaskBundle.load(s.task), expert=Expert.load(s.expert).act)
+                s.item: Lesson(
+                    bundle=TaskBundle.load(s.task), expert=InWorlds(labeller_of(s.expert))
+                )
                 for s in sources
             },
             student,

@@ -2,6 +2,7 @@
 
     video --> scene --> task --> (reward -->) expert --> episodes --+--> dataset --> (distillation -->) policy --> evaluation
     video --> scene --> task --> (reward -->) expert --> episodes --+
+          (cousin --> task --> ...) -----------------------------------+
 
 Each stage is a recipe and inputs (what it is) and a `make_*` function (how it comes about). A `make_*` loads
 its inputs, calls the craft, saves, and returns the counts that the record keeps. Heavy libraries are imported
@@ -35,7 +36,7 @@ from v2p_data.pipeline.artifact import (
     write_json_atomically,
 )
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
-from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.pipeline.runner import Runtime, Stage, in_order
 from v2p_data.policy_config import PolicyConfig
 from v2p_data.policy_training import (
     POLICY_FOLDER,
@@ -60,6 +61,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 ROOT_OF_TASKS = CARRIED_TASKS.as_posix()
+COUSIN_MARK = "_cousin_"
+"""Between a scene's item and the number of its cousin."""
 MODEL_CALLS_FOLDER = "vlm"
 """Of a run: everything that a language model was asked and answered."""
 SOLVED_POOL_FOLDER = "pool"
@@ -77,11 +80,24 @@ class SimulatorConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CousinsConfig:
+    """How many relatives of each reconstructed object become tasks of their own."""
+
+    count: int = 0
+    """Cousins of each scene; 0: none. A third is under 15 mm thick, a third over 150 mm high."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.count <= 300:
+            raise ValueError(f"count must be between 0 and 300, got {self.count}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class EngineConfig:
     """Everything that decides what the engine makes."""
 
     video: VideoConfig = field(default_factory=VideoConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
+    cousins: CousinsConfig = field(default_factory=CousinsConfig)
     task: TaskConfig = field(default_factory=TaskConfig)
     sim: SimulatorConfig = field(default_factory=SimulatorConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -157,6 +173,37 @@ def make_scene(
         "kind": scene.kind,
         "confidence": round(scene.confidence, 3),
     }
+
+
+# --- scene -> cousin (with --cousins.count above 0) --------------------------------------------------------------
+
+
+def cousin_stage(scene: Stage, number: int, cfg: EngineConfig) -> Stage:
+    """Return the stage that makes another scene of one: with a relative of its manipulated object."""
+    robot = cfg.sim.robot
+    return Stage(
+        name="cousin",
+        item=f"{scene.item}{COUSIN_MARK}{number:03d}",
+        config=Seeded(config={"number": number}, seed=cfg.seed),
+        inputs={"scene": scene},
+        sources=_robot_digests(robot),
+        make=partial(make_cousin, robot=robot),
+    )
+
+
+def make_cousin(
+    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime, *, robot: RobotConfig
+) -> dict[str, Any]:
+    """Stretch mesh and convex parts, draw mass and friction, write the scene."""
+    from v2p_data.scene.export import write_relative
+    from v2p_data.scene.scene import Scene
+    from v2p_data.sim.cousins import cousin_of
+
+    del runtime
+    scene, number = Scene.load(inputs["scene"]), cfg.config["number"]
+    thing, mesh, parts = cousin_of(scene, number, cfg.seed, robot)
+    write_relative(scene, f"{scene.title}{COUSIN_MARK}{number:03d}", thing, mesh, parts, out)
+    return {"size_m": list(thing.size_m), "mass_kg": round(thing.mass_kg, 4)}
 
 
 # --- scene -> task -------------------------------------------------------------------------------------------
@@ -323,9 +370,10 @@ def make_expert(
     teaches_model: bool,
     bonus_ratio: float,
 ) -> dict[str, Any]:
-    """Find a teacher, imitate it, go on with PPO; judge with the independent referee."""
-    from policies.ppo.policy import Expert
+    """Find a teacher, imitate it, go on with PPO, or let it act itself; judge with the independent referee."""
     from v2p_data.episodes.collect import judge_expert
+    from v2p_data.episodes.rollouts import InWorlds
+    from v2p_data.experts.labeller import choose_program, labeller_of
     from v2p_data.experts.learning import Worlds, learn
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.task_check import check_reward, check_task
@@ -342,19 +390,21 @@ def make_expert(
         num_threads=runtime.num_threads,
         bonus_ratio=bonus_ratio,
     )
-    learned = learn(
-        worlds,
-        expert_cfg,
-        out,
-        device=runtime.device,
-        solved=find_solved(warm_start) if warm_start else (),
-        on_progress=lambda share, words: runtime.progress(0.95 * share, words),
-    )
-    expert = Expert.load(out)
+    if expert_cfg.teacher == "as_expert":
+        learned = choose_program(worlds, expert_cfg, out)
+    else:
+        learned = learn(
+            worlds,
+            expert_cfg,
+            out,
+            device=runtime.device,
+            solved=find_solved(warm_start) if warm_start else (),
+            on_progress=lambda share, words: runtime.progress(0.95 * share, words),
+        )
     runtime.progress(0.95, "judging at the fine step")
     judged = judge_expert(
         bundle,
-        expert.act,
+        InWorlds(labeller_of(out)),
         episodes=expert_cfg.eval_episodes,
         seed=seed_for(cfg.seed, "expert-evaluation", bundle.title),
         num_threads=runtime.num_threads,
@@ -401,14 +451,15 @@ def make_episodes(
     cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
 ) -> dict[str, Any]:
     """Stage successful episodes one by one; list the failed ones."""
-    from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import collect
+    from v2p_data.episodes.rollouts import InWorlds
+    from v2p_data.experts.labeller import labeller_of
     from v2p_data.task.task import TaskBundle
 
     bundle = TaskBundle.load(inputs["task"])
     collected = collect(
         bundle,
-        Expert.load(inputs["expert"]).act,
+        InWorlds(labeller_of(inputs["expert"])),
         cfg.config,
         out,
         seed=seed_for(cfg.seed, "episodes", bundle.title),
@@ -654,6 +705,22 @@ def make_evaluation(
 
 
 # --- all of it -----------------------------------------------------------------------------------------------
+
+
+def with_cousins(stage: Stage, cfg: EngineConfig) -> list[Stage]:
+    """Return a stage that a scene leads to, and the same one of each of the scene's cousins."""
+    if not cfg.cousins.count:
+        return [stage]
+    scene = next(s for s in in_order([stage]) if s.name == "scene")
+    cousins = (cousin_stage(scene, k, cfg) for k in range(cfg.cousins.count))
+    return [stage, *(_of_cousin(stage, cousin) for cousin in cousins)]
+
+
+def _of_cousin(stage: Stage, cousin: Stage) -> Stage:
+    if stage.name == "scene":
+        return cousin
+    inputs = {name: _of_cousin(needed, cousin) for name, needed in stage.inputs.items()}
+    return replace(stage, item=cousin.item, inputs=inputs)
 
 
 def chain(video: VideoItem, cfg: EngineConfig) -> Stage:

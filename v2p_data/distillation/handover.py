@@ -5,7 +5,6 @@ with what the expert would do there, so `action` is the expert's throughout, als
 episodes that end in success are kept: the expert's labels in hopeless states teach nothing.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,15 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.rollouts import CutConfig, EpisodeEnds
+from v2p_data.episodes.rollouts import Act, CutConfig, EpisodeEnds, InWorlds
 from v2p_data.seeds import rng_for
 from v2p_data.sim.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.masks import MaskRenderer
 from v2p_data.sim.randomize import RandomizationConfig
 from v2p_data.sim.verdict import Course
 from v2p_data.task.task import TaskBundle
-
-ExpertAct = Callable[[Float32[np.ndarray, "env obs"]], Float32[np.ndarray, "env act"]]
 
 
 @runtime_checkable
@@ -64,7 +61,7 @@ class Handovers:
 
 def hand_over(
     bundle: TaskBundle,
-    expert: ExpertAct,
+    expert: Act | InWorlds,
     student: ActingStudent,
     cfg: DistillationConfig,
     *,
@@ -78,7 +75,7 @@ def hand_over(
 
     Args:
         bundle: the task.
-        expert: the deterministic expert.
+        expert: the deterministic expert, or whoever acts in the worlds themselves.
         student: the policy that begins.
         cfg: when the expert takes over, and how long an episode may last.
         seed: of everything that is drawn.
@@ -101,6 +98,7 @@ def hand_over(
     params = tuple(env.episode_params(k) for k in range(n))
     course = Course(env)
     course.restart()
+    acts = expert.begin(env) if isinstance(expert, InWorlds) else expert
     student.reset(bundle.description)
     obs = env.observe()
     labels = np.zeros((n, size_px, size_px), np.uint8)
@@ -114,7 +112,7 @@ def hand_over(
             snapshot = env.snapshot(going)
             labels[going] = renderer.draw_many([(snapshot, k) for k in range(len(going))])
             state = env.robot_state()
-            label = np.clip(np.asarray(expert(obs), np.float32), -1.0, 1.0)
+            label = np.clip(np.asarray(acts(obs), np.float32), -1.0, 1.0)
             action = label
             if (is_students := (t < takeover) & is_going).any():
                 action = np.where(is_students[:, None], student.act(labels, state), label)

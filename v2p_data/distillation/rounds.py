@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.distillation.handover import ActingStudent, ExpertAct, Handovers, hand_over
+from v2p_data.distillation.handover import ActingStudent, Handovers, hand_over
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
+from v2p_data.episodes.rollouts import Act, InWorlds
 from v2p_data.episodes.staging import Episode, refusals_told, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.json_files import read_object
@@ -68,7 +69,7 @@ class Lesson:
     """One task and who can do it."""
 
     bundle: TaskBundle
-    expert: ExpertAct
+    expert: Act | InWorlds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,6 +289,7 @@ def _stage(
         Episode(
             id=episode_id,
             item=bundle.title,
+            family=bundle.scene.family,
             task=bundle.description,
             seed=handovers.seed,
             labels=labels,

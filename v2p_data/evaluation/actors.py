@@ -84,12 +84,13 @@ class ProgramActor:
 
     Args:
         seed: of the trials.
+        name: of the program, where it is known already.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, name: str = "") -> None:
         self._seed = seed
         self._teacher: Teacher | None = None
-        self.name = ""
+        self.name = name
         """Of the program."""
 
     def begin(self, env: BatchEnv) -> None:
