@@ -45,6 +45,12 @@ class PolicyConfig:
     """Entries of the robot's state that are used, from the first on: 7 leaves the controller's command out."""
     learning_rate: float = 3e-4
     """Of everything but a pretrained backbone."""
+    weight_decay: float = 1e-4
+    """Of AdamW; more, as the next two, keeps a policy from fitting its objects too closely."""
+    mask_jitter_px: float = 0.0
+    """In training each mask is moved, grown or shrunk at random by up to this many pixels, as its moments tell."""
+    moments_dropout: float = 0.0
+    """In training this share of the masks' moments is hidden."""
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.batch_size < 1 or self.checkpoints < 1 or self.epochs < 0:
@@ -96,4 +102,7 @@ class PolicyConfig:
             "n_action_steps": self.n_action_steps,
             "state_entries": self.state_entries,
             "optimizer_lr": self.learning_rate,
+            "optimizer_weight_decay": self.weight_decay,
+            "mask_jitter_px": self.mask_jitter_px,
+            "moments_dropout": self.moments_dropout,
         }

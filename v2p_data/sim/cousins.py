@@ -42,8 +42,6 @@ TURNED, LEANING = 0.3, 0.3
 LEAN = 0.35
 """Sideways per upward, at most."""
 TRIES = 40
-APART = 0.1
-"""Two shapes differ if one extent does by so much [logarithm], or one of them leans or lies otherwise."""
 
 
 @dataclass(frozen=True, kw_only=True)
