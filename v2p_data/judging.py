@@ -4,6 +4,7 @@ All of them go through the same judge, so an expert's and a program's rates say 
 """
 
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.seeds import seed_for
 from v2p_data.task.reset_audit import has_own_reset
-from v2p_data.task.task import TaskBundle
+from v2p_data.task.task import TASK_FILE, TaskBundle
 
 PROGRAMS = "programs"
 """What `v2p eval` is told in a policy's place for the scripted programs."""
@@ -165,3 +166,21 @@ def _programs(seed: int) -> Play:
     from v2p_data.evaluation.actors import ProgramActor
 
     return lambda bundle: (ProgramActor(seed_for(seed, "programs", bundle.title)), UNSEEN_PX)
+
+
+def task_folders(folder: Path) -> dict[str, Path]:
+    """Return the task folders at or below `folder` by name.
+
+    Raises:
+        V2PError: there is none.
+    """
+    if (folder / TASK_FILE).is_file():
+        return {_item_name(folder): folder}
+    found = {_item_name(p.parent): p.parent for p in sorted(folder.glob(f"*/{TASK_FILE}"))}
+    if not found:
+        raise V2PError(f"{folder} holds no task; tasks are the folders with a {TASK_FILE}")
+    return found
+
+
+def _item_name(folder: Path) -> str:
+    return re.sub(r"-[0-9a-f]{8}$", "", folder.name)

@@ -1,6 +1,7 @@
 """Settings of the policy stage, without the libraries that train."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 Preset = Literal["custom", "small", "paper"]
@@ -26,6 +27,9 @@ class PolicyConfig:
     most is kept. 1: the end, unjudged."""
     judge_episodes: int = 32
     """Episodes a task that judge a checkpoint, on seeds of their own."""
+    judge_tasks: Path | None = None
+    """Folder of tasks that judge checkpoints instead of the dataset's own: of objects that nobody trains on, and that no
+    evaluation reports."""
 
     encoder: Literal["resnet18", "conv", "none"] = "resnet18"
     """Of the whole picture; see `policies/bc/configuration_v2p_bc.py`, as the next ones."""
@@ -57,6 +61,10 @@ class PolicyConfig:
             raise ValueError(
                 "steps, batch_size and checkpoints must be at least 1, epochs 0 or more"
             )
+        if self.judge_tasks is not None and self.checkpoints == 1:
+            raise ValueError(
+                "judge_tasks choose among checkpoints, and checkpoints is 1; raise it to 2 or more"
+            )
         if not 1 <= self.n_action_steps <= self.chunk_size:
             raise ValueError(
                 f"n_action_steps must lie between 1 and chunk_size ({self.chunk_size}), got {self.n_action_steps}"
@@ -81,6 +89,7 @@ class PolicyConfig:
             epochs=usual.epochs,
             checkpoints=usual.checkpoints,
             judge_episodes=usual.judge_episodes,
+            judge_tasks=None,
         )
 
     def num_steps(self, num_frames: int) -> int:

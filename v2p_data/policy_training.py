@@ -169,6 +169,7 @@ def make_policy(
     dataset: Path,
     repo_id: str,
     sources: Sequence[Source],
+    judges: Mapping[str, Path] | None = None,
 ) -> dict[str, Any]:
     """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
     from policies.bc.trainer import TrainerConfig, write_train_config
@@ -177,6 +178,7 @@ def make_policy(
 
     demand_whole_sources(dataset, sources, runtime.root)
     policy: PolicyConfig = cfg.config.resolved
+    judges = judges or {source.item: source.task for source in sources}
     seed = seed_for(cfg.seed, "policy")
     distilled = inputs.get("distillation")
     runtime.progress(0.0, "reading the frames")
@@ -197,8 +199,8 @@ def make_policy(
             recipe,
             out,
             seed=seed % 2**63,
-            judge=checkpoint_judge(student, sources, policy.judge_episodes, seed, runtime)
-            if policy.checkpoints > 1 and sources
+            judge=checkpoint_judge(student, judges, policy.judge_episodes, seed, runtime)
+            if policy.checkpoints > 1 and judges
             else None,
             on_progress=runtime.progress,
         )
@@ -271,14 +273,14 @@ class StudentActor:
 
 
 def checkpoint_judge(
-    student: "Student", sources: Sequence[Source], episodes: int, seed: int, runtime: Runtime
+    student: "Student", tasks: Mapping[str, Path], episodes: int, seed: int, runtime: Runtime
 ) -> Callable[[Any], float]:
-    """Return what gives a policy's mean success rate over tasks, on seeds that no evaluation uses."""
+    """Return what gives a policy's mean success rate over task folders, on seeds that no evaluation uses."""
     from v2p_data.evaluation.batch import judge
     from v2p_data.evaluation.config import EvaluationConfig
     from v2p_data.task.task import TaskBundle
 
-    bundles = {source.item: TaskBundle.load(source.task) for source in sources}
+    bundles = {item: TaskBundle.load(folder) for item, folder in tasks.items()}
     cfg = EvaluationConfig(episodes=episodes, worlds=episodes, at_end=False)
 
     def rate(policy: Any) -> float:

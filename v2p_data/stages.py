@@ -27,7 +27,15 @@ from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.solved import find_solved, solved_digests
-from v2p_data.judging import PROGRAMS, Contestant, judge_task, own_reset_rate, play_of, row_of
+from v2p_data.judging import (
+    PROGRAMS,
+    Contestant,
+    judge_task,
+    own_reset_rate,
+    play_of,
+    row_of,
+    task_folders,
+)
 from v2p_data.pipeline.artifact import (
     Record,
     demand_whole,
@@ -197,11 +205,11 @@ def make_cousin(
     """Stretch mesh and convex parts, draw mass and friction, write the scene."""
     from v2p_data.scene.export import write_relative
     from v2p_data.scene.scene import Scene
-    from v2p_data.sim.cousins import cousin_of
+    from v2p_data.sim.cousins import cousin_of, opening_m_of
 
     del runtime
     scene, number = Scene.load(inputs["scene"]), cfg.config["number"]
-    thing, mesh, parts = cousin_of(scene, number, cfg.seed, robot)
+    thing, mesh, parts = cousin_of(scene, number, cfg.seed, opening_m_of(robot))
     write_relative(scene, f"{scene.title}{COUSIN_MARK}{number:03d}", thing, mesh, parts, out)
     return {"size_m": list(thing.size_m), "mass_kg": round(thing.mass_kg, 4)}
 
@@ -580,22 +588,35 @@ def distilled_dataset_stage(
 def policy_stage(
     dataset: Path, record: Record, cfg: EngineConfig, sources: Sequence[Source] = ()
 ) -> Stage:
-    """Return the stage that trains a policy on a finished dataset, after a distillation where there are experts."""
+    """Return the stage that trains a policy on a finished dataset, after a distillation where there are experts.
+
+    Raises:
+        V2PError: there are no tasks to judge checkpoints, or the policy learns from one of them.
+    """
+    judges = task_folders(cfg.policy.judge_tasks) if cfg.policy.judge_tasks else {}
+    digests = {f"judge {name}": _code_digest(path) for name, path in judges.items()}
+    known = {_code_digest(source.task) for source in sources}
+    if seen := [name for name in judges if digests[f"judge {name}"] in known]:
+        raise V2PError(
+            f"--policy.judge-tasks={cfg.policy.judge_tasks} holds {', '.join(seen)}, which the policy learns from; "
+            "checkpoints are to be judged on tasks of other objects"
+        )
     inputs: dict[str, Stage] = {}
     if sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
         inputs["distillation"] = distillation_stage(dataset, record, cfg, sources)
     return Stage(
         name="policy",
         item=record.item,
-        config=Seeded(config=cfg.policy, seed=cfg.seed),
+        config=Seeded(config=replace(cfg.policy, judge_tasks=None), seed=cfg.seed),
         inputs=inputs,
-        sources={"dataset": f"{record.item}-{record.fingerprint}"},
+        sources={"dataset": f"{record.item}-{record.fingerprint}"} | digests,
         version=2,
         make=partial(
             make_policy,
             dataset=dataset,
             repo_id=str(record.counts["repo_id"]),
             sources=tuple(sources),
+            judges=judges,
         ),
         resumes=True,
     )

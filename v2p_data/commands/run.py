@@ -1,7 +1,6 @@
 """Commands that make things: the whole chain, or up to one stage."""
 
 import os
-import re
 import shlex
 import sys
 from collections import Counter
@@ -24,7 +23,7 @@ from v2p_data.commands.display import (
 )
 from v2p_data.episodes.repo_id import check_repo_id, is_repo_id
 from v2p_data.errors import NotAllError, V2PError
-from v2p_data.judging import PROGRAMS, Contestant, contestant
+from v2p_data.judging import PROGRAMS, Contestant, contestant, task_folders
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
 from v2p_data.pipeline.contents import list_files, memory_of
 from v2p_data.pipeline.fingerprint import fingerprint
@@ -443,20 +442,6 @@ def _record_to_train(dataset: Path, root: Path) -> tuple[Record, bool]:
     ), False  # fmt: skip
 
 
-def task_folders(folder: Path) -> dict[str, Path]:
-    """Return the task folders at or below `folder` by name.
-
-    Raises:
-        V2PError: there is none.
-    """
-    if (folder / TASK_FILE).is_file():
-        return {_item_name(folder): folder}
-    found = {_item_name(p.parent): p.parent for p in sorted(folder.glob(f"*/{TASK_FILE}"))}
-    if not found:
-        raise V2PError(f"{folder} holds no task; tasks are the folders with a {TASK_FILE}")
-    return found
-
-
 def _home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
     """Return the run folder that a policy or an expert lies in; of the programs, the one that the tasks lie in.
 
@@ -494,10 +479,6 @@ def _more(row: dict[str, Any]) -> str:
         words += f"; from the task's own starts {row['own_reset']['rate']:.0%}"
     failures = [f"{kind.replace('_', ' ')} {n}" for kind, n in row.get("failures", {}).items()]
     return words + (f"; failures: {', '.join(failures)}" if failures else "")
-
-
-def _item_name(folder: Path) -> str:
-    return re.sub(r"-[0-9a-f]{8}$", "", folder.name)
 
 
 def _unseen_tasks(

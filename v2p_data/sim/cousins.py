@@ -19,7 +19,7 @@ from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
 from v2p_data.sim.arms import RobotConfig, read_arm
-from v2p_data.sim.robot import FINGER_TRAVEL_M, PhysicsConfig, ServoConfig
+from v2p_data.sim.robot import FINE, FINGER_TRAVEL_M, ServoConfig
 from v2p_data.sim.solids import read_mesh, solids_of
 from v2p_data.sim.suitability import GRIP_MARGIN_M, MIN_THICKNESS_M, narrowest_m
 
@@ -58,13 +58,20 @@ class Cousin:
     friction: float
 
 
+def opening_m_of(robot: RobotConfig) -> float:
+    """Return the distance between the open pads."""
+    if robot.path is None:
+        return 2 * FINGER_TRAVEL_M
+    return 2 * read_arm(robot, FINE, ServoConfig()).finger_travel_m
+
+
 def demand_kind(kind: Kind) -> None:
     """Refuse kinds of task that ask for one shape.
 
     Raises:
         ItemRejectedError: `no_cousins`.
     """
-    if KINDS[kind].needs_hollow or KINDS[kind].touches:
+    if KINDS[kind].needs_hollow:
         raise ItemRejectedError(
             "no_cousins",
             f"a task of kind '{kind}' asks that two objects fit each other, so a stretched one has no sense; "
@@ -95,15 +102,15 @@ def draw(thing: SceneObject, form: Form, rng: np.random.Generator, opening_m: fl
         lean[sides, up] = rng.uniform(-LEAN, LEAN, 2)
         shape = lean @ shape
     old = np.abs(shape) @ np.array(thing.size_m)
-    widest = opening_m - GRIP_MARGIN_M - 0.004
+    widest = opening_m - 2 * GRIP_MARGIN_M
     size = np.empty(3)
     if form == "alike":
-        size = old * np.exp(rng.uniform(*np.log(ALIKE), 3))
+        size = old * np.exp(rng.uniform(*np.log(ALIKE), size=3))
         size[up] = max(size[up], MIN_THICKNESS_M)
     else:
         size[up] = rng.uniform(*(LOW_M if form == "low" else TALL_M))
         across, along = sides if rng.random() < 0.5 else sides[::-1]
-        least = 0.03 if form == "tall" or thing.hollow else NARROWEST_M
+        least = min(0.03 if form == "tall" or thing.hollow else NARROWEST_M, widest)
         size[across] = np.exp(rng.uniform(*np.log((least, widest))))
         shortest = max(size[across], LOW_LENGTH_M if form == "low" else 0.0)
         size[along] = np.exp(rng.uniform(*np.log((shortest, LONGEST_M))))
@@ -135,7 +142,7 @@ def mapped(
 
 
 def cousin_of(
-    scene: Scene, number: int, seed: int, robot: RobotConfig | None = None
+    scene: Scene, number: int, seed: int, opening_m: float = 2 * FINGER_TRAVEL_M
 ) -> tuple[SceneObject, trimesh.Trimesh, tuple[trimesh.Trimesh, ...]]:
     """Return cousin `number` of a scene's manipulated object, with mesh and convex parts, in the object's frame.
 
@@ -143,7 +150,7 @@ def cousin_of(
         scene: whose object it is.
         number: from 0; decides the form.
         seed: of the draws.
-        robot: whose gripper takes it; None: the built-in one.
+        opening_m: distance between the open pads.
 
     Raises:
         ItemRejectedError: `no_cousins` of this kind, `open_mesh`, or `too_few_shapes` that the gripper takes.
@@ -159,11 +166,11 @@ def cousin_of(
             "out with --cousins.count=0",
         )
     R = Rotation.from_quat(thing.laid_pose[3:], scalar_first=True).as_matrix() if thing.poses_world else np.eye(3)  # fmt: skip
-    opening_m = _opening_m(robot)
     must_fit = KINDS[scene.kind].must_grasp and not thing.hollow
     form = FORMS[number % len(FORMS)]
     rng = rng_for(seed, "cousin", scene.title, number)
-    for _ in range(TRIES):
+    width = NARROWEST_M
+    for _ in range(TRIES if opening_m > NARROWEST_M + 2 * GRIP_MARGIN_M else 0):
         cousin = draw(thing, form, rng, opening_m)
         new_mesh, new_parts = mapped(cousin, mesh, parts)
         width = min(narrowest_m(np.asarray(p.vertices) @ R.T) for p in new_parts)
@@ -172,7 +179,7 @@ def cousin_of(
     else:
         raise ItemRejectedError(
             "too_few_shapes",
-            f"none of {TRIES} '{form}' cousins of {where} is narrow enough for the gripper, which opens by "
+            f"no '{form}' one of {TRIES} cousins of {where} is narrow enough for the gripper, which opens by "
             f"{opening_m * 1000:.0f} mm",
             width,
         )
@@ -189,14 +196,10 @@ def _solid(
     path = scene.folder / thing.mesh
     ready = [scene.folder / part for part in thing.parts]
     solids = solids_of(path, thing.name, thing.size_m, ready=ready)
-    return read_mesh(path, thing.name), solids.parts
-
-
-def _opening_m(robot: RobotConfig | None) -> float:
-    """Return the distance between the open pads."""
-    if robot is None or robot.path is None:
-        return 2 * FINGER_TRAVEL_M
-    return 2 * read_arm(robot, PhysicsConfig(), ServoConfig()).finger_travel_m
+    mesh = read_mesh(path, thing.name)
+    mesh.apply_translation(-mesh.bounds.mean(0))
+    mesh.apply_transform(np.diag([*(np.asarray(thing.size_m) / mesh.extents), 1.0]))
+    return mesh, solids.parts
 
 
 def _described(
