@@ -10,7 +10,6 @@ from pathlib import Path
 
 from policies.ppo.policy import EXPERT_FILE, WEIGHTS_FILE
 from v2p_data.errors import V2PError
-from v2p_data.experts.labeller import program_in
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import demand_whole, read_record
 from v2p_data.pipeline.contents import damaged
@@ -38,8 +37,10 @@ def find_solved(runs: Path) -> list[Solved]:
     found: list[Solved] = []
     for folder in sorted(runs.glob("expert/*")):
         record = read_record(folder)
-        if record is None or record.rejected is not None or program_in(folder) is not None:
-            continue  # a program has no weights to start from
+        if record is None or record.rejected is not None:
+            continue
+        if (record.counts.get("learning") or {}).get("kept") == "program":
+            continue  # it has no weights to start from
         places = (runs / stage / record.inputs.get("task", "") for stage in ("task", "reward"))
         task = next((place for place in places if place.is_dir()), None)
         if task is None:
