@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """Cousins of an object: shapes that the laws of affine maps hold for, that a gripper takes, and whose files agree."""
 
 import xml.etree.ElementTree as ET
