@@ -2,6 +2,7 @@
 
     video --> scene --> task --> (reward -->) expert --> episodes --+--> dataset --> (distillation -->) policy --> evaluation
     video --> scene --> task --> (reward -->) expert --> episodes --+
+          (cousin --> task --> ...) -----------------------------------+
 
 Each stage is a recipe and inputs (what it is) and a `make_*` function (how it comes about). A `make_*` loads
 its inputs, calls the craft, saves, and returns the counts that the record keeps. Heavy libraries are imported
@@ -31,6 +32,7 @@ from v2p_data.evaluation.judging import (
     own_reset_rate,
     play_of,
     row_of,
+    task_folders,
 )
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.solved import find_solved, solved_digests
@@ -42,7 +44,7 @@ from v2p_data.pipeline.artifact import (
     write_json_atomically,
 )
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
-from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.pipeline.runner import Runtime, Stage, in_order
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.policy.training import (
     POLICY_FOLDER,
@@ -67,6 +69,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 ROOT_OF_TASKS = CARRIED_TASKS.as_posix()
+COUSIN_MARK = "_cousin_"
+"""Between a scene's item and the number of its cousin."""
 MODEL_CALLS_FOLDER = "vlm"
 """Of a run: everything that a language model was asked and answered."""
 SOLVED_POOL_FOLDER = "pool"
@@ -84,11 +88,24 @@ class SimulatorConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CousinsConfig:
+    """How many relatives of each reconstructed object become tasks of their own."""
+
+    count: int = 0
+    """Cousins of each scene; 0: none. A third is under 15 mm thick, a third over 150 mm high."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.count <= 300:
+            raise ValueError(f"count must be between 0 and 300, got {self.count}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class EngineConfig:
     """Everything that decides what the engine makes."""
 
     video: VideoConfig = field(default_factory=VideoConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
+    cousins: CousinsConfig = field(default_factory=CousinsConfig)
     task: TaskConfig = field(default_factory=TaskConfig)
     sim: SimulatorConfig = field(default_factory=SimulatorConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -164,6 +181,37 @@ def make_scene(
         "kind": scene.kind,
         "confidence": round(scene.confidence, 3),
     }
+
+
+# --- scene -> cousin (with --cousins.count above 0) --------------------------------------------------------------
+
+
+def cousin_stage(scene: Stage, number: int, cfg: EngineConfig) -> Stage:
+    """Return the stage that makes another scene of one: with a relative of its manipulated object."""
+    robot = cfg.sim.robot
+    return Stage(
+        name="cousin",
+        item=f"{scene.item}{COUSIN_MARK}{number:03d}",
+        config=Seeded(config={"number": number}, seed=cfg.seed),
+        inputs={"scene": scene},
+        sources=_robot_digests(robot),
+        make=partial(make_cousin, robot=robot),
+    )
+
+
+def make_cousin(
+    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime, *, robot: RobotConfig
+) -> dict[str, Any]:
+    """Stretch mesh and convex parts, draw mass and friction, write the scene."""
+    from v2p_data.scene.export import write_relative
+    from v2p_data.scene.scene import Scene
+    from v2p_data.sim.model.cousins import cousin_of, opening_m_of
+
+    del runtime
+    scene, number = Scene.load(inputs["scene"]), cfg.config["number"]
+    thing, mesh, parts = cousin_of(scene, number, cfg.seed, opening_m_of(robot))
+    write_relative(scene, f"{scene.title}{COUSIN_MARK}{number:03d}", thing, mesh, parts, out)
+    return {"size_m": list(thing.size_m), "mass_kg": round(thing.mass_kg, 4)}
 
 
 # --- scene -> task -------------------------------------------------------------------------------------------
@@ -330,11 +378,10 @@ def make_expert(
     teaches_model: bool,
     bonus_ratio: float,
 ) -> dict[str, Any]:
-    """Find a teacher, imitate it, go on with PPO; judge with the independent referee."""
-    from policies.ppo.policy import Expert
+    """Find a teacher, imitate it, go on with PPO, or let it act itself; judge with the independent referee."""
     from v2p_data.episodes.collect import judge_expert
+    from v2p_data.experts.labeller import choose_program, labeller_of
     from v2p_data.experts.learning import Worlds, learn
-    from v2p_data.play import StateActor
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.env.task_check import check_reward, check_task
     from v2p_data.task.llm.pool import add_solved
@@ -350,19 +397,21 @@ def make_expert(
         num_threads=runtime.num_threads,
         bonus_ratio=bonus_ratio,
     )
-    learned = learn(
-        worlds,
-        expert_cfg,
-        out,
-        device=runtime.device,
-        solved=find_solved(warm_start) if warm_start else (),
-        on_progress=lambda share, words: runtime.progress(0.95 * share, words),
-    )
-    expert = Expert.load(out)
+    if expert_cfg.teacher == "as_expert":
+        learned = choose_program(worlds, expert_cfg, out)
+    else:
+        learned = learn(
+            worlds,
+            expert_cfg,
+            out,
+            device=runtime.device,
+            solved=find_solved(warm_start) if warm_start else (),
+            on_progress=lambda share, words: runtime.progress(0.95 * share, words),
+        )
     runtime.progress(0.95, "judging at the fine step")
     judged = judge_expert(
         bundle,
-        StateActor(expert.act),
+        labeller_of(out),
         episodes=expert_cfg.eval_episodes,
         seed=seed_for(cfg.seed, "expert-evaluation", bundle.title),
         num_threads=runtime.num_threads,
@@ -409,15 +458,14 @@ def make_episodes(
     cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
 ) -> dict[str, Any]:
     """Stage successful episodes one by one; list the failed ones."""
-    from policies.ppo.policy import Expert
     from v2p_data.episodes.collect import collect
-    from v2p_data.play import StateActor
+    from v2p_data.experts.labeller import labeller_of
     from v2p_data.task.task import TaskBundle
 
     bundle = TaskBundle.load(inputs["task"])
     collected = collect(
         bundle,
-        StateActor(Expert.load(inputs["expert"]).act),
+        labeller_of(inputs["expert"]),
         cfg.config,
         out,
         seed=seed_for(cfg.seed, "episodes", bundle.title),
@@ -538,22 +586,35 @@ def distilled_dataset_stage(
 def policy_stage(
     dataset: Path, record: Record, cfg: EngineConfig, sources: Sequence[Source] = ()
 ) -> Stage:
-    """Return the stage that trains a policy on a finished dataset, after a distillation where there are experts."""
+    """Return the stage that trains a policy on a finished dataset, after a distillation where there are experts.
+
+    Raises:
+        V2PError: there are no tasks to judge checkpoints, or the policy learns from one of them.
+    """
+    judges = task_folders(cfg.policy.judge_tasks) if cfg.policy.judge_tasks else {}
+    digests = {f"judge {name}": _code_digest(path) for name, path in judges.items()}
+    known = {_code_digest(source.task) for source in sources}
+    if seen := [name for name in judges if digests[f"judge {name}"] in known]:
+        raise V2PError(
+            f"--policy.judge-tasks={cfg.policy.judge_tasks} holds {', '.join(seen)}, which the policy learns from; "
+            "checkpoints are to be judged on tasks of other objects"
+        )
     inputs: dict[str, Stage] = {}
     if sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
         inputs["distillation"] = distillation_stage(dataset, record, cfg, sources)
     return Stage(
         name="policy",
         item=record.item,
-        config=Seeded(config=cfg.policy, seed=cfg.seed),
+        config=Seeded(config=replace(cfg.policy, judge_tasks=None), seed=cfg.seed),
         inputs=inputs,
-        sources={"dataset": f"{record.item}-{record.fingerprint}"},
+        sources={"dataset": f"{record.item}-{record.fingerprint}"} | digests,
         version=2,
         make=partial(
             make_policy,
             dataset=dataset,
             repo_id=str(record.counts["repo_id"]),
             sources=tuple(sources),
+            judges=judges,
         ),
         resumes=True,
     )
@@ -663,6 +724,22 @@ def make_evaluation(
 
 
 # --- all of it -----------------------------------------------------------------------------------------------
+
+
+def with_cousins(stage: Stage, cfg: EngineConfig) -> list[Stage]:
+    """Return a stage that a scene leads to, and the same one of each of the scene's cousins."""
+    if not cfg.cousins.count:
+        return [stage]
+    scene = next(s for s in in_order([stage]) if s.name == "scene")
+    cousins = (cousin_stage(scene, k, cfg) for k in range(cfg.cousins.count))
+    return [stage, *(_of_cousin(stage, cousin) for cousin in cousins)]
+
+
+def _of_cousin(stage: Stage, cousin: Stage) -> Stage:
+    if stage.name == "scene":
+        return cousin
+    inputs = {name: _of_cousin(needed, cousin) for name, needed in stage.inputs.items()}
+    return replace(stage, item=cousin.item, inputs=inputs)
 
 
 def chain(video: VideoItem, cfg: EngineConfig) -> Stage:

@@ -334,7 +334,8 @@ class _Run:
         return torch.cat(rows)
 
     def _descend(self, batch: dict[str, Any]) -> Tensor:
-        if self.policy.config.random_shift:
+        cfg = self.policy.config
+        if cfg.random_shift or cfg.mask_jitter_px or cfg.moments_dropout:
             torch.random.default_generator.manual_seed((self.seed ^ self.step) % 2**63)
         with self.autocast():
             loss, _ = self.policy(batch)

@@ -27,16 +27,18 @@ from v2p_data.policy.training import POLICY_FOLDER, sources_of
 from v2p_data.reward.programs import ProgramPolicy
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.stages import (
+    EngineConfig,
     Seeded,
     dataset_stage,
     episodes_stage,
     policy_stage,
     scene_stage,
     task_stage,
+    with_cousins,
 )
 from v2p_data.task.task import TaskBundle
 
-from .config import Arm, LiftingConfig, Source, source_of
+from .config import WITH_COUSINS, Arm, LiftingConfig, Source, source_of
 from .objects import (
     Candidate,
     candidate_of,
@@ -184,9 +186,10 @@ class Study:
         self.tell(f"{len(taken)} real clips join, {len(refused)} do not: {refused}")
         return taken
 
-    def _candidates(self, source: Source, numbers: Sequence[int]) -> list[Candidate | str]:
+    def _candidates(
+        self, source: Source, numbers: Sequence[int], engine: EngineConfig
+    ) -> list[Candidate | str]:
         """Return candidates by their places in the pool; a word where not even the clip could be drawn."""
-        engine = self.cfg.pool_engine
         if source == "toys":
             return [candidate_of(toy_stage(k, self.cfg.pool), engine) for k in numbers]
         real = self._real
@@ -202,12 +205,15 @@ class Study:
                 out.append("clip: not drawn")
         return out
 
-    def find(self, source: Source, count: int, seed: int) -> Found:
+    def find(
+        self, source: Source, count: int, seed: int, engine: EngineConfig | None = None
+    ) -> Found:
         """Return the first `count` usable objects of a seed's order: with a scene, a task, an expert and demonstrations.
 
         Raises:
             V2PError: the pool is too small.
         """
+        engine = engine or self.cfg.pool_engine
         order = self.order(source, seed)
         kept: list[tuple[Candidate, Stage]] = []
         rejected: Counter[str] = Counter()
@@ -219,9 +225,9 @@ class Study:
                     f"only {len(kept)} of {tried} {source} became tasks with an expert (rejected: {dict(rejected)}), and "
                     f"N is {count}; raise pool.{'toys' if source == 'toys' else 'clips'}"
                 )
-            found = self._candidates(source, numbers)
+            found = self._candidates(source, numbers, engine)
             stages = {
-                k: episodes_stage(c.task, c.expert, self.cfg.pool_engine)
+                k: episodes_stage(c.task, c.expert, engine)
                 for k, c in zip(numbers, found, strict=True)
                 if isinstance(c, Candidate)
             }
@@ -288,20 +294,26 @@ class Study:
     def _policy(self, arm: Arm, count: int, seed: int) -> tuple[Path, Row]:
         """Return the folder of a cell's policy, and what became of its training."""
         source = source_of(arm)
-        found = self.find(source, count, seed)
+        pool = self.cfg.pool_engine_of(arm)
+        found = self.find(source, count, seed, pool)
         engine = self.cfg.engine_for(arm, count, seed)
-        demonstrations = [self._demonstrations(arm, count, c) for c in found.candidates]
+        demonstrations = [
+            stage
+            for c in found.candidates
+            for stage in with_cousins(self._demonstrations(arm, count, c), pool)
+        ]
         rejected = dict(found.rejected)
-        if arm == "bc_cop":
+        if arm == "bc_cop" or arm in WITH_COUSINS:
             outcomes = self.run(demonstrations)
             bad = [s for s in demonstrations if not outcomes[s.folder_name].is_usable]
             reasons = Counter(rejected) + Counter(_why(s, outcomes) for s in bad)
             rejected = dict(reasons.most_common())
             demonstrations = [s for s in demonstrations if s not in bad]
         trajectories = engine.episodes.num_episodes
-        who = "cop" if arm == "bc_cop" else source
+        who = {"bc_cop": "cop"}.get(arm, arm if arm in WITH_COUSINS else source)
         repo = f"study/{who}_n{count}_s{seed}_t{trajectories}"
-        trained = [c.task.folder(self.root) for c in found.candidates]
+        tasks = [stage.inputs["task"] for stage in demonstrations]
+        trained = [task.folder(self.root) for task in tasks]
         demand_apart(trained, self._unseen_meshes[2])
         dataset = dataset_stage(demonstrations, repo)
         of_dataset = self.made(dataset)
@@ -315,8 +327,9 @@ class Study:
             name: [record_of(stage.folder(self.root)) for stage in stages]
             for name, stages in {
                 "scene": [c.scene for c in found.candidates],
-                "task": [c.task.inputs["task"] for c in found.candidates],
-                "expert": [c.expert for c in found.candidates],
+                "task": [task.inputs["task"] for task in tasks],
+                "expert": [s.inputs["expert"] for s in demonstrations if "expert" in s.inputs]
+                or [c.expert for c in found.candidates],
                 "episodes": demonstrations,
             }.items()
         }
@@ -325,7 +338,7 @@ class Study:
         }
         experts = [r.counts["success"]["rate"] for r in chains["expert"]]
         return policy.folder(self.root) / POLICY_FOLDER, {
-            "tasks": [c.item for c in found.candidates],
+            "tasks": [task.item for task in tasks],
             "tried": found.tried,
             "rejected": rejected,
             "expert": {
@@ -347,7 +360,7 @@ class Study:
 
     def _demonstrations(self, arm: Arm, count: int, candidate: Candidate) -> Stage:
         """Return the stage of one task's demonstrations."""
-        engine = replace(self.cfg.pool_engine, episodes=self.cfg.episodes_for(arm, count))
+        engine = replace(self.cfg.pool_engine_of(arm), episodes=self.cfg.episodes_for(arm, count))
         if arm != "bc_cop":
             return episodes_stage(candidate.task, candidate.expert, engine)
         return Stage(

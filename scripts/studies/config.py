@@ -4,9 +4,11 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from v2p_data.policy.config import PolicyConfig
-from v2p_data.stages import EngineConfig
+from v2p_data.stages import CousinsConfig, EngineConfig
 
-Arm = Literal["videos", "fixed_total", "toys", "bc", "bc_cop", "paper", "cop"]
+Arm = Literal[
+    "videos", "fixed_total", "toys", "bc", "bc_cop", "paper", "cop", "cousins", "toys_cousins"
+]
 ARMS: dict[Arm, str] = {
     "videos": "objects from videos, distillation; data grow with N",
     "fixed_total": "objects from videos, distillation; all data and all training together as at the smallest N",
@@ -15,8 +17,11 @@ ARMS: dict[Arm, str] = {
     "bc_cop": "objects from videos, demonstrations of Code-as-Policies, behaviour cloning only, same network",
     "paper": "objects from videos, behaviour cloning only, ResNet18 on two frames",
     "cop": "Code-as-Policies with our primitives on the simulator's states; learns nothing, hence without N",
+    "cousins": "objects from videos and stretched cousins of each, all labelled by the scripted program, distillation",
+    "toys_cousins": "random toys and stretched cousins of each, all labelled by the scripted program, distillation",
 }
 """What each arm trains on, and how."""
+WITH_COUSINS: tuple[Arm, ...] = ("cousins", "toys_cousins")
 Source = Literal["videos", "toys"]
 
 
@@ -74,6 +79,8 @@ class LiftingConfig:
     """Of subset, distillation, weights and evaluation."""
     pool: PoolConfig = field(default_factory=PoolConfig)
     unseen: UnseenConfig = field(default_factory=UnseenConfig)
+    cousins: int = 4
+    """Of each object, in the arms with cousins; an object and its cousins share the trajectories of one object."""
     max_training: float = 4.0
     """Gradient steps grow with the data up to this multiple of `engine`'s, which are those of the smallest N."""
     paper_policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(preset="paper"))
@@ -95,8 +102,12 @@ class LiftingConfig:
         """Return the engine's settings of a cell: what scales with N, and how its policy learns."""
         least = self.counts[0]
         engine, grown = self.engine, min(count / least, self.max_training)
+        share = 1.0
         if arm == "fixed_total":
             share, grown = least / count, 1.0
+        elif arm in WITH_COUSINS:
+            share = 1 / (1 + self.cousins)
+        if share < 1:
             engine = replace(
                 engine,
                 episodes=self.episodes_for(arm, count),
@@ -129,9 +140,13 @@ class LiftingConfig:
     def episodes_for(self, arm: Arm, count: int):  # noqa: ANN201 - the engine's own type
         """Return how demonstrations of one task are collected; a smaller number is the beginning of a larger one."""
         episodes = self.engine.episodes
-        if arm != "fixed_total":
+        if arm in WITH_COUSINS:
+            share = 1 / (1 + self.cousins)
+        elif arm == "fixed_total":
+            share = self.counts[0] / count
+        else:
             return episodes
-        wanted = max(1, round(episodes.num_episodes * self.counts[0] / count))
+        wanted = max(1, round(episodes.num_episodes * share))
         return replace(
             episodes, num_episodes=wanted, min_episodes=min(episodes.min_episodes, wanted)
         )
@@ -141,7 +156,19 @@ class LiftingConfig:
         """The settings of scenes, tasks, experts and demonstrations."""
         return replace(self.engine, seed=self.pool.seed)
 
+    def pool_engine_of(self, arm: Arm) -> EngineConfig:
+        """Return the settings up to the demonstrations of an arm's tasks: with cousins the program labels all of them."""
+        engine = self.pool_engine
+        if arm not in WITH_COUSINS:
+            return engine
+        return replace(
+            engine,
+            episodes=self.episodes_for(arm, self.counts[0]),
+            cousins=CousinsConfig(count=self.cousins),
+            expert=replace(engine.expert, teacher="as_expert"),
+        )
+
 
 def source_of(arm: Arm) -> Source:
     """Return where an arm's training objects come from."""
-    return "toys" if arm == "toys" else "videos"
+    return "toys" if arm in ("toys", "toys_cousins") else "videos"

@@ -19,7 +19,17 @@ from .fits import (
     rate,
 )
 
-COLOURS = ("#0072b2", "#56b4e9", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#555555")
+COLOURS = (
+    "#0072b2",
+    "#56b4e9",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#555555",
+    "#000000",
+    "#f0e442",
+)
 """Per arm; told apart with any kind of colour blindness (Okabe and Ito)."""
 LEAST_FAILURE = 0.003
 """Log axes know no zero."""

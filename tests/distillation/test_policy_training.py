@@ -17,8 +17,8 @@ from v2p_data.distillation import rounds
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.rounds import handover_episodes
 from v2p_data.episodes.collect import staged_episodes
-from v2p_data.episodes.dataset import packing
 from v2p_data.episodes.dataset.verify import verify
+from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_record
 from v2p_data.pipeline.runner import Outcome, Runtime
 from v2p_data.policy.config import PolicyConfig
@@ -311,3 +311,35 @@ def test_a_distillation_belongs_to_its_dataset(finished: Path):
     )
 
     assert one != other
+
+
+def test_checkpoints_are_not_judged_on_what_the_policy_learns_from(root: Path):
+    tasks = root / "task"
+    judged = replace(ENGINE, policy=replace(ENGINE.policy, checkpoints=2, judge_tasks=tasks))
+
+    with pytest.raises(V2PError, match="holds toy, which the policy learns from"):
+        stage_of(root, judged)
+
+
+def test_tasks_that_judge_checkpoints_are_known_by_their_code_and_not_by_their_place(
+    root: Path, tmp_path: Path
+):
+    def judged_by(folder: Path):
+        policy = replace(ENGINE.policy, checkpoints=2, judge_tasks=folder)
+        return stage_of(root, replace(ENGINE, policy=policy)).fingerprint
+
+    places = [tmp_path / "a" / "other", tmp_path / "b" / "other", tmp_path / "c" / "other"]
+    for place in places:
+        shutil.copytree(next((root / "task").iterdir()), place)
+        (place / "task.py").write_text((place / "task.py").read_text() + "# another object\n")
+    (places[2] / "task.py").write_text("# a third\n")
+
+    one, two, three = (judged_by(place.parent) for place in places)
+
+    assert one == two
+    assert len({one, three, stage_of(root).fingerprint}) == 3
+
+
+def test_tasks_without_checkpoints_to_judge_are_refused(tmp_path: Path):
+    with pytest.raises(ValueError, match="choose among checkpoints, and checkpoints is 1"):
+        PolicyConfig(judge_tasks=tmp_path)

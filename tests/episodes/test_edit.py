@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ import pytest
 
 from v2p_data.episodes.dataset.about import CARRIED_TASKS, TASK_PARTS
 from v2p_data.episodes.dataset.edit import drop, merge
+from v2p_data.episodes.dataset.features import EPISODE_COLUMN
+from v2p_data.episodes.dataset.tables import episodes_of
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
@@ -146,6 +149,23 @@ def test_provenance_of_both_is_kept(merged: Path):
     assert [s["repo_id"] for s in edit["sources"]] == ["user/toys", "user/more"]
     assert edit["sources"][0]["commit"] == "abc"
     assert "user/both" in (merged / "README.md").read_text()
+
+
+def test_the_family_of_an_episode_is_in_the_table_and_stays_through_merging(
+    packed: Path, make_episode, tmp_path: Path
+):
+    cousin = replace(
+        make_episode(7), id="toy_cousin_002_00007", item="toy_cousin_002", family="toy"
+    )
+    path = cousin.save(tmp_path)
+    pack([path], "user/cousins", tmp_path / "cousins", provenance={})
+
+    merged = merge([packed, tmp_path / "cousins"], "user/both", tmp_path / "both").root
+
+    assert Episode.load(path).family == "toy"
+    assert [e["family"] for e in about(merged)["episodes"]] == ["toy"] * 4
+    column = episodes_of(merged).column(EPISODE_COLUMN).to_pylist()
+    assert [json.loads(text)["family"] for text in column] == ["toy"] * 4
 
 
 def test_dropping_a_task_leaves_the_others_pixel_by_pixel(

@@ -27,7 +27,7 @@ from v2p_data.pipeline.runner import (
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Event
 from v2p_data.policy.config import PolicyConfig
-from v2p_data.stages import EngineConfig
+from v2p_data.stages import CousinsConfig, EngineConfig, episodes_stage, with_cousins
 from v2p_data.task.generate import TaskConfig
 
 ROOT = Path(__file__).parents[2]
@@ -115,6 +115,41 @@ def test_cloning_takes_as_many_gradient_steps_as_distillation_has_in_all(parts):
     assert distilled.distillation.rounds == 3
     assert cloned.policy.steps == 2 * (10 + 2 * 20 + 100)
     assert cfg.engine_for("paper", 10, 0).policy.preset == "paper"
+
+
+def test_an_object_and_its_cousins_share_the_data_of_one_object_and_one_labeller(parts):
+    engine = EngineConfig(
+        episodes=EpisodesConfig(num_episodes=100),
+        distillation=DistillationConfig(episodes=128, worlds=128),
+    )
+    cfg = parts.config.LiftingConfig(counts=(5, 10), cousins=3, engine=engine)
+
+    family, alone = cfg.engine_for("toys_cousins", 10, 0), cfg.engine_for("toys", 10, 0)
+
+    assert parts.config.source_of("toys_cousins") == "toys"
+    assert (family.episodes.num_episodes, family.distillation.episodes) == (25, 32)
+    assert family.policy.steps == alone.policy.steps
+    pool = cfg.pool_engine_of("cousins")
+    assert (pool.cousins.count, pool.expert.teacher) == (3, "as_expert")
+    assert cfg.pool_engine_of("videos") == cfg.pool_engine
+
+
+def test_each_cousin_goes_through_the_same_stages_as_its_scene(parts):
+    cfg = replace(EngineConfig(), cousins=CousinsConfig(count=2))
+    candidate = parts.objects.candidate_of(parts.objects.toy_stage(4, parts.config.PoolConfig()), cfg)  # fmt: skip
+
+    own, *cousins = with_cousins(episodes_stage(candidate.task, candidate.expert, cfg), cfg)
+
+    assert [c.item for c in cousins] == ["toy_0004_cousin_000", "toy_0004_cousin_001"]
+    for cousin in cousins:
+        names = [(stage.name, stage.item) for stage in in_order([cousin])]
+        assert names == [
+            ("scene", "toy_0004"),
+            *((n, cousin.item) for n in ("cousin", "task", "lift", "expert", "episodes")),
+        ]
+        assert cousin.inputs["expert"].inputs["task"] == cousin.inputs["task"]
+    assert len({stage.folder_name for stage in (own, *cousins)}) == 3
+    assert with_cousins(own, EngineConfig()) == [own]
 
 
 def test_counts_that_do_not_grow_are_refused(parts):

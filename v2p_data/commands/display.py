@@ -19,7 +19,7 @@ from v2p_data.pipeline.workers import Event
 PLAIN_EVERY_S = 15.0
 """Nobody waits longer for a word."""
 STAGE_ORDER = (
-    *("scene", "task", "reward", "expert", "episodes"),
+    *("scene", "cousin", "task", "reward", "expert", "episodes"),
     *("dataset", "distillation", "policy", "evaluation"),
 )
 

@@ -1,10 +1,10 @@
 """Commands that make things: the whole chain, or up to one stage."""
 
 import os
-import re
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +23,7 @@ from v2p_data.commands.display import (
 )
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.errors import NotAllError, V2PError
-from v2p_data.evaluation.judging import PROGRAMS, Contestant, contestant
+from v2p_data.evaluation.judging import PROGRAMS, Contestant, contestant, task_folders
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
 from v2p_data.pipeline.contents import list_files, memory_of
 from v2p_data.pipeline.fingerprint import fingerprint
@@ -33,6 +33,7 @@ from v2p_data.pipeline.workers import Key, only_run_in, run_stages
 from v2p_data.policy.training import sources_of
 from v2p_data.report.page import write_page
 from v2p_data.stages import (
+    COUSIN_MARK,
     EVALUATION_FILE,
     POLICY_FOLDER,
     ROOT_OF_TASKS,
@@ -46,6 +47,7 @@ from v2p_data.stages import (
     policy_stage,
     scene_stage,
     task_stage,
+    with_cousins,
 )
 from v2p_data.task.task import TASK_FILE, TaskBundle
 from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, read_footage
@@ -283,10 +285,11 @@ def generate(
     A new dataset takes those whose scene, task and expert are still as they were made.
     """
     _fetch_learned(cfg)
-    chains = [chain(video, cfg) for video in _videos(videos)]
+    chains = [c for video in _videos(videos) for c in with_cousins(chain(video, cfg), cfg)]
     outcomes = _run(chains, runtime)
     good = [c for c in chains if outcomes[(c.name, c.folder_name)].is_usable]
     good = [c for c in good if _record(c.folder(root)).counts.get("episodes", 0)]
+    _tell_cousins(outcomes.values())
     print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
     if good and stored_outcome(dataset_stage(good, repo_id), root) is None:
         usable = {key for key, outcome in outcomes.items() if outcome.is_usable}
@@ -439,20 +442,6 @@ def _record_to_train(dataset: Path, root: Path) -> tuple[Record, bool]:
     ), False  # fmt: skip
 
 
-def task_folders(folder: Path) -> dict[str, Path]:
-    """Return the task folders at or below `folder` by name.
-
-    Raises:
-        V2PError: there is none.
-    """
-    if (folder / TASK_FILE).is_file():
-        return {_item_name(folder): folder}
-    found = {_item_name(p.parent): p.parent for p in sorted(folder.glob(f"*/{TASK_FILE}"))}
-    if not found:
-        raise V2PError(f"{folder} holds no task; tasks are the folders with a {TASK_FILE}")
-    return found
-
-
 def _home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
     """Return the run folder that a policy or an expert lies in; of the programs, the one that the tasks lie in.
 
@@ -492,10 +481,6 @@ def _more(row: dict[str, Any]) -> str:
     return words + (f"; failures: {', '.join(failures)}" if failures else "")
 
 
-def _item_name(folder: Path) -> str:
-    return re.sub(r"-[0-9a-f]{8}$", "", folder.name)
-
-
 def _unseen_tasks(
     videos: Path, root: Path, cfg: EngineConfig, runtime: Runtime
 ) -> tuple[dict[str, Path], int]:
@@ -513,9 +498,12 @@ def _up_to(
     _fetch_learned(args.engine)
     with only_run_in(root):
         stages = [stage_of(video, args.engine) for video in _videos(args.videos)]
-        outcomes = _run(stages, args.how.runtime(root))
+        family = [s for stage in stages for s in with_cousins(stage, args.engine)]
+        outcomes = _run(stages if name == "scene" else family, args.how.runtime(root))
+        _tell_cousins(outcomes.values())
         page = _page(root)
     print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
+    stages = stages if name == "scene" else family
     counts = tally(list(outcomes.values()), name)
     rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
     out = shlex.quote(str(args.out))
@@ -528,10 +516,29 @@ def _up_to(
         goes_on += " --repo-id USER/NAME"
     _say(
         f"Made {root / name}",
-        f"{counts['usable']} of {len(stages)} videos{f' ({rest})' if rest else ''}; page: {page}",
+        f"{counts['usable']} of {len(stages)} {'videos' if len(family) == len(stages) else 'tasks of videos and cousins'}{f' ({rest})' if rest else ''}; page: {page}",
         goes_on,
     )
     return exit_code(outcomes.values(), is_made=bool(counts["usable"]))
+
+
+def _tell_cousins(outcomes: Iterable[Outcome]) -> None:
+    """Say of each family how many cousins came through, and what became of the others."""
+    of_family: dict[str, dict[str, list[Outcome]]] = {}
+    for outcome in outcomes:
+        family, mark, number = outcome.item.rpartition(COUSIN_MARK)
+        if mark and number.isdecimal():
+            of_family.setdefault(family, {}).setdefault(number, []).append(outcome)
+    for family, cousins in of_family.items():
+        bad = [next((o for o in made if o.status in ("failed", "rejected")), None) for made in cousins.values()]  # fmt: skip
+        why = Counter(o.reason or o.status for o in bad if o is not None)
+        first = {o.reason: o.detail for o in reversed(bad) if o is not None}
+        told = "; ".join(f"{n} {reason}: {first.get(reason, '')}" for reason, n in why.most_common())  # fmt: skip
+        came = sum(all(o.is_usable for o in made) for made in cousins.values())
+        print(  # noqa: T201
+            f"{family}: {came} of {len(cousins)} cousins came through{f' ({told})' if told else ''}",
+            file=sys.stderr,
+        )
 
 
 def _settings_in(argv: Sequence[str], source: Path) -> list[str]:

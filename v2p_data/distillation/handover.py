@@ -85,7 +85,7 @@ def hand_over(
 
     Args:
         bundle: the task.
-        expert: the deterministic expert.
+        expert: the deterministic expert, or whoever acts in the worlds themselves.
         student: the policy that begins.
         cfg: when the expert takes over, and how long an episode may last.
         seed: of everything that is drawn.

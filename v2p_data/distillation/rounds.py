@@ -293,6 +293,7 @@ def _stage(
         Episode(
             id=episode_id,
             item=bundle.title,
+            family=bundle.scene.family,
             task=bundle.description,
             seed=handovers.seed,
             labels=labels,

@@ -75,6 +75,7 @@ class Artist:
         return Episode(
             id=episode_id,
             item=bundle.title,
+            family=bundle.scene.family,
             task=bundle.description,
             seed=rollouts.seed,
             labels=labels,

@@ -57,6 +57,8 @@ class Episode:
     """Which pictures go into a dataset: `mask`, `rgb` or both. Label images are staged in any case."""
     rgb_mp4: bytes = b""
     """The pictures of `rgb`, a video already."""
+    family: str = ""
+    """Title of the scene of which the task's object is a cousin; empty: its own."""
     intervention: Bool[np.ndarray, "time"] | None = None
     """Who acted: True the expert, which took over from a student; False the student. None for a demonstration.
     Where the student acted, `action` holds the expert's label: what it would have done, for that is to be learned."""
@@ -104,6 +106,8 @@ class Episode:
         arrays: dict[str, np.ndarray] = {name: getattr(self, name) for name in ARRAYS}
         if self.cameras != (MASK_CAMERA,):
             about["cameras"] = list(self.cameras)
+        if self.family:
+            about["family"] = self.family
         if self.intervention is not None:
             arrays[INTERVENTION] = self.intervention
         if self.rgb_mp4:

@@ -4,6 +4,7 @@ All of them go through the same judge, so an expert's and a program's rates say 
 """
 
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,12 +15,13 @@ from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.checkpoint import WEIGHTS_FILE, check_checkpoint
 from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.experts.labeller import PROGRAM_FILE, program_in
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import Actor, StateActor, VisionActor
 from v2p_data.seeds import seed_for
 from v2p_data.task.audit.resets import has_own_reset
-from v2p_data.task.task import TaskBundle
+from v2p_data.task.task import TASK_FILE, TaskBundle
 
 PROGRAMS = "programs"
 """What `v2p eval` is told in a policy's place for the scripted programs."""
@@ -48,7 +50,12 @@ class Contestant:
             case "policy":
                 return {"policy": file_digest(self.folder / WEIGHTS_FILE)}
             case "expert":
-                return {"expert": file_digest(self.folder / EXPERT_WEIGHTS_FILE)}
+                is_program = (self.folder / PROGRAM_FILE).is_file()
+                return {
+                    "expert": file_digest(
+                        self.folder / (PROGRAM_FILE if is_program else EXPERT_WEIGHTS_FILE)
+                    )
+                }
             case "programs":
                 return {"programs": ""}
 
@@ -64,7 +71,8 @@ def contestant(path: Path) -> Contestant:
     if os.path.lexists(path / WEIGHTS_FILE):
         check_checkpoint(path)
         return Contestant(kind="policy", folder=path.resolve())
-    if (path / EXPERT_FILE).is_file() and (path / EXPERT_WEIGHTS_FILE).is_file():
+    is_network = (path / EXPERT_FILE).is_file() and (path / EXPERT_WEIGHTS_FILE).is_file()
+    if is_network or (path / PROGRAM_FILE).is_file():
         return Contestant(kind="expert", folder=path.resolve())
     raise V2PError(
         f"{path} holds no {WEIGHTS_FILE}: it is no LeRobot policy. It holds no {EXPERT_FILE} either: it is no expert;"
@@ -144,7 +152,10 @@ def _policy(folder: Path, device: str) -> Play:
 
 def _expert(folder: Path) -> Play:
     from policies.ppo.policy import Expert
+    from v2p_data.experts.actors import ProgramActor
 
+    if (name := program_in(folder)) is not None:
+        return lambda bundle: (ProgramActor(0, name), UNSEEN_PX)
     try:
         expert = Expert.load(folder)
     except ValueError as error:
@@ -153,6 +164,24 @@ def _expert(folder: Path) -> Play:
 
 
 def _programs(seed: int) -> Play:
-    from v2p_data.evaluation.actors import ProgramActor
+    from v2p_data.experts.actors import ProgramActor
 
     return lambda bundle: (ProgramActor(seed_for(seed, "programs", bundle.title)), UNSEEN_PX)
+
+
+def task_folders(folder: Path) -> dict[str, Path]:
+    """Return the task folders at or below `folder` by name.
+
+    Raises:
+        V2PError: there is none.
+    """
+    if (folder / TASK_FILE).is_file():
+        return {_item_name(folder): folder}
+    found = {_item_name(p.parent): p.parent for p in sorted(folder.glob(f"*/{TASK_FILE}"))}
+    if not found:
+        raise V2PError(f"{folder} holds no task; tasks are the folders with a {TASK_FILE}")
+    return found
+
+
+def _item_name(folder: Path) -> str:
+    return re.sub(r"-[0-9a-f]{8}$", "", folder.name)

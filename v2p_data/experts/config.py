@@ -12,8 +12,9 @@ from v2p_data.sim.env.backends import Backend
 class ExpertConfig:
     """How an expert is trained and judged."""
 
-    teacher: Literal["programs", "none"] = "programs"
-    """`none`: PPO from nothing, as in the paper; ten times slower where it works at all."""
+    teacher: Literal["programs", "none", "as_expert"] = "programs"
+    """`none`: PPO from nothing, as in the paper; ten times slower where it works at all. `as_expert`: no network learns the
+    task; the best program itself demonstrates and labels, alike for all objects, and is named as what it is."""
     least_teacher_success: float = 0.1
     """A program that succeeds less often teaches nothing."""
     trial_worlds: int = 64

@@ -8,7 +8,7 @@
 * `keep_better`: the taught policy and PPO's play the same episodes at the fine time step, and PPO's is kept if it
   is surely better.
 
-The result is a neural network in any case; scripts never make a dataset. It is called PPO's only if PPO changed it.
+The result is a neural network; it is called PPO's only if PPO changed it. Where a program is to act itself, see `labeller`.
 """
 
 import logging

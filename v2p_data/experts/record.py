@@ -69,15 +69,21 @@ class Learned:
     stopped_by: str
     started_from: str = ""
     """Folder of another task's expert, if PPO started from one."""
+    is_program: bool = False
+    """No network was trained: the program acts itself."""
 
     @property
-    def kept(self) -> Literal["taught", "ppo"]:
-        """Who made the expert: imitation alone, or PPO."""
+    def kept(self) -> Literal["taught", "ppo", "program"]:
+        """Who made the expert: imitation alone, PPO, or nobody: it is a program."""
+        if self.is_program:
+            return "program"
         return "ppo" if self.actor_updates else "taught"
 
     @property
     def made_by(self) -> str:
         """Say who made the expert, in a few words."""
+        if self.is_program:
+            return f"program: '{self.teacher}' itself, nothing was learned"
         taught = f"imitation of the program '{self.teacher}'" if self.teacher else ""
         if self.kept == "taught":
             return f"taught: {taught}"

@@ -39,6 +39,8 @@ def find_solved(runs: Path) -> list[Solved]:
         record = read_record(folder)
         if record is None or record.rejected is not None:
             continue
+        if (record.counts.get("learning") or {}).get("kept") == "program":
+            continue  # it has no weights to start from
         places = (runs / stage / record.inputs.get("task", "") for stage in ("task", "reward"))
         task = next((place for place in places if place.is_dir()), None)
         if task is None:

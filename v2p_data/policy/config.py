@@ -1,6 +1,7 @@
 """Settings of the policy stage, without the libraries that train."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 Preset = Literal["custom", "small", "paper"]
@@ -26,6 +27,9 @@ class PolicyConfig:
     most is kept. 1: the end, unjudged."""
     judge_episodes: int = 32
     """Episodes a task that judge a checkpoint, on seeds of their own."""
+    judge_tasks: Path | None = None
+    """Folder of tasks that judge checkpoints instead of the dataset's own: of objects that nobody trains on, and that no
+    evaluation reports."""
 
     encoder: Literal["resnet18", "conv", "none"] = "resnet18"
     """Of the whole picture; see `policies/bc/configuration_v2p_bc.py`, as the next ones."""
@@ -45,11 +49,21 @@ class PolicyConfig:
     """Entries of the robot's state that are used, from the first on: 7 leaves the controller's command out."""
     learning_rate: float = 3e-4
     """Of everything but a pretrained backbone."""
+    weight_decay: float = 1e-4
+    """Of AdamW; more, as the next two, keeps a policy from fitting its objects too closely."""
+    mask_jitter_px: float = 0.0
+    """In training each mask is moved, grown or shrunk at random by up to this many pixels, as its moments tell."""
+    moments_dropout: float = 0.0
+    """In training this share of the masks' moments is hidden."""
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.batch_size < 1 or self.checkpoints < 1 or self.epochs < 0:
             raise ValueError(
                 "steps, batch_size and checkpoints must be at least 1, epochs 0 or more"
+            )
+        if self.judge_tasks is not None and self.checkpoints == 1:
+            raise ValueError(
+                "judge_tasks choose among checkpoints, and checkpoints is 1; raise it to 2 or more"
             )
         if not 1 <= self.n_action_steps <= self.chunk_size:
             raise ValueError(
@@ -75,6 +89,7 @@ class PolicyConfig:
             epochs=usual.epochs,
             checkpoints=usual.checkpoints,
             judge_episodes=usual.judge_episodes,
+            judge_tasks=None,
         )
 
     def num_steps(self, num_frames: int) -> int:
@@ -96,4 +111,7 @@ class PolicyConfig:
             "n_action_steps": self.n_action_steps,
             "state_entries": self.state_entries,
             "optimizer_lr": self.learning_rate,
+            "optimizer_weight_decay": self.weight_decay,
+            "mask_jitter_px": self.mask_jitter_px,
+            "moments_dropout": self.moments_dropout,
         }

@@ -88,9 +88,8 @@ def make_distillation(
 ) -> dict[str, Any]:
     """Let a student act, the expert label and take over, and train on, in rounds."""
     from policies.bc.trainer import TrainerConfig
-    from policies.ppo.policy import Expert
     from v2p_data.distillation.rounds import Lesson, demand_masks, distill
-    from v2p_data.play import StateActor
+    from v2p_data.experts.labeller import labeller_of
     from v2p_data.task.task import TaskBundle
 
     del inputs
@@ -116,9 +115,7 @@ def make_distillation(
 
         distilled = distill(
             {
-                s.item: Lesson(
-                    bundle=TaskBundle.load(s.task), expert=StateActor(Expert.load(s.expert).act)
-                )
+                s.item: Lesson(bundle=TaskBundle.load(s.task), expert=labeller_of(s.expert))
                 for s in sources
             },
             student,
@@ -169,6 +166,7 @@ def make_policy(
     dataset: Path,
     repo_id: str,
     sources: Sequence[Source],
+    judges: Mapping[str, Path] | None = None,
 ) -> dict[str, Any]:
     """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
     from policies.bc.trainer import TrainerConfig, write_train_config
@@ -177,6 +175,7 @@ def make_policy(
 
     demand_whole_sources(dataset, sources, runtime.root)
     policy: PolicyConfig = cfg.config.resolved
+    judges = judges or {source.item: source.task for source in sources}
     seed = seed_for(cfg.seed, "policy")
     distilled = inputs.get("distillation")
     runtime.progress(0.0, "reading the frames")
@@ -197,8 +196,8 @@ def make_policy(
             recipe,
             out,
             seed=seed % 2**63,
-            judge=checkpoint_judge(student, sources, policy.judge_episodes, seed, runtime)
-            if policy.checkpoints > 1 and sources
+            judge=checkpoint_judge(student, judges, policy.judge_episodes, seed, runtime)
+            if policy.checkpoints > 1 and judges
             else None,
             on_progress=runtime.progress,
         )
@@ -253,15 +252,15 @@ def new_student(
 
 
 def checkpoint_judge(
-    student: "Student", sources: Sequence[Source], episodes: int, seed: int, runtime: Runtime
+    student: "Student", tasks: Mapping[str, Path], episodes: int, seed: int, runtime: Runtime
 ) -> Callable[[Any], float]:
-    """Return what gives a policy's mean success rate over tasks, on seeds that no evaluation uses."""
+    """Return what gives a policy's mean success rate over task folders, on seeds that no evaluation uses."""
     from v2p_data.evaluation.batch import judge
     from v2p_data.evaluation.config import EvaluationConfig
     from v2p_data.play import VisionActor
     from v2p_data.task.task import TaskBundle
 
-    bundles = {source.item: TaskBundle.load(source.task) for source in sources}
+    bundles = {item: TaskBundle.load(folder) for item, folder in tasks.items()}
     cfg = EvaluationConfig(episodes=episodes, worlds=episodes, at_end=False)
 
     def rate(policy: Any) -> float:

@@ -5,8 +5,9 @@
 The simulator builds its own worlds from `scene.json`.
 """
 
+import shutil
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -18,9 +19,10 @@ from v2p_data.geometry.camera import mujoco_xyaxes, poses_over_table
 from v2p_data.geometry.mesh import mass_properties, mesh_for, parts_for, write_obj, write_ply
 from v2p_data.geometry.pose import pose_from_transform
 from v2p_data.scene.data_types import Estimate, Reconstruction
+from v2p_data.scene.files import own_file
 from v2p_data.scene.overlay import write_overlay
 from v2p_data.scene.scene import Scene, SceneObject, StageConfidence, write_masks
-from v2p_data.scene.schema import Shape
+from v2p_data.scene.schema import MAX_FILE_BYTES, Shape
 
 MJCF_FILE = "scene.xml"
 
@@ -203,7 +205,6 @@ def _write_object(thing: Estimate, folder: Path) -> _Body:
         hollow=noun.hollow,
         mesh=f"meshes/{name}.obj",
         mesh_ply=f"meshes/{name}.ply",
-        parts=_write_parts(mesh, parts, name, folder),
         urdf=f"urdf/{name}.urdf",
         mjcf=f"mjcf/{name}.xml",
         mask_track=f"masks/{name}.npz",
@@ -217,14 +218,71 @@ def _write_object(thing: Estimate, folder: Path) -> _Body:
         confidences=thing.confidences,
         observed=thing.observed or ("full",) * len(thing.frames),
     )
-    com, inertia = mass_properties(mesh, thing.mass_kg)
-    body = _Body(thing=written, com=com, inertia=inertia)
-    write_obj(mesh, folder / written.mesh)
-    write_ply(mesh, folder / written.mesh_ply)
     write_masks(folder / written.mask_track, thing.masks)
-    (folder / written.urdf).write_text(_xml(_urdf(body)))
-    (folder / written.mjcf).write_text(_xml(_object_mjcf(body)))
+    return _write_models(written, mesh, parts, folder)
+
+
+def _write_models(
+    thing: SceneObject, mesh: trimesh.Trimesh, parts: tuple[trimesh.Trimesh, ...], folder: Path
+) -> _Body:
+    """Write an object's mesh, convex parts, URDF and MJCF where it says that they are."""
+    thing = replace(thing, parts=_write_parts(mesh, parts, thing.name, folder))
+    com, inertia = mass_properties(mesh, thing.mass_kg)
+    body = _Body(thing=thing, com=com, inertia=inertia)
+    write_obj(mesh, folder / thing.mesh)
+    write_ply(mesh, folder / thing.mesh_ply)
+    (folder / thing.urdf).write_text(_xml(_urdf(body)))
+    (folder / thing.mjcf).write_text(_xml(_object_mjcf(body)))
     return body
+
+
+def write_relative(
+    scene: Scene,
+    title: str,
+    thing: SceneObject,
+    mesh: trimesh.Trimesh,
+    parts: tuple[trimesh.Trimesh, ...],
+    folder: Path,
+) -> Scene:
+    """Write a scene with another manipulated object, which no video shows: without masks and pictures.
+
+    Args:
+        scene: where the others come from.
+        title: of the new scene.
+        thing: what is manipulated instead.
+        mesh: of it.
+        parts: its convex solids.
+        folder: that exists and is empty.
+    """
+    for name in ("meshes", "urdf", "mjcf"):
+        (folder / name).mkdir()
+    name = thing.name
+    files = {"mesh": f"meshes/{name}.obj", "mesh_ply": f"meshes/{name}.ply"}
+    models = {"urdf": f"urdf/{name}.urdf", "mjcf": f"mjcf/{name}.xml"}
+    thing = replace(thing, **files, **models, mask_track="")
+    bodies = [_write_models(thing, mesh, parts, folder)]
+    for other in scene.others:
+        for file in {other.mesh, other.mesh_ply, other.urdf, other.mjcf, *other.parts} - {""}:
+            (folder / file).parent.mkdir(exist_ok=True)
+            shutil.copy(own_file(scene.folder, file, MAX_FILE_BYTES), folder / file)
+        solid = (
+            trimesh.load_mesh(folder / other.mesh)
+            if other.mesh
+            else mesh_for(other.shape, other.size_m, hollow=other.hollow)
+        )
+        com, inertia = mass_properties(solid, other.mass_kg)
+        bodies.append(_Body(thing=replace(other, mask_track=""), com=com, inertia=inertia))
+    made = replace(
+        scene,
+        title=title,
+        family=scene.family or scene.title,
+        video="",
+        objects=tuple(body.thing for body in bodies),
+        folder=folder,
+    )
+    (folder / MJCF_FILE).write_text(_xml(_scene_mjcf(made, bodies)))
+    made.save(folder)
+    return made
 
 
 def _write_parts(

@@ -222,6 +222,8 @@ class Scene:
     """The table's top."""
     gravity_m_s2: tuple[float, float, float] = GRAVITY_M_S2
     warnings: tuple[str, ...] = ()
+    family: str = ""
+    """Title of the scene whose cousin this is; empty where a video shows it."""
     folder: Path = Path()
     """Where the files are; set on load, never saved."""
 

@@ -186,6 +186,7 @@ class SceneFile(FileModel):
     table: PlaneEntry
     gravity_m_s2: tuple[Place, Place, Place] = (0.0, 0.0, -9.81)
     warnings: Annotated[tuple[Words, ...], Len(0, 200)] = ()
+    family: Annotated[str, StringConstraints(max_length=200), AfterValidator(_printable)] = ""
     version: Literal[2] = Field(alias="schema")
 
 

@@ -325,6 +325,7 @@ def _describe(episode: Episode, *, has_handovers: bool) -> dict[str, Any]:
     return {
         "id": episode.id,
         "item": episode.item,
+        "family": episode.family or episode.item,
         "task": episode.task,
         "seed": episode.seed,
         "length": episode.num_frames,

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from v2p_data.errors import V2PError
 from v2p_data.experts.teacher import Teacher
 from v2p_data.play import View
 from v2p_data.seeds import seed_for
@@ -25,7 +26,11 @@ class ProgramActor:
         self._teacher: Teacher | None = None
 
     def reset(self, worlds: BatchEnv) -> None:
-        """Choose a program, at the first call."""
+        """Choose a program, at the first call.
+
+        Raises:
+            V2PError: the task has no program of this name.
+        """
         self._teacher = Teacher(worlds)
         if not self.name:
             trials = BatchEnv(
@@ -36,6 +41,11 @@ class ProgramActor:
                 num_threads=1,
             )
             self.name = self._teacher.choose(trials).name
+        if self.name not in self._teacher.programs:
+            raise V2PError(
+                f"the expert is the program '{self.name}', and task '{worlds.bundle.title}' has "
+                f"{', '.join(self._teacher.programs)}; make the expert anew"
+            )
         self._teacher.name = self.name
 
     def act(self, view: View) -> Float[np.ndarray, "env 7"]:
