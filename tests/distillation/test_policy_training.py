@@ -17,6 +17,7 @@ from v2p_data.distillation import rounds
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.rounds import handover_episodes
 from v2p_data.episodes.collect import staged_episodes
+from v2p_data.episodes.dataset import packing
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_record

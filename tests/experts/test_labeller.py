@@ -12,6 +12,7 @@ from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.labeller import PROGRAM_FILE, choose_program, labeller_of
 from v2p_data.experts.learning import Worlds
 from v2p_data.experts.teacher import LIFT, Teacher
+from v2p_data.play import View
 from v2p_data.task.benchmark import load_benchmark
 
 
@@ -38,11 +39,13 @@ def test_the_program_that_lifts_is_the_expert_and_nobody_calls_it_learned(chosen
 
 def test_it_acts_from_any_state_as_the_teacher_does(chosen, lift: Worlds):
     env = lift.make(6, "acting")
-    act, teacher = labeller_of(chosen[0])(env), Teacher(env)
+    expert, teacher = labeller_of(chosen[0]), Teacher(env)
+    expert.reset(env)
     teacher.name = LIFT
+    view = View(env)
 
     for _ in range(3):
-        assert np.array_equal(act(env.observe()), teacher.act())
+        assert np.array_equal(expert.act(view), teacher.act())
         env.step(np.full((6, 7), 0.3))
 
 
@@ -57,5 +60,5 @@ def test_a_judge_takes_it_for_an_expert_and_knows_it_by_its_program(chosen, tmp_
 def test_a_program_that_the_task_has_not_is_named_with_those_it_has(lift: Worlds, tmp_path: Path):
     (tmp_path / PROGRAM_FILE).write_text(json.dumps({"program": "fly"}))
 
-    with pytest.raises(V2PError, match=r"names the program 'fly', and task '.*' has lift, "):
-        labeller_of(tmp_path)(lift.make(1, "none"))
+    with pytest.raises(V2PError, match=r"is the program 'fly', and task '.*' has lift, "):
+        labeller_of(tmp_path).reset(lift.make(1, "none"))
