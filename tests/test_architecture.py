@@ -68,7 +68,7 @@ BELOW: dict[str, set[str]] = {
         "seeds",
     },
     "policy": {
-        *("deployment", "distillation", "evaluation", "episodes", "play"),
+        *("deployment", "distillation", "evaluation", "episodes", "experts", "play"),
         *("scene", "task", "pipeline", "seeds"),
     },
     "report": {"episodes", "sim", "task", "scene", "video", "geometry", "pipeline"},
