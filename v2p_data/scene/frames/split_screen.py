@@ -1,7 +1,8 @@
-"""Split screens: clips that show several pictures at once are rejected, with the command that keeps one of them.
+"""Split screens: which pictures a clip shows at once, beside or above each other, on a plain page, or one in another.
 
 A seam between two pictures has a step along a whole column or row, in every frame. Lines of a scene may have one too. They are told by
-three facts: a seam is exactly upright or level, no texture goes on behind it, and nothing moves across it.
+three facts: a seam is exactly upright or level, no texture goes on behind it, and nothing moves across it. An inset has four such sides,
+some of which may be the picture's border.
 """
 
 from dataclasses import dataclass
@@ -11,13 +12,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.working_clip import WorkingClip
-from v2p_data.video.clip import Clip
 
-_Greys = Float32[np.ndarray, "time h w"]
+_Greys = Float32[np.ndarray, "sample h w"]
 _Changes = Bool[np.ndarray, "moments rows columns"]
 """Whether each pixel of the working frames differs from the first one."""
+PaneBox = tuple[int, int, int, int]
+"""x0, y0, x1, y1 [px of the clip's frames]."""
 _FRAMES = 9
 _REACH = 3
 """Pixels between the two columns whose difference is a step: encoded seams are that wide."""
@@ -36,6 +37,16 @@ _CROSSING = 0.5
 _STRIP_PX = (2, 6)
 """From a seam to the strip where changes are compared, of a picture 320 px wide."""
 _CHANGE_LAB, _LEAST_MOVING = 15.0, 0.002
+_PLAIN = 12.0
+"""Luma: a line whose 2nd and 98th percentile differ by less, over all frames, is a strip of the page."""
+_LEAST_BLOCK, _LEAST_BLOCK_PX = 0.12, 40
+"""Of the length that is cut, and pixels: narrower blocks are titles."""
+_MOST_CUTS = 4
+_INSET_AREA = (0.03, 0.6)
+_LEAST_SIDE = 0.12
+_GAP_PX, _NEAR_PX = 9, 5
+"""Gaps in a side that are closed, and how far an inset's corner may lie from its sides' ends."""
+_MOST_LINES = 24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,43 +62,181 @@ class Seam:
     """Share of the picture that changes at some time: left and right, or above and below."""
 
 
-def check_split(clip: Clip, working: WorkingClip) -> None:
-    """Reject a clip that shows several pictures at once.
+def panes_of(frames: UInt8[np.ndarray, "time h w 3"], working: WorkingClip) -> list[PaneBox]:
+    """Return the pictures in which something moves that a clip shows at once; none where it shows one.
 
-    Raises:
-        ItemRejectedError: `split_screen`, with the share of the seam's length that shows a step.
+    An inset comes first, and the picture that it lies in after it.
     """
-    seam = seam_of(clip.frames, working)
-    if seam is None:
-        return
-    x0, y0, x1, y1 = (round(v) for v in clip.in_file_px)
-    upright = seam.direction == "upright"
-    low, high = (x0, x1) if upright else (y0, y1)
-    cut = round(low + seam.place * (high - low))
-    begin, end = (low, cut) if seam.moving[0] >= seam.moving[1] else (cut, high)
-    x, y, w, h = (
-        (begin, y0, end - begin, y1 - y0) if upright else (x0, begin, x1 - x0, end - begin)
-    )
-    size_px = clip.source_size_px[0 if upright else 1]
-    raise ItemRejectedError(
-        "split_screen",
-        f"the picture is put together of several: a straight seam runs {'down' if upright else 'across'} it at {cut} of {size_px} px, along "
-        f"{seam.step_share:.0%} of its length; keep one of them: ffmpeg -i {clip.path.name} -vf "
-        f"crop={w - w % 2}:{h - h % 2}:{x}:{y} one.mp4",
-        round(seam.step_share, 3),
-    )
+    grey, changes = _seen(frames, working)
+    panes = _split(grey, changes, (0, 0, grey.shape[2], grey.shape[1]), _MOST_CUTS)
+    return panes if len(panes) > 1 else []
 
 
 def seam_of(frames: UInt8[np.ndarray, "time h w 3"], working: WorkingClip) -> Seam | None:
     """Return the seam with the longest step, None where there is no seam."""
+    return _longest_seam(*_seen(frames, working))
+
+
+def _seen(
+    frames: UInt8[np.ndarray, "time h w 3"], working: WorkingClip
+) -> tuple[_Greys, _Changes]:
+    """Return a few frames in grey, and what changes in the working frames."""
     pick = np.unique(
         np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
     )
     grey = np.stack([cv2.cvtColor(frames[i], cv2.COLOR_RGB2GRAY) for i in pick]).astype(np.float32)
-    if not any(_peaks(_step_shares(one)) for one in (grey, grey.swapaxes(1, 2))):
-        return None  # ordinary clips need no changes
     first = working.lab[0]
     changes = np.stack([np.linalg.norm(lab - first, axis=-1) > _CHANGE_LAB for lab in working.lab])
+    return grey, changes
+
+
+def _split(grey: _Greys, changes: _Changes, box: PaneBox, cuts: int) -> list[PaneBox]:
+    """Return the parts of a picture in which something moves, cut at plain strips and at seams."""
+    x0, y0, x1, y1 = box
+    k = changes.shape[2] / grey.shape[2]
+    here = grey[:, y0:y1, x0:x1]
+    moves = changes[:, round(y0 * k) : round(y1 * k), round(x0 * k) : round(x1 * k)]
+    if not moves.size or np.any(moves, axis=0).mean() < _LEAST_MOVING:
+        return []
+    parts = _blocks(here, moves, box)
+    if parts == [box] and (seam := _longest_seam(here, moves)) is not None:
+        across, down = x0 + round(seam.place * (x1 - x0)), y0 + round(seam.place * (y1 - y0))
+        upright = seam.direction == "upright"
+        parts = (
+            [(x0, y0, across, y1), (across, y0, x1, y1)]
+            if upright
+            else [(x0, y0, x1, down), (x0, down, x1, y1)]
+        )
+    if parts != [box] and cuts:
+        return [pane for part in parts for pane in _split(grey, changes, part, cuts - 1)]
+    inset = _inset(here, moves)
+    if inset is None:
+        return [box]
+    a, b, c, d = inset
+    return [(x0 + a, y0 + b, x0 + c, y0 + d), box]
+
+
+def _blocks(grey: _Greys, changes: _Changes, box: PaneBox) -> list[PaneBox]:
+    """Return the blocks between columns, else between rows, that have one colour from end to end and never change."""
+    x0, y0, x1, y1 = box
+    moving = np.any(changes, axis=0)
+    for axis, (begin, end) in ((1, (x0, x1)), (2, (y0, y1))):
+        spread = np.ptp(np.percentile(grey, (2, 98), axis=(0, axis)), axis=0)
+        line = moving.any(axis - 1)
+        moved = line[np.arange(end - begin) * len(line) // (end - begin)]
+        inside = _runs(
+            (spread > _PLAIN) | moved, max(_LEAST_BLOCK_PX, round(_LEAST_BLOCK * (end - begin)))
+        )
+        if len(inside) > 1 or (inside and inside[0] != (0, end - begin)):
+            return [
+                (x0 + a, y0, x0 + b, y1) if axis == 1 else (x0, y0 + a, x1, y0 + b)
+                for a, b in inside
+            ]
+    return [box]
+
+
+def _runs(there: Bool[np.ndarray, "n"], least: int) -> list[tuple[int, int]]:
+    """Return where runs of a line begin and end, of those that are long enough."""
+    edges = np.flatnonzero(np.diff(np.pad(there, 1).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
+
+
+def _inset(grey: _Greys, changes: _Changes) -> PaneBox | None:
+    """Return a small picture that lies in another one: four steps that stay, or the picture's border in their place."""
+    h, w = grey.shape[1:]
+    if min(changes.shape[1:]) < _LEAST_PX:
+        return None
+    moving = np.any(changes, axis=0)
+    k = moving.shape[1] / w
+    upright, level = _lasting(grey), _lasting(grey.swapaxes(1, 2)).T
+    columns = _lines(upright, h)
+    best, found = 0.0, None
+    for i, (xa, ya, yb) in enumerate(columns):
+        for xb, yc, yd in columns[i + 1 :]:
+            y0, y1 = max(ya, yc), min(yb, yd)
+            area = (xb - xa) * (y1 - y0) / (w * h)
+            if not _INSET_AREA[0] <= area <= _INSET_AREA[1]:
+                continue
+            for top in _edges_near(level, y0, xa, xb, h):
+                for bottom in _edges_near(level, y1, xa, xb, h):
+                    box = xa, top, xb, bottom
+                    sides = _sides(upright, level, box)
+                    y, x = (
+                        slice(round(a * k), round(b * k)) for a, b in ((top, bottom), (xa, xb))
+                    )
+                    inside = float(moving[y, x].mean()) if moving[y, x].size else 0.0
+                    outside = float(moving.sum() - moving[y, x].sum()) / moving.size
+                    if (
+                        min(sides) > max(best, _SHARE)
+                        and min(inside, outside) >= _LEAST_MOVING
+                        and _stays_inside(changes, box, k)
+                    ):
+                        best, found = min(sides), box
+    return found
+
+
+def _lasting(grey: _Greys) -> Bool[np.ndarray, "h w"]:
+    """Return where a step from left to right stays in all frames, by the column at which it is."""
+    steps = (np.abs(grey[:, :, _REACH:] - grey[:, :, :-_REACH]) > _STEP).all(0)
+    return np.pad(steps, ((0, 0), (2, 1)))
+
+
+def _lines(steps: Bool[np.ndarray, "h w"], h: int) -> list[tuple[int, int, int]]:
+    """Return the upright lines that may bound an inset: column, first and last row; the picture's border among them."""
+    w = steps.shape[1]
+    closed = cv2.morphologyEx(steps.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_GAP_PX, 1))) > 0
+    found = [(0, 0, h), (w, 0, h)]
+    long = [
+        (b - a, x, a, b) for x in range(w) for a, b in _runs(closed[:, x], round(_LEAST_SIDE * h))
+    ]
+    for _, x, a, b in sorted(long, reverse=True):
+        if all(abs(x - other) > _REACH or max(a, c) >= min(b, d) for other, c, d in found):
+            found.append((x, a, b))
+    return sorted(found[: _MOST_LINES + 2])
+
+
+def _edges_near(level: Bool[np.ndarray, "h w"], row: int, xa: int, xb: int, h: int) -> list[int]:
+    """Return the rows near to one that bound an inset, the picture's border among them."""
+    if row <= _REACH or row >= h - _REACH:
+        return [0 if row <= _REACH else h]
+    near = range(max(0, row - _NEAR_PX), min(h, row + _NEAR_PX + 1))
+    return [max(near, key=lambda y: float(level[y, xa:xb].mean()))]
+
+
+def _sides(
+    upright: Bool[np.ndarray, "h w"], level: Bool[np.ndarray, "h w"], box: PaneBox
+) -> list[float]:
+    """Return the shares of an inset's four sides that show a step; 1 where the picture ends there."""
+    h, w = level.shape
+    x0, y0, x1, y1 = box
+    if y1 - y0 < _LEAST_SIDE * h or x1 - x0 < _LEAST_SIDE * w:
+        return [0.0]
+    ends = [
+        1.0 if x in (0, w) else float(upright[y0:y1, max(0, x - 1) : x + 2].any(1).mean())
+        for x in (x0, x1)
+    ]
+    return ends + [
+        1.0 if y in (0, h) else float(level[max(0, y - 1) : y + 2, x0:x1].any(0).mean())
+        for y in (y0, y1)
+    ]
+
+
+def _stays_inside(changes: _Changes, box: PaneBox, k: float) -> bool:
+    """Return whether nothing moves across the sides of an inset."""
+    x0, y0, x1, y1 = (round(v * k) for v in box)
+    far = _STRIP_PX[1]
+    rows, columns = changes[:, y0:y1], changes[:, :, x0:x1].swapaxes(1, 2)
+    return all(
+        _motion_across(one, at) < _CROSSING
+        for one, ats in ((rows, (x0, x1)), (columns, (y0, y1)))
+        for at in ats
+        if far < at < one.shape[2] - far
+    )
+
+
+def _longest_seam(grey: _Greys, changes: _Changes) -> Seam | None:
+    if not any(_peaks(_step_shares(one)) for one in (grey, grey.swapaxes(1, 2))):
+        return None
     seams = [
         seam
         for seam in (
