@@ -86,7 +86,7 @@ def test_pictures_without_a_hand_are_rejected_with_the_parts_that_a_person_may_n
 
 
 def test_a_clip_of_one_picture_stays_as_it_is(clips):
-    for clip in clips:
+    for clip in (with_frames(clip, clip.frames[::4]) for clip in clips):
         assert with_one_pane(clip, working_clip_of(clip), hands_in(True)) is clip
 
 

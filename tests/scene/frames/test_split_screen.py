@@ -150,7 +150,8 @@ def test_two_pictures_beside_each_other_are_found_whatever_bar_is_between_them(c
 def test_a_picture_in_the_picture_is_found(clips, margin_px):
     first, second = two_pictures(clips)
     h, w = first.shape[1:3]
-    small = np.stack([cv2.resize(f, (w // 3, h // 3)) for f in second])
+    small = np.stack([cv2.resize(f, (w // 3, h // 3)) for f in 2 * second])
+    small[:, [0, 1, -2, -1]] = small[:, :, [0, 1, -2, -1]] = 255  # the frame that editors draw
     x1, y1 = w - margin_px, h - margin_px
     frames = first.copy()
     frames[:, y1 - h // 3 : y1, x1 - w // 3 : x1] = small
@@ -163,7 +164,7 @@ def test_a_picture_in_the_picture_is_found(clips, margin_px):
 
 
 def test_a_clip_of_one_picture_has_no_panes(clips):
-    assert [panes(clip, clip.frames) for clip in clips] == [[]] * len(clips)
+    assert [panes(clip, clip.frames[::4]) for clip in clips] == [[]] * len(clips)
 
 
 def test_a_clip_of_one_picture_has_no_seam(clips):

@@ -22,6 +22,8 @@ FindHands = Callable[[Clip, WorkingClip], HandTrack | None]
 """What a model that knows hands says of a clip; None without a model."""
 _LEAST_HAND = 0.15
 """Share of the frames with a hand, from which a picture counts as one with a hand."""
+_AS_GOOD = 0.8
+"""Of the largest share: among pictures so good the largest is taken, and no part of it."""
 _FRAMES = 12
 _LEAST_PX = 40
 """Pixels of a working frame: smaller regions are noise."""
@@ -95,7 +97,9 @@ def with_one_pane(clip: Clip, working: WorkingClip, find_hands: FindHands) -> Cl
         hand_share(cropped(_halted(bare, panes, k), box, ""), find_hands)
         for k, box in enumerate(panes)
     ]
-    best = int(np.argmax(shares))
+    areas = [(c - a) * (d - b) for a, b, c, d in panes]
+    likely = [k for k, share in enumerate(shares) if share >= _AS_GOOD * max(shares)]
+    best = max(likely, key=lambda k: areas[k])
     where = "; ".join(_in_words(clip, box) for box in panes)
     if shares[best] < _LEAST_HAND:
         raise ItemRejectedError(

@@ -6,6 +6,7 @@ some of which may be the picture's border.
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import cv2
@@ -38,12 +39,19 @@ _STRIP_PX = (2, 6)
 """From a seam to the strip where changes are compared, of a picture 320 px wide."""
 _CHANGE_LAB, _LEAST_MOVING = 15.0, 0.002
 _PLAIN = 12.0
-"""Luma: a line whose 2nd and 98th percentile differ by less, over all frames, is a strip of the page."""
+"""Luma: a line whose 2nd and 98th percentile, over all frames, are so near to the page is a strip of it."""
+_USUAL_PAGES = (248.0, 8.0)
+"""Luma of white and black ones; others show at the picture's corners."""
 _LEAST_BLOCK, _LEAST_BLOCK_PX = 0.12, 40
 """Of the length that is cut, and pixels: narrower blocks are titles."""
 _MOST_CUTS = 4
 _INSET_AREA = (0.03, 0.6)
 _LEAST_SIDE = 0.12
+_INSET_SHARE, _LEAST_SIDE_SHARE = 0.85, 0.75
+"""Shares of an inset's sides that show a step: their mean, and the least."""
+_BESIDE_PX = 7
+_LASTING = 0.75
+"""Of the frames: what moves may have the colour of the other side at times."""
 _GAP_PX, _NEAR_PX = 9, 5
 """Gaps in a side that are closed, and how far an inset's corner may lie from its sides' ends."""
 _MOST_LINES = 24
@@ -68,7 +76,11 @@ def panes_of(frames: UInt8[np.ndarray, "time h w 3"], working: WorkingClip) -> l
     An inset comes first, and the picture that it lies in after it.
     """
     grey, changes = _seen(frames, working)
-    panes = _split(grey, changes, (0, 0, grey.shape[2], grey.shape[1]), _MOST_CUTS)
+    corners = [np.median(grey[:, y, x]) for y in (1, -2) for x in (1, -2)]
+    own = [float(np.median(corners))] if np.ptp(corners) <= _PLAIN else []
+    panes = _split(
+        grey, changes, (*own, *_USUAL_PAGES), (0, 0, grey.shape[2], grey.shape[1]), _MOST_CUTS
+    )
     return panes if len(panes) > 1 else []
 
 
@@ -90,15 +102,18 @@ def _seen(
     return grey, changes
 
 
-def _split(grey: _Greys, changes: _Changes, box: PaneBox, cuts: int) -> list[PaneBox]:
-    """Return the parts of a picture in which something moves, cut at plain strips and at seams."""
+def _split(
+    grey: _Greys, changes: _Changes, pages: tuple[float, ...], box: PaneBox, cuts: int
+) -> list[PaneBox]:
+    """Return the parts of a picture in which something moves, cut at strips of a page of one of these lumas, and at seams."""
     x0, y0, x1, y1 = box
     k = changes.shape[2] / grey.shape[2]
     here = grey[:, y0:y1, x0:x1]
     moves = changes[:, round(y0 * k) : round(y1 * k), round(x0 * k) : round(x1 * k)]
     if not moves.size or np.any(moves, axis=0).mean() < _LEAST_MOVING:
         return []
-    parts = _blocks(here, moves, box)
+    cut = (parts for page in pages if (parts := _blocks(here, page, box)) != [box])
+    parts = next(cut, [box])
     if parts == [box] and (seam := _longest_seam(here, moves)) is not None:
         across, down = x0 + round(seam.place * (x1 - x0)), y0 + round(seam.place * (y1 - y0))
         upright = seam.direction == "upright"
@@ -108,7 +123,7 @@ def _split(grey: _Greys, changes: _Changes, box: PaneBox, cuts: int) -> list[Pan
             else [(x0, y0, x1, down), (x0, down, x1, y1)]
         )
     if parts != [box] and cuts:
-        return [pane for part in parts for pane in _split(grey, changes, part, cuts - 1)]
+        return [pane for part in parts for pane in _split(grey, changes, pages, part, cuts - 1)]
     inset = _inset(here, moves)
     if inset is None:
         return [box]
@@ -116,17 +131,13 @@ def _split(grey: _Greys, changes: _Changes, box: PaneBox, cuts: int) -> list[Pan
     return [(x0 + a, y0 + b, x0 + c, y0 + d), box]
 
 
-def _blocks(grey: _Greys, changes: _Changes, box: PaneBox) -> list[PaneBox]:
-    """Return the blocks between columns, else between rows, that have one colour from end to end and never change."""
+def _blocks(grey: _Greys, page: float, box: PaneBox) -> list[PaneBox]:
+    """Return the blocks between columns, else between rows, that have the page's luma from end to end in all frames."""
     x0, y0, x1, y1 = box
-    moving = np.any(changes, axis=0)
     for axis, (begin, end) in ((1, (x0, x1)), (2, (y0, y1))):
-        spread = np.ptp(np.percentile(grey, (2, 98), axis=(0, axis)), axis=0)
-        line = moving.any(axis - 1)
-        moved = line[np.arange(end - begin) * len(line) // (end - begin)]
-        inside = _runs(
-            (spread > _PLAIN) | moved, max(_LEAST_BLOCK_PX, round(_LEAST_BLOCK * (end - begin)))
-        )
+        spread = np.abs(np.percentile(grey, (2, 98), axis=(0, axis)) - page).max(0)
+        least = max(_LEAST_BLOCK_PX, round(_LEAST_BLOCK * (end - begin)))
+        inside = _runs(spread > _PLAIN, least)
         if len(inside) > 1 or (inside and inside[0] != (0, end - begin)):
             return [
                 (x0 + a, y0, x0 + b, y1) if axis == 1 else (x0, y0 + a, x1, y0 + b)
@@ -142,42 +153,32 @@ def _runs(there: Bool[np.ndarray, "n"], least: int) -> list[tuple[int, int]]:
 
 
 def _inset(grey: _Greys, changes: _Changes) -> PaneBox | None:
-    """Return a small picture that lies in another one: four steps that stay, or the picture's border in their place."""
+    """Return a small picture that lies in another one: two or more sides that stay, and the picture's border for the others."""
     h, w = grey.shape[1:]
     if min(changes.shape[1:]) < _LEAST_PX:
         return None
     moving = np.any(changes, axis=0)
     k = moving.shape[1] / w
     upright, level = _lasting(grey), _lasting(grey.swapaxes(1, 2)).T
-    columns = _lines(upright, h)
-    best, found = 0.0, None
-    for i, (xa, ya, yb) in enumerate(columns):
-        for xb, yc, yd in columns[i + 1 :]:
-            y0, y1 = max(ya, yc), min(yb, yd)
-            area = (xb - xa) * (y1 - y0) / (w * h)
-            if not _INSET_AREA[0] <= area <= _INSET_AREA[1]:
+    best, found = _INSET_SHARE, None
+    for left, right in combinations(_lines(upright, h), 2):
+        xa, xb = left[0], right[0]
+        for top, bottom in {left[1:], right[1:]}:
+            box = xa, _edge_near(level, top, xa, xb), xb, _edge_near(level, bottom, xa, xb)
+            sides = _sides(upright, level, box)
+            if len(sides) < 2 or min(sides) < _LEAST_SIDE_SHARE or np.mean(sides) <= best:
                 continue
-            for top in _edges_near(level, y0, xa, xb, h):
-                for bottom in _edges_near(level, y1, xa, xb, h):
-                    box = xa, top, xb, bottom
-                    sides = _sides(upright, level, box)
-                    y, x = (
-                        slice(round(a * k), round(b * k)) for a, b in ((top, bottom), (xa, xb))
-                    )
-                    inside = float(moving[y, x].mean()) if moving[y, x].size else 0.0
-                    outside = float(moving.sum() - moving[y, x].sum()) / moving.size
-                    if (
-                        min(sides) > max(best, _SHARE)
-                        and min(inside, outside) >= _LEAST_MOVING
-                        and _stays_inside(changes, box, k)
-                    ):
-                        best, found = min(sides), box
+            y, x = (slice(round(box[i] * k), round(box[i + 2] * k)) for i in (1, 0))
+            inside = float(moving[y, x].mean())
+            outside = float(moving.sum() - moving[y, x].sum()) / moving.size
+            if min(inside, outside) >= _LEAST_MOVING and _stays_inside(changes, box, k):
+                best, found = float(np.mean(sides)), box
     return found
 
 
 def _lasting(grey: _Greys) -> Bool[np.ndarray, "h w"]:
-    """Return where a step from left to right stays in all frames, by the column at which it is."""
-    steps = (np.abs(grey[:, :, _REACH:] - grey[:, :, :-_REACH]) > _STEP).all(0)
+    """Return where a step from left to right is there in most frames, by the column at which it is."""
+    steps = (np.abs(grey[:, :, _REACH:] - grey[:, :, :-_REACH]) > _STEP).mean(0) >= _LASTING
     return np.pad(steps, ((0, 0), (2, 1)))
 
 
@@ -195,30 +196,37 @@ def _lines(steps: Bool[np.ndarray, "h w"], h: int) -> list[tuple[int, int, int]]
     return sorted(found[: _MOST_LINES + 2])
 
 
-def _edges_near(level: Bool[np.ndarray, "h w"], row: int, xa: int, xb: int, h: int) -> list[int]:
-    """Return the rows near to one that bound an inset, the picture's border among them."""
-    if row <= _REACH or row >= h - _REACH:
-        return [0 if row <= _REACH else h]
+def _edge_near(level: Bool[np.ndarray, "h w"], row: int, xa: int, xb: int) -> int:
+    """Return the row near to one that bounds an inset; it may be the picture's border."""
+    h = len(level)
+    if xb <= xa or row <= _REACH or row >= h - _REACH:
+        return 0 if row <= _REACH else h
     near = range(max(0, row - _NEAR_PX), min(h, row + _NEAR_PX + 1))
-    return [max(near, key=lambda y: float(level[y, xa:xb].mean()))]
+    return max(near, key=lambda y: float(level[y, xa:xb].mean()))
 
 
 def _sides(
     upright: Bool[np.ndarray, "h w"], level: Bool[np.ndarray, "h w"], box: PaneBox
 ) -> list[float]:
-    """Return the shares of an inset's four sides that show a step; 1 where the picture ends there."""
+    """Return the shares of an inset's sides that show a step; none where it is too small, too large, or edges lie beside them too.
+
+    Sides at the picture's border are left out.
+    """
     h, w = level.shape
     x0, y0, x1, y1 = box
-    if y1 - y0 < _LEAST_SIDE * h or x1 - x0 < _LEAST_SIDE * w:
-        return [0.0]
-    ends = [
-        1.0 if x in (0, w) else float(upright[y0:y1, max(0, x - 1) : x + 2].any(1).mean())
-        for x in (x0, x1)
-    ]
-    return ends + [
-        1.0 if y in (0, h) else float(level[max(0, y - 1) : y + 2, x0:x1].any(0).mean())
-        for y in (y0, y1)
-    ]
+    area = (x1 - x0) * (y1 - y0) / (w * h)
+    if (
+        min((y1 - y0) / h, (x1 - x0) / w) < _LEAST_SIDE
+        or not _INSET_AREA[0] < area < _INSET_AREA[1]
+    ):
+        return []
+    sides = [(upright[y0:y1], x) for x in (x0, x1) if 0 < x < w]
+    sides += [(level[:, x0:x1].T, y) for y in (y0, y1) if 0 < y < h]
+    for lines, at in sides:
+        beside = (lines[:, max(0, i - 1) : i + 2] for i in (at - _BESIDE_PX, at + _BESIDE_PX))
+        if max(steps.any(1).mean() for steps in beside if steps.size) > _BESIDE_SHARE:
+            return []  # texture
+    return [float(lines[:, at - 1 : at + 2].any(1).mean()) for lines, at in sides]
 
 
 def _stays_inside(changes: _Changes, box: PaneBox, k: float) -> bool:
