@@ -327,9 +327,12 @@ def _half(
             cv2.rectangle(image, (x0, y0), (x1, y1), _GREEN, 1)
     if scene is None:
         return image
+    x0, y0, x1, y1 = (round(scale * v) for v in scene.clip.in_file_px)
     for thing in scene.objects:
         mask = _mask_at(scene, thing, frame).astype(np.uint8)
-        large = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+        large = np.zeros((size[1], size[0]), np.uint8)
+        part = large[y0:y1, x0:x1]
+        part[:] = cv2.resize(mask, part.shape[::-1], interpolation=cv2.INTER_NEAREST)
         outline, _ = cv2.findContours(large, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(image, outline, -1, _RED, 1, cv2.LINE_AA)
     return image

@@ -38,6 +38,25 @@ def test_an_unsure_scene_is_turned_away_with_its_weakest_cue():
     assert caught.value.reason == "low_confidence"
 
 
+def test_an_unsure_scene_says_what_a_person_can_do_about_the_weakest_cues_that_suffice():
+    """0.8 * 0.7 * 0.9 = 0.504; without the weakest it is 0.72, without the two weakest 0.9."""
+    cues = (
+        Cue(stage="grounding", what="finding 'cup'", value=0.8, advice="mark 'cup' with a box"),
+        Cue(stage="shape", what="'cup' is clear", value=0.7),
+        Cue(stage="size", what="size of 'cup'", value=0.9, advice="give its size_m"),
+    )
+
+    for least, helps in (
+        (0.6, "what helps: mark 'cup' with a box$"),
+        (0.68, "with a box; give its size_m$"),
+        (0.75, "give its size_m; even so"),
+    ):
+        with pytest.raises(ItemRejectedError, match=helps):
+            check_confidence(cues, least)
+    with pytest.raises(ItemRejectedError, match="no mark or measure"):
+        check_confidence(cues[1:2], 0.75)
+
+
 def test_a_caption_that_names_another_colour_than_what_moves_is_turned_away(draw):
     clip = draw(caption="Pushing red mug from right to left", objects=("red mug",))
 

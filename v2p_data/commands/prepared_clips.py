@@ -20,6 +20,7 @@ from v2p_data.scene.reconstruct import prepared_for
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.clip import Clip
 from v2p_data.video.decode import VideoConfig, read_clip
+from v2p_data.video.hints import CROP
 
 KEPT = 4
 """Clips in memory: one of 150 frames takes 0.4 GB."""
@@ -97,7 +98,8 @@ class PreparedClips:
             pass
         stills = self._stills[video.item]
         try:
-            clip = read_clip(replace(video, hints={}), video_cfg)
+            crop = {p: hint for p, hint in video.hints.items() if p == CROP}
+            clip = read_clip(replace(video, hints=crop), video_cfg)
             if not stills.done():
                 stills.set_result(_stills_of(clip))
         except BaseException as error:

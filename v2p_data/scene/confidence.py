@@ -27,6 +27,8 @@ _OUT_OF_SIGHT = 0.8
 """What went into a bin lies in it, and what a fist lifts goes with it, but nobody sees where."""
 _IN_THE_AIR = 0.6
 """Confidence in an object that does not rest on the table at first; it falls from 1 where half of what that needs is seen."""
+_GOOD, _LEAST_CUE = 0.95, 0.01
+"""A cue above the first needs no help; the second keeps a ratio finite."""
 _GROWN = 0.2
 """Logarithm: of twelve drawn things that a hand touches at first where they rest, none seems so much larger there than at the end."""
 
@@ -35,38 +37,62 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
     """Return everything that the scene's confidence is the product of."""
     cues: list[Cue] = []
 
-    def add(stage: str, what: str, value: float) -> None:
-        cues.append(Cue(stage=stage, what=what, value=float(np.clip(value, 0, 1))))
+    def add(stage: str, what: str, value: float, advice: str = "") -> None:
+        value = float(np.clip(value, 0, 1))
+        cues.append(Cue(stage=stage, what=what, value=value, advice=advice))
 
     for s, placed in zip(grounded.objects, placement.objects, strict=True):
         which = f"'{s.phrase}'"
-        add("grounding", f"finding {which}" + (f" ({s.why})" if s.why else ""), s.sure)
+        box = "" if s.hinted else f"mark {which} with a box"
+        add("grounding", f"finding {which}" + (f" ({s.why})" if s.why else ""), s.sure, box)
         if not s.hinted and (words := named_colours(s.phrase)):
             image = grounded.working.rgb[s.at]
             match = float(colour_match(balance(image), words)[s.first].mean())
-            add("grounding", f"colour of {which}", 0.4 + 0.6 * match / _COLOURED)
+            add(
+                "grounding",
+                f"colour of {which}",
+                0.4 + 0.6 * match / _COLOURED,
+                f"{box}, or correct its colour word",
+            )
         if s.moves:
-            add("segmentation", f"track of {which} from start to end", 0.8 + 0.7 * s.agreement)
+            add(
+                "segmentation", f"track of {which} from start to end", 0.8 + 0.7 * s.agreement, box
+            )
         touched = _touched_share(grounded) if s is grounded.objects[0] else None
         if touched is not None:
-            add("grounding", f"a hand at {which} while it moves", 0.4 + 2 * touched)
+            add("grounding", f"a hand at {which} while it moves", 0.4 + 2 * touched, box)
         off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
-        add("size", f"size of {which}", np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2))
+        add(
+            "size",
+            f"size of {which}",
+            np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2),
+            "" if s.known_m else f"measure {which} and give its size_m",
+        )
         covers = placed.first.iou / attainable_iou(s.first)
-        add("shape", f"outline of {which}", max(0.1, 0.5 + (covers - 0.6) / 0.6))
+        add("shape", f"outline of {which}", max(0.1, 0.5 + (covers - 0.6) / 0.6), box)
         if not s.moves:
             continue
         if s.hidden_in_container or placed.hidden_in_hand:
             add("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
             continue
         covers = placed.last.iou / attainable_iou(placed.last_mask)
-        add("pose", f"outline of {which} at the end", max(0.1, 0.6 + (covers - 0.45) / 0.875))
+        add("pose", f"outline of {which} at the end", max(0.1, 0.6 + (covers - 0.45) / 0.875), box)
         seen = placed.last.visible / max(0.2, placed.first.visible)
         # Of what is put into something only the upper part is left to see.
         least = 0.8 if KINDS[kind].hides else 0.5
-        add("pose", f"{which} seen at the end", max(0.1, least + seen))
+        add(
+            "pose",
+            f"{which} seen at the end",
+            max(0.1, least + seen),
+            f"end the clip while {which} is in full view",
+        )
     thing = grounded.objects[0]
-    add("camera", "camera height", height_plausibility(placement.height_m))
+    add(
+        "camera",
+        "camera height",
+        height_plausibility(placement.height_m),
+        "measure the camera's height and give --scene.camera-height-m",
+    )
     on_table = _seen_on_table(grounded)
     if on_table < 1:
         on_table = max(0.0, 2 * on_table - 1)
@@ -74,14 +100,25 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
             "grounding",
             "standing on the table at first",
             _IN_THE_AIR + (1 - _IN_THE_AIR) * on_table,
+            f"begin the clip while '{thing.phrase}' stands on the table, or mark the table",
         )
     if not (thing.noun.known or thing.known_m):
-        add("size", f"knowing what '{thing.phrase}' is", 0.9)
+        add(
+            "size",
+            f"knowing what '{thing.phrase}' is",
+            0.9,
+            f"give '{thing.phrase}' a name of the table of nouns",
+        )
     matter = "clear" if is_clear(thing.phrase) else thing.noun.matter
     if matter != "rigid":
         add("shape", f"'{thing.phrase}' is {matter}", {"soft": 0.8, "clear": 0.7}[matter])
     if kind == "generic":
-        add("grounding", "understanding the caption", 0.85)
+        add(
+            "grounding",
+            "understanding the caption",
+            0.85,
+            "say what happens with a verb of a known kind of task",
+        )
     return tuple(cues)
 
 
@@ -151,10 +188,25 @@ def check_confidence(cues: tuple[Cue, ...], least: float) -> float:
         raise ItemRejectedError(
             "low_confidence",
             f"the scene is sure to {confidence:.3f}, below {least:g}; weakest is {weakest.what} with "
-            f"{weakest.value:.2f}; in captions.json a box around each object helps, or a known size",
+            f"{weakest.value:.2f}; {_what_helps(cues, least)}",
             round(confidence, 3),
         )
     return confidence
+
+
+def _what_helps(cues: tuple[Cue, ...], least: float) -> str:
+    """Return what a person can do, by the weakest cues first, until the scene would be sure enough."""
+    left, steps = confidence_of(cues), list[str]()
+    for cue in sorted((cue for cue in cues if cue.advice), key=lambda cue: cue.value):
+        if left >= least or cue.value > _GOOD:
+            break
+        left /= max(cue.value, _LEAST_CUE)
+        steps += [cue.advice] if cue.advice not in steps else []
+    if not steps:
+        return "no mark or measure would change that: film it again, nearer and in full view"
+    return f"what helps: {'; '.join(steps)}" + (
+        "" if left >= least else "; even so it may stay too unsure"
+    )
 
 
 def check_motion(

@@ -185,6 +185,8 @@ class Cue:
     what: str
     value: float
     """0 to 1."""
+    advice: str = ""
+    """What a person can do that raises it; empty where nothing does."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ file of Something-Something-v2 in the same folder (`labels.py`), else from the f
                   "hints": {"can": {"frame": 0, "box": [310, 120, 380, 240], "size_m": [0.066, 0.066, 0.12]}}}}
 
 A hint marks one object: `box`, `click`, `stroke` or `points` in one `frame`, `size_m`, or the `name` of the object where the
-caption's words do not say it. A hint called `table` marks the table itself.
+caption's words do not say it. A hint called `table` marks the table itself, and `"crop": [x, y, width, height]` says which part of the picture counts.
 """
 
 import csv
@@ -24,7 +24,7 @@ from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.json_files import read_json
 from v2p_data.video.checked import check_keys, listed, same_name, shortened, type_of, words
 from v2p_data.video.clip import Hint
-from v2p_data.video.hints import TABLE, boxes_as_read, read_hint
+from v2p_data.video.hints import CROP, TABLE, boxes_as_read, read_crop, read_hint
 from v2p_data.video.labels import Labels, read_labels
 from v2p_data.video.meaning import Meaning as Meaning
 from v2p_data.video.meaning import parse_caption as parse_caption
@@ -236,7 +236,9 @@ def _item(item: str, path: Path, said: _Said) -> VideoItem:
     caption, objects, hints = said
     if not objects:
         found = parse_caption(caption).phrases
-        objects = tuple(dict.fromkeys([*found, *(name for name in hints if name != TABLE)]))
+        objects = tuple(
+            dict.fromkeys([*found, *(name for name in hints if name not in (TABLE, CROP))])
+        )
     return VideoItem(item=item, path=path, caption=caption, objects=objects, hints=hints)
 
 
@@ -271,7 +273,7 @@ def checked_entry(entry: Any, where: str) -> _Said:
     hints = entry.get("hints", {})
     if not isinstance(hints, dict):
         raise V2PError(f"{where}: 'hints' must be an object, name -> hint, not a {type_of(hints)}")
-    known = (*(objects or parse_caption(caption).phrases), TABLE)
+    known = (*(objects or parse_caption(caption).phrases), TABLE, CROP)
     checked: dict[str, Hint] = {}
     for said_name, hint in hints.items():
         name = same_name(said_name, known)
@@ -280,7 +282,8 @@ def checked_entry(entry: Any, where: str) -> _Said:
                 f"{where}: there is a hint for '{said_name}', which is none of the objects."
                 f"{did_you_mean(said_name, known)}"
             )
-        checked[name] = read_hint(hint, f"{where}, hint '{said_name}'")
+        read = read_crop if name == CROP and CROP not in objects else read_hint
+        checked[name] = read(hint, f"{where}, hint '{said_name}'")
     return caption, objects, checked
 
 

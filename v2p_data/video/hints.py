@@ -21,6 +21,10 @@ MARK_KEYS = ("box", "click", "frame", "points", "stroke")
 """What belongs to one frame and is replaced together."""
 TABLE = "table"
 """The name under which a person marks the table itself, where no object is called so."""
+MIN_CROP_PX = 64
+"""Smaller pictures show too little."""
+CROP = "crop"
+"""The name under which a person says which part of the picture counts, where no object is called so."""
 
 _KEYS = ("box", "click", "frame", "name", "points", "size_m", "stroke")
 _LARGEST_FRACTION = 1.5
@@ -68,6 +72,27 @@ def read_hint(hint: Any, where: str) -> Hint:
             f"{where}: says nothing; give a box, a click, points, a stroke, size_m or name"
         )
     return checked
+
+
+def read_crop(value: Any, where: str) -> Hint:
+    """Return the part of the picture that a person said counts, as a box.
+
+    Args:
+        value: `[x, y, width, height]` in pixels of the file, or a hint with a box.
+        where: what a sentence begins with.
+
+    Raises:
+        V2PError: it is neither.
+    """
+    if isinstance(value, dict):
+        return read_hint(value, where)
+    x, y, w, h = numbers(value, 4, f"{where}: must be [x, y, width, height]")
+    if min(x, y) < 0 or min(w, h) < MIN_CROP_PX:
+        raise V2PError(
+            f"{where}: [x, y, width, height] begins inside of the picture and is {MIN_CROP_PX} px wide and high or "
+            f"more, in pixels of the file, not {value}"
+        )
+    return Hint(frame=0, box=[x, y, x + w, y + h])
 
 
 def check_hints(
@@ -147,8 +172,38 @@ def hints_in_clip(
     return moved
 
 
-def hint_in_crop(hint: Hint, crop: Crop) -> Hint:
-    """Return a hint in the pixels of a cropped picture; marks outside of it are moved to its edge."""
+def hints_in_crop(
+    hints: Mapping[str, Hint],
+    crop: Crop,
+    in_file_px: tuple[float, float, float, float],
+    where: str,
+) -> dict[str, Hint]:
+    """Return hints in the pixels of a cropped picture; what of a mark reaches beyond it is moved to its edge.
+
+    Args:
+        hints: by object phrase, in the pixels of the decoded pictures.
+        crop: what is left of these.
+        in_file_px: the same as x0, y0, x1, y1 in the file's pixels.
+        where: what a sentence begins with, such as the file's name.
+
+    Raises:
+        V2PError: the middle of a mark lies outside of what is left.
+    """
+    x0, y0, x1, y1 = crop.box_px
+    for phrase, hint in hints.items():
+        a, b, c, d = hint.get("box", [0.0] * 4)
+        middles = [((a + c) / 2, (b + d) / 2)] if "box" in hint else []
+        if not all(x0 <= x <= x1 and y0 <= y <= y1 for x, y in (*middles, *marked_spots(hint))):
+            left, top, right, bottom = (round(v) for v in in_file_px)
+            raise V2PError(
+                f"{where}, hint '{phrase}': the mark lies outside of the part of the picture that is used, x {left} to "
+                f'{right} and y {top} to {bottom} px; marks are in pixels of the whole file, and "hints": '
+                '{"crop": [x, y, width, height]} takes another part'
+            )
+    return {phrase: _in_crop(hint, crop) for phrase, hint in hints.items()}
+
+
+def _in_crop(hint: Hint, crop: Crop) -> Hint:
     x0, y0, x1, y1 = crop.box_px
 
     def inside(x: float, y: float) -> list[float]:

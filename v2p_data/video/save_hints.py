@@ -91,7 +91,7 @@ def merge_captions(folder: Path, addition: Path) -> Merged:
         _, _, checked = checked_entry(new, where)
         changed[name] = checked
         added += [
-            f"{name}, '{phrase}': {', '.join(k for k in sorted(both[phrase]) if k != 'frame')}"
+            f"{name}, '{phrase}': {', '.join(str(k) for k in both[phrase] if k != 'frame')}"
             for phrase in hints
             if both[phrase] != old.get("hints", {}).get(phrase)
         ]

@@ -1,16 +1,13 @@
 """Split screens: sample clips put beside and above each other, and scenes with lines that look like seams, drawn here."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 from sample_clips import with_frames
 
-from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.frames.split_screen import Seam, check_split, seam_of
+from v2p_data.scene.frames.split_screen import Seam, panes_of, seam_of
 from v2p_data.scene.frames.working_clip import working_clip_of
-from v2p_data.video.clip import Clip, Crop
+from v2p_data.video.clip import Clip
 
 W, H = 320, 240
 
@@ -107,23 +104,67 @@ def test_a_tables_edge_that_an_arm_reaches_across_is_no_seam(clips):
     assert seam.place == pytest.approx(100 / H, abs=1 / H)
 
 
-@pytest.mark.parametrize("upright", [True, False])
-def test_the_crop_that_is_advised_is_one_picture_without_bars(clips, upright):
-    frames = composite(clips, 0.5, upright=upright)
-    h, w = frames.shape[1:3]
-    crop = Crop(box_px=(0, 40, w, 40 + h), full_px=(w, h + 80))
-    clip = replace(with_frames(clips[0], frames), crop=crop, source_size_px=(2 * w, 2 * h + 160))
+def two_pictures(clips: list[Clip], n: int = 24) -> tuple[np.ndarray, np.ndarray]:
+    """Return two clips of one size; the second is turned and darker, as in another room."""
+    first, second = (c.frames[np.linspace(0, len(c.frames) - 1, n).astype(int)] for c in clips[:2])
+    return first, second[:, ::-1, ::-1] // 2
 
-    with pytest.raises(ItemRejectedError, match=r"-vf crop=\d+:\d+:\d+:\d+ one.mp4") as error:
-        check_split(clip, working_clip_of(clip))
 
-    assert error.value.reason == "split_screen"
-    cw, ch, x, y = (int(v) for v in error.value.detail.split("crop=")[1].split(" ")[0].split(":"))
-    size, begin = (cw, x) if upright else (ch, y - 80)
-    full = 2 * w if upright else 2 * h
-    assert size == pytest.approx(full / 2, abs=4)
-    assert min(begin, abs(begin - full / 2)) <= 4
-    assert (ch, y) == (2 * h, 80) if upright else (cw, x) == (2 * w, 0)
+def panes(clip: Clip, frames: np.ndarray) -> list[tuple[int, int, int, int]]:
+    return panes_of(frames, working_clip_of(with_frames(clip, frames)))
+
+
+def test_two_pictures_on_a_page_with_titles_and_round_corners_are_found(clips):
+    first, second = two_pictures(clips)
+    h, w = first.shape[1:3]
+    page = np.full((len(first), h + 70, 2 * w + 60, 3), 255, np.uint8)
+    inside = np.zeros((h, w), np.uint8)
+    cv2.rectangle(inside, (12, 0), (w - 13, h - 1), 1, -1)
+    cv2.rectangle(inside, (0, 12), (w - 1, h - 13), 1, -1)
+    for i, frame in enumerate(page):
+        cv2.putText(frame, "Human", (w // 3, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (0, 0, 0), 2)
+        frame[50 : 50 + h, 20 : 20 + w][inside > 0] = first[i][inside > 0]
+        frame[50 : 50 + h, 40 + w : 40 + 2 * w][inside > 0] = second[i][inside > 0]
+
+    found = panes(clips[0], page)
+
+    expected = [(20, 50, 20 + w, 50 + h), (40 + w, 50, 40 + 2 * w, 50 + h)]
+    assert len(found) == 2
+    assert np.abs(np.array(found) - expected).max() <= 3
+
+
+@pytest.mark.parametrize("bar_px", [0, 1, 6])
+def test_two_pictures_beside_each_other_are_found_whatever_bar_is_between_them(clips, bar_px):
+    first, second = two_pictures(clips)
+    h, w = first.shape[1:3]
+    bar = np.full((len(first), h, bar_px, 3), 255, np.uint8)
+
+    found = panes(clips[0], np.concatenate([first, bar, second], 2))
+
+    expected = [(0, 0, w, h), (w + bar_px, 0, 2 * w + bar_px, h)]
+    assert len(found) == 2
+    assert np.abs(np.array(found) - expected).max() <= 8
+
+
+@pytest.mark.parametrize("margin_px", [0, 12])
+def test_a_picture_in_the_picture_is_found(clips, margin_px):
+    first, second = two_pictures(clips)
+    h, w = first.shape[1:3]
+    small = np.stack([cv2.resize(f, (w // 3, h // 3)) for f in 2 * second])
+    small[:, [0, 1, -2, -1]] = small[:, :, [0, 1, -2, -1]] = 255  # the frame that editors draw
+    x1, y1 = w - margin_px, h - margin_px
+    frames = first.copy()
+    frames[:, y1 - h // 3 : y1, x1 - w // 3 : x1] = small
+
+    found = panes(clips[0], frames)
+
+    assert len(found) == 2
+    assert np.abs(np.array(found[0]) - (x1 - w // 3, y1 - h // 3, x1, y1)).max() <= 4
+    assert found[1] == (0, 0, w, h)
+
+
+def test_a_clip_of_one_picture_has_no_panes(clips):
+    assert [panes(clip, clip.frames[::4]) for clip in clips] == [[]] * len(clips)
 
 
 def test_a_clip_of_one_picture_has_no_seam(clips):

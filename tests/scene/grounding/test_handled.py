@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.classes import MOVED
 from v2p_data.scene.frames.hand_track import HandTrack
+from v2p_data.scene.grounding.ground_objects import check_hand
 from v2p_data.scene.grounding.handled import handling_in
 from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network
 
@@ -103,3 +105,15 @@ def test_hands_found_in_few_frames_say_nothing(segmentation_of):
         assert found.cues == alone.cues
         np.testing.assert_array_equal(found.first, alone.first)
         np.testing.assert_array_equal(found.last, alone.last)
+
+
+def test_a_hand_that_a_model_sees_counts_where_our_network_sees_none(segmentation_of, draw):
+    working, seen = segmentation_of(two_alike())
+    clip = draw()
+
+    check_hand(clip, replace(working, hands=hand_along(working, LOWER_Y)), seen)
+
+    for hands in (None, replace(hand_along(working, LOWER_Y), at=np.zeros(FRAMES, int))):
+        with pytest.raises(ItemRejectedError) as caught:
+            check_hand(clip, replace(working, hands=hands), seen)
+        assert caught.value.reason == "no_hand"

@@ -3,16 +3,14 @@
 Cross-fades are not told from fast hands and moving cameras, and are not looked for.
 """
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.scene.frames.one_pane import cropped
 from v2p_data.scene.frames.working_clip import WorkingClip
-from v2p_data.video.clip import Clip, Crop
-from v2p_data.video.hints import hint_in_crop
+from v2p_data.video.clip import Clip
 
 _SAMPLES = 24
 _BLACK, _JUMP = 24, 14
@@ -45,18 +43,11 @@ def without_bars(clip: Clip) -> Clip:
     if box == (0, 0, w, h):
         return clip
     x0, y0, x1, y1 = box
-    crop = Crop(box_px=box, full_px=(w, h))
     note = (
         f"the picture has black bars: {x0} px left, {w - x1} right, {y0} above, {h - y1} below (of {w} x {h}) were cut off; masks, "
         "overlays and camera belong to the rest"
     )
-    return replace(
-        clip,
-        frames=np.ascontiguousarray(clip.frames[:, y0:y1, x0:x1]),
-        crop=crop,
-        hints={phrase: hint_in_crop(hint, crop) for phrase, hint in clip.hints.items()},
-        warnings=(*clip.warnings, note),
-    )
+    return cropped(clip, box, note)
 
 
 # --- bars ----------------------------------------------------------------------------------------------------

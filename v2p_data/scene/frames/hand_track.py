@@ -44,6 +44,11 @@ class HandTrack:
         """Whether hands were found often enough to say where no hand was."""
         return len(np.unique(self.at)) >= max(_FEWEST, _KNOWN_SHARE * self.num_sampled)
 
+    @property
+    def is_seen(self) -> bool:
+        """Return whether any hand was found, in more than a frame or two."""
+        return len(np.unique(self.at)) >= _FEWEST
+
     def touches(self, k: int, mask: Bool[np.ndarray, "h w"], reach: float = _REACH) -> bool:
         """Return whether a fingertip of hand `k` is at the mask, which is not empty."""
         h, w = mask.shape

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 from v2p_data.scene.frames.checks import check_change, check_still
 from v2p_data.scene.frames.footage import check_cuts, without_bars
+from v2p_data.scene.frames.one_pane import FindHands, as_a_person_cropped, with_one_pane
 from v2p_data.scene.frames.paint_over import without_graphics
 from v2p_data.scene.frames.repeats import without_repeats
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
-from v2p_data.scene.frames.split_screen import check_split
 from v2p_data.scene.frames.stabilise import hint_in_aligned, stabilised
 from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
 from v2p_data.video.clip import Clip, Hint
-from v2p_data.video.hints import check_hints, hint_in_crop, hints_in_clip
+from v2p_data.video.hints import CROP, check_hints, hints_in_clip, hints_in_crop
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,12 +32,14 @@ class PreparedClip:
             V2PError: a mark lies outside of the picture, or in a frame that there is not.
         """
         clip = self.clip
-        check_hints(hints, clip.source_size_px, clip.total_frames, clip.path.name)
+        name = clip.path.name
+        hints = {p: h for p, h in hints.items() if p != CROP or CROP in clip.objects}
+        check_hints(hints, clip.source_size_px, clip.total_frames, name)
         size_px = clip.width_px, clip.height_px
         decoded_px = size_px if clip.crop is None else clip.crop.full_px
         own = hints_in_clip(hints, decoded_px, clip.source_size_px, clip.source_frame)
         if clip.crop is not None:
-            own = {phrase: hint_in_crop(hint, clip.crop) for phrase, hint in own.items()}
+            own = hints_in_crop(own, clip.crop, clip.in_file_px, name)
         if clip.to_filmed is not None:
             own = {
                 phrase: hint_in_aligned(hint, clip.to_filmed, size_px)
@@ -46,19 +48,25 @@ class PreparedClip:
         return replace(self, clip=replace(clip, hints=own))
 
 
-def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> PreparedClip:
+def prepare(
+    clip: Clip, find_hands: FindHands, *, with_network: bool, max_camera_shift_px: float
+) -> PreparedClip:
     """Return the clip ready to be searched, with its working frames and what the network sees, where it is asked.
 
-    Black bars are cut off, repeated frames dropped, captions painted over, and frames aligned where the camera sways.
+    Of several pictures at once the one with the hand is taken. Black bars are cut off, repeated frames dropped, captions painted over, and frames aligned where the camera sways.
     `max_camera_shift_px` is of a picture 320 px wide.
 
     Raises:
-        ItemRejectedError: `nothing_moves`, `split_screen`, `cut`, `overlay` or `camera_moves`, with the number that decided.
+        ItemRejectedError: `bad_hint`, `nothing_moves`, `split_screen`, `cut`, `overlay` or `camera_moves`, with the number that
+            decided.
     """
-    clip = without_repeats(without_bars(clip))
+    asked = as_a_person_cropped(clip)
+    clip = without_repeats(without_bars(clip if asked is None else asked))
     working = working_clip_of(clip)
     check_change(working)
-    check_split(clip, working)
+    one = clip if asked is not None else with_one_pane(clip, working, find_hands)
+    if one is not clip:
+        clip, working = one, working_clip_of(one)
     check_cuts(clip, working)
     painted = without_graphics(clip)
     if painted is not clip:

@@ -16,11 +16,7 @@ from v2p_data.scene.data_types import GroundedObjects, ObjectTrack
 from v2p_data.scene.frames.classes import HAND, MOVED, TABLE
 from v2p_data.scene.frames.colour import histogram
 from v2p_data.scene.frames.mask_ops import bounding_box, grow
-from v2p_data.scene.frames.segmentation import (
-    Segmentation,
-    hand_at,
-    table_seen,
-)
+from v2p_data.scene.frames.segmentation import Segmentation, hand_at, table_seen
 from v2p_data.scene.frames.table import Table, find_table
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.held_tool import HeldTool, find_tool
@@ -89,7 +85,7 @@ def ground_objects(
             decided.
     """
     if segmentation is not None:
-        _check_hand(clip, segmentation)
+        check_hand(clip, working, segmentation)
         segmentation = with_marked_table(clip, working, segmentation)
         working = _knowing_hand(working, segmentation)
     table = find_table(working.always, table_seen(segmentation) if segmentation else None)
@@ -337,12 +333,18 @@ def _unseen_object(clip: Clip, phrase: str, role: Role) -> ObjectTrack:
     )
 
 
-def _check_hand(clip: Clip, segmentation: Segmentation) -> None:
+def check_hand(clip: Clip, working: WorkingClip, segmentation: Segmentation) -> None:
+    """Turn away a clip in which neither our network nor a model that knows hands sees one.
+
+    Raises:
+        ItemRejectedError: `no_hand`, with the share of the picture that a hand covers at most.
+    """
     most = float((segmentation.shares[:, HAND] > 0.5).mean((1, 2)).max())
-    if most < _LEAST_HAND:
+    if most < _LEAST_HAND and not (working.hands and working.hands.is_seen):
+        where = clip.item if clip.crop is None else f"the part of {clip.item} that was taken"
         raise ItemRejectedError(
             "no_hand",
-            f"no hand is seen in {clip.item}: it covers {most:.2%} of the picture at most; motion without a hand shows no "
+            f"no hand is seen in {where}: it covers {most:.2%} of the picture at most; motion without a hand shows no "
             "manipulation",
             round(most, 5),
         )
