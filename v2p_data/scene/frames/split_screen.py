@@ -46,7 +46,7 @@ _LEAST_BLOCK, _LEAST_BLOCK_PX = 0.12, 40
 """Of the length that is cut, and pixels: narrower blocks are titles."""
 _MOST_CUTS = 4
 _INSET_AREA = (0.03, 0.6)
-_LEAST_SIDE = 0.12
+_LEAST_SIDE = 0.15
 _INSET_SHARE, _LEAST_SIDE_SHARE = 0.85, 0.75
 """Shares of an inset's sides that show a step: their mean, and the least."""
 _BESIDE_PX = 7
