@@ -25,7 +25,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for folder, names in (
         ("scene", SCENE_FILES),
         ("task/templates", TEMPLATES),
-        ("task", craft_data.PROMPTS),
+        ("task/llm", craft_data.PROMPTS),
     ):
         (tmp_path / folder).mkdir(parents=True, exist_ok=True)
         for name in names:
@@ -82,7 +82,7 @@ def test_prompts_count_where_a_model_is_asked(package: Path, name: str):
     asks = EngineConfig(task=TaskConfig(writer="vlm"))
     before, asked = names(), names(asks)
 
-    edit(package / "task" / name)
+    edit(package / "task/llm" / name)
 
     assert names() == before
     assert names(asks)[1] != asked[1]

@@ -189,8 +189,9 @@ def test_a_policy_that_lerobot_trains_is_opened_and_acts(kind: str, tmp_path: Pa
 
     if kind == "tdmpc":  # acts on cameras named 'observation.image' only
         return
-    actor.reset(2)
-    action = actor.act(np.zeros((2, 64, 64), np.uint8), np.zeros((2, 11), np.float32))
+    policy = actor.policy
+    policy.reset(2)
+    action = policy.act(np.zeros((2, 64, 64), np.uint8), np.zeros((2, 11), np.float32))
     assert size_px == (64, 64)
     assert action.shape == (2, 7)
     assert np.isfinite(action).all()

@@ -13,8 +13,8 @@ from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.play import StateActor
 from v2p_data.scene.scene import SceneObject
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.task.sandbox import guarded
 from v2p_data.task.sandbox.guarded import StatesChangedError, TaskOutputError
-from v2p_data.task.sandbox.sandbox import guarded
 from v2p_data.task.task import TaskBundle
 
 NUM_WORLDS = 6

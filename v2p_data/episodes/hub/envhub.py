@@ -26,7 +26,7 @@ from v2p_data.task.task import TASK_FILE, TaskBundle, told_of
 
 PACKAGE = "v2p_data"
 SOURCE = Path(__file__).parents[2]
-ENTRY = f"{PACKAGE}.sim.lerobot_env"
+ENTRY = f"{PACKAGE}.sim.wrappers.lerobot_env"
 """What `env.py` imports; everything that it needs comes along."""
 PLACES = (Path(), CARRIED_TASKS, Path("task"))
 """Where a folder of tasks, a dataset and a run keep theirs."""
