@@ -224,7 +224,9 @@ def test_a_run_without_scenes_or_whose_videos_are_elsewhere_is_shown_all_the_sam
 @pytest.mark.parametrize("num_clips", [100, 1000])
 def test_stills_of_many_clips_fit_into_ten_megabytes_together(tmp_path, num_clips):
     rng = np.random.default_rng(0)
-    noise = rng.integers(0, 256, (240, 640, 3), np.uint8).repeat(2, axis=0)  # else it looks interlaced
+    noise = rng.integers(0, 256, (240, 640, 3), np.uint8).repeat(
+        2, axis=0
+    )  # else it looks interlaced
     frames = [np.roll(noise, 7 * i, axis=1) for i in range(6)]
     video = VideoItem(item="a", path=film(tmp_path / "a.mp4", frames), caption="x")
 
