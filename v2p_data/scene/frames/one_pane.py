@@ -109,8 +109,8 @@ def with_one_pane(clip: Clip, working: WorkingClip, find_hands: FindHands) -> Cl
             round(shares[best], 3),
         )
     note = (
-        f"the clip shows {len(panes)} pictures at once, {where}: {_in_words(clip, panes[best])} was taken, as a bare hand is at "
-        f'what moves there in {shares[best]:.0%} of the frames; "hints": {{"crop": [x, y, width, height]}} takes another'
+        f"the clip shows {len(panes)} pictures at once, {where}: {_in_words(clip, panes[best])} was taken, because a bare hand "
+        f'touches what moves in {shares[best]:.0%} of its frames; "hints": {{"crop": [x, y, width, height]}} takes another'
     )
     return cropped(_halted(clip, panes, best), panes[best], note)
 
