@@ -94,7 +94,7 @@ def with_one_pane(clip: Clip, working: WorkingClip, find_hands: FindHands) -> Cl
         return clip
     bare = replace(clip, hints={})
     shares = [
-        hand_share(cropped(_halted(bare, panes, k), box, ""), find_hands)
+        hand_share(cropped(_with_insets_frozen(bare, panes, k), box, ""), find_hands)
         for k, box in enumerate(panes)
     ]
     areas = [(c - a) * (d - b) for a, b, c, d in panes]
@@ -110,9 +110,9 @@ def with_one_pane(clip: Clip, working: WorkingClip, find_hands: FindHands) -> Cl
         )
     note = (
         f"the clip shows {len(panes)} pictures at once, {where}: {_in_words(clip, panes[best])} was taken, because a bare hand "
-        f'touches what moves in {shares[best]:.0%} of its frames; "hints": {{"crop": [x, y, width, height]}} takes another'
+        f'touches the moving object in {shares[best]:.0%} of its frames; "hints": {{"crop": [x, y, width, height]}} takes another'
     )
-    return cropped(_halted(clip, panes, best), panes[best], note)
+    return cropped(_with_insets_frozen(clip, panes, best), panes[best], note)
 
 
 def hand_share(clip: Clip, find_hands: FindHands) -> float:
@@ -136,8 +136,8 @@ def hand_share(clip: Clip, find_hands: FindHands) -> float:
     return seen / len(frames)
 
 
-def _halted(clip: Clip, panes: list[PaneBox], taken: int) -> Clip:
-    """Return the clip with what lies in the taken picture standing still: an inset."""
+def _with_insets_frozen(clip: Clip, panes: list[PaneBox], taken: int) -> Clip:
+    """Return the clip with every inset in the chosen picture frozen at its first frame."""
     x0, y0, x1, y1 = panes[taken]
     inside = [
         b

@@ -51,7 +51,7 @@ _INSET_SHARE, _LEAST_SIDE_SHARE = 0.85, 0.75
 """Shares of an inset's sides that show a step: their mean, and the least."""
 _BESIDE_PX = 7
 _LASTING = 0.75
-"""Of the frames: what moves may have the colour of the other side at times."""
+"""Share of the frames in which an edge must be seen. A moving object may hide it at times, where its colour equals the background."""
 _GAP_PX, _NEAR_PX = 9, 5
 """Gaps in a side that are closed, and how far an inset's corner may lie from its sides' ends."""
 _MOST_LINES = 24
