@@ -77,6 +77,16 @@ def test_another_version_of_mujoco_is_named_with_file_and_field(copied):
             "setting 'new' is not in meta/v2p.json",
         ),
         (lambda about: [e.update(source="handover") for e in about["episodes"]], "handovers only"),
+        (
+            lambda about: about["provenance"]["items"]["toy"]["recipe"]["config"]["config"].update(
+                batch_worlds=10**9
+            ),
+            "batch_worlds is 1000000000; at most 4096",
+        ),
+        (
+            lambda about: [e.update(item="../toy") for e in about["episodes"]],
+            "which is no folder in",
+        ),
     ],
 )
 def test_what_cannot_be_replayed_is_refused_in_a_sentence(copied, spoil, sentence):

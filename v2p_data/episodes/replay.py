@@ -37,6 +37,8 @@ from v2p_data.task.task import TaskBundle
 
 SAME = 1e-9
 """Largest difference of states [m, rad] that counts as none."""
+MAX_WORLDS = 4096
+"""A stranger's record may not ask for more worlds at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +133,11 @@ def replay(
     done: list[tuple[Replayed, np.ndarray]] = []
     for (item, seed), episodes in batches.items():
         on_progress(len(done) / total, f"{len(done)}/{total} episodes")
-        bundle = TaskBundle.load(root / CARRIED_TASKS / item)
-        cfg = _recipe(about, item)
+        if Path(item).name != item:
+            raise V2PError(
+                f"{METADATA_FILE} names the task '{item}', which is no folder in {CARRIED_TASKS}"
+            )
+        bundle, cfg = TaskBundle.load(root / CARRIED_TASKS / item), _recipe(about, item)
         rollouts = _played(bundle, cfg, seed, episodes, num_threads)
         done += [_compared(rollouts, e, item, e.world % cfg.batch_worlds) for e in episodes]
     done.sort(key=lambda pair: pair[0].episode)
@@ -188,7 +193,12 @@ def _recipe(about: Mapping[str, Any], item: str) -> EpisodesConfig:
         values = values.get(key) if isinstance(values, dict) else None
     if values is None:
         raise V2PError(f"{place} is missing: it does not say under what '{item}' was recorded")
-    return from_values(EpisodesConfig, values, place)
+    cfg = from_values(EpisodesConfig, values, place)
+    if cfg.batch_worlds > MAX_WORLDS:
+        raise V2PError(
+            f"{place}.batch_worlds is {cfg.batch_worlds}; at most {MAX_WORLDS} worlds are replayed at a time"
+        )
+    return cfg
 
 
 def _played(
