@@ -26,8 +26,8 @@ test-fast: $(STAMP)
 	@$(PY) -m pytest -q -m "not slow and not gpu and not live_llm"
 
 check: $(STAMP)
-	@$(VENV)/bin/ruff check .
-	@$(VENV)/bin/ruff format --check .
+	@$(VENV)/bin/ruff check --no-cache .  # a cached verdict is stale when a module moves
+	@$(VENV)/bin/ruff format --no-cache --check .
 	@$(VENV)/bin/codespell $$(git ls-files '*.py' '*.md' '*.toml' '*.yaml')
 	@$(PY) scripts/count_statements.py
 	@$(VENV)/bin/pyright --pythonpath $(PY)

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from v2p_data.experts.actors import ProgramActor
 
 from paper_tables import success
 from policies.evaluation.paired import median_difference, success_difference
@@ -28,6 +27,7 @@ from policies.ppo.policy import Expert
 from studies.results import append_result, commit, results_in
 from v2p_data.episodes.collect import judge_expert
 from v2p_data.episodes.rollouts import Rollouts
+from v2p_data.experts.actors import ProgramActor
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, learn
 from v2p_data.play import Actor, StateActor

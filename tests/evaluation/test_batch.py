@@ -6,12 +6,12 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from v2p_data.experts.actors import ProgramActor
 
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import NEVER, Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.judging import own_reset_rate
+from v2p_data.experts.actors import ProgramActor
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import StateActor, View, VisionActor
 from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv
