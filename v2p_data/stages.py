@@ -250,10 +250,14 @@ def make_task(
     robot: RobotConfig,
     how: TaskConfig,
 ) -> dict[str, Any]:
-    """Write eight task codes, audit them, keep the best. What a model answers is kept for all tasks of the run."""
+    """Write eight task codes, audit them, keep the best. What a model answers is kept for all tasks of the run.
+
+    A family's code, where one is given, is the only sample.
+    """
     from v2p_data.scene.scene import Scene
     from v2p_data.sim.env.task_check import check_task
     from v2p_data.task.generate import generate_task
+    from v2p_data.task.task import TaskBundle
 
     scene = Scene.load(inputs["scene"])
     runtime.progress(0.1, "writing task code")
@@ -261,6 +265,7 @@ def make_task(
         scene,
         how,
         seed_for(cfg.seed, "task", scene.title),
+        sources=[TaskBundle.load(inputs["family"]).code] if "family" in inputs else None,
         calls=runtime.root / MODEL_CALLS_FOLDER,
         pool=runtime.root / SOLVED_POOL_FOLDER,
     )
@@ -732,13 +737,19 @@ def with_cousins(stage: Stage, cfg: EngineConfig) -> list[Stage]:
         return [stage]
     scene = next(s for s in in_order([stage]) if s.name == "scene")
     cousins = (cousin_stage(scene, k, cfg) for k in range(cfg.cousins.count))
-    return [stage, *(_of_cousin(stage, cousin) for cousin in cousins)]
+    return [stage, *(_of_cousin(stage, cousin, cfg) for cousin in cousins)]
 
 
-def _of_cousin(stage: Stage, cousin: Stage) -> Stage:
+def _of_cousin(stage: Stage, cousin: Stage, cfg: EngineConfig) -> Stage:
+    """Return a stage for the cousin; searched rewards and a model's code are the family's, templates write one sample."""
     if stage.name == "scene":
         return cousin
-    inputs = {name: _of_cousin(needed, cousin) for name, needed in stage.inputs.items()}
+    if stage.name in ("task", "reward"):
+        task = task_stage(cousin, replace(cfg, task=replace(cfg.task, num_samples=1)))
+        if stage.name == "task" and cfg.task.writer == "templates":
+            return task
+        return replace(task, inputs={"scene": cousin, "family": stage})
+    inputs = {name: _of_cousin(needed, cousin, cfg) for name, needed in stage.inputs.items()}
     return replace(stage, item=cousin.item, inputs=inputs)
 
 

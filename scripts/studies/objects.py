@@ -163,12 +163,16 @@ def lifting_clips(folder: Path, pool: PoolConfig) -> tuple[list[VideoItem], dict
 # --- toys ----------------------------------------------------------------------------------------------------
 
 
+TOY_FORMS = ("box", "cylinder", "sphere", "ring", "cup")
+
+
 def toy_stage(number: int, pool: PoolConfig) -> Stage:
-    """Return the stage that makes a random toy: one to three boxes, cylinders, balls and rings on top of each other."""
+    """Return the stage that makes a random toy: a cup, or one to three boxes, cylinders, balls and rings on each other."""
     return Stage(
         name="scene",
         item=f"toy_{number:04d}",
         config={"seed": pool.seed, "kind": "toy"},
+        version=2,
         make=make_toy,
     )
 
@@ -180,16 +184,20 @@ def make_toy(
     del inputs, runtime
     item = out.name.split("-")[0]
     rng = rng_for(cfg["seed"], "study_lifting", item)
-    forms = [str(f) for f in rng.choice(["box", "cylinder", "sphere", "ring"], rng.integers(1, 4))]
+    forms = [str(f) for f in rng.choice(TOY_FORMS, rng.integers(1, 4))]
+    forms = ["cup"] if forms[0] == "cup" else [f for f in forms if f != "cup"]
     parts: list[trimesh.Trimesh] = []
     meshes: list[trimesh.Trimesh] = []
     top = 0.0
     for form in forms:
-        size, bore = _toy_size(form, rng), float(rng.uniform(0.35, 0.7)) if form == "ring" else 0.0
-        kind = "cylinder" if form == "ring" else form
+        kind = "cylinder" if form in ("ring", "cup") else form
+        size = _toy_size(form, rng)
+        bore = float(rng.uniform(0.35, 0.7)) if form == "ring" else 0.0
+        taper = float(rng.uniform(0.6, 1.0)) if form == "cup" else 1.0
+        shape = {"bore": bore, "hollow": form == "cup", "taper": taper}
         lift = [0.0, 0.0, top + size[2] / 2]
-        meshes.append(mesh_for(kind, size, bore=bore).apply_translation(lift))
-        parts += [p.apply_translation(lift) for p in parts_for(kind, size, bore=bore)]
+        meshes.append(mesh_for(kind, size, **shape).apply_translation(lift))
+        parts += [p.apply_translation(lift) for p in parts_for(kind, size, **shape)]
         top += size[2]
     whole = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
     assert isinstance(whole, trimesh.Trimesh)
@@ -197,7 +205,7 @@ def make_toy(
     whole.apply_translation(-middle)
     parts = [p.apply_translation(-middle) for p in parts]
     density = float(np.exp(rng.uniform(np.log(150), np.log(900))))
-    single = forms[0] if len(forms) == 1 and forms[0] != "ring" else None
+    single = forms[0] if len(forms) == 1 and forms[0] not in ("ring", "cup") else None
     thing = SceneObject(
         name="toy",
         label="toy",

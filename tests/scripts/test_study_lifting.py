@@ -27,7 +27,14 @@ from v2p_data.pipeline.runner import (
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Event
 from v2p_data.policy.config import PolicyConfig
-from v2p_data.stages import CousinsConfig, EngineConfig, episodes_stage, with_cousins
+from v2p_data.stages import (
+    CousinsConfig,
+    EngineConfig,
+    episodes_stage,
+    reward_stage,
+    task_stage,
+    with_cousins,
+)
 from v2p_data.task.generate import TaskConfig
 
 ROOT = Path(__file__).parents[2]
@@ -147,9 +154,23 @@ def test_each_cousin_goes_through_the_same_stages_as_its_scene(parts):
             ("scene", "toy_0004"),
             *((n, cousin.item) for n in ("cousin", "task", "lift", "expert", "episodes")),
         ]
-        assert cousin.inputs["expert"].inputs["task"] == cousin.inputs["task"]
+        lift = cousin.inputs["task"]
+        assert cousin.inputs["expert"].inputs["task"].folder_name == lift.folder_name
     assert len({stage.folder_name for stage in (own, *cousins)}) == 3
     assert with_cousins(own, EngineConfig()) == [own]
+
+
+def test_templates_write_one_code_for_a_cousin_and_a_searched_reward_is_its_familys(parts):
+    cfg = EngineConfig(cousins=CousinsConfig(count=1))
+    toy = parts.objects.toy_stage(4, parts.config.PoolConfig())
+    task = task_stage(toy, cfg)
+    reward = reward_stage(task, cfg)
+
+    _, plain = with_cousins(task, cfg)
+    _, searched = with_cousins(reward, cfg)
+
+    assert (plain.config.config.num_samples, set(plain.inputs)) == (1, {"scene"})
+    assert (searched.name, searched.inputs["family"]) == ("task", reward)
 
 
 def test_counts_that_do_not_grow_are_refused(parts):
