@@ -222,3 +222,13 @@ def test_what_ended_a_trial_is_called_by_its_name(number, said):
         return {}
 
     assert said in in_a_fork("", {"seconds_each": 20}, crash)["error"]
+
+
+def test_a_fork_neither_reads_the_next_request_nor_answers_in_its_parents_name(capfd):
+    def speak(source: str, request: dict) -> dict:
+        os.write(1, b"[]\n")
+        os.write(2, b"a complaint")
+        return {"read": os.read(0, 100).decode()}
+
+    assert in_a_fork("", {"seconds_each": 20}, speak) == {"read": ""}
+    assert tuple(capfd.readouterr()) == ("", "")

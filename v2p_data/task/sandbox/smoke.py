@@ -1,15 +1,22 @@
 """Runs unknown task code once, in a child process that cannot hurt anyone, and says whether it works.
 
-`smoke_run` starts one child (torch is imported once), which forks for every sample, so that a crash, a hang
-or a memory bomb in one sample is that sample's own result. See `sandbox` for what the child may not do.
+The child forks for every sample, so that a crash, a hang or a memory bomb in one sample is that sample's own result.
+It stays for the next question, because torch takes seconds to import. See `sandbox` for what a fork may not do.
 """
 
+import contextlib
 import hashlib
 import json
 import math
+import os
+import shutil
 import subprocess
 import tempfile
+import threading
+import time
+import weakref
 from dataclasses import dataclass, field
+from multiprocessing.connection import wait
 from typing import Any
 
 import numpy as np
@@ -30,6 +37,8 @@ BATCH = 16
 PARTS = 3
 """Batch sizes, drawn at random, at which every program is asked again."""
 MAX_ANSWER_CHARS = 20_000_000
+ENDS_S = 5.0
+"""A child that has closed its output has ended by then."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,13 +192,35 @@ def _ask_child(
 ) -> list[SmokeResult]:
     num_probes, num_starts = (len(x["eef_pos"]) if x else 0 for x in (probes, starts))
     request = trial_request(sources, scene, probes, seconds_each, starts)
-    with (
-        tempfile.TemporaryDirectory(prefix="v2p-task-") as folder,
-        subprocess.Popen(
+    deadline = time.monotonic() + timeout_s
+    while True:
+        child = _child()
+        try:
+            answer = child.ask(request, deadline)
+        except TimeoutError:
+            child.end()
+            return [
+                SmokeResult(runnable=False, error=f"the trial run took more than {timeout_s:g} s")
+            ] * len(sources)
+        if answer.endswith(b"\n"):
+            break
+        if child.end() != 0 or answer:  # 0: nobody had asked for long, and it ended just now
+            break
+    return _read(answer, child.complaint, len(sources), num_probes, num_starts)
+
+
+class _Child:
+    """A process that answers one request after the other, until nobody asks or its parent's thread ends."""
+
+    def __init__(self) -> None:
+        self._owner = os.getpid()
+        folder = tempfile.mkdtemp(prefix="v2p-task-")
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the child lives
+        self._process = subprocess.Popen(
             own_python(f"v2p_data.task.sandbox.{CHILD.removesuffix('.py')}"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._stderr,
             cwd=folder,
             env={
                 "OMP_NUM_THREADS": "1",
@@ -198,17 +229,70 @@ def _ask_child(
                 "PATH": "/usr/bin:/bin",
             },
             start_new_session=True,
-        ) as child,
-    ):
-        try:
-            answer, complaint = child.communicate(json.dumps(request).encode(), timeout_s)
-        except subprocess.TimeoutExpired:
-            return [
-                SmokeResult(runnable=False, error=f"the trial run took more than {timeout_s:g} s")
-            ] * len(sources)
-        finally:
-            end_group(child)
-    return _read(answer, complaint, len(sources), num_probes, num_starts)
+        )
+        self._end = weakref.finalize(self, _end, self._process, folder, self._owner)
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it can be asked: it lives, and is not that of a process from which this one was forked."""
+        return self._owner == os.getpid() and self._process.poll() is None
+
+    @property
+    def complaint(self) -> bytes:
+        """What it has written on its standard error."""
+        self._stderr.seek(0)
+        return self._stderr.read()
+
+    def ask(self, request: dict[str, Any], deadline: float) -> bytes:
+        """Return the answer, or what there is of it if the child ended.
+
+        Raises:
+            TimeoutError: the time is up.
+        """
+        questions, answers = self._process.stdin, self._process.stdout
+        assert questions is not None
+        assert answers is not None
+        answer = bytearray()
+        with contextlib.suppress(BrokenPipeError):
+            questions.write(json.dumps(request).encode() + b"\n")
+            questions.flush()
+        while not answer.endswith(b"\n") and len(answer) <= MAX_ANSWER_CHARS:
+            if not wait([answers.fileno()], max(0.0, deadline - time.monotonic())):
+                raise TimeoutError
+            chunk = os.read(answers.fileno(), 1 << 20)
+            if not chunk:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(ENDS_S)
+                break
+            answer += chunk
+        return bytes(answer)
+
+    def end(self) -> int | None:
+        """Kill it unless it has ended by itself; return how it ended."""
+        self._end()
+        return self._process.returncode
+
+
+def _end(process: subprocess.Popen[bytes], folder: str, owner: int) -> None:
+    if os.getpid() != owner:
+        return
+    end_group(process)
+    for stream in (process.stdin, process.stdout):
+        with contextlib.suppress(BrokenPipeError, AttributeError):
+            stream.close()  # pyright: ignore[reportOptionalMemberAccess]
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+_children = threading.local()
+"""One a thread: the kernel ends a child with the thread that started it."""
+
+
+def _child() -> _Child:
+    """Return this thread's child, a new one where there is none."""
+    child: _Child | None = getattr(_children, "child", None)
+    if child is None or not child.is_ours:
+        child = _children.child = _Child()
+    return child
 
 
 def _read(

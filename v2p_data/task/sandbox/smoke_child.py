@@ -1,4 +1,4 @@
-"""The child process of `smoke`: reads task codes as JSON, tries each in a fork with nothing left to abuse.
+"""The child process of `smoke`: reads task codes as lines of JSON, tries each in a fork with nothing left to abuse.
 
 A fork may open no file and no socket, start no process, write no file, and use a bounded amount of time and
 memory (`confine`).
@@ -28,6 +28,8 @@ MEMORY_BYTES = 2 * 1024**3
 LARGE_REWARD = 1000.0
 """Ten full rewards: beside them the bonus for success hardly counts."""
 MAX_ANSWER_BYTES = 4_000_000
+IDLE_S = 60.0
+"""A child that nobody asks for so long ends; its memory is wanted elsewhere."""
 SLOW_S = 1.0
 SCALED = ("_pos", "_size", "_width")
 """How the names of states in metres end."""
@@ -81,14 +83,15 @@ class FakePlacer:
 
 
 def main() -> None:
-    """Answer one request from stdin on stdout."""
-    request: dict[str, Any] = json.load(sys.stdin)
+    """Answer requests from stdin on stdout, a line each, until none comes for `IDLE_S`."""
     leave_the_network()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
-    warm_up(request)
-    answers = [in_a_fork(source, request) for source in request["sources"]]
-    sys.stdout.write(json.dumps(answers))
+    while select.select([sys.stdin], [], [], IDLE_S)[0] and (line := sys.stdin.readline()):
+        request: dict[str, Any] = json.loads(line)
+        warm_up(request)
+        answers = [in_a_fork(source, request) for source in request["sources"]]
+        print(json.dumps(answers), flush=True)  # noqa: T201 - this is the answer
 
 
 def warm_up(request: dict[str, Any]) -> None:
@@ -256,6 +259,7 @@ def in_a_fork(
         os.close(read_end)
         code = 1
         try:
+            _leave_the_pipes()
             confine(seconds, MEMORY_BYTES, parent_pid=parent_pid)
             _send(write_end, (answer_to or answer)(source, request))
             code = 0
@@ -277,6 +281,14 @@ def in_a_fork(
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) in _FAULTS:
             return _failed(_FAULTS[os.WTERMSIG(status)])
         return _failed("its process ended before it had answered; it may need too much memory")
+
+
+def _leave_the_pipes() -> None:
+    """Let a fork neither read the next request nor write an answer in our name."""
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in range(3):
+        os.dup2(nothing, stream)
+    os.close(nothing)
 
 
 def answer(source: str, request: dict[str, Any]) -> dict[str, Any]:
