@@ -12,29 +12,22 @@ shares of the referee's successes and of its failures on which a success functio
 import argparse
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
+from studies.success_functions import Moments, balanced_accuracy, held, play_programs
 from v2p_data.experts.teacher import Teacher
 from v2p_data.kinds import KINDS
 from v2p_data.seeds import rng_for, seed_for
-from v2p_data.sim.env import task_code
-from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv, SimConfig
-from v2p_data.sim.env.verdict import RefereeRecord
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.generate import TaskConfig, generate_task
-from v2p_data.task.sandbox.sandbox import class_name
-from v2p_data.task.task import TaskBundle
 
 NOISES = (0.0, 0.3, 0.6, 1.0)
 """Standard deviations of the noise on actions in [-1, 1]."""
-QUIET_STEPS = 20
-"""Control steps (1 s) without noise at the end, so that stillness alone does not decide."""
 IDLE_SHARE, STOPPED_SHARE, MEANT_SHARE = 0.1, 0.3, 0.5
 """Of the worlds: nobody acts; the robot stops half-way; the program is the one that the task's words mean."""
 
@@ -73,7 +66,9 @@ def measured(name: str, episodes: int, seed: int, threads: int) -> dict[str, Any
     last, right = _played(env, rng_for(seed, "bench_pick", "noise", name))
     agreements = []
     for sample in made.samples:
-        said = held(env, bundle, sample.code, last)
+        said = held(env, sample.code, last)
+        if said is None:
+            raise SystemExit(f"error: sample {len(agreements)} of {name} does not run")
         agreements.append(
             {
                 "balanced": balanced_accuracy(said, right),
@@ -100,59 +95,18 @@ def measured(name: str, episodes: int, seed: int, threads: int) -> dict[str, Any
     }
 
 
-def _played(
-    env: BatchEnv, rng: np.random.Generator
-) -> tuple[list[dict[str, torch.Tensor]], Bool[np.ndarray, "env"]]:
+def _played(env: BatchEnv, rng: np.random.Generator) -> tuple[Moments, Bool[np.ndarray, "env"]]:
     """Play one episode in every world; return the last moments, and what the referee says."""
     n, horizon = env.num_envs, env.horizon
-    teacher, referee = Teacher(env), RefereeRecord(env)
-    names = list(teacher.programs)
-    meant = [k for k, name in enumerate(names) if name.startswith(_meant(env.bundle))]
+    names = list(Teacher(env).programs)
+    meant = [k for k, name in enumerate(names) if name.startswith(KINDS[env.bundle.kind].programs)]
     program = np.where(
         rng.random(n) < MEANT_SHARE, rng.choice(meant, n), rng.integers(len(names), size=n)
     )
     noise = rng.choice(NOISES, n)
     is_idle = rng.random(n) < IDLE_SHARE
     stop = np.where(rng.random(n) < STOPPED_SHARE, rng.uniform(0.3, 1.0, n), np.inf) * horizon
-    env.reset(np.arange(n))
-    referee.restart()
-    last: list[dict[str, torch.Tensor]] = []
-    for step in range(horizon):
-        moment = teacher.moment()
-        said: Float[np.ndarray, "program env 7"] = np.stack(
-            [teacher.programs[name](moment) for name in names]
-        )
-        action = said[program, np.arange(n)]
-        if step < horizon - QUIET_STEPS:
-            action = action + noise[:, None] * rng.normal(size=action.shape)
-        action[is_idle | (step > stop)] = 0.0
-        env.step(action)
-        referee.note()
-        if step >= horizon - HELD_STEPS:
-            last.append({key: value.clone() for key, value in env.states().items()})
-    return last, referee.verdict()
-
-
-def _meant(bundle: TaskBundle) -> tuple[str, ...]:
-    return KINDS[bundle.kind].programs
-
-
-def held(
-    env: BatchEnv, bundle: TaskBundle, code: str, last: list[dict[str, torch.Tensor]]
-) -> Bool[np.ndarray, "env"]:
-    """Return where a task code's success is true at all of the last moments."""
-    task = task_code.load(replace(bundle, code=code, class_name=class_name(code)), env, None)
-    answers = [
-        task.succeeds(lambda moment=moment: {k: v.clone() for k, v in moment.items()})
-        for moment in last
-    ]
-    return torch.stack(answers).all(dim=0).numpy()
-
-
-def balanced_accuracy(said: Bool[np.ndarray, "env"], right: Bool[np.ndarray, "env"]) -> float:
-    """Return the mean of the shares of true and of false cases that are told right; of one kind, where there is one only."""
-    shares = [np.mean(said[right == value] == value) for value in (True, False) if (right == value).any()]  # fmt: skip
-    return float(np.mean(shares))
+    return play_programs(env, program, noise, np.where(is_idle, -1, stop), rng)
 
 
 def table(rows: list[dict[str, Any]]) -> str:
