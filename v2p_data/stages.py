@@ -74,12 +74,12 @@ ROOT_OF_TASKS = CARRIED_TASKS.as_posix()
 COUSIN_MARK = "_cousin_"
 """Between a scene's item and the number of its cousin."""
 MODEL_CALLS_FOLDER = "vlm"
-"""Of a run: everything that a language model was asked and answered."""
+"""Folder of a run with every question to a language model and its answer."""
 SOLVED_POOL_FOLDER = "pool"
-"""Of a run: solved tasks that a language model is shown as examples."""
+"""Folder of a run with solved tasks that a language model is shown as examples."""
 EVALUATION_FILE = "evaluation.json"
 VIDEOS_FOLDER, SHEET_FILE = "videos", "sheet.png"
-"""Of an evaluation: a folder per task with a few films and a contact sheet."""
+"""Folder of an evaluation: per task a few films and a contact sheet."""
 
 
 @dataclass(frozen=True, kw_only=True)

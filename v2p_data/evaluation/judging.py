@@ -40,9 +40,9 @@ class Contestant:
 
     kind: Kind
     folder: Path
-    """Of a policy or an expert."""
+    """Folder of a policy or an expert."""
     repo_id: str = ""
-    """Of a policy that was fetched from the Hub."""
+    """Name on the Hub of a policy that was fetched from there."""
 
     @property
     def sources(self) -> dict[str, str]:
