@@ -13,13 +13,16 @@ import logging
 import os
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from policies.bc.configuration_v2p_bc import V2PBCConfig
+from policies.bc.frames import FrameTable
 from policies.bc.student import Student
 from policies.bc.trainer import TrainerConfig
 from policies.evaluation.rate import wilson
@@ -125,7 +128,7 @@ def _one(name: str, seed: int, args: argparse.Namespace) -> None:
         num_threads=args.threads,
         action_limit=ACTION_LIMIT,
     )
-    student.table = student.table.of_tasks([b.description for b in bundles.values()])
+    student.table = of_tasks(student.table, [b.description for b in bundles.values()])
     rate = _samples_per_s(student, variant.batch_size, folder / "calibration")
     shares = [SHARES[0] if k == 0 else SHARES[1] for k in range(variant.rounds)]
     shares.append(1 - sum(shares))
@@ -170,6 +173,24 @@ def _one(name: str, seed: int, args: argparse.Namespace) -> None:
     }
     append_result(args.out, result)
     print(json.dumps(result), flush=True)
+
+
+def of_tasks(table: FrameTable, words: Sequence[str]) -> FrameTable:
+    """Return the frames of some tasks, named in words."""
+    wanted = torch.tensor([task in words for task in table.tasks])[table.task]
+    place = wanted.cumsum(0) - 1
+    return FrameTable(
+        pictures={
+            key: {name: value[wanted] for name, value in prepared.items()}
+            for key, prepared in table.pictures.items()
+        },
+        vectors={key: value[wanted] for key, value in table.vectors.items()},
+        action=table.action[wanted],
+        task=table.task[wanted],
+        tasks=table.tasks,
+        first=place[table.first[wanted]],
+        last=place[table.last[wanted]],
+    )
 
 
 def _samples_per_s(student: Student, batch_size: int, folder: Path) -> float:

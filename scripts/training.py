@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from v2p_data.seeds import rng_for
 
 HELD_OUT = 20
-"""Every so-manieth scene is for measuring."""
+"""One scene in so many is held out for measuring."""
 Scene = dict[str, np.ndarray]
 
 

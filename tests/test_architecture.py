@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LEAVES = {"errors", "json_files", "letters", "processes"}
+LEAVES = {"errors", "json_files", "letters", "local_page", "processes"}
 """Every room may use them; they know nothing but each other."""
 BELOW: dict[str, set[str]] = {
     "errors": set(),
     "json_files": set(),
     "letters": set(),
+    "local_page": set(),
     "processes": set(),
     "seeds": set(),
     "kinds": set(),

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from policies.evaluation.rate import wilson
 from v2p_data.craft_data import scene_data, task_data
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.collect import EpisodesConfig, collect, judge_expert, staged_episodes
 from v2p_data.episodes.dataset.about import CARRIED_TASKS
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
@@ -35,6 +35,7 @@ from v2p_data.evaluation.judging import (
     task_folders,
 )
 from v2p_data.experts.config import ExpertConfig
+from v2p_data.experts.labeller import choose_program, labeller_of
 from v2p_data.experts.solved import find_solved, solved_digests
 from v2p_data.pipeline.artifact import (
     Record,
@@ -55,13 +56,14 @@ from v2p_data.policy.training import (
 )
 from v2p_data.reward.config import RewardConfig
 from v2p_data.scene.config import SceneConfig
+from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.robot.arms import RobotConfig, robot_to_json
-from v2p_data.task.generate import TaskConfig
+from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.llm.config import VlmConfig
-from v2p_data.task.task import CODE_FILE, REWARD_SEARCH_FOLDER
+from v2p_data.task.task import CODE_FILE, REWARD_SEARCH_FOLDER, SCENE_FOLDER, TaskBundle, told_of
 from v2p_data.video.captions import VideoItem
-from v2p_data.video.decode import VideoConfig
+from v2p_data.video.decode import VideoConfig, read_clip
 
 if TYPE_CHECKING:
     from v2p_data.scene.frames.prepare import PreparedClip
@@ -72,12 +74,12 @@ ROOT_OF_TASKS = CARRIED_TASKS.as_posix()
 COUSIN_MARK = "_cousin_"
 """Between a scene's item and the number of its cousin."""
 MODEL_CALLS_FOLDER = "vlm"
-"""Of a run: everything that a language model was asked and answered."""
+"""Folder of a run with every question to a language model and its answer."""
 SOLVED_POOL_FOLDER = "pool"
-"""Of a run: solved tasks that a language model is shown as examples."""
+"""Folder of a run with solved tasks that a language model is shown as examples."""
 EVALUATION_FILE = "evaluation.json"
 VIDEOS_FOLDER, SHEET_FILE = "videos", "sheet.png"
-"""Of an evaluation: a folder per task with a few films and a contact sheet."""
+"""Folder of an evaluation: per task a few films and a contact sheet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +165,6 @@ def make_scene(
     """Decode the video and rebuild its objects; `prepared` gives the decoded clip where it is at hand."""
     from v2p_data.scene.export import write_scene
     from v2p_data.scene.reconstruct import prepared_for, reconstruct_prepared
-    from v2p_data.video.decode import read_clip
 
     del inputs
     if prepared is None:
@@ -204,7 +205,6 @@ def make_cousin(
 ) -> dict[str, Any]:
     """Stretch mesh and convex parts, draw mass and friction, write the scene."""
     from v2p_data.scene.export import write_relative
-    from v2p_data.scene.scene import Scene
     from v2p_data.sim.model.cousins import cousin_of, opening_m_of
 
     del runtime
@@ -254,10 +254,7 @@ def make_task(
 
     A family's code, where one is given, is the only sample.
     """
-    from v2p_data.scene.scene import Scene
     from v2p_data.sim.env.task_check import check_task
-    from v2p_data.task.generate import generate_task
-    from v2p_data.task.task import TaskBundle
 
     scene = Scene.load(inputs["scene"])
     runtime.progress(0.1, "writing task code")
@@ -320,7 +317,6 @@ def make_reward(
     """Search, and write the task with the reward that was found; a model, if there is one, writes the rewards."""
     from v2p_data.reward.methods import told
     from v2p_data.reward.search import How, search_reward
-    from v2p_data.task.task import SCENE_FOLDER, TaskBundle
 
     bundle = TaskBundle.load(inputs["task"])
     seed = seed_for(cfg.seed, "reward", bundle.title)
@@ -384,13 +380,10 @@ def make_expert(
     bonus_ratio: float,
 ) -> dict[str, Any]:
     """Find a teacher, imitate it, go on with PPO, or let it act itself; judge with the independent referee."""
-    from v2p_data.episodes.collect import judge_expert
-    from v2p_data.experts.labeller import choose_program, labeller_of
     from v2p_data.experts.learning import Worlds, learn
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.env.task_check import check_reward, check_task
     from v2p_data.task.llm.pool import add_solved
-    from v2p_data.task.task import TaskBundle
 
     expert_cfg: ExpertConfig = cfg.config
     bundle = TaskBundle.load(inputs["task"])
@@ -463,10 +456,6 @@ def make_episodes(
     cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
 ) -> dict[str, Any]:
     """Stage successful episodes one by one; list the failed ones."""
-    from v2p_data.episodes.collect import collect
-    from v2p_data.experts.labeller import labeller_of
-    from v2p_data.task.task import TaskBundle
-
     bundle = TaskBundle.load(inputs["task"])
     collected = collect(
         bundle,
@@ -504,7 +493,6 @@ def make_dataset(
     tasks: Mapping[str, Stage],
 ) -> dict[str, Any]:
     """Write the dataset, reopen it with LeRobot and compare every frame with what was drawn."""
-    from v2p_data.episodes.collect import staged_episodes
     from v2p_data.episodes.dataset.packing import pack_and_verify
 
     for task in tasks.values():
@@ -695,7 +683,6 @@ def make_evaluation(
     """Judge many episodes of each task; write rates with their intervals, kinds of failure, films and contact sheets."""
     from v2p_data.report.films import write_films
     from v2p_data.report.sheet import SheetConfig, write_contact_sheet
-    from v2p_data.task.task import TaskBundle, told_of
 
     del inputs
     for place in (who.folder, *tasks.values()):

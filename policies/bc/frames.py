@@ -95,23 +95,6 @@ class FrameTable:
             action=moved(self.action, device),
         )
 
-    def of_tasks(self, words: Sequence[str]) -> "FrameTable":
-        """Return the frames of some tasks, named in words."""
-        wanted = torch.tensor([task in words for task in self.tasks])[self.task]
-        place = wanted.cumsum(0) - 1
-        return FrameTable(
-            pictures={
-                key: {name: value[wanted] for name, value in prepared.items()}
-                for key, prepared in self.pictures.items()
-            },
-            vectors={key: value[wanted] for key, value in self.vectors.items()},
-            action=self.action[wanted],
-            task=self.task[wanted],
-            tasks=self.tasks,
-            first=place[self.first[wanted]],
-            last=place[self.last[wanted]],
-        )
-
     def batch(
         self, rows: Int64[Tensor, "n"], observed: Sequence[int], acted: Sequence[int]
     ) -> dict[str, Any]:

@@ -106,36 +106,6 @@ def roll_out(
     }
 
 
-def evaluate_policy(
-    policy: Path,
-    tasks: Path,
-    *,
-    episodes: int,
-    batch_size: int = 10,
-    first_seed: int = 0,
-    videos: Path | None = None,
-    **settings: Any,
-) -> list[bool]:
-    """Return which episodes of the task (or of all tasks, one after the other) in a folder succeeded.
-
-    Args:
-        policy: folder of a LeRobot policy.
-        tasks: a task folder, or a folder of several.
-        episodes: episodes per task.
-        batch_size: episodes at the same time.
-        first_seed: seed of a task's first episode; the others follow.
-        videos: where to put a few videos; none are made without it.
-        settings: of the environment, such as `size_px`.
-    """
-    config = env_config(tasks, **settings)
-    loaded = load_policy(policy, config)
-    envs = config.create_envs(n_envs=min(batch_size, episodes), use_async_envs=False)
-    results = roll_out(
-        loaded, envs, config, episodes=episodes, first_seed=first_seed, videos=videos
-    )
-    return [success for task in sorted(results) for success in results[task]]
-
-
 def _check_weights(folder: Path, config: Any) -> None:
     """Demand the weights of the network that the settings describe, before a network of any size takes memory.
 

@@ -26,7 +26,8 @@ def page():
 
 
 def fetched(address, body=None, host=None):
-    request = urllib.request.Request(address, data=body, headers={"Host": host} if host else {})
+    headers = {"Content-Type": "application/json"} | ({"Host": host} if host else {})
+    request = urllib.request.Request(address, data=body, headers=headers)
     with urllib.request.urlopen(request, timeout=10) as answer:
         return answer.read()
 

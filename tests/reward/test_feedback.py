@@ -34,8 +34,12 @@ def two_episodes(**changes):
     return Trajectories(**(fields | changes))
 
 
+def component(feedback, name):
+    return next(part for part in feedback.components if part.name == name)
+
+
 def test_successful_and_failed_trajectories_are_told_apart():
-    part = feedback_of(two_episodes(), 0.05).component("rises")
+    part = component(feedback_of(two_episodes(), 0.05), "rises")
 
     assert part.successful is not None
     assert part.failed is not None
@@ -71,19 +75,19 @@ def test_success_must_be_held_at_the_end_as_in_the_simulator():
 def test_a_component_that_never_varies_is_dead():
     feedback = feedback_of(two_episodes(), 0.05)
 
-    assert feedback.component("fine").is_dead
-    assert not feedback.component("rises").is_dead
+    assert component(feedback, "fine").is_dead
+    assert not component(feedback, "rises").is_dead
     assert "fine: share of the total magnitude 0.400, dead (always -1.5000)" in feedback.text()
 
 
 def test_shares_are_of_mean_absolute_values():
     feedback = feedback_of(two_episodes(), 0.05)
 
-    assert feedback.component("fine").share == pytest.approx(1.5 / (1.5 + 2.25))
+    assert component(feedback, "fine").share == pytest.approx(1.5 / (1.5 + 2.25))
 
 
 def test_saturation_is_the_share_of_steps_at_either_end_of_the_range():
-    part = feedback_of(two_episodes(), 0.05).component("rises")
+    part = component(feedback_of(two_episodes(), 0.05), "rises")
 
     # Range 0 to 9, margin 0.45: the 9 alone is high; ten zeros and one more are low.
     assert (part.saturated_high, part.saturated_low) == (1 / 20, 11 / 20)
@@ -91,7 +95,7 @@ def test_saturation_is_the_share_of_steps_at_either_end_of_the_range():
 
 def test_correlation_with_success_is_pearsons():
     trajectories = two_episodes()
-    part = feedback_of(trajectories, 0.05).component("rises")
+    part = component(feedback_of(trajectories, 0.05), "rises")
     x = trajectories.components["rises"].ravel().astype(float)
     y = trajectories.success.ravel().astype(float)
     by_hand = ((x - x.mean()) * (y - y.mean())).mean() / (x.std() * y.std())
@@ -107,7 +111,7 @@ def test_what_comes_after_an_episodes_end_counts_for_nothing():
 
     feedback = feedback_of(trajectories, 0.05)
 
-    part = feedback.component("rises")
+    part = component(feedback, "rises")
     assert part.overall is not None
     assert part.overall.mean == pytest.approx(45 / 14)
     assert feedback.num_successes == 1
@@ -156,7 +160,7 @@ def test_feedback_survives_json():
 
     assert again == feedback
     assert again.text() == feedback.text()
-    assert feedback.component("rises").curve[-1] == 1.0
+    assert component(feedback, "rises").curve[-1] == 1.0
     assert len(feedback.success_curve) == 10
     with pytest.raises(V2PError, match="no feedback"):
         Feedback.from_dict({"success": 1})

@@ -15,7 +15,6 @@ from v2p_data.sim.env.batch_env import (
     BatchEnv,
     SimConfig,
     Snapshot,
-    without_randomization,
 )
 from v2p_data.sim.env.randomize import RandomizationConfig
 from v2p_data.sim.model.world import CAMERA
@@ -24,7 +23,7 @@ from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.task.sandbox.reader.refusal import TaskCodeError
 from v2p_data.task.task import BASE_OBSERVATION_DIM, OBJECT_STATES, ROBOT_STATES, Task, TaskBundle
 
-CALM = without_randomization(SimConfig(fine=True))
+CALM = SimConfig(fine=True, randomization=randomize.none())
 
 
 @pytest.fixture

@@ -13,9 +13,13 @@ import tyro
 from v2p_data.cli import parse
 from v2p_data.deployment.limits import Guard, LimitsConfig
 from v2p_data.deployment.loop import LoopConfig, Outcome, Run
-from v2p_data.deployment.robot import Reading, Rig
-from v2p_data.deployment.segmentation import StreamTracker
-from v2p_data.errors import V2PError
+from v2p_data.deployment.recording import Recorder, check_free
+from v2p_data.deployment.robot import Reading, Rig, fingers_m
+from v2p_data.deployment.segmentation import ColourTracker, StreamTracker
+from v2p_data.deployment.sight import Sight, clicks_from
+from v2p_data.deployment.silhouette import Silhouette
+from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.sim.render.masks import PALETTE
 
 ROBOT_PREFIX = "--robot."
 CLICK_WAIT_S = 300.0
@@ -52,8 +56,6 @@ def deploy_command(argv: list[str]) -> int:
     robot_words, others = robot_settings(argv)
     args = parse(Deploy, others, "deploy")
     if args.record is not None:
-        from v2p_data.deployment.recording import check_free
-
         check_free(args.record)
     from v2p_data.commands.run import check_device
 
@@ -89,8 +91,6 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
         V2PError: anything that forbids to begin.
     """
     from v2p_data.deployment.checks import Offer, check_policy, unknowns
-    from v2p_data.deployment.recording import Recorder
-    from v2p_data.deployment.sight import Sight
 
     rig = Rig(robot)
     reading = rig.read()
@@ -212,8 +212,6 @@ def robot_config(words: Sequence[str]) -> Any:
             " --robot.task_folder=TASK for the simulated arm"
         )
     if named[-1] not in known:
-        from v2p_data.errors import did_you_mean
-
         raise V2PError(f"there is no robot '{named[-1]}'.{did_you_mean(named[-1], known)}")
     told = io.StringIO()
     try:
@@ -242,7 +240,6 @@ def loaded_policy(folder: Path, task: str, device: str) -> Any:
         V2PError: LeRobot cannot load it, or it needs to be told the task.
     """
     from policies.evaluation.actor import UnsuitablePolicyError, load_actor
-    from v2p_data.sim.render.masks import PALETTE
 
     try:
         actor = load_actor(folder, greys=PALETTE, task=task, device=device)
@@ -256,9 +253,6 @@ def loaded_policy(folder: Path, task: str, device: str) -> Any:
 def _clicks(args: Deploy, rig: Rig, reading: Reading) -> Sequence[tuple[float, float]]:
     """Return a pixel per object, from the command line or from the page."""
     from v2p_data.deployment.click_page import ClickPage
-    from v2p_data.deployment.robot import fingers_m
-    from v2p_data.deployment.sight import clicks_from
-    from v2p_data.deployment.silhouette import Silhouette
 
     if args.click:
         return clicks_from(args.click)
@@ -277,8 +271,6 @@ def _clicks(args: Deploy, rig: Rig, reading: Reading) -> Sequence[tuple[float, f
 
 def _tracker_maker(args: Deploy) -> Callable[[], StreamTracker]:
     if args.segmenter == "colour":
-        from v2p_data.deployment.segmentation import ColourTracker
-
         return ColourTracker
     from v2p_data.deployment.sam2_stream import Sam2Tracker
     from v2p_data.scene.backends.config import SegmentConfig

@@ -64,7 +64,7 @@ class PreparedClips:
     ) -> Future[PreparedClip]:
         """Return the clip, without hints, or the promise of it; it counts as the one asked for last.
 
-        What nobody looks at yet, `is_ahead`, begins when it is `quiet`.
+        A clip that is prepared ahead of time (`is_ahead`) waits until the machine is `quiet`.
 
         The future's error is the `ItemRejectedError` of a clip that cannot be used.
         """

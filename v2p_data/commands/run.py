@@ -21,6 +21,7 @@ from v2p_data.commands.display import (
     tally,
     telling,
 )
+from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.errors import NotAllError, V2PError
 from v2p_data.evaluation.judging import PROGRAMS, Contestant, contestant, task_folders
@@ -420,7 +421,6 @@ def _record_to_train(dataset: Path, root: Path) -> tuple[Record, bool]:
     """
     if not (dataset / "meta/info.json").exists():
         return _dataset_record(dataset), True  # which says what is wrong
-    from v2p_data.episodes.dataset.about import read_about
     from v2p_data.episodes.dataset.edited import demand_sound, is_like_ours
 
     record = read_record(dataset)

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import tyro
 
 from v2p_data.cli import parse
+from v2p_data.commands.display import telling
 from v2p_data.errors import V2PError
+from v2p_data.pipeline.artifact import demand_whole, write_json_atomically
 
 if TYPE_CHECKING:
     from v2p_data.episodes.hub.hub import Pushed
@@ -62,9 +64,7 @@ class Explain:
 
 def verify_command(argv: list[str]) -> int:
     """Return 0 where all is well, 1 where there are problems; what cannot be read is an error (2)."""
-    from v2p_data.commands.display import telling
     from v2p_data.episodes.dataset.verify import verify
-    from v2p_data.pipeline.artifact import write_json_atomically
 
     args = parse(Verify, argv, "verify")
     with telling("verify") as progress:
@@ -77,9 +77,7 @@ def verify_command(argv: list[str]) -> int:
 
 def replay_command(argv: list[str]) -> int:
     """Return 0 where every episode came back, 1 where one did not."""
-    from v2p_data.commands.display import telling
     from v2p_data.episodes.replay import replay
-    from v2p_data.pipeline.artifact import write_json_atomically
 
     args = parse(Replay, argv, "replay")
     with telling("replay") as progress:
@@ -133,7 +131,6 @@ def _pushed(args: Push) -> tuple["Pushed", str]:
 
 def explain_command(argv: list[str]) -> int:
     from v2p_data.episodes.dataset.explain import differences, explain, told_as_json
-    from v2p_data.pipeline.artifact import demand_whole, write_json_atomically
 
     args = parse(Explain, argv, "explain")
     for path in (args.path, args.other):

@@ -115,7 +115,7 @@ class Run:
         def bite() -> None:
             nonlocal late
             late = self._works_on
-            # Whoever cannot be told to hold while a reading is awaited stands still by itself: a simulator.
+            # A simulator cannot hold while a reading is awaited; it stands still by itself.
             if self.rig.can_hold:
                 self._hold()
 

@@ -20,6 +20,7 @@ from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import Actor, StateActor, VisionActor
 from v2p_data.seeds import seed_for
+from v2p_data.sim.render.masks import PALETTE
 from v2p_data.task.audit.resets import has_own_reset
 from v2p_data.task.task import TASK_FILE, TaskBundle
 
@@ -39,9 +40,9 @@ class Contestant:
 
     kind: Kind
     folder: Path
-    """Of a policy or an expert."""
+    """Folder of a policy or an expert."""
     repo_id: str = ""
-    """Of a policy that was fetched from the Hub."""
+    """Name on the Hub of a policy that was fetched from there."""
 
     @property
     def sources(self) -> dict[str, str]:
@@ -141,7 +142,6 @@ def row_of(judged: Judged) -> dict[str, Any]:
 
 def _policy(folder: Path, device: str) -> Play:
     from policies.evaluation.actor import UnsuitablePolicyError, load_actor
-    from v2p_data.sim.render.masks import PALETTE
 
     try:
         actor = load_actor(folder, greys=PALETTE, device=device)

@@ -83,7 +83,7 @@ class Taught:
     steps: int
     """Control steps, trials of programs included."""
     seconds: float
-    """Of imitation."""
+    """Duration of the imitation."""
 
 
 def learn(
@@ -115,32 +115,32 @@ def learn(
         )  # fmt: skip
         steps, seconds = taught.steps, taught.seconds
         del trial_env
-    pupil = taught.folder if taught else None
-    env = _training_worlds(worlds, cfg, device, is_taught=pupil is not None)
-    ranked = rank_solved(worlds.bundle, env.worlds.obs_dim, solved) if pupil is None else []
+    student = taught.folder if taught else None
+    env = _training_worlds(worlds, cfg, device, is_taught=student is not None)
+    ranked = rank_solved(worlds.bundle, env.worlds.obs_dim, solved) if student is None else []
     other = ranked[0].folder if ranked else None
     if other is not None:
         logger.info("PPO starts from %s", other)
-    begun = PROGRESS_TAUGHT if pupil else 0.0
+    begun = PROGRESS_TAUGHT if student else 0.0
     improved = improve_by_ppo(
         env,
         cfg,
         out,
         seed=worlds.seed_of("ppo"),
-        start=pupil or other,
+        start=student or other,
         on_progress=lambda share, words: on_progress(begun + (1 - begun) * share, words),
     )
     del env
     comparison, updates = None, improved.actor_updates
-    if improved.last_actor_updates == 0 or (pupil is None and updates == 0):
-        _say_unchanged(worlds.bundle.title, improved, pupil)
-    elif pupil is not None:
-        comparison, updates = keep_better(worlds, cfg, pupil, out, improved)
+    if improved.last_actor_updates == 0 or (student is None and updates == 0):
+        _say_unchanged(worlds.bundle.title, improved, student)
+    elif student is not None:
+        comparison, updates = keep_better(worlds, cfg, student, out, improved)
     return Learned(
         steps=steps + improved.steps,
         seconds=seconds + improved.seconds,
         actor_updates=updates,
-        teacher=taught.program if taught and pupil else "",
+        teacher=taught.program if taught and student else "",
         trials=taught.trials if taught else (),
         comparison=comparison,
         stopped_by=improved.stopped_by,
@@ -259,7 +259,7 @@ def keep_better(
     return comparison, updates if comparison.is_better else 0
 
 
-def _say_unchanged(title: str, improved: ExpertResult, pupil: Path | None) -> None:
+def _say_unchanged(title: str, improved: ExpertResult, student: Path | None) -> None:
     """Warn that PPO changed nothing of the policy that it started from, or nothing for the better.
 
     Raises:
@@ -269,7 +269,7 @@ def _say_unchanged(title: str, improved: ExpertResult, pupil: Path | None) -> No
         f"PPO ended ({improved.stopped_by}) after {improved.steps} steps, before the best policy of '{title}' had "
         "taken a gradient step"
     )
-    if pupil is None:
+    if student is None:
         raise ItemRejectedError(
             "ppo_changed_nothing",
             f"{words}; give it more with --expert.ppo.total-steps or --expert.ppo.max-seconds",

@@ -10,15 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.collect import EpisodesConfig, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import check_checkpoint
 from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
 from v2p_data.pipeline.contents import memory_of
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import from_values
+from v2p_data.play import VisionActor
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.seeds import seed_for
+from v2p_data.task.task import TaskBundle
 
 if TYPE_CHECKING:
     from policies.bc.student import Student
@@ -90,7 +92,6 @@ def make_distillation(
     from policies.bc.trainer import TrainerConfig
     from v2p_data.distillation.rounds import Lesson, demand_masks, distill
     from v2p_data.experts.labeller import labeller_of
-    from v2p_data.task.task import TaskBundle
 
     del inputs
     demand_whole_sources(dataset, sources, runtime.root)
@@ -140,7 +141,6 @@ def make_distilled_dataset(
 ) -> dict[str, Any]:
     """Write demonstrations and handover episodes as one LeRobot dataset and compare every frame with what was drawn."""
     from v2p_data.distillation.rounds import handover_episodes
-    from v2p_data.episodes.collect import staged_episodes
     from v2p_data.episodes.dataset.packing import pack_and_verify
 
     for source in sources:
@@ -257,8 +257,6 @@ def checkpoint_judge(
     """Return what gives a policy's mean success rate over task folders, on seeds that no evaluation uses."""
     from v2p_data.evaluation.batch import judge
     from v2p_data.evaluation.config import EvaluationConfig
-    from v2p_data.play import VisionActor
-    from v2p_data.task.task import TaskBundle
 
     bundles = {item: TaskBundle.load(folder) for item, folder in tasks.items()}
     cfg = EvaluationConfig(episodes=episodes, worlds=episodes, at_end=False)

@@ -1,30 +1,20 @@
-"""A review page that this machine serves to itself: a person marks objects, the clip is rebuilt, and the page shows the result.
-
-It listens on 127.0.0.1 only, at an address with a random token. Other paths, other hosts' names and requests that another web
-page sends get nothing.
-"""
+"""A review page that this machine serves to itself: a person marks objects, the clip is rebuilt, and the page shows the result."""
 
 import base64
-import contextlib
 import hashlib
 import json
 import re
-import secrets
-import threading
 from collections.abc import Mapping
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
-from urllib.parse import unquote, urlsplit
 
 import jinja2
 
 from v2p_data.errors import V2PError
+from v2p_data.local_page import LocalPage, Request
 from v2p_data.report.reading import as_dict
 
-LONGEST_BODY = 200_000
-"""Bytes: a stroke of a thousand corners is 20 kB."""
 _CHUNK = 1 << 16
 
 
@@ -73,7 +63,7 @@ class Session(Protocol):
         ...
 
 
-class ReviewServer:
+class ReviewServer(LocalPage):
     """The page, served from the start of the `with` block to its end.
 
     Args:
@@ -85,48 +75,23 @@ class ReviewServer:
         V2PError: the port is taken.
     """
 
+    longest_body = 200_000
+    """A stroke of a thousand corners is 20 kB."""
+
     def __init__(self, session: Session, title: str, port: int = 0) -> None:
+        super().__init__(port)
         self.session, self.title = session, title
-        self._token = secrets.token_urlsafe(16)
-        try:
-            self._server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
-        except (OSError, OverflowError) as error:
-            raise V2PError(
-                f"port {port} of this machine cannot be used ({error}); choose another --port, or leave it out"
-            ) from error
-        self._server.daemon_threads = True
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
 
-    @property
-    def address(self) -> str:
-        """Where to find it."""
-        return f"http://127.0.0.1:{self._server.server_address[1]}/{self._token}/"
-
-    def __enter__(self) -> "ReviewServer":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
-
-    def inner_path(self, path: str, host: str) -> str | None:
-        """Return a request's path behind the token; None where it is not for this page."""
-        port = self._server.server_address[1]
-        token, _, rest = urlsplit(path).path.removeprefix("/").partition("/")
-        is_ours = secrets.compare_digest(token.encode(), self._token.encode())
-        return unquote(rest) if is_ours and host in _names(port) else None
-
-    def is_own_page(self, headers: Any) -> bool:
-        """Return whether this page sent a request: what another page sends carries that page's origin."""
-        port = self._server.server_address[1]
-        own = {f"http://{name}" for name in _names(port)}
-        return (
-            headers.get("Origin") in own | {None}
-            and headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")
-            and headers.get("Content-Type", "").split(";")[0] == "application/json"
-        )
+    def show(self, path: str, request: Request) -> None:
+        """Answer with the page, a picture or film of it, or what it asks for."""
+        if path == "":
+            request.answer("text/html; charset=utf-8", self.page())
+        elif still := re.fullmatch(r"still/([a-z0-9_]+)/(\d{1,3})", path):
+            request.answer("image/jpeg", self.session.still(still[1], int(still[2])))
+        elif film := re.fullmatch(r"film/([a-z0-9_]+)/[a-z0-9_@:-]*", path):
+            _show_film(self.session.film(film[1]), request)
+        else:
+            request.json(self.answer(path))
 
     def page(self) -> bytes:
         """Return the page."""
@@ -179,112 +144,28 @@ class ReviewServer:
             return {"error": f"that cannot be read: {error}"}
 
 
-def _names(port: int) -> tuple[str, str]:
-    return f"127.0.0.1:{port}", f"localhost:{port}"
-
-
-def _handler(server: ReviewServer) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        timeout = 30
-        protocol_version = "HTTP/1.1"
-
-        def do_GET(self) -> None:
-            path = self._own_path()
-            if path is None:
-                return
-            try:
-                if path == "":
-                    self._answer("text/html; charset=utf-8", server.page())
-                elif still := re.fullmatch(r"still/([a-z0-9_]+)/(\d{1,3})", path):
-                    self._answer("image/jpeg", server.session.still(still[1], int(still[2])))
-                elif film := re.fullmatch(r"film/([a-z0-9_]+)/[a-z0-9_@:-]*", path):
-                    self._film(server.session.film(film[1]))
-                else:
-                    self._json(server.answer(path))
-            except LookupError:
-                self._refuse(HTTPStatus.NOT_FOUND)
-
-        def do_POST(self) -> None:
-            path = self._own_path()
-            if path is None:
-                return
-            length = self.headers.get("Content-Length", "")
-            if not re.fullmatch(r"[0-9]{1,9}", length) or int(length) > LONGEST_BODY:
-                self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-            elif not server.is_own_page(self.headers):
-                self._refuse(HTTPStatus.FORBIDDEN)
-            else:
-                try:
-                    self._json(server.changed(path, self.rfile.read(int(length))))
-                except LookupError:
-                    self._refuse(HTTPStatus.NOT_FOUND)
-
-        def _own_path(self) -> str | None:
-            path = server.inner_path(self.path, self.headers.get("Host", ""))
-            if path is None:
-                self._refuse(HTTPStatus.NOT_FOUND)
-            return path
-
-        def _refuse(self, status: HTTPStatus) -> None:
-            self.close_connection = True  # a body may be left unread
-            self.send_error(status)
-
-        def _json(self, data: dict[str, Any]) -> None:
-            self._answer("application/json", json.dumps(data).encode())
-
-        def _film(self, path: Path | None) -> None:
-            """Answer with a video, or with the part of it that a player asks for."""
-            if path is None or not path.is_file():
-                self._refuse(HTTPStatus.NOT_FOUND)
-                return
-            size = path.stat().st_size
-            asked = re.fullmatch(
-                r"bytes=([0-9]{1,15})-([0-9]{0,15})", self.headers.get("Range", "")
-            )
-            first = int(asked[1]) if asked else 0
-            last = min(size - 1, int(asked[2])) if asked and asked[2] else size - 1
-            if asked and first > last:
-                self._refuse(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE)
-                return
-            self._head(
-                HTTPStatus.PARTIAL_CONTENT if asked else HTTPStatus.OK,
-                "video/mp4",
-                last + 1 - first,
-                {"Accept-Ranges": "bytes"}
-                | ({"Content-Range": f"bytes {first}-{last}/{size}"} if asked else {}),
-            )
-            with path.open("rb") as stream:
-                stream.seek(first)
-                left = last + 1 - first
-                while left > 0 and (chunk := stream.read(min(_CHUNK, left))):
-                    self.wfile.write(chunk)
-                    left -= len(chunk)
-
-        def _answer(self, kind: str, body: bytes) -> None:
-            self._head(HTTPStatus.OK, kind, len(body), {})
-            self.wfile.write(body)
-
-        def _head(self, status: HTTPStatus, kind: str, size: int, more: dict[str, str]) -> None:
-            self.send_response(status)
-            about = {
-                "Content-Type": kind,
-                "Content-Length": str(size),
-                "Cache-Control": "no-store",
-            }
-            guard = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff"}
-            for name, value in {
-                **about,
-                **guard,
-                "Referrer-Policy": "no-referrer",
-                **more,
-            }.items():
-                self.send_header(name, value)
-            self.end_headers()
-
-        def handle(self) -> None:
-            with contextlib.suppress(ConnectionError, TimeoutError):  # the browser went on
-                super().handle()
-
-        def log_message(self, format: str, *args: Any) -> None: ...
-
-    return Handler
+def _show_film(path: Path | None, request: Request) -> None:
+    """Answer with a video, or with the part of it that a player asks for."""
+    if path is None or not path.is_file():
+        request.refuse(HTTPStatus.NOT_FOUND)
+        return
+    size = path.stat().st_size
+    asked = re.fullmatch(r"bytes=([0-9]{1,15})-([0-9]{0,15})", request.headers.get("Range", ""))
+    first = int(asked[1]) if asked else 0
+    last = min(size - 1, int(asked[2])) if asked and asked[2] else size - 1
+    if asked and first > last:
+        request.refuse(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE)
+        return
+    request.head(
+        HTTPStatus.PARTIAL_CONTENT if asked else HTTPStatus.OK,
+        "video/mp4",
+        last + 1 - first,
+        {"Accept-Ranges": "bytes"}
+        | ({"Content-Range": f"bytes {first}-{last}/{size}"} if asked else {}),
+    )
+    with path.open("rb") as stream:
+        stream.seek(first)
+        left = last + 1 - first
+        while left > 0 and (chunk := stream.read(min(_CHUNK, left))):
+            request.wfile.write(chunk)
+            left -= len(chunk)

@@ -106,18 +106,6 @@ class Feedback:
         """Share of episodes that succeeded."""
         return self.num_successes / self.num_episodes if self.num_episodes else 0.0
 
-    def component(self, name: str) -> ComponentFeedback:
-        """Return one component's numbers.
-
-        Raises:
-            V2PError: there is none of that name.
-        """
-        for part in self.components:
-            if part.name == name:
-                return part
-        known = ", ".join(c.name for c in self.components)
-        raise V2PError(f"the feedback knows no component '{name}'. Known: {known}.")
-
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON; see `from_dict`."""
         return {**asdict(self), "success_rate": self.success_rate}

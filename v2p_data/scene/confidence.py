@@ -24,13 +24,13 @@ _COLOURED = 0.25
 _AWAY_PX = 4.0
 """Of a picture 320 px wide: an object so far from both its ends moves."""
 _OUT_OF_SIGHT = 0.8
-"""What went into a bin lies in it, and what a fist lifts goes with it, but nobody sees where."""
+"""Confidence in an object that nobody sees at the end: in a bin, or in a fist."""
 _IN_THE_AIR = 0.6
 """Confidence in an object that does not rest on the table at first; it falls from 1 where half of what that needs is seen."""
 _GOOD, _LEAST_CUE = 0.95, 0.01
 """A cue above the first needs no help; the second keeps a ratio finite."""
 _GROWN = 0.2
-"""Logarithm: of twelve drawn things that a hand touches at first where they rest, none seems so much larger there than at the end."""
+"""Logarithm of the size at the beginning over the size at the end. Twelve drawn objects that rest at first all stay below it."""
 
 
 def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tuple[Cue, ...]:

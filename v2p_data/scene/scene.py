@@ -179,7 +179,7 @@ def read_masks(path: Path) -> dict[int, Bool[np.ndarray, "h w"]]:
 
 
 def _check_unpacked(path: Path) -> None:
-    """Refuse an archive that says it becomes larger than any mask track; NumPy reads no further than it says."""
+    """Refuse an archive whose stated size exceeds any mask track. NumPy reads no more than the stated size."""
     with zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > MAX_MASKS_BYTES:
             raise ValueError(f"more than {MAX_MASKS_BYTES / 1e6:.0f} MB when unpacked")
@@ -209,7 +209,7 @@ class Scene:
     fps: float
     num_frames: int
     confidence: float
-    """0 to 1; below the gate a scene is rejected."""
+    """0 to 1; a scene below the threshold is rejected."""
     confidences: dict[str, StageConfidence] = field(default_factory=dict[str, StageConfidence])
     """Per stage of the reconstruction."""
     scale_spread: float = 0.0

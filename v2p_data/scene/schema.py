@@ -211,7 +211,7 @@ def read_scene_file(folder: Path, name: str) -> SceneFile:
             f"{path}: its objects have {count} parts; at most {MAX_SCENE_PARTS} can be simulated"
         )
     for thing in found.objects:
-        _check_course(thing, path)
+        _check_trajectory(thing, path)
         for file in thing.files:
             if (folder / file).exists():
                 own_file(folder, file, MAX_FILE_BYTES)
@@ -263,8 +263,8 @@ def _fields(kind: type[FileModel]) -> set[str]:
     return {field.alias or name for m in models for name, field in m.model_fields.items()}
 
 
-def _check_course(thing: ObjectEntry, path: Path) -> None:
-    """Demand that what is told per frame is told of equally many frames."""
+def _check_trajectory(thing: ObjectEntry, path: Path) -> None:
+    """Demand that all lists with one entry a frame are equally long."""
     counts = {
         "frames": len(thing.frames),
         "poses_world": len(thing.poses_world),

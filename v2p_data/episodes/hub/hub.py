@@ -23,6 +23,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import httpx
+from huggingface_hub import HfApi, constants, snapshot_download
+from huggingface_hub.errors import (
+    HfHubHTTPError,
+    LocalEntryNotFoundError,
+    OfflineModeIsEnabled,
+    RevisionNotFoundError,
+)
+
 from v2p_data.episodes.dataset.about import CARRIED_TASKS
 from v2p_data.episodes.dataset.card import CARD_FILE, LICENSE, write_card, write_text
 from v2p_data.episodes.dataset.features import METADATA_FILE
@@ -204,9 +213,6 @@ def fetch_model(
     endpoint = _endpoint()
     token = next((t for name in TOKEN_VARIABLES if (t := os.environ.get(name, "").strip())), "")
 
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import LocalEntryNotFoundError
-
     def fetch() -> Path:
         try:
             return once()
@@ -259,9 +265,6 @@ def _push(upload: _Upload) -> Pushed:
     token = _token()
     _check_no_secret(upload.folder, token)
     endpoint = _endpoint()
-
-    from huggingface_hub import HfApi
-    from huggingface_hub.errors import RevisionNotFoundError
 
     api = HfApi(endpoint=endpoint, token=token)
     repo_id, repo_type = upload.repo_id, upload.repo_type
@@ -322,8 +325,6 @@ def _push(upload: _Upload) -> Pushed:
 @contextmanager
 def _without_xet() -> Generator[None]:
     """Have the library send files by LFS: it reads its variable at import, and the switch at each upload."""
-    from huggingface_hub import constants
-
     before, constants.HF_HUB_DISABLE_XET = constants.HF_HUB_DISABLE_XET, True
     try:
         yield
@@ -338,9 +339,6 @@ def _endpoint() -> str:
 
 def _patiently[T](send: Callable[[], T], waits_s: Sequence[float]) -> T:
     """Return what `send` returns, trying again after what may pass."""
-    import httpx
-    from huggingface_hub.errors import HfHubHTTPError
-
     for number, wait_s in enumerate(waits_s, start=2):
         try:
             return send()
@@ -387,9 +385,6 @@ def _check_no_secret(folder: Path, token: str) -> None:
 
 def _explained[T](transfer: Callable[[], T], doing: str, endpoint: str, token: str) -> T:
     """Return what `transfer` returns, or raise in one sentence what the Hub or the network had against it."""
-    import httpx
-    from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
-
     again = "run the same command again; what has arrived is not sent twice"
     try:
         return transfer()

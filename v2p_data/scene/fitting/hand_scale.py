@@ -32,11 +32,11 @@ REACH_M = 0.25
 """The end of a hand that touches a thing is no farther than this from the thing's foot."""
 WINDOW_M, _WINDOW_PX = 0.28, 112
 TOWARDS_ARM = 0.25
-"""Of the window: it shows more of the hand than of its surroundings."""
+"""Share of the window by which it is moved towards the arm: it then shows more of the hand."""
 _WIDTHS = (16, 32, 56, 96)
 TOUCHING_M = 0.02
 _IN_PLACE = 0.4
-"""Overlap of a thing's outline with the one where it rests, from which on it rests there still, or already."""
+"""Least overlap with the outline of the resting object at which it counts as resting."""
 _MOST_VIEWS = 12
 _DOUBT = 0.15
 """Added to the spread that the network states: it learned from drawn hands, and real ones differ from those."""

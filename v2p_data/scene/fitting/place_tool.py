@@ -45,7 +45,7 @@ def place_tool(
     seen_in: SeenIn,
     max_poses: int,
 ) -> PlacedObject:
-    """Return the poses of a tool in a hand, from when what it pushes sets out until that has come to rest."""
+    """Return the poses of a tool in a hand while the pushed object moves."""
     s = see.s
     ground = camera.on_plane(np.argwhere(s.first).mean(0)[None, ::-1])[0][:2]
     push = push_motion(

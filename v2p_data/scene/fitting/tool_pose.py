@@ -188,7 +188,7 @@ class ToolPose:
     fit: Fit
     """Where it is when the pushed object is where it was at first."""
     T_world_seen: Float[np.ndarray, "4 4"]
-    """Where the first of the views shows it: elsewhere, if it does not push there."""
+    """Its pose in the first of the views, in which it need not push yet."""
 
 
 def fit_tool_pose(
@@ -241,7 +241,7 @@ class _Parameters:
     """What is searched for, in this order."""
 
     along: float
-    """Of the tip from where it pushes, along the push [tool lengths]."""
+    """Distance of the tip from the pushed point, along the push [tool lengths]."""
     aside: float
     """The same across the push."""
     heading_rad: float

@@ -80,19 +80,9 @@ class Noun:
     """A `SourceKind`, then a colon and where the numbers come from, where there is more to say."""
 
     @property
-    def round_top(self) -> bool:
-        """Whether its rim is a circle seen from above while it stands: an ellipse in the image, which gives the camera's pitch."""
-        return self.form == "cylinder"
-
-    @property
     def handled(self) -> bool:
         """Whether things of that name are vessels with a handle or a spout: nothing else keeps them from being round."""
         return self.form == "cylinder" and self.hollow and self.symmetry == "none"
-
-    @property
-    def source_kind(self) -> SourceKind:
-        """The class of the source, from a standard down to a guess."""
-        return self.source.partition(":")[0]  # pyright: ignore[reportReturnType]  # read_nouns checks it
 
 
 def read_nouns(text: str, where: str) -> tuple[dict[str, Noun], dict[str, Noun]]:

@@ -19,7 +19,7 @@ _BEYOND = 0.35
 _RIM = 0.12
 """Of its height, what is open at the top does not close again so near to its rim: corners of outlines come out round."""
 _RING_INSIDE = 0.94
-"""Of a ring's points must lie in the mask: a disc half a percent too large has 6 % outside."""
+"""Share of a ring's points that must lie in the mask: a disc half a percent too large has 6 % outside."""
 
 
 def revolution(
@@ -81,7 +81,7 @@ def _carved(
     radii: Float[np.ndarray, "j"],
     shift: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "k"]:
-    """Return per height the largest radius up to which all rings about the shifted axis lie in the mask."""
+    """Return the largest radius at each height for which no ring about the shifted axis leaves the mask."""
     angles = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     x, y = np.cos(angles), np.sin(angles)
     rings = np.empty((len(z), len(radii), _AROUND, 3))

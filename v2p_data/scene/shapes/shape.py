@@ -41,7 +41,7 @@ class ShapeConfig:
     regular_margin: float = 0.15
     """For an inflated silhouette of anything else."""
     min_px: int = 80
-    """Of the mask, below which an outline has no form."""
+    """Fewest pixels of a mask; a smaller outline has no form."""
     handles: bool = True
     """Whether vessels get the handle that their outline shows."""
     max_hidden: float = 0.25

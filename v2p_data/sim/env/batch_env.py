@@ -12,7 +12,7 @@ ended go on until `reset` is called for them. Results depend on the seed only, n
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -691,11 +691,6 @@ _TARGET_HIGH_M = np.array([TARGET_HIGH_M]).T
 def robot_of(bundle: TaskBundle, cfg: SimConfig) -> RobotConfig:
     """Return the arm to simulate: the one in the settings, else the one that the task was made for."""
     return cfg.robot if cfg.robot.path else robot_from_json(bundle.robot)
-
-
-def without_randomization(cfg: SimConfig) -> SimConfig:
-    """Return the same settings with the video's layout and nothing random."""
-    return replace(cfg, randomization=randomize.none())
 
 
 def _log_warning(message: str) -> None:

@@ -1,6 +1,6 @@
 """What a camera sees beside the task: things that stand about, light and colours. Nothing of it takes part in physics.
 
-Pictures are drawn after the physics, from saved states, so the whole course of an episode is known by then.
+Pictures are drawn after the physics, from saved states, so the whole episode is known by then.
 Distractors are put where nothing comes near them during the episode; had they been there all along, nothing would
 have gone otherwise. In masks they are background that hides what is behind it.
 """
@@ -93,7 +93,7 @@ class Furnished:
 
 def furnish(
     bundle: TaskBundle,
-    course: list[Snapshot],
+    snapshots: list[Snapshot],
     index: int,
     distractors: DistractorConfig,
     look: LookConfig,
@@ -103,7 +103,7 @@ def furnish(
 
     Args:
         bundle: the task.
-        course: moments of the episode, all that distractors must keep clear of.
+        snapshots: moments of the episode, all that distractors must keep clear of.
         index: which world of the snapshots.
         distractors: how many, how large.
         look: light and colours.
@@ -120,7 +120,7 @@ def furnish(
         raise RuntimeError(f"distractors are geoms {ids} of {world.model.ngeom}, not the last")
     sizes = world.model.geom_size[ids].copy().reshape(-1, 3)
     furnished = Furnished(world=world, drawn={}, sizes=sizes)
-    _find_places(furnished, things, course, index, rng)
+    _find_places(furnished, things, snapshots, index, rng)
     return replace(furnished, drawn={"distractors": things, "look": drawn_look})
 
 
@@ -163,7 +163,7 @@ def _add_thing(
 def _find_places(
     furnished: Furnished,
     things: list[dict[str, Any]],
-    course: list[Snapshot],
+    snapshots: list[Snapshot],
     index: int,
     rng: np.random.Generator,
 ) -> None:
@@ -172,7 +172,7 @@ def _find_places(
         return
     model = furnished.world.model
     data = mujoco.MjData(model)
-    moments = [furnished.moment(s, index) for s in course]
+    moments = [furnished.moment(s, index) for s in snapshots]
     bodies = [model.body(t["name"]).id for t in things]
     geom_of = {int(model.geom(t["name"]).id): k for k, t in enumerate(things)}
     todo = set(range(len(things)))

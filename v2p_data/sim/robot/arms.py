@@ -477,7 +477,7 @@ def _quat(R: np.ndarray) -> np.ndarray:
 
 
 def sensor_ends(arm: ArmFile | None, pads: Iterable[str]) -> list[str]:
-    """Return per pad the attribute with which a contact sensor names it."""
+    """Return for each pad the XML attribute of a contact sensor that refers to it."""
     if arm is None:
         return [f'geom1="{pad}"' for pad in pads]
     return [f'{arm.pad_kind}1="{PREFIX}{pad}"' for pad in arm.cfg.pads]
