@@ -7,9 +7,11 @@ from typing import Any
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.features import (
     ACTION_NAMES,
+    DONE_KEY,
     INTERVENTION_KEY,
     MASK_KEY,
     METADATA_FILE,
+    SIMULATED,
     STATE_NAMES,
 )
 from v2p_data.episodes.dataset.handovers import who_acted
@@ -152,6 +154,10 @@ def _frame(info: dict[str, Any]) -> str:
             meaning = "each in [-1, 1]: " + _named(ACTION_NAMES, ACTION_UNITS)
         elif key == "next.success":
             meaning = "the task's success has held for 0.25 s by the end of this action"
+        elif key == DONE_KEY:
+            meaning = "true in the last row of an episode"
+        elif key in SIMULATED:
+            meaning = SIMULATED[key].meaning
         elif key == INTERVENTION_KEY:
             meaning = "true where the expert acted, false where a student did"
         else:
