@@ -381,6 +381,8 @@ def test_the_card_tells_tasks_palette_and_ranges(packed: Path, tmp_path: Path):
     assert "| objects toy mass_kg | 0.1 | 0.12 |" in card
     assert "license: apache-2.0" in card.split("---")[1]
     assert "- LeRobot" in card.split("---")[1]
+    parts = ["visualize_dataset?path=user/toys", "## Tasks", 'root="FOLDER"', "## Limits", "<details>", "mass_kg"]  # fmt: skip
+    assert [card.index(p) for p in parts] == sorted(card.index(p) for p in parts)
 
 
 def test_the_card_of_an_older_dataset_names_its_seven_numbers(packed: Path):

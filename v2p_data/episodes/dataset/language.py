@@ -31,8 +31,8 @@ ASKED = (
     "{}", "please {}", "{}, please", "can you {}?", "could you {}?", "I want you to {}", "now {}",
     "go ahead and {}", "your task is to {}", "the robot should {}",
 )  # fmt: skip
-LOSE_E = ("clos", "mov", "plac", "pok", "rais", "remov", "shov", "slid", "tak")
-"""Stems of verbs whose last letter is lost before -ing."""
+LOSE_E = ("close", "move", "place", "poke", "raise", "remove", "shove", "slide", "take")
+"""Verbs whose last letter is lost before -ing."""
 WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))
 MOVED_M = 0.005
 """An object that is so far from its first place has been moved."""
@@ -48,7 +48,7 @@ def paraphrases(task: str) -> list[str]:
     verb = verb.lower()
     if verb.endswith("ing") and len(verb) > 5:
         verb = verb[:-3]
-        if verb in LOSE_E:
+        if f"{verb}e" in LOSE_E:
             verb += "e"
         elif verb[-1] == verb[-2] and verb[-1] not in "ls":
             verb = verb[:-1]
