@@ -43,6 +43,7 @@ from jaxtyping import Float32
 from v2p_data.episodes.collect import EpisodesConfig, collect
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
+    DONE_KEY,
     FPS,
     MASK_KEY,
     ROBOT_TYPE,
@@ -205,7 +206,7 @@ def lerobots_way(
     wanted = [Episode.load(path, pictures=False) for path in staged]
     started = time.perf_counter()
     dataset = LeRobotDataset.create(
-        f"bench/{root.name}", fps=FPS, features=features(recipe.size_px), root=root,
+        f"bench/{root.name}", fps=FPS, features=features(recipe.size_px, is_simulated=True), root=root,
         robot_type=ROBOT_TYPE, rgb_encoder=codec,
     )  # fmt: skip
     made: list[np.ndarray] = []
@@ -217,6 +218,7 @@ def lerobots_way(
             renderer.enable_segmentation_rendering()
             for k in np.flatnonzero(rollouts.successes)[: len(wanted) - len(made)]:
                 length = int(rollouts.num_frames[k])
+                known = rollouts.simulated(int(k), recipe.size_px)
                 for t in range(length):
                     rollouts.snapshots[t].write(world.model, data, int(k))
                     renderer.update_scene(data, camera=CAMERA)
@@ -227,6 +229,8 @@ def lerobots_way(
                             STATE_KEY: rollouts.state[t, k],
                             ACTION_KEY: rollouts.action[t, k],
                             SUCCESS_KEY: np.array([t >= rollouts.held_at[k]]),
+                            DONE_KEY: np.array([t == length - 1]),
+                            **{key: np.atleast_1d(values[t]) for key, values in known.items()},
                             "task": bundle.description,
                         }
                     )

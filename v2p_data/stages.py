@@ -446,7 +446,7 @@ def episodes_stage(task: Stage, expert: Stage, cfg: EngineConfig) -> Stage:
         item=task.item,
         config=Seeded(config=cfg.episodes, seed=cfg.seed),
         inputs={"task": task, "expert": expert},
-        version=2,
+        version=3,
         make=make_episodes,
         resumes=True,
     )
@@ -479,7 +479,7 @@ def dataset_stage(episodes: Sequence[Stage], repo_id: str) -> Stage:
         item=repo_id.split("/")[-1],
         config={"repo_id": repo_id},
         inputs={stage.item: stage for stage in episodes},
-        version=2,
+        version=3,
         make=partial(make_dataset, tasks={s.item: s.inputs["task"] for s in episodes}),
     )
 

@@ -39,6 +39,22 @@ def test_every_episode_comes_back_with_the_same_states_on_any_number_of_threads(
     assert again == once
 
 
+def test_an_episode_whose_rewards_were_changed_does_not_come_back(copied):
+    (path,) = copied.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    k = table.column_names.index("next.reward")
+    rewards = table["next.reward"].to_numpy().copy()
+    rewards[0] += 0.5
+    field = table.schema.field(k)
+    pq.write_table(table.set_column(k, field, pa.array(rewards, field.type)), path)
+
+    report = replay(copied)
+
+    assert [e.is_same for e in report.episodes] == [False, True, True]
+    assert report.episodes[0].reward_error == pytest.approx(0.5)
+    assert report.episodes[0].state_error == 0
+
+
 def test_an_episode_whose_actions_were_changed_does_not_come_back(copied):
     (path,) = copied.glob("data/*/*.parquet")
     table = pq.read_table(path)

@@ -36,10 +36,27 @@ def an_episode(number: int, *, size_px: int = SIZE_PX, num_frames: int = NUM_FRA
         state=rng.normal(size=(num_frames, 11)).astype(np.float32),
         action=rng.uniform(-1, 1, (num_frames, 7)).astype(np.float32),
         success=np.arange(num_frames) >= num_frames - 4,
+        simulated=some_truths(num_frames, rng),
         referee=True,
         objects=("toy", "bowl", "lid"),
         params={"action_delay_ms": 12.5, "objects": {"toy": {"mass_kg": 0.1 + number / 100}}},
     )
+
+
+def some_truths(num_frames: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return rewards, poses and contacts of two objects, and a camera that looks straight down."""
+    poses = np.zeros((num_frames, 7, 7), np.float32)
+    poses[:, :2, :3] = rng.normal(size=(num_frames, 2, 3))
+    poses[:, :2, 3] = 1
+    touches = np.zeros((num_frames, 7, 2), bool)
+    touches[num_frames // 2 :, 0] = True
+    return {
+        "next.reward": rng.uniform(size=num_frames).astype(np.float32),
+        "privileged.object_pose": poses.reshape(num_frames, 49),
+        "privileged.contact": touches.reshape(num_frames, 14),
+        "camera.intrinsics": np.tile(np.float32([70, 70, 32, 32]), (num_frames, 1)),
+        "camera.pose": np.tile(np.float32([0.5, 0, 1, 0, 1, 0, 0]), (num_frames, 1)),
+    }
 
 
 @pytest.fixture(scope="session")

@@ -108,7 +108,7 @@ def test_tables_and_metadata_are_what_lerobots_writer_makes(
 
     root = tmp_path / "lerobots"
     dataset = LeRobotDataset.create(
-        "user/toys", fps=20, features=features(64), root=root, robot_type="v2p_franka",
+        "user/toys", fps=20, features=features(64, is_simulated=True), root=root, robot_type="v2p_franka",
         rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=0, pix_fmt="yuv420p", g=2),
     )  # fmt: skip
     for episode in map(Episode.load, staged):
@@ -119,6 +119,8 @@ def test_tables_and_metadata_are_what_lerobots_writer_makes(
                     "observation.state": episode.state[t],
                     "action": episode.action[t],
                     "next.success": episode.success[t : t + 1],
+                    "next.done": np.array([t == episode.num_frames - 1]),
+                    **{k: np.atleast_1d(v[t]) for k, v in episode.simulated.items()},
                     "task": episode.task,
                 }
             )
@@ -351,7 +353,7 @@ def test_a_repeated_episode_is_noticed(packed: Path, tmp_path: Path):
     root = copied(packed, tmp_path)
 
     def repeat(rows: dict) -> None:
-        for key in ("action", "observation.state"):
+        for key in ("action", "observation.state", "next.reward", "privileged.object_pose"):
             rows[key][12:24] = rows[key][:12]
 
     edit_table(root, "data/*/*.parquet", repeat)
@@ -379,6 +381,8 @@ def test_the_card_tells_tasks_palette_and_ranges(packed: Path, tmp_path: Path):
     assert "| objects toy mass_kg | 0.1 | 0.12 |" in card
     assert "license: apache-2.0" in card.split("---")[1]
     assert "- LeRobot" in card.split("---")[1]
+    parts = ["visualize_dataset?path=user/toys", "## Tasks", 'root="FOLDER"', "## Limits", "<details>", "mass_kg"]  # fmt: skip
+    assert [card.index(p) for p in parts] == sorted(card.index(p) for p in parts)
 
 
 def test_the_card_of_an_older_dataset_names_its_seven_numbers(packed: Path):

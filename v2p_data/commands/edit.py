@@ -24,6 +24,8 @@ class Merge:
     """USER/NAME, under which it will be pushed."""
     original: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """The dataset of v2p that LeRobot's tools made some of these from: what they left out is taken from it."""
+    language: bool = False
+    """Write LeRobot's language columns as well: subtasks, motions and questions with exact times."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +52,9 @@ def merge_command(argv: list[str]) -> int:
         for dataset in (*args.datasets, *([args.original] if args.original else [])):
             demand_sound(dataset)
         made = merge(
-            args.datasets, args.repo_id, args.out, original=args.original, on_progress=progress
-        )
+            args.datasets, args.repo_id, args.out,
+            original=args.original, language=args.language, on_progress=progress,
+        )  # fmt: skip
     return _tell(made)
 
 

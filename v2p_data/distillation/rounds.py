@@ -300,6 +300,7 @@ def _stage(
             state=handovers.state[:length, world].copy(),
             action=handovers.action[:length, world].copy(),
             success=rows >= handovers.held_at[world],
+            simulated=handovers.simulated(world, episodes.size_px),
             intervention=rows >= handovers.taken_over_at[world],
             referee=True,
             objects=tuple(o.name for o in bundle.scene.objects),

@@ -82,6 +82,7 @@ class Artist:
             state=rollouts.state[:length, world].copy(),
             action=rollouts.action[:length, world].copy(),
             success=np.arange(length) >= rollouts.held_at[world],
+            simulated=rollouts.simulated(world, self.size_px),
             referee=bool(rollouts.referee[world]),
             objects=tuple(o.name for o in bundle.scene.objects),
             params=rollouts.params[world] | drawn,

@@ -23,6 +23,7 @@ from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     HANDOVER,
     METADATA_FILE,
+    REWARD_KEY,
     STATE_KEY,
     SUCCESS_KEY,
 )
@@ -37,6 +38,8 @@ from v2p_data.task.task import TaskBundle
 
 SAME = 1e-9
 """Largest difference of states [m, rad] that counts as none."""
+SAME_REWARD = 1e-5
+"""Likewise of rewards, where a full one is 1: task code may use functions that processors round differently."""
 MAX_WORLDS = 4096
 """A stranger's record may not ask for more worlds at a time."""
 
@@ -52,6 +55,8 @@ class Recorded:
     state: Float32[np.ndarray, "time 11"]
     action: Float32[np.ndarray, "time 7"]
     success: Bool[np.ndarray, "time"]
+    reward: Float32[np.ndarray, "time"] | None = None
+    """None in datasets of earlier versions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,12 +67,15 @@ class Replayed:
     item: str
     state_error: float
     """Largest difference of a state from the recorded one [m, rad]."""
+    reward_error: float
+    """Largest difference of `next.reward` from the recorded one; 0 where none was."""
     same_success: bool
     """`next.success` is the same in every row, the length too, and the referee agrees again."""
 
     @property
     def is_same(self) -> bool:
-        return self.same_success and self.state_error <= SAME
+        is_near = self.state_error <= SAME and self.reward_error <= SAME_REWARD
+        return self.same_success and is_near
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,13 +98,13 @@ class ReplayReport:
         """Return a line per episode that did not come back, the note, and the sum."""
         others = [
             f"episode {e.episode} ({e.item}): states differ by up to {e.state_error:.2g}, "
-            f"success is {'the same' if e.same_success else 'another'}"
+            f"rewards by {e.reward_error:.2g}, success is {'the same' if e.same_success else 'another'}"
             for e in self.episodes
             if not e.is_same
         ]
         same = len(self.episodes) - len(others)
         left = f"; {self.skipped} handovers cannot be replayed" if self.skipped else ""
-        total = f"{same} of {len(self.episodes)} episodes came back with the same states and success{left}; states {self.digest[:16]}"
+        total = f"{same} of {len(self.episodes)} episodes came back with the same states, rewards and success{left}; states {self.digest[:16]}"
         return [*others, *([self.note] if self.note else []), total]
 
     def as_json(self) -> dict[str, Any]:
@@ -172,17 +180,13 @@ def _batches(
 def _rows(root: Path) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     names = {"state": STATE_KEY, "action": ACTION_KEY, "success": SUCCESS_KEY}
     for path in sorted(root.glob(DATA_GLOB)):
+        if REWARD_KEY in pq.read_schema(path).names:
+            names["reward"] = REWARD_KEY
         table = pq.read_table(path, columns=["episode_index", *names.values()])
         for number, (first, length) in row_spans(column(table, "episode_index")).items():
             rows = table.slice(first, length)
-            yield (
-                number,
-                {
-                    "state": np.array(rows[STATE_KEY].to_pylist(), np.float32),
-                    "action": np.array(rows[ACTION_KEY].to_pylist(), np.float32),
-                    "success": np.array(rows[SUCCESS_KEY].to_pylist(), bool).reshape(length),
-                },
-            )
+            columns = {k: np.array(rows[n].to_pylist(), np.float32) for k, n in names.items()}
+            yield number, columns | {"success": columns["success"].reshape(length) > 0}
 
 
 def _recipe(about: Mapping[str, Any], item: str) -> EpisodesConfig:
@@ -236,10 +240,16 @@ def _compared(
         and np.array_equal(held, recorded.success[:length])
     )
     error = float(np.abs(states.astype(float) - recorded.state[:length]).max())
-    return (
-        Replayed(episode=recorded.number, item=item, state_error=error, same_success=bool(same)),
-        states,
+    earned = rollouts.reward[:length, world]
+    noted = earned if recorded.reward is None else recorded.reward[:length]
+    replayed = Replayed(
+        episode=recorded.number,
+        item=item,
+        state_error=error,
+        reward_error=float(np.abs(earned - noted).max()),
+        same_success=bool(same),
     )
+    return replayed, states
 
 
 def _other_version(about: Mapping[str, Any]) -> str:

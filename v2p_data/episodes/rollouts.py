@@ -9,14 +9,27 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
-from v2p_data.episodes.dataset.features import FPS
+from v2p_data.episodes.dataset.features import (
+    CAMERA_POSE_KEY,
+    CONTACT_KEY,
+    FPS,
+    INTRINSICS_KEY,
+    OBJECT_POSE_KEY,
+    REWARD_KEY,
+    SIMULATED,
+    SLOTS,
+)
+from v2p_data.geometry.camera import intrinsics
+from v2p_data.geometry.rotation import product
 from v2p_data.play import Actor, Film, View, play
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.verdict import RefereeRecord, referee_verdict
 from v2p_data.task.task import Task, TaskBundle
 
+ABOUT_X = np.array([[0.0], [1.0], [0.0], [0.0]])
+"""Half a turn about x: from OpenCV's camera axes to MuJoCo's."""
 Referee = Callable[[TaskBundle, Mapping[str, np.ndarray]], Bool[np.ndarray, "env"]]
 """Given a task and `RefereeRecord.history_as_cut`, tells which episodes succeeded."""
 
@@ -41,6 +54,10 @@ class Rollouts:
     action: Float32[np.ndarray, "time env 7"]
     success: Bool[np.ndarray, "time env"]
     """The task's judgement after action `t`."""
+    reward: Float32[np.ndarray, "time env"]
+    """What action `t` earned, as environments give it; see `StepResult.reward`."""
+    object_pose: Float[np.ndarray, "time env object 7"]
+    touches: Bool[np.ndarray, "time env object 2"]
     snapshots: tuple[Snapshot, ...]
     """All worlds, before action `t`."""
     num_frames: Int[np.ndarray, "env"]
@@ -63,6 +80,29 @@ class Rollouts:
     @property
     def snapshot_seconds(self) -> tuple[float, ...]:
         return tuple(t / FPS for t in range(len(self.snapshots)))
+
+    def simulated(self, world: int, size_px: int) -> dict[str, np.ndarray]:
+        """Return the columns of an episode that only a simulator knows, by name.
+
+        Args:
+            world: in which it ran.
+            size_px: width and height of the pictures.
+        """
+        length, count = int(self.num_frames[world]), self.object_pose.shape[2]
+        pose, touches = np.zeros((length, SLOTS, 7)), np.zeros((length, SLOTS, 2), bool)
+        pose[:, :count] = self.object_pose[:length, world]
+        touches[:, :count] = self.touches[:length, world]
+        start = self.snapshots[0]
+        K = intrinsics(size_px, size_px, np.radians(start.camera_fovy_deg[world]))
+        quat = product(start.camera_quat[world][:, None], ABOUT_X)[:, 0]
+        found = {
+            REWARD_KEY: self.reward[:length, world],
+            OBJECT_POSE_KEY: pose.reshape(length, -1),
+            CONTACT_KEY: touches.reshape(length, -1),
+            INTRINSICS_KEY: np.tile(K[[0, 1, 0, 1], [0, 1, 2, 2]], (length, 1)),
+            CAMERA_POSE_KEY: np.tile(np.append(start.camera_pos[world], quat), (length, 1)),
+        }
+        return {key: found[key].astype(column.dtype) for key, column in SIMULATED.items()}
 
     def reject(self, world: int) -> dict[str, Any]:
         """Return why the episode of `world` is no demonstration."""
@@ -163,12 +203,16 @@ def record_rollouts(
     params = tuple(env.episode_params(k) for k in range(count))
     film, record = Film(env), RefereeRecord(env)
     ends = EpisodeEnds(count, horizon or env.horizon, cut)
-    states, actions, successes = [view.state], [], []
+    states, poses, touches = [view.state], [env.object_poses()], [env.touches()]
+    actions, successes, rewards = [], [], []
 
     def note(view: View) -> None:
         states.append(view.state)
+        poses.append(env.object_poses())
+        touches.append(env.touches())
         actions.append(view.action.astype(np.float32))
         successes.append(view.result.success)
+        rewards.append(view.result.reward)
 
     play(view, actor, [note, film.note, record.note], ends, ends.horizon)
     held = ends.successes
@@ -179,6 +223,9 @@ def record_rollouts(
         state=np.stack(states[:-1]),
         action=np.stack(actions),
         success=np.stack(successes),
+        reward=np.stack(rewards),
+        object_pose=np.stack(poses[:-1]),
+        touches=np.stack(touches[:-1]),
         snapshots=film.snapshots()[:-1],
         num_frames=ends.num_frames,
         held_at=ends.held_at,

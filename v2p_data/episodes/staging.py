@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from v2p_data.episodes.dataset.features import SIMULATED
 from v2p_data.errors import V2PError, write_refusal
 
 EPISODES_FOLDER = "episodes"
@@ -47,6 +48,8 @@ class Episode:
     action: Float32[np.ndarray, "time 7"]
     success: Bool[np.ndarray, "time"]
     """Whether success has held (0.25 s on end) by the end of the row's action; never falls back."""
+    simulated: Mapping[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
+    """What a simulator knows besides, by column (`features.SIMULATED`); empty for a robot's recording."""
     referee: bool
     """The verdict of the independent success function, which no training saw."""
     objects: tuple[str, ...]
@@ -65,6 +68,7 @@ class Episode:
 
     def __post_init__(self) -> None:
         lengths = {len(self.labels), len(self.state), len(self.action), len(self.success)}
+        lengths |= {len(values) for values in self.simulated.values()}
         if self.intervention is not None:
             lengths.add(len(self.intervention))
         if len(lengths) != 1:
@@ -103,7 +107,7 @@ class Episode:
             "objects": list(self.objects),
             "params": self.params,
         }
-        arrays: dict[str, np.ndarray] = {name: getattr(self, name) for name in ARRAYS}
+        arrays = {name: getattr(self, name) for name in ARRAYS} | dict(self.simulated)
         if self.cameras != (MASK_CAMERA,):
             about["cameras"] = list(self.cameras)
         if self.family:
@@ -128,6 +132,7 @@ class Episode:
                 about = _about(data, path)
                 names = ARRAYS if pictures else ARRAYS[1:]
                 arrays: dict[str, Any] = {k: data[k] for k in names}
+                arrays["simulated"] = {key: data[key] for key in SIMULATED if key in data}
                 if INTERVENTION in data:
                     arrays[INTERVENTION] = data[INTERVENTION]
                 if not pictures:
@@ -158,6 +163,8 @@ class Heading:
     cameras: tuple[str, ...]
     is_handover: bool
     """It holds who acted."""
+    is_simulated: bool
+    """It holds what only a simulator knows."""
     digest: str
     """SHA-256 of the file."""
 
@@ -173,6 +180,7 @@ class Heading:
             with np.load(path) as data:
                 about = _about(data, path)
                 is_handover = INTERVENTION in data
+                is_simulated = all(key in data for key in SIMULATED)
             with zipfile.ZipFile(path) as archive, archive.open("labels.npy") as member:
                 np.lib.format.read_magic(member)
                 shape, _, _ = np.lib.format.read_array_header_1_0(member)
@@ -192,6 +200,7 @@ class Heading:
             size_px=(height, width),
             cameras=about.get("cameras", (MASK_CAMERA,)),
             is_handover=is_handover,
+            is_simulated=is_simulated,
             digest=digest,
         )
 

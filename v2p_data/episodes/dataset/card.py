@@ -7,9 +7,11 @@ from typing import Any
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.features import (
     ACTION_NAMES,
+    DONE_KEY,
     INTERVENTION_KEY,
     MASK_KEY,
     METADATA_FILE,
+    SIMULATED,
     STATE_NAMES,
 )
 from v2p_data.episodes.dataset.handovers import who_acted
@@ -20,6 +22,26 @@ from v2p_data.errors import V2PError
 CARD_FILE = "README.md"
 TAGS = ("LeRobot", "robotics", "segmentation", "simulation", "mujoco", "video2policy")
 LICENSE = "apache-2.0"
+BADGE = (
+    "https://huggingface.co/datasets/huggingface/badges/resolve/main/visualize-this-dataset-xl.svg"
+)
+VISUALISER = "https://huggingface.co/spaces/lerobot/visualize_dataset?path="
+USE = """\
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("{0}")  # root="FOLDER" for a copy on disk
+```
+
+```bash
+hf download {0} --repo-type dataset --local-dir FOLDER
+v2p train FOLDER --out RUN
+lerobot-train --dataset.repo_id={0} --dataset.root=FOLDER --policy.type=act --policy.push_to_hub=false
+lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks=FOLDER/v2p/tasks
+```
+
+Masks are no photographs: give `lerobot-train` also `--dataset.use_imagenet_stats=false --policy.pretrained_backbone_weights=null`, and
+a `--policy.chunk_size` below the episodes' length."""
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 """The Hub's words for how many episodes there are."""
 STATE_UNITS = (
@@ -92,25 +114,24 @@ def dataset_card(
         "simulated task, an expert learned the task, and its successful episodes were recorded under "
         f"randomisation. {len(episodes)} episodes, {info['total_frames']} frames, {seconds:.0f} s at "
         f"{info['fps']} frames a second.",
+        f"[![Look at it in LeRobot's visualiser, once it is on the Hub]({BADGE})]({VISUALISER}{repo_id})\n\nLicense: {LICENSE}.",
         *([f"![Moments of one episode of each task]({SHEET_FILE})"] if has_sheet else []),
-        "```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
-        f'dataset = LeRobotDataset("{repo_id}")\n```',
-        "## Tasks",
+        "## Tasks and results",
         _tasks(episodes),
+        _results(about, episodes),
+        "## Load, train, evaluate",
+        USE.format(repo_id),
+        "## Limits",
+        "Everything is simulated, and sizes, masses and frictions of the objects are estimates from one video "
+        "each. Only episodes that succeeded by the task's own measure and by an independent one are included.",
         "## What a frame holds",
         _frame(info),
         *(["## Who acted", _who_acted(episodes)] if INTERVENTION_KEY in info["features"] else []),
         "## Masks",
         _palette(about, episodes),
-        "## Randomisation",
-        _randomisation(episodes),
-        "## Results",
-        _results(about, episodes),
         "## How it was made",
         _making(about),
-        "## Limits",
-        "Everything is simulated, and sizes, masses and frictions of the objects are estimates from one video "
-        "each. Only episodes that succeeded by the task's own measure and by an independent one are included.",
+        f"<details><summary>What was drawn for the episodes: ranges</summary>\n\n{_randomisation(episodes)}\n\n</details>",
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -152,6 +173,10 @@ def _frame(info: dict[str, Any]) -> str:
             meaning = "each in [-1, 1]: " + _named(ACTION_NAMES, ACTION_UNITS)
         elif key == "next.success":
             meaning = "the task's success has held for 0.25 s by the end of this action"
+        elif key == DONE_KEY:
+            meaning = "true in the last row of an episode"
+        elif key in SIMULATED:
+            meaning = SIMULATED[key].meaning
         elif key == INTERVENTION_KEY:
             meaning = "true where the expert acted, false where a student did"
         else:
@@ -256,7 +281,7 @@ def _results(about: dict[str, Any], episodes: list[dict[str, Any]]) -> str:
     lines.append("")
     lines.append(
         "An expert succeeds where the task's own measure and an independent one agree, at the simulator's fine time "
-        "step under the randomisation above; the interval is Wilson's at 95 %."
+        "step under the randomisation below; the interval is Wilson's at 95 %."
     )
     return "\n".join(lines)
 

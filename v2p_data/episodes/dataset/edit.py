@@ -29,6 +29,7 @@ from v2p_data.episodes.dataset.handovers import (
     write_with_column,
 )
 from v2p_data.episodes.dataset.intake import demand_bounded
+from v2p_data.episodes.dataset.language import write_language
 from v2p_data.episodes.dataset.repo_id import check_repo_id
 from v2p_data.episodes.dataset.tables import (
     DATA_PATH,
@@ -90,6 +91,7 @@ def merge(
     out: Path,
     *,
     original: Path | None = None,
+    language: bool = False,
     on_progress: Progress = lambda share, words: None,
 ) -> Edited:
     """Write the episodes of several LeRobot v3 datasets, in this order, as one at `out`; of one as a copy with exact statistics.
@@ -101,6 +103,7 @@ def merge(
         repo_id: `user/name`.
         out: where it shall lie; must not exist.
         original: the dataset of ours that LeRobot's tools made some of these from; what they left out is taken from it.
+        language: write LeRobot's language columns, too (`language.py`).
         on_progress: told the share that is done and a few words.
 
     Raises:
@@ -124,6 +127,9 @@ def merge(
             _aggregate(sources, folders, repo_id, partial)
         on_progress(0.4, "gathering tasks and provenance")
         about = _merged_about(sources, repo_id, partial)
+        if language:
+            on_progress(0.45, "writing the language columns")
+            write_language(partial, about)
         return _finish(
             partial, out, repo_id, about,
             [(s.root, range(len(s.lengths))) for s in sources], on_progress,

@@ -1,8 +1,10 @@
 """What a frame of our datasets holds: names, shapes and units of every column.
 
-State and action entries end in `.pos`, because `lerobot-rollout` drops other names without a word.
+State and action entries end in `.pos`, because `lerobot-rollout` drops other names without a word. Policies, LeRobot's
+and ours, take as inputs what begins with `observation.`; no other column may begin so.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 FPS = 20
@@ -12,6 +14,12 @@ RGB_KEY = "observation.images.rgb"
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 SUCCESS_KEY = "next.success"
+DONE_KEY = "next.done"
+REWARD_KEY = "next.reward"
+OBJECT_POSE_KEY = "privileged.object_pose"
+CONTACT_KEY = "privileged.contact"
+INTRINSICS_KEY = "camera.intrinsics"
+CAMERA_POSE_KEY = "camera.pose"
 INTERVENTION_KEY = "intervention"
 """Whether the expert acted, as LeRobot's DAgger recordings name it; True throughout in demonstrations."""
 INTERVENTION_FEATURE: dict[str, Any] = {"dtype": "bool", "shape": (1,), "names": None}
@@ -50,9 +58,60 @@ ACTION_NAMES = (
 )
 """Each in [-1, 1]: x 0.03 m, x 0.2 rad about the world's axes, and x 0.012 m of finger travel (+ closes)."""
 
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+SLOTS = 7
+"""Objects that masks can tell apart; slot 1 has the label 2, slot 2 the label 3, and so on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """Numbers that a simulator knows; a robot's recordings lack them."""
+
+    dtype: str = "float32"
+    names: tuple[str, ...] | None = None
+    """Of the entries; None for a single number."""
+    meaning: str
+
+    @property
+    def feature(self) -> dict[str, Any]:
+        """In LeRobot's words."""
+        names = None if self.names is None else list(self.names)
+        return {"dtype": self.dtype, "shape": (len(self.names or " "),), "names": names}
+
+
+SIMULATED = {
+    REWARD_KEY: Column(
+        meaning="the task's own shaped reward of what this action led to, 1 is a full one, and 1 more while it succeeds",
+    ),
+    OBJECT_POSE_KEY: Column(
+        names=tuple(f"object_{k}.{axis}" for k in range(1, SLOTS + 1) for axis in _POSE),
+        meaning="not for policies: per object the position of its centre [m] and its quaternion wxyz in the robot's base "
+        "frame, before the action; object 1 has the label 2; 0 throughout where there is none",
+    ),
+    CONTACT_KEY: Column(
+        dtype="bool",
+        names=tuple(f"object_{k}.{s}" for k in range(1, SLOTS + 1) for s in ("left", "right")),
+        meaning="not for policies: whether the left and the right finger's pad touches the object, before the action",
+    ),
+    INTRINSICS_KEY: Column(
+        names=("fx", "fy", "cx", "cy"),
+        meaning="focal lengths and principal point [px]; pixel centres are at integers plus one half",
+    ),
+    CAMERA_POSE_KEY: Column(
+        names=_POSE,
+        meaning="the camera's position [m] and quaternion wxyz in the robot's base frame; OpenCV's axes: x right, y down, "
+        "z forward",
+    ),
+}
+"""Shapes do not depend on the task, so that all datasets of ours go together."""
+
 
 def features(
-    size_px: int, cameras: tuple[str, ...] = ("mask",), *, has_handovers: bool = False
+    size_px: int,
+    cameras: tuple[str, ...] = ("mask",),
+    *,
+    has_handovers: bool = False,
+    is_simulated: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Return LeRobot's feature table for pictures of `size_px` x `size_px` from these cameras.
 
@@ -60,6 +119,7 @@ def features(
         size_px: width and height.
         cameras: which pictures there are.
         has_handovers: some episodes were acted by a student at first, so there is a column that says who acted.
+        is_simulated: all episodes are a simulator's, so there is what only a simulator knows.
     """
     return {
         **{
@@ -78,4 +138,6 @@ def features(
         ACTION_KEY: {"dtype": "float32", "shape": (7,), "names": list(ACTION_NAMES)},
         SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},
         **({INTERVENTION_KEY: INTERVENTION_FEATURE} if has_handovers else {}),
+        DONE_KEY: {"dtype": "bool", "shape": (1,), "names": None},
+        **({k: column.feature for k, column in SIMULATED.items()} if is_simulated else {}),
     }

@@ -14,10 +14,14 @@ from v2p_data.episodes.dataset.episode_stats import QUANTILES
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     ACTION_NAMES,
+    CAMERA_POSE_KEY,
     DEMONSTRATION,
+    DONE_KEY,
     INTERVENTION_KEY,
+    INTRINSICS_KEY,
     MASK_KEY,
     METADATA_FILE,
+    OBJECT_POSE_KEY,
     RGB_KEY,
     STATE_KEY,
     SUCCESS_KEY,
@@ -30,6 +34,8 @@ from v2p_data.sim.render.masks import PALETTE, rgb_to_labels
 TIME_TOLERANCE_S = 1e-4
 STATS_TOLERANCE = 1e-4
 VARIANCE_TOLERANCE = 1e-6
+UNIT_TOLERANCE = 1e-4
+"""Of the length of quaternions, which are stored in 32 bits."""
 QUANTILE_TOLERANCE = 0.005
 """Share of rows by which a quantile may be off, and share of the range: LeRobot estimates it from 5,000 bins."""
 PICTURE_MEAN_TOLERANCE = 0.1
@@ -255,6 +261,7 @@ class EpisodeCheck:
             add("action_bounds", where, f"an action is {largest:.3f}, beyond 1")
         self._success(columns)
         self._who_acted(columns)
+        self._simulated(columns)
         self._duplicate(columns)
         self._cameras(columns.get(STATE_KEY))
         if self.recorded is not None:
@@ -276,6 +283,20 @@ class EpisodeCheck:
                 "who_acted", self.where,
                 f"a student acted in {true} frames, {METADATA_FILE} tells of {said} in a {source}",
             )  # fmt: skip
+
+    def _simulated(self, columns: dict[str, np.ndarray]) -> None:
+        """Judge ends of episodes, poses and the camera, where they are in the dataset and it is ours."""
+        add = self.checks.said.add if self.checks.is_ours else self.checks.said.note
+        if DONE_KEY in columns and not (columns[DONE_KEY][-1] and columns[DONE_KEY].sum() == 1):
+            add("done", self.where, f"{DONE_KEY} is not true in the last row alone")
+        for key in (OBJECT_POSE_KEY, CAMERA_POSE_KEY):
+            if key in columns and columns[key].shape[1] % 7 == 0:
+                length = np.linalg.norm(columns[key].reshape(-1, 7)[:, 3:], axis=1)
+                is_none = (length == 0) & (key == OBJECT_POSE_KEY)
+                if not (is_none | (np.abs(length - 1) < UNIT_TOLERANCE)).all():
+                    add("poses", self.where, f"a quaternion of {key} is not of length 1")
+        if INTRINSICS_KEY in columns and not (columns[INTRINSICS_KEY] > 0).all():
+            add("poses", self.where, f"{INTRINSICS_KEY} are not above 0: the camera is not calibrated")  # fmt: skip
 
     def _duplicate(self, columns: dict[str, np.ndarray]) -> None:
         digest = hashlib.sha256()
@@ -320,6 +341,7 @@ class EpisodeCheck:
             ACTION_KEY: episode.action,
             SUCCESS_KEY: episode.success[:, None],
         }
+        recorded |= {k: v.reshape(len(v), -1) for k, v in episode.simulated.items()}
         if INTERVENTION_KEY in columns:
             recorded[INTERVENTION_KEY] = episode.expert_acted[:, None]
         elif episode.is_handover:

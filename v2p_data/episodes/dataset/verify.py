@@ -218,7 +218,7 @@ def frames_differ(
 ) -> str:
     """Return how the dataset at `root` differs from episodes of other datasets, frame by frame.
 
-    Of a source without the column that says who acted the expert did throughout.
+    Of a source without the column that says who acted the expert did throughout. One without words says nothing of them.
 
     Args:
         root: the dataset; its episodes are those of `sources`, in order.
@@ -231,6 +231,7 @@ def frames_differ(
     made = Rows(root)
     absent = {INTERVENTION_KEY: True}
     columns = [*(keys or (k for k in made.dataset.meta.features if k not in RENUMBERED)), "task"]
+    told = [key for key in columns if key.startswith("language_")]
     at = 0
     for folder, numbers in sources:
         source = Rows(folder)
@@ -241,6 +242,7 @@ def frames_differ(
                 return f"{root} ends before episode {number} of {folder}"
             pairs = zip(source.episode(start, length), made.episode(at, length), strict=True)
             for t, (old, new) in enumerate(pairs):
+                absent |= {key: new[key] for key in told}
                 wrong = [
                     key for key in columns if not same(old.get(key, absent.get(key)), new[key])
                 ]

@@ -9,7 +9,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,9 @@ from v2p_data.episodes.dataset.episode_stats import number_stats
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     ACTION_NAMES,
+    CONTACT_KEY,
     DEMONSTRATION,
+    DONE_KEY,
     EPISODE_COLUMN,
     FPS,
     HANDOVER,
@@ -33,6 +35,7 @@ from v2p_data.episodes.dataset.features import (
     METADATA_FILE,
     METADATA_SCHEMA,
     ROBOT_TYPE,
+    SIMULATED,
     STATE_KEY,
     STATE_NAMES,
     SUCCESS_KEY,
@@ -84,7 +87,8 @@ def pack(
     """Write staged episodes, in this order, as a LeRobot v3 dataset at `root`.
 
     A packing that was stopped goes on where it was when it is called again. Where handovers are among the episodes,
-    all frames have the column `intervention`: whether the expert acted.
+    all frames have the column `intervention`: whether the expert acted. What only a simulator knows is kept where all
+    episodes have it; those of earlier versions and of robots have not.
 
     Args:
         staged: files that `Episode.save` wrote.
@@ -177,11 +181,15 @@ def _write(
     from lerobot.datasets.io_utils import write_info
 
     first = shards[0].episodes[0]
-    has_handovers = any(e.is_handover for shard in shards for e in shard.episodes)
+    headings = [heading for shard in shards for heading in shard.episodes]
+    has_handovers = any(e.is_handover for e in headings)
+    is_simulated = all(e.is_simulated for e in headings)
     meta: Any = LeRobotDatasetMetadata.create(
         repo_id,
         fps=FPS,
-        features=features(first.size_px[0], first.cameras, has_handovers=has_handovers),
+        features=features(
+            first.size_px[0], first.cameras, has_handovers=has_handovers, is_simulated=is_simulated
+        ),
         robot_type=ROBOT_TYPE,
         root=root,
         video_files_size_in_mb=VIDEO_FILE_MB,
@@ -218,7 +226,7 @@ def _write(
                         f"{key}/from_timestamp": begin / FPS,
                         f"{key}/to_timestamp": (begin + episode.num_frames) / FPS,
                     }
-                described.append(_describe(episode, has_handovers=has_handovers))
+                described.append(_describe(episode, meta.features))
                 where[EPISODE_COLUMN] = json.dumps(described[-1])
                 data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
                 frame += episode.num_frames
@@ -256,14 +264,15 @@ class _DataFiles:
             STATE_KEY: episode.state,
             ACTION_KEY: episode.action,
             SUCCESS_KEY: episode.success,
+            INTERVENTION_KEY: episode.expert_acted,
+            DONE_KEY: np.arange(count) == count - 1,
+            **episode.simulated,
             "timestamp": (np.arange(count) / FPS).astype(np.float32),
             "frame_index": np.arange(count),
             "episode_index": np.full(count, index),
             "index": np.arange(first, first + count),
             "task_index": np.full(count, meta.get_task_index(episode.task)),
         }
-        if INTERVENTION_KEY in self.numbers:
-            columns[INTERVENTION_KEY] = episode.expert_acted
         if self.writer is None or first - self.first_row + count > DATA_FILE_FRAMES:
             self._next_file(first)
         assert self.writer is not None
@@ -274,7 +283,7 @@ class _DataFiles:
             index,
             count,
             [episode.task],
-            picture_stats | number_stats(columns, self.numbers),
+            picture_stats | number_stats({n: columns[n] for n in self.numbers}, self.numbers),
             {
                 "data/chunk_index": chunk,
                 "data/file_index": file,
@@ -317,7 +326,9 @@ def _video_path(meta: Any, number: int, camera: str) -> Path:
     return Path(meta.root) / name
 
 
-def _describe(episode: Episode, *, has_handovers: bool) -> dict[str, Any]:
+def _describe(episode: Episode, columns: Collection[str]) -> dict[str, Any]:
+    numbers = [episode.state, episode.action]
+    numbers += [episode.simulated[k] for k in SIMULATED if k in columns and k != CONTACT_KEY]
     source = {
         "source": HANDOVER if episode.is_handover else DEMONSTRATION,
         "student_frames": int((~episode.expert_acted).sum()),
@@ -332,9 +343,9 @@ def _describe(episode: Episode, *, has_handovers: bool) -> dict[str, Any]:
         "labels": {str(k): name for k, name in label_names(episode.objects).items()},
         "success": bool(np.any(episode.success)),
         "referee": episode.referee,
-        "numbers": number_digest((episode.state, episode.action)),
+        "numbers": number_digest(numbers),
         "params": episode.params,
-        **(source if has_handovers else {}),
+        **(source if INTERVENTION_KEY in columns else {}),
     }
 
 

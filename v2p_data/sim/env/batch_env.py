@@ -455,6 +455,14 @@ class BatchEnv:
         """Return copies of all worlds' positions and velocities: what changes in a `Snapshot` during an episode."""
         return self._qpos.copy(), self._qvel.copy()
 
+    def object_poses(self) -> Float[np.ndarray, "env object 7"]:
+        """Return a copy of the objects' poses: centre [m] and quaternion wxyz, in the robot's base frame."""
+        return self._object_qpos.copy()
+
+    def touches(self) -> Bool[np.ndarray, "env object 2"]:
+        """Return whether the left and the right finger's pad touched each object at the last time step."""
+        return self._touches > 0
+
     def episode_params(self, env: int) -> dict[str, Any]:
         """Return what was drawn for the episode in world `env`, for JSON."""
         return {

@@ -1,0 +1,121 @@
+"""What a simulator knows of an episode is true, no policy is given it, and damage to it is named."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_collect import SMALL
+from test_dataset import copied, edit_table
+from toy_task import collect_toys
+
+from v2p_data.episodes.collect import staged_episodes
+from v2p_data.episodes.dataset.edit import merge
+from v2p_data.episodes.dataset.features import SIMULATED, SLOTS, features
+from v2p_data.episodes.dataset.tables import read_info
+from v2p_data.episodes.dataset.verify import verify
+from v2p_data.episodes.dataset.writer import pack
+from v2p_data.episodes.staging import Episode
+from v2p_data.errors import V2PError
+from v2p_data.sim.env.randomize import recording
+from v2p_data.sim.render.masks import FIRST_OBJECT, PALETTE
+
+
+@pytest.fixture(scope="module")
+def toys(tmp_path_factory: pytest.TempPathFactory) -> list[Episode]:
+    """Episodes of a task with one cube, seen by cameras that differ from episode to episode."""
+    out = tmp_path_factory.mktemp("collected")
+    moved = replace(recording(), camera_pos_m=0.1, camera_angle_rad=0.05, camera_fovy_deg=5.0)
+    collect_toys(out, replace(SMALL, randomization=moved))
+    return [Episode.load(path) for path in staged_episodes(out)]
+
+
+def test_there_is_a_slot_for_every_object_that_masks_tell_apart():
+    assert len(PALETTE) == FIRST_OBJECT + SLOTS
+
+
+def test_an_objects_centre_is_seen_by_the_camera_in_the_middle_of_its_mask(toys: list[Episode]):
+    for episode in toys:
+        known = {k: v.astype(float) for k, v in episode.simulated.items()}
+        centre = known["privileged.object_pose"][0, :3]
+        fx, fy, cx, cy = known["camera.intrinsics"][0]
+        w, x, y, z = known["camera.pose"][0, 3:]
+        right = np.array([w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)])
+        down = np.array([2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)])
+        away = centre - known["camera.pose"][0, :3]
+        depth = away @ np.cross(right, down)
+        rows, columns = np.nonzero(episode.labels[0] == 2)
+
+        assert abs(fx * (away @ right) / depth + cx - (columns.mean() + 0.5)) < 1
+        assert abs(fy * (away @ down) / depth + cy - (rows.mean() + 0.5)) < 1
+    assert len({tuple(e.simulated["camera.intrinsics"][0]) for e in toys}) == len(toys)
+
+
+def test_rewards_are_those_of_what_the_action_led_to(toys: list[Episode]):
+    for episode in toys:
+        left = episode.state[1:, 1]  # the task's reward is the tool's y in the next row, per 100
+        paid = (left > 0.08).astype(float)
+        assert np.allclose(episode.simulated["next.reward"][:-1], left / 100 + paid, atol=1e-6)
+
+
+def test_free_slots_hold_nothing(toys: list[Episode]):
+    assert not toys[0].simulated["privileged.object_pose"][:, 7:].any()
+    assert not toys[0].simulated["privileged.contact"].any()  # it never comes near the cube
+
+
+def test_no_policy_is_given_what_a_camera_would_not_see():
+    from lerobot.processor.converters import batch_to_transition, transition_to_batch
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    table = features(64, has_handovers=True, is_simulated=True)
+
+    taken = set(dataset_to_policy_features(table))
+    batch: dict[str, Any] = transition_to_batch(batch_to_transition(dict.fromkeys(table)))
+    assert taken == {"observation.images.mask", "observation.state", "action"}
+    assert not {k for k in batch if k.startswith(("privileged", "camera"))}
+    assert set(SIMULATED) <= set(table)
+
+
+@pytest.mark.slow
+def test_every_column_comes_through_packing(packed: Path, staged: list[Path]):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset: Any = LeRobotDataset("user/toys", root=packed)
+    rows = [dataset[i] for i in range(12)]
+
+    for key, values in Episode.load(staged[0]).simulated.items():
+        assert np.array_equal(np.stack([np.asarray(r[key]) for r in rows]), values), key
+    assert [bool(r["next.done"]) for r in rows] == [False] * 11 + [True]
+
+
+@pytest.mark.slow
+def test_damage_is_named_with_its_column(packed: Path, tmp_path: Path):
+    root = copied(packed, tmp_path)
+    spoiled = {
+        "next.reward": (float("nan"), "finite"),
+        "next.done": (True, "done"),
+        "privileged.object_pose": ([0.1] * 49, "poses"),
+        "camera.pose": ([0.0] * 7, "poses"),
+        "camera.intrinsics": ([0.0] * 4, "poses"),
+    }
+    for column, (value, _) in spoiled.items():
+        edit_table(root, "data/*/*.parquet", lambda r, c=column, v=value: r[c].__setitem__(5, v))
+
+    found = {(p.check, column) for p in verify(root).problems for column in spoiled if column in p.detail}  # fmt: skip
+
+    assert found >= {(check, column) for column, (_, check) in spoiled.items()}
+
+
+@pytest.mark.slow
+def test_with_an_episode_that_lacks_the_columns_none_has_them(
+    make_episode, packed: Path, tmp_path: Path
+):
+    old = replace(make_episode(8), simulated={})
+    paths = [e.save(tmp_path / "staged") for e in (make_episode(7), old)]
+    pack(paths, "user/mixed", tmp_path / "mixed")
+
+    assert not set(SIMULATED) & set(read_info(tmp_path / "mixed")["features"])
+    assert verify(tmp_path / "mixed", paths).is_good
+    with pytest.raises(V2PError, match="do not go together: the list of columns"):
+        merge([packed, tmp_path / "mixed"], "user/both", tmp_path / "both")
