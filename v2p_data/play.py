@@ -45,6 +45,7 @@ class View:
         size_px: width and height of the pictures, or (height, width).
         num_threads: for the pictures; changes no result.
         watch: told what pictures, physics and actors take.
+        wrist: whether the wrist's picture comes below the table's.
 
     Attributes:
         t: control steps so far.
@@ -63,16 +64,18 @@ class View:
         size_px: int | tuple[int, int] = 256,
         num_threads: int = 1,
         watch: Stopwatch | None = None,
+        *,
+        wrist: bool = False,
     ) -> None:
         self.worlds, self.watch = worlds, watch or Stopwatch()
         self.t, self.going = 0, np.ones(worlds.num_envs, bool)
         self.obs = worlds.observe()
         self._state = worlds.robot_state()
         shape = (size_px, size_px) if isinstance(size_px, int) else size_px
-        self._labels = np.zeros((worlds.num_envs, *shape), np.uint8)
+        self._labels = np.zeros((worlds.num_envs, shape[0] * (1 + wrist), shape[1]), np.uint8)
         self._drawn_at = -1
         self._renderer: MaskRenderer | None = None
-        self._picture_settings = size_px, num_threads
+        self._picture_settings = size_px, num_threads, wrist
 
     @property
     def state(self) -> Float32[np.ndarray, "env 11"]:
@@ -95,8 +98,10 @@ class View:
 
     def _draw(self, seen: np.ndarray) -> None:
         if self._renderer is None:
-            size_px, num_threads = self._picture_settings
-            self._renderer = MaskRenderer(self.worlds.world, size_px, num_threads=num_threads)
+            size_px, num_threads, wrist = self._picture_settings
+            self._renderer = MaskRenderer(
+                self.worlds.world, size_px, num_threads=num_threads, wrist=wrist
+            )
         snapshot = self.worlds.snapshot(seen)
         self._labels[seen] = self._renderer.draw_many([(snapshot, k) for k in range(len(seen))])
 
@@ -134,6 +139,8 @@ class VisionActor:
     """A policy in the place of an actor."""
 
     policy: Policy
+    wrist: bool = False
+    """Whether it sees the wrist's picture too, below the table's."""
 
     def reset(self, worlds: BatchEnv) -> None:
         """Tell the policy that episodes begin."""

@@ -98,10 +98,10 @@ class Student:
         self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n dim"]
     ) -> Float32[np.ndarray, "n act"]:
         """Return the worlds' next actions; the same worlds in the same order at every call until `reset`."""
-        (camera,) = self.policy.net.camera_keys
         device = next(self.policy.parameters()).device
         batch = self.processors.before({STATE: torch.from_numpy(state)})
-        batch[camera] = torch.from_numpy(self._greys(labels))[:, None].to(device)
+        for camera, greys in self._pictures(labels).items():
+            batch[camera] = torch.from_numpy(greys)[:, None].to(device)
         batch["task"] = [self.task] * len(state)
         with torch_threads(self.num_threads):
             action = self.policy.select_action(batch)
@@ -118,10 +118,9 @@ class Student:
         lengths: Sequence[int],
     ) -> None:
         """Take in episodes, one after the other, of these lengths."""
-        (camera,) = self.policy.net.camera_keys
         more = frames_of(
             net=self.policy.net,
-            pictures={camera: self._greys(labels)},
+            pictures=self._pictures(labels),
             vectors={STATE: state},
             action=action,
             task=task,
@@ -164,8 +163,16 @@ class Student:
         device = str(next(self.policy.parameters()).device)
         self.policy, self.processors = load_policy(folder, device=device)
 
-    def _greys(self, labels: UInt8[np.ndarray, "n h w"]) -> UInt8[np.ndarray, "n h w"]:
-        return np.asarray(self.policy.config.mask_greys, np.uint8)[labels]
+    @property
+    def cameras(self) -> list[str]:
+        """Whose label pictures it is given, below each other."""
+        return sorted(self.policy.net.camera_keys)
+
+    def _pictures(
+        self, labels: UInt8[np.ndarray, "n h w"]
+    ) -> dict[str, UInt8[np.ndarray, "n h2 w"]]:
+        greys = np.asarray(self.policy.config.mask_greys, np.uint8)[labels]
+        return dict(zip(self.cameras, np.split(greys, len(self.cameras), axis=1), strict=True))
 
 
 def fill_in_features(cfg: V2PBCConfig, dataset: Path, repo_id: str) -> dict[str, dict[str, Any]]:

@@ -21,7 +21,7 @@ from policies.evaluation.rollout import (
     load_policy,
 )
 
-MASK_KEY = "observation.images.mask"
+MASK_KEY, WRIST_KEY = "observation.images.mask", "observation.images.mask_wrist"
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 GREY_TYPE = "v2p_bc"
@@ -42,7 +42,9 @@ class PolicyActor:
     task: str
     """The task in words."""
     size_px: tuple[int, int]
-    """Height and width of the pictures that the policy was trained on."""
+    """Height and width of the pictures that the policy was trained on, of each camera."""
+    cameras: tuple[str, ...] = (MASK_KEY,)
+    """Whose label pictures it is given, below each other."""
 
     def for_task(self, words: str) -> "PolicyActor":
         """Return the same policy, told another task."""
@@ -62,7 +64,7 @@ class PolicyActor:
         if self.channels > 1:
             picture = picture.expand(-1, self.channels, -1, -1).contiguous()
         observation = {
-            MASK_KEY: picture,
+            **dict(zip(self.cameras, picture.chunk(len(self.cameras), dim=-2), strict=True)),
             STATE_KEY: torch.from_numpy(state.copy()),
             "task": [self.task] * len(state),
         }
@@ -92,7 +94,7 @@ def load_actor(
 
     config = env_config()
     try:
-        height, width = check_features(folder, config)
+        height, width, cameras = check_features(folder, config)
         loaded = load_policy(folder, config, device)
     except UnsuitablePolicyError:
         raise
@@ -115,11 +117,12 @@ def load_actor(
         channels=1 if is_grey else 3,
         task=task,
         size_px=(height, width),
+        cameras=cameras,
     )
 
 
-def check_features(folder: Path, config: Any) -> tuple[int, int]:
-    """Demand that a checkpoint sees and does what the simulator has; return height and width of its pictures.
+def check_features(folder: Path, config: Any) -> tuple[int, int, tuple[str, ...]]:
+    """Demand that a checkpoint sees and does what the simulator has; return its pictures' height, width and cameras.
 
     Raises:
         UnsuitablePolicyError: it does not.
@@ -128,6 +131,7 @@ def check_features(folder: Path, config: Any) -> tuple[int, int]:
     from lerobot.envs.utils import env_to_policy_features
 
     given = env_to_policy_features(config)
+    given[WRIST_KEY] = given[MASK_KEY]
     policy = PreTrainedConfig.from_pretrained(folder)
     wanted = {**(policy.input_features or {}), **(policy.output_features or {})}
     for key, feature in wanted.items():
@@ -149,5 +153,11 @@ def check_features(folder: Path, config: Any) -> tuple[int, int]:
             f"the policy in {folder} has no camera '{MASK_KEY}', and masks are the only pictures that the simulator"
             f" gives; it wants {', '.join(wanted) or 'nothing'}"
         )
+    cameras = tuple(key for key in (MASK_KEY, WRIST_KEY) if key in wanted)
     _, height, width = wanted[MASK_KEY].shape
-    return int(height), int(width)
+    if tuple(wanted[cameras[-1]].shape) != tuple(wanted[MASK_KEY].shape):
+        raise UnsuitablePolicyError(
+            f"the policy in {folder} wants pictures of the wrist's camera of another size than the table's; the simulator"
+            " draws both alike"
+        )
+    return int(height), int(width), cameras

@@ -80,6 +80,7 @@ def hand_over(
     randomization: RandomizationConfig,
     cut: CutConfig,
     num_threads: int = 1,
+    wrist: bool = False,
 ) -> Handovers:
     """Run one handover episode in each of `cfg.worlds` worlds.
 
@@ -93,6 +94,7 @@ def hand_over(
         randomization: what the demonstrations were recorded under.
         cut: where an episode ends.
         num_threads: for physics and masks; changes no result.
+        wrist: whether the wrist's picture comes below the table's.
     """
     env = BatchEnv(
         bundle,
@@ -104,9 +106,9 @@ def hand_over(
     earliest, latest = (round(share * env.horizon) for share in cfg.takeover)
     takeover = rng_for(seed, "takeover").integers(earliest, latest + 1, cfg.worlds)
     horizon = round(cfg.time_scale * env.horizon)
-    pictures = np.empty((horizon, cfg.worlds, size_px, size_px), np.uint8)
+    pictures = np.empty((horizon, cfg.worlds, size_px * (1 + wrist), size_px), np.uint8)
     actor = Handover(student, expert, takeover, pictures)
-    view = View(env, size_px, num_threads)
+    view = View(env, size_px, num_threads, wrist=wrist)
     recorded = record_rollouts(view, actor, cut, seed=seed, horizon=horizon)
     columns: dict[str, Any] = vars(recorded) | {"action": np.stack(actor.answers)}
     return Handovers(

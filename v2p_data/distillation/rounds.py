@@ -258,6 +258,7 @@ def _collect(
                 randomization=episodes.randomization,
                 cut=episodes.cut,
                 num_threads=num_threads,
+                wrist=episodes.wrist,
             )
             first = batch * cfg.worlds
             write_json_atomically(
@@ -305,6 +306,7 @@ def _stage(
             referee=True,
             objects=tuple(o.name for o in bundle.scene.objects),
             params=params,
+            cameras=episodes.cameras,
         ).save(folder / "episodes")
         names.append(episode_id)
         frames += length

@@ -24,6 +24,8 @@ from v2p_data.episodes.pictures import Artist, Render
 from v2p_data.episodes.rollouts import CutConfig, Referee, Rollouts, roll_out
 from v2p_data.episodes.staging import (
     EPISODES_FOLDER,
+    MASK_CAMERAS,
+    RGB_CAMERA,
     Episode,
     refusals_told,
     save_arrays,
@@ -63,6 +65,8 @@ class EpisodesConfig:
     """Width and height of the pictures; even, as video must be."""
     render: Render = "masks"
     """Pictures in the dataset: exact label masks, colour pictures (close but not equal), or each as a camera of its own."""
+    wrist: bool = False
+    """Masks of a second camera too, which the hand carries: `observation.images.mask_wrist`."""
     cut: CutConfig = field(default_factory=CutConfig)
     randomization: RandomizationConfig = field(default_factory=randomize.recording)
     distractors: DistractorConfig = field(default_factory=DistractorConfig)
@@ -83,6 +87,16 @@ class EpisodesConfig:
             raise ValueError(f"size_px must be even and at least 16, got {self.size_px}")
         if not self.look.is_off and self.render == "masks":
             raise ValueError("look changes RGB pictures only; set render to rgb or both")
+        if self.wrist and (self.render == "rgb" or not self.mask_noise.is_off):
+            raise ValueError(
+                "the wrist's camera gives exact masks only; set render to masks or both and leave mask_noise off"
+            )
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras whose pictures are in the dataset."""
+        masks = () if self.render == "rgb" else MASK_CAMERAS[: 1 + self.wrist]
+        return masks if self.render == "masks" else (*masks, RGB_CAMERA)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,6 +254,7 @@ def _stage(
         look=cfg.look,
         mask_noise=cfg.mask_noise,
         num_threads=num_threads,
+        cameras=cfg.cameras,
     )
     with _writer(folder) as write, artist:
         for world in missing:

@@ -10,19 +10,15 @@ import numpy as np
 from v2p_data.episodes.dataset import stream
 from v2p_data.episodes.mask_noise import MaskNoiseConfig, apply_faults, as_json, draw_faults
 from v2p_data.episodes.rollouts import Rollouts
-from v2p_data.episodes.staging import MASK_CAMERA, RGB_CAMERA, Episode
+from v2p_data.episodes.staging import WRIST_CAMERA, Episode
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import Snapshot
+from v2p_data.sim.model.world import World
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig, furnish
 from v2p_data.sim.render.masks import BACKGROUND, MaskRenderer
 from v2p_data.task.task import TaskBundle
 
 Render = Literal["masks", "rgb", "both"]
-CAMERAS: dict[str, tuple[str, ...]] = {
-    "masks": (MASK_CAMERA,),
-    "rgb": (RGB_CAMERA,),
-    "both": (MASK_CAMERA, RGB_CAMERA),
-}
 
 
 class Artist:
@@ -36,6 +32,7 @@ class Artist:
         look: light and colours.
         mask_noise: faults of the masks.
         num_threads: for the masks, 0 for all cores; changes no result.
+        cameras: of the episode.
     """
 
     def __init__(
@@ -48,10 +45,12 @@ class Artist:
         look: LookConfig,
         mask_noise: MaskNoiseConfig,
         num_threads: int,
+        cameras: tuple[str, ...],
     ) -> None:
         self.bundle, self.size_px, self.render = bundle, size_px, render
         self.distractors, self.look, self.mask_noise = distractors, look, mask_noise
-        self.num_threads = num_threads
+        self.num_threads, self.cameras = num_threads, cameras
+        self.wrist = WRIST_CAMERA in cameras
         self.is_plain = distractors.count[1] == 0 and look.is_off
         self.renderer: MaskRenderer | None = None
 
@@ -86,7 +85,7 @@ class Artist:
             referee=bool(rollouts.referee[world]),
             objects=tuple(o.name for o in bundle.scene.objects),
             params=rollouts.params[world] | drawn,
-            cameras=CAMERAS[self.render],
+            cameras=self.cameras,
             rgb_mp4=rgb_mp4,
         )
 
@@ -96,17 +95,18 @@ class Artist:
         course = list(rollouts.snapshots[:length])
         if self.is_plain:
             if self.renderer is None:
-                self.renderer = MaskRenderer(
-                    self.bundle, self.size_px, num_threads=self.num_threads
-                )
+                self.renderer = self._renderer(self.bundle)
             return *self._drawn(self.renderer, [(s, world) for s in course]), {}
         rng = rng_for(rollouts.seed, "furnish", episode_id)
         scene = furnish(self.bundle, course, world, self.distractors, self.look, rng)
-        with MaskRenderer(scene.world, self.size_px, num_threads=self.num_threads) as renderer:
+        with self._renderer(scene.world) as renderer:
             if len(scene.sizes):  # the last geoms; before the first picture, which fixes labels
                 renderer.labels[-len(scene.sizes) :] = BACKGROUND
             moments = [(scene.moment(s, world), 0) for s in course]
             return *self._drawn(renderer, moments), scene.drawn
+
+    def _renderer(self, source: TaskBundle | World) -> MaskRenderer:
+        return MaskRenderer(source, self.size_px, num_threads=self.num_threads, wrist=self.wrist)
 
     def _drawn(
         self, renderer: MaskRenderer, moments: list[tuple[Snapshot, int]]

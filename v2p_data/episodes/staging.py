@@ -26,7 +26,8 @@ SCHEMA = 1
 ARRAYS = ("labels", "state", "action", "success")
 INTERVENTION = "intervention"
 """The array that only handovers have."""
-MASK_CAMERA, RGB_CAMERA = "mask", "rgb"
+MASK_CAMERA, WRIST_CAMERA, RGB_CAMERA = "mask", "mask_wrist", "rgb"
+MASK_CAMERAS = MASK_CAMERA, WRIST_CAMERA
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ class Episode:
     """The instruction in words."""
     seed: int
     labels: UInt8[np.ndarray, "time h w"]
-    """0 background, 1 robot, 2 manipulated object, 3.. the others."""
+    """0 background, 1 robot, 2 manipulated object, 3.. the others; of two cameras below each other."""
     state: Float32[np.ndarray, "time 11"]
     action: Float32[np.ndarray, "time 7"]
     success: Bool[np.ndarray, "time"]
@@ -57,7 +58,7 @@ class Episode:
     params: dict[str, Any] = field(default_factory=dict[str, Any])
     """What the randomisation drew."""
     cameras: tuple[str, ...] = (MASK_CAMERA,)
-    """Which pictures go into a dataset: `mask`, `rgb` or both. Label images are staged in any case."""
+    """Which pictures go into a dataset: `mask`, `mask_wrist`, `rgb`. Label images are staged in any case."""
     rgb_mp4: bytes = b""
     """The pictures of `rgb`, a video already."""
     family: str = ""
@@ -81,6 +82,11 @@ class Episode:
     @property
     def num_frames(self) -> int:
         return len(self.state)
+
+    def labels_of(self, camera: str) -> UInt8[np.ndarray, "time h w"]:
+        """Return the label images of one mask camera."""
+        masks = [c for c in MASK_CAMERAS if c in self.cameras]
+        return np.split(self.labels, len(masks), axis=1)[masks.index(camera)]
 
     @property
     def is_handover(self) -> bool:

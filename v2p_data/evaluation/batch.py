@@ -16,7 +16,7 @@ from jaxtyping import Bool, Int
 
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import failure_kinds
-from v2p_data.play import Actor, Film, Stopwatch, View, play
+from v2p_data.play import Actor, Film, Stopwatch, View, VisionActor, play
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.randomize import RandomizationConfig
@@ -144,7 +144,8 @@ def judge(
             )
             seeds = [stream_seed(first_seed + first + k) for k in range(count)]
             env.reset_seeded(np.arange(count), seeds)
-            view, film = View(env, size_px, num_threads, watch), Film(env)
+            wrist = isinstance(actor, VisionActor) and actor.wrist
+            view, film = View(env, size_px, num_threads, watch, wrist=wrist), Film(env)
             record = RefereeRecord(env)
             verdicts = Verdicts(record, count, steps, at_end=cfg.at_end)
 

@@ -147,7 +147,8 @@ def _policy(folder: Path, device: str) -> Play:
         actor = load_actor(folder, greys=PALETTE, device=device)
     except UnsuitablePolicyError as error:
         raise V2PError(str(error)) from error
-    return lambda bundle: (VisionActor(actor.for_task(bundle.description)), actor.size_px)
+    wrist = len(actor.cameras) > 1
+    return lambda bundle: (VisionActor(actor.for_task(bundle.description), wrist), actor.size_px)
 
 
 def _expert(folder: Path) -> Play:

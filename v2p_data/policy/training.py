@@ -265,7 +265,10 @@ def checkpoint_judge(
         judged = [
             judge(
                 bundle,
-                VisionActor(replace(student, policy=policy.eval(), task=bundle.description)),
+                VisionActor(
+                    replace(student, policy=policy.eval(), task=bundle.description),
+                    wrist=len(student.cameras) > 1,
+                ),
                 episodes=episodes,
                 first_seed=seed_for(seed, "checkpoints", item) % 2**31,
                 cfg=cfg,

@@ -7,12 +7,13 @@ from typing import Any
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.features import (
     ACTION_NAMES,
+    CAMERA_OF_MASKS,
     DONE_KEY,
     INTERVENTION_KEY,
-    MASK_KEY,
     METADATA_FILE,
     SIMULATED,
     STATE_NAMES,
+    WRIST_KEY,
 )
 from v2p_data.episodes.dataset.handovers import who_acted
 from v2p_data.episodes.dataset.sheet import SHEET_FILE, write_sheet
@@ -161,8 +162,9 @@ def _tasks(episodes: list[dict[str, Any]]) -> str:
 def _frame(info: dict[str, Any]) -> str:
     lines = ["| column | shape | meaning |", "|---|---|---|"]
     for key, feature in info["features"].items():
-        if key == MASK_KEY:
+        if key in CAMERA_OF_MASKS:
             meaning = "segmentation mask as grey video, lossless"
+            meaning += ", of a camera that the hand carries" if key == WRIST_KEY else ""
         elif key.startswith("observation.images"):
             meaning = "picture of the same camera at the same moment"
         elif key == "observation.state":

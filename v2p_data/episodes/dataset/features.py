@@ -10,6 +10,7 @@ from typing import Any
 FPS = 20
 ROBOT_TYPE = "v2p_franka"
 MASK_KEY = "observation.images.mask"
+WRIST_KEY = "observation.images.mask_wrist"
 RGB_KEY = "observation.images.rgb"
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
@@ -23,7 +24,8 @@ CAMERA_POSE_KEY = "camera.pose"
 INTERVENTION_KEY = "intervention"
 """Whether the expert acted, as LeRobot's DAgger recordings name it; True throughout in demonstrations."""
 INTERVENTION_FEATURE: dict[str, Any] = {"dtype": "bool", "shape": (1,), "names": None}
-KEY_OF_CAMERA = {"mask": MASK_KEY, "rgb": RGB_KEY}
+KEY_OF_CAMERA = {"mask": MASK_KEY, "mask_wrist": WRIST_KEY, "rgb": RGB_KEY}
+CAMERA_OF_MASKS = {MASK_KEY: "mask", WRIST_KEY: "mask_wrist"}
 DEMONSTRATION, HANDOVER = "demonstration", "handover"
 """Where an episode is from, in `METADATA_FILE` of datasets with handovers."""
 METADATA_FILE = "meta/v2p.json"

@@ -14,6 +14,7 @@ from v2p_data.episodes.dataset.episode_stats import QUANTILES
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     ACTION_NAMES,
+    CAMERA_OF_MASKS,
     CAMERA_POSE_KEY,
     DEMONSTRATION,
     DONE_KEY,
@@ -220,12 +221,12 @@ class EpisodeCheck:
         for key, camera in self.cameras.items():
             picture = np.asarray(row[key])
             camera.look_at(picture)
-            if key == MASK_KEY and self.checks.has_masks:
+            if key in CAMERA_OF_MASKS and self.checks.has_masks:
                 camera.strange |= not bool(IS_GREY[picture].all())
                 if self.comparable and self.recorded is not None:
                     labels = rgb_to_labels(np.ascontiguousarray(picture.transpose(1, 2, 0)))
-                    drawn = self.recorded.labels[camera.frames - 1]
-                    self.wrong_pixels += int((labels != drawn).sum())
+                    drawn = self.recorded.labels_of(CAMERA_OF_MASKS[key])
+                    self.wrong_pixels += int((labels != drawn[camera.frames - 1]).sum())
             elif key == RGB_KEY and self.pictures is not None:
                 shown = picture.transpose(1, 2, 0).astype(np.int16)
                 off = np.abs(shown - self.pictures[camera.frames - 1]).max()

@@ -22,7 +22,7 @@ import numpy as np
 
 from v2p_data.episodes.dataset import stream
 from v2p_data.episodes.dataset.episode_stats import Stats, mask_stats, rgb_stats
-from v2p_data.episodes.staging import MASK_CAMERA, Episode, Heading
+from v2p_data.episodes.staging import MASK_CAMERAS, Episode, Heading
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
@@ -171,9 +171,10 @@ def _encode(heading: Heading) -> _Encoded:
     stats: dict[str, Stats] = {}
     try:
         for camera in heading.cameras:
-            if camera == MASK_CAMERA:
-                videos[camera] = stream.encode_masks(episode.labels)
-                stats[camera] = mask_stats(episode.labels)
+            if camera in MASK_CAMERAS:
+                labels = np.ascontiguousarray(episode.labels_of(camera))
+                videos[camera] = stream.encode_masks(labels)
+                stats[camera] = mask_stats(labels)
             else:
                 videos[camera] = stream.Encoded(mp4=episode.rgb_mp4, num_frames=episode.num_frames)
                 stats[camera] = rgb_stats(stream.decode_rgb(episode.rgb_mp4))

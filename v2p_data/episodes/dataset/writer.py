@@ -51,7 +51,13 @@ from v2p_data.episodes.dataset.shards import (
     write_file,
 )
 from v2p_data.episodes.dataset.stream import MASK_CRF, RGB_CRF, encoder_config
-from v2p_data.episodes.staging import MASK_CAMERA, Episode, Heading, refusals_told
+from v2p_data.episodes.staging import (
+    MASK_CAMERAS,
+    WRIST_CAMERA,
+    Episode,
+    Heading,
+    refusals_told,
+)
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.sim.render.masks import PALETTE, label_names
@@ -151,7 +157,7 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
         twice = sorted({i for i in ids if ids.count(i) > 1})
         raise V2PError(f"episodes are given twice: {', '.join(twice[:5])}")
     first = headings[0]
-    if first.size_px[0] != first.size_px[1]:
+    if first.size_px[0] != first.size_px[1] * (1 + (WRIST_CAMERA in first.cameras)):
         raise V2PError(
             f"masks must be square, {first.path} has {first.size_px[0]} x {first.size_px[1]}"
         )
@@ -188,7 +194,7 @@ def _write(
         repo_id,
         fps=FPS,
         features=features(
-            first.size_px[0], first.cameras, has_handovers=has_handovers, is_simulated=is_simulated
+            first.size_px[1], first.cameras, has_handovers=has_handovers, is_simulated=is_simulated
         ),
         robot_type=ROBOT_TYPE,
         root=root,
@@ -205,7 +211,7 @@ def _write(
                 lies_in[camera, shard.number] = number, frame
                 frame += shard.num_frames
     for camera in first.cameras:
-        crf = MASK_CRF if camera == MASK_CAMERA else RGB_CRF
+        crf = MASK_CRF if camera in MASK_CAMERAS else RGB_CRF
         meta.update_video_info(KEY_OF_CAMERA[camera], video_encoder=encoder_config(crf))
     described: list[dict[str, Any]] = []
     data = _DataFiles(meta)

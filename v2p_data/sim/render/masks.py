@@ -22,7 +22,7 @@ from mujoco.batch import Batch
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.model.world import CAMERA, World, build_world
-from v2p_data.sim.robot.arms import robot_from_json
+from v2p_data.sim.robot.arms import Robot, robot_from_json
 from v2p_data.sim.robot.robot import FINE
 from v2p_data.task.task import TaskBundle
 
@@ -35,6 +35,10 @@ _GREYS = np.asarray(PALETTE, np.uint8)
 _LABELS = np.abs(np.arange(256)[:, None] - np.asarray(PALETTE)[None]).argmin(1).astype(np.uint8)
 
 Backend = Literal["auto", "zbuffer", "gl", "rays"]
+WRIST_POS_M = np.array([0.11, 0.0, -0.07])
+"""Of the wrist's camera in the tool's frame: x to the side, y from finger to finger, z where the fingers point."""
+WRIST_TARGET_M = np.array([0.0, 0.0, 0.05])
+WRIST_FOVY_DEG = 80.0
 
 
 def labels_to_rgb(labels: UInt8[np.ndarray, "*batch h w"]) -> UInt8[np.ndarray, "*batch h w 3"]:
@@ -74,6 +78,30 @@ def geom_labels(world: World) -> UInt8[np.ndarray, "geom"]:
     return labels
 
 
+class WristCamera:
+    """A camera that moves with the tool, beside the hand, and looks between the fingers from above; +y of the tool is up.
+
+    Args:
+        robot: whose tool carries it.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        ahead = WRIST_TARGET_M - WRIST_POS_M
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, (0.0, 1.0, 0.0))
+        self._axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
+        """MuJoCo's: right, up, backwards."""
+
+    def move(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> None:
+        """Put camera `camera` where the wrist's is; a snapshot's next `write` puts it back."""
+        arm, dofs = self.robot.arm, self.robot.arm_dofs
+        tool = self.robot.tool_state(data.qpos[arm][None], data.qvel[dofs][None])
+        data.cam_xpos[camera] = tool.pos[0] + tool.rotation[0] @ WRIST_POS_M
+        data.cam_xmat[camera] = (tool.rotation[0] @ self._axes).ravel()
+        model.cam_fovy[camera] = WRIST_FOVY_DEG
+
+
 @runtime_checkable
 class Moment(Protocol):
     """Saved states of a batch of worlds, enough to draw them (`batch_env.Snapshot`)."""
@@ -91,6 +119,7 @@ class MaskRenderer:
         size_px: width and height of the image, or (height, width).
         backend: what draws the masks; `auto` is `zbuffer`.
         num_threads: for the z-buffer, 0 for all cores; changes no result.
+        wrist: below the label image of the table's camera comes that of the wrist's, of the same size; by the z-buffer only.
 
     Raises:
         V2PError: `gl` was asked for and there is none.
@@ -103,6 +132,7 @@ class MaskRenderer:
         *,
         backend: Backend = "auto",
         num_threads: int = 0,
+        wrist: bool = False,
     ) -> None:
         world = source if isinstance(source, World) else _world_of(source)
         self.size_px = size_px
@@ -111,6 +141,7 @@ class MaskRenderer:
         self._model = world.model
         self._shape = (size_px, size_px) if isinstance(size_px, int) else size_px
         self._num_threads = num_threads
+        self._wrist = WristCamera(world.robot) if wrist else None
         self._painter: _Painter | None = None
         self._pictures: _GLPainter | None = None
         self._no_gl = ""
@@ -129,7 +160,9 @@ class MaskRenderer:
             if self.backend == "rays":
                 self._painter = _RayPainter(self._model, self.labels, self._shape)
             else:
-                self._painter = _ZPainter(self._model, self.labels, self._shape, self._num_threads)
+                self._painter = _ZPainter(
+                    self._model, self.labels, self._shape, self._num_threads, self._wrist
+                )
         return self._painter.draw(moments)
 
     def draw_rgb(self, snapshot: Moment, index: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -191,21 +224,26 @@ class _ZPainter:
         labels: np.ndarray,
         shape: tuple[int, int],
         num_threads: int,
+        wrist: WristCamera | None,
     ) -> None:
         from v2p_data.sim.render.zbuffer import Views, ZBuffer  # numba takes half a second to load
 
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.camera = self.model.camera(CAMERA).id
-        self.views = Views
+        self.views, self.wrist = Views, wrist
         self.zbuffer = ZBuffer(self.model, labels, *shape, num_threads=num_threads)
 
     def draw(self, moments: Sequence[tuple[Moment, int]]) -> np.ndarray:
-        views = self.views.empty(self.model, len(moments))
+        count = 1 if self.wrist is None else 2
+        views = [self.views.empty(self.model, len(moments)) for _ in range(count)]
         for k, (snapshot, index) in enumerate(moments):
             snapshot.write(self.model, self.data, index)
-            views.note(k, self.model, self.data, self.camera)
-        return self.zbuffer.draw(views)
+            views[0].note(k, self.model, self.data, self.camera)
+            if self.wrist is not None:
+                self.wrist.move(self.model, self.data, self.camera)
+                views[1].note(k, self.model, self.data, self.camera)
+        return np.concatenate([self.zbuffer.draw(each) for each in views], axis=1)
 
 
 class _GLPainter:
