@@ -240,4 +240,5 @@ def _carried_out(action: Float[np.ndarray, "env 7"], view: View) -> Float[np.nda
         raise V2PError(
             f"the action in world {odd[0]} of task '{worlds.bundle.title}' is not finite: {action[odd[0]].tolist()}"
         )
-    return np.clip(np.where(view.going[:, None], action, 0.0), -1.0, 1.0)
+    # Rounded as it is recorded, so that a recording plays again to the bit.
+    return np.clip(np.where(view.going[:, None], action, 0.0), -1.0, 1.0).astype(np.float32)

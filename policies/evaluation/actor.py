@@ -60,6 +60,11 @@ class PolicyActor:
         self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n state"]
     ) -> Float32[np.ndarray, "n act"]:
         """Return the next action of every world."""
+        height = self.size_px[0] * len(self.cameras)
+        if labels.shape[1] != height:
+            raise UnsuitablePolicyError(
+                f"the policy sees {' and '.join(self.cameras)}, {height} rows of labels, and is given {labels.shape[1]} rows"
+            )
         picture = torch.from_numpy(self.values[labels])[:, None]  # numpy's indexing is the faster
         if self.channels > 1:
             picture = picture.expand(-1, self.channels, -1, -1).contiguous()

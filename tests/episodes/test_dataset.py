@@ -272,6 +272,24 @@ def test_colours_and_masks_are_two_cameras_of_one_dataset(tmp_path: Path, make_e
         assert np.abs(colour - pictures[t]).mean() < 3
 
 
+def test_masks_of_two_cameras_are_two_features_and_each_is_compared(tmp_path: Path, make_episode):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    table, wrist = (make_episode(k).labels for k in (0, 1))
+    both = replace(make_episode(0), labels=np.concatenate([table, wrist], axis=1), cameras=("mask", "mask_wrist"))  # fmt: skip
+    staged, root = both.save(tmp_path), tmp_path / "toys"
+
+    pack([staged], "user/toys", root)
+
+    row = LeRobotDataset("user/toys", root=root)[7]
+    for key, labels in (("mask", table), ("mask_wrist", wrist)):
+        grey = np.asarray(row[f"observation.images.{key}"])[0] * 255
+        assert np.abs(grey - np.asarray(PALETTE)[labels[7]]).max() < 1e-3
+    assert verify(root, [staged]).is_good
+    swapped = replace(both, labels=np.concatenate([wrist, table], axis=1)).save(tmp_path / "swapped")  # fmt: skip
+    assert not verify(root, [swapped]).is_good
+
+
 def test_episodes_of_other_cameras_do_not_go_in(staged: list[Path], tmp_path: Path, make_episode):
     odd = replace(make_episode(7), cameras=("rgb",), rgb_mp4=b"video").save(tmp_path)
 

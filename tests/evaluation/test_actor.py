@@ -49,7 +49,7 @@ def test_a_policy_is_shown_pictures_of_the_size_that_it_knows(tmp_path):
     from policies.evaluation.actor import check_features
     from policies.evaluation.rollout import env_config
 
-    assert check_features(checkpoint(tmp_path), env_config()) == (48, 64)
+    assert check_features(checkpoint(tmp_path), env_config()) == (48, 64, (MASK,))
 
 
 def test_another_policy_type_sees_what_lerobot_shows_it():

@@ -11,8 +11,10 @@ import trimesh
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.model.world import World, build_world
 from v2p_data.sim.render.masks import (
+    FIRST_OBJECT,
     PALETTE,
     MaskRenderer,
     label_names,
@@ -20,6 +22,7 @@ from v2p_data.sim.render.masks import (
     rgb_to_labels,
 )
 from v2p_data.sim.robot.robot import FINE, HOME_QPOS
+from v2p_data.task.benchmark import load_benchmark
 
 SIZE_PX = 256
 
@@ -221,3 +224,30 @@ def test_the_callers_model_is_left_alone(world: World, moments: Moments, rendere
     assert world.model.geom_size[world.objects[0].geom_ids[0]] == pytest.approx(
         (0.025, 0.03, 0.04)
     )
+
+
+def test_the_wrists_picture_lies_below_the_tables_and_shows_the_object_where_a_pinhole_does():
+    bundle = load_benchmark("lift_up")
+    env = BatchEnv(bundle, SimConfig(fine=True), num_envs=3, seed=0, num_threads=1)
+    moments = [(env.snapshot(np.arange(3)), k) for k in range(3)]
+    with (
+        MaskRenderer(env.world, SIZE_PX, wrist=True) as both,
+        MaskRenderer(env.world, SIZE_PX) as table,
+    ):
+        drawn, alone = both.draw_many(moments), table.draw_many(moments)
+
+    assert np.array_equal(drawn[:, :SIZE_PX], alone)
+    focal_px = SIZE_PX / 2 / np.tan(np.radians(80.0) / 2)
+    seen, pos = 0, env.states()["tea_box_pos"].numpy()
+    for k in range(3):
+        x, y = env.observe()[k, 3:6], env.observe()[k, 6:9]
+        down = np.cross(x, y)
+        eye = env.robot_state()[k, :3] + 0.11 * x - 0.07 * down
+        ahead = (-0.11 * x + 0.12 * down) / np.hypot(0.11, 0.12)
+        to = pos[k] - eye
+        depth = to @ ahead
+        column = SIZE_PX / 2 + focal_px * (to @ np.cross(ahead, y)) / depth
+        row = SIZE_PX / 2 - focal_px * (to @ y) / depth
+        if depth > 0 and 0 <= column < SIZE_PX and 0 <= row < SIZE_PX:
+            seen += drawn[k, SIZE_PX + int(row), int(column)] == FIRST_OBJECT
+    assert seen >= 2

@@ -170,7 +170,7 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
         if heading.cameras != first.cameras:
             raise V2PError(
                 f"{heading.path} has pictures of {', '.join(heading.cameras)}, the first episode of "
-                f"{', '.join(first.cameras)}; collect all episodes with one --episodes.render"
+                f"{', '.join(first.cameras)}; collect all episodes with one --episodes.render and --episodes.wrist"
             )
         if heading.num_frames < 2:
             raise V2PError(
