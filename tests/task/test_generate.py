@@ -97,7 +97,7 @@ def test_what_does_not_run_is_vetoed(scene_of):
     assert not verdict.is_acceptable
 
 
-@pytest.mark.parametrize("kind", ["lift_up", "push_left", "tip_over", "push_next_to"])
+@pytest.mark.parametrize("kind", ["lift_up", "push_next_to"])
 def test_a_scene_becomes_a_task_that_can_be_loaded_again(kind, scene_of, tmp_path):
     scene = scene_of(kind)
     scene_folder = tmp_path / "scene"
@@ -200,19 +200,22 @@ RESETS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("change", "words"), RESETS.values(), ids=RESETS)
-def test_a_reset_that_makes_the_task_easy_is_refused(change, words, scene_of):
+def test_resets_that_make_the_task_easy_are_refused(scene_of):
     scene = scene_of("push_next_to")
-    code = write_samples(scene, 1)[0]
-    base = "        return super().reset_objects_states(env_ids)"
-    own = f"        poses = self.envs.sample_object_poses(env_ids)\n        {change}\n        return poses"
     made = "super().__init__(envs, urdf_assets_root, scene_info)"
-    cheat = code.replace(base, own).replace(made, f"{made}\n        self.count = 0")
-    harmless = code.replace(base, own.replace(change, "poses['can'][:, 0] += 0.01"))
+    code = write_samples(scene, 1)[0].replace(made, f"{made}\n        self.count = 0")
 
-    refused, accepted = audits(scene, [cheat, harmless])
+    def resetting(change):
+        own = f"        poses = self.envs.sample_object_poses(env_ids)\n        {change}\n        return poses"
+        return code.replace("        return super().reset_objects_states(env_ids)", own)
 
-    assert words in refused.vetoed
+    changes = [change for change, _ in RESETS.values()]
+    *refused, accepted = audits(
+        scene, [resetting(c) for c in (*changes, "poses['can'][:, 0] += 0.01")]
+    )
+
+    for name, (_, words), verdict in zip(RESETS, RESETS.values(), refused, strict=True):
+        assert words in verdict.vetoed, name
     assert accepted.is_acceptable
 
 
