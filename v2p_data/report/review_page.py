@@ -33,7 +33,7 @@ STILL_SIDE_PX = 640
 """The longer side, where few clips leave room for so large stills; 320 for a hundred clips."""
 NUM_STILLS = 5
 MAX_STILL_BYTES = 8_500_000
-"""Of all stills together, as they stand in the page: so it stays below 10 MB."""
+"""Size of all stills together in the page, which so stays below 10 MB."""
 _LEAST_BYTES = 4_000
 """For less a still shows nothing, and only the first and last are kept."""
 _QUALITIES = (
@@ -70,7 +70,7 @@ class ReviewClip:
     used_hints: tuple[str, ...] = ()
     """Phrases that had a hint when the scene was made."""
     folder: Path | None = None
-    """Of the accepted scene."""
+    """Folder of the accepted scene."""
     reason: str = ""
     """Slug of a rejection."""
     detail: str = ""

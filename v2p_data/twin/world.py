@@ -58,7 +58,7 @@ class TwinWorld:
     objects: tuple[ObjectModel, ...]
     size_m: Float[np.ndarray, "object 3"]
     rest_height_m: Float[np.ndarray, "object"]
-    """Of each object's centre at rest, above z = 0."""
+    """Height of each object's centre at rest, above z = 0."""
     object_qpos: Int[np.ndarray, "object 7"]
     object_dofs: Int[np.ndarray, "object 6"]
     pad_geoms: tuple[int, int]

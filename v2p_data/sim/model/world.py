@@ -86,7 +86,7 @@ class ObjectModel:
     dof_adr: int
     geom_ids: tuple[int, ...]
     mesh_ids: tuple[tuple[int, ...], ...]
-    """Of meshes: per geom one for each entry of `MESH_SCALES`."""
+    """Meshes: per geom one for each entry of `MESH_SCALES`."""
     rest_quat: tuple[float, float, float, float]
     """Orientation in which it stands on the table, at zero yaw; from its first pose in the video."""
     hull: Float[np.ndarray, "h 3"]
