@@ -27,9 +27,8 @@ from bench_reconstruction import (
     Job,
     Row,
     commit,
-    draw_clip,
+    drawn,
     each,
-    folder_of,
     planned,
     reconstructed,
     summarised,
@@ -69,14 +68,10 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at once")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench_handheld"))
     args = parser.parse_args()
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
     stands = planned(args.split, args.clips, list(KINDS), FPS)
     hands = [HandheldJob(kind=job.kind, seed=job.seed, fps=FPS) for job in stands]
     jobs = hands if args.align_only else [*stands, *hands]
-    folders = {job.name: folder_of(job, args.out / "clips", args.old_clips) for job in jobs}
-    missing = [(job, folders[job.name]) for job in jobs if not folders[job.name].is_dir()]
-    for _ in each(args.jobs, draw_clip, missing, "drawn"):
-        pass
+    folders = drawn(jobs, args)
     aligned = [alignment(job, folders[job.name]) for job in hands]
     print("\n".join(alignment_row(row) for row in aligned), flush=True)
     print(alignment_summary(aligned), flush=True)

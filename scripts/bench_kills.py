@@ -326,9 +326,11 @@ def workers_of(pid: int) -> list[int]:
     """Return the worker processes of a process."""
     found: list[int] = []
     with contextlib.suppress(OSError):
-        for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-            if b"spawn_main" in Path(f"/proc/{word}/cmdline").read_bytes():
-                found.append(int(word))
+        found.extend(
+            int(word)
+            for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+            if b"spawn_main" in Path(f"/proc/{word}/cmdline").read_bytes()
+        )
     return found
 
 

@@ -24,9 +24,8 @@ from bench_reconstruction import (
     FPS,
     KINDS,
     commit,
-    draw_clip,
+    drawn,
     each,
-    folder_of,
     reconstructed,
     summarised,
     table,
@@ -87,7 +86,6 @@ def _filmed_from(stand: int, clips: int) -> tuple[VideoSpec, ...]:
 def main() -> None:
     """Read the command line, draw, reconstruct twice, compare, print."""
     args = _arguments()
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
     args.out.mkdir(parents=True, exist_ok=True)
     odd = {"tune": 0, "final": 1}[args.split]
     jobs = [
@@ -95,10 +93,7 @@ def main() -> None:
         for k in range(args.stands)
         for place in range(args.clips)
     ]
-    folders = {job.name: folder_of(job, args.out / "clips", args.old_clips) for job in jobs}
-    missing = [(job, folders[job.name]) for job in jobs if not folders[job.name].is_dir()]
-    for _ in each(args.jobs, draw_clip, missing, "drawn"):
-        pass
+    folders = drawn(jobs, args)
     given = frozenset({"boxes"} if args.boxes else ())
     name = f"{args.split}{'_boxes' if args.boxes else ''}"
 

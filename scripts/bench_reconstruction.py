@@ -29,7 +29,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -136,13 +136,9 @@ def main() -> None:
     args = _arguments()
     logging.basicConfig(level=logging.WARNING)
     jobs = planned(args.split, args.clips, args.kinds, FPS)
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
     args.out.mkdir(parents=True, exist_ok=True)
     runs = _note_final_run(args) if args.split == "final" else []
-    folders = {job.name: folder_of(job, args.out / "clips", args.old_clips) for job in jobs}
-    missing = [(job, folders[job.name]) for job in jobs if not folders[job.name].is_dir()]
-    for _ in each(args.jobs, draw_clip, missing, "drawn"):
-        pass
+    folders = drawn(jobs, args)
     given = frozenset(way for way in WAYS if vars(args)[way])
     name = "_".join([args.split, *["quick"] * args.quick, *(way for way in WAYS if way in given)])
     pictures = args.out / f"pictures_{name}"
@@ -168,6 +164,16 @@ def main() -> None:
     print(table(rows, summary, boxes=args.boxes, jobs=args.jobs))
     print(f"\nrows: {path}\nworst clips: {sheet}")
     print(f"usable_scenes: {summary['usable']['rate']:.2f}")
+
+
+def drawn(jobs: Sequence[Drawn], args: argparse.Namespace) -> dict[str, Path]:
+    """Return each clip's folder; draw those that are not there yet, `args.jobs` at once."""
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
+    folders = {job.name: folder_of(job, args.out / "clips", args.old_clips) for job in jobs}
+    missing = [(job, folders[job.name]) for job in jobs if not folders[job.name].is_dir()]
+    for _ in each(args.jobs, draw_clip, missing, "drawn"):
+        pass
+    return folders
 
 
 def planned(split: str, clips: int, kinds: list[MotionKind], fps: int | None = None) -> list[Job]:

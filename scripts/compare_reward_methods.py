@@ -21,12 +21,12 @@ import numpy as np
 
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
+from studies.programs import ProgramPolicy
 from studies.results import append_result, results_in
 from v2p_data.play import Actor, StateActor, View, play
 from v2p_data.reward.candidate import DONE_FILE
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.jobs import Jobs
-from v2p_data.reward.programs import ProgramPolicy
 from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env import randomize

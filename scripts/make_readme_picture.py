@@ -33,8 +33,10 @@ def row(run: Path, item: str) -> np.ndarray:
         np.asarray(cv2.imread(str(scene / f"overlay_{end}.png"))) for end in ("first", "last")
     ]
     episode = Episode.load(staged_episodes(newest(run, "episodes", item))[0])
-    for moment in np.linspace(0, len(episode.labels) - 1, 3).round().astype(int):
-        pictures.append(labels_to_rgb(episode.labels[moment])[..., ::-1])
+    pictures.extend(
+        labels_to_rgb(episode.labels[moment])[..., ::-1]
+        for moment in np.linspace(0, len(episode.labels) - 1, 3).round().astype(int)
+    )
     return np.hstack([cv2.copyMakeBorder(fitted(p), 3, 3, 3, 3, cv2.BORDER_CONSTANT, value=(PAPER,) * 3) for p in pictures])  # fmt: skip
 
 

@@ -11,11 +11,11 @@ from paper_tables import FILE, PAGES, papers_value, success, with_column
 from policies.bc.configuration_v2p_bc import V2PBCConfig
 from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
 from results_table import ROOT
+from studies.programs import EVERY_STEPS
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.policy.config import PAPER_BATCH_SIZE, PAPER_EPOCHS
 from v2p_data.reward.config import RewardConfig
-from v2p_data.reward.programs import EVERY_STEPS
 from v2p_data.scene.backends.config import SegmentConfig
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import SimConfig

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent
 SCENE_DATA = ("*.tsv", "*.json", "*.safetensors")
 """Nouns, how likely a thing is meant, and the networks; they lie in the rooms of `scene`."""
 PROMPTS = ("prompts.py", "example_refinements.py", "example_tasks.py", "writer.py")
-"""Of `task/llm`."""
+"""Files in `task/llm` with what a model is told."""
 
 
 def scene_data() -> dict[str, str]:

@@ -13,7 +13,7 @@ from pathlib import Path
 PARENT_POLL_S = 0.5
 """How often a process looks for its parent where the kernel does not do it."""
 _PR_SET_PDEATHSIG = 1
-"""Of linux/prctl.h."""
+"""Number in linux/prctl.h."""
 
 
 def own_python(module: str, function: str = "main") -> list[str]:

@@ -32,7 +32,7 @@ from policies.threads import torch_threads
 
 STATE = "observation.state"
 STATE_STD_FLOOR = 0.01
-"""Of a state's entry [m, rad or share]: students visit states that no demonstration shows."""
+"""Least standard deviation of a state's entry [m, rad or share]: students visit states that no demonstration shows."""
 
 
 @dataclass(kw_only=True)

@@ -38,7 +38,7 @@ STATISTICS = {
 """Per way to normalise what it needs to know of a feature."""
 CURVE_FIELDS = ("step", "loss", "lr", "samples_per_s", "loader_share")
 GPU_SHARE_FOR_FRAMES = 0.5
-"""Of a GPU's free memory that frames may take; larger datasets stay in the computer's memory."""
+"""Share of a GPU's free memory that frames may take; larger datasets stay in the computer's memory."""
 Precision = Literal["auto", "float32", "bfloat16"]
 Judge = Callable[[V2PBCPolicy], float]
 """Returns the success rate of a policy in simulation."""
@@ -54,9 +54,9 @@ class TrainerConfig:
     batch_size: int = 64
     """Samples a step."""
     ema_decay: float = 0.995
-    """Of the running mean of the weights, which is what is kept; rises to this over the first steps. 0: none."""
+    """Decay of the running mean of the weights, which is kept; it rises to this over the first steps. 0: none."""
     precision: Precision = "auto"
-    """Of the network's arithmetic. `auto`: bfloat16 where the device computes with it, else float32."""
+    """Number format of the network. `auto`: bfloat16 where the device computes with it, else float32."""
     checkpoints: int = 1
     """Moments in the second half, the end included, at which the policy is judged in simulation if it can be; the one
     that succeeds most is kept. 1: the end."""
@@ -81,7 +81,7 @@ class Trained:
     seconds: float
     samples_per_s: float
     loader_share: float
-    """Of the time, spent on drawing batches and not on the network."""
+    """Share of the time that drawing batches takes."""
     judged: tuple[tuple[int, float], ...] = ()
     """Steps at which the policy was judged, and its success rates."""
 

@@ -103,7 +103,7 @@ class _Progress:
     """Steps of the episode before success was first held, per world."""
     deterministic: list[float] = field(default_factory=list[float])
     scores: list[float] = field(default_factory=list[float])
-    """Of the same episodes, see `policies.evaluation.paired.score`."""
+    """Score of each of the same episodes, see `policies.evaluation.paired.score`."""
     exploring: list[float] = field(default_factory=list[float])
     returns: list[float] = field(default_factory=list[float])
     actor_updates: int = 0

@@ -52,9 +52,11 @@ def cube_turns() -> list[Turn]:
     out = []
     for order in itertools.permutations(range(3)):
         even = order in {(0, 1, 2), (1, 2, 0), (2, 0, 1)}
-        for signs in itertools.product((1, -1), repeat=3):
-            if (np.prod(signs) > 0) == even:
-                out.append((order, signs))
+        out.extend(
+            (order, signs)
+            for signs in itertools.product((1, -1), repeat=3)
+            if (np.prod(signs) > 0) == even
+        )
     return out
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from studies.programs import ProgramPolicy
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.config import EvaluationConfig
@@ -24,7 +25,6 @@ from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 from v2p_data.pipeline.workers import run_stages
 from v2p_data.policy.training import POLICY_FOLDER, sources_of
-from v2p_data.reward.programs import ProgramPolicy
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.stages import (
     EngineConfig,

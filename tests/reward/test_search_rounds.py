@@ -24,12 +24,14 @@ from v2p_data.report.rewards import AUTHORS
 from v2p_data.reward.candidate import Candidate, Fault, load_candidates
 from v2p_data.reward.feedback import Feedback
 from v2p_data.reward.jobs import HEARTBEAT_FILE, Jobs
-from v2p_data.reward.methods import in_place_of_reward, save_bundle
+from v2p_data.reward.methods import in_place_of_reward, save_bundle, told
 from v2p_data.reward.reflect import proposals
 from v2p_data.reward.search import search_reward
 from v2p_data.reward.worker import run_job
 from v2p_data.stages import EngineConfig, chain
 from v2p_data.task.benchmark import load_benchmark
+from v2p_data.task.llm.client import VlmClient
+from v2p_data.task.llm.writer import ModelWriter
 from v2p_data.task.sandbox.splice import rest_part, reward_part, with_reward
 from v2p_data.task.task import REWARD_SEARCH_FOLDER, TaskBundle
 from v2p_data.video.captions import VideoItem
@@ -218,11 +220,11 @@ def test_a_round_is_full_also_where_its_parents_first_ideas_were_tried(
     flags = [*TINY, "--reward.iterations=2", "--reward.candidates=2", "--reward.elites=1"]
     cfg = parse(EngineConfig, [*flags, "--reward.target-success=2.0"], "reward").reward
     bundle = bundle_with(BY_CHANCE)
-    told = Feedback.from_dict(
+    feedback = Feedback.from_dict(
         json_or_none(folder(two_rounds, two_rounds.elites[0]) / "feedback.json")
     )
     parent = two_rounds.candidates[1].code
-    offered = proposals(bundle, parent, told, np.random.default_rng(0))
+    offered = proposals(bundle, parent, feedback, np.random.default_rng(0))
     tried = [child.code for child, _ in zip(offered, range(4), strict=False)]
     for number, code in enumerate([parent, *tried]):
         candidate = Candidate(
@@ -351,7 +353,11 @@ def test_the_page_shows_the_search(two_rounds: TwoRounds):
     ],
 )
 def test_a_method_that_hides_the_video_has_the_model_write_the_task_anew_without_it(
-    flags: list[str], hidden: tuple[str, ...], kept: tuple[str, ...], tmp_path: Path
+    flags: list[str],
+    hidden: tuple[str, ...],
+    kept: tuple[str, ...],
+    two_rounds: TwoRounds,
+    tmp_path: Path,
 ):
     bundle = bundle_with(BY_CHANCE)
     anew = bundle_with(BY_CHANCE.replace("[:, 1] < 0)", "[:, 1] < 0.05)"))
@@ -362,15 +368,24 @@ def test_a_method_that_hides_the_video_has_the_model_write_the_task_anew_without
         return said(f"```python\n{anew.code}\n```" if is_task else ANSWER.format(UPWARDS))
 
     server.otherwise = answer
+    cfg = parse(
+        EngineConfig,
+        [
+            *TINY, "--reward.iterations=1", "--reward.candidates=2", *flags,
+            f"--task.vlm.base-url={server.url}", "--task.vlm.key-env=",
+        ],
+        "reward",
+    )  # fmt: skip
+    client = VlmClient(told(cfg.task.vlm, cfg.reward), tmp_path / "calls", seed=3)
+    played = Played(folder(two_rounds, two_rounds.elites[0]))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NO_PROXY", "127.0.0.1")
-        search = searched(
-            tmp_path, bundle, *TINY, "--reward.iterations=1", "--reward.candidates=2", *flags,
-            "--task.writer=vlm", f"--task.vlm.base-url={server.url}", "--task.vlm.key-env=",
+        search_reward(
+            bundle, cfg.reward, tmp_path / "search", seed=3, writer=ModelWriter(client=client), jobs=played
         )  # fmt: skip
     server.close()
 
-    candidates = load_candidates(search)
+    candidates = load_candidates(tmp_path / "search")
     assert [c.origin for c in candidates] == ["model", "model"]
     assert {rest_part(c.code) for c in candidates} == {rest_part(anew.code)} != {rest_part(bundle.code)}  # fmt: skip
     questions = [words_of(r) for r in server.requests]

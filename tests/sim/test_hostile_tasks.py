@@ -189,11 +189,9 @@ def test_worlds_that_a_later_reset_starts_solved_never_count_and_end_it(
         reset=COUNTING.format(honest=1, cheat=lying),
         success="success = states['cube_up'].abs() < 0.5",
     )
-    held = []
 
     env.reset(np.arange(3))
-    for _ in range(12):
-        held.append(env.step(np.zeros((NUM_WORLDS, 7))).held)
+    held = [env.step(np.zeros((NUM_WORLDS, 7))).held for _ in range(12)]
     env.reset(np.arange(3))
 
     assert not np.any(held)

@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.task.audit.audit import audit
@@ -9,7 +10,8 @@ from v2p_data.task.audit.moments import build_probes
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.sandbox.probes import rest_height
-from v2p_data.task.sandbox.smoke import SmokeResult, smoke_run_all
+from v2p_data.task.sandbox.smoke import SmokeResult, trial_request
+from v2p_data.task.sandbox.smoke_child import answer
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
 
@@ -36,8 +38,12 @@ def lift(success):
 
 
 def audits(scene, codes):
+    """The trial run's questions, asked here: these codes are ours, and a child imports torch for seconds."""
     probes = build_probes(scene, np.random.default_rng(0))
-    results = smoke_run_all(codes, scene, probes=probes.states, starts=probes.starts)
+    request = trial_request(codes, scene, probes.states, 10.0, probes.starts)
+    counts = len(probes.states["eef_pos"]), len(probes.starts["eef_pos"])
+    with torch.no_grad():
+        results = [SmokeResult.from_json(answer(code, request), *counts) for code in codes]
     return [audit(scene, probes, r) for r in results]
 
 
@@ -97,7 +103,7 @@ def test_what_does_not_run_is_vetoed(scene_of):
     assert not verdict.is_acceptable
 
 
-@pytest.mark.parametrize("kind", ["lift_up", "push_left", "tip_over", "push_next_to"])
+@pytest.mark.parametrize("kind", ["lift_up", "push_next_to"])
 def test_a_scene_becomes_a_task_that_can_be_loaded_again(kind, scene_of, tmp_path):
     scene = scene_of(kind)
     scene_folder = tmp_path / "scene"
@@ -200,19 +206,22 @@ RESETS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("change", "words"), RESETS.values(), ids=RESETS)
-def test_a_reset_that_makes_the_task_easy_is_refused(change, words, scene_of):
+def test_resets_that_make_the_task_easy_are_refused(scene_of):
     scene = scene_of("push_next_to")
-    code = write_samples(scene, 1)[0]
-    base = "        return super().reset_objects_states(env_ids)"
-    own = f"        poses = self.envs.sample_object_poses(env_ids)\n        {change}\n        return poses"
     made = "super().__init__(envs, urdf_assets_root, scene_info)"
-    cheat = code.replace(base, own).replace(made, f"{made}\n        self.count = 0")
-    harmless = code.replace(base, own.replace(change, "poses['can'][:, 0] += 0.01"))
+    code = write_samples(scene, 1)[0].replace(made, f"{made}\n        self.count = 0")
 
-    refused, accepted = audits(scene, [cheat, harmless])
+    def resetting(change):
+        own = f"        poses = self.envs.sample_object_poses(env_ids)\n        {change}\n        return poses"
+        return code.replace("        return super().reset_objects_states(env_ids)", own)
 
-    assert words in refused.vetoed
+    changes = [change for change, _ in RESETS.values()]
+    *refused, accepted = audits(
+        scene, [resetting(c) for c in (*changes, "poses['can'][:, 0] += 0.01")]
+    )
+
+    for name, (_, words), verdict in zip(RESETS, RESETS.values(), refused, strict=True):
+        assert words in verdict.vetoed, name
     assert accepted.is_acceptable
 
 

@@ -24,7 +24,7 @@ TASKS_IN_DATASET = Path("v2p/tasks")
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """Of one policy; None or empty where it is not known."""
+    """Facts of one policy; None or empty where it is not known."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
 

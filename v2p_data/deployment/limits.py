@@ -38,7 +38,7 @@ class LimitsConfig:
     """Bounds of every action and of what the robot reports."""
 
     max_speed_m_s: float = 1.04
-    """Of the tool's target. The default is a full action of the training along all axes; begin with 0.1 on a real arm."""
+    """Speed of the tool's target. The default is a full action of the training along all axes; begin with 0.1 on a real arm."""
     max_turn_rad_s: float = 4.0
     """Of the tool's target, about any axis; a full action of the training about one. Whichever of the two limits acts
     slows both motions down alike."""

@@ -41,7 +41,7 @@ class Sample:
 
     pos_m: Float[np.ndarray, "3"]
     quat_wxyz: Float[np.ndarray, "4"]
-    """Of the tool: z out of the gripper, y along its opening; (0, 1, 0, 0) is straight down."""
+    """Orientation of the tool: z out of the gripper, y along its opening; (0, 1, 0, 0) is straight down."""
     opening: float
     joints_rad: Float[np.ndarray, "7"]
     force_n: float | None

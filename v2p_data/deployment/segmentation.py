@@ -33,7 +33,7 @@ class TrackerConfig:
     reach_px: float = 12.0
     """How far an object may get in one step of 50 ms, at 256 px; 0.6 m/s are about 10."""
     least_visible: float = 0.12
-    """Of the area that should be seen: with less the object counts as not seen in this picture."""
+    """Share of the expected area: with less the object counts as not seen in this picture."""
     background_rate: float = 0.15
     """Share of each new picture in the picture of what is behind."""
 

@@ -25,10 +25,10 @@ OTHER_FILES = ("v2p.json", "train_config.json")
 """Need not be there."""
 MAX_JSON_BYTES = 1_000_000
 MAX_STATE_BYTES = 50_000_000
-"""Of a processor's statistics."""
+"""Largest file of a processor's statistics."""
 MAX_WEIGHTS_BYTES = 40_000_000_000
 MAX_HEADER_BYTES = 16_000_000
-"""Of a file of tensors: names and shapes."""
+"""Largest header of a file of tensors: names and shapes."""
 CHECKED_AT_ONCE = 2**24
 """Numbers of a tensor."""
 MAX_SEEN = 32_000_000
@@ -63,7 +63,7 @@ LIMITS = (
 """Largest number, by a setting's name; the first that fits. A million where it is no whole number and the last one fits."""
 LARGEST_FRACTION = 1e6
 MAX_ENTRIES = 256
-"""Of a list or an object."""
+"""Most entries of a list or an object."""
 
 
 def bounded(value: Any, name: str) -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # they load torch and MuJoCo, and this file is read for listi
     from v2p_data.play import Actor
 
 PROGRAM_FILE = "program.json"
-"""Of an expert's folder where the program acts itself; there are no weights then."""
+"""File of an expert that is a program; it has no weights."""
 
 
 def choose_program(worlds: "Worlds", cfg: ExpertConfig, out: Path) -> "Learned":

@@ -65,7 +65,7 @@ class Learned:
     """The program's name, or nothing."""
     trials: tuple[Trial, ...]
     comparison: Comparison | None
-    """Of the taught policy and PPO's; None where nobody taught or PPO changed nothing."""
+    """Comparison of the taught policy with PPO's; None where nobody taught or PPO changed nothing."""
     stopped_by: str
     started_from: str = ""
     """Folder of another task's expert, if PPO started from one."""

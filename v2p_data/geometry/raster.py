@@ -6,7 +6,7 @@ from jaxtyping import Float, Int32, UInt8
 
 _BITS = 4
 PARTS = 2**_BITS
-"""Of a pixel, to which corners are rounded."""
+"""Parts of a pixel to which corners are rounded."""
 
 
 def in_parts(pixels: Float[np.ndarray, "*n 2"]) -> Int32[np.ndarray, "*n 2"]:

@@ -19,7 +19,7 @@ from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.fingerprint import file_digest
 
 MEMORY_FOLDER = ".checked"
-"""Of a run: what was compared already. Safe to delete."""
+"""Folder of a run with what was compared already. Safe to delete."""
 UNLISTED = (
     *("record.json", "README.md", "traceback.txt", "*.log", "events.out.tfevents.*"),
     *("*.tmp", "*.partial", ".cache", "__pycache__"),

@@ -32,7 +32,7 @@ class PolicyConfig:
     evaluation reports."""
 
     encoder: Literal["resnet18", "conv", "none"] = "resnet18"
-    """Of the whole picture; see `policies/bc/configuration_v2p_bc.py`, as the next ones."""
+    """Encoder of the whole picture; see `policies/bc/configuration_v2p_bc.py`, as the next ones."""
     input_size_px: int = 256
     """Pictures are scaled to this before the network; less is faster."""
     mask_moments: bool = True
@@ -48,9 +48,9 @@ class PolicyConfig:
     state_entries: int | None = None
     """Entries of the robot's state that are used, from the first on: 7 leaves the controller's command out."""
     learning_rate: float = 3e-4
-    """Of everything but a pretrained backbone."""
+    """Learning rate of all but a pretrained backbone."""
     weight_decay: float = 1e-4
-    """Of AdamW; more, as the next two, keeps a policy from fitting its objects too closely."""
+    """Weight decay of AdamW; more, as the next two, keeps a policy from fitting its objects too closely."""
     mask_jitter_px: float = 0.0
     """In training each mask is moved, grown or shrunk at random by up to this many pixels, as its moments tell."""
     moments_dropout: float = 0.0

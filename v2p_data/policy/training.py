@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from policies.bc.student import Student
 
 CACHE_FOLDER = "cache"
-"""Of a run: decoded pictures of its datasets, as networks take them. Safe to delete."""
+"""Folder of a run with decoded pictures of its datasets, as networks take them. Safe to delete."""
 POLICY_FOLDER = "policy"
 ACTION_LIMIT = 1.0
 """The simulator clips every entry of an action to this."""

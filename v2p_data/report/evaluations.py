@@ -25,9 +25,9 @@ class EvaluationRow:
     """Who: `policy`, `expert` or `programs`."""
     is_seen: bool
     rate: Rate
-    """Of episodes that succeeded once."""
+    """Share of the episodes that succeeded once."""
     at_end: Rate | None
-    """Of episodes that were still a success at their end."""
+    """Share of the episodes that were a success at their end."""
     failures: list[tuple[str, int]]
     """Kinds of failure, the most frequent first."""
     median_success_s: float | None

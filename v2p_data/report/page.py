@@ -46,7 +46,7 @@ class StageTime:
     num_items: int
     seconds: float
     share: float
-    """Of the longest stage, for the bar."""
+    """Share of the longest stage's time, for the bar."""
 
 
 def write_page(root: Path, out: Path | None = None, cfg: PageConfig | None = None) -> Path:

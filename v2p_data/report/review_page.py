@@ -33,7 +33,7 @@ STILL_SIDE_PX = 640
 """The longer side, where few clips leave room for so large stills; 320 for a hundred clips."""
 NUM_STILLS = 5
 MAX_STILL_BYTES = 8_500_000
-"""Of all stills together, as they stand in the page: so it stays below 10 MB."""
+"""Size of all stills together in the page, which so stays below 10 MB."""
 _LEAST_BYTES = 4_000
 """For less a still shows nothing, and only the first and last are kept."""
 _QUALITIES = (
@@ -70,7 +70,7 @@ class ReviewClip:
     used_hints: tuple[str, ...] = ()
     """Phrases that had a hint when the scene was made."""
     folder: Path | None = None
-    """Of the accepted scene."""
+    """Folder of the accepted scene."""
     reason: str = ""
     """Slug of a rejection."""
     detail: str = ""
@@ -141,22 +141,30 @@ def write_review(
         "commands": dict(commands),
         "clips": [clip_json(clip, out.parent) for clip in clips],
     }
-    source = (Path(__file__).parent / "review.html").read_text()
-    script = re.search(r'<script id="app">(.*?)</script>', source, re.S)
-    assert script is not None
-    digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.policies["json.dumps_kwargs"] = {"sort_keys": False}
-    page = environment.from_string(source).render(title=title, data=data, script_hash=digest)
+    page = rendered("review.html", title, data)
     temporary = out.with_name(out.name + ".tmp")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        # File names may hold bytes that are no text; they must not keep the page from being written.
-        temporary.write_bytes(page.encode("utf-8", "replace"))
+        temporary.write_bytes(page)
         temporary.replace(out)
     except OSError as error:
         raise V2PError(f"cannot write the page {out}: {error.strerror}") from error
     return out
+
+
+def rendered(template: str, title: str, data: Mapping[str, Any]) -> bytes:
+    """Return a page of this folder with its data; no script but its own may run."""
+    folder = Path(__file__).parent
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(folder), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": False}
+    script = re.search(r'<script id="app">(.*?)</script>', (folder / template).read_text(), re.S)
+    assert script is not None
+    digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
+    page = environment.get_template(template).render(title=title, data=data, script_hash=digest)
+    # File names may hold bytes that are no text; they must not keep the page from being made.
+    return page.encode("utf-8", "replace")
 
 
 def clip_json(clip: ReviewClip, home: Path) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """A review page that this machine serves to itself: a person marks objects, the clip is rebuilt, and the page shows the result."""
 
-import base64
-import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -9,11 +7,10 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import jinja2
-
 from v2p_data.errors import V2PError
 from v2p_data.local_page import LocalPage, Request
 from v2p_data.report.reading import as_dict
+from v2p_data.report.review_page import rendered
 
 _CHUNK = 1 << 16
 
@@ -95,16 +92,7 @@ class ReviewServer(LocalPage):
 
     def page(self) -> bytes:
         """Return the page."""
-        loader = jinja2.FileSystemLoader(Path(__file__).parent)
-        environment = jinja2.Environment(
-            loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
-        )
-        source = (Path(__file__).parent / "live.html").read_text()
-        script = re.search(r'<script id="app">(.*?)</script>', source, re.S)
-        assert script is not None
-        digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
-        words = {"title": self.title, "data": self.session.overview(), "script_hash": digest}
-        return environment.get_template("live.html").render(words).encode("utf-8", "replace")
+        return rendered("live.html", self.title, self.session.overview())
 
     def answer(self, path: str) -> dict[str, Any]:
         """Return the answer to a question of the page.

@@ -84,7 +84,7 @@ class Search:
     choice: Choice | None
     """None while it goes on."""
     audit: Any
-    """Of the success that all candidates share."""
+    """Audit of the success that all candidates share."""
 
     def success(self, candidate: Candidate) -> float | None:
         """Return the mean of a candidate's last evaluations, None without any."""

@@ -48,11 +48,11 @@ class ComponentFeedback:
     is_dead: bool
     """Its values do not vary."""
     share: float
-    """Of the total magnitude: mean absolute value, divided by the sum of those of all components."""
+    """Share of the total magnitude: mean absolute value, divided by the sum of those of all components."""
     step_correlation: float | None
-    """Of its value with the success of the same step; None where one of the two does not vary."""
+    """Correlation of its value with the success of the same step; None where one of the two does not vary."""
     episode_correlation: float | None
-    """Of its mean over an episode with the episode's outcome."""
+    """Correlation of its mean over an episode with the episode's outcome."""
     saturated_high: float
     """Share of steps within 5 % of the observed range from its maximum."""
     saturated_low: float
@@ -99,7 +99,7 @@ class Feedback:
     """Probability that a successful episode earned more generated reward per step than a failed one; 0.5 is chance."""
     success_curve: tuple[float, ...] = ()
     objects: tuple[ObjectFeedback, ...] = ()
-    """Of the moments whose states were kept, the manipulated object first."""
+    """Objects in the moments whose states were kept, the manipulated one first."""
 
     @property
     def success_rate(self) -> float:

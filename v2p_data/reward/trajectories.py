@@ -17,7 +17,7 @@ from v2p_data.errors import V2PError
 HELD_STEPS = 5
 """An episode succeeded if success is true for its last so many steps, as in `sim.batch_env`."""
 MAX_BYTES = 2_000_000_000
-"""Of one file, unpacked: more is refused, for it may come from a process that ran strange code."""
+"""Largest file, unpacked. It may come from a process that ran strange code."""
 MAX_NAMES = 4_000
 _TABLE = "table"
 

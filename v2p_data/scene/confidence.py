@@ -22,7 +22,7 @@ from v2p_data.scene.scale.nouns import is_clear
 _COLOURED = 0.25
 """Share of a thing's pixels that need its colour: few things are one colour all over."""
 _AWAY_PX = 4.0
-"""Of a picture 320 px wide: an object so far from both its ends moves."""
+"""An object so far from both its ends moves, in a picture 320 px wide."""
 _OUT_OF_SIGHT = 0.8
 """Confidence in an object that nobody sees at the end: in a bin, or in a fist."""
 _IN_THE_AIR = 0.6

@@ -28,11 +28,11 @@ class SceneConfig:
     min_found: float = 0.5
     """Objects that are found less surely are rejected."""
     max_camera_shift_px: float = 3.0
-    """Of a picture 320 px wide. Everything here takes the camera to stand still."""
+    """Largest shift in a picture 320 px wide. Everything here takes the camera to stand still."""
     check_motion: bool = True
     """Reject what does not move as its caption says."""
     camera_height_m: float | None = None
-    """Of the camera above the table, where you measured it: with pitch and field of view it gives all sizes, which are guesses otherwise."""
+    """Height of the camera above the table, where you measured it: with pitch and field of view it gives all sizes, which are guesses otherwise."""
     pitch_rad: float | None = None
     """How far the camera looks below the horizon, where you know it."""
     pitch_spread_rad: float = 0.14

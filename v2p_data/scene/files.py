@@ -13,7 +13,7 @@ from v2p_data.errors import V2PError
 
 MAX_PATH_CHARS = 255
 MAX_FILES = 5_000
-"""Of a folder that is copied."""
+"""Most files of a folder that is copied."""
 
 
 def user_cache(variable: str) -> Path:

@@ -21,7 +21,7 @@ from v2p_data.geometry.mesh import outline_points
 from v2p_data.scene.data_types import Estimate, Reconstruction
 
 LONG_SIDE_PX = 640
-"""Of the picture; smaller videos are enlarged, or the words would not fit."""
+"""Longer side of the picture; smaller videos are enlarged, or the words would not fit."""
 GRID_M = 0.1
 _HEAD_PX = 24
 _ROW_PX = 20

@@ -26,7 +26,7 @@ FLOOR_MIN_M = 0.006
 """Through thinner floors hard-pressed objects were pushed into the table."""
 FLOOR_MAX_M = 0.02
 MAX_MASKS_BYTES = 1_000_000_000
-"""Of an unpacked mask track: an hour at 10 Hz, one bit per pixel."""
+"""Largest unpacked mask track: an hour at 10 Hz, one bit per pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class Plane:
     """All points p of the world frame with normal · p = offset."""
 
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Of unit length."""
+    """Unit vector."""
     offset_m: float = 0.0
 
 
@@ -205,7 +205,7 @@ class Scene:
     objects: tuple[SceneObject, ...]
     """The manipulated object first."""
     camera: Camera
-    """Of the aligned frames, which is the first frame's where the camera moved."""
+    """Camera of the aligned frames, which is the first frame's where the camera moved."""
     fps: float
     num_frames: int
     confidence: float

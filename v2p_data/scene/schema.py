@@ -29,12 +29,12 @@ Observed = Literal["full", "no_depth"]
 MAX_SCENE_BYTES = 32_000_000
 """An hour of two objects at 10 Hz."""
 MAX_FILE_BYTES = 200_000_000
-"""Of a mesh or a mask track."""
+"""Largest mesh or mask track."""
 MAX_OBJECTS = 20
 MAX_PARTS = 128
-"""Of one object."""
+"""Most parts of one object."""
 MAX_SCENE_PARTS = 512
-"""Of all objects together; MuJoCo gets each in seven sizes."""
+"""Most parts of all objects together; MuJoCo gets each in seven sizes."""
 MAX_FRAMES = 50_000
 MESH_KINDS = (".obj", ".stl", ".ply")
 ERRORS_SHOWN = 3

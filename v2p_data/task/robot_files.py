@@ -13,7 +13,7 @@ from xml.parsers import expat
 from v2p_data.errors import V2PError
 
 ROBOT_FOLDER = "robot"
-"""Of a task folder: copies of another arm's files."""
+"""Folder of a task with copies of another arm's files."""
 MAX_XML_BYTES = 4_000_000
 MAX_FILE_BYTES = 64_000_000
 MAX_TOTAL_BYTES = 256_000_000
@@ -22,15 +22,15 @@ MAX_BODIES = 200
 MAX_ELEMENTS = 20_000
 MAX_DEPTH = 100
 MAX_COUNT = 1_000_000
-"""Of what `<size>` reserves."""
+"""Most that `<size>` may reserve."""
 GRID_ATTRIBUTES = frozenset(
     {"width", "height", "nrow", "ncol", "gridsize", "octree_maxdepth", "nsample", "maxhullvert"}
 )
 MAX_GRID = 4096
-"""Of pixels and cells along one side."""
+"""Most pixels or cells along one side."""
 MAX_PICTURE_PIXELS = MAX_GRID**2
 MAX_ALL_PIXELS = 4 * MAX_PICTURE_PIXELS
-"""Of all pictures together; decoded they take three bytes each."""
+"""Most pixels of all pictures together; decoded they take three bytes each."""
 MULTIPLYING = frozenset(
     {
         "replicate",

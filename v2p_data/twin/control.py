@@ -28,7 +28,7 @@ BRAKING = (3.0, 15.0)
 """The reference slows down in time to stop with these [m/s2, rad/s2], so that it does not overshoot."""
 STIFFNESS_NM_RAD = np.array([600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0])
 DAMPING_NM_S_RAD = np.array([50.0, 50.0, 50.0, 50.0, 30.0, 25.0, 15.0])
-"""Of libfranka's joint impedance example."""
+"""Damping of libfranka's joint impedance example."""
 IK_DAMPING = 0.02
 ELBOW_RETURN_HZ = 2.0
 """Joint 3 goes back to 0 at this rate where that moves no tool."""

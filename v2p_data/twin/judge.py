@@ -198,7 +198,7 @@ class _Table:
 
 
 _table: _Table | None = None
-"""Of this worker process."""
+"""The table of this worker process."""
 
 
 def _sit_down(*settings: Any) -> None:

@@ -28,7 +28,7 @@ class Start:
     object_poses: Float[np.ndarray, "object 7"]
     """Position [m] and `quat_wxyz` of each object."""
     rest_height_m: Float[np.ndarray, "object"]
-    """Of each object's centre at rest on the table, at the size that it has in the training simulator."""
+    """Height of each object's centre at rest on the table, at the size that it has in the training simulator."""
 
 
 @dataclass(frozen=True, kw_only=True)

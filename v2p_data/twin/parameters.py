@@ -16,7 +16,7 @@ from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.seeds import rng_for
 
 TWIN_SEED = 20261125
-"""Of the nominal twin. Nobody tunes on it: a test pins the digest of what it draws."""
+"""Seed of the nominal twin. Nobody tunes on it: a test pins the digest of what it draws."""
 
 
 def _drawn(low: float, high: float, source: str, count: int = 0) -> Any:
@@ -169,7 +169,7 @@ _BOUNDS = {
     "full_well": (10.0, 1e6),
     "jpeg_quality": (1.0, 100.0),
 }
-"""Of numbers that may not be zero, or beyond which nothing is simulated faithfully."""
+"""Bounds of numbers that may not be zero, or beyond which nothing is simulated faithfully."""
 
 
 def episode_rng(seed: int, what: str) -> np.random.Generator:

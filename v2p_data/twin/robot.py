@@ -38,7 +38,7 @@ class Measured:
     opening: float
     """By the gripper's register, 0 closed, 1 open."""
     time_s: float
-    """Of the report, since the episode began; what it reports is older by the latency."""
+    """Time of the report since the episode began; what it reports is older by the latency."""
 
 
 @dataclass(frozen=True, kw_only=True)

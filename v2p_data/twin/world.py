@@ -8,7 +8,6 @@ training simulator; its Cartesian servos are not there.
 # pyright: reportAttributeAccessIssue=false
 # mujoco's classes come from a compiled module that declares none of them.
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -29,6 +28,7 @@ from v2p_data.sim.robot.robot import (
     PADS,
     ServoConfig,
     robot_body_xml,
+    xml_row,
 )
 from v2p_data.twin.parameters import TwinParameters
 
@@ -58,7 +58,7 @@ class TwinWorld:
     objects: tuple[ObjectModel, ...]
     size_m: Float[np.ndarray, "object 3"]
     rest_height_m: Float[np.ndarray, "object"]
-    """Of each object's centre at rest, above z = 0."""
+    """Height of each object's centre at rest, above z = 0."""
     object_qpos: Int[np.ndarray, "object 7"]
     object_dofs: Int[np.ndarray, "object 6"]
     pad_geoms: tuple[int, int]
@@ -94,10 +94,10 @@ def build_twin(scene: Scene, parameters: TwinParameters, camera: Camera) -> Twin
         '<headlight ambient="0.35 0.35 0.35" diffuse="0.15 0.15 0.15" specular="0 0 0"/></visual>'
         '<asset><texture type="skybox" builtin="gradient" rgb1="0.75 0.76 0.78" rgb2="0.45 0.44 0.43" '
         f'width="128" height="128"/>{assets}</asset><worldbody>'
-        f'<light pos="{_row(lamp)}" dir="{_row(np.array([0.5, 0, 0]) - lamp)}" '
-        f'diffuse="{_row(np.full(3, 0.75 * p.lamp_scale))}" specular="0.2 0.2 0.2" castshadow="true"/>'
-        f'<camera name="{CAMERA}" pos="{_row(camera.T_world_cam[:3, 3])}" '
-        f'xyaxes="{_row(mujoco_xyaxes(camera.T_world_cam))}" fovy="{_fovy_deg(camera)}"/>'
+        f'<light pos="{xml_row(lamp)}" dir="{xml_row(np.array([0.5, 0, 0]) - lamp)}" '
+        f'diffuse="{xml_row(np.full(3, 0.75 * p.lamp_scale))}" specular="0.2 0.2 0.2" castshadow="true"/>'
+        f'<camera name="{CAMERA}" pos="{xml_row(camera.T_world_cam[:3, 3])}" '
+        f'xyaxes="{xml_row(mujoco_xyaxes(camera.T_world_cam))}" fovy="{_fovy_deg(camera)}"/>'
         f'<geom name="table" type="plane" size="1.5 1.5 0.1" pos="0 0 {p.table_height_m}" contype="1" '
         f'conaffinity="3" condim="6" friction="{p.table_friction:.6g} 0.003 0.0005" '
         f'solref="{p.contact_time_s:.6g} 1"/>'
@@ -173,11 +173,11 @@ def _object_xml(base: World, obj: ObjectModel, p: TwinParameters) -> tuple[str, 
     asset, geoms = "", ""
     for k, cloud in enumerate(clouds):
         name = f"{obj.name}_{k}"
-        asset += f'<mesh name="{name}" vertex="{_row(cloud.ravel())}"/>'
+        asset += f'<mesh name="{name}" vertex="{xml_row(cloud.ravel())}"/>'
         geoms += (
             f'<geom name="{name}" type="mesh" mesh="{name}" mass="{mass[k]:.9g}" contype="1" conaffinity="3" '
             f'condim="6" friction="{obj.friction * p.object_friction_scale:.6g} 0.003 0.0005" '
-            f'solref="{p.contact_time_s:.6g} 1" rgba="{_row(rgba)}"/>'
+            f'solref="{p.contact_time_s:.6g} 1" rgba="{xml_row(rgba)}"/>'
         )
     return asset, f'<body name="{obj.name}"><freejoint name="{obj.name}"/>{geoms}</body>'
 
@@ -266,7 +266,3 @@ def _paint_table(spec: Any, p: TwinParameters) -> None:
 
 def _fovy_deg(camera: Camera) -> float:
     return float(2 * np.degrees(np.arctan(camera.height_px / 2 / camera.K[1, 1])))
-
-
-def _row(values: Iterable[float | int]) -> str:
-    return " ".join(f"{v:.9g}" for v in values)

@@ -49,7 +49,7 @@ _COMBED = 0.2
 """Of the pixels that change, the share that stands out from the rows above and below alike. At most 0.13 in 36 clips as
 they were filmed, at least 0.3 in the same clips with every second row from the next picture."""
 _AS_WOVEN = 0.6
-"""Of the pixels that would stand out if a picture had the other rows of its neighbour: at most 0.21, at least 2.8 there."""
+"""Share of the pixels that would stand out if a picture had the other rows of its neighbour: at most 0.21, at least 2.8 there."""
 _LEAST_COMBED = 200
 """Pixels, below which a share says nothing."""
 _OTHER_SHAPE = 1.1
@@ -199,15 +199,15 @@ class _Film:
     """What the file's clock skipped; left out of the times."""
     shown_px: tuple[int, int] = (0, 0)
     changed_px: int = 0
-    """Of some columns of all kept pictures, those that differ from the picture before."""
+    """Pixels in some columns of all kept pictures that differ from the picture before."""
     combed_px: int = 0
-    """Of these, those that stand out from the rows above and below alike."""
+    """Those among them that stand out from the rows above and below alike."""
     woven_px: tuple[int, int] = (0, 0)
     """The same with the odd rows of the picture before, and with its even rows."""
     brightness: Int[np.ndarray, "h some"] = field(
         default_factory=lambda: np.empty((0, 0), np.int16)
     )
-    """Of some columns of the last kept picture, as stored."""
+    """Some columns of the last kept picture, as stored."""
 
     @property
     def is_cut(self) -> bool:

@@ -322,7 +322,6 @@ def _named(
     left = [o for o in objects if o not in used]
     if manipulated not in objects and left:
         manipulated = left.pop(0)
-    for unsaid in left:
-        named.append((unsaid, "reference"))
+    named.extend((unsaid, "reference") for unsaid in left)
     unnamed = "cover" if KINDS[kind].has_cover else _ANYTHING[0]
     return Meaning(kind=kind, manipulated=manipulated or unnamed, others=tuple(named))

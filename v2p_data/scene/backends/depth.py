@@ -39,9 +39,9 @@ class TablePlane:
     normal_cam: Float[np.ndarray, "3"]
     """Unit, up from the table."""
     height_m: float
-    """Of the camera over the table."""
+    """Height of the camera over the table."""
     inlier_share: float
-    """Of the usable pixels."""
+    """Share of the usable pixels that lie on it."""
     pitch_rad: float
     """How far the camera looks down below the horizon."""
     roll_rad: float

@@ -23,7 +23,7 @@ from v2p_data.scene.backends.pinned_packages import (
 WORKER = Path(__file__).parent / "hands_worker.py"
 REQUIREMENTS = Path(__file__).parent / "hands_requirements.lock"
 DOWNLOAD_MB, DISK_MB = 130, 340
-"""Of the pinned packages, measured on Linux."""
+"""Size of the pinned packages, measured on Linux."""
 _READY = "ready"
 """File that is written last: an environment without it is not used."""
 

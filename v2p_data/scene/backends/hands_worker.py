@@ -23,7 +23,7 @@ SCHEMA, VERSION, KIND = "v2p-worker", 1, "hands"
 BAD_REQUEST = 2
 MOST_HANDS = 2
 LEAST_SCORE = 0.5
-"""Of a palm's detection, and of its tracking from one picture to the next: MediaPipe's own default."""
+"""Least score of a palm's detection, and of its tracking from one picture to the next: MediaPipe's own default."""
 
 
 def main() -> int:

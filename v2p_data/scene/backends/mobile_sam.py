@@ -24,7 +24,7 @@ from v2p_data.scene.backends.outlines import EncodedPicture, Outlines, Spots
 from v2p_data.scene.backends.tiny_vit import SIDE_PX, TinyViT
 
 _MEAN, _SD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
-"""Of the pictures that the checkpoint was trained on, red, green, blue."""
+"""Mean and standard deviation of red, green and blue in the checkpoint's training pictures."""
 _UNREADABLE = (
     OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, RuntimeError, UnpicklingError, SafetensorError,
 )  # fmt: skip

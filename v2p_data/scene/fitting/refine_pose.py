@@ -17,9 +17,9 @@ from v2p_data.geometry.pose import angle_between, transform
 from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView, middle_of
 
 _LEAST_PX = 80
-"""Of the last outline, below which it has no form."""
+"""Fewest pixels of the last outline; a smaller one has no form."""
 _MOST_HIDDEN = 0.4
-"""Of the mesh's silhouette: where less is seen, the primitive's pose stays."""
+"""Hidden share of the mesh's silhouette from which on the primitive's pose stays."""
 _GAIN = 0.01
 """By how much the outline must be covered better than from the primitive's pose, in units of IoU."""
 _HOLD = 0.02
@@ -28,7 +28,7 @@ _SAME_REST = 0.9
 """Cosine between the own z axes of two poses that rest alike."""
 _ALIGNED_ROUNDS, _ITERATIONS = 2, 60
 _FIRST_STEPS = (0.05, 0.05, 0.2)
-"""Of the search: two in units of the mesh's diagonal, one in radians."""
+"""First steps of the search: two in units of the mesh's diagonal, one in radians."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Refit:
 
     T_world_mesh: Float[np.ndarray, "4 4"]
     iou: float
-    """Of the silhouette with the mask, where the object could be seen."""
+    """Overlap of the silhouette with the mask, where the object could be seen."""
 
 
 def refine_pose(

@@ -37,7 +37,7 @@ class Trajectory:
     """Poses in the world frame, growing with time."""
 
     frames: list[int]
-    """Of the working clip."""
+    """Frame numbers of the working clip."""
     poses: list[Float[np.ndarray, "4 4"]]
     sure: list[float]
     """How far to believe each pose, 0 to 1."""

@@ -63,7 +63,7 @@ class Noun:
     hollow: bool = False
     """Open at the top, so that something can be put in or it can be put over something."""
     bore: float = 0.0
-    """Of a roll or a ring: the diameter of the hole through it, as a share of its own; 0 where there is none."""
+    """Diameter of the hole through a roll or ring, as a share of its own; 0 where there is none."""
     taper: float = 1.0
     """Base diameter over top diameter, for solids of revolution."""
     variant: "Noun | None" = None

@@ -19,7 +19,7 @@ FEWEST = 2
 _SUREST = 0.05
 """No clip says its scale surer than this, whatever its scene claims; an older scene claims nothing."""
 _PITCH_SD_RAD, _FOCAL_SD = 0.07, 0.15
-"""Of one clip's pitch and of the logarithm of its focal length, on drawn clips."""
+"""Standard deviation of one clip's pitch and of the logarithm of its focal length, on drawn clips."""
 _COMMON = 0.05
 """Standard deviation of what all clips from one stand get wrong alike: the same picture misleads the network in the same way."""
 _FAR_OFF = 3.0

@@ -13,9 +13,9 @@ from v2p_data.scene.shapes.mesh_hypothesis import MeshHypothesis, Size, iou_of, 
 from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 
 _LOW = 0.6
-"""Of its diameter: a lower vessel is a pan, with a stick for a handle; a higher one a mug."""
+"""Height over diameter: a lower vessel is a pan, with a stick for a handle; a higher one a mug."""
 _HANDLE_AREA = 0.03
-"""Of the body's outline: what sticks out must be so large, or it is a shadow."""
+"""Share of the body's outline: what sticks out must be so large, or it is a shadow."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Handle:
 
     shortest: float
     longest: float
-    """Of the body's diameter."""
+    """Length as a share of the body's diameter."""
     gain: float
     """In units of IoU: what sticks out far need not cover much more."""
     heights: tuple[float, ...]
@@ -33,7 +33,7 @@ class Handle:
 
 _STICK = Handle(0.3, 1.1, 0.015, (0.2, 0.35, 0.5, 0.7))
 _PLATE = Handle(0.12, 0.6, 0.03, (0.0,))
-"""Of a low vessel, and of a high one."""
+"""Handle of a low vessel, and of a high one."""
 
 
 def handle_of_body(body: MeshHypothesis) -> Handle:

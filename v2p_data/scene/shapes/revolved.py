@@ -13,9 +13,9 @@ from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 
 _RINGS, _RADII, _AROUND = 48, 44, 30
 _MAX_RADIUS = 0.8
-"""Of the fitted diameter: rings are tried up to here."""
+"""Share of the fitted diameter up to which rings are tried."""
 _BEYOND = 0.35
-"""Of the fitted height: a profile may go on that far beyond the primitive."""
+"""Share of the fitted height: a profile may go on that far beyond the primitive."""
 _RIM = 0.12
 """Of its height, what is open at the top does not close again so near to its rim: corners of outlines come out round."""
 _RING_INSIDE = 0.94

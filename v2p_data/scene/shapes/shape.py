@@ -68,7 +68,7 @@ class ShapeChoice:
     T_obj_shape: Float[np.ndarray, "4 4"]
     """From the mesh's frame to the fitted primitive's: poses become `T_world_obj @ T_obj_shape`."""
     iou: float
-    """Of the mesh's silhouette with the mask where it can be seen, averaged over the views."""
+    """Overlap of the mesh's silhouette with the mask where it can be seen, averaged over the views."""
     confidence: float
     """0 to 1."""
     reason: str

@@ -23,7 +23,7 @@ class SilhouetteView:
     mask: Bool[np.ndarray, "h w"]
     """Its visible pixels, at the camera's size."""
     T_world_obj: Float[np.ndarray, "4 4"]
-    """Of the shape that is compared with the mask: the fitted primitive, or a mesh [m]."""
+    """Pose of the shape that is compared with the mask: the fitted primitive, or a mesh [m]."""
     hidden: Bool[np.ndarray, "h w"] | None = None
     """Pixels that say nothing, because something may stand in front."""
 

@@ -18,7 +18,7 @@ _BOWL_LENGTH, _BOWL_DEPTH, _WALL = 0.3, 0.42, 0.12
 _ROD, _RISEN = 0.22, 0.7
 """Diameter in widths of the bowl, and on which part of its way it has risen."""
 _PROFILE = np.array([(0.30, 0.0), (0.65, 0.22), (0.88, 0.6), (1.0, 1.0)])
-"""Of the bowl: radius and height over its foot, in shares of its own."""
+"""Profile of the bowl: radius and height over its foot, in shares of its own."""
 _RINGS, _AROUND, _A_PART = 9, 8, 2
 
 

@@ -118,7 +118,7 @@ class Snapshot:
     geom_pos: Float[np.ndarray, "n geom 3"]
     geom_dataid: Int[np.ndarray, "n geom"]
     camera_pos: Float[np.ndarray, "n 3"]
-    """Of the camera `view`, in the world frame."""
+    """Position of the camera `view`, in the world frame."""
     camera_quat: Float[np.ndarray, "n 4"]
     camera_fovy_deg: Float[np.ndarray, "n"]
 
@@ -231,7 +231,7 @@ class BatchEnv:
         )
         self._rng = rng_for(seed, "worlds")
         self._own_rngs: dict[int, np.random.Generator] = {}
-        """Of worlds whose episode was seeded by itself."""
+        """Generators of worlds whose episode was seeded by itself."""
         self._allocate()
         self.task = task_code.load(bundle, self, task)
         self.reset(np.arange(num_envs))
@@ -691,7 +691,7 @@ _ENV_STATE = (
 _BAD_STATE_WARNINGS = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADCTRL) + 1
 )
-"""Of positions, velocities, accelerations and controls."""
+"""Warnings about positions, velocities, accelerations and controls."""
 _TARGET_LOW_M = np.array([TARGET_LOW_M]).T
 _TARGET_HIGH_M = np.array([TARGET_HIGH_M]).T
 

@@ -159,7 +159,7 @@ IN_SLOT: dict[str, slice] = {
     )
     for term in _of_object("manipulated")
 }
-"""Of these terms, the columns within a slot."""
+"""Columns of these terms within a slot."""
 SLOT_WIDTH = IN_SLOT["vel"].stop
 SIZE_COLUMNS = _joined("manipulated_size", "other_size")
 MOVED_COLUMNS = _joined("manipulated_moved", "other_moved")

@@ -51,7 +51,7 @@ class RandomizationConfig:
     object_pos_m: float = 0.10
     """Objects are shifted together by up to this much along x and y."""
     layout_distance_scale: tuple[float, float] = (0.85, 1.2)
-    """Of the distance between manipulated and reference object."""
+    """Scale of the distance between manipulated and reference object."""
     layout_angle_rad: float = 0.35
     """The direction from manipulated to reference object turns by up to this much."""
     yaw_rad: float = float(np.pi)
@@ -64,7 +64,7 @@ class RandomizationConfig:
     delay_s: tuple[float, float] = (0.010, 0.020)
     """From command to servo, constant during an episode."""
     servo_gain_scale: tuple[float, float] = (0.9, 1.1)
-    """Of stiffness and of damping, drawn one by one for all servos; the tool lags by damping / stiffness."""
+    """Scale of stiffness and of damping, drawn one by one for all servos; the tool lags by damping / stiffness."""
     camera_pos_m: float = 0.0
     """The camera is shifted by up to this much, per axis. 0 is the fixed camera that policies of earlier datasets know;
     a policy that shall stand a moved camera is recorded, and then evaluated, with more."""

@@ -36,7 +36,7 @@ class ConvexConfig:
     max_parts: int = 8
     part_vertices: int = 32
     hull_vertices: int = 40
-    """Of a mesh that is not split."""
+    """Vertices of the hull of a mesh that is not split."""
     concavity: float = 0.05
     """Parts as far from convex as this are left as they are, in CoACD's unit."""
     time_limit_s: float = 120.0

@@ -18,7 +18,7 @@ from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 
 MAX_STANDING_SIZE_M = 0.45
-"""Of objects that stay where they are: trays, boxes beside the motion."""
+"""Size of objects that stay where they are: trays, boxes beside the motion."""
 MAX_SIZE_M = 0.35
 MIN_SIZE_M = 0.015
 MIN_STATED_M = 5e-4

@@ -9,7 +9,6 @@ uniform density. The manipulated object comes first, as in the scene.
 # pyright: reportAttributeAccessIssue=false
 # mujoco's classes come from a compiled module that declares none of them.
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from xml.sax.saxutils import quoteattr
 
@@ -35,6 +34,7 @@ from v2p_data.sim.robot.robot import (
     robot_body_xml,
     robot_rest_xml,
     servo_xml,
+    xml_row,
 )
 
 MESH_SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
@@ -86,7 +86,7 @@ class ObjectModel:
     dof_adr: int
     geom_ids: tuple[int, ...]
     mesh_ids: tuple[tuple[int, ...], ...]
-    """Of meshes: per geom one for each entry of `MESH_SCALES`."""
+    """Meshes: per geom one for each entry of `MESH_SCALES`."""
     rest_quat: tuple[float, float, float, float]
     """Orientation in which it stands on the table, at zero yaw; from its first pose in the video."""
     hull: Float[np.ndarray, "h 3"]
@@ -260,14 +260,14 @@ class _Draft:
                 form = f'type="mesh" mesh="{_mesh_name(o.name, k, MESH_SCALES.index(1.0))}"'
             else:
                 size = {"box": h, "cylinder": (h[0], h[2]), "sphere": (h[0],)}[part.kind]
-                form = f'type="{part.kind}" size="{_row(size)}" pos="{_row(part.pos)}" euler="0 0 {part.yaw_rad:.9g}"'
+                form = f'type="{part.kind}" size="{xml_row(size)}" pos="{xml_row(part.pos)}" euler="0 0 {part.yaw_rad:.9g}"'
             geoms += (
                 f'<geom name="{o.name}_{k}" {form} contype="1" conaffinity="3" condim="4" '
-                f'friction="{o.friction:.6g} 0.005 0.0001" solref="{physics.solref_s} 1" rgba="{_row(o.rgba)}"/>'
+                f'friction="{o.friction:.6g} 0.005 0.0001" solref="{physics.solref_s} 1" rgba="{xml_row(o.rgba)}"/>'
             )
         return (
             f'<body name="{o.name}" pos="0.5 0 {self.size_m[2] / 2:.6g}"><freejoint name="{o.name}"/>'
-            f'<inertial mass="{o.mass_kg:.9g}" pos="{_row(tuple(self.com))}" {moments}/>{geoms}</body>'
+            f'<inertial mass="{o.mass_kg:.9g}" pos="{xml_row(tuple(self.com))}" {moments}/>{geoms}</body>'
         )
 
     def located(self, model: mujoco.MjModel) -> ObjectModel:
@@ -327,7 +327,7 @@ def _draft(obj: SceneObject, scene: Scene, opening_m: float) -> _Draft:
         hull = solids.hull
         com, inertia = solids.mass_properties(obj.mass_kg)
         asset = "".join(
-            f'<mesh name="{_mesh_name(obj.name, part, k)}" vertex="{_row((np.asarray(p.vertices) * s).ravel())}"/>'
+            f'<mesh name="{_mesh_name(obj.name, part, k)}" vertex="{xml_row((np.asarray(p.vertices) * s).ravel())}"/>'
             for part, p in enumerate(solids.parts)
             for k, s in enumerate(MESH_SCALES)
         )
@@ -435,12 +435,8 @@ def _camera_xml() -> str:
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     up = np.cross(right, forward)
-    return f'<camera name="{CAMERA}" pos="{_row(CAMERA_POS)}" xyaxes="{_row((*right, *up))}" fovy="{CAMERA_FOVY_DEG}"/>'
+    return f'<camera name="{CAMERA}" pos="{xml_row(CAMERA_POS)}" xyaxes="{xml_row((*right, *up))}" fovy="{CAMERA_FOVY_DEG}"/>'
 
 
 def _mesh_name(name: str, part_idx: int, scale_idx: int) -> str:
     return f"{name}_mesh_{part_idx}_{scale_idx}"
-
-
-def _row(values: Iterable[float | int]) -> str:
-    return " ".join(f"{v:.9g}" for v in values)

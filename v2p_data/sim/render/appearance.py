@@ -75,7 +75,7 @@ class Furnished:
     drawn: dict[str, Any]
     """What was drawn, for the episode's parameters."""
     sizes: np.ndarray
-    """Of the distractors' geoms, half extents as MuJoCo has them, `(n, 3)`."""
+    """Half extents of the distractors' geoms, as MuJoCo has them, `(n, 3)`."""
 
     def moment(self, snapshot: Snapshot, world: int) -> Snapshot:
         """Return one world of a snapshot with the distractors in it; its index is 0."""

@@ -130,13 +130,13 @@ def robot_body_xml(physics: PhysicsConfig, servo: ServoConfig) -> str:
         stiffness = f' stiffness="{servo.elbow_stiffness_nm}"' if i == 2 else ""
         collision = "2" if i >= 4 else "0"
         opening += (
-            f'<body name="link{i + 1}" pos="{_row(pos)}" euler="{np.radians(angle)} 0 0" gravcomp="1">'
-            f'<inertial mass="{mass}" pos="{_row(com)}" fullinertia="{_row(inertia)}"/>'
-            f'<joint name="joint{i + 1}" axis="0 0 1" range="{_row(limits)}" armature="0.1" damping="1"{stiffness}/>'
+            f'<body name="link{i + 1}" pos="{xml_row(pos)}" euler="{np.radians(angle)} 0 0" gravcomp="1">'
+            f'<inertial mass="{mass}" pos="{xml_row(com)}" fullinertia="{xml_row(inertia)}"/>'
+            f'<joint name="joint{i + 1}" axis="0 0 1" range="{xml_row(limits)}" armature="0.1" damping="1"{stiffness}/>'
         )
         for k, (start, end, radius) in enumerate(capsules):
             opening += (
-                f'<geom name="link{i + 1}_{k}" type="capsule" fromto="{_row(start)} {_row(end)}" size="{radius}" '
+                f'<geom name="link{i + 1}_{k}" type="capsule" fromto="{xml_row(start)} {xml_row(end)}" size="{radius}" '
                 f'contype="{collision}" conaffinity="0" rgba="0.93 0.93 0.95 1"/>'
             )
         closing += "</body>"
@@ -346,5 +346,6 @@ def _rotation_error(wanted: np.ndarray, quat: np.ndarray) -> np.ndarray:
     return 2 * np.where(error[0] < 0, -1.0, 1.0) * error[1:]
 
 
-def _row(values: Iterable[float | int]) -> str:
+def xml_row(values: Iterable[float | int]) -> str:
+    """Return numbers as the value of an XML attribute."""
     return " ".join(f"{v:.9g}" for v in values)

@@ -165,14 +165,14 @@ def _leans(obj: SceneObject, poses: np.ndarray) -> Bool[np.ndarray, "start"]:
 def _outside(scene: Scene, made: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> float:
     """Return how far the video's place, and the distance between its objects, lie outside of the starts [m]."""
     spans = [(made[scene.manipulated.name][:, k], (0.5, 0.0)[k]) for k in range(2)]
-    for other in scene.others:
-        if not KINDS[scene.kind].starts_over:
-            spans.append(
-                (
-                    _apart(made, scene.manipulated, other),
-                    float(np.median(_apart(given, scene.manipulated, other))),
-                )
-            )
+    spans.extend(
+        (
+            _apart(made, scene.manipulated, other),
+            float(np.median(_apart(given, scene.manipulated, other))),
+        )
+        for other in scene.others
+        if not KINDS[scene.kind].starts_over
+    )
     return max(
         max(float(values.min()) - video, video - float(values.max()), 0.0)
         for values, video in spans

@@ -27,7 +27,7 @@ class VlmConfig:
     temperature: float | None = 1.0
     """High enough that eight samples differ; none: not sent, for models that refuse it."""
     max_tokens: int = 6000
-    """Of one answer: a task code of 300 lines and the thoughts before it."""
+    """Length of one answer: a task code of 300 lines and the thoughts before it."""
     token_limit_name: Literal["max_tokens", "max_completion_tokens"] = "max_tokens"
     """What the server calls that limit: OpenAI's reasoning models want the second."""
     connect_timeout_s: float = 10.0
