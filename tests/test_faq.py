@@ -18,7 +18,7 @@ LISTED = {
     if line.startswith("| `")
     for name in re.findall(r"`(\w+)`", line.split("|")[1])
 }
-LEROBOTS = {"--policy.type", "--policy.path", "--policy.push_to_hub"}
+LEROBOTS = {"--policy.type", "--policy.path", "--policy.push_to_hub", "--policy.device"}
 """Options of LeRobot's commands in a group that we have as well."""
 REASON = re.compile(r"[a-z]+(_[a-z]+)*")
 

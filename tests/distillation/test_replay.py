@@ -45,8 +45,7 @@ def test_an_episode_whose_rewards_were_changed_does_not_come_back(copied):
     k = table.column_names.index("next.reward")
     rewards = table["next.reward"].to_numpy().copy()
     rewards[0] += 0.5
-    field = table.schema.field(k)
-    pq.write_table(table.set_column(k, field, pa.array(rewards, field.type)), path)
+    pq.write_table(table.set_column(k, table.schema.field(k), pa.array(rewards)), path)
 
     report = replay(copied)
 

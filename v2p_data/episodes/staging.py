@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from v2p_data.episodes.dataset.features import SIMULATED
 from v2p_data.errors import V2PError, write_refusal
 
 EPISODES_FOLDER = "episodes"
@@ -28,6 +27,8 @@ INTERVENTION = "intervention"
 """The array that only handovers have."""
 MASK_CAMERA, WRIST_CAMERA, RGB_CAMERA = "mask", "mask_wrist", "rgb"
 MASK_CAMERAS = MASK_CAMERA, WRIST_CAMERA
+KNOWN = "simulated."
+"""How the names of arrays begin that only a simulator can fill; the column's name follows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +114,8 @@ class Episode:
             "objects": list(self.objects),
             "params": self.params,
         }
-        arrays = {name: getattr(self, name) for name in ARRAYS} | dict(self.simulated)
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        arrays |= {KNOWN + column: values for column, values in self.simulated.items()}
         if self.cameras != (MASK_CAMERA,):
             about["cameras"] = list(self.cameras)
         if self.family:
@@ -138,7 +140,7 @@ class Episode:
                 about = _about(data, path)
                 names = ARRAYS if pictures else ARRAYS[1:]
                 arrays: dict[str, Any] = {k: data[k] for k in names}
-                arrays["simulated"] = {key: data[key] for key in SIMULATED if key in data}
+                arrays["simulated"] = {column: data[KNOWN + column] for column in _known(data)}
                 if INTERVENTION in data:
                     arrays[INTERVENTION] = data[INTERVENTION]
                 if not pictures:
@@ -169,8 +171,8 @@ class Heading:
     cameras: tuple[str, ...]
     is_handover: bool
     """It holds who acted."""
-    is_simulated: bool
-    """It holds what only a simulator knows."""
+    known: tuple[str, ...]
+    """Columns that only a simulator can fill."""
     digest: str
     """SHA-256 of the file."""
 
@@ -186,7 +188,7 @@ class Heading:
             with np.load(path) as data:
                 about = _about(data, path)
                 is_handover = INTERVENTION in data
-                is_simulated = all(key in data for key in SIMULATED)
+                known = _known(data)
             with zipfile.ZipFile(path) as archive, archive.open("labels.npy") as member:
                 np.lib.format.read_magic(member)
                 shape, _, _ = np.lib.format.read_array_header_1_0(member)
@@ -206,7 +208,7 @@ class Heading:
             size_px=(height, width),
             cameras=about.get("cameras", (MASK_CAMERA,)),
             is_handover=is_handover,
-            is_simulated=is_simulated,
+            known=known,
             digest=digest,
         )
 
@@ -256,6 +258,10 @@ def _about(data: Any, path: Path) -> dict[str, Any]:
     if about.pop("schema", None) != SCHEMA:
         raise V2PError(f"staged episode {path} was written by another version; remake it")
     return about | {name: tuple(about[name]) for name in ("objects", "cameras") if name in about}
+
+
+def _known(data: Any) -> tuple[str, ...]:
+    return tuple(name.removeprefix(KNOWN) for name in data if name.startswith(KNOWN))
 
 
 def _unreadable(path: Path, error: Exception) -> V2PError:

@@ -170,7 +170,9 @@ class Checks:
 def wrong_quantiles(values: np.ndarray, said: dict[str, Any]) -> list[str]:
     """Return the names of the quantiles that are not those of `values` `(row, entry)`; what is not said is not wrong."""
     slack = QUANTILE_TOLERANCE + 1 / len(values)
-    near = QUANTILE_TOLERANCE * np.ptp(values, axis=0) + STATS_TOLERANCE * np.abs(values).max(0)
+    # Of what is 0 throughout LeRobot says 1e-10 or so.
+    largest = np.maximum(np.abs(values).max(0), 1e-3)
+    near = QUANTILE_TOLERANCE * np.ptp(values, axis=0) + STATS_TOLERANCE * largest
     wrong: list[str] = []
     for name, share in QUANTILES.items():
         if name in said:

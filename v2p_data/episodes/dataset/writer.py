@@ -189,7 +189,7 @@ def _write(
     first = shards[0].episodes[0]
     headings = [heading for shard in shards for heading in shard.episodes]
     has_handovers = any(e.is_handover for e in headings)
-    is_simulated = all(e.is_simulated for e in headings)
+    is_simulated = all(SIMULATED.keys() <= set(e.known) for e in headings)
     meta: Any = LeRobotDatasetMetadata.create(
         repo_id,
         fps=FPS,
