@@ -16,6 +16,7 @@ from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.hint_masks import HintMask
 from v2p_data.scene.grounding.moved_by_change import Moved, find_moved_by_change
 from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network, rated
+from v2p_data.scene.grounding.sighted import known_by_sight
 from v2p_data.scene.grounding.outlines import disjoint_ends, without_shadow
 from v2p_data.scene.grounding.tracking import track
 from v2p_data.video.clip import Clip
@@ -82,6 +83,8 @@ def find_moved_object(
             if moved is None or segmentation is None
             else _agreed(working, segmentation, meaning, moved, by_change)
         )
+    if moved is not None and mark is None and "second opinion" in moved.cues:
+        moved = _told_by_sight(working, meaning.manipulated, moved)
     if moved is None:
         check_there_at_first(clip, meaning.manipulated, segmentation)
         raise ItemRejectedError(
@@ -148,6 +151,15 @@ def _agreed(
         opinion = max(opinion, _NO_OPINION)
     cues = {**moved.cues, "second opinion": opinion}
     return replace(moved, score=moved.score * opinion, cues=cues)
+
+
+def _told_by_sight(working: WorkingClip, phrase: str, moved: Moved) -> Moved:
+    """Return what was found with a second opinion by what things look like, where that is higher."""
+    sure = known_by_sight(working, phrase, {0: moved.first, -1: moved.last})
+    if sure is None or sure <= moved.cues["second opinion"]:
+        return moved
+    score = moved.score * sure / moved.cues["second opinion"]
+    return replace(moved, cues={**moved.cues, "second opinion": sure}, score=score)
 
 
 def sureness_of(

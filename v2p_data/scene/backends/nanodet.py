@@ -1,0 +1,173 @@
+"""NanoDet: boxes of everyday things in one picture, each with how much it looks like each of 80 classes.
+
+`nanodet_setup.py` fetches the weights. The network sees 416 x 416 px; a picture is stretched to that.
+
+Source: RangiLyu 2021, NanoDet (Apache-2.0), the variant `nanodet-g`; Li et al. 2020 (boxes as distributions), arXiv:2006.04388.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from v2p_data.errors import V2PError
+
+CLASSES = tuple(
+    "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,stop sign,parking meter,bench,bird,cat,dog,"
+    "horse,sheep,cow,elephant,bear,zebra,giraffe,backpack,umbrella,handbag,tie,suitcase,frisbee,skis,snowboard,sports ball,kite,"
+    "baseball bat,baseball glove,skateboard,surfboard,tennis racket,bottle,wine glass,cup,fork,knife,spoon,bowl,banana,apple,sandwich,"
+    "orange,broccoli,carrot,hot dog,pizza,donut,cake,chair,couch,potted plant,bed,dining table,toilet,tv,laptop,mouse,remote,keyboard,"
+    "cell phone,microwave,oven,toaster,sink,refrigerator,book,clock,vase,scissors,teddy bear,hair drier,toothbrush".split(",")
+)
+"""Of COCO, in its order."""
+SIDE_PX = 416
+_STRIDES_PX = (8, 16, 32)
+_BINS = 11
+"""A side's distance from a cell's middle is the mean of a distribution over 0 to 10 strides."""
+_MEAN, _SD = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)
+"""Of the pictures that it was trained on, blue, green, red."""
+_LEAST, _SAME, _MOST = 0.05, 0.6, 40
+"""Score below which a box is dropped, overlap (IoU) from which two boxes are one, and boxes that are kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Boxes:
+    """What may be things in one picture, those that look most like anything first."""
+
+    xyxy: Float32[np.ndarray, "n 4"]
+    """Left, top, right, bottom [px]."""
+    scores: Float32[np.ndarray, "n 80"]
+    """How much each looks like each of `CLASSES`, 0 to 1."""
+
+
+class NanoDet(nn.Module):
+    """The network. Layers have the numbers of their order in the published graph."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        sizes = [(3, 32), (32, 32), (32, 16), (16, 16), (32, 32)]
+        for width, blocks in ((64, 2), (128, 2), (256, 3)):
+            half = width // 2
+            sizes += [(width, width), *[(width, half), (half, half)] * blocks, (width, width)]
+        near = [(128, 128), (256, 128), (512, 128)]
+        self.convs = nn.ModuleList(
+            [
+                *(nn.Conv2d(a, b, 3, 2 if k in (0, 5, 11, 17) else 1, 1) for k, (a, b) in enumerate(sizes)),
+                *(nn.Conv2d(a, b, 1) for a, b in near),
+                *(nn.Conv2d(128, b, s, padding=s // 2) for _ in near for b, s in ((128, 3), (124, 1))),
+            ]
+        )  # fmt: skip
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Return scores' logits and distances per cell, for cells of 8, 16 and 32 px."""
+        x = F.max_pool2d(self._layer(0, x), 3, 2, 1)
+        x, levels = self._stage(x, 1, 1), list[Tensor]()
+        for first, blocks in ((5, 2), (11, 2), (17, 3)):
+            x = self._stage(x, first, blocks)
+            levels.append(self.convs[25 + len(levels)](x))
+        near, middle, far = levels
+        middle = middle + _resized(far, 2.0)
+        near = near + _resized(middle, 2.0)
+        middle = middle + _resized(near, 0.5)
+        far = far + _resized(middle, 0.5)
+        return [
+            self.convs[29 + 2 * k](self._layer(28 + 2 * k, level)).flatten(2).transpose(1, 2)
+            for k, level in enumerate((near, middle, far))
+        ]
+
+    def _layer(self, k: int, x: Tensor) -> Tensor:
+        return F.leaky_relu(self.convs[k](x), 0.1)
+
+    def _stage(self, x: Tensor, first: int, blocks: int) -> Tensor:
+        """Return what layers from number `first` on make of the input: blocks of two, then one, beside a way past them."""
+        past = x = self._layer(first, x)
+        for k in range(first + 1, first + 1 + 2 * blocks, 2):
+            x = self._layer(k, x)
+            x = torch.cat([self._layer(k + 1, x), x], 1)
+        return torch.cat([self._layer(first + 1 + 2 * blocks, x), past], 1)
+
+
+def _resized(x: Tensor, factor: float) -> Tensor:
+    return F.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
+
+
+class Detector:
+    """The model on the CPU.
+
+    Args:
+        weights: file that `nanodet_setup.py` wrote.
+
+    Raises:
+        V2PError: the file does not hold NanoDet's weights.
+    """
+
+    def __init__(self, weights: Path) -> None:
+        self._network = NanoDet()
+        try:
+            self._network.load_state_dict(load_file(weights))
+        except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+            raise V2PError(
+                f"{weights} does not hold NanoDet's weights ({type(error).__name__}); delete it and run 'v2p scene detectors --setup'"
+            ) from error
+        self._network.eval()
+
+    @torch.inference_mode()
+    def boxes(self, picture: UInt8[np.ndarray, "h w 3"]) -> Boxes:
+        """Return what may be things in an RGB picture."""
+        h, w = picture.shape[:2]
+        square = cv2.resize(picture, (SIDE_PX, SIDE_PX)).astype(np.float32)[..., ::-1]
+        x = torch.from_numpy(((square - _MEAN) / _SD).astype(np.float32)).permute(2, 0, 1)[None]
+        scores, corners = list[Tensor](), list[Tensor]()
+        for stride, out in zip(_STRIDES_PX, self._network(x), strict=True):
+            n = SIDE_PX // stride
+            y, x_ = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
+            middle = (torch.stack([x_, y], -1).reshape(-1, 2) + 0.5) * stride
+            scores.append(out[0, :, : len(CLASSES)].sigmoid())
+            bins = out[0, :, len(CLASSES) :].reshape(-1, 4, _BINS).softmax(-1)
+            far = (bins @ torch.arange(float(_BINS))) * stride
+            corners.append(torch.cat([middle - far[:, :2], middle + far[:, 2:]], 1))
+        score = torch.cat(scores).numpy()
+        xyxy = torch.cat(corners).numpy() * np.array([w, h, w, h], np.float32) / SIDE_PX
+        xyxy = np.clip(xyxy, 0, np.array([w, h, w, h], np.float32))
+        return _apart(xyxy, score)
+
+
+def _apart(xyxy: Float32[np.ndarray, "n 4"], scores: Float32[np.ndarray, "n 80"]) -> Boxes:
+    """Return one box for all that show the same place, with the best score that any of them has for a class."""
+    best = scores.max(1)
+    left = np.argsort(-best)
+    left = left[best[left] > _LEAST]
+    kept, seen = list[int](), list[np.ndarray]()
+    while len(left) and len(kept) < _MOST:
+        same = overlaps(xyxy[left[0]], xyxy[left]) >= _SAME
+        kept.append(int(left[0]))
+        seen.append(scores[left[same]].max(0))
+        left = left[~same]
+    return Boxes(xyxy=xyxy[kept], scores=np.reshape(seen, (len(kept), len(CLASSES))))
+
+
+def overlaps(
+    box: Float32[np.ndarray, "4"], boxes: Float32[np.ndarray, "n 4"]
+) -> Float32[np.ndarray, "n"]:
+    """Return how far a box overlaps each of others (IoU)."""
+    size = np.clip(np.minimum(box[2:], boxes[:, 2:]) - np.maximum(box[:2], boxes[:, :2]), 0, None)
+    both, areas = size.prod(1), (boxes[:, 2:] - boxes[:, :2]).prod(1)
+    return both / np.maximum(1e-6, (box[2:] - box[:2]).prod() + areas - both)
+
+
+@lru_cache(maxsize=1)
+def detector(weights: Path) -> Detector:
+    """Return the model, loaded once.
+
+    Raises:
+        V2PError: as `Detector`.
+    """
+    return Detector(weights)

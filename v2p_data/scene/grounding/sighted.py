@@ -1,0 +1,127 @@
+"""What a model that knows everyday things by sight says of a phrase (`frames/sightings.py`), where it was asked for.
+
+Its boxes hold nearly every thing, but it knows few of them by name. `looks.tsv` says what a noun's things may look like to it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from v2p_data.scene.backends.nanodet import CLASSES, overlaps
+from v2p_data.scene.frames.colour import balance, colour_match, named_colours
+from v2p_data.scene.frames.mask_ops import bounding_box, from_box, grow, inside_box
+from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.scale.nouns import noun_for
+
+LOOKS = Path(__file__).with_name("looks.tsv")
+_LESS_EACH = 0.35
+"""The first class of a row counts in full, the k-th less by one over 1 + 0.35 k."""
+_NO_NAME = 0.3
+"""What the best class counts, whatever it is, for a noun without a row."""
+_OTHER_COLOUR = 0.2
+"""Added to the share of a box that has the named colour: colours of pictures are not sure."""
+_SAME_BOX = 0.5
+"""IoU of bounding boxes from which a box is that of an outline."""
+_UNSEEN = 0.03
+"""Likeness of what no box is around, beside the likest thing's."""
+_MOST_SHARE = 0.4
+"""Of the picture, for a box to be a thing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sighted:
+    """The boxes in one picture, and how like the named thing each is."""
+
+    xyxy: Float32[np.ndarray, "n 4"]
+    """Working pixels."""
+    likeness: Float[np.ndarray, "n"]
+
+    def of(self, mask: Bool[np.ndarray, "h w"]) -> float:
+        """Return how like the named thing an outline's thing is, beside the likest in the picture: 0 to 1."""
+        if not (len(self.xyxy) and mask.any()):
+            return 0.0
+        x, y, w, h = bounding_box(mask)
+        fits = overlaps(np.array([x, y, x + w, y + h], np.float32), self.xyxy)
+        here = float((self.likeness * (fits >= _SAME_BOX)).max())
+        return (here + _UNSEEN) / (float(self.likeness.max()) + _UNSEEN)
+
+    def boxed(
+        self,
+        image: UInt8[np.ndarray, "h w 3"],
+        thing: Float32[np.ndarray, "h w"],
+        most: int,
+        least_thing: float = 0.0,
+    ) -> list[Bool[np.ndarray, "h w"]]:
+        """Return outlines in the likest boxes.
+
+        Args:
+            image: the picture.
+            thing: how likely each pixel shows a thing of the kind that is searched.
+            most: so many at most.
+            least_thing: mean of `thing` in a box, below which it is left out.
+        """
+        out = list[Bool[np.ndarray, "h w"]]()
+        for k in np.argsort(-self.likeness):
+            box = tuple(float(v) for v in self.xyxy[k])
+            inside = inside_box(box, image.shape[:2])
+            if len(out) == most or not inside.any() or inside.mean() > _MOST_SHARE:
+                continue
+            if float(thing[inside].mean()) >= least_thing:
+                out.append(from_box(image, box, thing))
+        return out
+
+
+def sighted(working: WorkingClip, i: int, phrase: str) -> Sighted | None:
+    """Return the boxes in working frame `i` with how like the phrase's thing each is; None where no such model was asked for."""
+    if working.sightings is None:
+        return None
+    seen = working.sightings.at(i)
+    looks = _looks_of(phrase)
+    likeness = (seen.scores * looks).max(1)
+    if words := named_colours(phrase):
+        match = colour_match(balance(working.rgb[i]), words)
+        insides = [inside_box(tuple(box), working.shape) for box in seen.xyxy.tolist()]
+        share = [float(match[inside].mean()) if inside.any() else 0.0 for inside in insides]
+        likeness = likeness * (_OTHER_COLOUR + np.array(share))
+    return Sighted(xyxy=seen.xyxy, likeness=likeness)
+
+
+def known_by_sight(
+    working: WorkingClip, phrase: str, masks: Mapping[int, Bool[np.ndarray, "h w"]]
+) -> float | None:
+    """Return how like the named thing the outlines in these working frames are, beside the likest things there: 0 to 1.
+
+    None where no model was asked for.
+    """
+    told = [
+        seen.of(mask)
+        for i, mask in masks.items()
+        if (seen := sighted(working, i, phrase)) is not None
+    ]
+    return float(np.prod(told)) ** (1 / len(told)) if told else None
+
+
+def _looks_of(phrase: str) -> Float[np.ndarray, "80"]:
+    """Return how much each class speaks for a phrase's noun, 0 to 1: of the longest end of the noun that has a row."""
+    words = noun_for(phrase).word.split()
+    for k in range(len(words)):
+        if " ".join(words[k:]) in _table():
+            return _table()[" ".join(words[k:])]
+    return np.full(len(CLASSES), _NO_NAME)
+
+
+@cache
+def _table() -> dict[str, Float[np.ndarray, "80"]]:
+    out: dict[str, Float[np.ndarray, "80"]] = {}
+    for line in LOOKS.read_text().splitlines()[1:]:
+        nouns, classes = line.split("\t")
+        for noun in nouns.split(","):
+            looks = out.setdefault(noun, np.zeros(len(CLASSES)))
+            for k, name in enumerate(classes.split(",")):
+                at = CLASSES.index(name)
+                looks[at] = max(looks[at], 1 / (1 + _LESS_EACH * k))
+    return out
