@@ -10,7 +10,7 @@ import tyro
 from v2p_data.cli import parse
 from v2p_data.episodes.hub.hub import fetch_model
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends import hands_setup, mobile_sam_setup
+from v2p_data.scene.backends import hands_setup, mobile_sam_setup, nanodet_setup
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import (
     UNWANTED_FILES,
@@ -74,6 +74,9 @@ def not_set_up(cfg: SceneConfig) -> dict[str, Callable[[Tell], object]]:
     if wants_outlines and mobile_sam_setup.installed_weights() is None:
         megabytes = mobile_sam_setup.DOWNLOAD_MB
         named[f"MobileSAM for outlines ({megabytes} MB)"] = mobile_sam_setup.set_up_mobile_sam
+    if cfg.things.backend in ("auto", "nanodet") and nanodet_setup.installed_weights() is None:
+        megabytes = nanodet_setup.DOWNLOAD_MB
+        named[f"NanoDet for things ({megabytes} MB)"] = nanodet_setup.set_up_nanodet
     return named
 
 

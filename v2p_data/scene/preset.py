@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from v2p_data.scene.backends import nanodet_setup
 from v2p_data.scene.backends.config import DEFAULT_MODELS, OutlineConfig
 from v2p_data.scene.backends.hands_setup import installed_worker
 from v2p_data.scene.backends.mobile_sam_setup import installed_weights, transformers_is_there
@@ -88,6 +89,9 @@ def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machi
     if cfg.outline.backend == "auto":
         found = "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none"
         cfg = replace(cfg, outline=replace(cfg.outline, backend=found))
+    if cfg.things.backend == "auto":
+        found = "nanodet" if nanodet_setup.installed_weights() else "none"
+        cfg = replace(cfg, things=replace(cfg.things, backend=found))
     if cfg.preset != "learned":
         return cfg
     machine = machine_of()

@@ -16,16 +16,93 @@ from jaxtyping import Float32, UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn.functional import interpolate, leaky_relu, max_pool2d
 
 from v2p_data.errors import V2PError
 
 CLASSES = tuple(
-    "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,stop sign,parking meter,bench,bird,cat,dog,"
-    "horse,sheep,cow,elephant,bear,zebra,giraffe,backpack,umbrella,handbag,tie,suitcase,frisbee,skis,snowboard,sports ball,kite,"
-    "baseball bat,baseball glove,skateboard,surfboard,tennis racket,bottle,wine glass,cup,fork,knife,spoon,bowl,banana,apple,sandwich,"
-    "orange,broccoli,carrot,hot dog,pizza,donut,cake,chair,couch,potted plant,bed,dining table,toilet,tv,laptop,mouse,remote,keyboard,"
-    "cell phone,microwave,oven,toaster,sink,refrigerator,book,clock,vase,scissors,teddy bear,hair drier,toothbrush".split(",")
+    [
+        "person",
+        "bicycle",
+        "car",
+        "motorcycle",
+        "airplane",
+        "bus",
+        "train",
+        "truck",
+        "boat",
+        "traffic light",
+        "fire hydrant",
+        "stop sign",
+        "parking meter",
+        "bench",
+        "bird",
+        "cat",
+        "dog",
+        "horse",
+        "sheep",
+        "cow",
+        "elephant",
+        "bear",
+        "zebra",
+        "giraffe",
+        "backpack",
+        "umbrella",
+        "handbag",
+        "tie",
+        "suitcase",
+        "frisbee",
+        "skis",
+        "snowboard",
+        "sports ball",
+        "kite",
+        "baseball bat",
+        "baseball glove",
+        "skateboard",
+        "surfboard",
+        "tennis racket",
+        "bottle",
+        "wine glass",
+        "cup",
+        "fork",
+        "knife",
+        "spoon",
+        "bowl",
+        "banana",
+        "apple",
+        "sandwich",
+        "orange",
+        "broccoli",
+        "carrot",
+        "hot dog",
+        "pizza",
+        "donut",
+        "cake",
+        "chair",
+        "couch",
+        "potted plant",
+        "bed",
+        "dining table",
+        "toilet",
+        "tv",
+        "laptop",
+        "mouse",
+        "remote",
+        "keyboard",
+        "cell phone",
+        "microwave",
+        "oven",
+        "toaster",
+        "sink",
+        "refrigerator",
+        "book",
+        "clock",
+        "vase",
+        "scissors",
+        "teddy bear",
+        "hair drier",
+        "toothbrush",
+    ]
 )
 """Of COCO, in its order."""
 SIDE_PX = 416
@@ -68,7 +145,7 @@ class NanoDet(nn.Module):
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Return scores' logits and distances per cell, for cells of 8, 16 and 32 px."""
-        x = F.max_pool2d(self._layer(0, x), 3, 2, 1)
+        x = max_pool2d(self._layer(0, x), 3, 2, 1)
         x, levels = self._stage(x, 1, 1), list[Tensor]()
         for first, blocks in ((5, 2), (11, 2), (17, 3)):
             x = self._stage(x, first, blocks)
@@ -84,7 +161,7 @@ class NanoDet(nn.Module):
         ]
 
     def _layer(self, k: int, x: Tensor) -> Tensor:
-        return F.leaky_relu(self.convs[k](x), 0.1)
+        return leaky_relu(self.convs[k](x), 0.1)
 
     def _stage(self, x: Tensor, first: int, blocks: int) -> Tensor:
         """Return what layers from number `first` on make of the input: blocks of two, then one, beside a way past them."""
@@ -96,7 +173,7 @@ class NanoDet(nn.Module):
 
 
 def _resized(x: Tensor, factor: float) -> Tensor:
-    return F.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
+    return interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
 
 
 class Detector:

@@ -32,6 +32,7 @@ from v2p_data.scene.grounding.moved_object import (
     sureness_of,
     tracked_mover,
 )
+from v2p_data.scene.grounding.sighted import unlike_all
 from v2p_data.scene.grounding.static_by_change import find_static_by_change
 from v2p_data.scene.grounding.static_objects import StaticSearch, find_static_object
 from v2p_data.scene.grounding.tracking import carried
@@ -123,8 +124,17 @@ def ground_objects(
         working=working,
         table=table,
         segmentation=segmentation,
-        warnings=warnings,
+        warnings=(*warnings, *_not_known(working, meaning)),
     )
+
+
+def _not_known(working: WorkingClip, meaning: Meaning) -> list[str]:
+    """Return a warning for each phrase to which nothing is like, where a model that knows things by sight was asked."""
+    return [
+        f"nothing in the picture looks like '{phrase}' to the model that knows things by sight: motion and place alone decide"
+        for phrase in meaning.phrases
+        if unlike_all(working, phrase)
+    ]
 
 
 def _others(

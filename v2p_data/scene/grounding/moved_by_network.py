@@ -58,7 +58,7 @@ _WHOLE = 8.0
 """Exponent of the overlap that the model expects: 0.99 for most whole objects, 0.9 for their parts."""
 _NOT_OUTLINED = 0.4
 """What a blob counts beside the model's outlines."""
-_IN_BOXES, _LEAST_MOVED = 6, 0.1
+_IN_BOXES, _LEAST_MOVED = 6, 0.2
 """Of the likest boxes, so many become blobs where the network sees motion in this share of them."""
 _BY_SIGHT = 0.5
 """Exponent of how like the named thing a blob is to a model that knows things by sight."""

@@ -16,8 +16,8 @@ from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.hint_masks import HintMask
 from v2p_data.scene.grounding.moved_by_change import Moved, find_moved_by_change
 from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network, rated
-from v2p_data.scene.grounding.sighted import known_by_sight
 from v2p_data.scene.grounding.outlines import disjoint_ends, without_shadow
+from v2p_data.scene.grounding.sighted import known_by_sight
 from v2p_data.scene.grounding.tracking import track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.scene.backends.nanodet import CLASSES, overlaps
 from v2p_data.scene.frames.colour import balance, colour_match, named_colours
-from v2p_data.scene.frames.mask_ops import bounding_box, from_box, grow, inside_box
+from v2p_data.scene.frames.mask_ops import bounding_box, from_box, inside_box
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.nouns import noun_for
 
@@ -28,6 +28,8 @@ _SAME_BOX = 0.5
 """IoU of bounding boxes from which a box is that of an outline."""
 _UNSEEN = 0.03
 """Likeness of what no box is around, beside the likest thing's."""
+_LEAST_LIKE = 0.02
+"""Of the likest thing in a picture; below it the model says nothing."""
 _MOST_SHARE = 0.4
 """Of the picture, for a box to be a thing."""
 
@@ -42,8 +44,6 @@ class Sighted:
 
     def of(self, mask: Bool[np.ndarray, "h w"]) -> float:
         """Return how like the named thing an outline's thing is, beside the likest in the picture: 0 to 1."""
-        if not (len(self.xyxy) and mask.any()):
-            return 0.0
         x, y, w, h = bounding_box(mask)
         fits = overlaps(np.array([x, y, x + w, y + h], np.float32), self.xyxy)
         here = float((self.likeness * (fits >= _SAME_BOX)).max())
@@ -76,7 +76,10 @@ class Sighted:
 
 
 def sighted(working: WorkingClip, i: int, phrase: str) -> Sighted | None:
-    """Return the boxes in working frame `i` with how like the phrase's thing each is; None where no such model was asked for."""
+    """Return the boxes in working frame `i` with how like the phrase's thing each is.
+
+    None where no such model was asked for, or nothing in the picture is like that to it.
+    """
     if working.sightings is None:
         return None
     seen = working.sightings.at(i)
@@ -87,7 +90,14 @@ def sighted(working: WorkingClip, i: int, phrase: str) -> Sighted | None:
         insides = [inside_box(tuple(box), working.shape) for box in seen.xyxy.tolist()]
         share = [float(match[inside].mean()) if inside.any() else 0.0 for inside in insides]
         likeness = likeness * (_OTHER_COLOUR + np.array(share))
+    if likeness.max(initial=0.0) < _LEAST_LIKE:
+        return None
     return Sighted(xyxy=seen.xyxy, likeness=likeness)
+
+
+def unlike_all(working: WorkingClip, phrase: str) -> bool:
+    """Return whether a model was asked and sees nothing like a phrase's thing at either end of the clip."""
+    return working.sightings is not None and not any(sighted(working, i, phrase) for i in (0, -1))
 
 
 def known_by_sight(
@@ -116,7 +126,7 @@ def _looks_of(phrase: str) -> Float[np.ndarray, "80"]:
 
 @cache
 def _table() -> dict[str, Float[np.ndarray, "80"]]:
-    out: dict[str, Float[np.ndarray, "80"]] = {}
+    out: dict[str, Float[np.ndarray, 80]] = {}
     for line in LOOKS.read_text().splitlines()[1:]:
         nouns, classes = line.split("\t")
         for noun in nouns.split(","):

@@ -266,9 +266,7 @@ def _with_boxes(
 
 
 def _by_sight(one: StaticCandidate, seen: Sighted) -> StaticCandidate:
-    return replace(
-        one, preference=one.preference + _BY_SIGHT * float(np.log(seen.of(one.mask)))
-    )
+    return replace(one, preference=one.preference + _BY_SIGHT * float(np.log(seen.of(one.mask))))
 
 
 def _with_outlines(search: StaticSearch, found: list[StaticCandidate]) -> list[StaticCandidate]:

