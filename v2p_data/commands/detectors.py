@@ -4,12 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2p_data.cli import parse
-from v2p_data.scene.backends.nanodet_setup import (
-    DISK_MB,
-    DOWNLOAD_MB,
-    installed_weights,
-    set_up_nanodet,
-)
+from v2p_data.scene.backends import nanodet_setup
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,15 +19,12 @@ def detectors_command(argv: list[str]) -> int:
     """Say whether things are known by sight here; with --setup fetch the model's weights."""
     args = parse(Detectors, argv, "scene detectors")
     if args.setup:
-        set_up_nanodet(lambda words: print(words, flush=True), args.package)  # noqa: T201
-    weights = installed_weights()
-    if weights is None:
-        print(  # noqa: T201
-            f"not set up: 'v2p scene' goes without it; next: v2p scene detectors --setup   (about {DOWNLOAD_MB} MB to download, "
-            f"{DISK_MB} MB on disk)"
-        )
-    else:
-        print(  # noqa: T201
-            f"set up in {weights} ({weights.stat().st_size / 1e6:.0f} MB); 'v2p scene' uses it, unless --scene.things.backend=none"
-        )
+        nanodet_setup.set_up_nanodet(lambda words: print(words, flush=True), args.package)  # noqa: T201
+    weights = nanodet_setup.weights_file()
+    print(  # noqa: T201
+        f"set up in {weights}; 'v2p scene' uses it, unless --scene.things.backend=none"
+        if weights.is_file()
+        else "not set up: 'v2p scene' goes without it; next: v2p scene detectors --setup   "
+        f"(about {nanodet_setup.DOWNLOAD_MB} MB to download, {nanodet_setup.DISK_MB} MB on disk)"
+    )
     return 0

@@ -74,7 +74,8 @@ def not_set_up(cfg: SceneConfig) -> dict[str, Callable[[Tell], object]]:
     if wants_outlines and mobile_sam_setup.installed_weights() is None:
         megabytes = mobile_sam_setup.DOWNLOAD_MB
         named[f"MobileSAM for outlines ({megabytes} MB)"] = mobile_sam_setup.set_up_mobile_sam
-    if cfg.things.backend in ("auto", "nanodet") and nanodet_setup.installed_weights() is None:
+    wants_things = cfg.things.backend in ("auto", "nanodet")
+    if wants_things and not nanodet_setup.weights_file().is_file():
         megabytes = nanodet_setup.DOWNLOAD_MB
         named[f"NanoDet for things ({megabytes} MB)"] = nanodet_setup.set_up_nanodet
     return named

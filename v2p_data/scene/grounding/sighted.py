@@ -88,7 +88,7 @@ def sighted(working: WorkingClip, i: int, phrase: str) -> Sighted | None:
     if words := named_colours(phrase):
         match = colour_match(balance(working.rgb[i]), words)
         insides = [inside_box(tuple(box), working.shape) for box in seen.xyxy.tolist()]
-        share = [float(match[inside].mean()) if inside.any() else 0.0 for inside in insides]
+        share = [match[inside].sum() / max(1, inside.sum()) for inside in insides]
         likeness = likeness * (_OTHER_COLOUR + np.array(share))
     if likeness.max(initial=0.0) < _LEAST_LIKE:
         return None
@@ -117,21 +117,16 @@ def known_by_sight(
 
 def _looks_of(phrase: str) -> Float[np.ndarray, "80"]:
     """Return how much each class speaks for a phrase's noun, 0 to 1: of the longest end of the noun that has a row."""
-    words = noun_for(phrase).word.split()
-    for k in range(len(words)):
-        if " ".join(words[k:]) in _table():
-            return _table()[" ".join(words[k:])]
-    return np.full(len(CLASSES), _NO_NAME)
+    words, table = noun_for(phrase).word.split(), _table()
+    ends = (" ".join(words[k:]) for k in range(len(words)))
+    return next((table[end] for end in ends if end in table), np.full(len(CLASSES), _NO_NAME))
 
 
 @cache
 def _table() -> dict[str, Float[np.ndarray, "80"]]:
-    out: dict[str, Float[np.ndarray, 80]] = {}
-    for line in LOOKS.read_text().splitlines()[1:]:
-        nouns, classes = line.split("\t")
-        for noun in nouns.split(","):
-            looks = out.setdefault(noun, np.zeros(len(CLASSES)))
-            for k, name in enumerate(classes.split(",")):
-                at = CLASSES.index(name)
-                looks[at] = max(looks[at], 1 / (1 + _LESS_EACH * k))
-    return out
+    rows = [[cell.split(",") for cell in x.split("\t")] for x in LOOKS.read_text().splitlines()]
+    return {
+        noun: np.array([1 / (1 + _LESS_EACH * looks.index(c)) if c in looks else 0.0 for c in CLASSES])
+        for nouns, looks in rows[1:]
+        for noun in nouns
+    }  # fmt: skip
