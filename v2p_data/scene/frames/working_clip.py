@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+from v2p_data.scene.backends.nanodet import Sightings
 from v2p_data.scene.frames.colour import histogram, lab_of, likelihood, skin_prior
 from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.outliner import Outliner
-from v2p_data.scene.frames.sightings import Sightings
 from v2p_data.video.clip import Clip
 
 WIDTH_PX = 320

@@ -32,7 +32,7 @@ from v2p_data.scene.grounding.moved_object import (
     sureness_of,
     tracked_mover,
 )
-from v2p_data.scene.grounding.sighted import unlike_all
+from v2p_data.scene.grounding.sighted import not_known
 from v2p_data.scene.grounding.static_by_change import find_static_by_change
 from v2p_data.scene.grounding.static_objects import StaticSearch, find_static_object
 from v2p_data.scene.grounding.tracking import carried
@@ -124,17 +124,8 @@ def ground_objects(
         working=working,
         table=table,
         segmentation=segmentation,
-        warnings=(*warnings, *_not_known(working, meaning)),
+        warnings=(*warnings, *not_known(working, meaning.phrases)),
     )
-
-
-def _not_known(working: WorkingClip, meaning: Meaning) -> list[str]:
-    """Return a warning for each phrase to which nothing is like, where a model that knows things by sight was asked."""
-    return [
-        f"nothing in the picture looks like '{phrase}' to the model that knows things by sight: motion and place alone decide"
-        for phrase in meaning.phrases
-        if unlike_all(working, phrase)
-    ]
 
 
 def _others(

@@ -237,9 +237,8 @@ def _by_sight(blob: _Blob, seen: Sighted) -> _Blob:
     Where none does, light or a pale shade are to blame for the colour.
     """
     like = seen.of(blob.mask)
-    colour = max(blob.parts["colour"], 0.4 + 0.6 * like)
-    lit = replace(blob, preference=blob.preference * like**_BY_SIGHT)
-    return lit.weighed("colour", colour)
+    lit = blob.weighed("colour", max(blob.parts["colour"], 0.4 + 0.6 * like))
+    return replace(lit, preference=blob.preference * like**_BY_SIGHT)
 
 
 def _with_outlines(

@@ -83,8 +83,6 @@ def find_moved_object(
             if moved is None or segmentation is None
             else _agreed(working, segmentation, meaning, moved, by_change)
         )
-    if moved is not None and mark is None and "second opinion" in moved.cues:
-        moved = _told_by_sight(working, meaning.manipulated, moved)
     if moved is None:
         check_there_at_first(clip, meaning.manipulated, segmentation)
         raise ItemRejectedError(
@@ -126,9 +124,7 @@ def _agreed(
     whole = moved.outlined == (0, 1)
     if by_change is None or by_change.score < _CHANGE_TELLS:
         opinion = _NO_OPINION_OF_WHOLE if whole else _NO_OPINION
-        return replace(
-            moved, cues={**moved.cues, "second opinion": opinion}, score=opinion * moved.score
-        )
+        return _with_opinion(working, meaning.manipulated, moved, opinion)
     if by_change.first.any() and by_change.last.any():
         other = rated(working, segmentation, meaning.manipulated, meaning.kind, by_change)
         if other.score > _CLEARLY_BETTER * moved.score:
@@ -149,17 +145,15 @@ def _agreed(
     )
     if whole:
         opinion = max(opinion, _NO_OPINION)
+    return _with_opinion(working, meaning.manipulated, moved, opinion)
+
+
+def _with_opinion(working: WorkingClip, phrase: str, moved: Moved, opinion: float) -> Moved:
+    """Return what was found with a second opinion, or with what a model that knows things by sight says, where that is higher."""
+    known = known_by_sight(working, phrase, {0: moved.first, -1: moved.last})
+    opinion = max(opinion, known or 0.0)
     cues = {**moved.cues, "second opinion": opinion}
     return replace(moved, score=moved.score * opinion, cues=cues)
-
-
-def _told_by_sight(working: WorkingClip, phrase: str, moved: Moved) -> Moved:
-    """Return what was found with a second opinion by what things look like, where that is higher."""
-    sure = known_by_sight(working, phrase, {0: moved.first, -1: moved.last})
-    if sure is None or sure <= moved.cues["second opinion"]:
-        return moved
-    score = moved.score * sure / moved.cues["second opinion"]
-    return replace(moved, cues={**moved.cues, "second opinion": sure}, score=score)
 
 
 def sureness_of(

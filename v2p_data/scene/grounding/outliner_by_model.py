@@ -4,9 +4,8 @@ from v2p_data.errors import V2PError
 from v2p_data.scene.backends import nanodet_setup
 from v2p_data.scene.backends.config import OutlineConfig, ThingsConfig
 from v2p_data.scene.backends.mobile_sam_setup import installed_weights
-from v2p_data.scene.backends.nanodet import detector
+from v2p_data.scene.backends.nanodet import Sightings, nanodet
 from v2p_data.scene.frames.outliner import Outliner
-from v2p_data.scene.frames.sightings import Sightings
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.video.clip import Clip
 
@@ -55,7 +54,7 @@ def sightings_of(clip: Clip, working: WorkingClip, cfg: ThingsConfig) -> Sightin
             "scene.things.backend is 'nanodet', which was not set up here; run 'v2p scene detectors --setup', or leave the option out"
         )
     return Sightings(
-        model=detector(weights),
+        network=nanodet(weights),
         frames=clip.frames,
         frame_idx=working.frame_idx,
         px_scale=working.px_scale,

@@ -3,9 +3,10 @@
 Its boxes hold nearly every thing, but it knows few of them by name. `looks.tsv` says what a noun's things may look like to it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,20 +19,14 @@ from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.nouns import noun_for
 
 LOOKS = Path(__file__).with_name("looks.tsv")
-_LESS_EACH = 0.35
-"""The first class of a row counts in full, the k-th less by one over 1 + 0.35 k."""
-_NO_NAME = 0.3
-"""What the best class counts, whatever it is, for a noun without a row."""
+_LESS_EACH, _NO_NAME = 0.35, 0.3
+"""A row's first class counts in full, the k-th less by one over 1 + 0.35 k; of a noun without a row the best class, whatever it is, as 0.3."""
 _OTHER_COLOUR = 0.2
 """Added to the share of a box that has the named colour: colours of pictures are not sure."""
-_SAME_BOX = 0.5
-"""IoU of bounding boxes from which a box is that of an outline."""
-_UNSEEN = 0.03
-"""Likeness of what no box is around, beside the likest thing's."""
-_LEAST_LIKE = 0.02
-"""Of the likest thing in a picture; below it the model says nothing."""
-_MOST_SHARE = 0.4
-"""Of the picture, for a box to be a thing."""
+_UNSEEN, _LEAST_LIKE = 0.03, 0.02
+"""Likeness of what no box is around; and of the likest thing in a picture, below which the model says nothing."""
+_SAME_BOX, _MOST_SHARE = 0.5, 0.4
+"""IoU of bounding boxes from which a box is that of an outline; share of the picture up to which a box is a thing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,15 +59,16 @@ class Sighted:
             most: so many at most.
             least_thing: mean of `thing` in a box, below which it is left out.
         """
-        out = list[Bool[np.ndarray, "h w"]]()
-        for k in np.argsort(-self.likeness):
-            box = tuple(float(v) for v in self.xyxy[k])
-            inside = inside_box(box, image.shape[:2])
-            if len(out) == most or not inside.any() or inside.mean() > _MOST_SHARE:
-                continue
-            if float(thing[inside].mean()) >= least_thing:
-                out.append(from_box(image, box, thing))
-        return out
+        boxes = [tuple(box) for box in self.xyxy[np.argsort(-self.likeness)].tolist()]
+        insides = ((box, inside_box(box, thing.shape)) for box in boxes)
+        found = (
+            from_box(image, box, thing)
+            for box, inside in insides
+            if inside.any()
+            and inside.mean() <= _MOST_SHARE
+            and thing[inside].mean() >= least_thing
+        )
+        return list(islice(found, most))
 
 
 def sighted(working: WorkingClip, i: int, phrase: str) -> Sighted | None:
@@ -83,8 +79,7 @@ def sighted(working: WorkingClip, i: int, phrase: str) -> Sighted | None:
     if working.sightings is None:
         return None
     seen = working.sightings.at(i)
-    looks = _looks_of(phrase)
-    likeness = (seen.scores * looks).max(1)
+    likeness = (seen.scores * _looks_of(phrase)).max(1)
     if words := named_colours(phrase):
         match = colour_match(balance(working.rgb[i]), words)
         insides = [inside_box(tuple(box), working.shape) for box in seen.xyxy.tolist()]
@@ -95,9 +90,13 @@ def sighted(working: WorkingClip, i: int, phrase: str) -> Sighted | None:
     return Sighted(xyxy=seen.xyxy, likeness=likeness)
 
 
-def unlike_all(working: WorkingClip, phrase: str) -> bool:
-    """Return whether a model was asked and sees nothing like a phrase's thing at either end of the clip."""
-    return working.sightings is not None and not any(sighted(working, i, phrase) for i in (0, -1))
+def not_known(working: WorkingClip, phrases: Sequence[str]) -> list[str]:
+    """Return a warning for each phrase whose thing nothing is like at either end of the clip, where a model was asked."""
+    return [
+        f"nothing in the picture looks like '{phrase}' to the model that knows things by sight: motion and place alone decide"
+        for phrase in phrases
+        if working.sightings and not any(sighted(working, i, phrase) for i in (0, -1))
+    ]
 
 
 def known_by_sight(

@@ -165,7 +165,10 @@ def find_static_object(search: StaticSearch) -> Found | None:
     if not found:
         return None
     if seen is not None:
-        found = [_by_sight(one, seen) for one in found]
+        found = [
+            replace(one, preference=one.preference + _BY_SIGHT * float(np.log(seen.of(one.mask))))
+            for one in found
+        ]
     learned = _learned()
     rating = np.array([one.rating for one in found])
     likely = softmax(rating)
@@ -254,19 +257,15 @@ def _with_boxes(
     search: StaticSearch, found: list[StaticCandidate], seen: Sighted
 ) -> list[StaticCandidate]:
     """Return the candidates and those in the boxes that a model which knows things by sight finds likest."""
-    cues, late = search.cues, search.late
-    still = search.working.rgb[-1 if late else 0]
-    out = list(found)
-    for mask in seen.boxed(still, search.static, _IN_BOXES):
-        is_free = (mask & cues.free).sum() >= (1 - _MOST_TAKEN) * mask.sum()
-        if is_free and all(iou(mask, other.mask) < _SAME for other in out):
-            one = cues.candidate(mask, is_part=False)
-            out += [] if one is None else [one]
-    return out
-
-
-def _by_sight(one: StaticCandidate, seen: Sighted) -> StaticCandidate:
-    return replace(one, preference=one.preference + _BY_SIGHT * float(np.log(seen.of(one.mask))))
+    rated = (
+        search.cues.candidate(mask, is_part=False)
+        for mask in seen.boxed(
+            search.working.rgb[-1 if search.late else 0], search.static, _IN_BOXES
+        )
+        if (mask & search.cues.free).sum() >= (1 - _MOST_TAKEN) * mask.sum()
+        and all(iou(mask, other.mask) < _SAME for other in found)
+    )
+    return [*found, *(one for one in rated if one is not None)]
 
 
 def _with_outlines(search: StaticSearch, found: list[StaticCandidate]) -> list[StaticCandidate]:
