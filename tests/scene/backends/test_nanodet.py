@@ -14,7 +14,7 @@ from safetensors.numpy import load_file, save_file
 from v2p_data.cli import run
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends import nanodet_setup
-from v2p_data.scene.backends.config import GroundConfig, ThingsConfig
+from v2p_data.scene.backends.config import ThingsConfig
 from v2p_data.scene.backends.nanodet import (
     CLASSES,
     Boxes,
@@ -24,9 +24,10 @@ from v2p_data.scene.backends.nanodet import (
     nanodet,
 )
 from v2p_data.scene.config import SceneConfig
+from v2p_data.scene.frames.working_clip import working_clip_of
+from v2p_data.scene.grounding.outliner_by_model import sightings_of
 from v2p_data.scene.grounding.sighted import LOOKS, known_by_sight, not_known
 from v2p_data.scene.preset import with_preset
-from v2p_data.scene.reconstruct import prepared_for
 from v2p_data.scene.scale.nouns import _INDEX
 from v2p_data.stages import EngineConfig, scene_stage
 from v2p_data.video.captions import find_videos
@@ -50,9 +51,8 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     member.size = len(packed)
     with tarfile.open(path, "w:gz") as archive:
         archive.addfile(member, io.BytesIO(packed))
-    begins = " ".join(["4"] * len(NanoDet().state_dict()))
-    pin = f"{hashlib.sha256(packed).hexdigest()} n.bin"
-    lock.write_text("\n".join(["human-models@3.0.4", pin, begins]))
+    begins = len(NanoDet().state_dict()) * " 4"
+    lock.write_text(f"human-models@3.0.4\n{hashlib.sha256(packed).hexdigest()} n.bin\n{begins}")
     monkeypatch.setattr(nanodet_setup, "PACKAGE", lock)
     return path
 
@@ -66,12 +66,9 @@ def put_weights(**changed: np.ndarray) -> Path:
     return weights
 
 
-def test_setup_keeps_the_layers_of_the_package_and_nothing_else(
-    package: Path, cache: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_setup_keeps_the_layers_of_the_package_and_nothing_else(package: Path, cache: Path):
     assert run(["scene", "detectors", "--setup", "--package", str(package)]) == 0
 
-    assert "set up in" in capsys.readouterr().out
     weights = nanodet_setup.weights_file()
     assert [p for p in cache.rglob("*") if p.is_file()] == [weights]
     kept = load_file(str(weights))
@@ -152,13 +149,13 @@ def test_auto_takes_nanodet_where_it_was_set_up_and_the_recipe_says_so():
     assert scene_stage(video, left_out).fingerprint == without
 
 
-def test_without_setup_auto_asks_nobody_and_nanodet_says_what_to_do(draw):
+def test_without_setup_nobody_is_asked_and_nanodet_says_what_to_do(draw):
     clip = draw(num_frames=12)
-    cfg = SceneConfig(ground=GroundConfig(backend="heuristic"))
+    working = working_clip_of(clip)
 
-    assert prepared_for(clip, cfg).working.sightings is None
+    assert sightings_of(clip, working, ThingsConfig(backend="none")) is None
     with pytest.raises(V2PError, match="run 'v2p scene detectors --setup'"):
-        prepared_for(clip, replace(cfg, things=ThingsConfig(backend="nanodet")))
+        sightings_of(clip, working, ThingsConfig(backend="nanodet"))
 
 
 def test_the_likest_thing_of_the_named_colour_is_known_and_what_nothing_is_like_is_said(
@@ -171,8 +168,8 @@ def test_the_likest_thing_of_the_named_colour_is_known_and_what_nothing_is_like_
     xyxy = np.array([[20, 20, 40, 40], [80, 20, 100, 40]], np.float32) * scale
     scores = np.zeros((2, 80), np.float32)
     scores[:, CLASSES.index("bowl")] = 0.3, 0.4
-    seen = dict.fromkeys((0, -1), Boxes(xyxy=xyxy, scores=scores))
-    sightings = Sightings(network=NanoDet(), frames=working.rgb, frame_idx=working.frame_idx, px_scale=1, _seen=seen)  # fmt: skip
+    seen = Boxes(xyxy=xyxy, scores=scores)
+    sightings = Sightings(network=NanoDet(), frames=working.rgb, frame_idx=working.frame_idx, px_scale=1.0, _seen={0: seen, -1: seen})  # fmt: skip
     working = replace(working, sightings=sightings)
     large = [cv2.resize(m.astype(np.uint8), working.shape[::-1]) > 0 for m in (red, blue, table)]
 
