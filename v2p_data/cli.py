@@ -46,6 +46,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
 """Command -> module of `v2p_data.commands` that holds it, and what it does."""
 SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "scene camera": ("camera", "what all scenes of a run say of the one camera that filmed them"),
+    "scene detectors": (
+        "detectors",
+        "whether everyday things are known by sight here, and the model's download",
+    ),
     "scene hands": ("hands", "whether hands are found by a model here, and its installation"),
     "scene models": ("models", "which learned models a preset takes here, and their download"),
     "scene outlines": (

@@ -10,7 +10,7 @@ import tyro
 from v2p_data.cli import parse
 from v2p_data.episodes.hub.hub import fetch_model
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends import hands_setup, mobile_sam_setup
+from v2p_data.scene.backends import hands_setup, mobile_sam_setup, nanodet_setup
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import (
     UNWANTED_FILES,
@@ -66,15 +66,31 @@ def not_set_up(cfg: SceneConfig) -> dict[str, Callable[[Tell], object]]:
     Args:
         cfg: settings before the preset is written out.
     """
-    named: dict[str, Callable[[Tell], object]] = {}
-    if cfg.hands.backend in ("auto", "mediapipe") and not hands_setup.installed_worker():
-        megabytes = hands_setup.DOWNLOAD_MB
-        named[f"MediaPipe for hands ({megabytes} MB)"] = hands_setup.set_up_hands
-    wants_outlines = cfg.outline.backend in ("auto", "mobile_sam") and cfg.outline.weights is None
-    if wants_outlines and mobile_sam_setup.installed_weights() is None:
-        megabytes = mobile_sam_setup.DOWNLOAD_MB
-        named[f"MobileSAM for outlines ({megabytes} MB)"] = mobile_sam_setup.set_up_mobile_sam
-    return named
+    hands, outline, things = cfg.hands.backend, cfg.outline, cfg.things.backend
+    known: tuple[tuple[str, int, bool, Callable[[Tell], object]], ...] = (
+        (
+            "MediaPipe for hands",
+            hands_setup.DOWNLOAD_MB,
+            hands in ("auto", "mediapipe") and not hands_setup.installed_worker(),
+            hands_setup.set_up_hands,
+        ),
+        (
+            "MobileSAM for outlines",
+            mobile_sam_setup.DOWNLOAD_MB,
+            outline.backend in ("auto", "mobile_sam")
+            and not (outline.weights or mobile_sam_setup.installed_weights()),
+            mobile_sam_setup.set_up_mobile_sam,
+        ),
+        (
+            "NanoDet for things",
+            nanodet_setup.DOWNLOAD_MB,
+            things in ("auto", "nanodet") and not nanodet_setup.weights_file().is_file(),
+            nanodet_setup.set_up_nanodet,
+        ),
+    )
+    return {
+        f"{name} ({size} MB)": set_up for name, size, is_missing, set_up in known if is_missing
+    }
 
 
 def fetch_learned(models: Sequence[str]) -> None:

@@ -16,6 +16,7 @@ from v2p_data.scene.frames.hand_track import contact_share
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
 from v2p_data.scene.frames.segmentation import hand_at
 from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, seen_on_table
+from v2p_data.scene.grounding.sighted import known_by_sight
 from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
 from v2p_data.scene.scale.nouns import is_clear
 
@@ -48,10 +49,12 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
         if not s.hinted and (words := named_colours(s.phrase)):
             image = grounded.working.rgb[s.at]
             match = float(colour_match(balance(image), words)[s.first].mean())
+            # Where nothing else in the picture fits the words better, the light is to blame.
+            known = known_by_sight(grounded.working, s.phrase, {s.at: s.first}) or 0.0
             add(
                 "grounding",
                 f"colour of {which}",
-                0.4 + 0.6 * match / _COLOURED,
+                0.4 + 0.6 * max(match / _COLOURED, known),
                 f"{box}, or correct its colour word",
             )
         if s.moves:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from v2p_data.scene.backends import nanodet_setup
 from v2p_data.scene.backends.config import DEFAULT_MODELS, OutlineConfig
 from v2p_data.scene.backends.hands_setup import installed_worker
 from v2p_data.scene.backends.mobile_sam_setup import installed_weights, transformers_is_there
@@ -82,12 +83,14 @@ def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machi
         cfg: settings; a stage with a backend of its own keeps it.
         machine_of: asked only where the preset is `learned`.
     """
-    if cfg.hands.backend == "auto":
-        found = "mediapipe" if installed_worker() else "none"
-        cfg = replace(cfg, hands=replace(cfg.hands, backend=found))
-    if cfg.outline.backend == "auto":
-        found = "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none"
-        cfg = replace(cfg, outline=replace(cfg.outline, backend=found))
+    found = {
+        "hands": "mediapipe" if installed_worker() else "none",
+        "outline": "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none",
+        "things": "nanodet" if nanodet_setup.weights_file().is_file() else "none",
+    }
+    for stage, backend in found.items():
+        if getattr(cfg, stage).backend == "auto":
+            cfg = replace(cfg, **{stage: replace(getattr(cfg, stage), backend=backend)})
     if cfg.preset != "learned":
         return cfg
     machine = machine_of()

@@ -182,9 +182,12 @@ def test_without_setup_auto_asks_nobody_and_mobile_sam_says_what_to_do(
 
 def test_the_list_of_models_names_what_is_not_set_up():
     assert list(not_set_up(SceneConfig())) == [
-        "MediaPipe for hands (130 MB)", "MobileSAM for outlines (38 MB)",
+        "MediaPipe for hands (130 MB)", "MobileSAM for outlines (38 MB)", "NanoDet for things (145 MB)",
     ]  # fmt: skip
 
     put_weights()
 
-    assert list(not_set_up(SceneConfig())) == ["MediaPipe for hands (130 MB)"]
+    assert list(not_set_up(SceneConfig())) == [
+        "MediaPipe for hands (130 MB)",
+        "NanoDet for things (145 MB)",
+    ]

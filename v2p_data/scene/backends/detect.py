@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.checkpoint import Checkpoint, batches, load_checkpoint
 from v2p_data.scene.backends.config import GroundConfig
+from v2p_data.scene.backends.nanodet import overlaps
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
 _MAX_TOKENS = 256
@@ -215,19 +216,12 @@ def _things(boxes: np.ndarray, strength: np.ndarray, max_overlap: float) -> list
     for i in np.argsort(-strength):
         if strength[i] <= 0:
             continue
-        near = [t for t in things if _iou(boxes[t[0]], boxes[i]) > max_overlap]
-        if near:
-            max(near, key=lambda t: _iou(boxes[t[0]], boxes[i])).append(int(i))
+        fits = overlaps(boxes[i], boxes[[t[0] for t in things]])
+        if fits.max(initial=0.0) > max_overlap:
+            things[int(fits.argmax())].append(int(i))
         else:
             things.append([int(i)])
     return things
-
-
-def _iou(a: np.ndarray, b: np.ndarray) -> float:
-    size = np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0, None)
-    both = float(size[0] * size[1])
-    areas = [float((c[2] - c[0]) * (c[3] - c[1])) for c in (a, b)]
-    return both / max(1e-9, sum(areas) - both)
 
 
 def _tuple4(values: np.ndarray) -> tuple[float, float, float, float]:

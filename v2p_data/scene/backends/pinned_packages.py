@@ -6,6 +6,8 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 from v2p_data.errors import V2PError
@@ -37,6 +39,43 @@ def find_uv() -> str | None:
 def pinned(requirements: Path) -> list[str]:
     """Return the options of `uv pip install` and `pip install` for these packages and no others."""
     return ["--quiet", "--no-deps", "--require-hashes", "-r", str(requirements)]
+
+
+def keep_one_file(file: Path, fetch: Callable[[Path, Path], None], *, thing: str) -> Path:
+    """Fetch a file, unless it is there; return it.
+
+    Args:
+        file: where it is kept.
+        fetch: told a folder that is deleted afterwards, and the file to write there.
+        thing: what is set up, for the message.
+
+    Raises:
+        V2PError: the folder cannot be written to.
+    """
+    if file.is_file():
+        return file
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=file.parent, prefix="fetch-") as place:
+            partial = Path(place, file.name)
+            fetch(Path(place), partial)
+            return partial.replace(file)
+    except OSError as error:
+        raise V2PError(
+            f"{thing} cannot be set up in {file.parent}: {error}; V2P_CACHE names another folder"
+        ) from error
+
+
+def check_sha256(found: str, pinned: str, *, thing: str, name: str) -> None:
+    """Refuse a file of a package that is not the pinned one.
+
+    Raises:
+        V2PError: the digests differ.
+    """
+    if found != pinned:
+        raise V2PError(
+            f"{thing} cannot be set up: {name} of the package has the sha256 {found[:8]}..., not {pinned[:8]}..."
+        )
 
 
 def call_installer(words: list[str], *, thing: str, needs: str) -> None:

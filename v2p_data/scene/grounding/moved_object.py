@@ -17,6 +17,7 @@ from v2p_data.scene.grounding.hint_masks import HintMask
 from v2p_data.scene.grounding.moved_by_change import Moved, find_moved_by_change
 from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network, rated
 from v2p_data.scene.grounding.outlines import disjoint_ends, without_shadow
+from v2p_data.scene.grounding.sighted import known_by_sight
 from v2p_data.scene.grounding.tracking import track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
@@ -123,9 +124,7 @@ def _agreed(
     whole = moved.outlined == (0, 1)
     if by_change is None or by_change.score < _CHANGE_TELLS:
         opinion = _NO_OPINION_OF_WHOLE if whole else _NO_OPINION
-        return replace(
-            moved, cues={**moved.cues, "second opinion": opinion}, score=opinion * moved.score
-        )
+        return _with_opinion(working, meaning.manipulated, moved, opinion)
     if by_change.first.any() and by_change.last.any():
         other = rated(working, segmentation, meaning.manipulated, meaning.kind, by_change)
         if other.score > _CLEARLY_BETTER * moved.score:
@@ -146,6 +145,13 @@ def _agreed(
     )
     if whole:
         opinion = max(opinion, _NO_OPINION)
+    return _with_opinion(working, meaning.manipulated, moved, opinion)
+
+
+def _with_opinion(working: WorkingClip, phrase: str, moved: Moved, opinion: float) -> Moved:
+    """Return what was found with a second opinion, or with what a model that knows things by sight says, where that is higher."""
+    known = known_by_sight(working, phrase, {0: moved.first, -1: moved.last})
+    opinion = max(opinion, known or 0.0)
     cues = {**moved.cues, "second opinion": opinion}
     return replace(moved, score=moved.score * opinion, cues=cues)
 
