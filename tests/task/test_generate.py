@@ -164,10 +164,13 @@ def test_the_naive_code_of_figure_11_is_refused_for_hanging_on_other_worlds(scen
     beside = "(height > 0.1) & (speed < speed.mean() + 0.1)"
     own = lift("states['box_pos'][:, 2] - states['table_height'] > states['box_size'].amax(dim=1)")
 
-    naive, mean, single = audits(scene, [lift(over_worlds), lift(beside), own])
+    high = "states['box_pos'][:, 2] - states['table_height'] > 0.12"
+    majority = f"({high}) | (({high}).float().mean() > 0.5)"
 
-    assert "depends on the others" in naive.vetoed
-    assert "depends on the others" in mean.vetoed
+    codes = [lift(over_worlds), lift(beside), lift(majority), own]
+    *over_others, single = audits(scene, codes)
+
+    assert all("depends on the others" in each.vetoed for each in over_others)
     assert "flies past" in single.vetoed
 
 

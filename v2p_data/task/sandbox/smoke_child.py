@@ -156,21 +156,28 @@ def judge(source: str, request: dict[str, Any]) -> dict[str, Any]:
 def _demand_own_success(
     task: GuardedTask, states: dict[str, torch.Tensor], answers: Answers
 ) -> None:
-    """Demand that success in one world does not depend on the others, as that of a maximum over worlds does.
+    """Demand that success in one world does not depend on the others, as that of a maximum or a majority does.
 
     Raises:
-        BadTaskError: it changes when two worlds with very large and very small numbers are added.
+        BadTaskError: it changes when two worlds with very large and very small numbers are added, or more copies than
+            there are worlds of one that succeeds, or of one that fails.
     """
     one = {k: v[:1] for k, v in states.items()}
     wide = {k: v * 9 if k.endswith(SCALED) else v for k, v in one.items()}
     wide |= {k: v + 1e4 for k, v in one.items() if "_vel_" in k}
     narrow = {k: v * 0.01 if k.endswith(SCALED) else v for k, v in one.items()}
-    beside = {k: torch.cat([v, wide[k], narrow[k]]) for k, v in states.items()}
-    success = task.succeeds(lambda: {k: v.clone() for k, v in beside.items()})
-    if not torch.equal(success[: len(answers.success)], answers.success):
-        raise BadTaskError(
-            "success in one environment depends on the others; take the maximum, minimum or mean along a dimension"
-        )
+    crowds = [{k: torch.cat([wide[k], narrow[k]]) for k in one}]
+    count = len(answers.success)
+    for value in (True, False):
+        row = (answers.success == value).nonzero()[:1, 0].repeat(count + 1)
+        crowds.append({k: v[row] for k, v in states.items()})
+    for crowd in crowds:
+        beside = {k: torch.cat([v, crowd[k]]) for k, v in states.items()}
+        success = task.succeeds(lambda beside=beside: {k: v.clone() for k, v in beside.items()})
+        if not torch.equal(success[:count], answers.success):
+            raise BadTaskError(
+                "success in one environment depends on the others; take the maximum, minimum or mean along a dimension"
+            )
 
 
 def _starts(

@@ -18,7 +18,7 @@ from v2p_data.task.cache import cache_folder
 from v2p_data.task.sandbox.smoke import smoke_run
 from v2p_data.task.task import CODE_FILE, TaskBundle
 
-VERSION = 2
+VERSION = 3
 """Raise it when the trial run asks for more."""
 FOLDER = "tried"
 
