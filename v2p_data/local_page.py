@@ -132,7 +132,7 @@ class LocalPage:
         self._thread.join()
 
     def show(self, path: str, request: Request) -> None:
-        """Answer a request for what lies at a path behind the token; the page itself is at "".
+        """Answer a request for a path below the token; the path of the page itself is "".
 
         Raises:
             LookupError: there is nothing.
