@@ -14,9 +14,9 @@ import subprocess
 import tempfile
 import threading
 import time
-import weakref
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
+from multiprocessing.util import Finalize
 from typing import Any
 
 import numpy as np
@@ -230,7 +230,8 @@ class _Child:
             },
             start_new_session=True,
         )
-        self._end = weakref.finalize(self, _end, self._process, folder, self._owner)
+        # Also at the end of a worker process, which runs no `atexit`; never in a fork of this one.
+        self._end = Finalize(self, _end, args=(self._process, folder), exitpriority=0)
 
     @property
     def is_ours(self) -> bool:
@@ -273,9 +274,7 @@ class _Child:
         return self._process.returncode
 
 
-def _end(process: subprocess.Popen[bytes], folder: str, owner: int) -> None:
-    if os.getpid() != owner:
-        return
+def _end(process: subprocess.Popen[bytes], folder: str) -> None:
     end_group(process)
     for stream in (process.stdin, process.stdout):
         with contextlib.suppress(BrokenPipeError, AttributeError):
