@@ -193,19 +193,20 @@ def _ask_child(
     num_probes, num_starts = (len(x["eef_pos"]) if x else 0 for x in (probes, starts))
     request = trial_request(sources, scene, probes, seconds_each, starts)
     deadline = time.monotonic() + timeout_s
-    while True:
-        child = _child()
-        try:
-            answer = child.ask(request, deadline)
-        except TimeoutError:
+    child = _child()
+    try:
+        answer = child.ask(request, deadline)
+        if not answer:  # it has ended since the last question
             child.end()
-            return [
-                SmokeResult(runnable=False, error=f"the trial run took more than {timeout_s:g} s")
-            ] * len(sources)
-        if answer.endswith(b"\n"):
-            break
-        if child.end() != 0 or answer:  # 0: nobody had asked for long, and it ended just now
-            break
+            child = _child()
+            answer = child.ask(request, deadline)
+    except TimeoutError:
+        child.end()
+        return [
+            SmokeResult(runnable=False, error=f"the trial run took more than {timeout_s:g} s")
+        ] * len(sources)
+    if not answer.endswith(b"\n"):
+        child.end()
     return _read(answer, child.complaint, len(sources), num_probes, num_starts)
 
 
@@ -268,10 +269,9 @@ class _Child:
             answer += chunk
         return bytes(answer)
 
-    def end(self) -> int | None:
-        """Kill it unless it has ended by itself; return how it ended."""
+    def end(self) -> None:
+        """Kill it unless it has ended by itself."""
         self._end()
-        return self._process.returncode
 
 
 def _end(process: subprocess.Popen[bytes], folder: str) -> None:
