@@ -243,7 +243,8 @@ class _ZPainter:
             if self.wrist is not None:
                 self.wrist.move(self.model, self.data, self.camera)
                 views[1].note(k, self.model, self.data, self.camera)
-        return np.concatenate([self.zbuffer.draw(each) for each in views], axis=1)
+        drawn = [self.zbuffer.draw(each) for each in views]
+        return drawn[0] if self.wrist is None else np.concatenate(drawn, axis=1)
 
 
 class _GLPainter:
