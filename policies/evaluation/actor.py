@@ -97,7 +97,7 @@ def load_actor(
     """
     from lerobot.envs.factory import make_env_pre_post_processors
 
-    config = env_config()
+    config = env_config(wrist=True)
     try:
         height, width, cameras = check_features(folder, config)
         loaded = load_policy(folder, config, device)
@@ -136,7 +136,6 @@ def check_features(folder: Path, config: Any) -> tuple[int, int, tuple[str, ...]
     from lerobot.envs.utils import env_to_policy_features
 
     given = env_to_policy_features(config)
-    given[WRIST_KEY] = given[MASK_KEY]
     policy = PreTrainedConfig.from_pretrained(folder)
     wanted = {**(policy.input_features or {}), **(policy.output_features or {})}
     for key, feature in wanted.items():

@@ -11,7 +11,16 @@ SIZE_PX = 64
 
 @pytest.fixture(scope="session")
 def policy_folder(tmp_path_factory) -> Path:
-    """Return a checkpoint of an untrained v2p_bc policy whose actions are large enough to move something."""
+    return untrained(tmp_path_factory.mktemp("policy"), "mask")
+
+
+@pytest.fixture(scope="session")
+def wrist_policy_folder(tmp_path_factory) -> Path:
+    return untrained(tmp_path_factory.mktemp("wrist"), "mask", "mask_wrist")
+
+
+def untrained(folder: Path, *cameras: str) -> Path:
+    """Save a checkpoint of an untrained v2p_bc policy whose actions are large enough to move something."""
     from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.policies.factory import make_pre_post_processors
     from lerobot.utils.import_utils import register_third_party_plugins
@@ -20,10 +29,10 @@ def policy_folder(tmp_path_factory) -> Path:
     from policies.bc.configuration_v2p_bc import V2PBCConfig
     from policies.bc.modeling_v2p_bc import V2PBCPolicy
 
-    folder = tmp_path_factory.mktemp("policy")
+    mask = PolicyFeature(FeatureType.VISUAL, (3, SIZE_PX, SIZE_PX))
     config = V2PBCConfig(
-        input_features={
-            "observation.images.mask": PolicyFeature(FeatureType.VISUAL, (3, SIZE_PX, SIZE_PX)),
+        input_features={f"observation.images.{camera}": mask for camera in cameras}
+        | {
             "observation.state": PolicyFeature(FeatureType.STATE, (11,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},

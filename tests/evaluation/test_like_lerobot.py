@@ -63,29 +63,36 @@ def recorded(policy, monkeypatch) -> list[np.ndarray]:
     return actions
 
 
-@pytest.mark.parametrize("task", ["left_folder", "benchmark_folder"])
-@pytest.mark.parametrize("at_end", [True, False])
+@pytest.mark.parametrize(
+    ("task", "at_end", "policy"),
+    [
+        ("left_folder", True, "policy_folder"),
+        ("left_folder", False, "policy_folder"),
+        ("benchmark_folder", True, "wrist_policy_folder"),
+        ("benchmark_folder", False, "wrist_policy_folder"),
+    ],
+)
 def test_the_same_seeds_give_the_same_actions_and_the_same_successes(
-    task, at_end, policy_folder, request, monkeypatch
+    task, at_end, policy, request, monkeypatch
 ):
     from policies.evaluation import rollout
     from policies.evaluation.actor import load_actor
 
-    folder = request.getfixturevalue(task)
+    folder, policy_folder = request.getfixturevalue(task), request.getfixturevalue(policy)
     bundle = TaskBundle.load(folder)
     actor = load_actor(policy_folder, greys=PALETTE, task=bundle.description)
     ours = recorded(actor.loaded.policy, monkeypatch)
 
     judged = judge(
         bundle,
-        VisionActor(actor),
+        VisionActor(actor, wrist=policy == "wrist_policy_folder"),
         episodes=EPISODES,
         first_seed=FIRST_SEED,
         cfg=EvaluationConfig(worlds=EPISODES, at_end=at_end),
         size_px=actor.size_px,
     )
 
-    config = rollout.env_config(folder, size_px=64)
+    config = rollout.env_config(folder, size_px=64, wrist=policy == "wrist_policy_folder")
     loaded = rollout.load_policy(policy_folder, config)
     theirs = recorded(loaded.policy, monkeypatch)
     envs = config.create_envs(n_envs=EPISODES)

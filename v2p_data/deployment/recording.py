@@ -15,8 +15,9 @@ from v2p_data.deployment.robot import Reading
 from v2p_data.deployment.sight import Seen
 from v2p_data.episodes.dataset import stream
 from v2p_data.episodes.dataset.writer import Packed, pack
-from v2p_data.episodes.staging import MASK_CAMERA, RGB_CAMERA, Episode, refusals_told
+from v2p_data.episodes.staging import RGB_CAMERA, Episode, refusals_told
 from v2p_data.errors import V2PError
+from v2p_data.sim.render.masks import MASK_CAMERA
 
 FEWEST_FRAMES = 2
 STAGED = "staged"

@@ -24,7 +24,6 @@ from v2p_data.episodes.pictures import Artist, Render
 from v2p_data.episodes.rollouts import CutConfig, Referee, Rollouts, roll_out
 from v2p_data.episodes.staging import (
     EPISODES_FOLDER,
-    MASK_CAMERAS,
     RGB_CAMERA,
     Episode,
     refusals_told,
@@ -40,6 +39,7 @@ from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.env.randomize import RandomizationConfig
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig
+from v2p_data.sim.render.masks import MASK_CAMERAS
 from v2p_data.task.task import Task, TaskBundle
 
 logger = logging.getLogger(__name__)

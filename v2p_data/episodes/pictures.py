@@ -10,12 +10,12 @@ import numpy as np
 from v2p_data.episodes.dataset import stream
 from v2p_data.episodes.mask_noise import MaskNoiseConfig, apply_faults, as_json, draw_faults
 from v2p_data.episodes.rollouts import Rollouts
-from v2p_data.episodes.staging import WRIST_CAMERA, Episode
+from v2p_data.episodes.staging import Episode
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import Snapshot
 from v2p_data.sim.model.world import World
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig, furnish
-from v2p_data.sim.render.masks import BACKGROUND, MaskRenderer
+from v2p_data.sim.render.masks import BACKGROUND, WRIST_CAMERA, MaskRenderer
 from v2p_data.task.task import TaskBundle
 
 Render = Literal["masks", "rgb", "both"]

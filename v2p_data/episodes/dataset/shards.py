@@ -22,10 +22,11 @@ import numpy as np
 
 from v2p_data.episodes.dataset import stream
 from v2p_data.episodes.dataset.episode_stats import Stats, mask_stats, rgb_stats
-from v2p_data.episodes.staging import MASK_CAMERAS, Episode, Heading
+from v2p_data.episodes.staging import Episode, Heading
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.sim.render.masks import MASK_CAMERAS
 
 SHARD_FRAMES = 4096
 """A shard is full once it has so many: 2 MB of masks, lost at most when a packing is killed."""

@@ -52,15 +52,13 @@ from v2p_data.episodes.dataset.shards import (
 )
 from v2p_data.episodes.dataset.stream import MASK_CRF, RGB_CRF, encoder_config
 from v2p_data.episodes.staging import (
-    MASK_CAMERAS,
-    WRIST_CAMERA,
     Episode,
     Heading,
     refusals_told,
 )
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
-from v2p_data.sim.render.masks import PALETTE, label_names
+from v2p_data.sim.render.masks import MASK_CAMERAS, PALETTE, WRIST_CAMERA, label_names
 
 logger = logging.getLogger(__name__)
 

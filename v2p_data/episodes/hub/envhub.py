@@ -248,7 +248,7 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
         sys.path.insert(0, str(folder))
     from v2p_data.sim.wrappers.lerobot_env import V2PEnvConfig
 
-    named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg", "horizon_scale")
+    named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg", "horizon_scale", "wrist")
     given = {name: getattr(cfg, name) for name in named if hasattr(cfg, name)}
     return V2PEnvConfig(tasks=str(folder / TASKS), **given).create_envs(n_envs, use_async_envs)
 

@@ -26,6 +26,9 @@ from v2p_data.sim.robot.arms import Robot, robot_from_json
 from v2p_data.sim.robot.robot import FINE
 from v2p_data.task.task import TaskBundle
 
+MASK_CAMERA, WRIST_CAMERA = "mask", "mask_wrist"
+MASK_CAMERAS = MASK_CAMERA, WRIST_CAMERA
+"""In the order in which their label images lie below each other."""
 PALETTE = (0, 64, 128, 192, 255, 31, 95, 158, 222)
 """Grey level of each label."""
 BACKGROUND, ROBOT, FIRST_OBJECT = 0, 1, 2

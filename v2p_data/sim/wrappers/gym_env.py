@@ -2,7 +2,7 @@
 
 | | |
 |---|---|
-| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `agent_pos`: 11 float32, see `BatchEnv.robot_state` |
+| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `pixels/mask_wrist`: the same, if asked for; `agent_pos`: 11 float32, see `BatchEnv.robot_state` |
 | Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz |
 | Reward | the task's training reward |
 | Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
@@ -28,7 +28,7 @@ from v2p_data.sim.env import randomize
 from v2p_data.sim.env.batch_env import ACT_DIM, BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.model.world import World
-from v2p_data.sim.render.masks import MaskRenderer, labels_to_rgb
+from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS, MaskRenderer, labels_to_rgb
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
 
 ENV_ID = "v2p/Task-v0"
@@ -67,6 +67,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         camera_pos_m, camera_angle_rad, camera_fovy_deg: how far the camera is moved at each reset, as in
             `RandomizationConfig`; a policy is evaluated under what its dataset was recorded under.
         horizon_scale: an episode lasts at most this multiple of the task's own horizon.
+        wrist: whether masks of the camera that the hand carries are seen too.
 
     Raises:
         V2PError: the folder holds no task, or there is no such render mode.
@@ -85,6 +86,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         camera_angle_rad: float = 0.0,
         camera_fovy_deg: float = 0.0,
         horizon_scale: float = POLICY_HORIZON_SCALE,
+        wrist: bool = False,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise V2PError(f"render_mode is 'rgb_array' or None, got {render_mode!r}")
@@ -104,12 +106,12 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         with told_of(bundle.folder):
             self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
         self._referee = RefereeRecord(self._world)
-        self._masks = MaskRenderer(self._world.world, size_px)
+        self._masks = MaskRenderer(self._world.world, size_px, wrist=wrist)
+        self._cameras = MASK_CAMERAS[: 1 + wrist]
+        mask = spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)
         self.observation_space = spaces.Dict(
             {
-                "pixels": spaces.Dict(
-                    {"mask": spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)}
-                ),
+                "pixels": spaces.Dict(dict.fromkeys(self._cameras, mask)),
                 "agent_pos": spaces.Box(
                     np.array(STATE_LOW, np.float32), np.array(STATE_HIGH, np.float32)
                 ),
@@ -157,7 +159,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         try:
             return self._masks.draw_rgb(snapshot, 0)
         except V2PError:  # no OpenGL
-            return labels_to_rgb(self._masks.draw(snapshot, 0))
+            return self._pictures()[MASK_CAMERA]
 
     @property
     def world(self) -> World:
@@ -185,9 +187,12 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         self._masks.close()
 
     def _observe(self) -> dict[str, Any]:
-        labels = self._masks.draw(self._world.snapshot(np.array([0])), 0)
         state = np.clip(self._world.robot_state()[0], STATE_LOW, STATE_HIGH).astype(np.float32)
-        return {"pixels": {"mask": labels_to_rgb(labels)}, "agent_pos": state}
+        return {"pixels": self._pictures(), "agent_pos": state}
+
+    def _pictures(self) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+        drawn = labels_to_rgb(self._masks.draw(self.moment(), 0))
+        return dict(zip(self._cameras, np.split(drawn, len(self._cameras)), strict=True))
 
 
 def _next_seed(rng: np.random.Generator) -> int:

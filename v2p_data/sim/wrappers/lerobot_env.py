@@ -17,6 +17,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from v2p_data.errors import V2PError
+from v2p_data.sim.render.masks import MASK_CAMERAS
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_LOW, V2PEnv
 from v2p_data.task.sandbox.trial import demand_trial
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TASK_FILE, TaskBundle, told_of
@@ -62,21 +63,25 @@ class V2PEnvConfig(EnvConfig):
     camera_fovy_deg: float = 0.0
     horizon_scale: float = POLICY_HORIZON_SCALE
     """An episode lasts at most this multiple of the task's own horizon."""
+    wrist: bool = False
+    """Masks of the camera that the hand carries too, for policies trained on datasets of `--episodes.wrist`."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {
             ACTION: ACTION,
             "agent_pos": OBS_STATE,
-            "pixels/mask": f"{OBS_IMAGES}.mask",
         }
     )
 
     def __post_init__(self) -> None:
+        mask = PolicyFeature(FeatureType.VISUAL, (self.size_px, self.size_px, 3))
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (7,)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(STATE_LOW),)),
-            "pixels/mask": PolicyFeature(FeatureType.VISUAL, (self.size_px, self.size_px, 3)),
         }
+        for camera in MASK_CAMERAS[: 1 + self.wrist]:
+            self.features[f"pixels/{camera}"] = mask
+            self.features_map[f"pixels/{camera}"] = f"{OBS_IMAGES}.{camera}"
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -86,6 +91,7 @@ class V2PEnvConfig(EnvConfig):
             "camera_angle_rad": self.camera_angle_rad,
             "camera_fovy_deg": self.camera_fovy_deg,
             "horizon_scale": self.horizon_scale,
+            "wrist": self.wrist,
         }
 
     def create_envs(
