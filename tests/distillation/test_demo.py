@@ -74,6 +74,9 @@ def test_the_demo_ends_with_a_policy_judged_on_seen_and_unseen_tasks(
     )
     assert [row["trials"] for row in counts["evaluation"]["rows"]] == [2, 2]
     assert SEEN in (out / "report.html").read_text()
+    card = next(out.glob("policy/*/policy/README.md")).read_text()
+    assert f"| {SEEN} | yes |" in card
+    assert f"| {UNSEEN} | no |" in card
 
     before = finished(out)
     assert run(["demo", "--out", str(out), "--workers", "1"]) == 0

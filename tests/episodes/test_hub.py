@@ -12,6 +12,7 @@ from hub_server import CUT, LOST, TOKEN, Hub, Repo
 
 from v2p_data.cli import run
 from v2p_data.episodes.hub.hub import Pushed, push_dataset, push_envhub, push_policy
+from v2p_data.episodes.hub.policy_card import note_results, write_policy_card
 from v2p_data.errors import V2PError
 
 INFO = {
@@ -387,3 +388,23 @@ def test_a_policys_card_names_its_type_and_dataset(
     card = (tmp_path / "README.md").read_text()
     assert "datasets:\n- user/toys\n" in card
     assert "`v2p_bc`, trained on `user/toys`" in card
+
+
+def test_an_evaluation_is_noted_in_a_policys_card_and_nothing_else_of_it_changes(tmp_path: Path):
+    row = {"task": "lift", "seen": False, "rate": 0.5, "low": 0.25, "high": 0.75, "trials": 8}
+    (tmp_path / "config.json").write_text('{"type": "act", "input_features": {"x": {"shape": [3, 4]}}}')  # fmt: skip
+    write_policy_card(tmp_path)
+    card = tmp_path / "README.md"
+    card.write_text(card.read_text() + "\nA sentence of its owner.\n")
+
+    note_results(tmp_path, [row])
+    note_results(tmp_path, [row | {"at_end": {"rate": 0.25}}])
+
+    text = card.read_text()
+    assert "| lift | no | 50% (25% to 75%) | 25% | 8 |\n<!-- results: end -->" in text
+    assert text.count("| lift |") == 1
+    assert "| `x` | 3 x 4 |" in text
+    assert text.endswith("A sentence of its owner.\n")
+    card.write_text("A card by hand.")
+    note_results(tmp_path, [row])
+    assert card.read_text() == "A card by hand."

@@ -23,6 +23,7 @@ from v2p_data.commands.display import (
 )
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
+from v2p_data.episodes.hub.policy_card import note_results
 from v2p_data.errors import NotAllError, V2PError
 from v2p_data.evaluation.judging import PROGRAMS, Contestant, contestant, task_folders
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
@@ -347,7 +348,10 @@ def evaluate(
     stage = evaluation_stage(who, tasks, cfg, seen=list(seen))
     outcome = _run([stage], _all_threads(runtime))[(stage.name, stage.folder_name)]
     _demand(outcome)
-    return outcome, _record(outcome.folder).counts["rows"]
+    rows = _record(outcome.folder).counts["rows"]
+    if who.kind == "policy" and not who.repo_id and os.access(who.folder, os.W_OK):
+        note_results(who.folder, rows)
+    return outcome, rows
 
 
 def _contestant(policy: Path) -> Contestant:

@@ -172,6 +172,7 @@ def make_policy(
     from policies.bc.trainer import TrainerConfig, write_train_config
     from v2p_data.deployment.facts import write_facts
     from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
+    from v2p_data.episodes.hub.policy_card import write_policy_card
 
     demand_whole_sources(dataset, sources, runtime.root)
     policy: PolicyConfig = cfg.config.resolved
@@ -207,6 +208,7 @@ def make_policy(
     place = dataset.relative_to(runtime.root.resolve()) if is_own else Path(dataset.name)
     write_train_config(out / POLICY_FOLDER, student.policy, place, repo_id, recipe, seed)
     write_facts(out / POLICY_FOLDER, dataset)
+    write_policy_card(out / POLICY_FOLDER)
     return {
         "steps": steps,
         "samples": steps * policy.batch_size,

@@ -33,10 +33,11 @@ from huggingface_hub.errors import (
 )
 
 from v2p_data.episodes.dataset.about import CARRIED_TASKS
-from v2p_data.episodes.dataset.card import CARD_FILE, LICENSE, write_card, write_text
+from v2p_data.episodes.dataset.card import CARD_FILE, write_card
 from v2p_data.episodes.dataset.features import METADATA_FILE
 from v2p_data.episodes.dataset.intake import demand_bounded
 from v2p_data.episodes.dataset.repo_id import check_repo_id
+from v2p_data.episodes.hub.policy_card import write_policy_card
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
@@ -169,7 +170,7 @@ def push_policy(
             "'pretrained_model' of a checkpoint"
         )
     if not (folder / CARD_FILE).is_file():
-        write_text(folder / CARD_FILE, _policy_card(folder, repo_id))
+        write_policy_card(folder)
     return _push(
         _Upload(
             folder=folder,
@@ -432,29 +433,3 @@ def _remove_places(root: Path) -> None:
         data = json_or_none(path, max_bytes=None)
         if data is not None and (shareable := without_places(data)) != data:
             write_json_atomically(path, shareable)
-
-
-def _policy_card(folder: Path, repo_id: str) -> str:
-    config = json_or_none(folder / "config.json")
-    if not isinstance(config, dict):
-        raise V2PError(
-            f"{folder / 'config.json'} is damaged: it is no JSON object; nothing was pushed"
-        )
-    kind = str(config.get("type", "unknown"))
-    trained = json_or_none(folder / "train_config.json")
-    source = trained.get("dataset") if isinstance(trained, dict) else None
-    dataset = str(source.get("repo_id", "")) if isinstance(source, dict) else ""
-    fetched = (
-        f"hf download {dataset} --repo-type dataset --include 'v2p/tasks/*' --local-dir dataset\n"
-        if dataset
-        else ""
-    )
-    tasks = "dataset/v2p/tasks" if dataset else "TASKS"
-    trained_on = f"datasets:\n- {dataset}\n" if dataset else ""
-    words = f"Policy of type `{kind}`" + (f", trained on `{dataset}`." if dataset else ".")
-    return (
-        f"---\nlibrary_name: lerobot\npipeline_tag: robotics\nlicense: {LICENSE}\n{trained_on}"
-        f"tags:\n- lerobot\n- robotics\n- {kind}\n- video2policy\n---\n\n# {repo_id}\n\n{words}\n\n"
-        "It acts on segmentation masks and the robot's state. Evaluate it, in the tasks of its dataset or in others, with\n\n"
-        f"```\n{fetched}v2p eval {repo_id} --tasks {tasks}\n```\n"
-    )

@@ -1,0 +1,125 @@
+"""The card of a policy: written with its folder, told each evaluation, and pushed as it is."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from v2p_data.episodes.dataset.card import CARD_FILE, LICENSE, write_text
+from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
+
+BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
+NOT_JUDGED = "Not evaluated yet: `v2p eval` writes its rates here."
+CARD = """\
+---
+library_name: lerobot
+pipeline_tag: robotics
+license: {license}
+{head}tags:
+- lerobot
+- robotics
+- {kind}
+- video2policy
+---
+
+# {title}
+
+{words} It acts on segmentation masks and the robot's state. License: {license}.
+
+## Results
+
+{begin}
+{not_judged}
+{end}
+
+## Load, evaluate
+
+POLICY is this folder, or the name of this repository on the Hub. The package `lerobot_policy_v2p` knows policies of type `v2p_bc` and the
+simulated tasks.
+
+```bash
+{fetch}v2p eval POLICY --tasks {tasks}
+lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks={tasks}{wrist}
+```
+
+## What it sees and does
+
+| feature | shape |
+|---|---|
+{features}
+
+## Limits
+
+It was trained in simulation; sizes, masses and frictions of the objects are estimates from one video each.
+"""
+
+
+def write_policy_card(folder: Path) -> None:
+    """Write `README.md` into the folder of a LeRobot policy.
+
+    Raises:
+        V2PError: its settings cannot be read, or the card cannot be written.
+    """
+    config = json_or_none(folder / "config.json")
+    if not isinstance(config, dict):
+        raise V2PError(f"{folder / 'config.json'} is damaged: it is no JSON object")
+    trained = json_or_none(folder / "train_config.json")
+    recipe: dict[str, Any] = trained if isinstance(trained, dict) else {}
+    source = recipe.get("dataset")
+    dataset = str(source.get("repo_id", "")) if isinstance(source, dict) else ""
+    kind = str(config.get("type", "unknown"))
+    words = f"Policy of type `{kind}`" + (f", trained on `{dataset}`" if dataset else "")
+    if "steps" in recipe and "batch_size" in recipe:
+        words += f" for {recipe['steps']} steps of {recipe['batch_size']} frames"
+    features = _features(config)
+    text = CARD.format(
+        license=LICENSE,
+        head=f"datasets:\n- {dataset}\n" if dataset else "",
+        kind=kind,
+        title=f"Policy of {dataset}" if dataset else f"Policy of type {kind}",
+        words=f"{words}.",
+        begin=BEGIN,
+        not_judged=NOT_JUDGED,
+        end=END,
+        fetch=f"hf download {dataset} --repo-type dataset --include 'v2p/tasks/*' --local-dir dataset\n"
+        if dataset
+        else "",
+        tasks="dataset/v2p/tasks" if dataset else "TASKS",
+        wrist=" --env.wrist=true" if any("mask_wrist" in name for name in features) else "",
+        features="\n".join(f"| `{name}` | {shape} |" for name, shape in features.items()),
+    )
+    write_text(folder / CARD_FILE, text)
+
+
+def note_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Put an evaluation's rates into a policy's card; a card without a place for them stays as it is.
+
+    Args:
+        folder: of the policy.
+        rows: one a task, as in `evaluation.json`.
+    """
+    path = folder / CARD_FILE
+    card = path.read_text(errors="replace") if path.is_file() else ""
+    before, begin, rest = card.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        return
+    lines = ["| task | in training | success, 95 % interval | at the end | episodes |", "|---|---|---|---|---|"]  # fmt: skip
+    for row in rows:
+        at_end = f"{row['at_end']['rate']:.0%}" if row.get("at_end") else ""
+        lines.append(
+            f"| {row['task']} | {'yes' if row['seen'] else 'no'} | {row['rate']:.0%} ({row['low']:.0%} to {row['high']:.0%}) |"
+            f" {at_end} | {row['trials']} |"
+        )
+    write_text(path, f"{before}{begin}\n" + "\n".join(lines) + f"\n{end}{after}")
+
+
+def _features(config: Mapping[str, Any]) -> dict[str, str]:
+    parts = [config.get(name) for name in ("input_features", "output_features")]
+    return {
+        str(name): " x ".join(map(str, feature.get("shape") or ()))
+        for part in parts
+        if isinstance(part, dict)
+        for name, feature in part.items()
+        if isinstance(feature, dict)
+    }
