@@ -268,17 +268,25 @@ def test_training_resuming_and_evaluating_with_lerobots_own_tools(
     assert (tmp_path / "eval" / "videos" / "v2p_0" / "eval_episode_0.mp4").stat().st_size > 1000
 
 
-def test_lerobots_act_trains_on_the_same_dataset(run_tool, dataset, tmp_path):
-    small = ["dim_model=32", "dim_feedforward=32", "n_heads=2", "chunk_size=2", "n_action_steps=2"]
+RECIPES = [
+    line.split()[1:]
+    for line in (Path(__file__).parents[1] / "docs/policies.md").read_text().splitlines()
+    if line.startswith("lerobot-train ")
+]
+
+
+@pytest.mark.parametrize("recipe", RECIPES, ids=lambda r: next(w for w in r if ".type=" in w)[14:])
+def test_each_recipe_of_the_docs_trains_three_steps(recipe, run_tool, dataset, tmp_path):
+    if "--policy.type=diffusion" in recipe:
+        pytest.importorskip("diffusers", reason="LeRobot's extra for diffusion policies")
+    ours = ("--dataset.r", "--policy.push", "--batch_size", "--steps")
 
     checkpoint = trained(
         run_tool,
         dataset,
         tmp_path / "run",
-        "--policy.type=act",
-        "--policy.pretrained_backbone_weights=null",
-        *[f"--policy.{setting}" for setting in small],
-        "--steps=2",
+        *[word for word in recipe if not word.startswith(ours)],
+        "--steps=3",
     )
 
     assert (checkpoint / "model.safetensors").is_file()
