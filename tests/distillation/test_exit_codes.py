@@ -10,9 +10,10 @@ from toy_run import ENGINE, agree, bundle, made, make_expert, make_task, record_
 
 from v2p_data.cli import run
 from v2p_data.commands import run as commands
+from v2p_data.commands.display import cost_line
 from v2p_data.episodes import rollouts
 from v2p_data.errors import ItemRejectedError
-from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage, Status
 from v2p_data.stages import EngineConfig, episodes_stage
 from v2p_data.video.captions import VideoItem
 
@@ -137,3 +138,23 @@ def test_a_failed_scene_beside_whole_ones_leaves_3_and_alone_2(
     for name in CLIPS:
         (place / "videos" / f"{name}.mp4").unlink()
     assert run(["scene", str(place / "videos"), "--out", str(place / "run")]) == 2
+
+
+def test_a_run_says_what_a_usable_task_cost(tmp_path: Path):
+    def outcome(stage: str, item: str, seconds: float, status: Status = "made") -> Outcome:
+        return Outcome(stage=stage, item=item, status=status, folder=tmp_path, seconds=seconds)
+
+    said = cost_line(
+        [
+            outcome("scene", "cup", 60.0),
+            outcome("episodes", "cup", 120.0, "kept"),
+            outcome("scene", "blurred", 120.0, "rejected"),
+        ]
+    )
+
+    assert (
+        said == "5.0 minutes of worker time for 1 usable tasks, 5.0 each: scene 60%, episodes 40%"
+    )
+    assert cost_line([outcome("scene", "blurred", 60.0, "rejected")]).endswith(
+        "for 0 usable tasks: scene 100%"
+    )

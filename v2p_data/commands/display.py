@@ -139,6 +139,18 @@ def outcome_table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
+def cost_line(outcomes: Sequence[Outcome]) -> str:
+    """Return what a task with episodes cost: the workers' time, that of rejected items and of earlier runs included."""
+    usable = sum(o.stage == "episodes" and o.is_usable for o in outcomes)
+    by_stage = Counter[str]()
+    for outcome in outcomes:
+        by_stage[outcome.stage] += outcome.seconds
+    total = max(by_stage.total(), 1e-9)
+    shares = ", ".join(f"{stage} {s / total:.0%}" for stage, s in by_stage.most_common())
+    each = f", {total / 60 / usable:.1f} each" if usable else ""
+    return f"{total / 60:.1f} minutes of worker time for {usable} usable tasks{each}: {shares}"
+
+
 def outcomes_json(
     outcomes: Mapping[Any, Outcome], stages: Sequence[Stage]
 ) -> list[dict[str, Any]]:

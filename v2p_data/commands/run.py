@@ -14,6 +14,7 @@ import tyro
 from v2p_data.cli import parse
 from v2p_data.commands.display import (
     Display,
+    cost_line,
     describe,
     exit_code,
     outcome_table,
@@ -293,6 +294,7 @@ def generate(
     good = [c for c in good if _record(c.folder(root)).counts.get("episodes", 0)]
     _tell_cousins(outcomes.values())
     print(outcome_table(list(outcomes.values())), file=sys.stderr)  # noqa: T201
+    print(cost_line(list(outcomes.values())), file=sys.stderr)  # noqa: T201
     if good and stored_outcome(dataset_stage(good, repo_id), root) is None:
         usable = {key for key, outcome in outcomes.items() if outcome.is_usable}
         good = [c for c in good if all((s.name, s.folder_name) in usable for s in in_order([c]))]
