@@ -3,7 +3,8 @@
 import os
 import shutil
 import signal
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.runner import Stage
@@ -13,6 +14,24 @@ from v2p_data.pipeline.runner import Stage
 class Recipe:
     text: str = "a"
     trouble: str = ""
+    seconds: float = 0.0
+    """How long it takes."""
+
+
+BEGUN = "begun"
+"""File of a run with a line for every time that a stage was begun."""
+
+
+def make_noted(config, inputs, out, runtime):
+    with (runtime.root / BEGUN).open("a") as file:
+        file.write(f"{out.name.removesuffix('.partial')} {os.getppid()}\n")
+    time.sleep(config.seconds)
+    return make_text(config, inputs, out, runtime)
+
+
+def make_at_once(config, inputs, out, runtime):
+    """Make what `make_noted` makes: the recipe does not say how it is made."""
+    return make_noted(replace(config, seconds=0.0), inputs, out, runtime)
 
 
 def make_text(config, inputs, out, runtime):
