@@ -10,7 +10,6 @@ import sys
 import textwrap
 import time
 from collections import Counter
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,40 +22,18 @@ from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.pipeline.workers import only_run_in, run_stages
 
 sys.path.insert(0, str(Path(__file__).parent))
+from raylets import NODE, running_cluster
 from sample_stages import BEGUN, Recipe, chain, make_at_once, make_noted
 
 ROOT = Path(__file__).parents[2]
-PORTS = ("metrics_agent_port", "metrics_export_port", "runtime_env_agent_port", "dashboard_agent_listen_port")  # fmt: skip
 TIMES = ("seconds", "provenance")
 """Of a record: when and where, not what."""
 
 
-def free_ports() -> dict[str, int]:
-    """Named beforehand, they let a raylet start without its helpers, which take seconds."""
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in PORTS]
-        for one in sockets:
-            one.bind(("", 0))
-        return {name: one.getsockname()[1] for name, one in zip(PORTS, sockets, strict=True)}
-
-
-def settings() -> dict:
-    return {"num_cpus": 1, "object_store_memory": 80_000_000, "include_log_monitor": False, **free_ports()}  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def cluster():
-    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_register_timeout_seconds": "300"}
-    from ray.cluster_utils import Cluster
-
-    head = settings() | {"include_dashboard": False, "no_monitor": True}
-    cluster = Cluster(initialize_head=True, head_node_args=head)
-    try:
-        for _ in range(2):
-            cluster.add_node(**settings())
+    with running_cluster(3) as cluster:
         yield cluster
-    finally:
-        cluster.shutdown()
 
 
 def noted(item: str, seconds: float = 0.0, trouble: str = "") -> Stage:
@@ -147,7 +124,10 @@ def test_a_run_whose_driver_is_killed_goes_on_where_it_was(cluster, tmp_path):
     driver.kill()
     driver.wait()
 
-    quicker = [noted("quick"), replace(stages[1], inputs={"one": replace(slow, make=make_at_once)})]
+    quicker = [
+        noted("quick"),
+        replace(stages[1], inputs={"one": replace(slow, make=make_at_once)}),
+    ]
     found = run(quicker, root, engine="ray", address=cluster.address)
 
     assert set(found.values()) == {"kept", "made"}
@@ -163,7 +143,7 @@ def test_a_run_whose_driver_is_killed_goes_on_where_it_was(cluster, tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_raylet_costs_what_it_was_making_and_nothing_else(cluster, tmp_path):
-    victim = cluster.add_node(**settings())
+    victim = cluster.add_node(**NODE)
     raylet = victim.all_processes["raylet"][0].process
     stages = [noted(item, seconds=4.0) for item in "abcd"]
     killed: list[str] = []
@@ -199,7 +179,7 @@ def test_a_killed_raylet_costs_what_it_was_making_and_nothing_else(cluster, tmp_
 def test_a_cluster_without_a_gpu_says_so_before_anything_waits_for_one(cluster, tmp_path):
     stage = replace(noted("a").inputs["one"], on_device=True)
 
-    with pytest.raises(V2PError, match="no node of the Ray cluster at .* has a GPU"):
+    with pytest.raises(V2PError, match=r"no node of the Ray cluster at .* has a GPU"):
         run([stage], tmp_path, device="cuda", engine="ray", address=cluster.address)
 
 

@@ -1,8 +1,8 @@
 from pathlib import Path
 
 import pytest
-import simulate_scale
 
+import simulate_scale
 from v2p_data.pipeline import workers
 from v2p_data.pipeline.runner import Runtime
 

@@ -149,7 +149,9 @@ def demand_ray() -> None:
 
 def _connected(address: str) -> Any:
     demand_ray()
-    # Under `uv run` Ray would copy the working directory to every node.
+    # Ray reads these when it is imported. It says in our output which workers died; we say it, with the item.
+    os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = "."
+    # Under `uv run` it would copy the working directory to every node.
     os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
     import ray
 
