@@ -40,6 +40,7 @@ def running_cluster(num_raylets: int) -> Generator[Any]:
         return start(*args, **kwargs)
 
     with (
+        patch.dict(os.environ, {"PYTHONPATH": ""}),  # a node knows nothing of our tree
         patch.object(services, "_build_python_executable_command_memory_profileable", command),
         patch.object(services, "start_raylet", started),
         patch.object(ray_constants, "RAY_DASHBOARD_STARTUP_TIMEOUT_S", 0),

@@ -66,8 +66,8 @@ class RayEngine:
         self.run_name = run_name(self.runtime.root)
         self.tasks: dict[Any, _Task] = {}
 
-        # By value: a node learns only from its arguments where our code lies.
-        def task(paths: list[str], how: bytes, what: bytes) -> Outcome:
+        # Travels by value and names nothing of ours: a node learns from its arguments where our code lies.
+        def task(paths: list[str], how: bytes, what: bytes) -> Any:
             import sys
 
             sys.path[:0] = [path for path in paths if path not in sys.path]
