@@ -19,7 +19,8 @@ NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_log_monitor":
 def running_cluster(num_raylets: int) -> Generator[Any]:
     """Start a cluster whose raylets have room for one task each; give Ray's `Cluster`."""
     quiet = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_enable_metrics_collection": "0"}
-    os.environ |= quiet | {"RAY_worker_register_timeout_seconds": "300"}
+    patient = {"RAY_worker_register_timeout_seconds": "300", "RAY_memory_monitor_refresh_ms": "0"}
+    os.environ |= quiet | patient  # other programs may have the memory
     from ray._private import ray_constants, services
     from ray.cluster_utils import Cluster
 

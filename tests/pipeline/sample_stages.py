@@ -4,7 +4,7 @@ import os
 import shutil
 import signal
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.runner import Stage
@@ -14,24 +14,23 @@ from v2p_data.pipeline.runner import Stage
 class Recipe:
     text: str = "a"
     trouble: str = ""
-    seconds: float = 0.0
-    """How long it takes."""
+    waits: bool = False
+    """For somebody to let it go on."""
 
 
 BEGUN = "begun"
-"""File of a run with a line for every time that a stage was begun."""
+"""File of a run with a line for every time that a stage was begun, and the process that began it."""
+GO_ON = "go_on"
+"""File of a run that lets go on what waits."""
 
 
 def make_noted(config, inputs, out, runtime):
     with (runtime.root / BEGUN).open("a") as file:
         file.write(f"{out.name.removesuffix('.partial')} {os.getppid()}\n")
-    time.sleep(config.seconds)
+    deadline = time.monotonic() + 600
+    while config.waits and not (runtime.root / GO_ON).exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
     return make_text(config, inputs, out, runtime)
-
-
-def make_at_once(config, inputs, out, runtime):
-    """Make what `make_noted` makes: the recipe does not say how it is made."""
-    return make_noted(replace(config, seconds=0.0), inputs, out, runtime)
 
 
 def make_text(config, inputs, out, runtime):

@@ -23,7 +23,7 @@ from v2p_data.pipeline.workers import only_run_in, run_stages
 
 sys.path.insert(0, str(Path(__file__).parent))
 from raylets import NODE, running_cluster
-from sample_stages import BEGUN, Recipe, chain, make_at_once, make_noted
+from sample_stages import BEGUN, GO_ON, Recipe, chain, make_noted
 
 ROOT = Path(__file__).parents[2]
 TIMES = ("seconds", "provenance")
@@ -36,9 +36,9 @@ def cluster():
         yield cluster
 
 
-def noted(item: str, seconds: float = 0.0, trouble: str = "") -> Stage:
-    """Return two stages that note when they begin; the first one is slow or goes wrong."""
-    two = chain(Recipe(seconds=seconds, trouble=trouble), Recipe(text="b"), item=item)
+def noted(item: str, waits: bool = False, trouble: str = "") -> Stage:
+    """Return two stages that note when they begin; the first one may wait or go wrong."""
+    two = chain(Recipe(waits=waits, trouble=trouble), Recipe(text="b"), item=item)
     one = replace(two.inputs["one"], make=make_noted)
     return replace(two, inputs={"one": one}, make=make_noted)
 
@@ -47,6 +47,14 @@ def run(stages: list[Stage], root: Path, **runtime) -> dict[tuple[str, str], str
     with only_run_in(root):
         outcomes = run_stages(stages, Runtime(root=root, **runtime), lambda event: None)
     return {(o.stage, o.item): o.reason or o.status for o in outcomes.values()}
+
+
+def made_here(stages: list[Stage], root: Path) -> Path:
+    """Make stages by one worker process, without waiting; return where."""
+    root.mkdir()
+    (root / GO_ON).touch()
+    run(stages, root, workers=1)
+    return root
 
 
 def content(root: Path) -> dict[str, object]:
@@ -91,11 +99,13 @@ def test_a_task_that_always_crashes_fails_alone_and_what_a_stage_reports_is_not_
 ):
     crashes, raises, good = noted("x", trouble="crash"), noted("y", trouble="raise"), noted("z")
 
-    found = run([crashes, raises, good], tmp_path, engine="ray", address=cluster.address)
+    found = run(
+        [crashes, raises, good.inputs["one"]], tmp_path, engine="ray", address=cluster.address
+    )
 
     assert found["one", "x"] == found["two", "x"] == "crashed"
     assert found["one", "y"] == "RuntimeError"
-    assert found["two", "z"] == "made"
+    assert found["one", "z"] == "made"
     begun = times_begun(tmp_path)
     assert begun[crashes.inputs["one"].folder_name] == 3
     assert begun[raises.inputs["one"].folder_name] == 1
@@ -112,11 +122,11 @@ def test_a_run_whose_driver_is_killed_goes_on_where_it_was(cluster, tmp_path):
         from pathlib import Path
         sys.path[:0] = [{str(ROOT)!r}, {str(Path(__file__).parent)!r}]
         from test_ray import noted, run
-        run([noted("quick"), noted("slow", 60.0)], Path(sys.argv[1]), engine="ray", address=sys.argv[2])
+        run([noted("quick"), noted("slow", waits=True)], Path(sys.argv[1]), engine="ray", address=sys.argv[2])
         """)
     )
     root = tmp_path / "run"
-    stages = [noted("quick"), noted("slow", 60.0)]
+    stages = [noted("quick"), noted("slow", waits=True)]
     quick, slow = stages[0], stages[1].inputs["one"]
     driver = subprocess.Popen([sys.executable, script, root, cluster.address])
     wait_for(lambda: (quick.folder(root) / RECORD_FILE).exists())
@@ -124,11 +134,8 @@ def test_a_run_whose_driver_is_killed_goes_on_where_it_was(cluster, tmp_path):
     driver.kill()
     driver.wait()
 
-    quicker = [
-        noted("quick"),
-        replace(stages[1], inputs={"one": replace(slow, make=make_at_once)}),
-    ]
-    found = run(quicker, root, engine="ray", address=cluster.address)
+    (root / GO_ON).touch()
+    found = run(stages, root, engine="ray", address=cluster.address)
 
     assert set(found.values()) == {"kept", "made"}
     assert times_begun(root) == {
@@ -137,15 +144,14 @@ def test_a_run_whose_driver_is_killed_goes_on_where_it_was(cluster, tmp_path):
         slow.folder_name: 2,
         stages[1].folder_name: 1,
     }
-    run(quicker, tmp_path / "local", workers=1)
-    assert content(root) == content(tmp_path / "local")
+    assert content(root) == content(made_here(stages, tmp_path / "local"))
 
 
 @pytest.mark.slow
 def test_a_killed_raylet_costs_what_it_was_making_and_nothing_else(cluster, tmp_path):
     victim = cluster.add_node(**NODE)
     raylet = victim.all_processes["raylet"][0].process
-    stages = [noted(item, seconds=4.0) for item in "abcd"]
+    stages = [noted(item, waits=True).inputs["one"] for item in "abcd"]
     killed: list[str] = []
 
     def kill(event) -> None:
@@ -156,6 +162,7 @@ def test_a_killed_raylet_costs_what_it_was_making_and_nothing_else(cluster, tmp_
             wait_for(lambda: any(line.endswith(f" {raylet.pid}") for line in lines()))
             killed.extend(line.split()[0] for line in lines() if line.endswith(f" {raylet.pid}"))
             os.kill(raylet.pid, signal.SIGKILL)
+            (tmp_path / GO_ON).touch()
 
     def lines() -> list[str]:
         path = tmp_path / BEGUN
@@ -171,8 +178,7 @@ def test_a_killed_raylet_costs_what_it_was_making_and_nothing_else(cluster, tmp_
     assert killed
     assert {name for name, times in begun.items() if times == 2} == set(killed)
     assert set(begun.values()) == {1, 2}
-    run(stages, tmp_path / "local", workers=4)
-    assert content(tmp_path) == content(tmp_path / "local")
+    assert content(tmp_path) == content(made_here(stages, tmp_path / "local"))
 
 
 @pytest.mark.slow

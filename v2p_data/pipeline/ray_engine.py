@@ -58,7 +58,7 @@ class RayEngine:
         self.address = runtime.address
         self.ray = _connected(runtime.address)
         nodes = [n["Resources"] for n in self.ray.nodes() if n["Alive"]]
-        self.most = {k: max(n.get(k, 0.0) for n in nodes) for k in ("CPU", "GPU", "memory")}
+        self.most = {k: max(n.get(k, 0.0) for n in nodes) for k in ("CPU", "GPU")}
         num_cpus = int(sum(n.get("CPU", 0) for n in nodes))
         self.size = runtime.workers or max(FEWEST_IN_FLIGHT, 2 * num_cpus)
         self.runtime = replace(runtime, root=runtime.root.absolute(), progress=no_progress)
@@ -103,7 +103,6 @@ class RayEngine:
             name=f"{stage.name} {stage.item}",
             num_cpus=num_cpus,
             num_gpus=int(on_gpu),
-            memory=min(stage.memory_gb * 1e9, self.most["memory"]),
         ).remote(self.paths, how, self.ray.cloudpickle.dumps(stage))
         self.tasks[reference] = task
 

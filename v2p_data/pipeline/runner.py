@@ -75,8 +75,6 @@ class Stage:
     """The function goes on in a half-finished folder; otherwise it starts anew."""
     on_device: bool = False
     """The function works on the device; on a cluster it then takes one GPU."""
-    memory_gb: float = 0.0
-    """Peak of the function's memory where it was measured, for a cluster to plan with."""
 
     @property
     def recipe(self) -> dict[str, Any]:
