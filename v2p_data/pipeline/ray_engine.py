@@ -152,12 +152,12 @@ def _connected(address: str) -> Any:
     os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = "."
     # Under `uv run` it would copy the working directory to every node.
     os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
-    import ray
-
     host, _, port = address.rpartition(":")
     try:
-        if port.isdecimal():
+        if port.isdecimal():  # asked first: Ray itself waits long
             socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
+        import ray
+
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (OSError, RuntimeError, ValueError) as error:
         why = str(error).splitlines()[0]
