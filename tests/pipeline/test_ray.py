@@ -26,8 +26,8 @@ from raylets import NODE, running_cluster
 from sample_stages import BEGUN, GO_ON, Recipe, chain, make_noted
 
 ROOT = Path(__file__).parents[2]
-TIMES = ("seconds", "provenance")
-"""Of a record: when and where, not what."""
+TIMES = ("seconds", "provenance", "checksum")
+"""Of a record: when and where it was made, and the checksum over that; not what it is."""
 
 
 @pytest.fixture(scope="module")
