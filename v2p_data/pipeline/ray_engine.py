@@ -7,7 +7,9 @@ reports itself is not.
 
 import contextlib
 import fcntl
+import importlib
 import importlib.util
+import logging
 import os
 import pickle
 import signal
@@ -19,8 +21,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.runner import Outcome, Runtime, Stage, make_stage, stored_outcome
-from v2p_data.pipeline.workers import (
+from v2p_data.pipeline.at_work import (
     WORKER_LOCK,
     Event,
     limit_threads,
@@ -29,6 +30,7 @@ from v2p_data.pipeline.workers import (
     run_name,
     write_to,
 )
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage, make_stage, stored_outcome
 from v2p_data.processes import end_with_parent
 
 TRIES = 3
@@ -107,18 +109,17 @@ class RayEngine:
         self.tasks[reference] = task
 
     def events(self) -> Iterator[Event]:
-        from ray.exceptions import RayError, RayTaskError
-
+        errors = self.ray.exceptions
         ended, _ = self.ray.wait(list(self.tasks), timeout=1.0)
         for reference in ended:
             task = self.tasks.pop(reference)
             stage, root = task.stage, self.runtime.root
             try:
                 outcome: Outcome = self.ray.get(reference)
-            except RayTaskError as error:  # before the stage began
+            except errors.RayTaskError as error:  # before the stage began
                 why = f"a node cannot load our code or the recipe: {error.cause}"
                 outcome = _failed(stage, root, "error", why)
-            except RayError as error:
+            except errors.RayError as error:
                 how = type(error).__name__
                 if task.tries < TRIES:
                     self._submit(replace(task, tries=task.tries + 1))
@@ -156,9 +157,8 @@ def _connected(address: str) -> Any:
     try:
         if port.isdecimal():  # asked first: Ray itself waits long
             socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
-        import ray
-
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        ray: Any = importlib.import_module("ray")
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, RuntimeError, ValueError) as error:
         why = str(error).splitlines()[0]
         raise V2PError(

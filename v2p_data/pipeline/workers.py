@@ -7,7 +7,6 @@ when their parent is gone, however it went, so that a killed run leaves nothing 
 import contextlib
 import fcntl
 import heapq
-import logging
 import multiprocessing
 import os
 import signal
@@ -19,9 +18,18 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Literal, Protocol, TextIO, runtime_checkable
+from typing import Any, Protocol, TextIO, runtime_checkable
 
 from v2p_data.errors import V2PError
+from v2p_data.pipeline.at_work import (
+    RUN_LOCK,
+    WORKER_LOCK,
+    Event,
+    limit_threads,
+    lock,
+    no_progress,
+    write_to,
+)
 from v2p_data.pipeline.runner import (
     Outcome,
     Runtime,
@@ -36,21 +44,7 @@ from v2p_data.processes import end_with_parent
 PROGRESS_EVERY_S = 0.2
 WORKERS_END_S = 5.0
 """The workers of a killed run are gone by then."""
-RUN_LOCK = ".lock"
-WORKER_LOCK = ".workers.lock"
-"""Shared by the workers: as long as one lives, no new run begins."""
 Key = tuple[str, str]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Event:
-    """Something to show: a job began, moved on, or ended."""
-
-    kind: Literal["started", "progress", "ended"]
-    stage: Stage
-    share: float = 0.0
-    words: str = ""
-    outcome: Outcome | None = None
 
 
 @contextlib.contextmanager
@@ -75,29 +69,6 @@ def only_run_in(root: Path) -> Generator[None]:
         with (root / WORKER_LOCK).open("a") as workers:
             lock(workers, root, wait_s=WORKERS_END_S)
         yield
-
-
-def run_name(root: Path) -> str:
-    """Return what tells the run that is at work in a folder from earlier and later ones; empty: none began."""
-    return (root / RUN_LOCK).read_text() if (root / RUN_LOCK).exists() else ""
-
-
-def lock(stream: TextIO, root: Path, wait_s: float) -> None:
-    """Hold an open file alone.
-
-    Raises:
-        V2PError: another process holds it, and did so all the time.
-    """
-    deadline = time.monotonic() + wait_s
-    while True:
-        try:
-            return fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if time.monotonic() >= deadline:
-                raise V2PError(
-                    f"another v2p run is at work in {root}; wait for it or choose another --out"
-                ) from error
-            time.sleep(0.1)
 
 
 @runtime_checkable
@@ -269,10 +240,6 @@ def _how_it_died(exitcode: int | None, root: Path) -> str:
     return f"the worker process {how}; its output is in {root / 'logs'}"
 
 
-def no_progress(share: float, words: str) -> None:
-    del share, words
-
-
 def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends us
     end_with_parent(parent_pid)
@@ -294,18 +261,3 @@ def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) 
                 connection.send((share, words))
 
         connection.send(make_stage(stage, replace(runtime, progress=progress)))
-
-
-def write_to(log: Path) -> TextIO:
-    """Send all that this process says to the end of a log; return it, which stays open."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    stream = log.open("a")
-    os.dup2(stream.fileno(), 1)
-    os.dup2(stream.fileno(), 2)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", force=True)
-    return stream
-
-
-def limit_threads(num_threads: int) -> None:
-    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ[variable] = str(num_threads)
