@@ -5,33 +5,22 @@ fresh process. A task that dies with its process or its node is tried again here
 reports itself is not.
 """
 
-import contextlib
-import fcntl
 import importlib
 import importlib.util
 import logging
 import os
 import pickle
-import signal
 import socket
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.at_work import (
-    WORKER_LOCK,
-    Event,
-    limit_threads,
-    lock,
-    no_progress,
-    run_name,
-    write_to,
-)
-from v2p_data.pipeline.runner import Outcome, Runtime, Stage, make_stage, stored_outcome
-from v2p_data.processes import end_with_parent
+from v2p_data.pipeline.at_work import Event, no_progress, run_name
+from v2p_data.pipeline.ray_task import failed, log_of
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 
 TRIES = 3
 """A task that dies is begun so often; then its item has failed."""
@@ -39,8 +28,6 @@ CONNECT_S = 5.0
 """The head of a cluster answers sooner."""
 FEWEST_IN_FLIGHT = 64
 """Tasks that a small cluster is told of at a time: what waits there makes it grow, where it can."""
-ITEM_FREE_S = 120.0
-"""The process of a lost node has let go of its item by then, or still works."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +60,7 @@ class RayEngine:
             import sys
 
             sys.path[:0] = [path for path in paths if path not in sys.path]
-            from v2p_data.pipeline.ray_engine import work
+            from v2p_data.pipeline.ray_task import work
 
             return work(how, what)
 
@@ -118,15 +105,15 @@ class RayEngine:
                 outcome: Outcome = self.ray.get(reference)
             except errors.RayTaskError as error:  # before the stage began
                 why = f"a node cannot load our code or the recipe: {error.cause}"
-                outcome = _failed(stage, root, "error", why)
+                outcome = failed(stage, root, "error", why)
             except errors.RayError as error:
                 how = type(error).__name__
                 if task.tries < TRIES:
                     self._submit(replace(task, tries=task.tries + 1))
                     yield Event(kind="progress", stage=stage, words=f"begun again after {how}")
                     continue
-                why = f"its process ended {TRIES} times, last of {how}; its output is in {_log(stage, root)}"
-                outcome = _failed(stage, root, "crashed", why)
+                why = f"its process ended {TRIES} times, last of {how}; its output is in {log_of(stage, root)}"
+                outcome = failed(stage, root, "crashed", why)
             yield Event(kind="ended", stage=stage, outcome=outcome)
 
     def close(self) -> None:
@@ -165,52 +152,3 @@ def _connected(address: str) -> Any:
             f"no Ray cluster answers at {address} ({why}); start one with 'ray start --head' and name its HOST:PORT in --address"
         ) from error
     return ray
-
-
-def _log(stage: Stage, root: Path) -> Path:
-    return root / "logs" / f"{stage.name}-{stage.folder_name}.log"
-
-
-def work(how: bytes, what: bytes) -> Outcome:
-    """Make a stage in this process of a node, which does nothing else; return what became of it.
-
-    Two processes never fill one folder: the item's log is held until the process ends, and a run that has been followed
-    by another one begins nothing more.
-    """
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once, not when Python gets round to it
-    end_with_parent(os.getppid())
-    runtime, run, home = pickle.loads(how)
-    limit_threads(runtime.num_threads)
-    with contextlib.suppress(OSError):
-        os.chdir(home)  # recipes may name videos relative to it
-    stage: Stage = pickle.loads(what)
-    try:
-        alive = _part_of(run, runtime.root)
-        lock(write_to(_log(stage, runtime.root)), runtime.root, wait_s=ITEM_FREE_S)
-    except V2PError as error:
-        return _failed(stage, runtime.root, "error", str(error))
-    with alive:
-        return stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
-
-
-def _part_of(run: str, root: Path) -> TextIO:
-    """Return the workers' lock, held, of a run that is still at work.
-
-    Raises:
-        V2PError: this node does not see that run.
-    """
-    with contextlib.suppress(FileNotFoundError):
-        alive = (root / WORKER_LOCK).open("a")
-        fcntl.flock(alive, fcntl.LOCK_SH)
-        if run_name(root) == run:  # asked after the lock, for which a new run waits
-            return alive
-    raise V2PError(
-        f"{socket.gethostname()} does not see this run in {root}: all nodes need the run folder at the same path"
-    )
-
-
-def _failed(stage: Stage, root: Path, reason: str, detail: str) -> Outcome:
-    return Outcome(
-        stage=stage.name, item=stage.item, status="failed", folder=stage.folder(root),
-        reason=reason, detail=detail,
-    )  # fmt: skip
