@@ -1,0 +1,69 @@
+"""What a task does on its node: one stage, in a process of its own. Knows nothing of Ray."""
+
+import contextlib
+import fcntl
+import os
+import pickle
+import signal
+import socket
+from pathlib import Path
+from typing import TextIO
+
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.at_work import WORKER_LOCK, limit_threads, lock, run_name, write_to
+from v2p_data.pipeline.runner import Outcome, Stage, make_stage, stored_outcome
+from v2p_data.processes import end_with_parent
+
+ITEM_FREE_S = 120.0
+"""The process of a lost node has let go of its item by then, or still works."""
+
+
+def log_of(stage: Stage, root: Path) -> Path:
+    """Return where a stage's task says what it does."""
+    return root / "logs" / f"{stage.name}-{stage.folder_name}.log"
+
+
+def work(how: bytes, what: bytes) -> Outcome:
+    """Make a stage in this process of a node, which does nothing else; return what became of it.
+
+    Two processes never fill one folder: the item's log is held until the process ends, and a run that has been followed
+    by another one begins nothing more.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once, not when Python gets round to it
+    end_with_parent(os.getppid())
+    runtime, run, home = pickle.loads(how)
+    limit_threads(runtime.num_threads)
+    with contextlib.suppress(OSError):
+        os.chdir(home)  # recipes may name videos relative to it
+    stage: Stage = pickle.loads(what)
+    try:
+        alive = _part_of(run, runtime.root)
+        lock(write_to(log_of(stage, runtime.root)), runtime.root, wait_s=ITEM_FREE_S)
+    except V2PError as error:
+        return failed(stage, runtime.root, "error", str(error))
+    with alive:
+        return stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
+
+
+def _part_of(run: str, root: Path) -> TextIO:
+    """Return the workers' lock, held, of a run that is still at work.
+
+    Raises:
+        V2PError: this node does not see that run.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        alive = (root / WORKER_LOCK).open("a")
+        fcntl.flock(alive, fcntl.LOCK_SH)
+        if run_name(root) == run:  # asked after the lock, for which a new run waits
+            return alive
+    raise V2PError(
+        f"{socket.gethostname()} does not see this run in {root}: all nodes need the run folder at the same path"
+    )
+
+
+def failed(stage: Stage, root: Path, reason: str, detail: str) -> Outcome:
+    """Return what became of a stage that was not begun, or not ended."""
+    return Outcome(
+        stage=stage.name, item=stage.item, status="failed", folder=stage.folder(root),
+        reason=reason, detail=detail,
+    )  # fmt: skip
