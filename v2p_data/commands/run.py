@@ -1,5 +1,6 @@
 """Commands that make things: the whole chain, or up to one stage."""
 
+import math
 import os
 import shlex
 import sys
@@ -66,15 +67,24 @@ class How:
     """Threads per job."""
     device: str = "cpu"
     """Where the policy trains: cpu, cuda, mps."""
+    store: str = ""
+    """Folder or URL (s3://BUCKET/PREFIX) that drivers and machines share results in; each keeps an --out of its own."""
+    lease_s: float = 60.0
+    """With --store: a driver without a sign of life for so long is taken for dead by the others."""
 
     def runtime(self, root: Path) -> Runtime:
         if self.workers < 0 or self.threads < 1:
             raise V2PError(
                 f"--workers is at least 0 and --threads at least 1, got {self.workers} and {self.threads}"
             )
+        if not 0 < self.lease_s < math.inf:
+            raise V2PError(f"--lease-s is a number of seconds above 0, got {self.lease_s}")
         check_device(self.device)
         workers = self.workers or os.cpu_count() or 1
-        return Runtime(root=root, workers=workers, num_threads=self.threads, device=self.device)
+        return Runtime(
+            root=root, workers=workers, num_threads=self.threads, device=self.device,
+            store=self.store, lease_s=self.lease_s,
+        )  # fmt: skip
 
 
 Engine = Annotated[EngineConfig, tyro.conf.arg(name="")]

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, TextIO
 
 from v2p_data.errors import V2PError
+from v2p_data.pipeline.leases import Shared
 from v2p_data.pipeline.runner import (
     Outcome,
     Runtime,
@@ -26,7 +27,6 @@ from v2p_data.pipeline.runner import (
     blocked_by,
     in_order,
     make_stage,
-    stored_outcome,
 )
 from v2p_data.processes import end_with_parent
 
@@ -87,12 +87,24 @@ def _lock(stream: TextIO, root: Path, wait_s: float) -> None:
 def run_stages(
     stages: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None]
 ) -> dict[Key, Outcome]:
-    """Make every stage and what it needs; return the outcome per (stage name, folder name)."""
+    """Make every stage and what it needs; return the outcome per (stage name, folder name).
+
+    With a store, what others made is taken and what they are making is waited for, while all else goes on.
+    """
     ordered = list(in_order(stages))
+    with Shared(runtime) as shared:
+        outcomes = _run_stages(ordered, runtime, on_event, shared)
+        shared.fetch_all(ordered, outcomes)
+    return outcomes
+
+
+def _run_stages(
+    ordered: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None], shared: Shared
+) -> dict[Key, Outcome]:
     outcomes: dict[Key, Outcome] = {}
     pending: list[Stage] = []
     for stage in ordered:
-        stored = stored_outcome(stage, runtime.root)
+        stored = shared.stored(stage)
         if stored is None:
             pending.append(stage)
         else:
@@ -114,10 +126,16 @@ def run_stages(
                 elif all(_key(needed) in outcomes for needed in stage.inputs.values()):
                     if not pool.has_room:
                         continue
-                    pool.start(stage)
-                    on_event(Event(kind="started", stage=stage))
-                    pending.remove(stage)
-                    continue
+                    claimed = shared.claim(stage)
+                    if claimed is None:
+                        continue
+                    if isinstance(claimed, Outcome):
+                        outcome = claimed
+                    else:
+                        pool.start(stage)
+                        on_event(Event(kind="started", stage=stage))
+                        pending.remove(stage)
+                        continue
                 else:
                     continue
                 pending.remove(stage)
@@ -126,6 +144,7 @@ def run_stages(
             for event in pool.events():
                 if event.outcome is not None:
                     outcomes[_key(event.stage)] = event.outcome
+                    shared.ended(event.stage)
                 on_event(event)
     finally:
         pool.close()
