@@ -26,8 +26,8 @@ OWNER_FILE = ".owner"
 """In a run folder: the name of its driver, so that a killed one finds its own leases again."""
 BEATS = 4
 """Signs of life within `lease_s`."""
-POLLS = 10
-"""How often within `lease_s` a stage that somebody else makes is asked for."""
+POLL_S = 2.0
+"""A stage that somebody else makes is asked for so often, and ten times within a short `lease_s`."""
 FREE = b"free"
 """Content of a lease that was given back with nothing made."""
 
@@ -86,7 +86,7 @@ class Shared:
         key = key_of(stage.folder(self.root))
         if time.monotonic() < self.asked.get(key, 0.0):
             return None
-        self.asked[key] = time.monotonic() + self.lease_s / POLLS
+        self.asked[key] = time.monotonic() + min(POLL_S, self.lease_s / 10)
         if not self._claim(self.store, key):
             return None
         theirs = self._theirs(self.store, stage)
@@ -125,15 +125,17 @@ class Shared:
     def _claim(self, store: Store, key: str) -> bool:
         for number in itertools.count(1):
             lease = f"leases/{key}.{number}"
-            if store.create(lease, self.owner.encode()):
-                self.held[key] = lease
-                return True
             holder = store.read(lease)
-            if holder in (FREE, self.owner.encode()):  # our own is of a run that was killed
-                continue
-            if holder is None or not self._is_dead(store, holder.decode()):
-                return False
-        raise AssertionError
+            if holder is None:
+                if store.create(lease, self.owner.encode()):
+                    self.held[key] = lease
+                break
+            # Our own is of a run that was killed.
+            if holder not in (FREE, self.owner.encode()) and not self._is_dead(
+                store, holder.decode()
+            ):
+                break
+        return key in self.held
 
     def _is_dead(self, store: Store, owner: str) -> bool:
         """Return whether a driver has given no sign of life while we looked on for `lease_s`."""

@@ -124,9 +124,9 @@ def stored_outcome(stage: Stage, root: Path) -> Outcome | None:
 
     def whole_record() -> Record | None:
         record = read_record(folder)
-        if record is None:
-            if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-                raise damaged(folder, f"{folder / RECORD_FILE} is missing")
+        is_empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+        if record is None and not is_empty:
+            raise damaged(folder, f"{folder / RECORD_FILE} is missing")
         return record
 
     return outcome_of(stage, root, whole_record)
