@@ -63,8 +63,8 @@ def place(request):
     return (str(where), where) if request.param == "folder" else ("s3://bucket/run", where / "run")
 
 
-def run(stages, root, store, lease_s=60.0):
-    runtime = Runtime(root=root, store=str(store), lease_s=lease_s)
+def run(stages, root, store):
+    runtime = Runtime(root=root, store=str(store))
     return {(o.stage, o.item): o for o in run_stages(stages, runtime, lambda event: None).values()}
 
 
@@ -99,14 +99,13 @@ def test_what_one_driver_made_is_fetched_by_the_next(tmp_path, place):
     url, where = place
     stages = [marked("a", tmp_path / "marks"), marked("b", tmp_path / "marks")]
 
-    first = run(stages, tmp_path / "first", url)
+    publish(stages, tmp_path / "first", url)
+
     second = run(stages, tmp_path / "second", url)
 
-    assert {o.status for o in first.values()} == {"made"}
     assert {o.status for o in second.values()} == {"kept"}
     assert len((tmp_path / "marks").read_text().splitlines()) == 4
     assert files(tmp_path / "first") == files(tmp_path / "second") == files(where)
-    assert list((where / "leases").rglob("*.*")) == list((where / "drivers").glob("*")) == []
 
 
 @pytest.mark.slow
@@ -121,6 +120,7 @@ def test_two_drivers_at_once_make_each_item_once(tmp_path, place):
     assert sorted(made) == [f"{stage} {item}" for stage in ("one", "two") for item in ITEMS]
     assert {status for statuses in said for status in statuses.values()} == {"made", "kept"}
     assert files(tmp_path / "first") == files(tmp_path / "second") == files(where)
+    assert list((where / "leases").rglob("*.*")) == list((where / "drivers").glob("*")) == []
 
 
 @pytest.mark.slow
@@ -165,20 +165,38 @@ def test_a_killed_driver_that_is_started_again_waits_for_nobody(tmp_path, folder
         assert again.claim(stage) == "ours"
 
 
-def test_a_failure_gives_the_lease_to_whoever_asks_next(tmp_path, folder):
-    stage = marked("a", tmp_path / "nowhere" / "marks").inputs["one"]
+def test_what_ends_with_nothing_made_may_be_tried_by_whoever_asks_next(tmp_path, folder):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    first, second, third = (
+        Shared(Runtime(root=tmp_path / name, store=str(folder))) for name in ("1", "2", "3")
+    )
+    with first, second, third:
+        assert first.claim(stage) == "ours"
+        first.ended(stage)
 
-    assert run([stage], tmp_path / "first", folder)["one", "a"].status == "failed"
-    (tmp_path / "nowhere").mkdir()
-
-    assert run([stage], tmp_path / "second", folder)["one", "a"].status == "made"
+        assert second.claim(stage) == "ours"
+        assert third.claim(stage) is None
 
 
-def test_a_file_that_changed_in_the_store_is_named_and_not_used(tmp_path, place):
-    url, where = place
+def test_a_driver_that_asks_too_late_gets_what_was_made(tmp_path, folder):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    late = Shared(Runtime(root=tmp_path / "late", store=str(folder)))
+    with late:
+        assert late.stored(stage) is None
+        publish([stage], tmp_path / "first", str(folder))
+
+        theirs = late.claim(stage)
+
+    assert theirs.status == "kept"
+    assert list((folder / "leases").rglob("*.*")) == []
+
+
+@pytest.mark.slow
+def test_a_file_that_changed_in_the_store_is_named_and_not_used(tmp_path, folder):
+    url = str(folder)
     stages = [marked("a", tmp_path / "marks"), marked("b", tmp_path / "marks")]
     publish([s.inputs["one"] for s in stages], tmp_path / "first", url)
-    bad = where / "one" / stages[0].inputs["one"].folder_name / "text"
+    bad = folder / "one" / stages[0].inputs["one"].folder_name / "text"
     content = bytearray(bad.read_bytes())
     content[0] ^= 1
     bad.write_bytes(content)
@@ -215,7 +233,7 @@ def test_what_was_published_by_half_does_not_count(tmp_path, place):
     record.unlink()
     (record.parent / "text").write_text("half")
 
-    assert run([stage], tmp_path / "second", url)["one", "a"].status == "made"
+    publish([stage], tmp_path / "second", url)
     assert run([stage], tmp_path / "third", url)["one", "a"].status == "kept"
     assert (stage.folder(tmp_path / "third") / "text").read_text() == "one a"
 
@@ -275,7 +293,10 @@ def test_what_was_made_while_the_store_was_away_is_published_by_the_next_run(
         open_store(str(folder)).read("x")
     away.rename(folder)
 
-    assert run([stage], runtime.root, folder)["one", "a"].status == "kept"
+    with Shared(runtime) as shared:
+        assert shared.stored(stage) is None
+        assert make_stage(stage, runtime).status == "kept"
+        assert shared.stored(stage).status == "kept"
     assert files(folder) == files(runtime.root)
     assert (tmp_path / "marks").read_text() == "one a\n"
 
