@@ -22,6 +22,7 @@ from v2p_data.commands.display import (
     tally,
     telling,
 )
+from v2p_data.commands.progress import Progress
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.errors import NotAllError, V2PError
@@ -597,7 +598,9 @@ def _videos(folder: Path) -> list[VideoItem]:
 
 def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:
     with Display() as display:
-        outcomes = run_stages(stages, runtime, display)
+        progress = Progress(runtime, stages, display)
+        outcomes = run_stages(stages, runtime, progress)
+        progress.write()
     path = runtime.root / RUN_FILE
     try:
         write_json_atomically(path, outcomes_json(outcomes, stages))

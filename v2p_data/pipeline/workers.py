@@ -65,10 +65,22 @@ def only_run_in(root: Path) -> Generator[None]:
             f"cannot write to {root}: {error.strerror}; choose another folder with --out"
         ) from error
     with stream:
-        _lock(stream, root, wait_s=0.0)
+        _lock(stream, root, wait_s=0.2)  # `is_at_work` holds it for a moment
         with (root / WORKER_LOCK).open("a") as workers:
             _lock(workers, root, wait_s=WORKERS_END_S)
         yield
+
+
+def is_at_work(root: Path) -> bool:
+    """Return whether a run holds the folder's lock."""
+    try:
+        with (root / RUN_LOCK).open() as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 def _lock(stream: TextIO, root: Path, wait_s: float) -> None:
