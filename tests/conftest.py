@@ -10,6 +10,7 @@ from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parents[1]
 UNCHECKED = (
+    "v2p_data.pipeline.ray_engine",
     "v2p_data.geometry.raster",
     "v2p_data.scene.fitting.cuboid_network",
     "v2p_data.scene.fitting.shape_fit",
@@ -17,7 +18,8 @@ UNCHECKED = (
     "v2p_data.task.sandbox.reader",
     "v2p_data.reward.code",
 )
-"""Called ten thousand times and more a clip or a reward: checking their arguments takes as long as their work."""
+"""Called ten thousand times and more a clip or a reward: checking their arguments takes as long as their work. The first
+sends a function to nodes that may not have the checker."""
 
 
 def _modules_of(folder: Path) -> list[str]:

@@ -360,6 +360,7 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
         inputs={"task": task},
         sources=solved_digests(cfg.expert.warm_start) | named,
         version=4,
+        on_device=True,
         make=partial(
             make_expert,
             warm_start=cfg.expert.warm_start,
@@ -551,6 +552,7 @@ def distillation_stage(
         ),
         sources={"dataset": f"{record.item}-{record.fingerprint}"},
         version=1,
+        on_device=True,
         make=partial(
             make_distillation,
             dataset=dataset,
@@ -602,6 +604,7 @@ def policy_stage(
         inputs=inputs,
         sources={"dataset": f"{record.item}-{record.fingerprint}"} | digests,
         version=2,
+        on_device=True,
         make=partial(
             make_policy,
             dataset=dataset,
@@ -636,6 +639,7 @@ def evaluation_stage(
             **{f"task {name}": _code_digest(path) for name, path in tasks.items()},
         },
         version=3,
+        on_device=True,
         make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=tuple(seen)),
     )
 

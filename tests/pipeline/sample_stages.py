@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import time
 from dataclasses import dataclass
 
 from v2p_data.errors import ItemRejectedError
@@ -13,6 +14,23 @@ from v2p_data.pipeline.runner import Stage
 class Recipe:
     text: str = "a"
     trouble: str = ""
+    waits: bool = False
+    """For somebody to let it go on."""
+
+
+BEGUN = "begun"
+"""File of a run with a line for every time that a stage was begun, and the process that began it."""
+GO_ON = "go_on"
+"""File of a run that lets go on what waits."""
+
+
+def make_noted(config, inputs, out, runtime):
+    with (runtime.root / BEGUN).open("a") as file:
+        file.write(f"{out.name.removesuffix('.partial')} {os.getppid()}\n")
+    deadline = time.monotonic() + 600
+    while config.waits and not (runtime.root / GO_ON).exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return make_text(config, inputs, out, runtime)
 
 
 def make_text(config, inputs, out, runtime):

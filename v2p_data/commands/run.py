@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -30,6 +30,7 @@ from v2p_data.evaluation.judging import PROGRAMS, Contestant, contestant, task_f
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
 from v2p_data.pipeline.contents import list_files, memory_of
 from v2p_data.pipeline.fingerprint import fingerprint
+from v2p_data.pipeline.ray_engine import demand_ray
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, stored_outcome
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Key, only_run_in, run_stages
@@ -63,7 +64,7 @@ class How:
     """How to run; never part of what is made."""
 
     workers: int = 0
-    """Jobs at the same time; 0: as many as there are cores."""
+    """Jobs at the same time; 0: as many as there are cores, here or on the cluster."""
     threads: int = 1
     """Threads per job."""
     device: str = "cpu"
@@ -72,6 +73,10 @@ class How:
     """Folder or URL (s3://BUCKET/PREFIX) that drivers and machines share results in; each keeps an --out of its own."""
     lease_s: float = 60.0
     """With --store: a driver without a sign of life for so long is taken for dead by the others."""
+    engine: Literal["local", "ray"] = "local"
+    """Where jobs run: processes of this machine, or tasks of a Ray cluster whose nodes share --out."""
+    address: str = "auto"
+    """Of the Ray cluster's head, HOST:PORT; auto: the one that this machine belongs to."""
 
     def runtime(self, root: Path) -> Runtime:
         if self.workers < 0 or self.threads < 1:
@@ -80,12 +85,20 @@ class How:
             )
         if not 0 < self.lease_s < math.inf:
             raise V2PError(f"--lease-s is a number of seconds above 0, got {self.lease_s}")
-        check_device(self.device)
-        workers = self.workers or os.cpu_count() or 1
+        if self.engine == "ray":
+            demand_ray()
+        else:
+            check_device(self.device)
         return Runtime(
-            root=root, workers=workers, num_threads=self.threads, device=self.device,
-            store=self.store, lease_s=self.lease_s,
-        )  # fmt: skip
+            root=root,
+            workers=self.workers or (0 if self.engine == "ray" else os.cpu_count() or 1),
+            num_threads=self.threads,
+            device=self.device,
+            engine=self.engine,
+            address=self.address,
+            store=self.store,
+            lease_s=self.lease_s,
+        )
 
 
 Engine = Annotated[EngineConfig, tyro.conf.arg(name="")]

@@ -4,6 +4,7 @@ Jobs run in worker processes, so that a crash in a decoder or a simulator is tha
 """
 
 import contextlib
+import functools
 import logging
 import shutil
 import time
@@ -46,7 +47,11 @@ class Runtime:
     num_threads: int = 1
     """Threads one job may use."""
     workers: int = 1
-    """Jobs at the same time."""
+    """Jobs at the same time; 0 on a cluster: as many as keep it busy."""
+    engine: Literal["local", "ray"] = "local"
+    """Where jobs run: processes of this machine, or tasks of a Ray cluster."""
+    address: str = "auto"
+    """Of the cluster."""
     store: str = ""
     """Folder or URL where finished results are shared; empty: nowhere."""
     lease_s: float = 60.0
@@ -73,6 +78,8 @@ class Stage:
     make: Make
     resumes: bool = False
     """The function goes on in a half-finished folder; otherwise it starts anew."""
+    on_device: bool = False
+    """The function works on the device; on a cluster it then takes one GPU."""
 
     @property
     def recipe(self) -> dict[str, Any]:
@@ -85,7 +92,7 @@ class Stage:
             "sources": dict(sorted(self.sources.items())),
         }
 
-    @property
+    @functools.cached_property
     def fingerprint(self) -> str:
         return fingerprint(self.recipe)
 

@@ -6,17 +6,20 @@ when their parent is gone, however it went, so that a killed run leaves nothing 
 
 import contextlib
 import fcntl
+import heapq
 import logging
 import multiprocessing
 import os
 import signal
 import time
+import uuid
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal, Protocol, TextIO, runtime_checkable
 
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.leases import Shared
@@ -65,9 +68,12 @@ def only_run_in(root: Path) -> Generator[None]:
             f"cannot write to {root}: {error.strerror}; choose another folder with --out"
         ) from error
     with stream:
-        _lock(stream, root, wait_s=0.2)  # `is_at_work` holds it for a moment
+        lock(stream, root, wait_s=0.2)  # `is_at_work` holds it for a moment
+        stream.truncate(0)
+        stream.write(uuid.uuid4().hex)
+        stream.flush()
         with (root / WORKER_LOCK).open("a") as workers:
-            _lock(workers, root, wait_s=WORKERS_END_S)
+            lock(workers, root, wait_s=WORKERS_END_S)
         yield
 
 
@@ -83,7 +89,17 @@ def is_at_work(root: Path) -> bool:
     return False
 
 
-def _lock(stream: TextIO, root: Path, wait_s: float) -> None:
+def run_name(root: Path) -> str:
+    """Return what tells the run that is at work in a folder from earlier and later ones; empty: none began."""
+    return (root / RUN_LOCK).read_text() if (root / RUN_LOCK).exists() else ""
+
+
+def lock(stream: TextIO, root: Path, wait_s: float) -> None:
+    """Hold an open file alone.
+
+    Raises:
+        V2PError: another process holds it, and did so all the time.
+    """
     deadline = time.monotonic() + wait_s
     while True:
         try:
@@ -94,6 +110,19 @@ def _lock(stream: TextIO, root: Path, wait_s: float) -> None:
                     f"another v2p run is at work in {root}; wait for it or choose another --out"
                 ) from error
             time.sleep(0.1)
+
+
+@runtime_checkable
+class Engine(Protocol):
+    """What makes stages: worker processes of this machine, or a cluster."""
+
+    @property
+    def is_busy(self) -> bool: ...
+    @property
+    def has_room(self) -> bool: ...
+    def start(self, stage: Stage) -> None: ...
+    def events(self) -> Iterator[Event]: ...
+    def close(self) -> None: ...
 
 
 def run_stages(
@@ -114,53 +143,79 @@ def _run_stages(
     ordered: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None], shared: Shared
 ) -> dict[Key, Outcome]:
     outcomes: dict[Key, Outcome] = {}
-    pending: list[Stage] = []
-    for stage in ordered:
+    ready: list[tuple[int, Stage]] = []  # a heap by place: the first item is finished first
+    num_missing: dict[Key, int] = {}
+    needed_by: dict[Key, list[tuple[int, Stage]]] = defaultdict(list)
+
+    def ended(stage: Stage, outcome: Outcome) -> None:
+        key = _key(stage)
+        outcomes[key] = outcome
+        on_event(Event(kind="ended", stage=stage, outcome=outcome))
+        for place, other in needed_by.pop(key, ()):
+            num_missing[_key(other)] -= 1
+            if not outcome.is_usable and _key(other) not in outcomes:
+                ended(other, _blocked(other, outcome, runtime.root))
+            elif num_missing[_key(other)] == 0 and _key(other) not in outcomes:
+                heapq.heappush(ready, (place, other))
+
+    for place, stage in enumerate(ordered):
         stored = shared.stored(stage)
-        if stored is None:
-            pending.append(stage)
-        else:
-            outcomes[_key(stage)] = stored
-            on_event(Event(kind="ended", stage=stage, outcome=stored))
-    if not pending:
+        if stored is None and (blocker := blocked_by(stage, outcomes)) is not None:
+            stored = _blocked(stage, blocker, runtime.root)
+        if stored is not None:
+            ended(stage, stored)
+            continue
+        missing = {_key(needed) for needed in stage.inputs.values()} - outcomes.keys()
+        num_missing[_key(stage)] = len(missing)
+        for key in missing:
+            needed_by[key].append((place, stage))
+        if not missing:
+            ready.append((place, stage))
+    if not ready:
         return outcomes
-    pool = _Pool(runtime, size=min(max(1, runtime.workers), len(pending)))
+    engine = _engine(runtime, num_pending=len(num_missing))
     try:
-        while pending or pool.is_busy:
-            for stage in list(pending):
-                blocker = blocked_by(stage, outcomes)
-                if blocker is not None:
-                    outcome = Outcome(
-                        stage=stage.name, item=stage.item, status="blocked",
-                        folder=stage.folder(runtime.root), reason=blocker.reason,
-                        detail=f"needs {blocker.stage} of {blocker.item}",
-                    )  # fmt: skip
-                elif all(_key(needed) in outcomes for needed in stage.inputs.values()):
-                    if not pool.has_room:
-                        continue
-                    claimed = shared.claim(stage)
-                    if claimed is None:
-                        continue
-                    if isinstance(claimed, Outcome):
-                        outcome = claimed
-                    else:
-                        pool.start(stage)
-                        on_event(Event(kind="started", stage=stage))
-                        pending.remove(stage)
-                        continue
+        while ready or engine.is_busy:
+            others: list[tuple[int, Stage]] = []  # at work on another driver
+            while ready and engine.has_room:
+                place, stage = heapq.heappop(ready)
+                claimed = shared.claim(stage)
+                if claimed is None:
+                    others.append((place, stage))
+                elif isinstance(claimed, Outcome):
+                    ended(stage, claimed)
                 else:
-                    continue
-                pending.remove(stage)
-                outcomes[_key(stage)] = outcome
-                on_event(Event(kind="ended", stage=stage, outcome=outcome))
-            for event in pool.events():
-                if event.outcome is not None:
-                    outcomes[_key(event.stage)] = event.outcome
+                    engine.start(stage)
+                    on_event(Event(kind="started", stage=stage))
+            for entry in others:
+                heapq.heappush(ready, entry)
+            if not engine.is_busy:
+                time.sleep(0.2 if others else 0.0)
+                continue
+            for event in engine.events():
+                if event.outcome is None:
+                    on_event(event)
+                else:
                     shared.ended(event.stage)
-                on_event(event)
+                    ended(event.stage, event.outcome)
     finally:
-        pool.close()
+        engine.close()
     return outcomes
+
+
+def _blocked(stage: Stage, blocker: Outcome, root: Path) -> Outcome:
+    return Outcome(
+        stage=stage.name, item=stage.item, status="blocked", folder=stage.folder(root),
+        reason=blocker.reason, detail=f"needs {blocker.stage} of {blocker.item}",
+    )  # fmt: skip
+
+
+def _engine(runtime: Runtime, num_pending: int) -> Engine:
+    if runtime.engine == "ray":
+        from v2p_data.pipeline.ray_engine import RayEngine
+
+        return RayEngine(runtime)
+    return _Pool(runtime, size=min(max(1, runtime.workers), num_pending))
 
 
 def _key(stage: Stage) -> Key:
@@ -179,7 +234,7 @@ class _Pool:
     def __init__(self, runtime: Runtime, size: int) -> None:
         # Spawned, not forked: a fork would share the caller's OpenGL and thread state.
         self.context = multiprocessing.get_context("spawn")
-        self.runtime = replace(runtime, progress=_no_progress)
+        self.runtime = replace(runtime, progress=no_progress)
         self.size = size
         self.workers: list[_Worker] = []
 
@@ -252,19 +307,15 @@ def _how_it_died(exitcode: int | None, root: Path) -> str:
     return f"the worker process {how}; its output is in {root / 'logs'}"
 
 
-def _no_progress(share: float, words: str) -> None:
+def no_progress(share: float, words: str) -> None:
     del share, words
 
 
 def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends us
     end_with_parent(parent_pid)
-    log.parent.mkdir(parents=True, exist_ok=True)
-    stream = log.open("a")
-    os.dup2(stream.fileno(), 1)
-    os.dup2(stream.fileno(), 2)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
-    _limit_threads(runtime.num_threads)
+    write_to(log)
+    limit_threads(runtime.num_threads)
     alive = (runtime.root / WORKER_LOCK).open("a")
     fcntl.flock(alive, fcntl.LOCK_SH)
     while True:
@@ -283,6 +334,16 @@ def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) 
         connection.send(make_stage(stage, replace(runtime, progress=progress)))
 
 
-def _limit_threads(num_threads: int) -> None:
+def write_to(log: Path) -> TextIO:
+    """Send all that this process says to the end of a log; return it, which stays open."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    stream = log.open("a")
+    os.dup2(stream.fileno(), 1)
+    os.dup2(stream.fileno(), 2)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", force=True)
+    return stream
+
+
+def limit_threads(num_threads: int) -> None:
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = str(num_threads)

@@ -1,0 +1,216 @@
+"""Stages as tasks of a Ray cluster, behind the same interface as the worker processes.
+
+Only a stage and its outcome travel: results lie in the run folder, which all nodes see at the same path. Each task has a
+fresh process. A task that dies with its process or its node is tried again here, never by Ray; a failure that a stage
+reports itself is not.
+"""
+
+import contextlib
+import fcntl
+import importlib.util
+import os
+import pickle
+import signal
+import socket
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TextIO
+
+from v2p_data.errors import V2PError
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage, make_stage, stored_outcome
+from v2p_data.pipeline.workers import (
+    WORKER_LOCK,
+    Event,
+    limit_threads,
+    lock,
+    no_progress,
+    run_name,
+    write_to,
+)
+from v2p_data.processes import end_with_parent
+
+TRIES = 3
+"""A task that dies is begun so often; then its item has failed."""
+CONNECT_S = 5.0
+"""The head of a cluster answers sooner."""
+FEWEST_IN_FLIGHT = 64
+"""Tasks that a small cluster is told of at a time: what waits there makes it grow, where it can."""
+ITEM_FREE_S = 120.0
+"""The process of a lost node has let go of its item by then, or still works."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    stage: Stage
+    tries: int
+
+
+class RayEngine:
+    """Tasks in flight on a cluster.
+
+    Raises:
+        V2PError: Ray is not installed, or no cluster answers at the address.
+    """
+
+    def __init__(self, runtime: Runtime) -> None:
+        self.address = runtime.address
+        self.ray = _connected(runtime.address)
+        nodes = [n["Resources"] for n in self.ray.nodes() if n["Alive"]]
+        self.most = {k: max(n.get(k, 0.0) for n in nodes) for k in ("CPU", "GPU")}
+        num_cpus = int(sum(n.get("CPU", 0) for n in nodes))
+        self.size = runtime.workers or max(FEWEST_IN_FLIGHT, 2 * num_cpus)
+        self.runtime = replace(runtime, root=runtime.root.absolute(), progress=no_progress)
+        self.runtime.root.mkdir(parents=True, exist_ok=True)
+        self.run_name = run_name(self.runtime.root)
+        self.tasks: dict[Any, _Task] = {}
+
+        # Travels by value and names nothing of ours: a node learns from its arguments where our code lies.
+        def task(paths: list[str], how: bytes, what: bytes) -> Any:
+            import sys
+
+            sys.path[:0] = [path for path in paths if path not in sys.path]
+            from v2p_data.pipeline.ray_engine import work
+
+            return work(how, what)
+
+        self.task = self.ray.remote(max_calls=1, max_retries=0)(task)
+        self.paths = [str(Path(__file__).parents[2]), *(p for p in sys.path if p)]
+
+    @property
+    def is_busy(self) -> bool:
+        return bool(self.tasks)
+
+    @property
+    def has_room(self) -> bool:
+        return len(self.tasks) < self.size
+
+    def start(self, stage: Stage) -> None:
+        self._submit(_Task(stage=stage, tries=1))
+
+    def _submit(self, task: _Task) -> None:
+        stage, runtime = task.stage, self.runtime
+        on_gpu = stage.on_device and runtime.device.startswith("cuda")
+        if on_gpu and not self.most["GPU"]:
+            raise V2PError(
+                f"no node of the Ray cluster at {self.address} has a GPU; start one that has or use --device=cpu"
+            )
+        num_cpus = max(1, min(runtime.num_threads, int(self.most["CPU"])))
+        here = replace(runtime, num_threads=num_cpus, device="cuda" if on_gpu else "cpu")
+        how = pickle.dumps((here, self.run_name, str(Path.cwd())))
+        reference = self.task.options(
+            name=f"{stage.name} {stage.item}",
+            num_cpus=num_cpus,
+            num_gpus=int(on_gpu),
+        ).remote(self.paths, how, self.ray.cloudpickle.dumps(stage))
+        self.tasks[reference] = task
+
+    def events(self) -> Iterator[Event]:
+        from ray.exceptions import RayError, RayTaskError
+
+        ended, _ = self.ray.wait(list(self.tasks), timeout=1.0)
+        for reference in ended:
+            task = self.tasks.pop(reference)
+            stage, root = task.stage, self.runtime.root
+            try:
+                outcome: Outcome = self.ray.get(reference)
+            except RayTaskError as error:  # before the stage began
+                why = f"a node cannot load our code or the recipe: {error.cause}"
+                outcome = _failed(stage, root, "error", why)
+            except RayError as error:
+                how = type(error).__name__
+                if task.tries < TRIES:
+                    self._submit(replace(task, tries=task.tries + 1))
+                    yield Event(kind="progress", stage=stage, words=f"begun again after {how}")
+                    continue
+                why = f"its process ended {TRIES} times, last of {how}; its output is in {_log(stage, root)}"
+                outcome = _failed(stage, root, "crashed", why)
+            yield Event(kind="ended", stage=stage, outcome=outcome)
+
+    def close(self) -> None:
+        for reference in self.tasks:
+            self.ray.cancel(reference, force=True)
+        self.ray.shutdown()  # the cluster ends what is still at work for us
+
+
+def demand_ray() -> None:
+    """Raise if Ray is not installed.
+
+    Raises:
+        V2PError: says how to install it.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise V2PError(
+            "--engine=ray needs the ray package: pip install 'lerobot_policy_v2p[scale]'"
+        )
+
+
+def _connected(address: str) -> Any:
+    demand_ray()
+    # Ray reads these when it is imported. It says in our output which workers died; we say it, with the item.
+    os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = "."
+    # Under `uv run` it would copy the working directory to every node.
+    os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
+    import ray
+
+    host, _, port = address.rpartition(":")
+    try:
+        if port.isdecimal():
+            socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except (OSError, RuntimeError, ValueError) as error:
+        why = str(error).splitlines()[0]
+        raise V2PError(
+            f"no Ray cluster answers at {address} ({why}); start one with 'ray start --head' and name its HOST:PORT in --address"
+        ) from error
+    return ray
+
+
+def _log(stage: Stage, root: Path) -> Path:
+    return root / "logs" / f"{stage.name}-{stage.folder_name}.log"
+
+
+def work(how: bytes, what: bytes) -> Outcome:
+    """Make a stage in this process of a node, which does nothing else; return what became of it.
+
+    Two processes never fill one folder: the item's log is held until the process ends, and a run that has been followed
+    by another one begins nothing more.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once, not when Python gets round to it
+    end_with_parent(os.getppid())
+    runtime, run, home = pickle.loads(how)
+    limit_threads(runtime.num_threads)
+    with contextlib.suppress(OSError):
+        os.chdir(home)  # recipes may name videos relative to it
+    stage: Stage = pickle.loads(what)
+    try:
+        alive = _part_of(run, runtime.root)
+        lock(write_to(_log(stage, runtime.root)), runtime.root, wait_s=ITEM_FREE_S)
+    except V2PError as error:
+        return _failed(stage, runtime.root, "error", str(error))
+    with alive:
+        return stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
+
+
+def _part_of(run: str, root: Path) -> TextIO:
+    """Return the workers' lock, held, of a run that is still at work.
+
+    Raises:
+        V2PError: this node does not see that run.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        alive = (root / WORKER_LOCK).open("a")
+        fcntl.flock(alive, fcntl.LOCK_SH)
+        if run_name(root) == run:  # asked after the lock, for which a new run waits
+            return alive
+    raise V2PError(
+        f"{socket.gethostname()} does not see this run in {root}: all nodes need the run folder at the same path"
+    )
+
+
+def _failed(stage: Stage, root: Path, reason: str, detail: str) -> Outcome:
+    return Outcome(
+        stage=stage.name, item=stage.item, status="failed", folder=stage.folder(root),
+        reason=reason, detail=detail,
+    )  # fmt: skip
