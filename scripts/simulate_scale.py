@@ -23,8 +23,9 @@ import tyro
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline import workers
 from v2p_data.pipeline.artifact import RECORD_FILE
+from v2p_data.pipeline.at_work import Event
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
-from v2p_data.pipeline.workers import Event, run_stages
+from v2p_data.pipeline.workers import run_stages
 
 REJECTED_EVERY = 50
 """About as often as a clip that is no good."""

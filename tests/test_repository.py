@@ -63,6 +63,7 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
         deploy,
         detectors,
         edit,
+        gc,
         hands,
         models,
         outlines,
@@ -82,7 +83,7 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
         "status": show.Status, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.Review, "scene models": models.Models, "scene hands": hands.Hands,
         "scene outlines": outlines.Outlines, "scene detectors": detectors.Detectors,
         "reward": run.FromVideos, "task show": task.ShowTask, "reward search": reward.Search,
-        "reward show": reward.ShowReward, "explain": share.Explain, "merge": edit.Merge, "drop": edit.Drop,
+        "reward show": reward.ShowReward, "explain": share.Explain, "merge": edit.Merge, "drop": edit.Drop, "gc": gc.Gc,
     }  # fmt: skip
     assert set(kinds) == {*COMMANDS, *SUBCOMMANDS}
     for words in map(shlex.split, shown_commands(page)):

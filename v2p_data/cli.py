@@ -41,6 +41,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "drop": ("edit", "a dataset without some of its tasks"),
     "status": ("show", "what a run folder holds, and what failed and why"),
     "report": ("show", "write a run's page again"),
+    "gc": ("gc", "what can be deleted of a run folder, and what making it again would cost"),
     "demo": ("run", "the whole chain on three sample clips"),
 }
 """Command -> module of `v2p_data.commands` that holds it, and what it does."""

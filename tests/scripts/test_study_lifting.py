@@ -16,6 +16,7 @@ from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import V2PError
 from v2p_data.experts.config import ExpertConfig
+from v2p_data.pipeline.at_work import Event
 from v2p_data.pipeline.runner import (
     Outcome,
     Runtime,
@@ -25,7 +26,6 @@ from v2p_data.pipeline.runner import (
     stored_outcome,
 )
 from v2p_data.pipeline.settings import load_settings
-from v2p_data.pipeline.workers import Event
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.stages import (
     CousinsConfig,

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn, TimeRemainingColumn
 
 from v2p_data.errors import NOT_ALL, NOTHING
+from v2p_data.pipeline.at_work import Event
 from v2p_data.pipeline.runner import Outcome, Progress, Stage
-from v2p_data.pipeline.workers import Event
 
 PLAIN_EVERY_S = 15.0
 """Nobody waits longer for a word."""

@@ -1,5 +1,6 @@
 """Commands that make things: the whole chain, or up to one stage."""
 
+import math
 import os
 import shlex
 import sys
@@ -22,6 +23,7 @@ from v2p_data.commands.display import (
     tally,
     telling,
 )
+from v2p_data.commands.progress import Progress
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.episodes.hub.policy_card import note_results
@@ -69,6 +71,10 @@ class How:
     """Threads per job."""
     device: str = "cpu"
     """Where the policy trains: cpu, cuda, mps."""
+    store: str = ""
+    """Folder or URL (s3://BUCKET/PREFIX) that drivers and machines share results in; each keeps an --out of its own."""
+    lease_s: float = 60.0
+    """With --store: a driver without a sign of life for so long is taken for dead by the others."""
     engine: Literal["local", "ray"] = "local"
     """Where jobs run: processes of this machine, or tasks of a Ray cluster whose nodes share --out."""
     address: str = "auto"
@@ -79,6 +85,8 @@ class How:
             raise V2PError(
                 f"--workers is at least 0 and --threads at least 1, got {self.workers} and {self.threads}"
             )
+        if not 0 < self.lease_s < math.inf:
+            raise V2PError(f"--lease-s is a number of seconds above 0, got {self.lease_s}")
         if self.engine == "ray":
             demand_ray()
         else:
@@ -90,6 +98,8 @@ class How:
             device=self.device,
             engine=self.engine,
             address=self.address,
+            store=self.store,
+            lease_s=self.lease_s,
         )
 
 
@@ -607,7 +617,9 @@ def _videos(folder: Path) -> list[VideoItem]:
 
 def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:
     with Display() as display:
-        outcomes = run_stages(stages, runtime, display)
+        progress = Progress(runtime, stages, display)
+        outcomes = run_stages(stages, runtime, progress)
+        progress.write()
     path = runtime.root / RUN_FILE
     try:
         write_json_atomically(path, outcomes_json(outcomes, stages))

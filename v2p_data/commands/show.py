@@ -1,5 +1,6 @@
 """Commands that show what a run made."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.commands.display import STAGE_ORDER, telling
+from v2p_data.commands.progress import progress_of
 from v2p_data.errors import UnusableError, V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import RECORD_FILE, read_record
@@ -28,12 +30,21 @@ class Shown:
 class Status(Shown):
     check: bool = False
     """Read every file and compare it with its digest; otherwise only sizes are looked at."""
+    json: bool = False
+    """Print how far the run's last command is, and what failed, as JSON for machines; this looks at no result."""
 
 
 def status_command(argv: list[str]) -> int:
     """Return 0; with `--check` 1 where something is damaged."""
     args = parse(Status, argv, "status")
-    run = _run(args.run)
+    run = run_folder(args.run)
+    if args.json:
+        failures = [
+            dict(zip(("stage", "item", "state", "why"), row, strict=True))
+            for row in _failures(run)
+        ]
+        print(json.dumps(progress_of(run) | {"failures": failures}, indent=1))  # noqa: T201
+        return 0
     rows = [
         row
         for stage in STAGE_ORDER
@@ -54,7 +65,7 @@ def report_command(argv: list[str]) -> int:
     from v2p_data.report.page import write_page
 
     with telling("report"):
-        page = write_page(_run(parse(Shown, argv, "report").run))
+        page = write_page(run_folder(parse(Shown, argv, "report").run))
     print(f"Made {page}, {page.stat().st_size / 1e6:.1f} MB\nNext: open it in a browser")  # noqa: T201
     return 0
 
@@ -100,7 +111,7 @@ def _failures(run: Path) -> Iterator[Row]:
             yield stage, item, "failed", f"{reason}: {detail}"
 
 
-def _run(run: Path) -> Path:
+def run_folder(run: Path) -> Path:
     if not any((run / stage).is_dir() for stage in STAGE_ORDER):
         raise V2PError(f"{run} is no run folder: it holds none of {', '.join(STAGE_ORDER)}")
     return run

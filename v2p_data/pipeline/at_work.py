@@ -27,6 +27,18 @@ class Event:
     outcome: Outcome | None = None
 
 
+def is_at_work(root: Path) -> bool:
+    """Return whether a run holds the folder's lock."""
+    try:
+        with (root / RUN_LOCK).open() as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
 def run_name(root: Path) -> str:
     """Return what tells the run that is at work in a folder from earlier and later ones; empty: none began."""
     return (root / RUN_LOCK).read_text() if (root / RUN_LOCK).exists() else ""

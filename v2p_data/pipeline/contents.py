@@ -130,10 +130,14 @@ def memory_of(folder: Path, root: Path) -> Path | None:
     return root / MEMORY_FOLDER / folder.relative_to(root).with_name(f"{folder.name}.json")
 
 
+def must_stay(name: str) -> bool:
+    """Return whether a file of this path in a finished folder is listed, so that it must stay as it was made."""
+    return not any(fnmatch(part, unlisted) for part in name.split("/") for unlisted in UNLISTED)
+
+
 def _listed(folder: Path) -> Iterator[Path]:
     for path in sorted(folder.rglob("*")):
-        parts = path.relative_to(folder).parts
-        if path.is_file() and not any(fnmatch(p, u) for p in parts for u in UNLISTED):
+        if path.is_file() and must_stay(path.relative_to(folder).as_posix()):
             yield path
 
 

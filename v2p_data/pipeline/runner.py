@@ -29,6 +29,7 @@ from v2p_data.pipeline.artifact import (
 )
 from v2p_data.pipeline.contents import damaged, list_files, memory_of, remember_made
 from v2p_data.pipeline.fingerprint import canonical, fingerprint
+from v2p_data.pipeline.store import open_store
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +52,10 @@ class Runtime:
     """Where jobs run: processes of this machine, or tasks of a Ray cluster."""
     address: str = "auto"
     """Of the cluster."""
+    store: str = ""
+    """Folder or URL where finished results are shared; empty: nowhere."""
+    lease_s: float = 60.0
+    """A driver without a sign of life for so long is taken for dead by the others."""
     progress: Progress = field(default=lambda share, words: None)
 
 
@@ -123,11 +128,29 @@ def stored_outcome(stage: Stage, root: Path) -> Outcome | None:
     What is damaged has failed: it is neither used nor deleted.
     """
     folder = stage.folder(root)
-    try:
+
+    def whole_record() -> Record | None:
         record = read_record(folder)
+        is_empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+        if record is None and not is_empty:
+            raise damaged(folder, f"{folder / RECORD_FILE} is missing")
+        return record
+
+    return outcome_of(stage, root, whole_record)
+
+
+def outcome_of(stage: Stage, root: Path, read: Callable[[], Record | None]) -> Outcome | None:
+    """Return the outcome that a stage's record tells, None where there is no record.
+
+    Args:
+        stage: the stage.
+        root: the run folder.
+        read: returns the record, or raises `UnusableError`, which is a failure.
+    """
+    folder = stage.folder(root)
+    try:
+        record = read()
         if record is None:
-            if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-                raise damaged(folder, f"{folder / RECORD_FILE} is missing")
             return None
         if record.fingerprint != stage.fingerprint:
             raise damaged(folder, f"{folder / RECORD_FILE} is of another result")
@@ -137,18 +160,15 @@ def stored_outcome(stage: Stage, root: Path) -> Outcome | None:
             stage=stage.name, item=stage.item, status="failed", folder=folder,
             reason=error.reason, detail=error.detail,
         )  # fmt: skip
-    if record.rejected:
-        return Outcome(
-            stage=stage.name,
-            item=stage.item,
-            status="rejected",
-            folder=folder,
-            seconds=record.seconds,
-            reason=str(record.rejected.get("reason", "")),
-            detail=str(record.rejected.get("detail", "")),
-        )
+    rejected = record.rejected or {}
     return Outcome(
-        stage=stage.name, item=stage.item, status="kept", folder=folder, seconds=record.seconds
+        stage=stage.name,
+        item=stage.item,
+        status="rejected" if rejected else "kept",
+        folder=folder,
+        seconds=record.seconds,
+        reason=str(rejected.get("reason", "")),
+        detail=str(rejected.get("detail", "")),
     )
 
 
@@ -156,18 +176,22 @@ def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
     """Make one result whose inputs are complete, and write its record last.
 
     The inputs are compared with what their records list. A rejected item gets a folder with a record too, so that
-    running again does not try it again.
+    running again does not try it again. With a store, inputs that are not here are fetched, and the result is published.
     """
     folder = stage.folder(runtime.root)
     partial = folder.with_name(folder.name + ".partial")
     started = time.monotonic()
     is_begun = False
     try:
+        if runtime.store and (here := stored_outcome(stage, runtime.root)) is not None:
+            return _published(here, runtime)  # made before, while the store was away
+        if runtime.store:
+            _fetch_inputs(stage, runtime)
         if partial.exists() and not stage.resumes:
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
         is_begun = True
-        return _made(stage, runtime, partial, folder, started)
+        return _published(_made(stage, runtime, partial, folder, started), runtime)
     except Exception as error:  # noqa: BLE001 - whatever a stage raises is its own result
         reason, detail = _why(error, partial)
         if is_begun and not partial.exists() and not folder.exists():
@@ -177,6 +201,22 @@ def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
             stage=stage.name, item=stage.item, status="failed", folder=folder,
             seconds=time.monotonic() - started, reason=reason, detail=detail,
         )  # fmt: skip
+
+
+def _fetch_inputs(stage: Stage, runtime: Runtime) -> None:
+    """Bring all that a stage comes from into the run folder: histories and packing look beyond its own inputs."""
+    for needed in in_order(list(stage.inputs.values())):
+        if not open_store(runtime.store).fetch(needed.folder(runtime.root), runtime.root):
+            raise V2PError(
+                f"{needed.name} of {needed.item} is neither in {runtime.root} nor in {runtime.store}; run the same command "
+                "again where it was made"
+            )
+
+
+def _published(outcome: Outcome, runtime: Runtime) -> Outcome:
+    if runtime.store and outcome.status != "failed":
+        open_store(runtime.store).publish(outcome.folder)
+    return outcome
 
 
 def _why(error: Exception, partial: Path) -> tuple[str, str]:

@@ -30,6 +30,7 @@ from v2p_data.pipeline.at_work import (
     no_progress,
     write_to,
 )
+from v2p_data.pipeline.leases import Shared
 from v2p_data.pipeline.runner import (
     Outcome,
     Runtime,
@@ -37,7 +38,6 @@ from v2p_data.pipeline.runner import (
     blocked_by,
     in_order,
     make_stage,
-    stored_outcome,
 )
 from v2p_data.processes import end_with_parent
 
@@ -62,7 +62,7 @@ def only_run_in(root: Path) -> Generator[None]:
             f"cannot write to {root}: {error.strerror}; choose another folder with --out"
         ) from error
     with stream:
-        lock(stream, root, wait_s=0.0)
+        lock(stream, root, wait_s=0.2)  # `is_at_work` holds it for a moment
         stream.truncate(0)
         stream.write(uuid.uuid4().hex)
         stream.flush()
@@ -87,7 +87,20 @@ class Engine(Protocol):
 def run_stages(
     stages: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None]
 ) -> dict[Key, Outcome]:
-    """Make every stage and what it needs; return the outcome per (stage name, folder name)."""
+    """Make every stage and what it needs; return the outcome per (stage name, folder name).
+
+    With a store, what others made is taken and what they are making is waited for, while all else goes on.
+    """
+    ordered = list(in_order(stages))
+    with Shared(runtime) as shared:
+        outcomes = _run_stages(ordered, runtime, on_event, shared)
+        shared.fetch_all(ordered, outcomes)
+    return outcomes
+
+
+def _run_stages(
+    ordered: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None], shared: Shared
+) -> dict[Key, Outcome]:
     outcomes: dict[Key, Outcome] = {}
     ready: list[tuple[int, Stage]] = []  # a heap by place: the first item is finished first
     num_missing: dict[Key, int] = {}
@@ -104,8 +117,8 @@ def run_stages(
             elif num_missing[_key(other)] == 0 and _key(other) not in outcomes:
                 heapq.heappush(ready, (place, other))
 
-    for place, stage in enumerate(in_order(stages)):
-        stored = stored_outcome(stage, runtime.root)
+    for place, stage in enumerate(ordered):
+        stored = shared.stored(stage)
         if stored is None and (blocker := blocked_by(stage, outcomes)) is not None:
             stored = _blocked(stage, blocker, runtime.root)
         if stored is not None:
@@ -122,14 +135,27 @@ def run_stages(
     engine = _engine(runtime, num_pending=len(num_missing))
     try:
         while ready or engine.is_busy:
+            others: list[tuple[int, Stage]] = []  # at work on another driver
             while ready and engine.has_room:
-                _, stage = heapq.heappop(ready)
-                engine.start(stage)
-                on_event(Event(kind="started", stage=stage))
+                place, stage = heapq.heappop(ready)
+                claimed = shared.claim(stage)
+                if claimed is None:
+                    others.append((place, stage))
+                elif isinstance(claimed, Outcome):
+                    ended(stage, claimed)
+                else:
+                    engine.start(stage)
+                    on_event(Event(kind="started", stage=stage))
+            for entry in others:
+                heapq.heappush(ready, entry)
+            if not engine.is_busy:
+                time.sleep(0.2 if others else 0.0)
+                continue
             for event in engine.events():
                 if event.outcome is None:
                     on_event(event)
                 else:
+                    shared.ended(event.stage)
                     ended(event.stage, event.outcome)
     finally:
         engine.close()

@@ -1,0 +1,128 @@
+import json
+import time
+
+import pytest
+
+from v2p_data.commands.gc import gc_command
+from v2p_data.commands.progress import Progress, progress_of
+from v2p_data.commands.show import status_command
+from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.pipeline.at_work import Event
+from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, make_stage
+from v2p_data.pipeline.workers import only_run_in
+
+
+def make_bytes(config, inputs, out, runtime):
+    del inputs, runtime
+    if config == "rejected":
+        raise ItemRejectedError("too_dull", "it is too dull")
+    (out / "bytes").write_bytes(bytes(1000))
+
+
+def dataset(config: str, item: str = "clip") -> Stage:
+    scene = Stage(name="scene", item=item, config=config, make=make_bytes)
+    return Stage(name="dataset", item="all", config="", inputs={item: scene}, make=make_bytes)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Return a run with a dataset, a scene that an older setting made, a rejected one, and work that was killed."""
+    rejected = Stage(name="scene", item="bad", config="rejected", make=make_bytes)
+    old = dataset("old").inputs["clip"]
+    for stage in (*in_order([dataset("new")]), old, rejected):
+        make_stage(stage, Runtime(root=tmp_path))
+    (tmp_path / "scene" / "half-00000000.partial").mkdir()
+    return tmp_path
+
+
+def folders(run):
+    return {path.name for path in run.glob("*/*") if path.parent.name[0] != "."}
+
+
+def test_gc_lists_what_no_dataset_came_from_and_deletes_it_when_told(run, capsys):
+    before, old = folders(run), dataset("old").inputs["clip"].folder_name
+
+    assert gc_command([str(run)]) == 0
+    listed = capsys.readouterr().out
+    assert folders(run) == before
+    assert "Could delete 2 folders" in listed
+    assert f"scene/{old}  (nothing came of it)" in listed
+    assert "scene/half-00000000.partial  (unfinished)" in listed
+
+    assert gc_command([str(run), "--delete"]) == 0
+    assert before - folders(run) == {old, "half-00000000.partial"}
+    assert not any((run / ".fetching").iterdir())
+
+
+def test_gc_keeps_what_the_last_command_asked_for(run, capsys):
+    old = dataset("old").inputs["clip"]
+    write_json_atomically(run / "run.json", [{"stage": "scene", "folder": old.folder_name}])
+
+    gc_command([str(run)])
+
+    assert old.folder_name not in capsys.readouterr().out
+
+
+def test_gc_takes_no_finished_result_before_there_is_a_dataset(run, capsys):
+    (made,) = (run / "dataset").iterdir()
+    made.rename(run / "elsewhere")
+
+    gc_command([str(run)])
+
+    assert "Could delete 1 folders" in capsys.readouterr().out
+
+
+def test_gc_waits_for_no_run_and_touches_no_store(run):
+    with only_run_in(run), pytest.raises(V2PError, match="another v2p run is at work"):
+        gc_command([str(run), "--delete"])
+    (run / "store.json").touch()
+    with pytest.raises(V2PError, match="is a store"):
+        gc_command([str(run), "--delete"])
+
+
+def test_status_tells_machines_how_far_a_run_is(tmp_path, capsys, monkeypatch):
+    stages = [dataset("", item) for item in "abc"]
+    scenes = [stage.inputs[stage_item] for stage, stage_item in zip(stages, "abc", strict=True)]
+    shown = []
+    progress = Progress(Runtime(root=tmp_path, workers=2), scenes, shown.append)
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 36.0)  # a hundredth of an hour later
+
+    def ended(stage, status, seconds):
+        outcome = Outcome(stage="scene", item=stage.item, status=status, folder=tmp_path, seconds=seconds)  # fmt: skip
+        progress(Event(kind="ended", stage=stage, outcome=outcome))
+
+    for scene in scenes[:2]:
+        progress(Event(kind="started", stage=scene))
+    ended(scenes[0], "made", 5.0)
+    progress.write()
+    (tmp_path / "scene").mkdir()
+
+    with only_run_in(tmp_path):
+        scene = progress_of(tmp_path)["stages"]["scene"]
+    assert (scene["planned"], scene["made"], scene["left"], scene["running"]) == (3, 1, 2, ["b"])
+    assert scene["made_per_hour"] == pytest.approx(100.0, rel=0.01)
+    assert scene["seconds_left"] == 2 * 5.0 / 2  # two items, five seconds each, two workers
+    assert len(shown) == 3
+    failure = {
+        "stage": "scene",
+        "item": "c",
+        "status": "failed",
+        "reason": "error",
+        "detail": "boom",
+    }
+    write_json_atomically(tmp_path / "run.json", [failure])
+    assert status_command([str(tmp_path), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["at_work"], said["stages"]["scene"]["running"]) == (False, [])
+    assert said["failures"] == [
+        {"stage": "scene", "item": "c", "state": "failed", "why": "error: boom"}
+    ]
+
+
+def test_status_names_a_folder_without_counts(tmp_path):
+    (tmp_path / "scene").mkdir()
+
+    with pytest.raises(V2PError, match=r"progress\.json cannot be read"):
+        status_command([str(tmp_path), "--json"])

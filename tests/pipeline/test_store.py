@@ -1,0 +1,319 @@
+import json
+import subprocess
+import sys
+import threading
+import time
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from v2p_data.errors import V2PError
+from v2p_data.pipeline import store as store_module
+from v2p_data.pipeline.leases import Shared
+from v2p_data.pipeline.runner import Runtime, in_order, make_stage
+from v2p_data.pipeline.store import open_store
+from v2p_data.pipeline.workers import run_stages
+
+sys.path.insert(0, str(Path(__file__).parent))
+from sample_driver import ITEMS, marked
+
+pytest.importorskip("obstore", reason="shared stores need the extra 'store'")
+localbucket = pytest.importorskip("localbucket", reason="an S3 server of the extra 'dev'")
+
+DRIVER = Path(__file__).parent / "sample_driver.py"
+KEY = "testtesttest"
+
+
+@pytest.fixture(autouse=True)
+def _no_open_store():
+    open_store.cache_clear()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "store"
+
+
+@pytest.fixture
+def bucket(tmp_path, monkeypatch):
+    """Return the folder in which a running S3 server keeps what is put into s3://bucket."""
+    yield from served(localbucket.S3Handler, tmp_path, monkeypatch)
+
+
+def served(handler, tmp_path, monkeypatch):
+    handler = type("Handler", (handler,), {"data_root": tmp_path / "s3", "log_message": print})
+    (tmp_path / "s3" / "bucket").mkdir(parents=True)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+    monkeypatch.setenv("AWS_ALLOW_HTTP", "true")
+    monkeypatch.setenv("AWS_REGION", "us-east-1")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", KEY)
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", KEY)
+    yield tmp_path / "s3" / "bucket"
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def place(request):
+    """Return a store's URL and the folder that it keeps its objects in."""
+    where = request.getfixturevalue(request.param)
+    return (str(where), where) if request.param == "folder" else ("s3://bucket/run", where / "run")
+
+
+def run(stages, root, store):
+    runtime = Runtime(root=root, store=str(store))
+    return {(o.stage, o.item): o for o in run_stages(stages, runtime, lambda event: None).values()}
+
+
+def publish(stages, root, url):
+    """Make stages in this process, which publishes them too."""
+    open_store(url).begin()
+    runtime = Runtime(root=root, store=url)
+    assert {make_stage(s, runtime).status for s in in_order(stages)} == {"made"}
+
+
+def files(root: Path) -> dict[str, bytes]:
+    """Return a run's results, byte by byte."""
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for stage in ("one", "two")
+        for path in (root / stage).rglob("*")
+        if path.is_file()
+    }
+
+
+def drivers(tmp_path, url, seconds, lease_s, names):
+    words = [url, tmp_path / "marks", str(seconds), str(lease_s)]
+    return [
+        subprocess.Popen(
+            [sys.executable, DRIVER, tmp_path / name, *words], stdout=subprocess.PIPE, text=True
+        )
+        for name in names
+    ]
+
+
+def test_what_one_driver_made_is_fetched_by_the_next(tmp_path, place):
+    url, where = place
+    stages = [marked("a", tmp_path / "marks"), marked("b", tmp_path / "marks")]
+
+    publish(stages, tmp_path / "first", url)
+
+    second = run(stages, tmp_path / "second", url)
+
+    assert {o.status for o in second.values()} == {"kept"}
+    assert len((tmp_path / "marks").read_text().splitlines()) == 4
+    assert files(tmp_path / "first") == files(tmp_path / "second") == files(where)
+
+
+@pytest.mark.slow
+def test_two_drivers_at_once_make_each_item_once(tmp_path, place):
+    url, where = place
+    both = drivers(tmp_path, url, 0.3, 60, ("first", "second"))
+
+    said = [json.loads(driver.communicate(timeout=120)[0]) for driver in both]
+
+    made = [name for statuses in said for name, status in statuses.items() if status == "made"]
+    assert sorted(made) == sorted((tmp_path / "marks").read_text().splitlines())
+    assert sorted(made) == [f"{stage} {item}" for stage in ("one", "two") for item in ITEMS]
+    assert {status for statuses in said for status in statuses.values()} == {"made", "kept"}
+    assert files(tmp_path / "first") == files(tmp_path / "second") == files(where)
+    assert list((where / "leases").rglob("*.*")) == list((where / "drivers").glob("*")) == []
+
+
+@pytest.mark.slow
+def test_the_lease_of_a_killed_driver_ends(tmp_path, folder):
+    (killed,) = drivers(tmp_path, str(folder), 30, 2.0, ("killed",))
+    marks = tmp_path / "marks"
+    while not marks.exists():
+        time.sleep(0.05)
+    killed.kill()
+    killed.wait()
+    (lease,) = (folder / "leases" / "one").iterdir()
+    other = Shared(Runtime(root=tmp_path / "other", store=str(folder), lease_s=2.0))
+    stage = marked("a", marks, 30.0).inputs["one"]
+
+    with other:
+        began = time.monotonic()
+        assert other.claim(stage) is None
+        while other.claim(stage) is None:
+            time.sleep(0.05)
+        waited = time.monotonic() - began
+        with Shared(Runtime(root=tmp_path / "third", store=str(folder), lease_s=2.0)) as third:
+            assert third.claim(stage) is None
+        held = sorted(path.name for path in lease.parent.iterdir())
+
+    assert 2.0 < waited < 10.0
+    assert held == [f"{stage.folder_name}.1", f"{stage.folder_name}.2"]
+
+
+def test_a_killed_driver_that_is_started_again_waits_for_nobody(tmp_path, folder):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    runtime = Runtime(root=tmp_path / "run", store=str(folder), lease_s=1000.0)
+    killed, again, other = (
+        Shared(runtime),
+        Shared(runtime),
+        Shared(Runtime(root=tmp_path / "other", store=str(folder))),
+    )
+    with killed, again, other:
+        assert killed.claim(stage) == "ours"
+        killed.held.clear()  # it never gives it back
+
+        assert other.claim(stage) is None
+        assert again.claim(stage) == "ours"
+
+
+def test_what_ends_with_nothing_made_may_be_tried_by_whoever_asks_next(tmp_path, folder):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    first, second, third = (
+        Shared(Runtime(root=tmp_path / name, store=str(folder))) for name in ("1", "2", "3")
+    )
+    with first, second, third:
+        assert first.claim(stage) == "ours"
+        first.ended(stage)
+
+        assert second.claim(stage) == "ours"
+        assert third.claim(stage) is None
+
+
+def test_a_driver_that_asks_too_late_gets_what_was_made(tmp_path, folder):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    late = Shared(Runtime(root=tmp_path / "late", store=str(folder)))
+    with late:
+        assert late.stored(stage) is None
+        publish([stage], tmp_path / "first", str(folder))
+
+        theirs = late.claim(stage)
+
+    assert theirs.status == "kept"
+    assert list((folder / "leases").rglob("*.*")) == []
+
+
+@pytest.mark.slow
+def test_a_file_that_changed_in_the_store_is_named_and_not_used(tmp_path, folder):
+    url = str(folder)
+    stages = [marked("a", tmp_path / "marks"), marked("b", tmp_path / "marks")]
+    publish([s.inputs["one"] for s in stages], tmp_path / "first", url)
+    bad = folder / "one" / stages[0].inputs["one"].folder_name / "text"
+    content = bytearray(bad.read_bytes())
+    content[0] ^= 1
+    bad.write_bytes(content)
+
+    outcomes = run(stages, tmp_path / "second", url)
+
+    assert outcomes["two", "b"].status == "made"
+    assert outcomes["one", "a"].status == outcomes["two", "a"].status == "failed"
+    named = f"{url}/one/{stages[0].inputs['one'].folder_name}"
+    for failed in (outcomes["one", "a"], outcomes["two", "a"]):
+        assert failed.reason == "damaged"
+        assert f"{named}/text has another content" in failed.detail
+    assert not stages[0].inputs["one"].folder(tmp_path / "second").exists()
+    assert not any((tmp_path / "second" / ".fetching").iterdir())
+
+
+def test_a_record_that_changed_in_the_store_is_named_too(tmp_path, folder):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    publish([stage], tmp_path / "first", str(folder))
+    record = stage.folder(folder) / "record.json"
+    record.write_text(record.read_text().replace("letters", "lettres"))
+
+    failed = run([stage], tmp_path / "second", folder)["one", "a"]
+
+    assert failed.reason == "damaged"
+    assert f"{record} has another content" in failed.detail
+
+
+def test_what_was_published_by_half_does_not_count(tmp_path, place):
+    url, where = place
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    publish([stage], tmp_path / "first", url)
+    record = where / "one" / stage.folder_name / "record.json"
+    record.unlink()
+    (record.parent / "text").write_text("half")
+
+    publish([stage], tmp_path / "second", url)
+    assert run([stage], tmp_path / "third", url)["one", "a"].status == "kept"
+    assert (stage.folder(tmp_path / "third") / "text").read_text() == "one a"
+
+
+def test_who_publishes_second_changes_nothing(tmp_path, place):
+    url, where = place
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    alone = Runtime(root=tmp_path / "alone")
+    publish([stage], tmp_path / "first", url)
+    make_stage(stage, alone)
+    before = files(where)
+
+    open_store(url).publish(stage.folder(alone.root))
+
+    assert files(where) == before
+    assert files(alone.root) != before  # its record has another time
+
+
+def test_a_stage_fetches_what_it_comes_from_and_no_more(tmp_path, folder):
+    stages = [marked("a", tmp_path / "marks"), marked("b", tmp_path / "marks")]
+    publish([s.inputs["one"] for s in stages], tmp_path / "first", str(folder))
+
+    made = make_stage(stages[0], Runtime(root=tmp_path / "second", store=str(folder)))
+
+    assert made.status == "made"
+    assert [p.name for p in (tmp_path / "second" / "one").iterdir()] == [
+        stages[0].inputs["one"].folder_name
+    ]
+
+
+def test_a_store_that_comes_back_is_waited_for(tmp_path, folder, caplog):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    runtime = Runtime(root=tmp_path / "run", store=str(folder))
+    open_store(str(folder)).begin()
+    away = folder.rename(tmp_path / "away")
+    threading.Timer(0.8, lambda: away.rename(folder)).start()
+
+    assert make_stage(stage, runtime).status == "made"
+    assert "does not answer" in caplog.text
+    assert (stage.folder(folder) / "record.json").exists()
+
+
+def test_what_was_made_while_the_store_was_away_is_published_by_the_next_run(
+    tmp_path, folder, monkeypatch
+):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    runtime = Runtime(root=tmp_path / "run", store=str(folder))
+    open_store(str(folder)).begin()
+    away = folder.rename(tmp_path / "away")
+    monkeypatch.setattr(store_module, "PATIENCE_S", 0.0)
+
+    failed = make_stage(stage, runtime)
+    assert failed.status == "failed"
+    assert f"{folder} does not answer" in failed.detail
+    assert not folder.exists()
+    with pytest.raises(V2PError, match="does not answer"):
+        open_store(str(folder)).read("x")
+    away.rename(folder)
+
+    with Shared(runtime) as shared:
+        assert shared.stored(stage) is None
+        assert make_stage(stage, runtime).status == "kept"
+        assert shared.stored(stage).status == "kept"
+    assert files(folder) == files(runtime.root)
+    assert (tmp_path / "marks").read_text() == "one a\n"
+
+
+def test_a_bucket_that_lets_two_create_one_object_is_refused(tmp_path, monkeypatch):
+    class Old(localbucket.S3Handler):
+        def do_PUT(self):  # noqa: N802 - http.server's name
+            del self.headers["If-None-Match"]
+            super().do_PUT()
+
+    for _ in served(Old, tmp_path, monkeypatch):
+        with pytest.raises(V2PError, match="If-None-Match"):
+            open_store("s3://bucket/run").begin()
+
+
+@pytest.mark.parametrize("url", ["nowhere://bucket", "s3://no-such-bucket/run"])
+def test_a_place_that_is_no_store_is_named(url, bucket):
+    del bucket
+    with pytest.raises(V2PError, match=url):
+        open_store(url).begin()

@@ -1,0 +1,113 @@
+"""What can be deleted of a run folder, and what it would cost to make again."""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2p_data.cli import parse
+from v2p_data.commands.display import STAGE_ORDER
+from v2p_data.commands.show import Shown, run_folder
+from v2p_data.errors import UnusableError, V2PError
+from v2p_data.json_files import json_or_none
+from v2p_data.pipeline.artifact import Record, read_record
+from v2p_data.pipeline.store import FETCHING_FOLDER, MARK
+from v2p_data.pipeline.workers import only_run_in
+from v2p_data.report.reading import PARTIAL_SUFFIX, RUN_FILE
+
+FINAL = ("dataset", "policy", "evaluation")
+"""Stages whose results are wanted for themselves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gc(Shown):
+    delete: bool = False
+    """Delete what is listed; otherwise it is only listed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waste:
+    """A folder that nothing needs."""
+
+    folder: Path
+    why: str
+    seconds: float
+    """What making it took."""
+
+    @property
+    def size(self) -> int:
+        return sum(p.stat().st_size for p in self.folder.rglob("*") if p.is_file())
+
+
+def gc_command(argv: list[str]) -> int:
+    args = parse(Gc, argv, "gc")
+    run = run_folder(args.run)
+    if (run / MARK).exists():
+        raise V2PError(
+            f"{run} is a store that other drivers may be using; give the folder of a run"
+        )
+    with only_run_in(run):
+        found = wastes(run)
+        print(f"{'MB':>10}  {'seconds':>8}  folder")  # noqa: T201
+        for waste in found:
+            name = waste.folder.relative_to(run)
+            print(f"{waste.size / 1e6:10.1f}  {waste.seconds:8.0f}  {name}  ({waste.why})")  # noqa: T201
+        total, seconds = sum(w.size for w in found), sum(w.seconds for w in found)
+        for waste in found if args.delete else ():
+            gone = (
+                run / FETCHING_FOLDER / waste.folder.name
+            )  # half a folder would count as damaged
+            gone.parent.mkdir(exist_ok=True)
+            shutil.rmtree(waste.folder.rename(gone) if waste.folder != gone else gone)
+    does = "Deleted" if args.delete else "Could delete"
+    print(  # noqa: T201
+        f"\n{does} {len(found)} folders, {total / 1e6:.1f} MB; to make them again takes {seconds:.0f} s\n"
+        f"Next: v2p {'status' if args.delete else 'gc --delete'} {run}"
+    )
+    return 0
+
+
+def wastes(run: Path) -> list[Waste]:
+    """Return unfinished work, and results that no dataset, policy, evaluation or rejection came from.
+
+    What the last command asked for is no waste either, and without a final result nothing finished is.
+    """
+    records = dict(_records(run))
+    asked = json_or_none(run / RUN_FILE)
+    needed = {str(entry.get("folder")) for entry in (asked if isinstance(asked, list) else [])}
+    needed |= {
+        name for name, record in records.items() if record.stage in FINAL or record.rejected
+    }
+    todo = list(needed)
+    while todo:
+        if (record := records.get(todo.pop())) is not None:
+            dataset = record.recipe.get("sources", {}).get("dataset")
+            new = {*record.inputs.values(), *([dataset] if dataset else [])} - needed
+            needed |= new
+            todo += new
+    is_final = any(record.stage in FINAL for record in records.values())
+    found = [
+        Waste(folder=f, why="half fetched", seconds=0.0) for f in run.glob(f"{FETCHING_FOLDER}/*")
+    ]
+    for stage in STAGE_ORDER:
+        for folder in sorted((run / stage).glob("*")):
+            record = records.get(folder.name)
+            if folder.suffix == PARTIAL_SUFFIX:
+                found.append(Waste(folder=folder, why="unfinished", seconds=0.0))
+            elif is_final and record is not None and folder.name not in needed:
+                found.append(
+                    Waste(folder=folder, why="nothing came of it", seconds=record.seconds)
+                )
+    return found
+
+
+def _records(run: Path) -> Iterator[tuple[str, Record]]:
+    """Yield the name and record of each result that can be read; what is damaged is for `v2p status`."""
+    for stage in STAGE_ORDER:
+        for folder in (run / stage).glob("*"):
+            try:
+                record = read_record(folder)
+            except UnusableError:
+                continue
+            if record is not None and folder.suffix != PARTIAL_SUFFIX:
+                yield folder.name, record
