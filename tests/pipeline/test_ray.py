@@ -114,6 +114,7 @@ def test_a_task_that_always_crashes_fails_alone_and_what_a_stage_reports_is_not_
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_run_whose_driver_is_killed_goes_on_where_it_was(cluster, tmp_path):
     script = tmp_path / "driver.py"
     script.write_text(
@@ -148,6 +149,7 @@ def test_a_run_whose_driver_is_killed_goes_on_where_it_was(cluster, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_raylet_costs_what_it_was_making_and_nothing_else(cluster, tmp_path):
     victim = cluster.add_node(**NODE)
     raylet = victim.all_processes["raylet"][0].process

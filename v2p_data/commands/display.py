@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
@@ -142,11 +142,12 @@ def outcome_table(outcomes: Sequence[Outcome]) -> str:
 def cost_line(outcomes: Sequence[Outcome]) -> str:
     """Return what a task with episodes cost: the workers' time, that of rejected items and of earlier runs included."""
     usable = sum(o.stage == "episodes" and o.is_usable for o in outcomes)
-    by_stage = Counter[str]()
+    by_stage: dict[str, float] = defaultdict(float)
     for outcome in outcomes:
         by_stage[outcome.stage] += outcome.seconds
-    total = max(by_stage.total(), 1e-9)
-    shares = ", ".join(f"{stage} {s / total:.0%}" for stage, s in by_stage.most_common())
+    total = max(sum(by_stage.values()), 1e-9)
+    dearest = sorted(by_stage.items(), key=lambda pair: -pair[1])
+    shares = ", ".join(f"{stage} {seconds / total:.0%}" for stage, seconds in dearest)
     each = f", {total / 60 / usable:.1f} each" if usable else ""
     return f"{total / 60:.1f} minutes of worker time for {usable} usable tasks{each}: {shares}"
 
