@@ -45,13 +45,6 @@ def test_the_readme_has_at_most_a_thousand_words_beside_its_code():
     assert len(prose.split()) <= 1000
 
 
-def test_every_v2p_command_in_the_readme_exists():
-    ours = [shlex.split(line) for line in shown_commands("README.md") if line.startswith("v2p ")]
-
-    assert ours
-    assert {words[1] for words in ours} <= set(COMMANDS)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "page", ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
