@@ -1,4 +1,4 @@
-"""The moments that an audit asks a success function about: the video's own poses, and what must not count.
+"""Moments on which an audit tests a success function: the video's own poses, and poses that must not count.
 
 Probes are built here and answered in the child process of `smoke`; nothing here runs task code.
 """
@@ -45,10 +45,10 @@ SIZE_SIGMA_M, SIZE_SIGMA_SHARE = SIZE_ERROR_M / 0.674, SIZE_ERROR_SHARE / 0.674
 """The median of a normal number's amount is 0.674 standard deviations. The smaller of the two counts."""
 YAW_SIGMA_RAD = 0.1
 SWAY_M_S, SWAY_RAD_S = 0.016, 0.1
-"""Per axis: how a thing held up at the end still moves. In 32 lifts at the fine step 90 % were slower than 0.027 m/s and
+"""Motion per axis of an object that is held up at the end. In 32 lifts at the fine step 90 % were slower than 0.027 m/s and
 0.15 rad/s over the last quarter of a second."""
 LIFTED_M = 0.02
-"""What is higher than this above where it would rest is off the table, at a height that may be wrong, too."""
+"""Height above its rest from which an object is off the table; that height may be wrong, too."""
 TURNED_AWAY_M = 0.05
 """A motion longer than this on the table may also go in a wrong direction, or end too far from where it leads."""
 HANDS = ("held", "let go", "touching")
