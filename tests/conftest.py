@@ -1,11 +1,17 @@
 """What holds for all tests."""
 
+import contextlib
+import inspect
+import itertools
+import operator
 import os
-from collections.abc import Generator
+import sys
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
 import torch
+from beartype import beartype
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parents[1]
@@ -20,6 +26,8 @@ UNCHECKED = (
 )
 """Called ten thousand times and more a clip or a reward: checking their arguments takes as long as their work. The first
 sends a function to nodes that may not have the checker."""
+CHECKED_CALLS = 300
+"""Arguments of a function are checked on so many calls; some are called a million times by one test."""
 
 
 def _modules_of(folder: Path) -> list[str]:
@@ -27,11 +35,30 @@ def _modules_of(folder: Path) -> list[str]:
     return [".".join(p.relative_to(folder.parent).with_suffix("").parts) for p in files]
 
 
+def checked_at_first(stub: Callable[..., object]) -> Callable[..., object]:
+    """Return the check of a function's arguments, which ends itself after `CHECKED_CALLS`: it costs as much as the work.
+
+    Args:
+        stub: jaxtyping's empty function with the name, place and signature of the one to check.
+    """
+    check, calls = beartype(stub), itertools.count(1)
+
+    def counted(*args: object, **kwargs: object) -> object:
+        if next(calls) == CHECKED_CALLS:
+            with contextlib.suppress(AttributeError):  # of a function inside a function
+                found = operator.attrgetter(stub.__qualname__)(sys.modules[stub.__module__])
+                found = getattr(found, "fget", getattr(found, "__func__", found))
+                inspect.unwrap(found).__no_type_check__ = True
+        return check(*args, **kwargs)
+
+    return counted
+
+
 # Shapes and types of arguments are checked in every module that is imported from here on.
 _PACKAGES = (ROOT / "v2p_data", ROOT / "policies", ROOT / "scripts/drawn_clips")
 install_import_hook(
     [n for package in _PACKAGES for n in _modules_of(package) if not n.startswith(UNCHECKED)],
-    "beartype.beartype",
+    f"{__name__}.{checked_at_first.__name__}",
 )
 
 # What a user has set up on this machine, such as the model that finds hands, changes no test.

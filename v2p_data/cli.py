@@ -48,13 +48,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
 SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "scene camera": ("camera", "what all scenes of a run say of the one camera that filmed them"),
     "scene detectors": (
-        "detectors",
+        "models",
         "whether everyday things are known by sight here, and the model's download",
     ),
-    "scene hands": ("hands", "whether hands are found by a model here, and its installation"),
+    "scene hands": ("models", "whether hands are found by a model here, and its installation"),
     "scene models": ("models", "which learned models a preset takes here, and their download"),
     "scene outlines": (
-        "outlines",
+        "models",
         "whether objects are outlined by a model here, and its download",
     ),
     "scene review": ("review", "a page to judge a run's scenes on and to mark what was not found"),

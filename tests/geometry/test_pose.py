@@ -11,7 +11,6 @@ from v2p_data.geometry.pose import (
     matrix_from_quat,
     pose_from_transform,
     quat_from_matrix,
-    quat_from_yaw,
     transform,
     transform_from_pose,
 )
@@ -124,23 +123,6 @@ def test_quaternions_multiply_as_their_matrices_do(rng):
     found = quat_from_matrix(matrix_from_quat(p) @ matrix_from_quat(q))
 
     assert same_up_to_sign(found, product)
-
-
-@pytest.mark.parametrize("yaw_rad", [-2.5, -0.3, 0.0, 0.4, 1.6, 3.0])
-def test_a_yaw_turns_x_towards_y(yaw_rad: float):
-    matrix = matrix_from_quat(quat_from_yaw(yaw_rad))
-
-    np.testing.assert_allclose(matrix[:, 0], [np.cos(yaw_rad), np.sin(yaw_rad), 0], atol=1e-12)
-    np.testing.assert_allclose(matrix[:, 2], [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(matrix @ [0, 1, 0], [-np.sin(yaw_rad), np.cos(yaw_rad), 0])
-
-
-def test_yaws_add_up(rng):
-    a, b = rng.uniform(-1, 1, 2)
-
-    chained = matrix_from_quat(quat_from_yaw(a)) @ matrix_from_quat(quat_from_yaw(b))
-
-    assert same_up_to_sign(quat_from_matrix(chained), quat_from_yaw(a + b))
 
 
 def test_a_pose_is_where_and_then_how_turned(rng, draw_transform):

@@ -267,14 +267,6 @@ def test_the_model_writes_a_parents_children_from_what_training_showed(
         assert all(rate in question for question in told)
 
 
-def test_where_the_model_gives_no_reward_rules_write_all(two_rounds: TwoRounds):
-    _, second = two_rounds.elites
-
-    origins = [row["origin"] for row in two_rounds.rows(1) if row["parent"] == second]
-
-    assert set(origins) == {"reflection"}
-
-
 def test_every_call_of_the_model_is_kept_with_the_result(two_rounds: TwoRounds):
     stored = list((two_rounds.search.parent / "calls").glob("*.json"))
 

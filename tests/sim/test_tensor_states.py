@@ -8,13 +8,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.env.states import Observed, StateBlock
+from v2p_data.sim.env.states import Observed, StateBlock, named_states
 from v2p_data.sim.env.tensor_states import (
     SeenTensors,
     base_observation,
     moved_position,
     moved_rotation,
-    named_states,
     object_block,
     robot_block,
 )

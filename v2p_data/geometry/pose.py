@@ -38,11 +38,6 @@ def quat_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4
     return Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
 
 
-def quat_from_yaw(yaw_rad: float) -> Float[np.ndarray, "4"]:
-    """Return the rotation about +z."""
-    return np.array([np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)])
-
-
 def pose_from_transform(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "7"]:
     """Return `[x, y, z, qw, qx, qy, qz]`."""
     return np.concatenate([T[:3, 3], quat_from_matrix(T[:3, :3])])

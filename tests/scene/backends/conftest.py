@@ -29,6 +29,13 @@ class Checkpoints:
         return str(self._made[backend])
 
 
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder for models that are set up."""
+    monkeypatch.setenv("V2P_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
 @pytest.fixture(scope="session")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory, device: str) -> Checkpoints:
     return Checkpoints(tmp_path_factory, device)

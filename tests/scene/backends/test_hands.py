@@ -7,20 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from v2p_data.cli import run
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.scene.backends import hands_setup
 from v2p_data.scene.backends.config import HandsConfig
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
-from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import RestingObject
 from v2p_data.scene.fitting.landmark_scale import height_from_landmarks, px_per_m
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.hand_track import HandTrack, contact_share, people_face
 from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.scene.grounding.hands_by_model import track_hands
-from v2p_data.scene.preset import with_preset
 
 HAND_M = np.random.default_rng(3).normal(0, 0.03, (21, 3))
 """Any 21 points of the size of a hand will do: [m], axes right, down, forward."""
@@ -103,32 +100,17 @@ def test_a_picture_without_hands_is_an_answer(tmp_path, draw):
     assert not hands.is_known
 
 
-def test_without_an_installation_auto_asks_nobody_and_mediapipe_says_what_to_do(
-    tmp_path, monkeypatch: pytest.MonkeyPatch, draw, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setenv("V2P_CACHE", str(tmp_path))
-    clip = draw(num_frames=12)
-    working = working_clip_of(clip)
-
-    assert with_preset(SceneConfig()).hands.backend == "none"
-    assert track_hands(clip, working, HandsConfig()) is None
-    with pytest.raises(V2PError, match="run 'v2p scene hands --setup'"):
-        track_hands(clip, working, HandsConfig(backend="mediapipe"))
-    assert run(["scene", "hands"]) == 0
-    assert "v2p scene hands --setup" in capsys.readouterr().out
-
-
-def test_a_half_made_environment_is_not_used(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("V2P_CACHE", str(tmp_path))
+@pytest.mark.usefixtures("cache")
+def test_a_half_made_environment_is_not_used():
     hands_setup.hands_folder().mkdir(parents=True)
 
     assert hands_setup.installed_worker() == ""
 
 
+@pytest.mark.usefixtures("cache")
 def test_an_installation_that_fails_is_one_sentence_and_leaves_nothing_in_use(
     tmp_path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setenv("V2P_CACHE", str(tmp_path))
     lock = tmp_path / "requirements.lock"
     lock.write_text("no-such-package==1 --hash=sha256:" + 64 * "0" + "\n")
     monkeypatch.setattr(hands_setup, "REQUIREMENTS", lock)
@@ -139,15 +121,6 @@ def test_an_installation_that_fails_is_one_sentence_and_leaves_nothing_in_use(
         hands_setup.set_up_hands(lambda words: None)
 
     assert hands_setup.installed_worker() == ""
-
-
-def test_every_pinned_package_has_a_hash():
-    lines = hands_setup.REQUIREMENTS.read_text().splitlines()
-    pins = [line for line in lines if "==" in line]
-
-    assert any(pin.startswith("mediapipe==") for pin in pins)
-    assert all(pin.endswith("\\") for pin in pins)
-    assert not any("http" in line for line in lines)
 
 
 def test_the_real_worker_finds_no_hand_in_an_empty_picture(monkeypatch: pytest.MonkeyPatch):

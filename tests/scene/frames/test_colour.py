@@ -5,6 +5,7 @@ from v2p_data.scene.frames.colour import (
     balance,
     colour_match,
     histogram,
+    lab_distance,
     lab_of,
     shadow,
     similarity,
@@ -34,6 +35,14 @@ def test_a_plain_colour_answers_to_its_name_better_than_to_the_others(rgb, word)
 
     assert max(match, key=match.__getitem__) == word
     assert match[word] > 0.6
+
+
+def test_the_distance_of_two_pictures_is_numpys_norm_bit_for_bit():
+    pictures = np.random.default_rng(0).normal(0, 50, (2, 7, 240, 320, 3)).astype(np.float32)
+
+    found = lab_distance(pictures[0], pictures[1, 0])
+
+    np.testing.assert_array_equal(found, np.linalg.norm(pictures[0] - pictures[1, 0], axis=-1))
 
 
 @pytest.mark.parametrize("skin", [(225, 175, 150), (150, 100, 75), (85, 50, 35)])

@@ -101,7 +101,7 @@ def _dataset(root: Path) -> list[str]:
         f"{root.name}: LeRobot dataset, {info['total_episodes']} episodes, {info['total_frames']} frames at "
         f"{info['fps']} frames a second, robot {info.get('robot_type')}",
     ]
-    if not about is not None:
+    if about is None:
         return [*lines, f"It holds no {METADATA_FILE}, so nothing is known of how it was made."]
     provenance: dict[str, Any] = about.get("provenance", {})
     lines += [f"repository  {about['repo_id']}", *_made_with(provenance)]

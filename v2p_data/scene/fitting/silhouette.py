@@ -123,17 +123,17 @@ class Silhouette:
         if homogeneous[:, 2].min() < 1e-6:
             return None
         pixels = homogeneous[:, :2] / homogeneous[:, 2:]
-        if not np.isfinite(pixels).all() or np.abs(pixels).max() > 4000:
+        if not np.abs(pixels).max() <= 4000:  # of what is not finite, too
             return None
         drawn = np.zeros(self._mask.shape, np.uint8)
         hull = cv2.convexHull(in_parts(pixels))
         fill(drawn, hull)
         covered = drawn > 0
-        total = float(covered.sum())
+        total = float(np.count_nonzero(covered))
         seen = covered & self._known
-        common, hidden = float((seen & self._mask).sum()), total - float(seen.sum())
+        common, known = (float(np.count_nonzero(m)) for m in (seen & self._mask, seen))
         beyond = 0.0 if self._at_border else max(0.0, cv2.contourArea(hull) / PARTS**2 - total)
-        return common, float(seen.sum()) - common + beyond, hidden, total + beyond
+        return common, known - common + beyond, total - known, total + beyond
 
     @property
     def centre(self) -> Float[np.ndarray, "2"]:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.scene.frames.colour import lab_distance
 from v2p_data.scene.frames.segmentation import Segmentation, passers_by
 from v2p_data.scene.frames.working_clip import WorkingClip, camera_shift_px
 
@@ -20,7 +21,7 @@ def check_change(working: WorkingClip) -> None:
     """
     change = np.zeros(working.shape, np.float32)
     for lab in working.lab[1:]:
-        np.maximum(change, np.linalg.norm(lab - working.lab[0], axis=-1), out=change)
+        np.maximum(change, lab_distance(lab, working.lab[0]), out=change)
     share = float((change > _CHANGED_LAB).mean())
     if share < _LEAST_CHANGE:
         raise ItemRejectedError(

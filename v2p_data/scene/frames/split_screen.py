@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from v2p_data.scene.frames.colour import lab_distance
 from v2p_data.scene.frames.working_clip import WorkingClip
 
 _Greys = Float32[np.ndarray, "sample h w"]
@@ -98,7 +99,7 @@ def _seen(
     )
     grey = np.stack([cv2.cvtColor(frames[i], cv2.COLOR_RGB2GRAY) for i in pick]).astype(np.float32)
     first = working.lab[0]
-    changes = np.stack([np.linalg.norm(lab - first, axis=-1) > _CHANGE_LAB for lab in working.lab])
+    changes = np.stack([lab_distance(lab, first) > _CHANGE_LAB for lab in working.lab])
     return grey, changes
 
 

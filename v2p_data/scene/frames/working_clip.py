@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from v2p_data.scene.backends.nanodet import Sightings
-from v2p_data.scene.frames.colour import histogram, lab_of, likelihood, skin_prior
+from v2p_data.scene.frames.colour import histogram, lab_distance, lab_of, likelihood, skin_prior
 from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.video.clip import Clip
@@ -87,9 +87,7 @@ class WorkingClip:
         What stands free may have a hand's colours and is none, unless nearly all of it does.
         """
         here = lab_of(image)
-        passing = np.any(
-            [np.linalg.norm(here - lab_of(still), axis=-1) > 9 for still in self._stills], axis=0
-        )
+        passing = np.any([lab_distance(here, lab_of(still)) > 9 for still in self._stills], axis=0)
         moving, still = likelihood(self.hand_hist, image), likelihood(self.rest_hist, image)
         count, parts = cv2.connectedComponents(passing.astype(np.uint8))
         likely = (moving > 2 * still + 1e-7) & passing
@@ -163,7 +161,7 @@ def still_of(rgb: UInt8[np.ndarray, "time h w 3"]) -> UInt8[np.ndarray, "h w 3"]
         centre = np.median(lab, axis=0)
         weight = np.ones(lab.shape[:3], np.float32)
         for _ in range(3):
-            distance = np.linalg.norm(lab - centre, axis=-1)
+            distance = lab_distance(lab, centre)
             weight = np.exp(-((distance / 8) ** 2)) + 1e-4
             centre = (weight[..., None] * lab).sum(0) / weight.sum(0)[..., None]
         mean = (weight[..., None] * colours).sum(0) / weight.sum(0)[..., None]
@@ -262,5 +260,5 @@ def _passing(
     """Return a sample of the colours that are there for a while only, where something usually is not."""
     usual = lab_of(always)
     pick = np.unique(np.linspace(0, len(rgb) - 1, 24).astype(int))
-    away = [np.linalg.norm(lab[i] - usual, axis=-1) > 15 for i in pick]
+    away = [lab_distance(lab[i], usual) > 15 for i in pick]
     return np.concatenate([rgb[i][there] for i, there in zip(pick, away, strict=True)])

@@ -11,6 +11,7 @@ from v2p_data.scene.frames.colour import (
     balance,
     colour_match,
     histogram,
+    lab_distance,
     lab_of,
     likelihood,
     shadow,
@@ -129,7 +130,7 @@ class _End:
         gone = working.early if at_end else working.late
         lab, gone_lab = lab_of(image), lab_of(gone)
         smooth = cv2.GaussianBlur(lab, (0, 0), 1.0)
-        difference = np.linalg.norm(smooth - cv2.GaussianBlur(gone_lab, (0, 0), 1.0), axis=-1)
+        difference = lab_distance(smooth, cv2.GaussianBlur(gone_lab, (0, 0), 1.0))
         changed = difference > max(7.0, 2.5 * float(np.median(difference)) + 3)
         match = colour_match(balance(image), words) if words else np.full((h, w), 0.5, np.float32)
         # A colour that the table has as well says nothing ("white" on a white table).
@@ -212,12 +213,12 @@ class _End:
 def _stays(
     working: WorkingClip, lab: Float32[np.ndarray, "h w 3"], *, at_end: bool
 ) -> Float[np.ndarray, "h w"]:
-    """Return for which share of the clip each pixel keeps the look that it has at one end: an arm leaves at once.
+    """Return the share of the clip during which each pixel keeps its colour from one end: an arm leaves at once.
 
     Frame by frame: all at once are a fifth of a gigabyte.
     """
     n = len(working.lab)
-    moved = np.stack([np.linalg.norm(frame - lab, axis=-1) > 11 for frame in working.lab])
+    moved = np.stack([lab_distance(frame, lab) > 11 for frame in working.lab])
     order = moved[::-1] if at_end else moved
     return np.where(order.any(0), order.argmax(0), n) / n
 

@@ -13,7 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.scene.frames.classes import HAND, MOVED
-from v2p_data.scene.frames.colour import histogram, lab_of, likelihood, shadow, similarity
+from v2p_data.scene.frames.colour import (
+    histogram,
+    lab_distance,
+    lab_of,
+    likelihood,
+    shadow,
+    similarity,
+)
 from v2p_data.scene.frames.flow import flow_to
 from v2p_data.scene.frames.mask_ops import DRAWN_OFF_PX, bounding_box, grow, iou, is_cut, tidy
 from v2p_data.scene.frames.segmentation import Segmentation
@@ -168,7 +175,7 @@ def _frame(
     i: int,
 ) -> ToolFrame:
     lab, shares = working.lab[i], segmentation.at(i)
-    passing = np.linalg.norm(lab - background, axis=-1) > _PASSING_LAB
+    passing = lab_distance(lab, background) > _PASSING_LAB
     return ToolFrame(
         rgb=working.rgb[i],
         lab=lab,

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.frames.classes import MOVED, OTHER
+from v2p_data.scene.frames.colour import lab_distance
 from v2p_data.scene.frames.mask_ops import (
     DRAWN_OFF_PX,
     bounding_box,
@@ -69,7 +70,7 @@ class HintMask:
     def on_its_way(self, working: WorkingClip) -> bool:
         """Return whether what is marked is elsewhere at the nearer end of the clip: then the mark shows how it looks, not where it ends."""
         end = -1 if self.at_end(working) else 0
-        off = np.linalg.norm(working.lab[self.frame] - working.lab[end], axis=-1)[self.mask]
+        off = lab_distance(working.lab[self.frame], working.lab[end])[self.mask]
         return bool(off.size and np.median(off) > _ELSEWHERE_LAB)
 
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from v2p_data.scene.frames.colour import histogram, likelihood, similarity
+from v2p_data.scene.frames.colour import histogram, lab_distance, likelihood, similarity
 from v2p_data.scene.frames.flow import flow_to
 from v2p_data.scene.frames.mask_ops import bounding_box, convex_hull, grow, tidy
 from v2p_data.scene.frames.working_clip import WorkingClip
@@ -145,7 +145,7 @@ class _Follower:
         working, area = self._working, self._area
         vote = cv2.GaussianBlur(self._votes(i, prior, window).astype(np.float32), (0, 0), 1)
         smooth = smoothed(working.lab[i][window])
-        still = np.linalg.norm(smooth - self._before[window], axis=-1) < CONFIG.same_lab
+        still = lab_distance(smooth, self._before[window]) < CONFIG.same_lab
         floor = 0.03 if self._mask.sum() < 1.3 * area else 0.3
         allowed = (prior > floor) & ~(still & ~self._home[window])
         found = tidy((vote > 0) & allowed, 2 * int(0.1 * np.sqrt(area)) + 1)
@@ -179,7 +179,7 @@ class _Follower:
         """Return the mask with the part of the first outline that looks as before, where that is most of it."""
         there = self._there
         rests = np.zeros(self._working.shape, bool)
-        off = np.linalg.norm(smoothed(self._working.lab[i][there]) - self._before[there], axis=-1)
+        off = lab_distance(smoothed(self._working.lab[i][there]), self._before[there])
         rests[there] = self._start[there] & (off < CONFIG.same_lab)
         if rests.sum() > max(CONFIG.rests * self._area, CONFIG.shrunk * mask.sum()):
             return mask | rests
@@ -193,7 +193,7 @@ class _Follower:
             likelihood(working.hand_hist, image), 0.7 * likelihood(working.rest_hist, image)
         )
         ratio = np.log(likelihood(hist, image) + 1e-6) - np.log(others + 1e-6)
-        changed = np.linalg.norm(smoothed(working.lab[i]) - self._before, axis=-1) > 7
+        changed = lab_distance(smoothed(working.lab[i]), self._before) > 7
         pixels = cv2.GaussianBlur(ratio.astype(np.float32), (0, 0), 1.5) > 0.3
         count, parts = cv2.connectedComponents(
             tidy(pixels & (changed | self._home), 7).astype(np.uint8)

@@ -14,6 +14,7 @@ from v2p_data.kinds import Kind
 from v2p_data.scene.frames.colour import (
     colour_words,
     histogram,
+    lab_distance,
     lab_of,
     likelihood,
     shadow,
@@ -168,7 +169,7 @@ def _typical(working: WorkingClip, mask: np.ndarray, words: tuple[str, ...]) -> 
     if named.sum() < 0.15 * mask.sum():
         sure = mask & ~working.hand(image)
         return sure if sure.sum() > 0.2 * mask.sum() else mask
-    passing = np.linalg.norm(lab_of(image) - lab_of(working.late), axis=-1) > 12
+    passing = lab_distance(lab_of(image), lab_of(working.late)) > 12
     outside, skin = tidy(passing & ~mask), skin_prior(image)
     sure = mask & convex_hull(tidy(named) | shrink(named, 1))
     count, parts = cv2.connectedComponents((sure & ~named).astype(np.uint8))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from v2p_data.scene.frames.colour import histogram, lab_of, likelihood
+from v2p_data.scene.frames.colour import histogram, lab_distance, lab_of, likelihood
 from v2p_data.scene.frames.mask_ops import grow, iou, largest, tidy
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.mask_follower import CONFIG, Moving, follow, likeness_of, smoothed
@@ -217,7 +217,7 @@ def _alike_share(
     but_for: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
     """Return how much of a mask looks in a frame as in a smoothed still; `but_for` are pixels that do not count as alike."""
-    alike = np.linalg.norm(smoothed(lab) - still, axis=-1) < CONFIG.same_lab
+    alike = lab_distance(smoothed(lab), still) < CONFIG.same_lab
     if but_for is not None:
         alike &= ~but_for
     return float(alike[mask].mean()) if mask.any() else 0.0

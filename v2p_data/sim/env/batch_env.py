@@ -314,29 +314,10 @@ class BatchEnv:
         self._history[ids[:, None], self._history_values] = self._ctrl[ids][:, self._history_ctrl]
         self._show(ids)
 
-    def rows(self, ids: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """Return copies of all that the worlds `ids` depend on, to `restore` into any worlds of the same task."""
-        return {name: array[ids] for name, array in self._per_world().items()}
-
-    def restore(self, ids: Int[np.ndarray, "n"], rows: dict[str, np.ndarray]) -> None:
-        """Let the worlds `ids` go on where others were when `rows` was called for them."""
-        self._batch.state[ids] = self._fresh_state
-        self._batch.warning[ids] = 0
-        for name, array in self._per_world().items():
-            array[ids] = rows[name]
-        self._show(ids)
-
     @property
     def is_broken(self) -> Bool[np.ndarray, "env"]:
         """Which worlds broke down at the last step."""
         return self._broken
-
-    def _per_world(self) -> dict[str, np.ndarray]:
-        """Return all that worlds depend on, as live arrays with a row per world."""
-        arrays = {f"batch.{name}": self._batch.bind(name) for name in _BATCH_STATE}
-        arrays |= {f"model.{name}": array for name, array in self.randomizer.fields().items()}
-        arrays |= {f"drawn.{name}": a for name, a in self.randomizer.per_world_arrays().items()}
-        return arrays | {f"env.{name}": getattr(self, name) for name in _ENV_STATE}
 
     def _show(self, ids: Int[np.ndarray, "n"]) -> None:
         """Bring what is seen of the worlds `ids` up to date after their state was written."""
@@ -476,14 +457,8 @@ class BatchEnv:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything the next step depends on, as tensors and text; see `load_state_dict`."""
-        tensors = {f"batch.{name}": self._batch.bind(name) for name in _BATCH_STATE}
-        tensors |= {f"model.{name}": value for name, value in self.randomizer.fields().items()}
-        tensors |= {
-            f"drawn.{name}": value for name, value in self.randomizer.drawn_arrays().items()
-        }
-        tensors |= {f"env.{name}": getattr(self, name) for name in _ENV_STATE}
         return {
-            **{key: torch.from_numpy(np.array(value)) for key, value in tensors.items()},
+            **{key: torch.from_numpy(np.array(value)) for key, value in self._arrays().items()},
             "rng": json.dumps(self._rng.bit_generator.state),
             "broken_count": self.broken_count,
             "num_starts": self._num_starts,
@@ -492,14 +467,8 @@ class BatchEnv:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on exactly from what `state_dict` of an environment made with the same arguments returned."""
-        for name in _BATCH_STATE:
-            self._batch.bind(name)[:] = state[f"batch.{name}"].numpy()
-        for name, value in (self.randomizer.fields() | self.randomizer.drawn_arrays()).items():
-            value[:] = state[
-                f"model.{name}" if f"model.{name}" in state else f"drawn.{name}"
-            ].numpy()
-        for name in _ENV_STATE:
-            getattr(self, name)[:] = state[f"env.{name}"].numpy()
+        for key, value in self._arrays().items():
+            value[:] = state[key].numpy()
         self._rng.bit_generator.state = json.loads(state["rng"])
         self.broken_count = int(state["broken_count"])
         self._num_starts, self._num_solved = int(state["num_starts"]), int(state["num_solved"])
@@ -507,6 +476,13 @@ class BatchEnv:
         self._fill(slice(None), self._tool)
 
     # -- inside
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that the next step depends on, live, by their names in `state_dict`."""
+        arrays = {f"batch.{name}": self._batch.bind(name) for name in _BATCH_STATE}
+        arrays |= {f"model.{name}": array for name, array in self.randomizer.fields().items()}
+        arrays |= {f"drawn.{name}": a for name, a in self.randomizer.drawn_arrays().items()}
+        return arrays | {f"env.{name}": getattr(self, name) for name in _ENV_STATE}
 
     def _take_over(self, moment: Followed) -> None:
         self._qpos[:, self._robot.arm] = moment.arm_qpos

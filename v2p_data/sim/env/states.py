@@ -132,14 +132,23 @@ class StateBlock:
         return dict(self._copied)
 
     def _views(self, rows: torch.Tensor, base: torch.Tensor) -> dict[str, torch.Tensor]:
-        states = {key: rows[:, columns] for key, columns in ROBOT_COLUMNS.items()}
-        states["base_observation"] = base.T
-        for k, name in enumerate(self._names):
-            start = NUM_ROBOT_COLUMNS + NUM_OBJECT_COLUMNS * k
-            block = rows[:, start : start + NUM_OBJECT_COLUMNS]
-            for key, columns in OBJECT_COLUMNS.items():
-                states[f"{name}_{key}"] = block[:, columns]
-        return states
+        objects = rows[:, NUM_ROBOT_COLUMNS:].view(len(rows), len(self._names), NUM_OBJECT_COLUMNS)
+        return named_states(rows[:, :NUM_ROBOT_COLUMNS], objects, base.T, self._names)
+
+
+def named_states(
+    robot: Float[torch.Tensor, "env 16"],
+    objects: Float[torch.Tensor, "env object 26"],
+    base: Float[torch.Tensor, "env obs"],
+    names: list[str],
+) -> dict[str, torch.Tensor]:
+    """Return the columns of the three blocks by the names that task code knows, as views."""
+    states = {key: robot[:, columns] for key, columns in ROBOT_COLUMNS.items()}
+    states["base_observation"] = base
+    for k, name in enumerate(names):
+        for key, columns in OBJECT_COLUMNS.items():
+            states[f"{name}_{key}"] = objects[:, k, columns]
+    return states
 
 
 def _fill(

@@ -20,7 +20,7 @@ from v2p_data.sim.env.observation import (
     SCALES,
     TOOL_CENTRE_M,
 )
-from v2p_data.sim.env.states import NEARLY_OPEN_M, OBJECT_COLUMNS, ROBOT_COLUMNS
+from v2p_data.sim.env.states import NEARLY_OPEN_M
 from v2p_data.sim.robot import grips
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M, TARGET_HIGH_M, TARGET_LOW_M
 from v2p_data.task.task import BASE_OBSERVATION_DIM
@@ -45,21 +45,6 @@ class SeenTensors:
     target_finger: Float[torch.Tensor, "env"]
     last_action: Float[torch.Tensor, "env 7"]
     progress: Float[torch.Tensor, "env"]
-
-
-def named_states(
-    robot: Float[torch.Tensor, "env 16"],
-    objects: Float[torch.Tensor, "env object 26"],
-    base: Float[torch.Tensor, "env obs"],
-    names: list[str],
-) -> dict[str, torch.Tensor]:
-    """Return the columns of the three blocks by the names that task code knows, as views."""
-    states = {key: robot[:, columns] for key, columns in ROBOT_COLUMNS.items()}
-    states["base_observation"] = base
-    for k, name in enumerate(names):
-        for key, columns in OBJECT_COLUMNS.items():
-            states[f"{name}_{key}"] = objects[:, k, columns]
-    return states
 
 
 def robot_block(seen: SeenTensors) -> Float[torch.Tensor, "env 16"]:

