@@ -48,6 +48,9 @@ def gc_command(argv: list[str]) -> int:
         )
     with only_run_in(run):
         found = wastes(run)
+        if not found:
+            print(f"Nothing in {run} can be deleted without a loss")  # noqa: T201
+            return 0
         print(f"{'MB':>10}  {'seconds':>8}  folder")  # noqa: T201
         for waste in found:
             name = waste.folder.relative_to(run)
