@@ -263,6 +263,8 @@ def _how_it_died(exitcode: int | None, root: Path) -> str:
     how = "stopped without a word"
     if exitcode is not None and exitcode < 0:
         how = f"was killed by {signal.Signals(-exitcode).name}"
+    if exitcode == -signal.SIGKILL:
+        how += ", as the system does where memory is short"
     return f"the worker process {how}; its output is in {root / 'logs'}"
 
 
