@@ -160,7 +160,7 @@ def test_a_pushed_policy_is_judged_as_its_card_says(
     assert run(["push", str(policy_of(root)), "--repo-id", "user/policy"]) == 0
     assert run(["push", str(dataset_of(root)), "--repo-id", "user/toys"]) == 0
     card = online.repos["models/user/policy"].files["README.md"].decode()
-    fetch, judge = card.split("```\n")[1].splitlines()
+    fetch, judge, _ = card.split("```")[1].splitlines()[1:]
     assert shlex.split(fetch)[:3] == ["hf", "download", "user/toys"]
     for name, data in online.repos["datasets/user/toys"].files.items():
         if name.startswith("v2p/tasks/"):  # what the first command fetches

@@ -37,7 +37,7 @@ from v2p_data.episodes.dataset.card import CARD_FILE, write_card
 from v2p_data.episodes.dataset.features import METADATA_FILE
 from v2p_data.episodes.dataset.intake import demand_bounded
 from v2p_data.episodes.dataset.repo_id import check_repo_id
-from v2p_data.episodes.hub.policy_card import write_policy_card
+from v2p_data.episodes.hub.policy_card import name_policy, write_policy_card
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
@@ -171,6 +171,7 @@ def push_policy(
         )
     if not (folder / CARD_FILE).is_file():
         write_policy_card(folder)
+    name_policy(folder, repo_id)
     return _push(
         _Upload(
             folder=folder,

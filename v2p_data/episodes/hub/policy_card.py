@@ -10,6 +10,7 @@ from v2p_data.json_files import json_or_none
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 NOT_JUDGED = "Not evaluated yet: `v2p eval` writes its rates here."
+PLACEHOLDER = "POLICY is this folder, or its name on the Hub. "
 CARD = """\
 ---
 library_name: lerobot
@@ -34,8 +35,7 @@ license: {license}
 
 ## Load, evaluate
 
-POLICY is this folder, or the name of this repository on the Hub. The package `lerobot_policy_v2p` knows policies of type `v2p_bc` and the
-simulated tasks.
+{placeholder}The package `lerobot_policy_v2p` knows policies of type `v2p_bc` and the simulated tasks.
 
 ```bash
 {fetch}v2p eval POLICY --tasks {tasks}
@@ -81,6 +81,7 @@ def write_policy_card(folder: Path) -> None:
         begin=BEGIN,
         not_judged=NOT_JUDGED,
         end=END,
+        placeholder=PLACEHOLDER,
         fetch=f"hf download {dataset} --repo-type dataset --include 'v2p/tasks/*' --local-dir dataset\n"
         if dataset
         else "",
@@ -89,6 +90,14 @@ def write_policy_card(folder: Path) -> None:
         features="\n".join(f"| `{name}` | {shape} |" for name, shape in features.items()),
     )
     write_text(folder / CARD_FILE, text)
+
+
+def name_policy(folder: Path, repo_id: str) -> None:
+    """Put a policy's name on the Hub into the commands of its card; a card of other hands stays as it is."""
+    path = folder / CARD_FILE
+    card = path.read_text(errors="replace")
+    if PLACEHOLDER in card:
+        write_text(path, card.replace(PLACEHOLDER, "").replace("POLICY", repo_id))
 
 
 def note_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
