@@ -3,8 +3,8 @@ process that takes seconds to start and that no task needs."""
 
 import inspect
 import os
-from collections.abc import Generator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -13,6 +13,14 @@ AGENTS = ("dashboard", "dashboard_agent", "runtime_env_agent")
 PORT_FILES = ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port", "runtime_env_agent_port")  # fmt: skip
 """Files in which a raylet looks for where its agents listen."""
 NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_log_monitor": False}
+
+
+def patiently[T](start: Callable[[], T]) -> T:
+    """Return what starts; try again where Ray gives a raylet up, which it does after half a minute, on a busy machine too."""
+    for _ in range(2):
+        with suppress(Exception):
+            return start()
+    return start()
 
 
 @contextmanager
@@ -47,13 +55,11 @@ def running_cluster(num_raylets: int) -> Generator[Any]:
         patch.object(ray_constants, "RAY_DASHBOARD_STARTUP_TIMEOUT_S", 0),
         patch.object(services, "logger"),  # which misses the dashboard
     ):
-        cluster = Cluster(
-            initialize_head=True,
-            head_node_args=NODE | {"include_dashboard": False, "no_monitor": True},
-        )
+        head = NODE | {"include_dashboard": False, "no_monitor": True}
+        cluster = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
         try:
             for _ in range(num_raylets - 1):
-                cluster.add_node(**NODE)
+                patiently(lambda: cluster.add_node(**NODE))
             yield cluster
         finally:
             cluster.shutdown()
