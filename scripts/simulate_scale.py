@@ -5,7 +5,7 @@
 
 Every item is a chain of `scene`, `task` and `episodes`; one of fifty is rejected at its scene. The line that is printed is
 JSON: seconds in all, the driver's CPU milliseconds an item, its peak memory, the CPU milliseconds an item that a second run
-needs to find all of it done, and those to count what lies in the run folder.
+needs to find all of it done, and those to count the results in the run folder.
 """
 
 import json
