@@ -79,20 +79,21 @@ def test_the_same_seeds_give_the_same_actions_and_the_same_successes(
     from policies.evaluation.actor import load_actor
 
     folder, policy_folder = request.getfixturevalue(task), request.getfixturevalue(policy)
+    wrist = policy == "wrist_policy_folder"
     bundle = TaskBundle.load(folder)
     actor = load_actor(policy_folder, greys=PALETTE, task=bundle.description)
     ours = recorded(actor.loaded.policy, monkeypatch)
 
     judged = judge(
         bundle,
-        VisionActor(actor, wrist=policy == "wrist_policy_folder"),
+        VisionActor(actor, wrist=wrist),
         episodes=EPISODES,
         first_seed=FIRST_SEED,
         cfg=EvaluationConfig(worlds=EPISODES, at_end=at_end),
         size_px=actor.size_px,
     )
 
-    config = rollout.env_config(folder, size_px=64, wrist=policy == "wrist_policy_folder")
+    config = rollout.env_config(folder, size_px=64, wrist=wrist)
     loaded = rollout.load_policy(policy_folder, config)
     theirs = recorded(loaded.policy, monkeypatch)
     envs = config.create_envs(n_envs=EPISODES)

@@ -57,9 +57,8 @@ def gc_command(argv: list[str]) -> int:
             print(f"{waste.size / 1e6:10.1f}  {waste.seconds:8.0f}  {name}  ({waste.why})")  # noqa: T201
         total, seconds = sum(w.size for w in found), sum(w.seconds for w in found)
         for waste in found if args.delete else ():
-            gone = (
-                run / FETCHING_FOLDER / waste.folder.name
-            )  # half a folder would count as damaged
+            # Moved away first: half a folder would count as damaged.
+            gone = run / FETCHING_FOLDER / waste.folder.name
             gone.parent.mkdir(exist_ok=True)
             shutil.rmtree(waste.folder.rename(gone) if waste.folder != gone else gone)
     does = "Deleted" if args.delete else "Could delete"
