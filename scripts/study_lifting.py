@@ -16,7 +16,7 @@ from pathlib import Path
 
 from studies.cells import Key, Study, cells_of, key_of
 from studies.config import ARMS, LiftingConfig
-from studies.results import append_result, results_in, results_to_show
+from studies.results import make_missing, results_to_show
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import load_settings
@@ -72,28 +72,17 @@ def make_cells(args: argparse.Namespace) -> None:
         videos=args.videos,
         tell=lambda words: print(words, file=sys.stderr, flush=True),
     )
-    failed: list[str] = []
     with only_run_in(args.out):
-        done = {key_of(row): row for row in results_in(args.out)}
-        others = {row["study"] for row in done.values()} - {study.identity}
-        if others:
-            raise V2PError(
-                f"{args.out} holds cells of another study (other settings, meshes or clips); choose another --out"
-            )
-        for arm, count, seed in wanted[: args.max_cells]:
-            if (arm, count, seed) in done:
-                continue
-            try:
-                row = study.cell(arm, count, seed)
-            except V2PError as error:
-                failed.append(f"{arm} N={count} seed {seed}: {error}")
-                print(f"failed: {failed[-1]}", file=sys.stderr, flush=True)
-                continue
-            append_result(args.out, row)
-            print(f"{arm} N={count} seed {seed}: done in {row['wall_s']:.0f} s", flush=True)
-    if failed:
-        raise V2PError(
-            f"{len(failed)} cells could not be made, the others were: " + "; ".join(failed)
+        make_missing(
+            args.out,
+            wanted[: args.max_cells],
+            key_of,
+            lambda key: study.cell(*key),
+            lambda row: (
+                f"{row['arm']} N={row['n']} seed {row['seed']}: done in {row['wall_s']:.0f} s"
+            ),
+            study.identity,
+            lambda key: "{} N={} seed {}".format(*key),
         )
 
 

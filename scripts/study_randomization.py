@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from studies.randomization import SETTINGS, RandomizationStudy, RandomizationStudyConfig, key_of
-from studies.results import append_result, results_in, results_to_show
+from studies.results import make_missing, rate_of, results_to_show
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import load_settings
@@ -55,29 +55,14 @@ def make_results(args: argparse.Namespace) -> None:
         runtime=Runtime(root=args.out, device=args.device, num_threads=args.threads),
         tell=lambda words: print(words, file=sys.stderr, flush=True),
     )
-    failed: list[str] = []
     with only_run_in(args.out):
-        done = {key_of(row): row for row in results_in(args.out)}
-        identity = study.identity
-        if {row["study"] for row in done.values()} - {identity}:
-            raise V2PError(
-                f"{args.out} holds results of another study (other settings, task or expert); choose another --out"
-            )
-        for setting, seed, place in study.cfg.cells:
-            if (setting, seed, place) in done:
-                continue
-            try:
-                row = study.result(setting, seed, place)
-            except V2PError as error:
-                failed.append(f"{setting}, seed {seed}, {place}: {error}")
-                print(f"failed: {failed[-1]}", file=sys.stderr, flush=True)
-                continue
-            append_result(args.out, row)
-            once = row["once"]
-            print(f"{setting}, seed {seed}, {place}: {once.count('1')} of {len(once)}", flush=True)
-    if failed:
-        raise V2PError(
-            f"{len(failed)} results could not be made, the others were: " + "; ".join(failed)
+        make_missing(
+            args.out,
+            study.cfg.cells,
+            key_of,
+            lambda key: study.result(*key),
+            lambda row: f"{row['setting']}, seed {row['seed']}, {row['place']}: {rate_of(row)}",
+            study.identity,
         )
 
 

@@ -17,30 +17,30 @@ from pathlib import Path
 import numpy as np
 
 from bench_deploy import PATIENCE_MS, Measured, TimedPolicy, episode, robot_in
-from studies.results import Row, append_result, letters_of, results_in
+from studies.places import in_training, in_twin
+from studies.results import Row, letters_of, make_missing, rate_of, results_to_show
 from studies.sim_to_sim import table
 from studies.sweeps import SWEEPS, FaultyLook
 from v2p_data.commands.deploy import loaded_policy
 from v2p_data.deployment.limits import LimitsConfig
 from v2p_data.deployment.view import allowing_for_place
 from v2p_data.errors import V2PError
-from v2p_data.evaluation.batch import judge
-from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.evaluation.judging import contestant, play_of
 from v2p_data.task.task import TaskBundle
-from v2p_data.twin.judge import judge_in_twin, true_labels
+from v2p_data.twin.judge import true_labels
 from v2p_data.twin.parameters import nominal
 
 PLACES = ("training", "twin", "twin_hasty", "twin_raw", "tracked")
 """Training simulator; twin with true masks, through all of `v2p deploy`; without waiting for the gripper; without carrying
 masks over to the training camera either; masks tracked in the twin's pictures."""
 
+Key = tuple[str, str, str, float | None]
+"""Policy, task, place, value."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Asked:
     """One policy on one task."""
 
-    name: str
     policy: Path
     task: Path
     first_seed: int
@@ -70,28 +70,38 @@ def play(args: argparse.Namespace) -> None:
         V2PError: a policy or task cannot be read, or the lines are of other episodes.
     """
     args.out.mkdir(parents=True, exist_ok=True)
-    done = {(r["policy"], r["task"], r["place"], r["value"]) for r in results_in(args.out)}
+    tasks = {TaskBundle.load(folder).title: folder for folder in args.tasks}
+    wanted: list[tuple[str, float | None]] = [(place, None) for place in args.places]
+    wanted += [(s, float(v)) for s in args.sweeps for v in SWEEPS[s].values]
     for word in args.policies:
         name, _, folder = word.partition("=")
         if not folder:
             raise V2PError(f"--policies takes NAME=FOLDER, got '{word}'")
-        for task in args.tasks:
+
+        def made(key: Key, policy: Path = Path(folder)) -> Row:
+            name, title, place, value = key
             asked = Asked(
-                name=name, policy=Path(folder), task=task, first_seed=args.first_seed,
+                policy=policy,
+                task=tasks[title],
+                first_seed=args.first_seed,
                 episodes=args.episodes,
-            )  # fmt: skip
-            title = TaskBundle.load(task).title
-            wanted: list[tuple[str, float | None]] = [(place, None) for place in args.places]
-            wanted += [(s, float(v)) for s in args.sweeps for v in SWEEPS[s].values]
-            for place, value in wanted:
-                if (name, title, place, value) in done:
-                    continue
-                row = {"policy": name, "task": title, "place": place, "value": value}
-                row |= {"first_seed": asked.first_seed, "episodes": asked.episodes}
-                row |= _played(asked, place, value)
-                append_result(args.out, row)
-                at = "" if value is None else f" {value:g}"
-                print(f"{name}, {title}, {place}{at}: {row['once'].count('1')} of {len(row['once'])}", flush=True)  # fmt: skip
+            )
+            about = {"policy": name, "task": title, "place": place, "value": value}
+            about |= {"first_seed": asked.first_seed, "episodes": asked.episodes}
+            return about | _played(asked, place, value)
+
+        keys = [(name, title, *one) for title in tasks for one in wanted]
+        make_missing(args.out, keys, key_of, made, told)
+
+
+def key_of(row: Row) -> Key:
+    return row["policy"], row["task"], row["place"], row["value"]
+
+
+def told(row: Row) -> str:
+    """Return what is printed of a line."""
+    at = "" if row["value"] is None else f" {row['value']:g}"
+    return f"{row['policy']}, {row['task']}, {row['place']}{at}: {rate_of(row)}"
 
 
 def show(args: argparse.Namespace) -> None:
@@ -100,9 +110,7 @@ def show(args: argparse.Namespace) -> None:
     Raises:
         V2PError: there is no result yet.
     """
-    rows = results_in(args.out)
-    if not rows:
-        raise V2PError(f"{args.out} holds no results; give --policies and --tasks")
+    rows = results_to_show(args.out)
     if args.table:
         print(table(rows))
     if args.figure:
@@ -114,18 +122,7 @@ def show(args: argparse.Namespace) -> None:
 
 def _played(asked: Asked, place: str, value: float | None) -> Row:
     if place == "training":
-        bundle = TaskBundle.load(asked.task)
-        actor, size_px = play_of(contestant(asked.policy), asked.first_seed, "cpu")(bundle)
-        judged = judge(
-            bundle, actor, episodes=asked.episodes, first_seed=asked.first_seed,
-            cfg=EvaluationConfig(episodes=asked.episodes, at_end=True), size_px=size_px,
-        )  # fmt: skip
-        assert judged.at_end is not None
-        return {
-            "once": letters_of(judged.successes),
-            "at_end": letters_of(judged.at_end),
-            "failures": judged.failure_counts(),
-        }
+        return in_training(asked.policy, asked.task, asked.seeds, at_end=True)
     if place == "tracked":
         return _tracked(asked)
     look, parameters = allowing_for_place, nominal()
@@ -137,18 +134,10 @@ def _played(asked: Asked, place: str, value: float | None) -> Row:
             parameters = sweep.parameters(value)
         else:
             look = FaultyLook(place, value, asked.first_seed)
-    found = judge_in_twin(
-        asked.task, play_of(contestant(asked.policy), asked.first_seed, "cpu"), seeds=asked.seeds,
-        cfg=EvaluationConfig(episodes=asked.episodes, at_end=place.startswith("twin")),
-        parameters=parameters, look=look, waits=place not in ("twin_raw", "twin_hasty"),
+    row = in_twin(
+        asked.policy, asked.task, asked.seeds, at_end=place.startswith("twin"), parameters=parameters,
+        look=look, waits=place not in ("twin_raw", "twin_hasty"),
     )  # fmt: skip
-    row = {
-        "once": letters_of(found.successes),
-        "failures": found.failure_counts(),
-        "twin": parameters.digest()[:12],
-    }
-    if place.startswith("twin"):
-        row["at_end"] = letters_of(found.at_end)
     if isinstance(look, FaultyLook):
         row["iou"] = round(float(np.mean(look.overlaps)), 4)
     return row

@@ -23,7 +23,6 @@ from v2p_data.evaluation.judging import UNSEEN_PX, Play, contestant, play_of
 from v2p_data.pipeline.artifact import Record, provenance, read_record
 from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
-from v2p_data.pipeline.workers import run_stages
 from v2p_data.policy.training import POLICY_FOLDER, sources_of
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.stages import (
@@ -54,6 +53,7 @@ from .objects import (
     unseen_stage,
 )
 from .results import Row, letters_of
+from .stages import run_shown
 
 FILMS_FOLDER = "films"
 Key = tuple[Arm, int, int]
@@ -108,22 +108,7 @@ class Study:
 
     def run(self, stages: Sequence[Stage], root: Path | None = None) -> dict[str, Outcome]:
         """Make stages; return the outcome of each by its folder's name."""
-        runtime = Runtime(
-            root=root or self.root,
-            device=self.runtime.device,
-            num_threads=self.runtime.num_threads,
-            workers=self.runtime.workers,
-        )
-
-        def show(event: Any) -> None:
-            if event.kind == "ended" and event.outcome.status != "kept":
-                o = event.outcome
-                self.tell(
-                    f"{o.stage} {o.item}: {o.status} in {o.seconds:.0f} s {o.reason}".rstrip()
-                )
-
-        outcomes = run_stages(list(stages), runtime, show)
-        return {folder: outcome for (_, folder), outcome in outcomes.items()}
+        return run_shown(stages, replace(self.runtime, root=root or self.root), self.tell)
 
     def made(self, stage: Stage) -> Record:
         """Make a stage and return its record.

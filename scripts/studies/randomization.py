@@ -12,24 +12,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from v2p_data.deployment.view import allowing_for_place
 from v2p_data.errors import V2PError
-from v2p_data.evaluation.batch import judge
-from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.evaluation.judging import contestant, play_of
 from v2p_data.pipeline.artifact import Record, provenance, read_record
 from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
-from v2p_data.pipeline.workers import run_stages
 from v2p_data.policy.training import POLICY_FOLDER, sources_of
 from v2p_data.sim.env import randomize
 from v2p_data.sim.env.randomize import RandomizationConfig
 from v2p_data.stages import EngineConfig, dataset_stage, episodes_stage, policy_stage
-from v2p_data.task.task import TaskBundle
-from v2p_data.twin.judge import judge_in_twin
 from v2p_data.twin.parameters import nominal
 
-from .results import Row, letters_of
+from .places import in_training, in_twin
+from .results import Row
+from .stages import run_shown
 
 ALL, NONE, NOISE = "all", "none", "noise"
 """Settings: every randomisation as configured; none but the noise, without which episodes would repeat each other."""
@@ -188,45 +183,29 @@ class RandomizationStudy:
         """
         folder, about = self.policy(setting, seed)
         began = time.monotonic()
-        task = self.taught()[0].folder(self.root)
-        judged = (self._trained if place == "training" else self._in_twin)(folder, task)
+        task, first, cfg = self.taught()[0].folder(self.root), self.cfg.first_start, self.cfg
+        device = self.runtime.device
+        if place == "training":
+            seeds = range(first, first + cfg.training_episodes)
+            judged = in_training(
+                folder,
+                task,
+                seeds,
+                at_end=False,
+                device=device,
+                num_threads=self.runtime.num_threads,
+            )
+        else:
+            seeds = range(first, first + cfg.twin_episodes)
+            judged = in_twin(folder, task, seeds, at_end=False, device=device)
         return {
             "setting": setting, "seed": seed, "place": place, "task": self.item, "study": self.identity,
-            "first_start": self.cfg.first_start, **judged, **about,
+            "first_start": first, **judged, **about,
             "judging_s": round(time.monotonic() - began, 1), "commit": provenance()["commit"][:12],
         }  # fmt: skip
 
-    def _trained(self, policy: Path, task: Path) -> Row:
-        bundle, count = TaskBundle.load(task), self.cfg.training_episodes
-        actor, size_px = play_of(contestant(policy), self.cfg.first_start, self.runtime.device)(bundle)  # fmt: skip
-        judged = judge(
-            bundle, actor, episodes=count, first_seed=self.cfg.first_start,
-            cfg=EvaluationConfig(episodes=count, at_end=False), num_threads=self.runtime.num_threads,
-            size_px=size_px,
-        )  # fmt: skip
-        return {"once": letters_of(judged.successes), "failures": judged.failure_counts()}
-
-    def _in_twin(self, policy: Path, task: Path) -> Row:
-        count, first = self.cfg.twin_episodes, self.cfg.first_start
-        judged = judge_in_twin(
-            task, play_of(contestant(policy), first, self.runtime.device), seeds=range(first, first + count),
-            cfg=EvaluationConfig(episodes=count, at_end=False), look=allowing_for_place, waits=True,
-        )  # fmt: skip
-        return {
-            "once": letters_of(judged.successes),
-            "failures": judged.failure_counts(),
-            "twin": nominal().digest()[:12],
-        }
-
     def _made(self, stage: Stage) -> Record:
-        runtime = replace(self.runtime, root=self.root)
-
-        def show(event: Any) -> None:
-            if event.kind == "ended" and event.outcome.status != "kept":
-                o = event.outcome
-                self.tell(f"{o.stage} {o.item}: {o.status} in {o.seconds:.0f} s {o.reason}".rstrip())  # fmt: skip
-
-        outcomes = run_stages([stage], runtime, show)
+        outcomes = run_shown([stage], replace(self.runtime, root=self.root), self.tell)
         bad = next((o for o in outcomes.values() if not o.is_usable), None)
         if bad is not None:
             raise V2PError(f"{bad.stage} of {bad.item}: {bad.detail}")

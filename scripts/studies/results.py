@@ -3,6 +3,8 @@
 import json
 import logging
 import subprocess
+import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,57 @@ def append_result(out: Path, row: Row) -> None:
     cut = path.is_file() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
     with path.open("a") as stream:
         stream.write(("\n" if cut else "") + json.dumps(row) + "\n")
+
+
+def make_missing[K](
+    out: Path,
+    wanted: Iterable[K],
+    key_of: Callable[[Row], K],
+    make: Callable[[K], Row],
+    words: Callable[[Row], str],
+    study: str | None = None,
+    name: Callable[[K], str] = str,
+) -> None:
+    """Make and append the lines that are not there yet, one after the other, whichever of them fail.
+
+    Args:
+        out: folder of the study.
+        wanted: the key of each line.
+        key_of: the key of a line that is there.
+        make: makes a key's line.
+        words: what is printed of a new line.
+        study: what the lines that are there must say of themselves under `study`.
+        name: what a key is called where it fails.
+
+    Raises:
+        V2PError: the lines are another study's; or, after all others, some could not be made.
+    """
+    rows = results_in(out)
+    if study is not None and {row["study"] for row in rows} - {study}:
+        raise V2PError(
+            f"{out} holds results of another study (other settings, inputs or clips); choose another --out"
+        )
+    done, failed = {key_of(row) for row in rows}, list[str]()
+    for key in wanted:
+        if key in done:
+            continue
+        try:
+            row = make(key)
+        except V2PError as error:
+            failed.append(f"{name(key)}: {error}")
+            print(f"failed: {failed[-1]}", file=sys.stderr, flush=True)
+            continue
+        append_result(out, row)
+        print(words(row), flush=True)
+    if failed:
+        raise V2PError(
+            f"{len(failed)} results could not be made, the others were: " + "; ".join(failed)
+        )
+
+
+def rate_of(row: Row) -> str:
+    """Return how many of a line's episodes succeeded."""
+    return f"{row['once'].count('1')} of {len(row['once'])}"
 
 
 def letters_of(successes: Bool[np.ndarray, "episode"]) -> str:

@@ -47,7 +47,7 @@ def study(load_script):
 
 @pytest.fixture(scope="module")
 def parts(study):
-    names = ("cells", "config", "figure", "fits", "objects", "page", "table")
+    names = ("cells", "config", "figure", "fits", "objects", "page", "results", "table")
     modules = {name: importlib.import_module(f"studies.{name}") for name in names}
     return argparse.Namespace(**modules)
 
@@ -424,17 +424,17 @@ def test_a_study_that_was_killed_after_a_cell_goes_on_and_ends_with_every_cell_o
     first = (tmp_path / "results.jsonl").read_text()
     with (tmp_path / "results.jsonl").open("a") as stream:
         stream.write('{"arm": "fixed_total", "n": 2')  # as a kill leaves it
-    with pytest.raises(V2PError, match="1 cells could not be made, the others were: toys N=2"):
+    with pytest.raises(V2PError, match="1 results could not be made, the others were: toys N=2"):
         study.make_cells(arguments(tmp_path))
     study.make_cells(arguments(tmp_path))
 
-    done = [parts.cells.key_of(r) for r in study.results_in(tmp_path)]
+    done = [parts.cells.key_of(r) for r in parts.results.results_in(tmp_path)]
     assert (tmp_path / "results.jsonl").read_text().startswith(first)
     assert len(set(done)) == len(done) == 1 + 6 * 2
     assert sorted(cells) == sorted([*done, ("toys", 2, 0)])  # the failed one alone is tried again
     study.show(arguments(tmp_path))
     assert "| bc_cop | 3 |" in capsys.readouterr().out
-    with pytest.raises(V2PError, match="cells of another study"):
+    with pytest.raises(V2PError, match="results of another study"):
         study.make_cells(arguments(tmp_path, config=ROOT / "configs/studies/lifting_laptop.yaml"))
     with pytest.raises(V2PError, match=r"--counts \[7\] are not all among the counts"):
         study.make_cells(arguments(tmp_path, counts=[7]))

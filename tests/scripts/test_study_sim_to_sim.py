@@ -21,7 +21,7 @@ def study(load_script):
 
 @pytest.fixture(scope="module")
 def parts(study):
-    names = ("agreement", "sweeps", "sim_to_sim", "sim_to_sim_figure")
+    names = ("agreement", "results", "sweeps", "sim_to_sim", "sim_to_sim_figure")
     return argparse.Namespace(**{n: importlib.import_module(f"studies.{n}") for n in names})
 
 
@@ -153,7 +153,7 @@ def test_tables_and_figure_show_every_line_and_say_sim_to_sim(parts, tmp_path: P
 
 
 def test_lines_that_are_there_are_kept_and_a_cut_line_is_played_again(
-    study, tmp_path: Path, monkeypatch
+    study, parts, tmp_path: Path, monkeypatch
 ):
     (tmp_path / "results.jsonl").write_text(
         json.dumps(row("a", "training", "11") | {"task": "lift"}) + "\n" + '{"policy": "a", "ta'
@@ -171,7 +171,7 @@ def test_lines_that_are_there_are_kept_and_a_cut_line_is_played_again(
     study.play(args)
 
     assert played == ["twin"]
-    assert [r["place"] for r in study.results_in(tmp_path)] == ["training", "twin"]
+    assert [r["place"] for r in parts.results.results_in(tmp_path)] == ["training", "twin"]
 
 
 def test_a_policy_without_a_name_is_refused(study, tmp_path: Path):
