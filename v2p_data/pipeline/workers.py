@@ -26,6 +26,7 @@ from v2p_data.pipeline.at_work import (
     WORKER_LOCK,
     Event,
     limit_threads,
+    limit_time,
     lock,
     no_progress,
     write_to,
@@ -232,11 +233,13 @@ class _Pool:
             except (EOFError, ConnectionResetError):
                 worker.process.join(5)
                 self.workers.remove(worker)
+                seconds, limit_s = time.monotonic() - worker.started, self.runtime.limit_s
+                is_late = worker.process.exitcode == 1 and 0 < limit_s <= seconds
                 outcome = Outcome(
                     stage=stage.name, item=stage.item, status="failed",
-                    folder=stage.folder(self.runtime.root), reason="crashed",
-                    seconds=time.monotonic() - worker.started,
-                    detail=_how_it_died(worker.process.exitcode, self.runtime.root),
+                    folder=stage.folder(self.runtime.root), seconds=seconds,
+                    reason="too_long" if is_late else "crashed",
+                    detail=_how_it_died(worker.process.exitcode, self.runtime, is_late),
                 )  # fmt: skip
                 yield Event(kind="ended", stage=stage, outcome=outcome)
                 continue
@@ -259,13 +262,15 @@ class _Pool:
                 worker.process.join(5)
 
 
-def _how_it_died(exitcode: int | None, root: Path) -> str:
+def _how_it_died(exitcode: int | None, runtime: Runtime, is_late: bool) -> str:
     how = "stopped without a word"
+    if is_late:
+        how = f"took longer than --limit-s={runtime.limit_s:g} s and was ended"
     if exitcode is not None and exitcode < 0:
         how = f"was killed by {signal.Signals(-exitcode).name}"
     if exitcode == -signal.SIGKILL:
         how += ", as the system does where memory is short"
-    return f"the worker process {how}; its output is in {root / 'logs'}"
+    return f"the worker process {how}; its output is in {runtime.root / 'logs'}"
 
 
 def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) -> None:
@@ -288,4 +293,7 @@ def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) 
                 last = time.monotonic()
                 connection.send((share, words))
 
-        connection.send(make_stage(stage, replace(runtime, progress=progress)))
+        limit_time(runtime.limit_s)
+        outcome = make_stage(stage, replace(runtime, progress=progress))
+        limit_time(0.0)
+        connection.send(outcome)
