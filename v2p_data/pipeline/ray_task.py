@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import TextIO
 
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.at_work import WORKER_LOCK, limit_threads, limit_time, lock, run_name, write_to
+from v2p_data.pipeline.at_work import (
+    WORKER_LOCK,
+    limit_threads,
+    limit_time,
+    lock,
+    run_name,
+    write_to,
+)
 from v2p_data.pipeline.runner import Outcome, Stage, make_stage, stored_outcome
 from v2p_data.processes import end_with_parent
 

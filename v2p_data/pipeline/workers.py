@@ -207,6 +207,8 @@ class _Pool:
         return len(self.workers) < self.size or any(w.stage is None for w in self.workers)
 
     def start(self, stage: Stage) -> None:
+        # One without work may have been killed as well.
+        self.workers = [w for w in self.workers if w.stage is not None or w.process.is_alive()]
         worker = next((w for w in self.workers if w.stage is None), None)
         if worker is None:
             ours, theirs = self.context.Pipe()
@@ -219,7 +221,8 @@ class _Pool:
             worker = _Worker(process=process, connection=ours)
             self.workers.append(worker)
         worker.stage, worker.started = stage, time.monotonic()
-        worker.connection.send(stage)
+        with contextlib.suppress(BrokenPipeError):  # it died just now, which `events` sees
+            worker.connection.send(stage)
 
     def events(self) -> Iterator[Event]:
         busy = [w for w in self.workers if w.stage is not None]
