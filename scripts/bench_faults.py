@@ -101,7 +101,7 @@ def chains() -> list[Stage]:
         for name in STAGES:
             stage = Stage(name=name, item=item, config=[name, item], inputs=inputs, make=make)
             inputs = {name: stage}
-        ends.append(stage)
+        ends.extend(inputs.values())
     return ends
 
 
@@ -140,7 +140,7 @@ def make(
 def be_patient() -> None:
     """Give a store up after as long as the trial says."""
     store: Any = importlib.import_module("v2p_data.pipeline.store")
-    store.PATIENCE_S = float(os.environ.get("BENCH_PATIENCE_S", store.PATIENCE_S))
+    store.PATIENCE_S = float(os.environ.get("BENCH_PATIENCE_S") or store.PATIENCE_S)
 
 
 def drive(root: Path, how: dict[str, Any]) -> None:
@@ -224,7 +224,11 @@ class Trial:
             self.troubles.append(str(words))
 
     def start(
-        self, how: Mapping[str, Any], prefix: str = "exec", root: Path | None = None, **env: str
+        self,
+        how: Mapping[str, Any],
+        prefix: str = "exec",
+        root: Path | None = None,
+        env: Mapping[str, str] | None = None,
     ) -> Program:
         """Start a run.
 
@@ -232,7 +236,7 @@ class Trial:
             how: fields of `Runtime`.
             prefix: words of a shell that come before the command.
             root: the run folder, by default the trial's.
-            env: of the process.
+            env: more variables of its environment.
         """
         root = root or self.root
         log = self.place / f"{root.name}.{time.monotonic_ns()}.out"
@@ -240,7 +244,7 @@ class Trial:
         with log.open("wb") as out, log.with_suffix(".err").open("wb") as err:
             process = subprocess.Popen(
                 ["sh", "-c", f"{prefix} {shlex.join(words)}"],
-                stdout=out, stderr=err, env={**os.environ, **env}, start_new_session=True,
+                stdout=out, stderr=err, env={**os.environ, **(env or {})}, start_new_session=True,
             )  # fmt: skip
         return Program(process=process, root=root, log=log)
 
@@ -450,7 +454,7 @@ def folder_away(t: Trial) -> None:
 
 def store_gone(t: Trial) -> None:
     store = t.place / "store"
-    run = t.start({"store": str(store)}, BENCH_PATIENCE_S="0.5")
+    run = t.start({"store": str(store)}, env={"BENCH_PATIENCE_S": "0.5"})
     t.moment(run)
     with moved_away(store):
         code = t.ended(run)
@@ -538,7 +542,7 @@ def clock_back(t: Trial) -> None:
     how: dict[str, Any] = {}
     if t.rng.random() < 0.5:
         how = {"store": str(t.place / "store"), "lease_s": 2.0}
-    run = t.start(how, **env)
+    run = t.start(how, env=env)
     t.moment(run)
     back.touch()
     from v2p_data.commands.progress import progress_of
@@ -554,7 +558,7 @@ def clock_back(t: Trial) -> None:
 def in_place(t: Trial, prefix: str = "exec", **env: str) -> None:
     """A run in an odd place ends like any other, with a store too."""
     how = {"store": str(t.place / "store")} if t.rng.random() < 0.5 else {}
-    run = t.start(how, prefix, **env)
+    run = t.start(how, prefix, env=env)
     t.ended(run)
     t.all_is_done(run, how)
     t.goes_on(how, prefix)
