@@ -13,8 +13,8 @@ the time the phase takes. What must hold right after the kill:
 - collect: every finished episode is there, byte by byte as in the undisturbed run, and every one can be read;
 - pack, merge: the dataset is absent, or it is there whole, byte by byte;
 - push: the version that loads is absent or whole, file by file;
-- run, worker, distill, train: every finished result is there, byte by byte. `worker` kills a worker process only, the
-  others what started them, and then no worker may be at work any more.
+- run, distill, train: every finished result is there, byte by byte. What started the workers is killed; `bench_faults.py`
+  kills single workers.
 
 Names of event files, seconds and times are no bytes that count.
 
@@ -24,7 +24,6 @@ the undisturbed run. The children are forks of one process, because imports take
 The last line, `kills_survived: K of N`, counts kills that met a child at work and after which all of this held.
 """
 
-import contextlib
 import hashlib
 import os
 import shutil
@@ -44,7 +43,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "distillation"))
 import tyro
 from hub_server import TOKEN, Hub, running_hub
 
-PHASES = ("collect", "pack", "merge", "push", "run", "worker", "distill", "train")
+PHASES = ("collect", "pack", "merge", "push", "run", "distill", "train")
 RESULTS = ("run", "distilled", "trained")
 """Folders with results of stages in them."""
 TOLD = (
@@ -86,8 +85,6 @@ class Phase:
     """Folders of the undisturbed run that it starts from."""
     makes: str
     """What it makes there."""
-    hits_worker: bool = False
-    """A worker process is killed, and not what started it."""
 
 
 def main() -> None:
@@ -120,8 +117,6 @@ def run(cfg: BenchConfig, place: Path, hub: Hub) -> tuple[int, int]:
         for name, p in every.items()
         if name in phases or p.makes in needed
     }
-    if "run" in seconds and "worker" in seconds:
-        seconds["worker"] = seconds["run"]  # whose work it found done
     print("undisturbed [s]: " + ", ".join(f"{n} {s:.2f}" for n, s in seconds.items()), flush=True)
     pushed = dict(hub.repos[f"datasets/{REPO}"].files) if "push" in phases else {}
     rng = np.random.default_rng(cfg.seed)
@@ -266,7 +261,6 @@ def toy_phases() -> dict[str, Phase]:
     distill = ("distilled", "distill", *(f"--distillation.{setting}" for setting in few))
     return {
         "run": Phase(run=running, needs=(), makes="run"),
-        "worker": Phase(run=running, needs=(), makes="run", hits_worker=True),
         "distill": Phase(
             run=lambda place: commanding(place, *distill), needs=("run",), makes="distilled"
         ),
@@ -309,29 +303,9 @@ def killed(phase: Phase, work: Path, after_s: float) -> bool:
         if os.waitpid(pid, os.WNOHANG)[0]:
             return False
         time.sleep(min(0.002, max(deadline - time.perf_counter(), 0)))
-    if phase.hits_worker:
-        while not (workers := workers_of(pid)):
-            if os.waitpid(pid, os.WNOHANG)[0]:
-                return False
-            time.sleep(0.002)
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(workers[-1], signal.SIGKILL)
-        return os.waitpid(pid, 0)[1] != 0
     os.kill(pid, signal.SIGKILL)
     _, status = os.waitpid(pid, 0)
     return os.WIFSIGNALED(status)
-
-
-def workers_of(pid: int) -> list[int]:
-    """Return the worker processes of a process."""
-    found: list[int] = []
-    with contextlib.suppress(OSError):
-        found.extend(
-            int(word)
-            for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-            if b"spawn_main" in Path(f"/proc/{word}/cmdline").read_bytes()
-        )
-    return found
 
 
 def finished(phase: Phase, work: Path) -> bool:

@@ -1,4 +1,5 @@
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -276,6 +277,28 @@ def test_a_store_that_comes_back_is_waited_for(tmp_path, folder, caplog):
     assert make_stage(stage, runtime).status == "made"
     assert "does not answer" in caplog.text
     assert (stage.folder(folder) / "record.json").exists()
+
+
+def test_what_went_below_the_place_of_a_disk_that_had_gone_is_written_again(tmp_path, folder):
+    store, away, tries = open_store(str(folder)), tmp_path / "away", []
+    store.begin()
+
+    def back():
+        shutil.rmtree(folder)
+        away.rename(folder)
+
+    def write():
+        tries.append("")
+        if len(tries) == 1:  # gone after we looked
+            folder.rename(away)
+            folder.mkdir()
+            threading.Timer(0.2, back).start()
+        (folder / "text").write_text("a")
+
+    store._tried(write)
+
+    assert len(tries) == 2
+    assert (folder / "text").exists()
 
 
 def test_what_was_made_while_the_store_was_away_is_published_by_the_next_run(

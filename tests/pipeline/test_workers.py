@@ -1,3 +1,4 @@
+import multiprocessing
 import resource
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.pipeline.workers import only_run_in, run_stages
 
 sys.path.insert(0, str(Path(__file__).parent))
-from sample_stages import Recipe, chain, make_text
+from sample_stages import Recipe, chain, make_noted, make_text
 
 
 def statuses(stages, root: Path, workers: int = 1) -> list[str]:
@@ -54,6 +55,30 @@ def test_one_bad_item_blocks_only_what_needs_it(tmp_path, trouble):
     assert by_item["good", "two"].status == "made"
     assert by_item["bad", "one"].status == ("rejected" if trouble == "reject" else "failed")
     assert by_item["bad", "two"].status == "blocked"
+
+
+def test_a_worker_that_is_killed_between_two_stages_costs_nothing(tmp_path):
+    def kill(event):
+        for worker in multiprocessing.active_children() if event.kind == "ended" else ():
+            worker.kill()
+            worker.join()
+
+    outcomes = run_stages([chain(Recipe(), Recipe())], Runtime(root=tmp_path), kill)
+
+    assert [o.status for o in outcomes.values()] == ["made", "made"]
+
+
+def test_a_stage_that_hangs_is_ended_after_its_time_and_says_where_it_was(tmp_path):
+    hangs = Stage(name="one", item="hangs", config=Recipe(waits=True), make=make_noted)
+    good = chain(Recipe(), Recipe(), item="good")
+
+    outcomes = run_stages([hangs, good], Runtime(root=tmp_path, limit_s=1.0), lambda event: None)
+
+    hung, *rest = outcomes.values()
+    assert (hung.status, hung.reason) == ("failed", "too_long")
+    assert "longer than --limit-s=1 s" in hung.detail
+    assert {o.status for o in rest} == {"made"}
+    assert "in make_noted" in (tmp_path / "logs" / "worker-0.log").read_text()
 
 
 def test_a_place_that_takes_nothing_more_is_named_by_workers_too(tmp_path):

@@ -75,6 +75,8 @@ class How:
     """Folder or URL (s3://BUCKET/PREFIX) that drivers and machines share results in; each keeps an --out of its own."""
     lease_s: float = 60.0
     """With --store: a driver without a sign of life for so long is taken for dead by the others."""
+    limit_s: float = 0.0
+    """A job that takes longer is ended, and its item has failed; 0: no limit. A policy may take days."""
     engine: Literal["local", "ray"] = "local"
     """Where jobs run: processes of this machine, or tasks of a Ray cluster whose nodes share --out."""
     address: str = "auto"
@@ -87,6 +89,8 @@ class How:
             )
         if not 0 < self.lease_s < math.inf:
             raise V2PError(f"--lease-s is a number of seconds above 0, got {self.lease_s}")
+        if not 0 <= self.limit_s < math.inf:
+            raise V2PError(f"--limit-s is a number of seconds, 0 for no limit, got {self.limit_s}")
         if self.engine == "ray":
             demand_ray()
         else:
@@ -100,6 +104,7 @@ class How:
             address=self.address,
             store=self.store,
             lease_s=self.lease_s,
+            limit_s=self.limit_s,
         )
 
 

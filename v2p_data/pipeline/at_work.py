@@ -1,5 +1,6 @@
 """What a run and its workers agree on, wherever these are: events, locks, and what a worker does with its output."""
 
+import faulthandler
 import fcntl
 import logging
 import os
@@ -79,3 +80,15 @@ def write_to(log: Path) -> TextIO:
 def limit_threads(num_threads: int) -> None:
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = str(num_threads)
+
+
+def limit_time(limit_s: float) -> None:
+    """End this process unless it calls this again in time; what it was at goes to its output.
+
+    Args:
+        limit_s: seconds; 0: it has all the time there is.
+    """
+    faulthandler.cancel_dump_traceback_later()
+    if limit_s:
+        # A thread that needs no lock of Python's ends it, so that a library that hangs cannot keep it.
+        faulthandler.dump_traceback_later(limit_s, exit=True)

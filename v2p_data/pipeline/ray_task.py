@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import TextIO
 
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.at_work import WORKER_LOCK, limit_threads, lock, run_name, write_to
+from v2p_data.pipeline.at_work import (
+    WORKER_LOCK,
+    limit_threads,
+    limit_time,
+    lock,
+    run_name,
+    write_to,
+)
 from v2p_data.pipeline.runner import Outcome, Stage, make_stage, stored_outcome
 from v2p_data.processes import end_with_parent
 
@@ -41,6 +48,7 @@ def work(how: bytes, what: bytes) -> Outcome:
         lock(write_to(log_of(stage, runtime.root)), runtime.root, wait_s=ITEM_FREE_S)
     except V2PError as error:
         return failed(stage, runtime.root, "error", str(error))
+    limit_time(runtime.limit_s)
     with alive:
         return stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
 

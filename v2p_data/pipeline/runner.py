@@ -56,6 +56,8 @@ class Runtime:
     """Folder or URL where finished results are shared; empty: nowhere."""
     lease_s: float = 60.0
     """A driver without a sign of life for so long is taken for dead by the others."""
+    limit_s: float = 0.0
+    """A job that takes longer is ended, and has failed; 0: it may take any time."""
     progress: Progress = field(default=lambda share, words: None)
 
 

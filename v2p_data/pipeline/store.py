@@ -224,7 +224,8 @@ class Store:
         while True:
             try:
                 self._demand_mounted()
-                return call()
+                got = call()
+                self._demand_mounted()  # it may have gone, and what lies below took what was written
             except (FileNotFoundError, self.exists_error):
                 raise
             except Exception as error:
@@ -240,6 +241,8 @@ class Store:
                 )
                 time.sleep(pause)
                 pause = min(2 * pause, LONGEST_PAUSE_S)
+            else:
+                return got
 
     def _demand_mounted(self) -> None:
         if self.folder is not None and not (self.folder / MARK).exists():

@@ -26,6 +26,7 @@ from v2p_data.pipeline.at_work import (
     WORKER_LOCK,
     Event,
     limit_threads,
+    limit_time,
     lock,
     no_progress,
     write_to,
@@ -206,6 +207,8 @@ class _Pool:
         return len(self.workers) < self.size or any(w.stage is None for w in self.workers)
 
     def start(self, stage: Stage) -> None:
+        # One without work may have been killed as well.
+        self.workers = [w for w in self.workers if w.stage is not None or w.process.is_alive()]
         worker = next((w for w in self.workers if w.stage is None), None)
         if worker is None:
             ours, theirs = self.context.Pipe()
@@ -218,7 +221,8 @@ class _Pool:
             worker = _Worker(process=process, connection=ours)
             self.workers.append(worker)
         worker.stage, worker.started = stage, time.monotonic()
-        worker.connection.send(stage)
+        with contextlib.suppress(BrokenPipeError):  # it died just now, which `events` sees
+            worker.connection.send(stage)
 
     def events(self) -> Iterator[Event]:
         busy = [w for w in self.workers if w.stage is not None]
@@ -232,11 +236,13 @@ class _Pool:
             except (EOFError, ConnectionResetError):
                 worker.process.join(5)
                 self.workers.remove(worker)
+                seconds, limit_s = time.monotonic() - worker.started, self.runtime.limit_s
+                is_late = worker.process.exitcode == 1 and 0 < limit_s <= seconds
                 outcome = Outcome(
                     stage=stage.name, item=stage.item, status="failed",
-                    folder=stage.folder(self.runtime.root), reason="crashed",
-                    seconds=time.monotonic() - worker.started,
-                    detail=_how_it_died(worker.process.exitcode, self.runtime.root),
+                    folder=stage.folder(self.runtime.root), seconds=seconds,
+                    reason="too_long" if is_late else "crashed",
+                    detail=_how_it_died(worker.process.exitcode, self.runtime, is_late),
                 )  # fmt: skip
                 yield Event(kind="ended", stage=stage, outcome=outcome)
                 continue
@@ -259,13 +265,15 @@ class _Pool:
                 worker.process.join(5)
 
 
-def _how_it_died(exitcode: int | None, root: Path) -> str:
+def _how_it_died(exitcode: int | None, runtime: Runtime, is_late: bool) -> str:
     how = "stopped without a word"
+    if is_late:
+        how = f"took longer than --limit-s={runtime.limit_s:g} s and was ended"
     if exitcode is not None and exitcode < 0:
         how = f"was killed by {signal.Signals(-exitcode).name}"
     if exitcode == -signal.SIGKILL:
         how += ", as the system does where memory is short"
-    return f"the worker process {how}; its output is in {root / 'logs'}"
+    return f"the worker process {how}; its output is in {runtime.root / 'logs'}"
 
 
 def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) -> None:
@@ -288,4 +296,7 @@ def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) 
                 last = time.monotonic()
                 connection.send((share, words))
 
-        connection.send(make_stage(stage, replace(runtime, progress=progress)))
+        limit_time(runtime.limit_s)
+        outcome = make_stage(stage, replace(runtime, progress=progress))
+        limit_time(0.0)
+        connection.send(outcome)
