@@ -225,7 +225,7 @@ class Store:
             try:
                 self._demand_mounted()
                 got = call()
-                self._demand_mounted()  # it may have gone, and what lies below took what was written
+                self._demand_mounted()  # an unmounted store leaves an empty folder, which accepts the files
             except (FileNotFoundError, self.exists_error):
                 raise
             except Exception as error:
