@@ -7,7 +7,7 @@ from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.judging import contestant, play_of
 from v2p_data.task.task import TaskBundle
-from v2p_data.twin.judge import judge_in_twin
+from v2p_data.twin.judge import Look, judge_in_twin
 from v2p_data.twin.parameters import TwinParameters, nominal
 
 from .results import Row, letters_of
@@ -46,7 +46,7 @@ def in_twin(
     at_end: bool,
     device: str = "cpu",
     parameters: TwinParameters | None = None,
-    look=allowing_for_place,  # noqa: ANN001 - as `judge_in_twin` takes it
+    look: Look = allowing_for_place,
     waits: bool = True,
 ) -> Row:
     """Return what became of each episode in the twin, the nominal one through all of `v2p deploy` by default."""
