@@ -13,7 +13,8 @@ a moment drawn from a named stream, lets it end, mends the fault, and gives the 
 - nothing that was finished is begun again or changed, and what was tried again was tried so often and no more;
 - in the end the run folder, and the store, hold the same bytes as an undisturbed run's.
 
-One line of JSON is written for each fault to `--out`; a trial that stands there is not repeated. The kind `packing` kills the
+One line of JSON is written for each fault to `--out`; a trial that stands there is not repeated. A run that had ended before its fault came
+counts as none injected. The kind `packing` kills the
 packing of a real dataset: `bench_kills.py`. `full_disk` mounts a small tmpfs, and `no_home` makes /dev/shm read-only in a name
 space of its own; both need root.
 """
@@ -215,6 +216,8 @@ class Trial:
     place: Path
     bench: "Bench"
     troubles: list[str] = field(default_factory=list)
+    missed: bool = False
+    """The run had ended before the fault came."""
 
     @property
     def root(self) -> Path:
@@ -273,6 +276,7 @@ class Trial:
         """Wait until a run is at work, and then for some of the time it takes."""
         wait_for(lambda: program.process.poll() is not None or bool(self.noted(program.root)))
         time.sleep(self.rng.uniform(0, longest_s or self.bench.work_s))
+        self.missed |= program.process.poll() is not None
 
     def trouble(self, *names: str, what: str) -> None:
         self.root.with_suffix(".troubles").write_text(json.dumps(dict.fromkeys(names, what)))
@@ -362,8 +366,10 @@ def killed_worker(t: Trial) -> None:
     pid = run.process.pid
     words = Path(f"/proc/{pid}/task/{pid}/children").read_text().split() if is_alive(pid) else []
     found = [int(w) for w in words if b"spawn_main" in Path(f"/proc/{w}/cmdline").read_bytes()]
-    with contextlib.suppress(ProcessLookupError, ValueError):
-        os.kill(int(t.rng.choice(found)), signal.SIGKILL)
+    t.missed |= not found
+    with contextlib.suppress(ProcessLookupError):
+        for worker in t.rng.permutation(found)[:1]:
+            os.kill(int(worker), signal.SIGKILL)
     t.ended(run)
     failed = [name for name, o in run.outcomes().items() if o["status"] == "failed"]
     t.claim(len(failed) < 2, f"one worker was killed, and {failed} failed")
@@ -459,6 +465,7 @@ def store_gone(t: Trial) -> None:
     t.moment(run)
     with moved_away(store):
         code = t.ended(run)
+    t.missed |= not code
     if code:
         told = run.said + json.dumps(run.outcomes())
         t.claim(f"{store} does not answer" in told, f"the store is not named: {told[-300:]}")
@@ -508,7 +515,7 @@ def two_runs(t: Trial) -> None:
     time.sleep(t.rng.uniform(0, t.bench.work_s))
     second = t.start({})
     code = t.ended(second)
-    late = run.process.poll() is not None
+    late = t.missed = run.process.poll() is not None
     refused = code == 2 and f"another v2p run is at work in {t.root}" in second.said
     t.claim(refused or (late and code == 0), f"the second run: {code} {second.said}")
     t.ended(run)
@@ -523,6 +530,7 @@ def two_drivers(t: Trial) -> None:
     runs = [t.start(how), t.start(how, root=other)]
     t.moment(runs[1])
     victim = int(t.rng.integers(2))
+    t.missed = runs[victim].process.poll() is not None
     runs[victim].process.kill()
     for run in runs:
         t.ended(run)
@@ -585,6 +593,7 @@ def ray_raylet(t: Trial) -> None:
     run = t.start(how)
     wait_for(lambda: any(parent == raylet.pid for *_, parent in t.noted()))
     time.sleep(t.rng.uniform(0, 5))
+    t.missed = run.process.poll() is not None
     raylet.kill()
     t.ended(run)
     t.bench.nodes.remove_node(victim, allow_graceful=False)
@@ -733,6 +742,8 @@ def inject(kind: str, number: int, seed: int, bench: Bench) -> dict[str, Any]:
         trial.claim(survived == injected, told)
     else:
         FAULTS[kind](trial)
+    if trial.missed and not trial.troubles:
+        injected = survived = 0
     shutil.rmtree(place)
     return {
         "kind": kind, "number": number, "seed": seed, "injected": injected,
