@@ -13,8 +13,10 @@ import torch
 from jaxtyping import Bool, Float
 
 from v2p_data.geometry.rotation import matrices
+from v2p_data.scene.scene import hollow_floor_m
 from v2p_data.sim.env.observation import value_of
-from v2p_data.sim.model.world import ObjectModel
+from v2p_data.sim.model.suitability import GRIP_MARGIN_M
+from v2p_data.sim.model.world import ObjectModel, wall_m
 from v2p_data.sim.robot.grips import turn_to_grip
 from v2p_data.sim.robot.robot import FINGERTIP_BELOW_TCP_M, TARGET_HIGH_M, TARGET_LOW_M
 
@@ -89,6 +91,8 @@ class Moment:
     step_m: float
     """Displacement of the target at action 1."""
     turn_rad: float
+    opening_m: float
+    """Between the open pads."""
 
     @staticmethod
     def of(
@@ -97,6 +101,7 @@ class Moment:
         *,
         step_m: float,
         turn_rad: float,
+        opening_m: float,
     ) -> "Moment":
         """Read the moment from what task code and policies see."""
 
@@ -126,11 +131,18 @@ class Moment:
             bodies=bodies,
             step_m=step_m,
             turn_rad=turn_rad,
+            opening_m=opening_m,
         )
+
+    def by_wall(self, body: Body) -> Flags:
+        """Tell whether the gripper takes the object by a wall: it is open above, and the pads do not span it."""
+        widest = self.opening_m - GRIP_MARGIN_M
+        return body.model.opens_up & (body.size[:, :2].min(1) > widest)
 
     def holds(self, body: Body) -> Flags:
         """Tell whether the gripper has the object between its pads."""
-        return body.grasped & (np.linalg.norm((self.tool - body.pos)[:, :2], axis=1) < 0.06)
+        reach = np.where(self.by_wall(body), body.size[:, :2].max(1) / 2 + 0.03, 0.06)
+        return body.grasped & (np.linalg.norm((self.tool - body.pos)[:, :2], axis=1) < reach)
 
     def go(
         self, to: Points, gripper: Numbers | float, yaw: Numbers | float = 0.0, speed: float = 1.0
@@ -154,8 +166,8 @@ class Moment:
 
 def grasp(m: Moment, body: Body) -> Actions:
     """Go over the object, turn, descend around it and close; for worlds that do not hold it yet."""
-    point = grasp_point(body)
     yaw = turn_to_grasp(m, body)
+    point = grasp_point(m, body, yaw)
     off = np.linalg.norm((point - m.tool)[:, :2], axis=1)
     tips = m.tool[:, 2] - FINGERTIP_BELOW_TCP_M
     above = body.top + FINGERTIP_BELOW_TCP_M + HOVER_M
@@ -177,10 +189,21 @@ def grasp(m: Moment, body: Body) -> Actions:
     return m.go(to, np.where(is_at_depth, CLOSE, OPEN), yaw)
 
 
-def grasp_point(body: Body) -> Points:
-    """Return where the tool's centre should be around an object: its middle, or less deep where it is tall."""
+def grasp_point(m: Moment, body: Body, yaw: Numbers) -> Points:
+    """Return where the tool's centre should be once it has turned by `yaw` [rad].
+
+    In the object's middle, less deep where it is tall; or around the nearer of two walls, above the floor.
+    """
     point = body.pos.copy()
     deepest = np.maximum(body.top - FINGER_DEPTH_M, body.pos[:, 2])
+    by_wall = m.by_wall(body)
+    heading = np.arctan2(m.rotation[:, 1, 1], m.rotation[:, 0, 1]) + yaw
+    across = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    across *= np.where(((m.tool - body.pos)[:, :2] * across).sum(1) < 0, -1, 1)[:, None]
+    middle = body.reach(across) - wall_m(body.size[:, :2].min(1)) / 2
+    point[:, :2] += across * (by_wall * middle)[:, None]
+    floor = body.lowest + hollow_floor_m(body.size[:, 2]) + FINGERTIP_BELOW_TCP_M + 0.003
+    deepest = np.where(by_wall, np.maximum(body.top - FINGER_DEPTH_M, floor), deepest)
     point[:, 2] = np.maximum(deepest, TARGET_LOW_M[2])
     return point
 

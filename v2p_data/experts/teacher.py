@@ -79,6 +79,7 @@ class Teacher:
             env.world.objects,
             step_m=env.cfg.position_step_m * env.bundle.motion_scale,
             turn_rad=env.cfg.rotation_step_rad,
+            opening_m=2 * env.world.robot.finger_travel_m,
         )
 
     def choose(self, env: BatchEnv) -> Trial:

@@ -15,6 +15,7 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.rotation import product, quats_about_z
 from v2p_data.kinds import KINDS, TaskKind
 from v2p_data.scene.scene import FLOOR_MAX_M, Scene
+from v2p_data.sim.model.suitability import GRIP_MARGIN_M
 from v2p_data.sim.model.world import (
     CAMERA,
     CAMERA_FOVY_DEG,
@@ -24,6 +25,7 @@ from v2p_data.sim.model.world import (
     World,
     cover_of,
 )
+from v2p_data.sim.robot.grips import LEVEL
 
 WORKSPACE_CENTRE_M = (0.5, 0.0)
 OBJECT_LOW_M = (0.37, -0.28)
@@ -203,6 +205,7 @@ class Randomizer:
         self._rest = [
             Rotation.from_quat(o.rest_quat, scalar_first=True).as_matrix() for o in objects
         ]
+        self._largest_scale = [self._largest_scale_of(k, o) for k, o in enumerate(objects)]
         self.start_tool_pos, self.start_yaw, self.start_qpos = self._start_bank(rng)
         self._live = {**self._fields, **self.per_world_arrays()}
         self._prepared = {
@@ -233,14 +236,17 @@ class Randomizer:
     ) -> None:
         cfg, n = self.cfg, len(rows)
         for k, obj in enumerate(self.world.objects):
-            scale = rng.uniform(*cfg.size_scale, (n, 3))
+            most = self._largest_scale[k]
+            scale = rng.uniform(cfg.size_scale[0], most, (n, 3))
             mesh_idx = np.full(n, MESH_SCALES.index(1.0))
             if obj.is_round:
                 scale[:, 1] = scale[:, 0]
             elif obj.kind == "sphere":
                 scale[:] = scale[:, :1]
             elif obj.kind == "mesh":
-                library = np.asarray(MESH_SCALES)
+                library = np.asarray(
+                    [s for s in MESH_SCALES if s <= max(most[0], cfg.size_scale[0])]
+                )
                 mesh_idx = np.abs(library - scale[:, :1]).argmin(1)
                 scale = np.repeat(library[mesh_idx, None], 3, axis=1)
             mass = obj.mass_kg * rng.uniform(*cfg.mass_scale, n)
@@ -424,6 +430,20 @@ class Randomizer:
                 f"'{self.world.scene.title}': {excess * 1000:.0f} mm too large",
                 excess,
             )
+
+    def _largest_scale_of(self, k: int, obj: ObjectModel) -> Float[np.ndarray, "3"]:
+        """Return the largest factor of each own axis: what must be grasped stays within the open pads, where it can."""
+        low, high = self.cfg.size_scale
+        most = np.full(3, high)
+        if k or not KINDS[self.world.scene.kind].must_grasp:
+            return most
+        size = np.where(np.abs(self._rest[k][2]) < LEVEL, obj.size_m, np.inf)
+        fits = (2 * self.world.robot.finger_travel_m - GRIP_MARGIN_M) / size.min()
+        if fits >= low:
+            shared = obj.kind in {"mesh", "sphere"}
+            narrow = slice(3) if shared else slice(2) if obj.is_round else int(size.argmin())
+            most[narrow] = min(high, fits)
+        return most
 
     def _write(
         self,

@@ -78,6 +78,8 @@ class ObjectModel:
     role: str
     kind: str
     """`box`, `cylinder`, `sphere`, `mesh`, `box_hollow` or `round_hollow`."""
+    opens_up: bool
+    """A floor with walls; a cover's walls point down."""
     size_m: tuple[float, float, float]
     mass_kg: float
     friction: float
@@ -180,6 +182,11 @@ def cover_of(scene: Scene) -> int | None:
     return 0 if KINDS[scene.kind].has_cover and len(scene.objects) > 1 else None
 
 
+def wall_m(width_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return how thick the walls of a hollow object are simulated, given its narrower width [m]."""
+    return np.clip(0.08 * width_m, 0.006, WALL_MAX_M)
+
+
 def hollow_parts(
     size_m: tuple[float, float, float], *, is_round: bool, upside_down: bool = False
 ) -> list[Part]:
@@ -190,7 +197,7 @@ def hollow_parts(
     """
     half = np.asarray(size_m) / 2
     floor = float(hollow_floor_m(np.array([size_m[2]]))[0])
-    wall = float(np.clip(0.08 * min(size_m[0], size_m[1]), 0.006, WALL_MAX_M))
+    wall = float(wall_m(np.array(min(size_m[:2]))))
     flip = -1.0 if upside_down else 1.0
     wall_half_height = half[2] - floor / 2
     wall_z = flip * floor / 2
@@ -237,6 +244,7 @@ class _Draft:
 
     obj: SceneObject
     kind: str
+    opens_up: bool
     size_m: tuple[float, float, float]
     parts: tuple[Part, ...]
     rest_quat: tuple[float, float, float, float]
@@ -279,6 +287,7 @@ class _Draft:
             name=self.obj.name,
             role=self.obj.role,
             kind=self.kind,
+            opens_up=self.opens_up,
             size_m=self.size_m,
             mass_kg=self.obj.mass_kg,
             friction=self.obj.friction,
@@ -354,6 +363,7 @@ def _draft(obj: SceneObject, scene: Scene, opening_m: float) -> _Draft:
     return _Draft(
         obj=obj,
         kind=kind,
+        opens_up=is_hollow and not is_cover,
         size_m=thick,
         parts=tuple(parts),
         rest_quat=rest_quat,

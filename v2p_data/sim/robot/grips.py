@@ -11,7 +11,7 @@ GRIPS_UP_TO_M = 0.078
 """Sides narrower than this fit between the open pads with some room."""
 LEVEL = 0.5
 """An own axis lies flat enough to be gripped along while its vertical part is below this."""
-TOO_WIDE, NARROW_IS_BETTER, NOT_LEVEL = 60.0, 3.0, 100.0
+TOO_WIDE, NARROW_IS_BETTER, NOT_LEVEL = 300.0, 3.0, 1000.0
 """Costs in radians per metre: a side is chosen by how far to turn and by how wide it is."""
 
 

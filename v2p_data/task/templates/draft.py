@@ -5,9 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from v2p_data.kinds import Kind
+from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.sandbox.probes import first_pose
+
+SPANNED_M = 0.083 / 0.9
+"""Things up to here fit between the open pads in some episodes: sizes are drawn from nine tenths on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +29,12 @@ class Measured:
     """At the end, horizontally, from the first other object to the manipulated one."""
     stood: bool = True
     """Whether the object's axis that pointed up at first did so at the end, too."""
+
+    @property
+    def by_wall(self) -> bool:
+        """Whether the gripper takes the manipulated object by a wall: it is open above and too wide for the pads."""
+        is_cover = KINDS[self.kind].has_cover
+        return self.obj.hollow and not is_cover and min(self.obj.size_m[:2]) > SPANNED_M
 
     @staticmethod
     def of(scene: Scene) -> "Measured":

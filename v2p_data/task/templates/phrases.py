@@ -19,19 +19,19 @@ STANDING = "upright(obj_quat, obj_start_quat).clamp(0.0, 1.0)"
 LEVEL = ("level", "-0.4 * lean")
 
 
-def grasp_setup(name: str = "obj") -> list[str]:
+def grasp_setup(name: str = "obj", *, by_wall: bool = False) -> list[str]:
     """Lines for the point at which the gripper holds an object, `obj` or `ref`, and for the side that it spans.
 
     While the gripper is beside a tall object the point is above that object: whoever comes straight at it presses on
-    its rim and never gets the open fingers over it.
+    its rim and never gets the open fingers over it. `by_wall`: the point is in the nearer of the manipulated object's two walls.
     """
-    return [
+    height = "(tall - 0.035).clamp(min=0.0) + torch.minimum(1.5 * (beside - 0.01).clamp(min=0.0), 2 * tall)"
+    lines = [
         *_LEAN_SETUP,
         f"grasp_point = {name}_pos.clone()",
         f"tall = {name}_start[:, 2] - table_height",
         f"beside = torch.norm(({name}_pos - eef_pos)[:, :2], dim=-1)",
-        f"grasp_point[:, 2] = {name}_pos[:, 2] + (tall - 0.035).clamp(min=0.0)"
-        " + torch.minimum(1.5 * (beside - 0.01).clamp(min=0.0), 2 * tall)",
+        f"grasp_point[:, 2] = {name}_pos[:, 2] + {height}",
         # The pads close along the gripper's own y axis.
         "closing = torch.zeros_like(eef_pos)",
         "closing[:, 1] = 1",
@@ -41,6 +41,23 @@ def grasp_setup(name: str = "obj") -> list[str]:
         f"gripped = {name}_grasped * (eef_pos[:, 2] - {name}_pos[:, 2] < (tall - 0.002).clamp(min=0.02)).float()",
         f"diagonal = torch.norm({name}_size[:, :2], dim=-1)",
         f"snug = (torch.minimum({name}_size[:, 0], {name}_size[:, 1]) > 0.06).float()",
+    ]
+    return [*lines, *_by_wall(height)] if by_wall else lines
+
+
+def _by_wall(height: str) -> list[str]:
+    return [
+        "across = torch.nn.functional.normalize(closing * torch.tensor([1.0, 1.0, 0.0], device=obj_pos.device), dim=-1)",
+        "side = torch.sign(((eef_pos - obj_pos) * across).sum(dim=-1))",
+        "middle = side * (obj_half(obj_quat, obj_size, across) - 0.005)",
+        "grasp_point = obj_pos + across * middle.unsqueeze(-1)",
+        "beside = torch.norm((grasp_point - eef_pos)[:, :2], dim=-1)",
+        f"grasp_point[:, 2] = obj_pos[:, 2] + {height}",
+        # Held by a wall it hangs at any angle.
+        "grasp_point = torch.where((obj_grasped > 0.5).unsqueeze(-1), eef_pos, grasp_point)",
+        "gripped = obj_grasped",
+        "pads_apart = torch.full_like(gripped, 0.01)",
+        "snug = torch.zeros_like(gripped)",
     ]
 
 

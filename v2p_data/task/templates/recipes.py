@@ -55,7 +55,9 @@ def _generic(m: Measured, v: Variant) -> Draft:
             "remaining = torch.norm(goal_point - obj_pos, dim=-1)",
         ],
         success=success,
-        reward_setup=grasp_setup() if lifts else push_point_setup(clearance_m=0.02),
+        reward_setup=grasp_setup(by_wall=m.by_wall)
+        if lifts
+        else push_point_setup(clearance_m=0.02),
         target="grasp_point" if lifts else "push_point",
         contact="gripped * near" if lifts else "near",
         pays_contact=bool(lifts),

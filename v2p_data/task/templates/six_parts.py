@@ -120,7 +120,8 @@ def _state_lines(m: Measured) -> list[str]:
         f'obj_vel = states["{n}_vel_linear"]',
         f'obj_spin = states["{n}_vel_angular"]',
         "half_height = obj_start[:, 2] - table_height",
-        "reach_limit = 0.05 + half_height",
+        "reach_limit = 0.05 + "
+        + ("torch.norm(obj_size, dim=-1) / 2" if m.by_wall else "half_height"),
     ]
 
 
