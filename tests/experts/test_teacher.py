@@ -1,6 +1,7 @@
 """Programs solve the benchmark, remember nothing, and the right one is found by trying."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -59,6 +60,25 @@ def test_every_benchmark_task_has_a_program_that_is_meant(name: str):
     env = worlds(name, 1)
 
     assert any(p.startswith(KINDS[env.bundle.kind].programs) for p in programs_for(env))
+
+
+@pytest.mark.parametrize(
+    "shape_and_size",
+    ["box, size_m: [0.2, 0.15, 0.065]", "cylinder, size_m: [0.18, 0.18, 0.067]"],
+    ids=["crate", "bowl"],
+)
+def test_a_thing_wider_than_the_open_pads_is_lifted_by_its_wall(
+    shape_and_size: str, tmp_path: Path
+):
+    (tmp_path / "wide.yaml").write_text(
+        "description: Lifting it\nkind: lift_up\nobjects:\n  - {name: thing, hollow: true, mass_kg: 0.2, friction: 0.6,"
+        f" path: [[0.0, 0.0], [0.0, 0.0, 0.16]], shape: {shape_and_size}}}\n"
+    )
+    env = BatchEnv(load_benchmark("wide", tmp_path), num_envs=16, seed=7, num_threads=1)
+
+    assert playing(env, "lift").play() > 0.9
+    aside = np.linalg.norm((env.states()["eef_pos"] - env.states()["thing_pos"]).numpy(), axis=1)
+    assert (aside > 0.06).all()
 
 
 @pytest.mark.parametrize("name", ["push_left", "insert", "throw_into"])

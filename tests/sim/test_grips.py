@@ -65,6 +65,7 @@ def test_a_side_that_does_not_fit_is_avoided_at_the_price_of_a_quarter_turn():
 
     assert turn_deg(90, turned(10), (0.07, fits, 0.05)) == pytest.approx([10], abs=1e-9)
     assert turn_deg(90, turned(10), (0.07, too_wide, 0.05)) == pytest.approx([-80], abs=1e-9)
+    assert turn_deg(90, turned(0), (0.057, 0.087, 0.05)) == pytest.approx([-90], abs=1e-9)
 
 
 def test_a_box_lying_on_its_side_is_gripped_by_the_axes_that_are_level():

@@ -81,6 +81,33 @@ def test_objects_of_any_drawn_size_start_at_rest(
     assert np.ptp(poses[:, 0, 2]) > 1e-3  # sizes did differ
 
 
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        ("box", (0.10, 0.081, 0.05)),
+        ("cylinder", (0.082, 0.082, 0.09)),
+        ("sphere", (0.08, 0.08, 0.08)),
+        ("mesh", (0.08, 0.12, 0.04)),
+    ],
+)
+def test_no_object_is_drawn_wider_than_the_gripper_that_must_take_it(
+    shape: str,
+    size: tuple[float, float, float],
+    make_object: Callable[..., SceneObject],
+    make_scene: Callable[..., Scene],
+    tmp_path: Path,
+):
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "block.obj")
+    thing = make_object("thing", shape, size, mesh="block.obj" if shape == "mesh" else "")
+    lifted, pushed = (
+        worlds_of(make_scene(thing, kind=kind, folder=tmp_path))[0].size_m[:, 0, :2].min(1)
+        for kind in ("lift_up", "push_left")
+    )
+
+    assert lifted.max() < 2 * FINGER_TRAVEL_M < pushed.max()
+    assert lifted.min() < 0.93 * min(size[:2])
+
+
 def test_a_drawn_box_has_the_inertia_of_a_solid_box(
     make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
 ):

@@ -16,7 +16,7 @@ from v2p_data.geometry.rotation import matrices
 from v2p_data.scene.scene import hollow_floor_m
 from v2p_data.sim.env.observation import value_of
 from v2p_data.sim.model.suitability import GRIP_MARGIN_M
-from v2p_data.sim.model.world import ObjectModel, wall_m
+from v2p_data.sim.model.world import ObjectModel, hollow_wall_m
 from v2p_data.sim.robot.grips import turn_to_grip
 from v2p_data.sim.robot.robot import FINGERTIP_BELOW_TCP_M, TARGET_HIGH_M, TARGET_LOW_M
 
@@ -200,7 +200,7 @@ def grasp_point(m: Moment, body: Body, yaw: Numbers) -> Points:
     heading = np.arctan2(m.rotation[:, 1, 1], m.rotation[:, 0, 1]) + yaw
     across = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     across *= np.where(((m.tool - body.pos)[:, :2] * across).sum(1) < 0, -1, 1)[:, None]
-    middle = body.reach(across) - wall_m(body.size[:, :2].min(1)) / 2
+    middle = body.reach(across) - hollow_wall_m(body.size[:, :2].min(1)) / 2
     point[:, :2] += across * (by_wall * middle)[:, None]
     floor = body.lowest + hollow_floor_m(body.size[:, 2]) + FINGERTIP_BELOW_TCP_M + 0.003
     deepest = np.where(by_wall, np.maximum(body.top - FINGER_DEPTH_M, floor), deepest)

@@ -182,7 +182,7 @@ def cover_of(scene: Scene) -> int | None:
     return 0 if KINDS[scene.kind].has_cover and len(scene.objects) > 1 else None
 
 
-def wall_m(width_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def hollow_wall_m(width_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Return how thick the walls of a hollow object are simulated, given its narrower width [m]."""
     return np.clip(0.08 * width_m, 0.006, WALL_MAX_M)
 
@@ -197,7 +197,7 @@ def hollow_parts(
     """
     half = np.asarray(size_m) / 2
     floor = float(hollow_floor_m(np.array([size_m[2]]))[0])
-    wall = float(wall_m(np.array(min(size_m[:2]))))
+    wall = float(hollow_wall_m(np.array([min(size_m[:2])]))[0])
     flip = -1.0 if upside_down else 1.0
     wall_half_height = half[2] - floor / 2
     wall_z = flip * floor / 2
