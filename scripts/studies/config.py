@@ -33,6 +33,8 @@ class PoolConfig:
     """Clips that may be drawn, at most; a clip whose scene, task or expert is rejected counts."""
     toys: int = 60
     """Toys that may be made, at most."""
+    chains: float = 0.0
+    """Share of the toys that are bars, balls and rings one after another in a curve; the others are stacks."""
     fps: int = 12
     """Of drawn clips, as of Something-Something-v2."""
     held_out: tuple[str, ...] = (

@@ -167,11 +167,12 @@ TOY_FORMS = ("box", "cylinder", "sphere", "ring", "cup")
 
 
 def toy_stage(number: int, pool: PoolConfig) -> Stage:
-    """Return the stage that makes a random toy: a cup, or one to three boxes, cylinders, balls and rings on each other."""
+    """Return the stage that makes a random toy: a cup, one to three boxes, cylinders, balls and rings on each other, or a chain."""
+    is_chain = rng_for(pool.seed, "study_lifting", "chain", number).random() < pool.chains
     return Stage(
         name="scene",
         item=f"toy_{number:04d}",
-        config={"seed": pool.seed, "kind": "toy"},
+        config={"seed": pool.seed, "kind": "chain" if is_chain else "toy"},
         version=2,
         make=make_toy,
     )
@@ -184,6 +185,34 @@ def make_toy(
     del inputs, runtime
     item = out.name.split("-")[0]
     rng = rng_for(cfg["seed"], "study_lifting", item)
+    forms, meshes, parts = (_chain if cfg["kind"] == "chain" else _stack)(rng)
+    whole = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
+    assert isinstance(whole, trimesh.Trimesh)
+    T_square = square_turn(whole) if cfg["kind"] == "chain" else np.eye(4)
+    whole.apply_transform(T_square)
+    middle = whole.bounds.mean(0)
+    whole.apply_translation(-middle)
+    parts = [p.apply_transform(T_square).apply_translation(-middle) for p in parts]
+    density = float(np.exp(rng.uniform(np.log(150), np.log(900))))
+    single = forms[0] if len(forms) == 1 and forms[0] not in ("ring", "cup") else None
+    thing = SceneObject(
+        name="toy",
+        label="toy",
+        role="manipulated",
+        shape=single or "mesh",  # pyright: ignore[reportArgumentType]
+        size_m=_size(whole.extents),
+        mass_kg=float(np.clip(density * sum(p.volume for p in parts), 0.01, 0.6)),
+        friction=float(rng.uniform(0.4, 0.8)),
+        source={"size": "drawn", "mass": "drawn", "friction": "drawn"},
+    )
+    _write_scene(thing, whole, parts, out, "Lifting toy up")
+    return {"forms": forms}
+
+
+def _stack(
+    rng: np.random.Generator,
+) -> tuple[list[str], list[trimesh.Trimesh], list[trimesh.Trimesh]]:
+    """Return the forms of a stack's pieces, their meshes and their convex parts."""
     forms = [str(f) for f in rng.choice(TOY_FORMS, rng.integers(1, 4))]
     forms = ["cup"] if forms[0] == "cup" else [f for f in forms if f != "cup"]
     parts: list[trimesh.Trimesh] = []
@@ -199,25 +228,34 @@ def make_toy(
         meshes.append(mesh_for(kind, size, **shape).apply_translation(lift))
         parts += [p.apply_translation(lift) for p in parts_for(kind, size, **shape)]
         top += size[2]
-    whole = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
-    assert isinstance(whole, trimesh.Trimesh)
-    middle = whole.bounds.mean(0)
-    whole.apply_translation(-middle)
-    parts = [p.apply_translation(-middle) for p in parts]
-    density = float(np.exp(rng.uniform(np.log(150), np.log(900))))
-    single = forms[0] if len(forms) == 1 and forms[0] not in ("ring", "cup") else None
-    thing = SceneObject(
-        name="toy",
-        label="toy",
-        role="manipulated",
-        shape=single or "mesh",  # pyright: ignore[reportArgumentType]
-        size_m=_size(whole.extents),
-        mass_kg=float(np.clip(density * sum(p.volume for p in parts), 0.01, 0.6)),
-        friction=float(rng.uniform(0.4, 0.8)),
-        source={"size": "drawn", "mass": "drawn", "friction": "drawn"},
-    )
-    _write_scene(thing, whole, parts, out, "Lifting toy up")
-    return {"forms": forms}
+    return forms, meshes, parts
+
+
+def _chain(
+    rng: np.random.Generator,
+) -> tuple[list[str], list[trimesh.Trimesh], list[trimesh.Trimesh]]:
+    """Return the same of two to four pieces that lie one after another, each turned against the one before."""
+    forms = [str(f) for f in rng.choice(("box", "sphere", "ring"), rng.integers(2, 5))]
+    parts: list[trimesh.Trimesh] = []
+    meshes: list[trimesh.Trimesh] = []
+    end, heading, bend = np.zeros(2), 0.0, float(rng.uniform(-0.7, 0.7))
+    for form in forms:
+        long, wide, high = (
+            float(np.exp(rng.uniform(np.log(low), np.log(top))))
+            for low, top in ((0.03, 0.09), (0.012, 0.035), (0.011, 0.03))
+        )
+        size = (long, wide, high) if form != "ring" else (min(long, 0.05), min(long, 0.05), high)
+        unit = (1.0, 1.0, 1.0) if form == "sphere" else size
+        kind, bore = ("cylinder", 0.6) if form == "ring" else (form, 0.0)
+        way = np.array([np.cos(heading), np.sin(heading)])
+        place = trimesh.transformations.rotation_matrix(heading, [0.0, 0.0, 1.0])
+        place[:3, :3] @= np.diag(np.array(size) / unit)
+        place[:3, 3] = [*(end + way * size[0] / 2), high / 2]
+        meshes.append(mesh_for(kind, unit, bore=bore).apply_transform(place))
+        parts += [p.apply_transform(place) for p in parts_for(kind, unit, bore=bore)]
+        end = end + 0.85 * size[0] * way
+        heading += bend + float(rng.uniform(-0.2, 0.2))
+    return forms, meshes, parts
 
 
 def _toy_size(form: str, rng: np.random.Generator) -> Size:
@@ -346,13 +384,18 @@ def turned_square(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     Reconstructed objects lie along their own axes; a scanner's axes are anyhow, and features of how an object lies
     between the pads are told along them.
     """
+    out = mesh.copy()
+    out.apply_transform(square_turn(mesh))
+    out.apply_translation(-out.bounds.mean(0))
+    return out
+
+
+def square_turn(mesh: trimesh.Trimesh) -> Float[np.ndarray, "4 4"]:
+    """Return the turn about the vertical after which the mesh's bounding box is smallest."""
     T_flat, _ = trimesh.bounds.oriented_bounds_2D(np.asarray(mesh.vertices)[:, :2])
     turn = np.eye(4)
     turn[:2, :2] = T_flat[:2, :2]
-    out = mesh.copy()
-    out.apply_transform(turn)
-    out.apply_translation(-out.bounds.mean(0))
-    return out
+    return turn
 
 
 def masses_in(folder: Path) -> dict[str, float]:

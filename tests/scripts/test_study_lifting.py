@@ -47,7 +47,7 @@ def study(load_script):
 
 @pytest.fixture(scope="module")
 def parts(study):
-    names = ("cells", "config", "figure", "fits", "objects", "page", "results", "table")
+    names = ("cells", "config", "figure", "fits", "objects", "page", "results", "stages", "table")
     modules = {name: importlib.import_module(f"studies.{name}") for name in names}
     return argparse.Namespace(**modules)
 
@@ -461,7 +461,7 @@ def in_this_process(parts, monkeypatch):
             on_event(Event(kind="ended", stage=stage, outcome=outcome))
         return outcomes
 
-    monkeypatch.setattr(parts.cells, "run_stages", run)
+    monkeypatch.setattr(parts.stages, "run_stages", run)
 
 
 @pytest.mark.slow

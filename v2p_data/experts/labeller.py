@@ -21,7 +21,7 @@ def choose_program(worlds: "Worlds", cfg: ExpertConfig, out: Path) -> "Learned":
     from v2p_data.experts.record import Learned
     from v2p_data.experts.teacher import Teacher
 
-    env = worlds.make(cfg.trial_worlds, "trials")
+    env = worlds.make(cfg.trial_worlds, "trials", fine=True)  # where it will act
     teacher = Teacher(env)
     best = teacher.choose(env)
     write_json_atomically(out / PROGRAM_FILE, {"program": best.name})
