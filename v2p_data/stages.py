@@ -226,7 +226,7 @@ def task_stage(scene: Stage, cfg: EngineConfig) -> Stage:
         config=Seeded(config=cfg.task.recipe(), seed=cfg.seed),
         inputs={"scene": scene},
         sources=_robot_digests(robot) | task_data(asks_model=cfg.task.writer == "vlm"),
-        version=2,
+        version=3,
         make=partial(make_task, robot=robot, how=cfg.task),
     )
 
@@ -359,7 +359,7 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
         config=Seeded(config=replace(cfg.expert, warm_start=None), seed=cfg.seed),
         inputs={"task": task},
         sources=solved_digests(cfg.expert.warm_start) | named,
-        version=4,
+        version=5,
         on_device=True,
         make=partial(
             make_expert,
