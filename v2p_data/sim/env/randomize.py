@@ -244,9 +244,9 @@ class Randomizer:
             elif obj.kind == "sphere":
                 scale[:] = scale[:, :1]
             elif obj.kind == "mesh":
-                library = np.asarray(
-                    [s for s in MESH_SCALES if s <= max(most[0], cfg.size_scale[0])]
-                )
+                library = np.asarray(MESH_SCALES)
+                if most[0] < cfg.size_scale[1]:
+                    library = library[: max(1, int(np.searchsorted(library, most[0], "right")))]
                 mesh_idx = np.abs(library - scale[:, :1]).argmin(1)
                 scale = np.repeat(library[mesh_idx, None], 3, axis=1)
             mass = obj.mass_kg * rng.uniform(*cfg.mass_scale, n)
