@@ -17,7 +17,7 @@ import numpy as np
 
 from policies.evaluation.paired import success_difference
 from policies.evaluation.rate import wilson
-from studies.results import commit, make_missing, results_to_show
+from studies.results import commit, letters_of, make_missing, results_to_show
 from v2p_data.episodes.collect import judge_expert
 from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.labeller import labeller_of
@@ -65,7 +65,7 @@ def row_of(run: Path, item: str, expert: Path, episodes: int) -> dict[str, Any]:
     for each in (bundle, true):
         try:
             played = judge_expert(each, labeller_of(expert), episodes=episodes, seed=SEED)
-            once.append("".join("01"[won] for won in played.successes.astype(int)))
+            once.append(letters_of(played.successes))
         except ItemRejectedError as error:
             print(f"{item}: {error}")
             once.append(None)
