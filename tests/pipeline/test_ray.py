@@ -114,6 +114,16 @@ def test_a_task_that_always_crashes_fails_alone_and_what_a_stage_reports_is_not_
 
 
 @pytest.mark.slow
+def test_a_task_that_hangs_is_ended_after_its_time_and_not_begun_again(cluster, tmp_path):
+    hangs = noted("hangs", waits=True).inputs["one"]
+
+    found = run([hangs], tmp_path, engine="ray", address=cluster.address, limit_s=2.0)
+
+    assert found["one", "hangs"] == "too_long"
+    assert times_begun(tmp_path)[hangs.folder_name] == 1
+
+
+@pytest.mark.slow
 @pytest.mark.long
 def test_a_run_whose_driver_is_killed_goes_on_where_it_was(cluster, tmp_path):
     script = tmp_path / "driver.py"

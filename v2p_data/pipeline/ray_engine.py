@@ -22,6 +22,8 @@ from v2p_data.pipeline.at_work import Event, no_progress, run_name
 from v2p_data.pipeline.ray_task import failed, log_of
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage
 
+OUT_OF_TIME = b"Timeout ("
+"""What `limit_time` leaves in a task's log."""
 TRIES = 3
 """A task that dies is begun so often; then its item has failed."""
 CONNECT_S = 5.0
@@ -34,6 +36,8 @@ FEWEST_IN_FLIGHT = 64
 class _Task:
     stage: Stage
     tries: int
+    said: int
+    """Bytes in its log before it began."""
 
 
 class RayEngine:
@@ -76,10 +80,10 @@ class RayEngine:
         return len(self.tasks) < self.size
 
     def start(self, stage: Stage) -> None:
-        self._submit(_Task(stage=stage, tries=1))
+        self._submit(stage, tries=1)
 
-    def _submit(self, task: _Task) -> None:
-        stage, runtime = task.stage, self.runtime
+    def _submit(self, stage: Stage, *, tries: int) -> None:
+        runtime = self.runtime
         on_gpu = stage.on_device and runtime.device.startswith("cuda")
         if on_gpu and not self.most["GPU"]:
             raise V2PError(
@@ -93,7 +97,9 @@ class RayEngine:
             num_cpus=num_cpus,
             num_gpus=int(on_gpu),
         ).remote(self.paths, how, self.ray.cloudpickle.dumps(stage))
-        self.tasks[reference] = task
+        log = log_of(stage, runtime.root)
+        said = log.stat().st_size if log.exists() else 0
+        self.tasks[reference] = _Task(stage=stage, tries=tries, said=said)
 
     def events(self) -> Iterator[Event]:
         errors = self.ray.exceptions
@@ -107,13 +113,16 @@ class RayEngine:
                 why = f"a node cannot load our code or the recipe: {error.cause}"
                 outcome = failed(stage, root, "error", why)
             except errors.RayError as error:
-                how = type(error).__name__
-                if task.tries < TRIES:
-                    self._submit(replace(task, tries=task.tries + 1))
+                how, log, reason = type(error).__name__, log_of(stage, root), "crashed"
+                why = f"its process ended {TRIES} times, last of {how}; its output is in {log}"
+                if log.exists() and OUT_OF_TIME in log.read_bytes()[task.said :]:
+                    reason = "too_long"
+                    why = f"it took longer than --limit-s={self.runtime.limit_s:g} s and was ended; its output is in {log}"
+                elif task.tries < TRIES:
+                    self._submit(stage, tries=task.tries + 1)
                     yield Event(kind="progress", stage=stage, words=f"begun again after {how}")
                     continue
-                why = f"its process ended {TRIES} times, last of {how}; its output is in {log_of(stage, root)}"
-                outcome = failed(stage, root, "crashed", why)
+                outcome = failed(stage, root, reason, why)
             yield Event(kind="ended", stage=stage, outcome=outcome)
 
     def close(self) -> None:
