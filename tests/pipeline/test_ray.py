@@ -91,6 +91,8 @@ def test_one_worker_two_workers_and_a_cluster_make_the_same_bytes(cluster, tmp_p
     assert ray["two", "a"] == "made"
     assert content(tmp_path / "one") == content(tmp_path / "two") == content(tmp_path / "ray")
     assert set(times_begun(tmp_path / "ray").values()) == {1}
+    for record in (tmp_path / "ray").glob(f"*/*/{RECORD_FILE}"):
+        assert json.loads(record.read_text())["provenance"]["argv"][1:] == sys.argv[1:]
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import sys
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
 
@@ -14,7 +14,7 @@ from rich.progress import BarColumn, TaskID, TextColumn, TimeRemainingColumn
 
 from v2p_data.errors import NOT_ALL, NOTHING
 from v2p_data.pipeline.at_work import Event
-from v2p_data.pipeline.runner import Outcome, Progress, Stage
+from v2p_data.pipeline.runner import Outcome, Progress
 
 PLAIN_EVERY_S = 15.0
 """Nobody waits longer for a word."""
@@ -152,11 +152,8 @@ def cost_line(outcomes: Sequence[Outcome]) -> str:
     return f"{total / 60:.1f} minutes of worker time for {usable} usable tasks{each}: {shares}"
 
 
-def outcomes_json(
-    outcomes: Mapping[Any, Outcome], stages: Sequence[Stage]
-) -> list[dict[str, Any]]:
+def outcomes_json(outcomes: Iterable[Outcome]) -> list[dict[str, Any]]:
     """Return the outcomes as they are kept in `run.json`, without paths of this machine."""
-    del stages
     return [
         {
             "stage": o.stage,
@@ -167,7 +164,7 @@ def outcomes_json(
             "reason": o.reason,
             "detail": o.detail,
         }
-        for o in outcomes.values()
+        for o in outcomes
     ]
 
 

@@ -279,7 +279,7 @@ class LiveReview:
         path = self.root / RUN_FILE
         rows = as_dicts(json_or_none(path))
         others = [r for r in rows if (r.get("stage"), r.get("item")) != ("scene", outcome.item)]
-        write_json_atomically(path, [*others, *outcomes_json({0: outcome}, [])])
+        write_json_atomically(path, [*others, *outcomes_json([outcome])])
 
     # --- what is shown ---------------------------------------------------------------------------------------
 

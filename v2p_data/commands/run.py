@@ -627,7 +627,7 @@ def _run(stages: Sequence[Stage], runtime: Runtime) -> dict[Key, Outcome]:
         progress.write()
     path = runtime.root / RUN_FILE
     try:
-        write_json_atomically(path, outcomes_json(outcomes, stages))
+        write_json_atomically(path, outcomes_json(outcomes.values()))
     except OSError as error:
         raise V2PError(
             f"cannot write {path} ({error.strerror}); what was made is kept: remove what is there and run again"

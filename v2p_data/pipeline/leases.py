@@ -96,8 +96,10 @@ class Shared:
 
     def ended(self, stage: Stage) -> None:
         """Give a stage's lease back."""
+        if self.store is None:
+            return
         key = key_of(stage.folder(self.root))
-        if self.store is not None and (lease := self.held.pop(key, None)):
+        if lease := self.held.pop(key, None):
             if self.store.has(key):
                 self.store.delete(lease)
             else:

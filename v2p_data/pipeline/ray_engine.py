@@ -91,7 +91,7 @@ class RayEngine:
             )
         num_cpus = max(1, min(runtime.num_threads, int(self.most["CPU"])))
         here = replace(runtime, num_threads=num_cpus, device="cuda" if on_gpu else "cpu")
-        how = pickle.dumps((here, self.run_name, str(Path.cwd())))
+        how = pickle.dumps((here, self.run_name, str(Path.cwd()), sys.argv))
         reference = self.task.options(
             name=f"{stage.name} {stage.item}",
             num_cpus=num_cpus,

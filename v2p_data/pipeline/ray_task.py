@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 import socket
+import sys
 from pathlib import Path
 from typing import TextIO
 
@@ -38,7 +39,7 @@ def work(how: bytes, what: bytes) -> Outcome:
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once, not when Python gets round to it
     end_with_parent(os.getppid())
-    runtime, run, home = pickle.loads(how)
+    runtime, run, home, sys.argv = pickle.loads(how)  # records tell the user's command, not Ray's
     limit_threads(runtime.num_threads)
     with contextlib.suppress(OSError):
         os.chdir(home)  # recipes may name videos relative to it

@@ -6,6 +6,7 @@ Jobs run in worker processes, so that a crash in a decoder or a simulator is tha
 import contextlib
 import functools
 import logging
+import os
 import shutil
 import time
 import traceback
@@ -129,6 +130,8 @@ def stored_outcome(stage: Stage, root: Path) -> Outcome | None:
 
     What is damaged has failed: it is neither used nor deleted.
     """
+    if not os.access(f"{root}/{stage.name}/{stage.folder_name}", os.F_OK):
+        return None  # asked without a `Path`, of which Python 3.12 keeps every part for ever
     folder = stage.folder(root)
 
     def whole_record() -> Record | None:
