@@ -84,8 +84,8 @@ def row_of(run: Path, item: str, expert: Path, episodes: int) -> dict[str, Any]:
 def true_size(thing: SceneObject, size_m: list[float]) -> tuple[float, float, float]:
     """Return the true extents along the axes that the reconstruction chose: its horizontal axes may be the other way round."""
     x, y, z = size_m
-    other_way = abs(np.log(thing.size_m[0] / x)) > abs(np.log(thing.size_m[0] / y))
-    return (y, x, z) if other_way else (x, y, z)
+    ways = (x, y, z), (y, x, z)
+    return min(ways, key=lambda way: float(np.abs(np.log(np.divide(way, thing.size_m))).sum()))
 
 
 def pair(row: dict[str, Any]) -> tuple[str | None, str | None]:
