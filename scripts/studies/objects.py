@@ -188,11 +188,9 @@ def make_toy(
     forms, meshes, parts = (_chain if cfg["kind"] == "chain" else _stack)(rng)
     whole = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
     assert isinstance(whole, trimesh.Trimesh)
-    T_square = square_turn(whole) if cfg["kind"] == "chain" else np.eye(4)
-    whole.apply_transform(T_square)
     middle = whole.bounds.mean(0)
     whole.apply_translation(-middle)
-    parts = [p.apply_transform(T_square).apply_translation(-middle) for p in parts]
+    parts = [p.apply_translation(-middle) for p in parts]
     density = float(np.exp(rng.uniform(np.log(150), np.log(900))))
     single = forms[0] if len(forms) == 1 and forms[0] not in ("ring", "cup") else None
     thing = SceneObject(
@@ -255,6 +253,9 @@ def _chain(
         parts += [p.apply_transform(place) for p in parts_for(kind, unit, bore=bore)]
         end = end + 0.85 * size[0] * way
         heading += bend + float(rng.uniform(-0.2, 0.2))
+    T_square = square_turn(trimesh.util.concatenate(meshes))
+    for piece in (*meshes, *parts):
+        piece.apply_transform(T_square)
     return forms, meshes, parts
 
 
