@@ -3,12 +3,14 @@
 A scene's confidence is the product of its cues; each cue belongs to one stage, whose confidence is the product of its own.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Float
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.scene.data_types import Cue, GroundedObjects, Placement
+from v2p_data.scene.data_types import Cue, GroundedObjects, ObjectTrack, PlacedObject, Placement
 from v2p_data.scene.fitting.placement import vote_of
 from v2p_data.scene.fitting.trajectory import TOUCH_PX
 from v2p_data.scene.frames.colour import balance, colour_match, named_colours
@@ -36,61 +38,60 @@ _GROWN = 0.2
 
 def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tuple[Cue, ...]:
     """Return everything that the scene's confidence is the product of."""
-    cues: list[Cue] = []
+    pairs = zip(grounded.objects, placement.objects, strict=True)
+    of_objects = [cue for s, placed in pairs for cue in _object_cues(grounded, placement, kind, s, placed)]  # fmt: skip
+    return (*of_objects, *_scene_cues(grounded, placement, kind))
 
-    def add(stage: str, what: str, value: float, advice: str = "") -> None:
-        value = float(np.clip(value, 0, 1))
-        cues.append(Cue(stage=stage, what=what, value=value, advice=advice))
 
-    for s, placed in zip(grounded.objects, placement.objects, strict=True):
-        which = f"'{s.phrase}'"
-        box = "" if s.hinted else f"mark {which} with a box"
-        add("grounding", f"finding {which}" + (f" ({s.why})" if s.why else ""), s.sure, box)
-        if not s.hinted and (words := named_colours(s.phrase)):
-            image = grounded.working.rgb[s.at]
-            match = float(colour_match(balance(image), words)[s.first].mean())
-            # Where nothing else in the picture fits the words better, the light is to blame.
-            known = known_by_sight(grounded.working, s.phrase, {s.at: s.first}) or 0.0
-            add(
-                "grounding",
-                f"colour of {which}",
-                0.4 + 0.6 * max(match / _COLOURED, known),
-                f"{box}, or correct its colour word",
-            )
-        if s.moves:
-            add(
-                "segmentation", f"track of {which} from start to end", 0.8 + 0.7 * s.agreement, box
-            )
-        touched = _touched_share(grounded) if s is grounded.objects[0] else None
-        if touched is not None:
-            add("grounding", f"a hand at {which} while it moves", 0.4 + 2 * touched, box)
-        off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
-        add(
-            "size",
-            f"size of {which}",
-            np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2),
-            "" if s.known_m else f"measure {which} and give its size_m",
-        )
-        covers = placed.first.iou / attainable_iou(s.first)
-        add("shape", f"outline of {which}", max(0.1, 0.5 + (covers - 0.6) / 0.6), box)
-        if not s.moves:
-            continue
-        if s.hidden_in_container or placed.hidden_in_hand:
-            add("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
-            continue
-        covers = placed.last.iou / attainable_iou(placed.last_mask)
-        add("pose", f"outline of {which} at the end", max(0.1, 0.6 + (covers - 0.45) / 0.875), box)
-        seen = placed.last.visible / max(0.2, placed.first.visible)
-        # Of what is put into something only the upper part is left to see.
-        least = 0.8 if KINDS[kind].hides else 0.5
-        add(
-            "pose",
-            f"{which} seen at the end",
-            max(0.1, least + seen),
-            f"end the clip while {which} is in full view",
-        )
+def _cue(stage: str, what: str, value: float, advice: str = "") -> Cue:
+    return Cue(stage=stage, what=what, value=float(np.clip(value, 0, 1)), advice=advice)
+
+
+def _object_cues(
+    grounded: GroundedObjects, placement: Placement, kind: Kind, s: ObjectTrack, placed: PlacedObject
+) -> Iterator[Cue]:  # fmt: skip
+    """Yield the cues of one object: found, outlined, touched, sized, placed at the start and the end."""
+    which = f"'{s.phrase}'"
+    box = "" if s.hinted else f"mark {which} with a box"
+    yield _cue("grounding", f"finding {which}" + (f" ({s.why})" if s.why else ""), s.sure, box)
+    if not s.hinted and (words := named_colours(s.phrase)):
+        image = grounded.working.rgb[s.at]
+        match = float(colour_match(balance(image), words)[s.first].mean())
+        # Where nothing else in the picture fits the words better, the light is to blame.
+        known = known_by_sight(grounded.working, s.phrase, {s.at: s.first}) or 0.0
+        value = 0.4 + 0.6 * max(match / _COLOURED, known)
+        yield _cue("grounding", f"colour of {which}", value, f"{box}, or correct its colour word")
+    if s.moves:
+        track = f"track of {which} from start to end"
+        yield _cue("segmentation", track, 0.8 + 0.7 * s.agreement, box)
+    touched = _touched_share(grounded) if s is grounded.objects[0] else None
+    if touched is not None:
+        yield _cue("grounding", f"a hand at {which} while it moves", 0.4 + 2 * touched, box)
+    off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
+    value = np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2)
+    advice = "" if s.known_m else f"measure {which} and give its size_m"
+    yield _cue("size", f"size of {which}", value, advice)
+    covers = placed.first.iou / attainable_iou(s.first)
+    yield _cue("shape", f"outline of {which}", max(0.1, 0.5 + (covers - 0.6) / 0.6), box)
+    if not s.moves:
+        return
+    if s.hidden_in_container or placed.hidden_in_hand:
+        yield _cue("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
+        return
+    covers = placed.last.iou / attainable_iou(placed.last_mask)
+    value = max(0.1, 0.6 + (covers - 0.45) / 0.875)
+    yield _cue("pose", f"outline of {which} at the end", value, box)
+    seen = placed.last.visible / max(0.2, placed.first.visible)
+    # Of what is put into something only the upper part is left to see.
+    least = 0.8 if KINDS[kind].hides else 0.5
+    advice = f"end the clip while {which} is in full view"
+    yield _cue("pose", f"{which} seen at the end", max(0.1, least + seen), advice)
+
+
+def _scene_cues(grounded: GroundedObjects, placement: Placement, kind: Kind) -> Iterator[Cue]:
+    """Yield the cues of the camera, the start on the table and the caption."""
     thing = grounded.objects[0]
-    add(
+    yield _cue(
         "camera",
         "camera height",
         height_plausibility(placement.height_m),
@@ -99,30 +100,21 @@ def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tupl
     on_table = _seen_on_table(grounded)
     if on_table < 1:
         on_table = max(0.0, 2 * on_table - 1)
-        add(
+        yield _cue(
             "grounding",
             "standing on the table at first",
             _IN_THE_AIR + (1 - _IN_THE_AIR) * on_table,
             f"begin the clip while '{thing.phrase}' stands on the table, or mark the table",
         )
     if not (thing.noun.known or thing.known_m):
-        add(
-            "size",
-            f"knowing what '{thing.phrase}' is",
-            0.9,
-            f"give '{thing.phrase}' a name of the table of nouns",
-        )
+        what = f"knowing what '{thing.phrase}' is"
+        yield _cue("size", what, 0.9, f"give '{thing.phrase}' a name of the table of nouns")
     matter = "clear" if is_clear(thing.phrase) else thing.noun.matter
     if matter != "rigid":
-        add("shape", f"'{thing.phrase}' is {matter}", {"soft": 0.8, "clear": 0.7}[matter])
+        yield _cue("shape", f"'{thing.phrase}' is {matter}", {"soft": 0.8, "clear": 0.7}[matter])
     if kind == "generic":
-        add(
-            "grounding",
-            "understanding the caption",
-            0.85,
-            "say what happens with a verb of a known kind of task",
-        )
-    return tuple(cues)
+        advice = "say what happens with a verb of a known kind of task"
+        yield _cue("grounding", "understanding the caption", 0.85, advice)
 
 
 def _touched_share(grounded: GroundedObjects) -> float | None:

@@ -105,46 +105,8 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
     """
     film = _decode(item.path, cfg)
     total = film.seen
-    warnings = [*film.notes]
     name = item.path.name
-    if film.is_cut:
-        detail = f"{name} is cut off: {total} of about {film.promise.frames} frames can be decoded"
-        if total < cfg.min_frames:
-            raise ItemRejectedError("truncated", f"{detail}; copy it again", float(total))
-        warnings.append(f"{detail}; the rest of the motion is missing")
-    elif film.broken and total >= cfg.min_frames:
-        warnings.append(f"{name} has {film.broken} damaged places; frames there may be missing")
-    if film.jumps:
-        warnings.append(
-            f"the clock of {name} jumps in {film.jumps} places, by {film.jumped_s:.0f} s in all; its pictures are "
-            "taken to follow one another"
-        )
-    if total < cfg.min_frames:
-        if film.broken:
-            raise ItemRejectedError(
-                "unreadable",
-                f"{name} is damaged: only {total} frames can be decoded",
-                float(total),
-            )
-        raise ItemRejectedError(
-            "too_few_frames",
-            f"{name} has {total} frames; at least {cfg.min_frames} are needed to see a motion",
-            float(total),
-        )
-    if len(film.numbers) < cfg.min_frames:
-        raise ItemRejectedError(
-            "unreadable",
-            f"{name} holds pictures that cannot be shown: {len(film.numbers)} of {total} can",
-            float(len(film.numbers)),
-        )
-    if film.is_interlaced:
-        share = film.combed_px / film.changed_px
-        raise ItemRejectedError(
-            "interlaced",
-            f"{name} is interlaced: every second row shows another moment, as {share:.0%} of what moves tells; make whole "
-            f"pictures of it: ffmpeg -i {name} -vf bwdif whole.mp4",
-            share,
-        )
+    warnings = _demand_usable(film, name, cfg)
     try:
         check_hints(item.hints, film.shown_px, total, name)
     except V2PError as error:
@@ -270,6 +232,51 @@ def _combs(brightness: Int[np.ndarray, "h w"]) -> Bool[np.ndarray, "inner w"]:
     """Return which pixels differ from the rows above and below alike; the first and the last row are left out."""
     above, below = brightness[1:-1] - brightness[:-2], brightness[1:-1] - brightness[2:]
     return (np.minimum(np.abs(above), np.abs(below)) > 15) & ((above > 0) == (below > 0))
+
+
+def _demand_usable(film: _Film, name: str, cfg: VideoConfig) -> list[str]:
+    """Return what a person should know of a film; refuse one whose pictures do not show a motion."""
+    total = film.seen
+    warnings = [*film.notes]
+    if film.is_cut:
+        detail = f"{name} is cut off: {total} of about {film.promise.frames} frames can be decoded"
+        if total < cfg.min_frames:
+            raise ItemRejectedError("truncated", f"{detail}; copy it again", float(total))
+        warnings.append(f"{detail}; the rest of the motion is missing")
+    elif film.broken and total >= cfg.min_frames:
+        warnings.append(f"{name} has {film.broken} damaged places; frames there may be missing")
+    if film.jumps:
+        warnings.append(
+            f"the clock of {name} jumps in {film.jumps} places, by {film.jumped_s:.0f} s in all; its pictures are "
+            "taken to follow one another"
+        )
+    if total < cfg.min_frames:
+        if film.broken:
+            raise ItemRejectedError(
+                "unreadable",
+                f"{name} is damaged: only {total} frames can be decoded",
+                float(total),
+            )
+        raise ItemRejectedError(
+            "too_few_frames",
+            f"{name} has {total} frames; at least {cfg.min_frames} are needed to see a motion",
+            float(total),
+        )
+    if len(film.numbers) < cfg.min_frames:
+        raise ItemRejectedError(
+            "unreadable",
+            f"{name} holds pictures that cannot be shown: {len(film.numbers)} of {total} can",
+            float(len(film.numbers)),
+        )
+    if film.is_interlaced:
+        share = film.combed_px / film.changed_px
+        raise ItemRejectedError(
+            "interlaced",
+            f"{name} is interlaced: every second row shows another moment, as {share:.0%} of what moves tells; make whole "
+            f"pictures of it: ffmpeg -i {name} -vf bwdif whole.mp4",
+            share,
+        )
+    return warnings
 
 
 def _decode(path: Path, cfg: VideoConfig) -> _Film:

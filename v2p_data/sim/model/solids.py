@@ -106,6 +106,14 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
         ItemRejectedError: `mesh_missing`, `mesh_too_large`, `mesh_unreadable`, `mesh_not_finite` or `flat_mesh`.
     """
     where = f"mesh of '{name}' in {path}"
+    mesh = _demand_solid(_loaded(path, name, where), where)
+    mesh.merge_vertices()
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _loaded(path: Path, name: str, where: str) -> trimesh.Geometry:
+    """Return what a mesh file holds, which may be no mesh of triangles."""
     if not path.is_file():
         raise ItemRejectedError("mesh_missing", f"mesh of '{name}' is missing: {path}")
     kind = path.suffix.lower().removeprefix(".")
@@ -133,6 +141,11 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
             "mesh_unreadable",
             f"{where} cannot be read ({type(error).__name__}: {error}); export it again as OBJ with triangles",
         ) from error
+    return mesh
+
+
+def _demand_solid(mesh: trimesh.Geometry, where: str) -> trimesh.Trimesh:
+    """Return the mesh; refuse one without faces, with too many, with bad numbers or without thickness."""
     faces = np.asarray(getattr(mesh, "faces", ()))
     if len(faces) > MAX_FACES:
         raise ItemRejectedError(
@@ -168,8 +181,6 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
             "give the object the shape 'box' instead, or a mesh with a thickness",
             float(widths[2]),
         )
-    mesh.merge_vertices()
-    mesh.remove_unreferenced_vertices()
     return mesh
 
 

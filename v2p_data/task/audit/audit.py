@@ -98,48 +98,26 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
     if not result.runnable:
         return Audit(vetoed=f"it does not run: {result.error}")
     success = np.array(result.probe_success, bool)
-    reward = np.array(result.probe_reward)
     answers = {name: success[rows] for name, rows in probes.rows.items()}
     num_hands = len(hands_of(scene))
 
     def any_hand(name: str) -> Any:
         return np.any(answers[name].reshape(num_hands, -1), axis=0)
 
-    path = any_hand("path")
-    begins = int(np.argmax(path)) if path.any() else None
-    threshold = probes.path_m[begins] if begins is not None else None
-    length = probes.path_m[-1] / PATH_END
-    tracked = any_hand("tracked")
+    path, tracked = any_hand("path"), any_hand("tracked")
+    threshold = probes.path_m[int(np.argmax(path))] if path.any() else None
     last = bool(any_hand("last").any())
     if (
         KINDS[scene.kind].end == "in_air"
     ):  # true at the highest pose will do: the clip may set it down again
         last = last or bool(tracked.any())
-
-    rises = _reward_rises(probes, reward, num_hands)
-    turns = KINDS[scene.kind].end == "on_side"
-    threshold_good = threshold is not None and (
-        turns or SMALLEST_M <= threshold <= max(1.3 * length, 0.15)
-    )
-    near = answers["near_misses"]
     disturbed = {
         "accepts_end": any_hand("disturbed_last"),
         "rejects_start": ~any_hand("disturbed_first"),
-        "rejects_near_misses": ~near,
+        "rejects_near_misses": ~answers["near_misses"],
     }
     checks = (
-        _must_be_false("first_pose", "false at the video's first pose?", answers["first"], 0.0, veto=True),
-        _must_be_false("reset", "false at every reset?", answers["reset"], 0.0, veto=True),
-        Check(
-            name="reachable",
-            asks="true somewhere in the workspace?",
-            passed=bool(answers["reachable"].any() or path.any()),
-            share=float(answers["reachable"].mean()),
-            weight=0.0,
-            is_veto=True,
-        ),
-        _must_be_false("touched", "false when merely touched?", answers["touched"], 0.0, veto=True),
-        _must_be_false("flung", "false when it flies past?", answers["flung"], 0.0, veto=True),
+        *_vetoes(answers, can_be_reached=bool(answers["reachable"].any() or path.any())),
         *_of_reset(reset_findings(scene, probes.starts, result)),
         *[_margin(name, right) for name, right in disturbed.items()],
         Check(
@@ -152,10 +130,49 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
         Check(
             name="becomes_true",
             asks="true after a plausible displacement?",
-            passed=threshold_good,
+            passed=_is_plausible(threshold, scene, probes),
             share=-1.0 if threshold is None else threshold,
             weight=0.05,
         ),
+        *_minor_checks(answers, result, _reward_rises(probes, np.array(result.probe_reward), num_hands)),
+    )  # fmt: skip
+    failed = [VETO_WORDS[c.name] for c in checks if c.is_veto and not c.passed]
+    if success.all():
+        failed = [ALWAYS_TRUE]
+    total = sum(c.weight for c in checks)
+    return Audit(
+        checks=checks,
+        score=round(sum(c.earned for c in checks) / total, 4),
+        vetoed=failed[0] if failed else "",
+        true_from_pose=_true_from(tracked),
+        threshold_m=threshold,
+        notes=result.warnings,
+    )
+
+
+def _vetoes(answers: dict[str, np.ndarray], *, can_be_reached: bool) -> tuple[Check, ...]:
+    """Return the checks each of which refuses a sample by itself."""
+    return (
+        _must_be_false("first_pose", "false at the video's first pose?", answers["first"], 0.0, veto=True),
+        _must_be_false("reset", "false at every reset?", answers["reset"], 0.0, veto=True),
+        Check(
+            name="reachable",
+            asks="true somewhere in the workspace?",
+            passed=can_be_reached,
+            share=float(answers["reachable"].mean()),
+            weight=0.0,
+            is_veto=True,
+        ),
+        _must_be_false("touched", "false when merely touched?", answers["touched"], 0.0, veto=True),
+        _must_be_false("flung", "false when it flies past?", answers["flung"], 0.0, veto=True),
+    )  # fmt: skip
+
+
+def _minor_checks(
+    answers: dict[str, np.ndarray], result: SmokeResult, rises: float
+) -> tuple[Check, ...]:
+    """Return the checks that cost a sample little."""
+    return (
         _must_be_false("in_the_air", "false where it should stand, or barely lifted?", answers["in_the_air"], 0.05),
         _must_be_false("off_the_table", "false off the table?", answers["off_the_table"], 0.05),
         Check(
@@ -173,18 +190,13 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
             weight=0.05,
         ),
     )  # fmt: skip
-    failed = [VETO_WORDS[c.name] for c in checks if c.is_veto and not c.passed]
-    if success.all():
-        failed = [ALWAYS_TRUE]
-    total = sum(c.weight for c in checks)
-    return Audit(
-        checks=checks,
-        score=round(sum(c.earned for c in checks) / total, 4),
-        vetoed=failed[0] if failed else "",
-        true_from_pose=_true_from(tracked),
-        threshold_m=threshold,
-        notes=result.warnings,
-    )
+
+
+def _is_plausible(threshold_m: float | None, scene: Scene, probes: AuditProbes) -> bool:
+    """Return whether success begins after a displacement that the video's motion suggests."""
+    if threshold_m is None or KINDS[scene.kind].end == "on_side":
+        return threshold_m is not None
+    return SMALLEST_M <= threshold_m <= max(1.3 * probes.path_m[-1] / PATH_END, 0.15)
 
 
 def _must_be_false(
