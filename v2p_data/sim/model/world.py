@@ -10,6 +10,7 @@ uniform density. The manipulated object comes first, as in the scene.
 # mujoco's classes come from a compiled module that declares none of them.
 
 from dataclasses import dataclass
+from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import mujoco
@@ -36,6 +37,9 @@ from v2p_data.sim.robot.robot import (
     servo_xml,
     xml_row,
 )
+
+type Size = tuple[float, float, float]
+"""Extents along x, y, z [m]."""
 
 MESH_SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
 """Ready-made sizes of each mesh; a world picks one, because MuJoCo cannot scale a mesh per world."""
@@ -144,7 +148,7 @@ def build_world(
         f'<mujoco model={quoteattr(scene.title)}><compiler angle="radian" autolimits="true"/>{option_xml(physics)}'
         '<visual><global offwidth="640" offheight="640"/><quality offsamples="0" shadowsize="1024"/>'
         '<headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>'
-        f"<asset>{''.join(d.asset_xml for d in drafts)}</asset>"
+        f"<asset>{''.join(d.form.asset_xml for d in drafts)}</asset>"
         f'<worldbody><light pos="0.5 -0.5 2" dir="0 0.2 -1" castshadow="false"/>{_camera_xml()}'
         '<geom name="table" type="plane" size="1.5 1.5 0.1" contype="1" conaffinity="3" condim="4" '
         f'friction="0.8 0.005 0.0001" solref="{physics.solref_s} 1" rgba="0.55 0.5 0.45 1"/>'
@@ -239,30 +243,39 @@ def hollow_parts(
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Form:
+    """The shape of an object in the simulator."""
+
+    kind: str
+    size_m: tuple[float, float, float]
+    parts: tuple[Part, ...]
+    hull: np.ndarray
+    corners: tuple[np.ndarray, ...]
+    """Points on its surface, by convex part."""
+    com: np.ndarray
+    inertia: np.ndarray
+    """Full 3 x 3, about the centre of mass."""
+    asset_xml: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Draft:
     """An object before the model is compiled."""
 
     obj: SceneObject
-    kind: str
+    form: _Form
     opens_up: bool
-    size_m: tuple[float, float, float]
-    parts: tuple[Part, ...]
     rest_quat: tuple[float, float, float, float]
-    hull: np.ndarray
-    com: np.ndarray
-    inertia: np.ndarray
-    """Full 3 x 3, about the centre of mass."""
-    asset_xml: str
 
     def body_xml(self, physics: PhysicsConfig) -> str:
         o = self.obj
-        i = self.inertia
-        if self.kind == "mesh":
+        i = self.form.inertia
+        if self.form.kind == "mesh":
             moments = f'fullinertia="{i[0, 0]:.9g} {i[1, 1]:.9g} {i[2, 2]:.9g} {i[0, 1]:.9g} {i[0, 2]:.9g} {i[1, 2]:.9g}"'
         else:
             moments = f'diaginertia="{i[0, 0]:.9g} {i[1, 1]:.9g} {i[2, 2]:.9g}"'
         geoms = ""
-        for k, part in enumerate(self.parts):
+        for k, part in enumerate(self.form.parts):
             h = part.half_size
             if part.kind == "mesh":
                 form = f'type="mesh" mesh="{_mesh_name(o.name, k, MESH_SCALES.index(1.0))}"'
@@ -274,103 +287,120 @@ class _Draft:
                 f'friction="{o.friction:.6g} 0.005 0.0001" solref="{physics.solref_s} 1" rgba="{xml_row(o.rgba)}"/>'
             )
         return (
-            f'<body name="{o.name}" pos="0.5 0 {self.size_m[2] / 2:.6g}"><freejoint name="{o.name}"/>'
-            f'<inertial mass="{o.mass_kg:.9g}" pos="{xml_row(tuple(self.com))}" {moments}/>{geoms}</body>'
+            f'<body name="{o.name}" pos="0.5 0 {self.form.size_m[2] / 2:.6g}"><freejoint name="{o.name}"/>'
+            f'<inertial mass="{o.mass_kg:.9g}" pos="{xml_row(tuple(self.form.com))}" {moments}/>{geoms}</body>'
         )
 
     def located(self, model: mujoco.MjModel) -> ObjectModel:
         body = model.body(self.obj.name).id
         joint = model.body_jntadr[body]
         first = int(model.body_geomadr[body])
-        is_mesh = self.kind == "mesh"
+        is_mesh = self.form.kind == "mesh"
         return ObjectModel(
             name=self.obj.name,
             role=self.obj.role,
-            kind=self.kind,
+            kind=self.form.kind,
             opens_up=self.opens_up,
-            size_m=self.size_m,
+            size_m=self.form.size_m,
             mass_kg=self.obj.mass_kg,
             friction=self.obj.friction,
             body_id=int(body),
             qpos_adr=int(model.jnt_qposadr[joint]),
             dof_adr=int(model.jnt_dofadr[joint]),
-            geom_ids=tuple(range(first, first + len(self.parts))),
+            geom_ids=tuple(range(first, first + len(self.form.parts))),
             mesh_ids=tuple(
                 tuple(
                     int(model.mesh(_mesh_name(self.obj.name, part, k)).id)
                     for k in range(len(MESH_SCALES))
                 )
-                for part in range(len(self.parts))
+                for part in range(len(self.form.parts))
                 if is_mesh
             ),
             rest_quat=self.rest_quat,
-            hull=self.hull,
+            hull=self.form.hull,
         )
 
 
 def _draft(obj: SceneObject, scene: Scene, opening_m: float) -> _Draft:
-    x, y, z = thick = checked_size(obj, scene)
-    hull = np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)]) / 2
-    asset, com, inertia, solids = "", np.zeros(3), np.zeros((3, 3)), None
     cover = cover_of(scene)
     is_cover = cover is not None and scene.objects[cover] is obj
     is_hollow = obj.hollow or is_cover
+    size_m = checked_size(obj, scene)
     if is_hollow:
-        is_round = obj.shape in {"cylinder", "sphere"} or (
-            obj.shape == "mesh" and abs(x - y) < 0.12 * max(x, y)
-        )
-        if is_round:
-            x = y = (x + y) / 2
-            thick = (x, y, z)
-            hull = _disc(x / 2, z / 2)
-        kind = "round_hollow" if is_round else "box_hollow"
-        parts = hollow_parts(thick, is_round=is_round, upside_down=is_cover)
-        com, inertia = _mass_properties(parts, obj.mass_kg)
+        form = _hollow_form(obj, size_m, upside_down=is_cover)
     elif obj.shape == "mesh":
-        kind = "mesh"
-        ready = [scene.folder / part for part in obj.parts]
-        solids = solids_of(scene.folder / obj.mesh, obj.name, thick, ready=ready)
-        parts = [
+        form = _mesh_form(obj, size_m, scene.folder)
+    else:
+        form = _primitive_form(obj, size_m)
+    rest_quat = _rest_quat(obj, form.kind)
+    if not is_hollow or is_cover:  # other hollow things are taken by the wall
+        check_grasp(obj, scene, form.corners, rest_quat, opening_m)
+    return _Draft(obj=obj, form=form, opens_up=is_hollow and not is_cover, rest_quat=rest_quat)
+
+
+def _hollow_form(obj: SceneObject, size_m: Size, *, upside_down: bool) -> _Form:
+    x, y, z = size_m
+    is_round = obj.shape in {"cylinder", "sphere"} or (
+        obj.shape == "mesh" and abs(x - y) < 0.12 * max(x, y)
+    )
+    hull = _box(size_m)
+    if is_round:
+        x = y = (x + y) / 2
+        hull = _disc(x / 2, z / 2)
+    parts = hollow_parts((x, y, z), is_round=is_round, upside_down=upside_down)
+    com, inertia = _mass_properties(parts, obj.mass_kg)
+    return _Form(
+        kind="round_hollow" if is_round else "box_hollow",
+        size_m=(x, y, z),
+        parts=tuple(parts),
+        hull=hull,
+        corners=(hull,),
+        com=com,
+        inertia=inertia,
+    )
+
+
+def _mesh_form(obj: SceneObject, size_m: Size, folder: Path) -> _Form:
+    ready = [folder / part for part in obj.parts]
+    solids = solids_of(folder / obj.mesh, obj.name, size_m, ready=ready)
+    com, inertia = solids.mass_properties(obj.mass_kg)
+    return _Form(
+        kind="mesh",
+        size_m=size_m,
+        parts=tuple(
             Part(kind="mesh", half_size=_half(np.ptp(p.vertices, axis=0))) for p in solids.parts
-        ]
-        hull = solids.hull
-        com, inertia = solids.mass_properties(obj.mass_kg)
-        asset = "".join(
+        ),
+        hull=solids.hull,
+        corners=tuple(np.asarray(p.vertices) for p in solids.parts),
+        com=com,
+        inertia=inertia,
+        asset_xml="".join(
             f'<mesh name="{_mesh_name(obj.name, part, k)}" vertex="{xml_row((np.asarray(p.vertices) * s).ravel())}"/>'
             for part, p in enumerate(solids.parts)
             for k, s in enumerate(MESH_SCALES)
-        )
-    else:
-        kind = obj.shape
-        if kind == "cylinder":
-            x = y = (x + y) / 2
-            thick = (x, y, z)
-            hull = _disc(x / 2, z / 2)
-        elif kind == "sphere":
-            x = y = z = float(np.mean(thick))
-            thick = (x, y, z)
-            hull = np.concatenate([np.eye(3), -np.eye(3)]) * x / 2
-        parts = [Part(kind=kind, half_size=(x / 2, y / 2, z / 2))]
-        com, inertia = _mass_properties(parts, obj.mass_kg)
-    rest_quat = _rest_quat(obj, kind)
-    if not is_hollow or is_cover:  # other hollow things are taken by the wall
-        corners = (
-            [np.asarray(p.vertices) for p in solids.parts]
-            if solids
-            else [_outline(kind, hull, thick)]
-        )
-        check_grasp(obj, scene, corners, rest_quat, opening_m)
-    return _Draft(
-        obj=obj,
+        ),
+    )
+
+
+def _primitive_form(obj: SceneObject, size_m: Size) -> _Form:
+    kind, (x, y, z) = obj.shape, size_m
+    hull = _box(size_m)
+    if kind == "cylinder":
+        x = y = (x + y) / 2
+        hull = _disc(x / 2, z / 2)
+    elif kind == "sphere":
+        x = y = z = float(np.mean(size_m))
+        hull = np.concatenate([np.eye(3), -np.eye(3)]) * x / 2
+    parts = [Part(kind=kind, half_size=(x / 2, y / 2, z / 2))]
+    com, inertia = _mass_properties(parts, obj.mass_kg)
+    return _Form(
         kind=kind,
-        opens_up=is_hollow and not is_cover,
-        size_m=thick,
+        size_m=(x, y, z),
         parts=tuple(parts),
-        rest_quat=rest_quat,
         hull=hull,
+        corners=(_outline(kind, hull, (x, y, z)),),
         com=com,
         inertia=inertia,
-        asset_xml=asset,
     )
 
 
@@ -402,11 +432,16 @@ def _half(extents: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _outline(kind: str, hull: np.ndarray, size_m: tuple[float, float, float]) -> np.ndarray:
+def _outline(kind: str, hull: np.ndarray, size_m: Size) -> np.ndarray:
     """Return points on the surface of a primitive, dense enough to be measured."""
     if kind == "sphere":
         return np.asarray(trimesh.creation.icosphere(2, size_m[0] / 2).vertices)
     return hull
+
+
+def _box(size_m: Size) -> np.ndarray:
+    x, y, z = size_m
+    return np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)]) / 2
 
 
 def _disc(radius: float, half_height: float) -> np.ndarray:
