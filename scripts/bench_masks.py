@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.model.world import CAMERA, World
 from v2p_data.sim.render.masks import BACKGROUND, GL_HINT, MaskRenderer, geom_labels
@@ -368,7 +368,7 @@ def _bundle(folder: Path, name: str, seed: int) -> TaskBundle:
 
 def _states(bundle: TaskBundle, rng: np.random.Generator) -> dict[str, Any]:
     randomization = replace(
-        randomize.recording(), camera_pos_m=0.08, camera_angle_rad=0.08, camera_fovy_deg=5.0
+        ranges.recording(), camera_pos_m=0.08, camera_angle_rad=0.08, camera_fovy_deg=5.0
     )
     cfg = SimConfig(fine=True, randomization=randomization)
     env = BatchEnv(bundle, cfg, num_envs=STATES, seed=int(rng.integers(2**31)), num_threads=1)

@@ -29,7 +29,7 @@ from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.jobs import Jobs
 from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward
 from v2p_data.seeds import seed_for
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.task.benchmark import load_benchmark
@@ -123,7 +123,7 @@ def judge(bundle: TaskBundle, actor: Actor, episodes: int, seed: int) -> int:
 
     Sources of randomness are those of recorded episodes.
     """
-    sim = SimConfig(fine=True, randomization=randomize.recording())
+    sim = SimConfig(fine=True, randomization=ranges.recording())
     env = BatchEnv(bundle, sim, num_envs=episodes, seed=seed, num_threads=1)
     env.reset(np.arange(episodes))
     record = RefereeRecord(env)

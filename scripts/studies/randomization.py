@@ -17,8 +17,8 @@ from v2p_data.pipeline.artifact import Record, provenance, read_record
 from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.policy.training import POLICY_FOLDER, sources_of
-from v2p_data.sim.env import randomize
-from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.env import ranges
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.stages import EngineConfig, dataset_stage, episodes_stage, policy_stage
 from v2p_data.twin.parameters import nominal
 
@@ -87,7 +87,7 @@ def randomization_of(setting: str, every: RandomizationConfig) -> RandomizationC
     """
     if setting == ALL:
         return every
-    off = randomize.none()
+    off = ranges.none()
     groups = [g for g in GROUPS if g != NOISE] if setting == NONE else [setting]
     return replace(every, **{name: getattr(off, name) for g in groups for name in GROUPS[g]})
 

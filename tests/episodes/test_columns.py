@@ -18,7 +18,7 @@ from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
-from v2p_data.sim.env.randomize import recording
+from v2p_data.sim.env.ranges import recording
 from v2p_data.sim.render.masks import FIRST_OBJECT, PALETTE
 
 

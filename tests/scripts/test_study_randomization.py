@@ -10,7 +10,7 @@ import pytest
 
 from v2p_data.pipeline.runner import Runtime, Stage, make_stage, stored_outcome
 from v2p_data.pipeline.settings import load_settings
-from v2p_data.sim.env.randomize import RandomizationConfig, none
+from v2p_data.sim.env.ranges import RandomizationConfig, none
 
 CONFIG = Path(__file__).parents[2] / "configs" / "studies" / "randomization.yaml"
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Stage
 from v2p_data.scene.scene import Scene, SceneObject
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.model.world import World, build_world
 from v2p_data.sim.render.masks import FIRST_OBJECT, ROBOT, MaskRenderer
@@ -66,7 +66,7 @@ SIX = RobotConfig(
     pads=("pad_l", "pad_r"),
     home_qpos=(0.0, 0.58, 1.78, 0.0, 0.78, np.pi),
 )
-CALM = SimConfig(fine=True, randomization=randomize.none())
+CALM = SimConfig(fine=True, randomization=ranges.none())
 
 
 @pytest.fixture

@@ -9,21 +9,21 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.scene import SceneObject
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import (
     HELD_STEPS,
     BatchEnv,
     SimConfig,
     Snapshot,
 )
-from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.model.world import CAMERA
 from v2p_data.sim.render.masks import FIRST_OBJECT, MaskRenderer
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.task.sandbox.reader.refusal import TaskCodeError
 from v2p_data.task.task import BASE_OBSERVATION_DIM, OBJECT_STATES, ROBOT_STATES, Task, TaskBundle
 
-CALM = SimConfig(fine=True, randomization=randomize.none())
+CALM = SimConfig(fine=True, randomization=ranges.none())
 
 
 @pytest.fixture
@@ -199,7 +199,7 @@ def test_a_restarted_stream_draws_the_same_whatever_was_drawn_before(
 
 
 def test_a_reset_starts_at_rest_whatever_the_delay(make_env: Callable[..., BatchEnv]):
-    cfg = SimConfig(fine=True, randomization=replace(randomize.none(), delay_s=(0.02, 0.02)))
+    cfg = SimConfig(fine=True, randomization=replace(ranges.none(), delay_s=(0.02, 0.02)))
     env = make_env(cfg=cfg)
     start = env.states()["eef_pos"].clone()
 
@@ -211,7 +211,7 @@ def test_a_reset_starts_at_rest_whatever_the_delay(make_env: Callable[..., Batch
 def test_delayed_worlds_answer_later_to_the_same_action(make_env: Callable[..., BatchEnv]):
     moved = []
     for delay in (0.0, 0.02):
-        cfg = replace(CALM, randomization=replace(randomize.none(), delay_s=(delay, delay)))
+        cfg = replace(CALM, randomization=replace(ranges.none(), delay_s=(delay, delay)))
         env = make_env(cfg=cfg)
         start = env.states()["eef_pos"].clone()
         action = np.zeros((8, 7))

@@ -11,14 +11,10 @@ from mujoco.batch import Batch
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
-from v2p_data.sim.env import randomize
-from v2p_data.sim.env.randomize import (
-    OBJECT_HIGH_M,
-    OBJECT_LOW_M,
-    PUSH_ROOM_M,
-    RandomizationConfig,
-    Randomizer,
-)
+from v2p_data.sim.env import ranges
+from v2p_data.sim.env.layout import OBJECT_HIGH_M, OBJECT_LOW_M, PUSH_ROOM_M
+from v2p_data.sim.env.randomize import Randomizer
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.model.world import build_world
 from v2p_data.sim.robot.robot import FINE, FINGER_TRAVEL_M, QUAT_DOWN, ServoConfig
 
@@ -32,7 +28,7 @@ def worlds_of(
     world = build_world(scene, FINE)
     batch = Batch(world.model, NUM_ENVS, 2)
     batch.reset(stage=0)
-    randomizer = Randomizer(world, batch, cfg or randomize.training(), rng_for(0, "bank"))
+    randomizer = Randomizer(world, batch, cfg or ranges.training(), rng_for(0, "bank"))
     rng, ids = rng_for(0, "test"), np.arange(NUM_ENVS)
     randomizer.draw(ids, rng)
     poses = randomizer.place(ids, rng)
@@ -176,7 +172,7 @@ def test_a_reference_object_stays_on_its_side(
 
     offset = poses[:, 1, :2] - poses[:, 0, :2]
     angle = np.arctan2(offset[:, 1], offset[:, 0])
-    assert np.abs(angle - np.pi / 2).max() < 3 * randomize.training().layout_angle_rad
+    assert np.abs(angle - np.pi / 2).max() < 3 * ranges.training().layout_angle_rad
 
 
 @pytest.mark.parametrize(("kind", "side"), [("push_left", 1.0), ("push_right", -1.0)])
@@ -203,7 +199,7 @@ def test_without_randomisation_the_layout_is_the_videos(
         ),
     )
 
-    randomizer, _, poses = worlds_of(scene, randomize.none())
+    randomizer, _, poses = worlds_of(scene, ranges.none())
 
     assert np.ptp(poses, axis=0).max() == 0
     np.testing.assert_allclose(poses[0, 1, :2] - poses[0, 0, :2], (0.06, 0.12), atol=1e-9)
@@ -338,7 +334,7 @@ def test_a_pushed_tool_gives_way_by_force_over_stiffness(
 def test_without_randomisation_the_servos_have_their_own_gains(
     make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
 ):
-    randomizer, batch, _ = worlds_of(make_scene(make_object("cube")), randomize.none())
+    randomizer, batch, _ = worlds_of(make_scene(make_object("cube")), ranges.none())
 
     model = randomizer.world.model
     for name in ("actuator_gainprm", "actuator_biasprm"):

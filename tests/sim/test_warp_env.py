@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.scene import SceneObject
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.backends import make_batch_env
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
@@ -29,7 +29,7 @@ except V2PError:
 needs_warp = pytest.mark.skipif(
     WarpBatchEnv is None, reason="MuJoCo Warp is not installed: the extra 'gpu'"
 )
-NOISELESS = replace(randomize.training(), action_noise=0.0)
+NOISELESS = replace(ranges.training(), action_noise=0.0)
 DOWN = Rotation.from_quat((0, 1, 0, 0), scalar_first=True)
 
 Pair = tuple["WarpBatchEnv", BatchEnv]
@@ -44,7 +44,7 @@ def make_pair(
     def make(
         *objects: SceneObject,
         fine: bool = False,
-        randomization: randomize.RandomizationConfig = NOISELESS,
+        randomization: ranges.RandomizationConfig = NOISELESS,
         num_envs: int = 8,
         task: type[Task] = lift_task,
         **options,
@@ -202,7 +202,7 @@ def test_a_dropped_object_comes_to_rest_where_it_does_on_the_cpu(
 def test_a_pushed_object_moves_as_on_the_cpu_from_step_to_step(
     make_pair: Callable[..., Pair],
 ):
-    none = replace(randomize.none(), mass_scale=(0.6, 1.6), friction_scale=(0.8, 1.2))
+    none = replace(ranges.none(), mass_scale=(0.6, 1.6), friction_scale=(0.8, 1.2))
     pair = make_pair(randomization=none)
     start = seen(pair[1])["cube_pos"].clone()
 
@@ -332,7 +332,7 @@ def test_resetting_some_worlds_leaves_the_others_alone(make_pair: Callable[..., 
 
 @needs_warp
 def test_a_reset_starts_at_rest_whatever_the_delay(make_pair: Callable[..., Pair]):
-    gpu, _ = make_pair(randomization=replace(randomize.none(), delay_s=(0.02, 0.02)))
+    gpu, _ = make_pair(randomization=replace(ranges.none(), delay_s=(0.02, 0.02)))
     start = seen(gpu)["eef_pos"].clone()
 
     gpu.step(torch.zeros(8, 7))
@@ -391,7 +391,7 @@ def test_random_actions_and_resets_stay_finite(
     gpu, _ = make_pair(
         make_object("cube"),
         make_object("box", "box", (0.14, 0.12, 0.06), hollow=True, pos=(0, 0.2, 0.03)),
-        randomization=randomize.training(),
+        randomization=ranges.training(),
         horizon=15,
     )
     gpu.stagger()
@@ -440,7 +440,7 @@ def test_torchrl_and_checkpoints_take_it_as_they_take_the_cpus(make_pair: Callab
 
     from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 
-    gpu, _ = make_pair(horizon=6, randomization=randomize.training())
+    gpu, _ = make_pair(horizon=6, randomization=ranges.training())
     env = TorchRLEnv(gpu)
     check_env_specs(env)
     still = TensorDict({"action": torch.zeros(8, 7)}, [8], device=gpu.device)

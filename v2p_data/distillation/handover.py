@@ -16,7 +16,7 @@ from v2p_data.episodes.rollouts import CutConfig, Rollouts, record_rollouts
 from v2p_data.play import Actor, View
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.task.task import TaskBundle
 
 

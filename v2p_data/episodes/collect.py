@@ -35,9 +35,9 @@ from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import REJECTS_FILE, write_json_atomically, write_rejects
 from v2p_data.play import Actor
 from v2p_data.seeds import seed_for
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import SimConfig
-from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig
 from v2p_data.sim.render.masks import MASK_CAMERAS
 from v2p_data.task.task import Task, TaskBundle
@@ -68,7 +68,7 @@ class EpisodesConfig:
     wrist: bool = False
     """Masks of a second camera too, which the hand carries: `observation.images.mask_wrist`."""
     cut: CutConfig = field(default_factory=CutConfig)
-    randomization: RandomizationConfig = field(default_factory=randomize.recording)
+    randomization: RandomizationConfig = field(default_factory=ranges.recording)
     distractors: DistractorConfig = field(default_factory=DistractorConfig)
     """Things that stand about in the pictures; none by default."""
     look: LookConfig = field(default_factory=LookConfig)
@@ -215,7 +215,7 @@ def judge_expert(
     return roll_out(
         bundle,
         actor,
-        SimConfig(fine=True, randomization=randomization or randomize.recording()),
+        SimConfig(fine=True, randomization=randomization or ranges.recording()),
         num_worlds=episodes,
         seed=seed,
         num_threads=num_threads,

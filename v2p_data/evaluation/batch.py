@@ -17,9 +17,9 @@ from jaxtyping import Bool, Int
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import failure_kinds
 from v2p_data.play import Actor, Film, Stopwatch, View, VisionActor, play
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
-from v2p_data.sim.env.randomize import RandomizationConfig
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, stream_seed
 from v2p_data.task.task import Task, TaskBundle
@@ -125,7 +125,7 @@ def judge(
         V2PError: the actor's actions are not finite or have another shape.
     """
     start, watch = time.perf_counter(), Stopwatch()
-    sim = SimConfig(fine=True, randomization=randomization or randomize.recording())
+    sim = SimConfig(fine=True, randomization=randomization or ranges.recording())
     steps = bundle.policy_steps(cfg.horizon_scale)
     parts: list[tuple[np.ndarray, ...]] = []
     failures: list[str] = []

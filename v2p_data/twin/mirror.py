@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, Followed, SimConfig, StepResult, robot_of
 from v2p_data.sim.env.targets import ToolPose
 from v2p_data.sim.env.verdict import RefereeRecord
@@ -62,7 +62,7 @@ class Mirror:
     """
 
     def __init__(self, bundle: TaskBundle) -> None:
-        sim = SimConfig(fine=True, randomization=randomize.recording())
+        sim = SimConfig(fine=True, randomization=ranges.recording())
         robot = robot_of(bundle, sim)
         if robot.path:
             raise V2PError(

@@ -32,8 +32,9 @@ from v2p_data.geometry.rotation import (
     tilt_limited,
 )
 from v2p_data.seeds import rng_for
-from v2p_data.sim.env import randomize, task_code
-from v2p_data.sim.env.randomize import RandomizationConfig, Randomizer
+from v2p_data.sim.env import ranges, task_code
+from v2p_data.sim.env.randomize import Randomizer
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.env.start_check import (
     check_poses,
     check_solved,
@@ -71,7 +72,7 @@ class SimConfig:
     """Small time steps, for evaluation and recording; else large ones, for training."""
     robot: RobotConfig = field(default_factory=RobotConfig)
     """Without a path, the task's own, which is the built-in arm unless the task says otherwise."""
-    randomization: RandomizationConfig = field(default_factory=randomize.training)
+    randomization: RandomizationConfig = field(default_factory=ranges.training)
     position_step_m: float = 0.03
     """Target displacement at action 1, per control step."""
     rotation_step_rad: float = 0.2

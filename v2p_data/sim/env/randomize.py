@@ -4,7 +4,6 @@ Every value drawn is kept per world (`Randomizer.drawn`), so that an episode can
 under. Values are written into the batch's per-simulation model fields; nothing is recompiled.
 """
 
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -13,115 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.rotation import product, quats_about_z
-from v2p_data.kinds import KINDS, TaskKind
-from v2p_data.scene.scene import FLOOR_MAX_M, Scene
+from v2p_data.kinds import KINDS
+from v2p_data.scene.scene import FLOOR_MAX_M
+from v2p_data.sim.env.layout import drawn_layouts
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.model.suitability import GRIP_MARGIN_M
-from v2p_data.sim.model.world import (
-    CAMERA,
-    CAMERA_FOVY_DEG,
-    MESH_SCALES,
-    WALL_MAX_M,
-    ObjectModel,
-    World,
-    cover_of,
-)
+from v2p_data.sim.model.world import CAMERA, MESH_SCALES, WALL_MAX_M, ObjectModel, World, cover_of
 from v2p_data.sim.robot.grips import LEVEL
 
-WORKSPACE_CENTRE_M = (0.5, 0.0)
-OBJECT_LOW_M = (0.37, -0.28)
-OBJECT_HIGH_M = (0.66, 0.28)
-"""Objects' centres lie in this part of the table, which the gripper reaches pointing down."""
-PUSH_ROOM_M = 0.15
-"""Free way that push tasks get on the side they push to."""
-BEYOND_LOW_M = (0.90, -0.12)
-BEYOND_HIGH_M = (1.0, 0.12)
-"""Where a container stands that things are thrown into: beyond the gripper's reach (0.72 m)."""
-PLACEMENT_TRIES = 100
 START_BANK = 256
 PREPARED = 128
 """Draws made at once: a few worlds start anew at most steps, and drawing for a few costs as much as for many."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RandomizationConfig:
-    """Ranges of what is drawn at each reset. Pairs are (lowest, highest) factors or values."""
-
-    size_scale: tuple[float, float] = (0.9, 1.1)
-    """Per axis, independently; one factor for both axes of round things, one for all of a mesh."""
-    mass_scale: tuple[float, float] = (0.6, 1.6)
-    friction_scale: tuple[float, float] = (0.8, 1.2)
-    object_pos_m: float = 0.10
-    """Objects are shifted together by up to this much along x and y."""
-    layout_distance_scale: tuple[float, float] = (0.85, 1.2)
-    """Scale of the distance between manipulated and reference object."""
-    layout_angle_rad: float = 0.35
-    """The direction from manipulated to reference object turns by up to this much."""
-    yaw_rad: float = float(np.pi)
-    """Each object turns about the vertical by up to this much."""
-    arm_pos_m: tuple[float, float, float] = (0.09, 0.12, 0.05)
-    """The tool starts within this distance of its home position, per axis."""
-    arm_yaw_rad: float = 0.4
-    action_noise: float = 0.02
-    """Standard deviation added to actions in [-1, 1] before they are carried out."""
-    delay_s: tuple[float, float] = (0.010, 0.020)
-    """From command to servo, constant during an episode."""
-    servo_gain_scale: tuple[float, float] = (0.9, 1.1)
-    """Scale of stiffness and of damping, drawn one by one for all servos; the tool lags by damping / stiffness."""
-    camera_pos_m: float = 0.0
-    """The camera is shifted by up to this much, per axis. 0 is the fixed camera that policies of earlier datasets know;
-    a policy that shall stand a moved camera is recorded, and then evaluated, with more."""
-    camera_angle_rad: float = 0.0
-    """The camera is turned by up to this much about each of its own axes."""
-    camera_fovy_deg: float = 0.0
-    """The camera's vertical field of view changes by up to this much."""
-
-    def __post_init__(self) -> None:
-        for low, high in (
-            self.size_scale,
-            self.mass_scale,
-            self.friction_scale,
-            self.layout_distance_scale,
-            self.servo_gain_scale,
-        ):
-            if not 0 < low <= high:
-                raise ValueError(f"need 0 < lowest <= highest, got {low} and {high}")
-        if not 0 <= self.delay_s[0] <= self.delay_s[1] <= 0.02:
-            raise ValueError(f"delays of 0 to 20 ms can be simulated, got {self.delay_s} s")
-        moved = (self.camera_pos_m, self.camera_angle_rad, self.camera_fovy_deg)
-        if min(moved) < 0 or self.camera_fovy_deg >= CAMERA_FOVY_DEG:
-            raise ValueError(
-                f"camera_pos_m, camera_angle_rad and camera_fovy_deg must be 0 or more, the last below "
-                f"{CAMERA_FOVY_DEG}, got {moved}"
-            )
-
-
-def training() -> RandomizationConfig:
-    """Return what experts train under: the same as is recorded, so that they are at home there."""
-    return RandomizationConfig()
-
-
-def recording() -> RandomizationConfig:
-    """Return what episodes are recorded under (the paper's list)."""
-    return RandomizationConfig()
-
-
-def none() -> RandomizationConfig:
-    """Return the video's layout about the workspace centre, true sizes, no noise and no delay."""
-    one = (1.0, 1.0)
-    return RandomizationConfig(
-        size_scale=one,
-        mass_scale=one,
-        friction_scale=one,
-        object_pos_m=0.0,
-        layout_distance_scale=one,
-        layout_angle_rad=0.0,
-        yaw_rad=0.0,
-        arm_pos_m=(0.0, 0.0, 0.0),
-        arm_yaw_rad=0.0,
-        action_noise=0.0,
-        delay_s=(0.0, 0.0),
-        servo_gain_scale=one,
-    )
 
 
 @runtime_checkable
@@ -276,71 +177,13 @@ class Randomizer:
     ) -> Float[np.ndarray, "n object 7"]:
         """Return poses of all objects at rest on the table, apart from each other and within reach.
 
-        The layout follows the video: reference objects keep their direction from the manipulated one, at a
-        distance that fits. Push tasks leave `PUSH_ROOM_M` free on the side they push to.
-
         Raises:
-            ItemRejectedError: the objects do not fit on the table together.
+            ItemRejectedError: the objects do not fit on the table together, or under the cover.
         """
-        cfg, n = self.cfg, len(ids)
-        count = len(self.world.objects)
-        radius = self._radius[ids]
-        offsets = scene_offsets(self.world.scene)
-        kind = KINDS[self.world.scene.kind]
-        low, high = _placement_boxes(kind, count)
-        centre = np.array([WORKSPACE_CENTRE_M[0], (low[0, 1] + high[0, 1]) / 2])
         pair = self._cover_pair()
         if pair is not None:
             self._check_covered_fits(ids, *pair)
-            pair = pair if kind.starts_over else None  # else they start apart
-        xy = np.zeros((n, count, 2))
-        todo = np.arange(n)
-        for attempt in range(PLACEMENT_TRIES):
-            m = len(todo)
-            loosen = 1.0 + 2.0 * attempt / PLACEMENT_TRIES if attempt >= 10 else 1.0
-            spot = np.zeros((m, count, 2))
-            r = radius[todo]
-            for k in range(1, count):
-                offset = offsets[k]
-                distance = np.linalg.norm(offset) * rng.uniform(*cfg.layout_distance_scale, m)
-                angle = np.arctan2(offset[1], offset[0]) + loosen * rng.uniform(
-                    -cfg.layout_angle_rad, cfg.layout_angle_rad, m
-                )
-                nearest = r[:, 0] + r[:, k] + 0.02
-                distance = np.clip(distance, nearest, np.maximum(nearest, 0.28))
-                if pair is not None and k == max(pair):
-                    distance = np.zeros(m)
-                spot[:, k] = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            shift = rng.uniform(-cfg.object_pos_m, cfg.object_pos_m, (m, 2)) * min(loosen, 1.5)
-            middle = (spot.max(1) + spot.min(1)) / 2 if count > 1 else np.zeros((m, 2))
-            spot += (centre + shift - middle)[:, None]
-            # The whole group moves back into the box where it can.
-            over = np.maximum(spot - high, 0).max(1) - np.maximum(low - spot, 0).max(1)
-            spot -= over[:, None]
-            if kind.other_starts == "beyond_reach" and count > 1:
-                spot[:, 0] = centre + shift
-                spot[:, 1:] = rng.uniform(BEYOND_LOW_M, BEYOND_HIGH_M, (m, 1, 2))
-            inside = ((spot >= low - 1e-9) & (spot <= high + 1e-9)).all((1, 2))
-            apart = np.ones(m, bool)
-            for a in range(count):
-                for b in range(a + 1, count):
-                    if pair in {(a, b), (b, a)}:
-                        continue
-                    gap = np.linalg.norm(spot[:, a] - spot[:, b], axis=1) - r[:, a] - r[:, b]
-                    apart &= gap > 0.005
-            good = inside & apart
-            xy[todo[good]] = spot[good]
-            todo = todo[~good]
-            if not len(todo):
-                break
-        if len(todo):
-            names = ", ".join(o.name for o in self.world.objects)
-            raise ItemRejectedError(
-                "no_room",
-                f"{names} do not fit on the table of scene '{self.world.scene.title}' within the robot's reach "
-                f"without touching, in {PLACEMENT_TRIES} tries",
-                float(len(todo)),
-            )
+        xy = drawn_layouts(self.world.scene, self._radius[ids], pair, self.cfg, rng)
         return self._poses(ids, xy, rng)
 
     def start_arm(
@@ -479,6 +322,25 @@ class Randomizer:
         start, count = model.body_bvhadr[obj.body_id], model.body_bvhnum[obj.body_id]
         nodes = np.arange(start, start + count)
         f["bvh_aabb"][rows, nodes] = base["bvh_aabb"][nodes] * np.tile(g, (1, 1, 2))
+        self._write_mass(into, ids, obj, scale, mass)
+        f["size_m"][ids, k] = np.asarray(obj.size_m) * scale
+        f["mass_kg"][ids, k] = mass
+        f["friction"][ids, k] = friction
+        corners = obj.hull * g @ self._rest[k].T
+        f["height_above_table"][ids, k] = -corners[:, :, 2].min(1)
+        f["radius"][ids, k] = np.linalg.norm(corners[:, :, :2], axis=2).max(1)
+
+    def _write_mass(
+        self,
+        into: dict[str, np.ndarray],
+        ids: np.ndarray,
+        obj: ObjectModel,
+        scale: np.ndarray,
+        mass: np.ndarray,
+    ) -> None:
+        """Write mass and inertia, and what MuJoCo derives from them when it compiles."""
+        f, base, model = into, self._base, self.world.model
+        rows = ids[:, None]
         body, dofs = obj.body_id, np.arange(obj.dof_adr, obj.dof_adr + 6)
         ratio = mass / base["body_mass"][body]
         second = base["body_inertia"][body].sum() / 2 - base["body_inertia"][body]  # of x, y, z
@@ -501,12 +363,6 @@ class Randomizer:
             # MuJoCo takes a simple body's inertia from here; else a heavier one would fall faster.
             f["dof_M0"][rows, dofs[:3]] = mass[:, None]
             f["dof_M0"][rows, dofs[3:]] = inertia
-        f["size_m"][ids, k] = np.asarray(obj.size_m) * scale
-        f["mass_kg"][ids, k] = mass
-        f["friction"][ids, k] = friction
-        corners = obj.hull * g @ self._rest[k].T
-        f["height_above_table"][ids, k] = -corners[:, :, 2].min(1)
-        f["radius"][ids, k] = np.linalg.norm(corners[:, :, :2], axis=2).max(1)
 
     def _size_scale(self, obj: ObjectModel, scale: np.ndarray) -> np.ndarray:
         """Return factors of `geom_size`, whose meaning depends on the geom's type."""
@@ -532,27 +388,3 @@ class Randomizer:
         pos = home + rng.uniform(-1, 1, (START_BANK, 3)) * reach
         yaw = rng.uniform(-self.cfg.arm_yaw_rad, self.cfg.arm_yaw_rad, START_BANK)
         return pos, yaw, self.world.robot.qpos_for(pos, yaw)
-
-
-def scene_offsets(scene: Scene) -> Float[np.ndarray, "object 2"]:
-    """Return where each object stood at first in the video, relative to the manipulated one [m]."""
-    first = np.array([o.first_pose[:2] if o.poses_world else np.zeros(2) for o in scene.objects])
-    offsets = first - first[0]
-    for k in range(1, len(offsets)):
-        if np.linalg.norm(offsets[k]) < 1e-3:
-            offsets[k] = (0.15, 0.0)
-    return offsets
-
-
-def _placement_boxes(kind: TaskKind, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return per object the lowest and highest x and y of its centre [m]."""
-    low, high = np.tile(OBJECT_LOW_M, (count, 1)), np.tile(OBJECT_HIGH_M, (count, 1))
-    if kind.side > 0:
-        high[:, 1] -= PUSH_ROOM_M
-    elif kind.side < 0:
-        low[:, 1] += PUSH_ROOM_M
-    elif kind.other_starts == "beyond_reach":
-        low[1:], high[1:] = BEYOND_LOW_M, BEYOND_HIGH_M
-    elif kind.other_starts == "far_side":
-        low[1:, 0] += 0.1  # what is in front of it must be within reach, too
-    return low, high

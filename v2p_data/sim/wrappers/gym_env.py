@@ -24,7 +24,7 @@ from gymnasium.utils.seeding import np_random
 from jaxtyping import Float, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.env import randomize
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import ACT_DIM, BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.model.world import World
@@ -97,7 +97,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         self._max_episode_steps = bundle.policy_steps(horizon_scale)
         self._num_steps = 0
         randomization = replace(
-            randomize.recording(),
+            ranges.recording(),
             camera_pos_m=camera_pos_m,
             camera_angle_rad=camera_angle_rad,
             camera_fovy_deg=camera_fovy_deg,
