@@ -272,18 +272,8 @@ class _Run:
             part_loader_s += loaded - begun
             self.step += 1
             if self.step % log_every == 0 or self.step == cfg.steps:
-                loss = float(torch.stack(losses).mean())
-                if not loss == loss or loss in (float("inf"), float("-inf")):
-                    raise DatasetError(
-                        f"the loss is {loss} at step {self.step} of {cfg.steps}; columns were finite, so lower"
-                        " optimizer_lr"
-                    )
                 rate = len(losses) * cfg.batch_size / part_s
-                row = (self.step, loss, self.optimizer.param_groups[0]["lr"], rate, part_loader_s / part_s)  # fmt: skip
-                self.rows.append(row)
-                if writer is not None:
-                    for name, value in zip(CURVE_FIELDS[1:], row[1:], strict=True):
-                        writer.add_scalar(f"train/{name}", value, self.step)
+                loss = self._note(losses, rate, part_loader_s / part_s, writer)
                 loader_s += part_loader_s
                 left_s = (time.monotonic() - started) / (self.step - first) * (cfg.steps - self.step)  # fmt: skip
                 self.on_progress(
@@ -311,6 +301,25 @@ class _Run:
             loader_share=loader_s / max(seconds, 1e-9),
             judged=tuple(self.judged),
         )
+
+    def _note(self, losses: list[Tensor], rate: float, loader_share: float, writer: Any) -> float:
+        """Add a row to the curve; return the mean loss since the last one.
+
+        Raises:
+            DatasetError: it is no number.
+        """
+        loss = float(torch.stack(losses).mean())
+        if not loss == loss or loss in (float("inf"), float("-inf")):
+            raise DatasetError(
+                f"the loss is {loss} at step {self.step} of {self.cfg.steps}; columns were finite, so lower"
+                " optimizer_lr"
+            )
+        row = (self.step, loss, self.optimizer.param_groups[0]["lr"], rate, loader_share)  # fmt: skip
+        self.rows.append(row)
+        if writer is not None:
+            for name, value in zip(CURVE_FIELDS[1:], row[1:], strict=True):
+                writer.add_scalar(f"train/{name}", value, self.step)
+        return loss
 
     def _batch(self, step: int) -> dict[str, Any]:
         batch = self.table.batch(self._rows_of(step), self.observed, self.acted)

@@ -99,56 +99,68 @@ def run_stages(
     return outcomes
 
 
+class _Schedule:
+    """What has ended, what is ready to run, and what still waits for what."""
+
+    def __init__(self, root: Path, on_event: Callable[[Event], None]) -> None:
+        self.outcomes: dict[Key, Outcome] = {}
+        self.ready: list[tuple[int, Stage]] = []
+        """A heap by place: the first item is finished first."""
+        self.num_missing: dict[Key, int] = {}
+        self._needed_by: dict[Key, list[tuple[int, Stage]]] = defaultdict(list)
+        self._root, self._on_event = root, on_event
+
+    def add(self, place: int, stage: Stage, stored: Outcome | None) -> None:
+        """Take in a stage after all that it needs; it has ended already if an outcome is stored."""
+        if stored is None and (blocker := blocked_by(stage, self.outcomes)) is not None:
+            stored = _blocked(stage, blocker, self._root)
+        if stored is not None:
+            self.ended(stage, stored)
+            return
+        missing = {_key(needed) for needed in stage.inputs.values()} - self.outcomes.keys()
+        self.num_missing[_key(stage)] = len(missing)
+        for key in missing:
+            self._needed_by[key].append((place, stage))
+        if not missing:
+            self.ready.append((place, stage))
+
+    def ended(self, stage: Stage, outcome: Outcome) -> None:
+        """Note an outcome; what waited for it is ready or blocked."""
+        key = _key(stage)
+        self.outcomes[key] = outcome
+        self._on_event(Event(kind="ended", stage=stage, outcome=outcome))
+        for place, other in self._needed_by.pop(key, ()):
+            self.num_missing[_key(other)] -= 1
+            if not outcome.is_usable and _key(other) not in self.outcomes:
+                self.ended(other, _blocked(other, outcome, self._root))
+            elif self.num_missing[_key(other)] == 0 and _key(other) not in self.outcomes:
+                heapq.heappush(self.ready, (place, other))
+
+
 def _run_stages(
     ordered: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None], shared: Shared
 ) -> dict[Key, Outcome]:
-    outcomes: dict[Key, Outcome] = {}
-    ready: list[tuple[int, Stage]] = []  # a heap by place: the first item is finished first
-    num_missing: dict[Key, int] = {}
-    needed_by: dict[Key, list[tuple[int, Stage]]] = defaultdict(list)
-
-    def ended(stage: Stage, outcome: Outcome) -> None:
-        key = _key(stage)
-        outcomes[key] = outcome
-        on_event(Event(kind="ended", stage=stage, outcome=outcome))
-        for place, other in needed_by.pop(key, ()):
-            num_missing[_key(other)] -= 1
-            if not outcome.is_usable and _key(other) not in outcomes:
-                ended(other, _blocked(other, outcome, runtime.root))
-            elif num_missing[_key(other)] == 0 and _key(other) not in outcomes:
-                heapq.heappush(ready, (place, other))
-
+    plan = _Schedule(runtime.root, on_event)
     for place, stage in enumerate(ordered):
-        stored = shared.stored(stage)
-        if stored is None and (blocker := blocked_by(stage, outcomes)) is not None:
-            stored = _blocked(stage, blocker, runtime.root)
-        if stored is not None:
-            ended(stage, stored)
-            continue
-        missing = {_key(needed) for needed in stage.inputs.values()} - outcomes.keys()
-        num_missing[_key(stage)] = len(missing)
-        for key in missing:
-            needed_by[key].append((place, stage))
-        if not missing:
-            ready.append((place, stage))
-    if not ready:
-        return outcomes
-    engine = _engine(runtime, num_pending=len(num_missing))
+        plan.add(place, stage, shared.stored(stage))
+    if not plan.ready:
+        return plan.outcomes
+    engine = _engine(runtime, num_pending=len(plan.num_missing))
     try:
-        while ready or engine.is_busy:
+        while plan.ready or engine.is_busy:
             others: list[tuple[int, Stage]] = []  # at work on another driver
-            while ready and engine.has_room:
-                place, stage = heapq.heappop(ready)
+            while plan.ready and engine.has_room:
+                place, stage = heapq.heappop(plan.ready)
                 claimed = shared.claim(stage)
                 if claimed is None:
                     others.append((place, stage))
                 elif isinstance(claimed, Outcome):
-                    ended(stage, claimed)
+                    plan.ended(stage, claimed)
                 else:
                     engine.start(stage)
                     on_event(Event(kind="started", stage=stage))
             for entry in others:
-                heapq.heappush(ready, entry)
+                heapq.heappush(plan.ready, entry)
             if not engine.is_busy:
                 time.sleep(0.2 if others else 0.0)
                 continue
@@ -157,10 +169,10 @@ def _run_stages(
                     on_event(event)
                 else:
                     shared.ended(event.stage)
-                    ended(event.stage, event.outcome)
+                    plan.ended(event.stage, event.outcome)
     finally:
         engine.close()
-    return outcomes
+    return plan.outcomes
 
 
 def _blocked(stage: Stage, blocker: Outcome, root: Path) -> Outcome:

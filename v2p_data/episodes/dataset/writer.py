@@ -199,18 +199,7 @@ def _write(
         video_files_size_in_mb=VIDEO_FILE_MB,
         metadata_buffer_size=EPISODES_PER_WRITE,
     )
-    lies_in: dict[tuple[str, int], tuple[int, int]] = {}  # file, and frame in it, of a shard
-    for camera in first.cameras:
-        planned = plan_files(shards, finished, camera, VIDEO_FILE_MB * 2**20)
-        for number, group in enumerate(planned):
-            write_file(group, finished, camera, _video_path(meta, number, camera))
-            frame = 0
-            for shard in group:
-                lies_in[camera, shard.number] = number, frame
-                frame += shard.num_frames
-    for camera in first.cameras:
-        crf = MASK_CRF if camera in MASK_CAMERAS else RGB_CRF
-        meta.update_video_info(KEY_OF_CAMERA[camera], video_encoder=encoder_config(crf))
+    lies_in = _write_videos(shards, finished, first.cameras, meta)
     described: list[dict[str, Any]] = []
     data = _DataFiles(meta)
     try:
@@ -240,6 +229,25 @@ def _write(
     write_info(meta.info, root)
     write_stats(root)
     return described
+
+
+def _write_videos(
+    shards: Sequence[Shard], finished: Path, cameras: Sequence[str], meta: Any
+) -> dict[tuple[str, int], tuple[int, int]]:
+    """Write each camera's video files; return the file, and the frame in it, of every camera and shard."""
+    lies_in: dict[tuple[str, int], tuple[int, int]] = {}
+    for camera in cameras:
+        planned = plan_files(shards, finished, camera, VIDEO_FILE_MB * 2**20)
+        for number, group in enumerate(planned):
+            write_file(group, finished, camera, _video_path(meta, number, camera))
+            frame = 0
+            for shard in group:
+                lies_in[camera, shard.number] = number, frame
+                frame += shard.num_frames
+    for camera in cameras:
+        crf = MASK_CRF if camera in MASK_CAMERAS else RGB_CRF
+        meta.update_video_info(KEY_OF_CAMERA[camera], video_encoder=encoder_config(crf))
+    return lies_in
 
 
 class _DataFiles:

@@ -270,15 +270,7 @@ def _carry(
             ("is_left_alone", REF_STILL),
             is_still(v),
         ],
-        reward_setup=[
-            *grasp_setup(by_wall=m.by_wall),
-            "raised = (height / 0.08).clamp(0.0, 1.0)",
-            "way = torch.norm((goal_point - obj_start)[:, :2], dim=-1).clamp(min=0.05)",
-            "carried = (1 - to_goal / way).clamp(-1.0, 1.0)",
-            # From any height: with a slope that ended at 15 cm, a matchbox was held 20 cm above its goal for good.
-            "lowered = 0.5 * (1 - above_goal / 0.4).clamp(0.0, 1.0) + 0.5 * (1 - above_goal / 0.1).clamp(0.0, 1.0)",
-            f"opened = (gripper_width / 0.085).clamp(0.0, 1.0) * (1 - above_goal / {falls_m}).clamp(0.0, 1.0)",
-        ],
+        reward_setup=[*grasp_setup(by_wall=m.by_wall), *_carry_stages(falls_m)],
         target="grasp_point",
         contact="torch.maximum(gripped * near, arrived.float())",
         pays_contact=True,
@@ -302,3 +294,15 @@ def _carry(
             ),
         ],
     )
+
+
+def _carry_stages(falls_m: float) -> list[str]:
+    """Return lines for the reward that measure raising, carrying, lowering and opening."""
+    return [
+        "raised = (height / 0.08).clamp(0.0, 1.0)",
+        "way = torch.norm((goal_point - obj_start)[:, :2], dim=-1).clamp(min=0.05)",
+        "carried = (1 - to_goal / way).clamp(-1.0, 1.0)",
+        # From any height: with a slope that ended at 15 cm, a matchbox was held 20 cm above its goal for good.
+        "lowered = 0.5 * (1 - above_goal / 0.4).clamp(0.0, 1.0) + 0.5 * (1 - above_goal / 0.1).clamp(0.0, 1.0)",
+        f"opened = (gripper_width / 0.085).clamp(0.0, 1.0) * (1 - above_goal / {falls_m}).clamp(0.0, 1.0)",
+    ]
