@@ -66,6 +66,7 @@ from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig, read_clip
 
 if TYPE_CHECKING:
+    from v2p_data.experts.record import Learned
     from v2p_data.scene.frames.prepare import PreparedClip
 
 logger = logging.getLogger(__name__)
@@ -381,7 +382,6 @@ def make_expert(
     bonus_ratio: float,
 ) -> dict[str, Any]:
     """Find a teacher, imitate it, go on with PPO, or let it act itself; judge with the independent referee."""
-    from v2p_data.experts.learning import Worlds, learn
     from v2p_data.report.sheet import write_contact_sheet
     from v2p_data.sim.env.task_check import check_reward, check_task
     from v2p_data.task.llm.pool import add_solved
@@ -390,23 +390,7 @@ def make_expert(
     bundle = TaskBundle.load(inputs["task"])
     check_task(bundle, num_threads=runtime.num_threads)
     check_reward(bundle)
-    worlds = Worlds(
-        bundle=bundle,
-        seed=seed_for(cfg.seed, "expert", bundle.title),
-        num_threads=runtime.num_threads,
-        bonus_ratio=bonus_ratio,
-    )
-    if expert_cfg.teacher == "as_expert":
-        learned = choose_program(worlds, expert_cfg, out)
-    else:
-        learned = learn(
-            worlds,
-            expert_cfg,
-            out,
-            device=runtime.device,
-            solved=find_solved(warm_start) if warm_start else (),
-            on_progress=lambda share, words: runtime.progress(0.95 * share, words),
-        )
+    learned = _learned(bundle, cfg, out, runtime, warm_start=warm_start, bonus_ratio=bonus_ratio)
     runtime.progress(0.95, "judging at the fine step")
     judged = judge_expert(
         bundle,
@@ -435,6 +419,36 @@ def make_expert(
     if teaches_model:  # an example for the tasks that come after
         add_solved(runtime.root / SOLVED_POOL_FOLDER, bundle, rate.value)
     return counts
+
+
+def _learned(
+    bundle: TaskBundle,
+    cfg: Seeded,
+    out: Path,
+    runtime: Runtime,
+    *,
+    warm_start: Path | None,
+    bonus_ratio: float,
+) -> "Learned":
+    """Let an expert learn the task, or choose the program that acts in its place."""
+    from v2p_data.experts.learning import Worlds, learn
+
+    worlds = Worlds(
+        bundle=bundle,
+        seed=seed_for(cfg.seed, "expert", bundle.title),
+        num_threads=runtime.num_threads,
+        bonus_ratio=bonus_ratio,
+    )
+    if cfg.config.teacher == "as_expert":
+        return choose_program(worlds, cfg.config, out)
+    return learn(
+        worlds,
+        cfg.config,
+        out,
+        device=runtime.device,
+        solved=find_solved(warm_start) if warm_start else (),
+        on_progress=lambda share, words: runtime.progress(0.95 * share, words),
+    )
 
 
 # --- expert -> episodes --------------------------------------------------------------------------------------

@@ -91,15 +91,9 @@ def _imitate(
         follows = torch.rand(num_envs, generator=generator) >= share
         start = len(seen)
         for _ in range(cfg.round_steps):
-            obs = now["observation"].clone()
-            advice = torch.from_numpy(teacher()).float()
-            seen.append(obs)
-            said.append(advice)
-            action = advice
-            if bool(follows.any()):
-                with torch.no_grad():
-                    mean, _ = model.actor(obs)
-                action = torch.where(follows[:, None], mean, advice)
+            seen.append(now["observation"].clone())
+            said.append(torch.from_numpy(teacher()).float())
+            action = _mixed(model, seen[-1], said[-1], follows)
             noise = cfg.noise * torch.randn(action.shape, generator=generator)
             _, now = env.step_and_maybe_reset(
                 TensorDict({"action": action + noise}, env.batch_size)
@@ -125,6 +119,17 @@ def _imitate(
         seconds=time.monotonic() - started,
         loss=loss,
     )
+
+
+def _mixed(
+    model: ActorCritic, obs: torch.Tensor, advice: torch.Tensor, follows: torch.Tensor
+) -> torch.Tensor:
+    """Return the learner's actions in the worlds where it is followed, the teacher's elsewhere."""
+    if not bool(follows.any()):
+        return advice
+    with torch.no_grad():
+        mean, _ = model.actor(obs)
+    return torch.where(follows[:, None], mean, advice)
 
 
 def _fit(

@@ -203,9 +203,7 @@ def make_policy(
             on_progress=runtime.progress,
         )
     student.save(out / POLICY_FOLDER)
-    # As seen from the run folder: the file is pushed, and a place names its maker.
-    is_own = dataset.is_relative_to(runtime.root.resolve())
-    place = dataset.relative_to(runtime.root.resolve()) if is_own else Path(dataset.name)
+    place = _seen_from(runtime.root.resolve(), dataset)
     write_train_config(out / POLICY_FOLDER, student.policy, place, repo_id, recipe, seed)
     write_facts(out / POLICY_FOLDER, dataset)
     write_policy_card(out / POLICY_FOLDER)
@@ -219,6 +217,11 @@ def make_policy(
         "judged": [list(pair) for pair in trained.judged],
         "policy": POLICY_FOLDER,
     }
+
+
+def _seen_from(root: Path, dataset: Path) -> Path:
+    """Return where a dataset lies in the run folder, its name alone elsewhere: what is pushed must not name its maker."""
+    return dataset.relative_to(root) if dataset.is_relative_to(root) else Path(dataset.name)
 
 
 def new_student(
