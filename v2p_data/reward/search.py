@@ -16,7 +16,7 @@ import logging
 import shutil
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,39 +26,28 @@ from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none, read_object
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.pipeline.fingerprint import canonical
-from v2p_data.reward import redesign
 from v2p_data.reward.candidate import (
     DONE_FILE,
-    FEEDBACK_FILE,
     TRAIN_FOLDER,
     TRAJECTORIES_FILE,
     Candidate,
     Fault,
     Training,
 )
-from v2p_data.reward.code.function_body import UnreadableError
 from v2p_data.reward.config import Limits, RewardConfig
-from v2p_data.reward.feedback import Feedback
+from v2p_data.reward.drafts import RoundWriter
 from v2p_data.reward.jobs import Job, Jobs
 from v2p_data.reward.methods import (
     Prepared,
     RewardWriter,
-    in_place_of_reward,
     prepare,
     save_bundle,
 )
-from v2p_data.reward.prescreen import PrescreenConfig, prescreen, stored_moments
-from v2p_data.reward.reflect import reflect
+from v2p_data.reward.screening import screened
 from v2p_data.reward.trajectories import Trajectories
 from v2p_data.seeds import rng_for, seed_for
-from v2p_data.task.audit.rewards import reward_fault
-from v2p_data.task.llm.client import UnusableAnswersError
-from v2p_data.task.sandbox.probes import random_states
 from v2p_data.task.sandbox.sandbox import class_name
-from v2p_data.task.sandbox.smoke import smoke_run_all
-from v2p_data.task.sandbox.splice import SpliceError, reward_part
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates.variants import NUM_VARIANTS
 
 logger = logging.getLogger(__name__)
 
@@ -66,8 +55,6 @@ SEARCH_FILE = "search.json"
 RECIPE_FILE = "recipe.json"
 BUNDLE_FOLDER = "bundle"
 TAUGHT_FOLDER = "taught"
-PROBES = 64
-"""States on which first rewards are asked, for none are stored yet."""
 
 Progress = Callable[[float, str], None]
 
@@ -165,36 +152,6 @@ def search_reward(
             return _Search(bundle, cfg, out, seed, how, writer, own, on_progress).run()
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Draft:
-    """A reward that is about to become a candidate."""
-
-    code: str
-    origin: str
-    parent: int | None = None
-    reasons: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Asked:
-    """What came of asking the model."""
-
-    drafts: list[_Draft] = field(default_factory=list[_Draft])
-    said: tuple[str, ...] = ()
-    """Why others write the rest, for their reasons."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Family:
-    """One of the best rewards, and what its children are written from."""
-
-    told: TaskBundle
-    """The task as the writer sees it."""
-    parent: Candidate
-    feedback: Feedback
-    rng: np.random.Generator
-
-
 class _Search:
     def __init__(
         self,
@@ -251,10 +208,18 @@ class _Search:
         if isinstance(numbers, list):
             return [Candidate.load(folder / f"{n:03d}") for n in numbers]
         self._tell(f"round {iteration + 1}: writing rewards")
-        drafts = self._first() if iteration == 0 else self._children(iteration)
+        writing = RoundWriter(
+            prepared=self.prepared,
+            cfg=self.cfg,
+            seed=self.seed,
+            writer=self.writer,
+            tried=tuple(c.code for r in self.rounds for c in r),
+        )
+        elites = [standing.candidate for standing in self._elites()]
+        drafts = writing.first() if iteration == 0 else writing.children(iteration, elites)
         start = sum(len(r) for r in self.rounds)
         made: list[Candidate] = []
-        faults = self._screened(drafts)
+        faults = screened(drafts, self.base.scene, self._stored_trajectories(), self.seed)
         for k, (draft, fault) in enumerate(zip(drafts, faults, strict=True)):
             place = folder / f"{start + k:03d}"
             shutil.rmtree(place, ignore_errors=True)  # of a round that a kill cut short
@@ -275,185 +240,10 @@ class _Search:
         write_json_atomically(path, [c.number for c in made])
         return made
 
-    def _first(self) -> list[_Draft]:
-        """Return the first rewards: the method's and the model's, filled up with templates whose weights vary."""
-        prepared, count = self.prepared, self.cfg.num_candidates
-        drafts = [
-            _Draft(code=code, origin=origin)
-            for code, origin in zip(prepared.codes, prepared.origins, strict=True)
-        ]
-        new = self._new_ones(drafts)[:count]
-        base = self.base
-        asked = self._asked(lambda w, n: w.first_rewards(base, n), None, count - len(new), new)
-        new += asked.drafts
-        rng = rng_for(self.seed, "more first rewards")
-        for index in range(NUM_VARIANTS, NUM_VARIANTS + 2 * count):
-            if len(new) == count:
-                break
-            with suppress(UnreadableError):
-                design = redesign.from_template(self.base.code, prepared.seen, rng, index)
-                reasons = (*asked.said, design.words)
-                more = _Draft(code=design.code, origin="template", reasons=reasons)
-                new += self._new_ones([more], besides=new)
-        return new
-
-    def _children(self, iteration: int) -> list[_Draft]:
-        """Return rewards written from what the best ones so far did, as many from each of them as can be.
-
-        Where there is nothing more to be made of one, the others fill the round.
-        """
-        families = self._families(iteration)
-        count = self.cfg.num_candidates
-        new: list[_Draft] = []
-        for rank, family in enumerate(families):
-            share = count // len(families) + (rank < count % len(families))
-            asked = self._better(family, share, besides=new)
-            said = asked.said
-            new += asked.drafts
-            new += self._by_rule(family, share - len(asked.drafts), besides=new, said=said)
-        for family in families:
-            new += self._by_rule(family, count - len(new), besides=new)
-        return new
-
-    def _better(self, family: _Family, count: int, besides: Sequence[_Draft]) -> _Asked:
-        """Return what the model makes of a parent's reward."""
-        code, words = family.parent.code, family.feedback.text()
-        return self._asked(
-            lambda w, n: w.better_rewards(self.base, code, words, n),
-            family.parent.number,
-            count,
-            besides,
-        )
-
-    def _families(self, iteration: int) -> list[_Family]:
-        told = replace(self.base, scene=self.prepared.seen)
-        families: list[_Family] = []
-        for standing in self._elites():
-            parent = standing.candidate
-            try:
-                feedback = Feedback.from_dict(
-                    json_or_none(standing.training.folder / FEEDBACK_FILE)
-                )
-            except V2PError:  # its process ran generated code
-                logger.warning("candidate %d left no readable feedback", parent.number)
-                continue
-            rng = rng_for(self.seed, "reflect", iteration, parent.number)
-            families.append(_Family(told=told, parent=parent, feedback=feedback, rng=rng))
-        return families
-
-    def _by_rule(
-        self,
-        family: _Family,
-        count: int,
-        besides: Sequence[_Draft],
-        said: tuple[str, ...] = (),
-    ) -> list[_Draft]:
-        """Return rewards that rules make of a parent's, other ones than all before and besides them."""
-        if count < 1:
-            return []
-        parent = family.parent
-        tried = [c.code for r in self.rounds for c in r] + [d.code for d in besides]
-        children = reflect(
-            family.told, parent.code, family.feedback, family.rng, count, tried=tried
-        )
-        drafts = [
-            _Draft(
-                code=child.code,
-                origin="reflection",
-                parent=parent.number,
-                reasons=(*said, *child.reasons),
-            )
-            for child in children
-        ]
-        return self._new_ones(drafts, besides)
-
-    def _asked(
-        self,
-        ask: Callable[[RewardWriter, int], list[str]],
-        parent: int | None,
-        count: int,
-        besides: Sequence[_Draft],
-    ) -> _Asked:
-        """Return what the model wrote, if there is one, and in words how much of it is missing."""
-        if self.writer is None or count < 1:
-            return _Asked()
-        fault = "the others do not run, or were tried before"
-        try:
-            codes = ask(self.writer, count)
-        except UnusableAnswersError as error:
-            codes, fault = [], str(error)
-        drafts = [_Draft(code=c, origin="model", parent=parent) for c in codes]
-        drafts = self._new_ones(drafts, besides)[:count]
-        if len(drafts) == count:
-            return _Asked(drafts=drafts)
-        words = f"the model gave {len(drafts)} of {count} rewards that could be used ({fault})"
-        logger.warning("%s: %s", self.base.title, words)
-        return _Asked(drafts=drafts, said=(f"not by the model: {words}",))
-
-    def _new_ones(self, drafts: Sequence[_Draft], besides: Sequence[_Draft] = ()) -> list[_Draft]:
-        """Return the drafts without rewards that were tried before or are among the others of this round.
-
-        Whoever wrote them, all they bring into the task is their reward.
-        """
-        known = {reward_part(c.code) for r in self.rounds for c in r}
-        known |= {reward_part(d.code) for d in besides}
-        new: list[_Draft] = []
-        for each in drafts:
-            try:
-                draft = replace(each, code=in_place_of_reward(self.base.code, each.code))
-            except SpliceError:
-                logger.info("a reward of %s cannot be put into the task", each.origin)
-                continue
-            part = reward_part(draft.code)
-            if part not in known:
-                known.add(part)
-                new.append(draft)
-        return new
-
-    def _screened(self, drafts: Sequence[_Draft]) -> list[Fault | None]:
-        """Return per draft why it is not worth training, or None."""
-        if not drafts:
-            return []
-        stored = self._stored_trajectories()
-        if stored_moments(stored, PrescreenConfig()) is None:
-            return self._refused(drafts)
-        faults: list[Fault | None] = []
-        for draft, verdict in zip(
-            drafts, prescreen([d.code for d in drafts], self.base.scene, stored), strict=True
-        ):
-            if verdict.accepted:
-                faults.append(None)
-            elif draft.origin == "model" and verdict.reason == "not_runnable":
-                faults.append(Fault(kind="refused", reason=verdict.detail))
-            else:
-                reason = f"{verdict.reason}: {verdict.detail}"
-                faults.append(Fault(kind="prescreened", reason=reason))
-        return faults
-
-    def _refused(self, drafts: Sequence[_Draft]) -> list[Fault | None]:
-        """Return per draft why it cannot be learned from, or None; on stored states the pre-screen finds that out."""
-        # Templates are ours, and what `reflect` gives has run already.
-        unknown = [d.code for d in drafts if d.origin in ("model", "given")]
-        probes = random_states(self.base.scene, PROBES, rng_for(self.seed, "probes"))
-        results = iter(smoke_run_all(unknown, self.base.scene, probes=probes))
-        faults: list[Fault | None] = []
-        for draft in drafts:
-            if draft.code not in unknown:
-                faults.append(None)
-                continue
-            result = next(results)
-            if not result.runnable:
-                faults.append(Fault(kind="refused", reason=result.error))
-                continue
-            found = reward_fault(np.array(result.probe_reward), "states that were tried")
-            words = found and f"{found.reason}: it {found.words}"
-            faults.append(None if words is None else Fault(kind="prescreened", reason=words))
-        return faults
-
     def _stored_trajectories(self) -> list[Trajectories]:
         """Return what the elites' policies did, successes and failures."""
         stored: list[Trajectories] = []
-        for standing in self._elites() if self.rounds else []:
+        for standing in self._elites():
             path = standing.training.folder / TRAJECTORIES_FILE
             with suppress(V2PError):
                 stored.append(Trajectories.load(path))
