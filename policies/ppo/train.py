@@ -119,6 +119,38 @@ class _Progress:
         outcomes = self.deterministic if deterministic else self.exploring
         return float(np.mean(outcomes)) if len(outcomes) >= cfg.min_window_episodes else math.nan
 
+    def follow(self, batch: TensorDictBase, cfg: PPOConfig) -> None:
+        """Take note of finished episodes and of the scale of the returns."""
+        reward, done = batch["next", "reward"][..., 0], batch["next", "done"][..., 0]
+        success = outcome(batch.get("next")).reshape(done.shape)
+        squares = torch.zeros((), device=reward.device)
+        for t in range(cfg.batch_time):
+            self.discounted = cfg.gamma * self.discounted + reward[:, t]
+            self.episode_return = self.episode_return + reward[:, t]
+            self.age = self.age + 1
+            is_first = (self.waited == 0) & success[:, t]
+            self.waited = torch.where(is_first, self.age, self.waited)
+            squares = squares + self.discounted.square().mean() / cfg.batch_time
+            ended = done[:, t].nonzero()[:, 0]
+            for world in ended.tolist():
+                outcomes = self.deterministic if world < cfg.num_deterministic else self.exploring
+                outcomes.append(float(success[world, t]))
+                if world < cfg.num_deterministic:
+                    waited = float(self.waited[world] / self.age[world])
+                    self.scores.append(score(float(waited > 0), waited))
+                self.returns.append(float(self.episode_return[world]))
+            for name in ("discounted", "episode_return", "age", "waited"):
+                getattr(self, name)[ended] = 0.0
+        for outcomes in (
+            self.deterministic,
+            self.scores,
+            self.exploring,
+            self.returns,
+        ):
+            del outcomes[: -cfg.window_episodes]
+        keep = 0.95 if self.iteration else 0.0
+        self.mean_square_return = keep * self.mean_square_return + (1 - keep) * float(squares)
+
 
 def train_expert(
     env: EnvBase,
@@ -273,7 +305,7 @@ class _Learner:
         """Learn from one batch (env, time) and return the numbers of its curve row."""
         cfg, progress = self.cfg, self.progress
         self._check_finite(batch)
-        self._follow_episodes(batch)
+        progress.follow(batch, cfg)
         success = progress.success(cfg)
         self._compare_with_best(success)
         learning = batch[cfg.num_deterministic :]
@@ -320,43 +352,6 @@ class _Learner:
         if now >= progress.plateau_score + self.cfg.plateau_gain:
             progress.plateau_score = now
             progress.plateau_since = progress.steps + self.num_envs * self.cfg.batch_time
-
-    def _follow_episodes(self, batch: TensorDictBase) -> None:
-        """Take note of finished episodes and of the scale of the returns."""
-        cfg, progress = self.cfg, self.progress
-        reward, done = batch["next", "reward"][..., 0], batch["next", "done"][..., 0]
-        success = outcome(batch.get("next")).reshape(done.shape)
-        squares = torch.zeros((), device=reward.device)
-        for t in range(cfg.batch_time):
-            progress.discounted = cfg.gamma * progress.discounted + reward[:, t]
-            progress.episode_return = progress.episode_return + reward[:, t]
-            progress.age = progress.age + 1
-            is_first = (progress.waited == 0) & success[:, t]
-            progress.waited = torch.where(is_first, progress.age, progress.waited)
-            squares = squares + progress.discounted.square().mean() / cfg.batch_time
-            ended = done[:, t].nonzero()[:, 0]
-            for world in ended.tolist():
-                outcomes = (
-                    progress.deterministic if world < cfg.num_deterministic else progress.exploring
-                )
-                outcomes.append(float(success[world, t]))
-                if world < cfg.num_deterministic:
-                    waited = float(progress.waited[world] / progress.age[world])
-                    progress.scores.append(score(float(waited > 0), waited))
-                progress.returns.append(float(progress.episode_return[world]))
-            for name in ("discounted", "episode_return", "age", "waited"):
-                getattr(progress, name)[ended] = 0.0
-        for outcomes in (
-            progress.deterministic,
-            progress.scores,
-            progress.exploring,
-            progress.returns,
-        ):
-            del outcomes[: -cfg.window_episodes]
-        keep = 0.95 if progress.iteration else 0.0
-        progress.mean_square_return = keep * progress.mean_square_return + (1 - keep) * float(
-            squares
-        )
 
     def _update(self, batch: TensorDictBase) -> float:
         """Run the epochs over one batch and return the KL divergence from the collecting policy."""

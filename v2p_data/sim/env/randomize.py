@@ -16,6 +16,7 @@ from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import FLOOR_MAX_M
 from v2p_data.sim.env.layout import drawn_layouts
 from v2p_data.sim.env.ranges import RandomizationConfig
+from v2p_data.sim.env.scaling import Draw, FieldWriter
 from v2p_data.sim.model.suitability import GRIP_MARGIN_M
 from v2p_data.sim.model.world import CAMERA, MESH_SCALES, WALL_MAX_M, ObjectModel, World, cover_of
 from v2p_data.sim.robot.grips import LEVEL
@@ -103,9 +104,8 @@ class Randomizer:
             ]
         }
         self._base = {name: array[0].copy() for name, array in self._fields.items()}
-        self._rest = [
-            Rotation.from_quat(o.rest_quat, scalar_first=True).as_matrix() for o in objects
-        ]
+        self._writer = FieldWriter(world, self._base)
+        self._rest = self._writer.rest
         self._largest_scale = [self._largest_scale_of(k, o) for k, o in enumerate(objects)]
         self.start_tool_pos, self.start_yaw, self.start_qpos = self._start_bank(rng)
         self._live = {**self._fields, **self.per_world_arrays()}
@@ -152,7 +152,8 @@ class Randomizer:
                 scale = np.repeat(library[mesh_idx, None], 3, axis=1)
             mass = obj.mass_kg * rng.uniform(*cfg.mass_scale, n)
             friction = obj.friction * rng.uniform(*cfg.friction_scale, n)
-            self._write(into, rows, k, obj, scale, mass, friction, mesh_idx)
+            draw = Draw(scale=scale, mass=mass, friction=friction, mesh_idx=mesh_idx)
+            self._writer.write(into, rows, k, draw)
         into["delay_s"][rows] = rng.uniform(*cfg.delay_s, n)
         into["actuator_delay"][rows] = into["delay_s"][rows, None]
         gain = into["servo_gain"][rows] = rng.uniform(*cfg.servo_gain_scale, (n, 2))
@@ -287,94 +288,6 @@ class Randomizer:
             narrow = slice(3) if shared else slice(2) if obj.is_round else int(size.argmin())
             most[narrow] = min(high, fits)
         return most
-
-    def _write(
-        self,
-        into: dict[str, np.ndarray],
-        ids: np.ndarray,
-        k: int,
-        obj: ObjectModel,
-        scale: np.ndarray,
-        mass: np.ndarray,
-        friction: np.ndarray,
-        mesh_idx: np.ndarray,
-    ) -> None:
-        f, base, model = into, self._base, self.world.model
-        geoms = np.asarray(obj.geom_ids)
-        rows = ids[:, None]
-        g = scale[
-            :, None, :
-        ]  # also along turned geoms' own axes: those belong to round things, where x = y
-        f["geom_size"][rows, geoms] = base["geom_size"][geoms] * self._size_scale(obj, scale)
-        f["geom_pos"][rows, geoms] = base["geom_pos"][geoms] * g
-        f["geom_aabb"][rows, geoms] = base["geom_aabb"][geoms] * np.tile(g, (1, 1, 2))
-        if obj.kind == "sphere":
-            f["geom_rbound"][rows, geoms] = base["geom_rbound"][geoms] * scale[:, :1]
-        else:
-            # The radius about the geom's centre of the box that bounds it.
-            aabb = f["geom_aabb"][rows, geoms]
-            f["geom_rbound"][rows, geoms] = np.linalg.norm(
-                np.abs(aabb[..., :3]) + aabb[..., 3:], axis=2
-            )
-        f["geom_friction"][rows, geoms, 0] = friction[:, None]
-        if obj.kind == "mesh":
-            f["geom_dataid"][rows, geoms] = np.asarray(obj.mesh_ids).T[mesh_idx]
-        start, count = model.body_bvhadr[obj.body_id], model.body_bvhnum[obj.body_id]
-        nodes = np.arange(start, start + count)
-        f["bvh_aabb"][rows, nodes] = base["bvh_aabb"][nodes] * np.tile(g, (1, 1, 2))
-        self._write_mass(into, ids, obj, scale, mass)
-        f["size_m"][ids, k] = np.asarray(obj.size_m) * scale
-        f["mass_kg"][ids, k] = mass
-        f["friction"][ids, k] = friction
-        corners = obj.hull * g @ self._rest[k].T
-        f["height_above_table"][ids, k] = -corners[:, :, 2].min(1)
-        f["radius"][ids, k] = np.linalg.norm(corners[:, :, :2], axis=2).max(1)
-
-    def _write_mass(
-        self,
-        into: dict[str, np.ndarray],
-        ids: np.ndarray,
-        obj: ObjectModel,
-        scale: np.ndarray,
-        mass: np.ndarray,
-    ) -> None:
-        """Write mass and inertia, and what MuJoCo derives from them when it compiles."""
-        f, base, model = into, self._base, self.world.model
-        rows = ids[:, None]
-        body, dofs = obj.body_id, np.arange(obj.dof_adr, obj.dof_adr + 6)
-        ratio = mass / base["body_mass"][body]
-        second = base["body_inertia"][body].sum() / 2 - base["body_inertia"][body]  # of x, y, z
-        if obj.kind == "mesh":  # its inertia has axes of its own, but is scaled uniformly
-            inertia = base["body_inertia"][body] * scale[:, :1] ** 2
-        else:
-            stretched = second * scale**2
-            inertia = stretched.sum(1, keepdims=True) - stretched
-        inertia = inertia * ratio[:, None]
-        f["body_mass"][ids, body] = mass
-        f["body_subtreemass"][ids, body] = mass
-        f["body_inertia"][ids, body] = inertia
-        f["body_ipos"][ids, body] = base["body_ipos"][body] * scale
-        turn = (1 / inertia).mean(1) / (1 / base["body_inertia"][body]).mean()
-        f["body_invweight0"][ids, body, 0] = base["body_invweight0"][body, 0] / ratio
-        f["body_invweight0"][ids, body, 1] = base["body_invweight0"][body, 1] * turn
-        f["dof_invweight0"][rows, dofs[:3]] = base["dof_invweight0"][dofs[:3]] / ratio[:, None]
-        f["dof_invweight0"][rows, dofs[3:]] = base["dof_invweight0"][dofs[3:]] * turn[:, None]
-        if model.body_simple[body]:
-            # MuJoCo takes a simple body's inertia from here; else a heavier one would fall faster.
-            f["dof_M0"][rows, dofs[:3]] = mass[:, None]
-            f["dof_M0"][rows, dofs[3:]] = inertia
-
-    def _size_scale(self, obj: ObjectModel, scale: np.ndarray) -> np.ndarray:
-        """Return factors of `geom_size`, whose meaning depends on the geom's type."""
-        if obj.kind == "cylinder":
-            return scale[:, None, [0, 2, 2]]
-        if (
-            obj.kind == "round_hollow"
-        ):  # first the floor, a cylinder (radius, half height); then boxes
-            factors = np.repeat(scale[:, None, :], len(obj.geom_ids), axis=1)
-            factors[:, 0] = scale[:, [0, 2, 2]]
-            return factors
-        return scale[:, None, :]
 
     def _start_bank(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return tool positions, yaws and joint angles of arm poses above the tallest object."""
