@@ -5,7 +5,7 @@ import pytest
 
 from v2p_data.commands.gc import gc_command
 from v2p_data.commands.progress import Progress, progress_of
-from v2p_data.commands.show import status_command
+from v2p_data.commands.show import MANY, status_command
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.pipeline.at_work import Event
@@ -126,3 +126,16 @@ def test_status_names_a_folder_without_counts(tmp_path):
 
     with pytest.raises(V2PError, match=r"progress\.json cannot be read"):
         status_command([str(tmp_path), "--json"])
+
+
+def test_status_tells_kinds_of_results_where_they_are_many(tmp_path, capsys):
+    configs = ["good"] * MANY + ["rejected"] * 2
+    for k, config in enumerate(configs):
+        scene = Stage(name="scene", item=f"clip_{k}", config=config, make=make_bytes)
+        make_stage(scene, Runtime(root=tmp_path))
+
+    assert status_command([str(tmp_path)]) == 0
+    first, *more = capsys.readouterr().out.splitlines()
+    assert first.split() == ["scene", f"{MANY}", "items", "made"]
+    assert [line.split()[1] for line in more[:2]] == [f"clip_{MANY}", f"clip_{MANY + 1}"]
+    assert more[-2].startswith(f"{MANY + 2} results in")

@@ -1,7 +1,8 @@
 """Commands that show what a run made."""
 
 import json
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from v2p_data.report.reading import PARTIAL_SUFFIX, RUN_FILE
 
 Row = tuple[str, str, str, str]
 """Stage, item, what became of it, more."""
+MANY = 50
+"""A stage with more results is told by kinds of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +56,9 @@ def status_command(argv: list[str]) -> int:
     ]
     num_damaged = sum(state == "damaged" for _, _, state, _ in rows)
     rows += _failures(run)
-    widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
-    for row in rows:
+    shown = list(_gathered(rows))
+    widths = [max((len(row[i]) for row in shown), default=0) for i in range(3)]
+    for row in shown:
         print("  ".join(word.ljust(w) for word, w in zip(row, [*widths, 0], strict=True)).rstrip())  # noqa: T201
     note = f", {num_damaged} of them damaged" if num_damaged else ""
     print(f"\n{len(rows)} results in {run}{note}\nNext: v2p report {run}")  # noqa: T201
@@ -90,6 +94,25 @@ def _row(stage: str, folder: Path, *, check: bool) -> Row | None:
         return stage, record.item, "rejected", f"{record.rejected.get('reason')}: {record.rejected.get('detail')}"  # fmt: skip
     counts = ", ".join(f"{k} {v}" for k, v in record.counts.items() if isinstance(v, int | float | str))  # fmt: skip
     return stage, record.item, f"{record.seconds:.0f} s", counts
+
+
+def _gathered(rows: Sequence[Row]) -> Iterator[Row]:
+    """Yield the rows; of a stage with many, one for all that were made, and one for many that failed alike."""
+    stages = {stage: [row for row in rows if row[0] == stage] for stage, *_ in rows}
+    for stage, of_stage in stages.items():
+        if len(of_stage) <= MANY:
+            yield from of_stage
+            continue
+        alike: dict[str, list[Row]] = defaultdict(list)
+        for row in of_stage:
+            is_made = row[2].endswith(" s")
+            alike["made" if is_made else f"{row[2]}: {row[3].partition(':')[0]}"].append(row)
+        for state, group in alike.items():
+            if state == "made" or len(group) > MANY:
+                example = "" if state == "made" else f"e.g. {group[0][1]}"
+                yield stage, f"{len(group)} items", state, example
+            else:
+                yield from group
 
 
 def _failures(run: Path) -> Iterator[Row]:
