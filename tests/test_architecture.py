@@ -229,3 +229,19 @@ def test_the_code_map_names_every_room():
     elsewhere = (ROOT / "docs/scene_rooms.md").read_text()
 
     assert {room for room in rooms if f"{room}/" not in text + elsewhere} == set()
+
+
+def test_no_function_has_over_60_lines_and_no_class_over_300():
+    """Docstrings of functions aside; the two engines of the simulator aside."""
+    long: list[str] = []
+    for path in [*MODULES, *(ROOT / "policies").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            lines = getattr(node, "end_lineno", 0) - getattr(node, "lineno", 0) + 1
+            if isinstance(node, ast.FunctionDef):
+                if ast.get_docstring(node) is not None:
+                    lines -= node.body[0].end_lineno - node.body[0].lineno + 1
+                long += [node.name] if lines > 60 else []
+            elif isinstance(node, ast.ClassDef) and lines > 300:
+                long.append(node.name)
+
+    assert set(long) == {"BatchEnv", "WarpBatchEnv"}

@@ -133,17 +133,8 @@ def judge(
     for first in range(0, episodes, cfg.worlds):
         count = min(cfg.worlds, episodes - first)
         with watch.on("physics"):
-            env = BatchEnv(
-                bundle,
-                sim,
-                num_envs=count,
-                seed=0,
-                num_threads=num_threads,
-                task=task,
-                base_reset=cfg.reset == "base",
-            )
             seeds = [stream_seed(first_seed + first + k) for k in range(count)]
-            env.reset_seeded(np.arange(count), seeds)
+            env = _begun(bundle, sim, seeds, num_threads, task, base_reset=cfg.reset == "base")
             wrist = isinstance(actor, VisionActor) and actor.wrist
             view, film = View(env, size_px, num_threads, watch, wrist=wrist), Film(env)
             record = RefereeRecord(env)
@@ -172,6 +163,29 @@ def judge(
         seconds=watch.seconds,
         shown=shown,
     )
+
+
+def _begun(
+    bundle: TaskBundle,
+    sim: SimConfig,
+    seeds: Sequence[int],
+    num_threads: int,
+    task: type[Task] | None,
+    *,
+    base_reset: bool,
+) -> BatchEnv:
+    """Return worlds at the start of their episodes, one for each seed."""
+    env = BatchEnv(
+        bundle,
+        sim,
+        num_envs=len(seeds),
+        seed=0,
+        num_threads=num_threads,
+        task=task,
+        base_reset=base_reset,
+    )
+    env.reset_seeded(np.arange(len(seeds)), seeds)
+    return env
 
 
 class Verdicts:
