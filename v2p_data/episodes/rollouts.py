@@ -189,10 +189,10 @@ class Telling:
     """
 
     def __init__(self, actor: Actor, actions: Actions, worlds: BatchEnv) -> None:
-        self._actor, self._actions = actor, actions
+        self._actor = actor
+        self._actions: Actions = actions
         self._targets: list[np.ndarray] = []
-        arm = worlds.world.robot.arm
-        self._names = action_names(actions, arm.stop - arm.start)
+        self._names = action_names(actions, worlds.world.robot.num_joints)
 
     def reset(self, worlds: BatchEnv) -> None:
         """Tell the actor that episodes begin."""

@@ -10,9 +10,9 @@ from jaxtyping import Float
 from v2p_data.errors import V2PError
 from v2p_data.geometry.rotation import conjugates, exp, product, rotvec_from_down
 from v2p_data.sim.env.batch_env import BatchEnv
-from v2p_data.sim.robot.action_names import Actions, action_names
+from v2p_data.sim.robot.action_names import DELTA_NAMES, Actions, action_names
 from v2p_data.sim.robot.arms import Robot
-from v2p_data.sim.robot.robot import QUAT_DOWN
+from v2p_data.sim.robot.robot import QUAT_DOWN, TARGET_HIGH_M, TARGET_LOW_M
 
 LARGEST_RAD = 2 * np.pi
 _DOWN = np.array([QUAT_DOWN]).T
@@ -45,7 +45,7 @@ def steps_to(
         V2PError: the actions have not as many entries as the arm takes.
     """
     robot, cfg = worlds.world.robot, worlds.cfg
-    names = action_names(actions, robot.arm.stop - robot.arm.start)
+    names = action_names(actions, robot.num_joints)
     if target.shape[1] != len(names):
         raise V2PError(
             f"an action has {target.shape[1]} entries, and '{actions}' of the arm of task '{worlds.bundle.title}' has"
@@ -67,6 +67,18 @@ def steps_to(
     far = (pos - from_pos) / (cfg.position_step_m * worlds.bundle.motion_scale)
     step = [far, turn / cfg.rotation_step_rad, close[:, None] / cfg.finger_step_m]
     return np.clip(np.concatenate(step, axis=1), -1.0, 1.0)
+
+
+def bounds_of(actions: Actions, num_joints: int) -> tuple[list[float], list[float]]:
+    """Return the lowest and highest value of each entry, for an environment's space of actions."""
+    turn = [np.pi] * 3
+    match actions:
+        case "delta_tool":
+            return [-1.0] * len(DELTA_NAMES), [1.0] * len(DELTA_NAMES)
+        case "absolute_tool":
+            return [*TARGET_LOW_M, *(-a for a in turn), 0.0], [*TARGET_HIGH_M, *turn, 1.0]
+        case "joints":
+            return [-LARGEST_RAD] * num_joints + [0.0], [LARGEST_RAD] * num_joints + [1.0]
 
 
 def joints_near(
