@@ -8,14 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from v2p_data.errors import V2PError
-from v2p_data.geometry.rotation import conjugates, exp, product, rotvec_from_down
+from v2p_data.geometry.rotation import conjugates, log, product, quats_from_down, rotvec_from_down
 from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.sim.robot.action_names import DELTA_NAMES, Actions, action_names
 from v2p_data.sim.robot.arms import Robot
-from v2p_data.sim.robot.robot import QUAT_DOWN, TARGET_HIGH_M, TARGET_LOW_M
+from v2p_data.sim.robot.robot import TARGET_HIGH_M, TARGET_LOW_M
 
 LARGEST_RAD = 2 * np.pi
-_DOWN = np.array([QUAT_DOWN]).T
 _NEWTON_STEPS, _NEAR, _LONGEST = 30, 1e-13, 0.3
 
 
@@ -55,18 +54,19 @@ def steps_to(
         return target
     target = target.astype(float)
     if actions == "absolute_tool":
-        pos, quat = target[:, :3], product(_DOWN, exp(target[:, 3:6].T))
+        pos, quat = target[:, :3], quats_from_down(target[:, 3:6].T)
     else:
         # Beyond two turns no arm goes; numpy's tangent would make nothing of it.
         angles = np.clip(target[:, :-1], -LARGEST_RAD, LARGEST_RAD)
         tool = robot.tool_state(angles, np.zeros_like(angles))
         pos, quat = tool.pos, tool.quat_wxyz.T
     from_pos, from_quat, from_finger = worlds.targets
-    turn = rotvec_from_down(product(_DOWN, product(quat, conjugates(from_quat.T)))).T
+    turn = log(product(quat, conjugates(from_quat.T))).T
     close = from_finger - target[:, -1] * robot.finger_travel_m
     far = (pos - from_pos) / (cfg.position_step_m * worlds.bundle.motion_scale)
     step = [far, turn / cfg.rotation_step_rad, close[:, None] / cfg.finger_step_m]
-    return np.clip(np.concatenate(step, axis=1), -1.0, 1.0)
+    # In 32 bits, as `play` carries steps out, so that an environment does the same.
+    return np.clip(np.concatenate(step, axis=1), -1.0, 1.0).astype(np.float32)
 
 
 def bounds_of(actions: Actions, num_joints: int) -> tuple[list[float], list[float]]:
@@ -101,7 +101,7 @@ def joints_near(
             count, joints, 6
         )
         turn = product(quat_wxyz.T, conjugates(tool.quat_wxyz[::joints].T))
-        error = np.concatenate([pos - tool.pos[::joints], rotvec_from_down(product(_DOWN, turn)).T], axis=1)  # fmt: skip
+        error = np.concatenate([pos - tool.pos[::joints], log(turn).T], axis=1)  # fmt: skip
         if not np.abs(error).max() > _NEAR:
             break
         square = across.transpose(0, 2, 1) @ across + 1e-12 * np.eye(6)
