@@ -56,7 +56,7 @@ def steps_to(
     if actions == "absolute_tool":
         pos, quat = target[:, :3], quats_from_down(target[:, 3:6].T)
     else:
-        # Beyond two turns no arm goes; numpy's tangent would make nothing of it.
+        # No joint turns further; what a policy predicts may lie anywhere.
         angles = np.clip(target[:, :-1], -LARGEST_RAD, LARGEST_RAD)
         tool = robot.tool_state(angles, np.zeros_like(angles))
         pos, quat = tool.pos, tool.quat_wxyz.T
@@ -102,7 +102,7 @@ def joints_near(
         )
         turn = product(quat_wxyz.T, conjugates(tool.quat_wxyz[::joints].T))
         error = np.concatenate([pos - tool.pos[::joints], log(turn).T], axis=1)  # fmt: skip
-        if not np.abs(error).max() > _NEAR:
+        if not (np.abs(error) > _NEAR).any():
             break
         square = across.transpose(0, 2, 1) @ across + 1e-12 * np.eye(6)
         change = (across @ np.linalg.solve(square, error[..., None]))[..., 0]
