@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import toy_run
+import toy_task
 from toy_run import DISTILLATION, ENGINE, EPISODES, dataset_of, made, record_of
 
 from v2p_data.deployment.checks import check_meaning
@@ -20,14 +21,18 @@ from v2p_data.episodes.dataset.features import EXECUTED_KEY, METADATA_FILE
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.replay import replay
+from v2p_data.episodes.rollouts import CutConfig
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.facts import actions_of
 from v2p_data.evaluation.judging import contestant
 from v2p_data.pipeline.runner import Runtime
+from v2p_data.play import StateActor
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.policy.training import POLICY_FOLDER, sources_of
-from v2p_data.sim.env import verdict
+from v2p_data.sim.env import randomize, verdict
+from v2p_data.sim.env.actions import steps_to
+from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.robot.action_names import DELTA_NAMES, action_names
 from v2p_data.stages import (
     EVALUATION_FILE,
@@ -134,6 +139,30 @@ def test_every_episode_comes_back_from_what_was_carried_out(agreed, roots, actio
     assert len(report.episodes) == EPISODES.num_episodes
     assert report.is_same
     assert max(e.state_error for e in report.episodes) == 0
+
+
+@pytest.mark.parametrize("actions", KINDS)
+def test_recorded_targets_bring_the_same_states_back_where_no_noise_is_on_them(actions):
+    calm = replace(randomize.recording(), action_noise=0.0)
+    sim = SimConfig(fine=True, randomization=calm)
+
+    class Follow(StateActor):
+        def act(self, view):
+            return steps_to(view.worlds, first.targets[view.t], actions)
+
+    def played(actor):
+        return rollouts.roll_out(
+            toy_task.bundle(), actor, sim, num_worlds=8, seed=3, cut=CutConfig(), actions=actions,
+            task=toy_task.PushTask, referee=toy_task.agree,
+        )  # fmt: skip
+
+    first = played(StateActor(toy_task.act))
+    again = played(Follow(toy_task.act))
+
+    assert first.successes.any()
+    np.testing.assert_array_equal(again.num_frames, first.num_frames)
+    for then, now in zip(first.snapshots, again.snapshots, strict=True):
+        np.testing.assert_allclose(now.qpos, then.qpos, rtol=0, atol=1e-9)
 
 
 def test_datasets_of_two_kinds_do_not_go_together(roots, tmp_path):
