@@ -224,8 +224,8 @@ def toy_phases() -> dict[str, Phase]:
 
     import toy_run
 
-    import v2p_data.deployment.facts
-    import v2p_data.distillation.rounds  # noqa: F401
+    import v2p_data.distillation.rounds
+    import v2p_data.evaluation.facts  # noqa: F401
     from v2p_data.commands import run as commands
     from v2p_data.episodes import rollouts
     from v2p_data.evaluation import batch

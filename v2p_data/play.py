@@ -15,8 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.errors import V2PError
+from v2p_data.sim.env.actions import steps_to
 from v2p_data.sim.env.batch_env import BatchEnv, Snapshot, StepResult
 from v2p_data.sim.render.masks import MaskRenderer
+from v2p_data.sim.robot.action_names import Actions
 from v2p_data.sim.wrappers.gym_env import STATE_HIGH, STATE_LOW
 
 
@@ -129,7 +131,7 @@ class Policy(Protocol):
 
     def act(
         self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n 11"]
-    ) -> Float32[np.ndarray, "n 7"]:
+    ) -> Float32[np.ndarray, "n act"]:
         """Return the next action of every world."""
         ...
 
@@ -141,15 +143,17 @@ class VisionActor:
     policy: Policy
     wrist: bool = False
     """Whether it sees the wrist's picture too, below the table's."""
+    actions: Actions = "delta_tool"
+    """What its actions say."""
 
     def reset(self, worlds: BatchEnv) -> None:
         """Tell the policy that episodes begin."""
         self.policy.reset(worlds.num_envs)
 
     def act(self, view: View) -> Float[np.ndarray, "env 7"]:
-        """Return the policy's actions on what `V2PEnv` shows: the state is within bounds."""
+        """Return the steps to the policy's actions on what `V2PEnv` shows: the state is within bounds."""
         state = np.clip(view.state, STATE_LOW, STATE_HIGH).astype(np.float32)
-        return self.policy.act(view.labels, state)
+        return steps_to(view.worlds, self.policy.act(view.labels, state), self.actions)
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,12 @@ class PolicyActor:
 
 
 def load_actor(
-    folder: Path, *, greys: Sequence[int], task: str = "", device: str | None = None
+    folder: Path,
+    *,
+    greys: Sequence[int],
+    task: str = "",
+    device: str | None = None,
+    num_actions: int = 7,
 ) -> PolicyActor:
     """Read a checkpoint of any policy type LeRobot knows.
 
@@ -91,6 +96,7 @@ def load_actor(
         greys: grey (0 to 255) of each label of a picture.
         task: the task in words; see `PolicyActor.for_task`.
         device: where the policy runs; by default, where its settings say.
+        num_actions: entries of an action that the simulator is given.
 
     Raises:
         UnsuitablePolicyError: it cannot be opened, or wants to see or do what the simulator does not have.
@@ -98,6 +104,7 @@ def load_actor(
     from lerobot.envs.factory import make_env_pre_post_processors
 
     config = env_config(wrist=True)
+    config.features[ACTION_KEY] = replace(config.features[ACTION_KEY], shape=(num_actions,))
     try:
         height, width, cameras = check_features(folder, config)
         loaded = load_policy(folder, config, device)

@@ -136,6 +136,7 @@ def _check_weights(folder: Path, config: Any) -> None:
 
 
 def _register_plugins() -> None:
+    import lerobot.policies  # noqa: F401 - registers LeRobot's own types
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()

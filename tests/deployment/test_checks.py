@@ -8,10 +8,10 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from v2p_data.deployment.checks import Offer, check_policy, unknowns
-from v2p_data.deployment.facts import Facts, facts_of_dataset, write_facts
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
+from v2p_data.evaluation.facts import Facts, facts_of_dataset, write_facts
 
 OFFER = Offer(size_px=(256, 256), scale=ActionScale())
 BEFORE = "policy_preprocessor_step_3_normalizer_processor.safetensors"

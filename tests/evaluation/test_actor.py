@@ -1,5 +1,8 @@
 """Policies that do not suit the simulator are turned away, and those that do see what LeRobot would show them."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -96,3 +99,12 @@ def test_another_policy_type_sees_what_lerobot_shows_it():
     assert policy.seen.keys() == theirs.keys()
     for key, value in theirs.items():
         torch.testing.assert_close(policy.seen[key], value, rtol=0, atol=0)
+
+
+def test_lerobots_own_types_are_known_in_a_process_that_has_read_no_policy_yet():
+    code = (
+        "from policies.evaluation.rollout import env_config; env_config()\n"
+        "from lerobot.configs import PreTrainedConfig; PreTrainedConfig.get_choice_class('act')"
+    )
+
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -16,6 +16,7 @@ from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Stage
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.sim.env import ranges
+from v2p_data.sim.env.actions import steps_to, targets_of
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.model.world import World, build_world
 from v2p_data.sim.render.masks import FIRST_OBJECT, ROBOT, MaskRenderer
@@ -546,3 +547,17 @@ def test_a_robot_file_cannot_name_an_object_of_the_scene(
 
     with pytest.raises(V2PError, match=f"unknown element '{cube}'"):
         world_of(six)
+
+
+def test_targets_of_its_joints_lead_to_where_steps_lead(env_with, six):
+    env = env_with(six)
+    rng = np.random.default_rng(0)
+    for step in rng.uniform(-0.5, 0.5, (10, 8, 7)).astype(np.float32) * [1, 1, 1, 0.2, 0.2, 1, 1]:
+        target = targets_of(env, step, "joints")
+
+        made = steps_to(env, target, "joints")
+
+        assert target.shape == (8, 7)  # six joints and the gripper
+        led, wanted = env.targets_after(made), env.targets_after(step)
+        assert max(np.abs(a - b).max() for a, b in zip(led, wanted, strict=True)) < 1e-8
+        env.step(step)

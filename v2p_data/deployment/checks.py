@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from v2p_data.deployment.facts import Facts, read_facts
 from v2p_data.deployment.limits import STEP_S
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.episodes.dataset.features import (
@@ -22,6 +21,7 @@ from v2p_data.episodes.dataset.features import (
 )
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import PROCESSOR_FILES, Checkpoint, check_checkpoint
+from v2p_data.evaluation.facts import Facts, actions_of, read_facts
 from v2p_data.sim.render.masks import PALETTE
 
 HZ = round(1 / STEP_S)
@@ -53,7 +53,7 @@ def check_policy(folder: Path, offer: Offer, task: str = "") -> Facts:
     Raises:
         V2PError: it does not, or its checkpoint is damaged.
     """
-    found = check_checkpoint(folder)
+    found = _opened(folder)
     _check_features(folder, found, offer)
     return _check_meaning(folder, found, offer.scale, task)
 
@@ -71,7 +71,18 @@ def check_meaning(folder: Path, scale: ActionScale, task: str = "") -> Facts:
     Raises:
         V2PError: they do not, or the policy's files are damaged.
     """
-    return _check_meaning(folder, check_checkpoint(folder), scale, task)
+    return _check_meaning(folder, _opened(folder), scale, task)
+
+
+def _opened(folder: Path) -> Checkpoint:
+    found = check_checkpoint(folder)
+    actions, _ = actions_of(folder)
+    if actions != "delta_tool":
+        raise V2PError(
+            f"the policy in {folder} was trained with --episodes.actions={actions}, and robots and the twin carry out 'delta_tool'"
+            " only; train one on episodes that were recorded without this option"
+        )
+    return found
 
 
 def _check_meaning(folder: Path, found: Checkpoint, scale: ActionScale, task: str) -> Facts:

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.rollouts import CutConfig, Rollouts, record_rollouts
+from v2p_data.episodes.rollouts import CutConfig, Rollouts, Telling, record_rollouts
 from v2p_data.play import Actor, View
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.ranges import RandomizationConfig
+from v2p_data.sim.robot.action_names import Actions
 from v2p_data.task.task import TaskBundle
 
 
@@ -79,6 +80,7 @@ def hand_over(
     size_px: int,
     randomization: RandomizationConfig,
     cut: CutConfig,
+    actions: Actions = "delta_tool",
     num_threads: int = 1,
     wrist: bool = False,
 ) -> Handovers:
@@ -93,6 +95,7 @@ def hand_over(
         size_px: width and height of the label images.
         randomization: what the demonstrations were recorded under.
         cut: where an episode ends.
+        actions: what a dataset's `action` says.
         num_threads: for physics and masks; changes no result.
         wrist: whether the wrist's picture comes below the table's.
     """
@@ -107,10 +110,11 @@ def hand_over(
     takeover = rng_for(seed, "takeover").integers(earliest, latest + 1, cfg.worlds)
     horizon = round(cfg.time_scale * env.horizon)
     pictures = np.empty((horizon, cfg.worlds, size_px * (1 + wrist), size_px), np.uint8)
-    actor = Handover(student, expert, takeover, pictures)
+    telling = Telling(expert, actions, env)
+    actor = Handover(student, telling, takeover, pictures)
     view = View(env, size_px, num_threads, wrist=wrist)
     recorded = record_rollouts(view, actor, cut, seed=seed, horizon=horizon)
-    columns: dict[str, Any] = vars(recorded) | {"action": np.stack(actor.answers)}
+    columns: dict[str, Any] = vars(recorded) | {"action": np.stack(actor.answers)} | telling.told()
     return Handovers(
         **columns,
         labels=pictures[: len(actor.answers)],

@@ -48,7 +48,7 @@ class LearningStudent(Protocol):
         self,
         labels: UInt8[np.ndarray, "frame h w"],
         state: Float32[np.ndarray, "frame 11"],
-        action: Float32[np.ndarray, "frame 7"],
+        action: Float32[np.ndarray, "frame act"],
         task: str,
         lengths: Sequence[int],
     ) -> None:
@@ -251,12 +251,13 @@ def _collect(
             handovers = hand_over(
                 lesson.bundle,
                 lesson.expert,
-                VisionActor(student.for_task(lesson.bundle.description)),
+                VisionActor(student.for_task(lesson.bundle.description), actions=episodes.actions),
                 cfg,
                 seed=seed_for(seed, "batch", batch),
                 size_px=episodes.size_px,
                 randomization=episodes.randomization,
                 cut=episodes.cut,
+                actions=episodes.actions,
                 num_threads=num_threads,
                 wrist=episodes.wrist,
             )
@@ -299,7 +300,7 @@ def _stage(
             seed=handovers.seed,
             labels=labels,
             state=handovers.state[:length, world].copy(),
-            action=handovers.action[:length, world].copy(),
+            action=handovers.told[:length, world].copy(),
             success=rows >= handovers.held_at[world],
             simulated=handovers.simulated(world, episodes.size_px),
             intervention=rows >= handovers.taken_over_at[world],
@@ -307,6 +308,7 @@ def _stage(
             objects=tuple(o.name for o in bundle.scene.objects),
             params=params,
             cameras=episodes.cameras,
+            actions=handovers.names,
         ).save(folder / "episodes")
         names.append(episode_id)
         frames += length

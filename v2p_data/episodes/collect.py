@@ -33,6 +33,7 @@ from v2p_data.episodes.staging import (
 from v2p_data.errors import ItemRejectedError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import REJECTS_FILE, write_json_atomically, write_rejects
+from v2p_data.pipeline.fingerprint import UNSAID_BY_DEFAULT
 from v2p_data.play import Actor
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env import ranges
@@ -40,6 +41,7 @@ from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig
 from v2p_data.sim.render.masks import MASK_CAMERAS
+from v2p_data.sim.robot.action_names import Actions
 from v2p_data.task.task import Task, TaskBundle
 
 logger = logging.getLogger(__name__)
@@ -67,6 +69,8 @@ class EpisodesConfig:
     """Pictures in the dataset: exact label masks, colour pictures (close but not equal), or each as a camera of its own."""
     wrist: bool = False
     """Masks of a second camera too, which the hand carries: `observation.images.mask_wrist`."""
+    actions: Actions = field(default="delta_tool", metadata=UNSAID_BY_DEFAULT)
+    """What `action` says: the tool's step, the tool's target after it, or the joint angles of that target."""
     cut: CutConfig = field(default_factory=CutConfig)
     randomization: RandomizationConfig = field(default_factory=ranges.recording)
     distractors: DistractorConfig = field(default_factory=DistractorConfig)
@@ -191,6 +195,7 @@ def _collect(
                 seed=seed_for(seed, "batch", number),
                 num_threads=num_threads,
                 cut=cfg.cut,
+                actions=cfg.actions,
                 task=task,
                 referee=referee,
             )

@@ -79,13 +79,14 @@ class Artist:
             seed=rollouts.seed,
             labels=labels,
             state=rollouts.state[:length, world].copy(),
-            action=rollouts.action[:length, world].copy(),
+            action=rollouts.told[:length, world].copy(),
             success=np.arange(length) >= rollouts.held_at[world],
             simulated=rollouts.simulated(world, self.size_px),
             referee=bool(rollouts.referee[world]),
             objects=tuple(o.name for o in bundle.scene.objects),
             params=rollouts.params[world] | drawn,
             cameras=self.cameras,
+            actions=rollouts.names,
             rgb_mp4=rgb_mp4,
         )
 

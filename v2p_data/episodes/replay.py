@@ -21,6 +21,7 @@ from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.episodes.dataset.about import CARRIED_TASKS, read_about
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
+    EXECUTED_KEY,
     HANDOVER,
     METADATA_FILE,
     REWARD_KEY,
@@ -180,8 +181,11 @@ def _batches(
 def _rows(root: Path) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     names = {"state": STATE_KEY, "action": ACTION_KEY, "success": SUCCESS_KEY}
     for path in sorted(root.glob(DATA_GLOB)):
-        if REWARD_KEY in pq.read_schema(path).names:
+        there = pq.read_schema(path).names
+        if REWARD_KEY in there:
             names["reward"] = REWARD_KEY
+        if EXECUTED_KEY in there:
+            names["action"] = EXECUTED_KEY
         table = pq.read_table(path, columns=["episode_index", *names.values()])
         for number, (first, length) in row_spans(column(table, "episode_index")).items():
             rows = table.slice(first, length)

@@ -5,7 +5,7 @@ has held, and the referee sees it as cut: each world stands still from its episo
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from v2p_data.episodes.dataset.features import (
     CAMERA_POSE_KEY,
     CONTACT_KEY,
+    EXECUTED_KEY,
     FPS,
     INTRINSICS_KEY,
     OBJECT_POSE_KEY,
@@ -24,8 +25,10 @@ from v2p_data.episodes.dataset.features import (
 from v2p_data.geometry.camera import intrinsics
 from v2p_data.geometry.rotation import product
 from v2p_data.play import Actor, Film, View, play
+from v2p_data.sim.env.actions import targets_of
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.verdict import RefereeRecord, referee_verdict
+from v2p_data.sim.robot.action_names import Actions, action_names
 from v2p_data.task.task import Task, TaskBundle
 
 ABOUT_X = np.array([[0.0], [1.0], [0.0], [0.0]])
@@ -52,6 +55,9 @@ class Rollouts:
     seed: int
     state: Float32[np.ndarray, "time env 11"]
     action: Float32[np.ndarray, "time env 7"]
+    """Steps of the tool."""
+    executed: Float32[np.ndarray, "time env 7"]
+    """What was carried out: `action`, but in a handover, where `action` is the expert's throughout."""
     success: Bool[np.ndarray, "time env"]
     """The task's judgement after action `t`."""
     reward: Float32[np.ndarray, "time env"]
@@ -72,6 +78,15 @@ class Rollouts:
     """The simulation broke down during the episode."""
     params: tuple[dict[str, Any], ...]
     """What the randomisation drew, per world."""
+    names: tuple[str, ...] = ()
+    """Of the entries of `targets`; empty without."""
+    targets: Float[np.ndarray, "time env act"] | None = None
+    """What `action` leads to, where a dataset's `action` is a target."""
+
+    @property
+    def told(self) -> Float32[np.ndarray, "time env act"]:
+        """A dataset's `action`."""
+        return self.action if self.targets is None else self.targets.astype(np.float32)
 
     @property
     def successes(self) -> Bool[np.ndarray, "env"]:
@@ -102,7 +117,8 @@ class Rollouts:
             INTRINSICS_KEY: np.tile(K[[0, 1, 0, 1], [0, 1, 2, 2]], (length, 1)),
             CAMERA_POSE_KEY: np.tile(np.append(start.camera_pos[world], quat), (length, 1)),
         }
-        return {key: found[key].astype(column.dtype) for key, column in SIMULATED.items()}
+        columns = {key: found[key].astype(column.dtype) for key, column in SIMULATED.items()}
+        return columns | ({EXECUTED_KEY: self.executed[:length, world]} if self.names else {})
 
     def reject(self, world: int) -> dict[str, Any]:
         """Return why the episode of `world` is no demonstration."""
@@ -163,6 +179,39 @@ class EpisodeEnds:
         return self._held & ~self.broke
 
 
+class Telling:
+    """An actor whose steps are told as targets, too.
+
+    Args:
+        actor: who acts.
+        actions: what a dataset's `action` says.
+        worlds: in which it acts.
+    """
+
+    def __init__(self, actor: Actor, actions: Actions, worlds: BatchEnv) -> None:
+        self._actor = actor
+        self._actions: Actions = actions
+        self._targets: list[np.ndarray] = []
+        self._names = action_names(actions, worlds.world.robot.num_joints)
+
+    def reset(self, worlds: BatchEnv) -> None:
+        """Tell the actor that episodes begin."""
+        self._actor.reset(worlds)
+
+    def act(self, view: View) -> Float[np.ndarray, "env 7"]:
+        """Return the actor's actions."""
+        action = self._actor.act(view)
+        if self._actions != "delta_tool":
+            step = np.clip(action, -1.0, 1.0).astype(np.float32)
+            self._targets.append(targets_of(view.worlds, step, self._actions))
+        return action
+
+    def told(self) -> dict[str, Any]:
+        """Return `names` and `targets` of `Rollouts`."""
+        is_step = self._actions == "delta_tool"
+        return {} if is_step else {"names": self._names, "targets": np.stack(self._targets)}
+
+
 def roll_out(
     bundle: TaskBundle,
     actor: Actor,
@@ -172,12 +221,15 @@ def roll_out(
     seed: int,
     num_threads: int = 1,
     cut: CutConfig,
+    actions: Actions = "delta_tool",
     task: type[Task] | None = None,
     referee: Referee | None = None,
 ) -> Rollouts:
     """Run one episode in every world until each has succeeded or its time is up."""
     env = BatchEnv(bundle, sim, num_envs=num_worlds, seed=seed, num_threads=num_threads, task=task)
-    return record_rollouts(View(env), actor, cut, seed=seed, referee=referee)
+    telling = Telling(actor, actions, env)
+    recorded = record_rollouts(View(env), telling, cut, seed=seed, referee=referee)
+    return replace(recorded, **telling.told())
 
 
 def record_rollouts(
@@ -222,6 +274,7 @@ def record_rollouts(
         seed=seed,
         state=np.stack(states[:-1]),
         action=np.stack(actions),
+        executed=np.stack(actions),
         success=np.stack(successes),
         reward=np.stack(rewards),
         object_pose=np.stack(poses[:-1]),

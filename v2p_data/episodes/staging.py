@@ -47,7 +47,7 @@ class Episode:
     labels: UInt8[np.ndarray, "time h w"]
     """0 background, 1 robot, 2 manipulated object, 3.. the others; of two cameras below each other."""
     state: Float32[np.ndarray, "time 11"]
-    action: Float32[np.ndarray, "time 7"]
+    action: Float32[np.ndarray, "time act"]
     success: Bool[np.ndarray, "time"]
     """Whether success has held (0.25 s on end) by the end of the row's action; never falls back."""
     simulated: Mapping[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
@@ -62,6 +62,8 @@ class Episode:
     """Which pictures go into a dataset: `mask`, `mask_wrist`, `rgb`. Label images are staged in any case."""
     rgb_mp4: bytes = b""
     """The pictures of `rgb`, a video already."""
+    actions: tuple[str, ...] = ()
+    """Names of the action's entries; empty: steps of the tool."""
     family: str = ""
     """Title of the scene of which the task's object is a cousin; empty: its own."""
     intervention: Bool[np.ndarray, "time"] | None = None
@@ -120,6 +122,8 @@ class Episode:
             about["cameras"] = list(self.cameras)
         if self.family:
             about["family"] = self.family
+        if self.actions:
+            about["actions"] = list(self.actions)
         if self.intervention is not None:
             arrays[INTERVENTION] = self.intervention
         if self.rgb_mp4:
@@ -169,6 +173,8 @@ class Heading:
     size_px: tuple[int, int]
     """Height and width of the label images."""
     cameras: tuple[str, ...]
+    actions: tuple[str, ...]
+    """Names of the action's entries; empty: steps of the tool."""
     is_handover: bool
     """It holds who acted."""
     known: tuple[str, ...]
@@ -207,6 +213,7 @@ class Heading:
             num_frames=count,
             size_px=(height, width),
             cameras=about.get("cameras", (MASK_CAMERA,)),
+            actions=about.get("actions", ()),
             is_handover=is_handover,
             known=known,
             digest=digest,
@@ -257,7 +264,8 @@ def _about(data: Any, path: Path) -> dict[str, Any]:
     about: dict[str, Any] = json.loads(str(data["about"]))
     if about.pop("schema", None) != SCHEMA:
         raise V2PError(f"staged episode {path} was written by another version; remake it")
-    return about | {name: tuple(about[name]) for name in ("objects", "cameras") if name in about}
+    named = ("objects", "cameras", "actions")
+    return about | {name: tuple(about[name]) for name in named if name in about}
 
 
 def _known(data: Any) -> tuple[str, ...]:

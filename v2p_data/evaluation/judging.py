@@ -15,11 +15,13 @@ from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.checkpoint import WEIGHTS_FILE, check_checkpoint
 from v2p_data.evaluation.config import EvaluationConfig
+from v2p_data.evaluation.facts import actions_of
 from v2p_data.experts.labeller import PROGRAM_FILE, program_in
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import Actor, StateActor, VisionActor
 from v2p_data.seeds import seed_for
+from v2p_data.sim.env.batch_env import ACT_DIM
 from v2p_data.sim.render.masks import PALETTE
 from v2p_data.task.audit.resets import has_own_reset
 from v2p_data.task.task import TASK_FILE, TaskBundle
@@ -144,11 +146,20 @@ def _policy(folder: Path, device: str) -> Play:
     from policies.evaluation.actor import UnsuitablePolicyError, load_actor
 
     try:
-        actor = load_actor(folder, greys=PALETTE, device=device)
+        actions, count = actions_of(folder)
+        actor = load_actor(
+            folder,
+            greys=PALETTE,
+            device=device,
+            num_actions=count if actions == "joints" else ACT_DIM,
+        )
     except UnsuitablePolicyError as error:
         raise V2PError(str(error)) from error
     wrist = len(actor.cameras) > 1
-    return lambda bundle: (VisionActor(actor.for_task(bundle.description), wrist), actor.size_px)
+    return lambda bundle: (
+        VisionActor(actor.for_task(bundle.description), wrist, actions),
+        actor.size_px,
+    )
 
 
 def _expert(folder: Path) -> Play:

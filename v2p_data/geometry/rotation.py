@@ -77,8 +77,18 @@ def quats_pointing_down(yaw_rad: Float[np.ndarray, "n"]) -> Float[np.ndarray, "4
 def rotvec_from_down(quat_wxyz: Float[np.ndarray, "4 n"]) -> Float[np.ndarray, "3 n"]:
     """Return the rotation vectors of `R_down^T R`, where `R_down` is `(0, 1, 0, 0)`; their angle is at most pi."""
     w, x, y, z = quat_wxyz
-    # conj(0, 1, 0, 0) * quat
-    relative = np.stack([x, -w, z, -y], axis=1)
+    return log(np.stack([x, -w, z, -y]))  # conj(0, 1, 0, 0) * quat
+
+
+def quats_from_down(rotvec: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "4 n"]:
+    """Return the quaternions whose `rotvec_from_down` are these [rad]."""
+    w, x, y, z = exp(rotvec)
+    return np.stack([-x, w, -z, y])
+
+
+def log(quat_wxyz: Float[np.ndarray, "4 n"]) -> Float[np.ndarray, "3 n"]:
+    """Return the rotation vectors of quaternions [rad]; their angle is at most pi."""
+    relative = np.array(quat_wxyz.T, order="C")
     relative *= np.where(relative[:, :1] < 0, -1.0, 1.0)
     sine = np.linalg.norm(relative[:, 1:], axis=1, keepdims=True)
     angle = 2 * np.arctan2(sine, relative[:, :1])

@@ -15,6 +15,8 @@ from typing import Any, cast
 import numpy as np
 
 FINGERPRINT_LENGTH = 8
+UNSAID_BY_DEFAULT = {"unsaid by default": True}
+"""Metadata of a dataclass's field that came later: no recipe names it at its default, so that older results stay theirs."""
 
 
 def canonical(value: Any) -> Any:
@@ -38,7 +40,12 @@ def canonical(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return canonical(cast(list[Any], value.tolist()))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        said = {
+            f.name: getattr(value, f.name)
+            for f in dataclasses.fields(value)
+            if not _is_unsaid(f, value)
+        }
+        return {name: canonical(part) for name, part in said.items()}
     if isinstance(value, dict):
         items = cast(dict[Any, Any], value)
         if not all(isinstance(k, str) for k in items):
@@ -51,6 +58,11 @@ def canonical(value: Any) -> Any:
     raise TypeError(
         f"{type(value).__name__} cannot be part of a recipe; use plain values, dataclasses or paths"
     )
+
+
+def _is_unsaid(field: dataclasses.Field[Any], value: Any) -> bool:
+    later = UNSAID_BY_DEFAULT.items() <= field.metadata.items()
+    return later and getattr(value, field.name) == field.default
 
 
 def canonical_json(value: Any) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig, staged_episodes
+from v2p_data.episodes.dataset.features import Actions, actions_in
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import check_checkpoint
 from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
@@ -170,9 +171,9 @@ def make_policy(
 ) -> dict[str, Any]:
     """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
     from policies.bc.trainer import TrainerConfig, write_train_config
-    from v2p_data.deployment.facts import write_facts
     from v2p_data.distillation.rounds import STUDENT_FOLDER, handover_episodes, take_in
     from v2p_data.episodes.hub.policy_card import write_policy_card
+    from v2p_data.evaluation.facts import write_facts
 
     demand_whole_sources(dataset, sources, runtime.root)
     policy: PolicyConfig = cfg.config.resolved
@@ -193,14 +194,12 @@ def make_policy(
         recipe = TrainerConfig(
             steps=steps, batch_size=policy.batch_size, checkpoints=policy.checkpoints
         )
+        judge = None
+        if policy.checkpoints > 1 and judges:
+            actions, episodes = actions_in_dataset(dataset), policy.judge_episodes
+            judge = checkpoint_judge(student, judges, episodes, seed, runtime, actions)
         trained = student.train(
-            recipe,
-            out,
-            seed=seed % 2**63,
-            judge=checkpoint_judge(student, judges, policy.judge_episodes, seed, runtime)
-            if policy.checkpoints > 1 and judges
-            else None,
-            on_progress=runtime.progress,
+            recipe, out, seed=seed % 2**63, judge=judge, on_progress=runtime.progress
         )
     student.save(out / POLICY_FOLDER)
     place = _seen_from(runtime.root.resolve(), dataset)
@@ -252,12 +251,24 @@ def new_student(
         device=runtime.device,
         start_from=start_from,
         num_threads=runtime.num_threads,
-        action_limit=ACTION_LIMIT,
+        action_limit=ACTION_LIMIT if actions_in_dataset(dataset) == "delta_tool" else None,
     )
 
 
+def actions_in_dataset(dataset: Path) -> Actions:
+    """Return what the actions of a dataset say; those of others are taken for steps of the tool."""
+    from v2p_data.episodes.dataset.tables import read_info
+
+    return actions_in(read_info(dataset)) or "delta_tool"
+
+
 def checkpoint_judge(
-    student: "Student", tasks: Mapping[str, Path], episodes: int, seed: int, runtime: Runtime
+    student: "Student",
+    tasks: Mapping[str, Path],
+    episodes: int,
+    seed: int,
+    runtime: Runtime,
+    actions: Actions = "delta_tool",
 ) -> Callable[[Any], float]:
     """Return what gives a policy's mean success rate over task folders, on seeds that no evaluation uses."""
     from v2p_data.evaluation.batch import judge
@@ -273,6 +284,7 @@ def checkpoint_judge(
                 VisionActor(
                     replace(student, policy=policy.eval(), task=bundle.description),
                     wrist=len(student.cameras) > 1,
+                    actions=actions,
                 ),
                 episodes=episodes,
                 first_seed=seed_for(seed, "checkpoints", item) % 2**31,

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from policies.evaluation.rate import Rate
-from v2p_data.episodes.dataset.features import ACTION_NAMES, FPS
+from v2p_data.episodes.dataset.features import ACTION_NAMES, EXECUTED_KEY, FPS
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
@@ -249,8 +249,9 @@ def _episode_view(episode: Episode, cfg: PageConfig, budget: MediaBudget) -> Epi
         f"moments of episode {episode.id}",
     )
     seconds = np.arange(episode.num_frames) / FPS
+    steps = episode.simulated.get(EXECUTED_KEY, episode.action)
     lines = [
-        Line(name=name.split(".")[0].replace("_", " "), x=seconds, y=episode.action[:, k].astype(float))
+        Line(name=name.split(".")[0].replace("_", " "), x=seconds, y=steps[:, k].astype(float))
         for k, name in enumerate(ACTION_NAMES)
     ]  # fmt: skip
     return EpisodeView(

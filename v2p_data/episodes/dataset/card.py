@@ -9,6 +9,8 @@ from v2p_data.episodes.dataset.features import (
     ACTION_NAMES,
     CAMERA_OF_MASKS,
     DONE_KEY,
+    EXECUTED,
+    EXECUTED_KEY,
     INTERVENTION_KEY,
     METADATA_FILE,
     SIMULATED,
@@ -19,6 +21,7 @@ from v2p_data.episodes.dataset.handovers import who_acted
 from v2p_data.episodes.dataset.sheet import SHEET_FILE, write_sheet
 from v2p_data.episodes.dataset.tables import damage_told, read_info
 from v2p_data.errors import V2PError
+from v2p_data.sim.robot.action_names import TOOL_NAMES, actions_named
 
 CARD_FILE = "README.md"
 TAGS = ("LeRobot", "robotics", "segmentation", "simulation", "mujoco", "video2policy")
@@ -172,19 +175,32 @@ def _frame(info: dict[str, Any]) -> str:
             shown = len(feature["names"])
             meaning = _named(STATE_NAMES[:shown], STATE_UNITS[:shown])
         elif key == "action":
-            meaning = "each in [-1, 1]: " + _named(ACTION_NAMES, ACTION_UNITS)
+            meaning = _action(feature["names"])
         elif key == "next.success":
             meaning = "the task's success has held for 0.25 s by the end of this action"
         elif key == DONE_KEY:
             meaning = "true in the last row of an episode"
-        elif key in SIMULATED:
-            meaning = SIMULATED[key].meaning
+        elif key in SIMULATED or key == EXECUTED_KEY:
+            meaning = (SIMULATED | {EXECUTED_KEY: EXECUTED})[key].meaning
         elif key == INTERVENTION_KEY:
             meaning = "true where the expert acted, false where a student did"
         else:
             continue
         lines.append(f"| `{key}` | {list(feature['shape'])} | {meaning} |")
     return "\n".join(lines)
+
+
+def _action(names: list[str]) -> str:
+    match actions_named(names):
+        case "absolute_tool":
+            return "where the tool shall be after this step: " + _named(
+                TOOL_NAMES, STATE_UNITS[:7]
+            )
+        case "joints":
+            units = ("rad",) * (len(names) - 1) + STATE_UNITS[6:7]
+            return "where the joints shall be after this step: " + _named(tuple(names), units)
+        case _:
+            return "each in [-1, 1]: " + _named(ACTION_NAMES, ACTION_UNITS)
 
 
 def _who_acted(episodes: list[dict[str, Any]]) -> str:

@@ -22,7 +22,12 @@ from v2p_data.episodes.dataset.alike import common_features, first_difference, w
 from v2p_data.episodes.dataset.card import write_card
 from v2p_data.episodes.dataset.cut import write_episodes, write_stats, write_without
 from v2p_data.episodes.dataset.edited import is_like_ours, number_digests
-from v2p_data.episodes.dataset.features import EPISODE_COLUMN, INTERVENTION_KEY, METADATA_FILE
+from v2p_data.episodes.dataset.features import (
+    EPISODE_COLUMN,
+    INTERVENTION_KEY,
+    METADATA_FILE,
+    actions_in,
+)
 from v2p_data.episodes.dataset.handovers import (
     about_with_sources,
     info_with_column,
@@ -248,6 +253,12 @@ def _check_alike(a: _Source, b: _Source) -> None:
                 f"{a.root} and {b.root} do not go together: {what} is {one} in the first and {two} in the second"
             )
 
+    said = [actions_in(source.info) for source in (a, b)]
+    if None not in said and said[0] != said[1]:
+        raise V2PError(
+            f"the actions of {a.root} are '{said[0]}' and those of {b.root} '{said[1]}': a dataset has actions of one kind;"
+            " collect the episodes of one of them anew with the other's --episodes.actions"
+        )
     if difference := first_difference(a.info, b.info):
         differ(*difference)
     for source in (a, b):

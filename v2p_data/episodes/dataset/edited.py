@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.episode_stats import rows_stats
-from v2p_data.episodes.dataset.features import ACTION_KEY, ACTION_NAMES
+from v2p_data.episodes.dataset.features import actions_in
 from v2p_data.episodes.dataset.intake import INFO_FILE, STATS_FILE, demand_bounded
 from v2p_data.episodes.dataset.tables import (
     BOOKKEEPING,
@@ -95,7 +95,7 @@ def demand_sound(root: Path, memory: Path | None = None) -> Changed:
 
 def is_like_ours(root: Path) -> bool:
     """Return whether a dataset has the actions of ours: LeRobot's tools keep the columns and their names."""
-    return read_info(root)["features"].get(ACTION_KEY, {}).get("names") == list(ACTION_NAMES)
+    return actions_in(read_info(root)) is not None
 
 
 def number_digests(root: Path, info: dict[str, Any], count: int) -> list[str]:

@@ -4,8 +4,12 @@ State and action entries end in `.pos`, because `lerobot-rollout` drops other na
 and ours, take as inputs what begins with `observation.`; no other column may begin so.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from v2p_data.sim.robot.action_names import DELTA_NAMES as ACTION_NAMES
+from v2p_data.sim.robot.action_names import Actions, actions_named
 
 FPS = 20
 ROBOT_TYPE = "v2p_franka"
@@ -19,6 +23,7 @@ DONE_KEY = "next.done"
 REWARD_KEY = "next.reward"
 OBJECT_POSE_KEY = "privileged.object_pose"
 CONTACT_KEY = "privileged.contact"
+EXECUTED_KEY = "privileged.executed"
 INTRINSICS_KEY = "camera.intrinsics"
 CAMERA_POSE_KEY = "camera.pose"
 INTERVENTION_KEY = "intervention"
@@ -49,17 +54,6 @@ STATE_NAMES = (
 )
 """Tool position [m], rotation vector from straight down [rad], gripper opening 0 to 1; then the controller's command:
 target position minus tool position [m], target opening 0 to 1. Robot base frame."""
-ACTION_NAMES = (
-    "delta_x.pos",
-    "delta_y.pos",
-    "delta_z.pos",
-    "delta_rx.pos",
-    "delta_ry.pos",
-    "delta_rz.pos",
-    "gripper_close.pos",
-)
-"""Each in [-1, 1]: x 0.03 m, x 0.2 rad about the world's axes, and x 0.012 m of finger travel (+ closes)."""
-
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 SLOTS = 7
 """Objects that masks can tell apart; slot 1 has the label 2, slot 2 the label 3, and so on."""
@@ -106,12 +100,23 @@ SIMULATED = {
     ),
 }
 """Shapes do not depend on the task, so that all datasets of ours go together."""
+EXECUTED = Column(
+    names=ACTION_NAMES,
+    meaning="not for policies: the step of the tool that was carried out, each in [-1, 1]; of these episodes `action` is a target",
+)
+"""Only where `action` is not the step itself."""
+
+
+def actions_in(info: Mapping[str, Any]) -> Actions | None:
+    """Return what the actions of a dataset with this `meta/info.json` say, None where they are not ours."""
+    return actions_named(info.get("features", {}).get(ACTION_KEY, {}).get("names"))
 
 
 def features(
     size_px: int,
     cameras: tuple[str, ...] = ("mask",),
     *,
+    actions: Sequence[str] = ACTION_NAMES,
     has_handovers: bool = False,
     is_simulated: bool = False,
 ) -> dict[str, dict[str, Any]]:
@@ -120,6 +125,7 @@ def features(
     Args:
         size_px: width and height.
         cameras: which pictures there are.
+        actions: names of the action's entries.
         has_handovers: some episodes were acted by a student at first, so there is a column that says who acted.
         is_simulated: all episodes are a simulator's, so there is what only a simulator knows.
     """
@@ -137,9 +143,10 @@ def features(
             "shape": (len(STATE_NAMES),),
             "names": list(STATE_NAMES),
         },
-        ACTION_KEY: {"dtype": "float32", "shape": (7,), "names": list(ACTION_NAMES)},
+        ACTION_KEY: {"dtype": "float32", "shape": (len(actions),), "names": list(actions)},
         SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},
         **({INTERVENTION_KEY: INTERVENTION_FEATURE} if has_handovers else {}),
         DONE_KEY: {"dtype": "bool", "shape": (1,), "names": None},
         **({k: column.feature for k, column in SIMULATED.items()} if is_simulated else {}),
+        **({EXECUTED_KEY: EXECUTED.feature} if tuple(actions) != ACTION_NAMES else {}),
     }

@@ -13,11 +13,11 @@ import numpy as np
 from v2p_data.episodes.dataset.episode_stats import QUANTILES
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
-    ACTION_NAMES,
     CAMERA_OF_MASKS,
     CAMERA_POSE_KEY,
     DEMONSTRATION,
     DONE_KEY,
+    EXECUTED_KEY,
     INTERVENTION_KEY,
     INTRINSICS_KEY,
     MASK_KEY,
@@ -26,6 +26,7 @@ from v2p_data.episodes.dataset.features import (
     RGB_KEY,
     STATE_KEY,
     SUCCESS_KEY,
+    actions_in,
 )
 from v2p_data.episodes.dataset.stream import decode_rgb
 from v2p_data.episodes.dataset.tables import BOOKKEEPING, STATS_FILE, Found
@@ -88,9 +89,9 @@ class Checks:
             if f["dtype"].startswith(("float", "int", "uint", "bool")) and k not in BOOKKEEPING
         ]
         self.floats = [k for k in self.numbers if self.features[k]["dtype"].startswith("float")]
-        self.has_our_actions = (
-            list(self.features.get(ACTION_KEY, {}).get("names") or []) == list(ACTION_NAMES)
-        )  # fmt: skip
+        actions = actions_in(info)
+        self.has_our_actions = actions is not None
+        self.steps = ACTION_KEY if actions == "delta_tool" else EXECUTED_KEY
         self.has_masks = self.is_ours and MASK_KEY in self.features
         self.seen: dict[str, int] = {}
         self.sources: list[dict[str, Any]] | None = None
@@ -259,7 +260,7 @@ class EpisodeCheck:
                 add("finite", where, f"{key} holds NaN or infinity")
         if (
             self.checks.has_our_actions
-            and (largest := float(np.abs(columns[ACTION_KEY]).max())) > 1
+            and (largest := np.abs(columns.get(self.checks.steps, np.zeros(1))).max()) > 1
         ):
             add("action_bounds", where, f"an action is {largest:.3f}, beyond 1")
         self._success(columns)

@@ -28,6 +28,7 @@ from v2p_data.episodes.dataset.features import (
     DEMONSTRATION,
     DONE_KEY,
     EPISODE_COLUMN,
+    EXECUTED_KEY,
     FPS,
     HANDOVER,
     INTERVENTION_KEY,
@@ -131,7 +132,7 @@ def pack(
                 "repo_id": repo_id,
                 "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
                 "state": list(STATE_NAMES),
-                "action": list(ACTION_NAMES),
+                "action": list(headings[0].actions or ACTION_NAMES),
                 "episodes": described,
                 "provenance": dict(provenance or {}),
             },
@@ -170,6 +171,11 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
                 f"{heading.path} has pictures of {', '.join(heading.cameras)}, the first episode of "
                 f"{', '.join(first.cameras)}; collect all episodes with one --episodes.render and --episodes.wrist"
             )
+        if heading.actions != first.actions:
+            raise V2PError(
+                f"{heading.path} has actions of {', '.join(heading.actions or ACTION_NAMES)}, the first episode of "
+                f"{', '.join(first.actions or ACTION_NAMES)}; collect all episodes with one --episodes.actions and one arm"
+            )
         if heading.num_frames < 2:
             raise V2PError(
                 f"{heading.path} has {heading.num_frames} frames; an episode has two at least"
@@ -192,7 +198,11 @@ def _write(
         repo_id,
         fps=FPS,
         features=features(
-            first.size_px[1], first.cameras, has_handovers=has_handovers, is_simulated=is_simulated
+            first.size_px[1],
+            first.cameras,
+            actions=first.actions or ACTION_NAMES,
+            has_handovers=has_handovers,
+            is_simulated=is_simulated,
         ),
         robot_type=ROBOT_TYPE,
         root=root,
@@ -340,7 +350,8 @@ def _video_path(meta: Any, number: int, camera: str) -> Path:
 
 def _describe(episode: Episode, columns: Collection[str]) -> dict[str, Any]:
     numbers = [episode.state, episode.action]
-    numbers += [episode.simulated[k] for k in SIMULATED if k in columns and k != CONTACT_KEY]
+    known = [k for k in (*SIMULATED, EXECUTED_KEY) if k in columns and k != CONTACT_KEY]
+    numbers += [episode.simulated[k] for k in known]
     source = {
         "source": HANDOVER if episode.is_handover else DEMONSTRATION,
         "student_frames": int((~episode.expert_acted).sum()),

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from v2p_data.episodes.dataset.about import CARRIED_TASKS
 from v2p_data.episodes.dataset.card import LICENSE
-from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
+from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES, actions_named
 from v2p_data.episodes.dataset.repo_id import check_repo_id
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import demand_whole
@@ -58,7 +58,11 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
     check_repo_id(repo_id)
     if out.exists():
         raise V2PError(f"{out} exists already; choose another place")
+    from v2p_data.sim.wrappers.lerobot_env import actions_of_tasks
+
     folders = _tasks_in(source)
+    names = actions_of_tasks(source) or ACTION_NAMES
+    actions = actions_named(names) or "delta_tool"
     demand_whole(source, below=f"{CARRIED_TASKS.as_posix()}/")
     for folder in folders.values():
         demand_whole(folder)
@@ -86,9 +90,9 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
         into = partial / path.relative_to(SOURCE.parent)
         into.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, into)
-    (partial / "env.py").write_text(ENV_PY.replace("REPO_ID", repo_id))
+    (partial / "env.py").write_text(ENV_PY.replace("REPO_ID", repo_id).replace("ACTIONS", actions))
     (partial / "requirements.txt").write_text("\n".join(requirements(modules)) + "\n")
-    (partial / "README.md").write_text(_card(repo_id, rows))
+    (partial / "README.md").write_text(_card(repo_id, rows, names))
     partial.rename(out)
     return EnvHub(folder=out, repo_id=repo_id, tasks=tuple(folders))
 
@@ -174,9 +178,9 @@ def _tasks_in(source: Path) -> dict[str, Path]:
     )
 
 
-def _card(repo_id: str, rows: list[str]) -> str:
+def _card(repo_id: str, rows: list[str], actions: tuple[str, ...]) -> str:
     tasks = "\n".join(["| number | task | folder | steps |", "|---|---|---|---|", *rows])
-    state, action = (", ".join(f"`{n}`" for n in names) for names in (STATE_NAMES, ACTION_NAMES))
+    state, action = (", ".join(f"`{n}`" for n in names) for names in (STATE_NAMES, actions))
     return f"""---
 library_name: lerobot
 license: {LICENSE}
@@ -221,7 +225,7 @@ function agrees.
 |---|---|
 | `pixels/mask` | 256 x 256 x 3 uint8: segmentation mask, a grey (R = G = B) per label: 0 background, 64 robot, 128 manipulated object, then 192, 255, 31, 95, 158, 222 |
 | `agent_pos` | {state} |
-| action | each in [-1, 1], 20 Hz: {action} |
+| action | {"each in [-1, 1], " * (actions == ACTION_NAMES)}20 Hz: {action} |
 
 ## What is in here
 
@@ -250,7 +254,7 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
 
     named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg", "horizon_scale", "wrist")
     given = {name: getattr(cfg, name) for name in named if hasattr(cfg, name)}
-    return V2PEnvConfig(tasks=str(folder / TASKS), **given).create_envs(n_envs, use_async_envs)
+    return V2PEnvConfig(tasks=str(folder / TASKS), actions="ACTIONS", **given).create_envs(n_envs, use_async_envs)
 
 
 def _whole_repository():

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.episodes.dataset.card import CARD_FILE, LICENSE, write_text
+from v2p_data.episodes.dataset.features import actions_named
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 
@@ -39,7 +40,7 @@ license: {license}
 
 ```bash
 {fetch}v2p eval POLICY --tasks {tasks}
-lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks={tasks}{wrist}
+lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks={tasks}{wrist}{actions}
 ```
 
 ## What it sees and does
@@ -72,6 +73,8 @@ def write_policy_card(folder: Path) -> None:
     if "steps" in recipe and "batch_size" in recipe:
         words += f" for {recipe['steps']} steps of {recipe['batch_size']} frames"
     features = _features(config)
+    facts = json_or_none(folder / "v2p.json")
+    actions = actions_named(facts.get("action")) if isinstance(facts, dict) else None
     text = CARD.format(
         license=LICENSE,
         head=f"datasets:\n- {dataset}\n" if dataset else "",
@@ -86,6 +89,7 @@ def write_policy_card(folder: Path) -> None:
         if dataset
         else "",
         tasks="dataset/v2p/tasks" if dataset else "TASKS",
+        actions=f" --env.actions={actions}" if actions not in (None, "delta_tool") else "",
         wrist=" --env.wrist=true" if any("mask_wrist" in name for name in features) else "",
         features="\n".join(f"| `{name}` | {shape} |" for name, shape in features.items()),
     )

@@ -62,6 +62,8 @@ STARTS_LOOKED_AT = 8
 """Worlds whose first poses are held against MuJoCo's collisions when an environment is made."""
 FRESH, BEGAN_SOLVED = -1, -2
 """Values of `_held`: before an episode's first step, and all through one that began in success."""
+Targets = tuple[Float[np.ndarray, "env 3"], Float[np.ndarray, "env 4"], Float[np.ndarray, "env"]]
+"""Of the controller: the tool's position [m] and quaternion `wxyz`, and the travel of a finger [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -418,6 +420,15 @@ class BatchEnv:
             dtype=np.float32,
         )
 
+    @property
+    def targets(self) -> Targets:
+        """What the controller goes for now."""
+        return self._target_pos, self._target_quat, self._target_finger
+
+    def targets_after(self, action: Float[np.ndarray, "env 7"]) -> Targets:
+        """Return what the controller would go for after an action, each entry in [-1, 1], without its noise."""
+        return self._moved(np.array(action.T, float, order="C"))
+
     def snapshot(self, ids: Int[np.ndarray, "n"]) -> Snapshot:
         """Return what is needed to draw the worlds `ids` as they are now."""
         drawn = self.randomizer.fields() | self.randomizer.per_world_arrays()
@@ -540,6 +551,9 @@ class BatchEnv:
         return drawn
 
     def _move_targets(self, action: Float[np.ndarray, "7 env"]) -> None:
+        self._target_pos, self._target_quat, self._target_finger = self._moved(action)
+
+    def _moved(self, action: Float[np.ndarray, "7 env"]) -> Targets:
         cfg, tool = self.cfg, self._tool
         scale = self.bundle.motion_scale
         pos, tool_pos = self._target_pos.T, tool.pos.T
@@ -561,7 +575,7 @@ class BatchEnv:
                 target[:, ~np.isfinite(target).all(0)] = safe
         if not np.isfinite(finger).all():
             finger[~np.isfinite(finger)] = self._robot.finger_travel_m
-        self._target_pos, self._target_quat, self._target_finger = pos.T, quat.T, finger
+        return pos.T, quat.T, finger
 
     def _tool_of(self, rows: slice | np.ndarray) -> ToolState:
         robot = self._robot

@@ -94,6 +94,10 @@ class Robot:
     qpos_for: Callable[[np.ndarray, np.ndarray], np.ndarray]
     """Joint angles for tool positions and yaws, gripper down."""
 
+    @property
+    def num_joints(self) -> int:
+        return self.arm.stop - self.arm.start
+
 
 BUILT_IN = Robot(
     arm=slice(0, NUM_ARM_JOINTS),

@@ -3,7 +3,7 @@
 | | |
 |---|---|
 | Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `pixels/mask_wrist`: the same, if asked for; `agent_pos`: 11 float32, see `BatchEnv.robot_state` |
-| Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz |
+| Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz; with `actions`, a target of the tool (7) or of the joints (8) |
 | Reward | the task's training reward |
 | Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
 | End | terminated: success, or the simulation broke down; truncated: twice the task's horizon (`horizon_scale`) |
@@ -25,10 +25,12 @@ from jaxtyping import Float, UInt8
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.env import ranges
-from v2p_data.sim.env.batch_env import ACT_DIM, BatchEnv, SimConfig, Snapshot
+from v2p_data.sim.env.actions import bounds_of, steps_to
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.model.world import World
 from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS, MaskRenderer, labels_to_rgb
+from v2p_data.sim.robot.action_names import Actions
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
 
 ENV_ID = "v2p/Task-v0"
@@ -68,6 +70,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             `RandomizationConfig`; a policy is evaluated under what its dataset was recorded under.
         horizon_scale: an episode lasts at most this multiple of the task's own horizon.
         wrist: whether masks of the camera that the hand carries are seen too.
+        actions: what an action says: `delta_tool`, `absolute_tool`, `joints`; see `sim.env.actions`.
 
     Raises:
         V2PError: the folder holds no task, or there is no such render mode.
@@ -87,6 +90,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         camera_fovy_deg: float = 0.0,
         horizon_scale: float = POLICY_HORIZON_SCALE,
         wrist: bool = False,
+        actions: Actions = "delta_tool",
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise V2PError(f"render_mode is 'rgb_array' or None, got {render_mode!r}")
@@ -117,7 +121,9 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
                 ),
             }
         )
-        self.action_space = spaces.Box(-1.0, 1.0, (ACT_DIM,), np.float32)
+        self._actions: Actions = actions
+        low, high = bounds_of(actions, self.world.robot.num_joints)
+        self.action_space = spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -136,8 +142,13 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Carry out one action; it is clipped to [-1, 1]."""
-        result = self._world.step(np.asarray(action, float)[None])
+        """Carry out one action; a step of the tool is clipped to [-1, 1], a target is gone for as far as one step leads.
+
+        Raises:
+            V2PError: it has another number of entries.
+        """
+        target = np.asarray(action, float)[None]
+        result = self._world.step(steps_to(self._world, target, self._actions))
         self._referee.note()
         self._num_steps += 1
         broke = bool(result.terminated[0])

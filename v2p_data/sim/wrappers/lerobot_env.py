@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
@@ -17,7 +17,9 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from v2p_data.errors import V2PError
+from v2p_data.json_files import json_or_none
 from v2p_data.sim.render.masks import MASK_CAMERAS
+from v2p_data.sim.robot.action_names import Actions, action_names, actions_named
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_LOW, V2PEnv
 from v2p_data.task.sandbox.trial import demand_trial
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TASK_FILE, TaskBundle, told_of
@@ -47,6 +49,18 @@ def find_tasks(folder: Path) -> list[Path]:
     )
 
 
+def actions_of_tasks(folder: Path) -> tuple[str, ...]:
+    """Return the names of the actions of the dataset that carries these tasks, nothing where they lie in none of ours."""
+    for root in (folder, *folder.absolute().parents[:3]):
+        if (root / TASKS_IN_DATASET).is_dir():
+            info = json_or_none(root / "meta/info.json")
+            features = info.get("features") if isinstance(info, dict) else None
+            action = features.get(ACTION) if isinstance(features, dict) else None
+            names = action.get("names") if isinstance(action, dict) else None
+            return tuple(names or ()) if actions_named(names) else ()
+    return ()
+
+
 @EnvConfig.register_subclass("v2p")
 @dataclass
 class V2PEnvConfig(EnvConfig):
@@ -65,6 +79,8 @@ class V2PEnvConfig(EnvConfig):
     """An episode lasts at most this multiple of the task's own horizon."""
     wrist: bool = False
     """Masks of the camera that the hand carries too, for policies trained on datasets of `--episodes.wrist`."""
+    actions: str = ""
+    """What an action says: `delta_tool`, `absolute_tool` or `joints`; by default as in the dataset that carries the tasks."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {
@@ -74,9 +90,20 @@ class V2PEnvConfig(EnvConfig):
     )
 
     def __post_init__(self) -> None:
+        told = actions_of_tasks(Path(self.tasks)) if self.tasks else ()
+        self.actions = self.actions or actions_named(told) or "delta_tool"
+        if self.actions not in get_args(Actions):
+            raise V2PError(
+                f"--env.actions is {', '.join(get_args(Actions))}, got '{self.actions}'"
+            )
+        names = (
+            told
+            if actions_named(told) == self.actions
+            else action_names(cast(Actions, self.actions))
+        )
         mask = PolicyFeature(FeatureType.VISUAL, (self.size_px, self.size_px, 3))
         self.features = {
-            ACTION: PolicyFeature(FeatureType.ACTION, (7,)),
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(names),)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(STATE_LOW),)),
         }
         for camera in MASK_CAMERAS[: 1 + self.wrist]:
@@ -92,6 +119,7 @@ class V2PEnvConfig(EnvConfig):
             "camera_fovy_deg": self.camera_fovy_deg,
             "horizon_scale": self.horizon_scale,
             "wrist": self.wrist,
+            "actions": self.actions,
         }
 
     def create_envs(

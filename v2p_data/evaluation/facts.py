@@ -10,16 +10,27 @@ from typing import Annotated, Any
 
 from annotated_types import Gt
 from pydantic import ConfigDict, TypeAdapter, ValidationError
+from safetensors.numpy import load_file
 
 from v2p_data.episodes.dataset.features import ACTION_KEY, METADATA_FILE, STATE_KEY
 from v2p_data.errors import V2PError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import read_record, write_json_atomically
 from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.robot.action_names import (
+    DELTA_NAMES,
+    TOOL_NAMES,
+    Actions,
+    action_names,
+    actions_named,
+)
+from v2p_data.sim.robot.robot import TARGET_LOW_M
 from v2p_data.task.task import TASK_FILE
 
 FACTS_FILE = "v2p.json"
 TASKS_IN_DATASET = Path("v2p/tasks")
+NEAREST_M = TARGET_LOW_M[0] - 1e-3
+"""No target of the tool is nearer to the arm's base."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +82,28 @@ def facts_of_dataset(dataset: Path) -> Facts:
             f"the metadata of dataset {dataset} cannot be understood ({type(error).__name__}: {error}); check it with"
             " 'v2p verify'"
         ) from error
+
+
+def actions_of(policy: Path) -> tuple[Actions, int]:
+    """Return what a policy's actions say, and how many entries they have.
+
+    Its dataset's names tell. Where nothing knows them the shape tells of joints, and the statistics of the tool's targets:
+    all are in front of the arm, and no episode goes forward in every step.
+
+    Raises:
+        V2PError: its file is damaged.
+    """
+    does = _told(policy / "config.json").get("output_features") or {}
+    count = int(does.get(ACTION_KEY, {}).get("shape", [len(DELTA_NAMES)])[0])
+    if names := read_facts(policy).action:
+        return actions_named(names) or "delta_tool", count
+    if count == len(action_names("joints")):
+        return "joints", count
+    for path in policy.glob("policy_postprocessor*.safetensors"):
+        low = load_file(path).get(f"{ACTION_KEY}.min")
+        if low is not None and low.shape == (count,) == (len(TOOL_NAMES),) and low[0] > NEAREST_M:
+            return "absolute_tool", count
+    return "delta_tool", count
 
 
 def write_facts(policy: Path, dataset: Path) -> None:
