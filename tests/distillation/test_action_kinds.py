@@ -30,7 +30,7 @@ from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import StateActor
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.policy.training import POLICY_FOLDER, sources_of
-from v2p_data.sim.env import verdict
+from v2p_data.sim.env import ranges, verdict
 from v2p_data.sim.env.actions import steps_to
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.robot.action_names import DELTA_NAMES, action_names
