@@ -360,7 +360,7 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
         config=Seeded(config=replace(cfg.expert, warm_start=None), seed=cfg.seed),
         inputs={"task": task},
         sources=solved_digests(cfg.expert.warm_start) | named,
-        version=5,
+        version=6,
         on_device=True,
         make=partial(
             make_expert,

@@ -140,6 +140,20 @@ def test_inserted_means_carried_in_let_go_and_above_the_floor():
     assert not verdict("insert", [track(HERE, (0.5, 0.12, 0.02)), bowl_track()], BOX, BOWL)
 
 
+@pytest.mark.parametrize(("lift_m", "thick_m", "counts"), [
+    (0.028, 0.011, True), (0.018, 0.011, False), (0.028, 0.025, False), (0.035, 0.025, True),
+])  # fmt: skip
+def test_what_is_put_onto_something_low_needs_no_higher_lift(lift_m, thick_m, counts):
+    size = (0.12, 0.12, thick_m)
+    there = (0.5, 0.2, thick_m / 2)
+    put = track(HERE, (0.5, 0.2, thick_m + 0.02))
+    put.pos[5, 0, 2] = 0.02 + lift_m
+
+    coaster = thing("coaster", size=size, role="reference")
+    low = track(there, there, touched_before=False, size=size)
+    assert verdict("place_onto", [put, low], BOX, coaster) == counts
+
+
 def test_a_thing_lowered_into_a_bowl_was_not_thrown():
     assert not verdict("throw_into", [carried((0.5, 0.2, 0.03)), bowl_track()], BOX, BOWL)
     far = carried((0.5, 0.2, 0.03))

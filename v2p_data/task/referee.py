@@ -236,8 +236,8 @@ def _pushed_with(case: Case) -> Verdict:
     return by_tool & (case.thing.moved >= CLEAR_M) & _slid(case)
 
 
-def _put_down(case: Case) -> Verdict:
-    was_carried = case.highest_clearance() > SLIDES_M
+def _put_down(case: Case, lift_m: Float[np.ndarray, "env"] | float = SLIDES_M) -> Verdict:
+    was_carried = case.highest_clearance() > lift_m
     return was_carried & case.thing.is_free & case.thing.is_at_rest
 
 
@@ -281,7 +281,8 @@ def _placed_onto(case: Case) -> Verdict:
     low = case.lowest(case.thing)
     # A thing may sink a little into a bowl or a tray, but no deeper than the table.
     on_top = case.within() & (low < top + 0.015) & (low > -BELOW_M)
-    return on_top & (case.other.moved < STAYS_M) & _put_down(case)
+    lift_m = np.minimum(SLIDES_M, top + REST_M)  # onto a coaster nobody lifts a mug higher
+    return on_top & (case.other.moved < STAYS_M) & _put_down(case, lift_m)
 
 
 def _covered(case: Case) -> Verdict:
