@@ -272,7 +272,7 @@ def _demand_usable(film: _Film, name: str, cfg: VideoConfig) -> list[str]:
         share = film.combed_px / film.changed_px
         raise ItemRejectedError(
             "interlaced",
-            f"{name} is interlaced: every second row shows another moment, as {share:.0%} of what moves tells; make whole "
+            f"{name} is interlaced: every second row shows another moment in {share:.0%} of the picture that changes; make whole "
             f"pictures of it: ffmpeg -i {name} -vf bwdif whole.mp4",
             share,
         )
