@@ -98,7 +98,9 @@ def _row(stage: str, folder: Path, *, check: bool) -> Row | None:
 
 def _gathered(rows: Sequence[Row]) -> Iterator[Row]:
     """Yield the rows; of a stage with many, one for all that were made, and one for many that failed alike."""
-    stages = {stage: [row for row in rows if row[0] == stage] for stage, *_ in rows}
+    stages: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        stages[row[0]].append(row)
     for stage, of_stage in stages.items():
         if len(of_stage) <= MANY:
             yield from of_stage
