@@ -30,11 +30,10 @@ from typing import Any
 
 import numpy as np
 import tyro
-from scipy import stats
 
 from policies.evaluation.rate import Rate, wilson
 from policies.ppo.policy import Expert
-from studies.results import Row, append_result, letters_of, results_in
+from studies.results import Row, append_result, letters_of, mean_over_seeds, results_in
 from v2p_data.episodes.collect import judge_expert
 from v2p_data.experts.teacher import try_out
 from v2p_data.play import StateActor
@@ -47,7 +46,7 @@ from v2p_data.reward.candidate import (
 )
 from v2p_data.reward.config import RewardConfig
 from v2p_data.reward.jobs import REQUEST_FILE, Job, Jobs
-from v2p_data.reward.search import Found, How, search_reward
+from v2p_data.reward.search import Found, How, search_reward, standings
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.task.benchmark import load_benchmark
@@ -196,7 +195,7 @@ def compare_rounds(
     found = search_reward(bundle, cfg, place / "search", seed=seed, how=how, jobs=jobs)
     steps = _spent(found)
     first = [c for c in load_candidates(place / "search") if c.iteration == 0]
-    best = max(first, key=lambda c: (_standing(c, cfg), -c.number))
+    best = standings(first, cfg)[0].candidate
     first_steps = sum(_steps_of(c.training(), cfg) for c in first)
     policies: dict[str, tuple[Path, int]] = {
         "search": (found.policy, steps),
@@ -247,15 +246,10 @@ def differences(rows: list[Row]) -> str:
                 s for t, s, a in by_arm if (t, a) == (task, arm) and (task, s, "search") in by_arm
             )
             pairs = [(by_arm[task, s, "search"], by_arm[task, s, arm]) for s in seeds]
-            apart = np.array([a["success"] - b["success"] for a, b in pairs])
+            apart = [a["success"] - b["success"] for a, b in pairs]
             cost = np.mean([b["control_steps"] / a["control_steps"] for a, b in pairs])
-            interval = "-"
-            if len(apart) > 1:
-                half = stats.t.ppf(0.975, len(apart) - 1) * apart.std(ddof=1) / np.sqrt(len(apart))
-                interval = f"{apart.mean() - half:+.3f} to {apart.mean() + half:+.3f}"
-            lines.append(
-                f"| {task} | {arm} | {len(apart)} | {apart.mean():+.3f} | {interval} | {cost:.2f} |"
-            )
+            mean, interval = mean_over_seeds(apart)
+            lines.append(f"| {task} | {arm} | {len(apart)} | {mean} | {interval} | {cost:.2f} |")
     return "\n".join(lines)
 
 
@@ -270,12 +264,6 @@ def _steps_of(training: Training, cfg: RewardConfig) -> int:
 
 def _steps_per_mark(bundle: TaskBundle, cfg: RewardConfig) -> int:
     return round(cfg.steps * cfg.rungs[0]) + cfg.eval_worlds * bundle.horizon_steps
-
-
-def _standing(candidate: Candidate, cfg: RewardConfig) -> tuple[bool, float]:
-    """Return what the search ranks by: trained to the end first."""
-    training = candidate.training()
-    return training.done >= cfg.marks[-1], training.rank(cfg.evaluations)
 
 
 def _trained_on(best: Candidate, more: int, place: Path, jobs: Jobs) -> Training:

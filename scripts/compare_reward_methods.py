@@ -1,12 +1,14 @@
-"""Compare what V2P, Eureka, RoboGen and Code-as-Policies come to, offline: the table of `docs/rewards_table.md`.
+"""Compare what V2P, Eureka, RoboGen and Code-as-Policies come to, and V2P without one of its parts, offline: `docs/rewards_table.md`.
 
-Every method gets the same task, worlds, PPO recipe and control steps per candidate (`v2p_data/reward/methods.py` says in
-what they differ), and its final policy is judged by `v2p_data/task/referee.py`, which no training sees, on fresh episodes
+Every arm gets the same task, worlds, PPO recipe and control steps per candidate (`v2p_data/reward/methods.py` says in
+what they differ), and its policies are judged by `v2p_data/task/referee.py`, which no training sees, on fresh episodes
 at the fine time step. Candidates go on from a policy that a short imitation of a scripted program left half
 taught; with `--start nothing` they start as in the paper, which takes a hundred times the steps. Results are
 appended to a JSON-lines file: a stopped run goes on, `--table` prints what is there.
 
     python scripts/compare_reward_methods.py --out outputs/reward_methods
+
+`--arms` takes parts of V2P away, as in the paper's tables 3 and 7; `docs/lab/reward_parts.md` has the command.
 """
 
 import argparse
@@ -14,20 +16,22 @@ import json
 import shutil
 import time
 from collections import defaultdict
+from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
 from studies.programs import ProgramPolicy
-from studies.results import append_result, results_in
+from studies.results import append_result, mean_over_seeds, results_in
 from v2p_data.play import Actor, StateActor, View, play
-from v2p_data.reward.candidate import DONE_FILE
-from v2p_data.reward.config import RewardConfig
+from v2p_data.reward.candidate import DONE_FILE, load_candidates
+from v2p_data.reward.config import Part, RewardConfig
 from v2p_data.reward.jobs import Jobs
-from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward
+from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward, standings
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
@@ -36,21 +40,27 @@ from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 
 METHODS = ("v2p", "eureka", "robogen", "code_as_policy")
-TAUGHT_ROUNDS = {"lift_up": 2, "uncover": 2, "throw_into": 8}
-"""Rounds of imitation that leave something to be learned."""
+PARTS = tuple(f"without_{part}" for part in get_args(Part))
+FIRST_REWARDS = "first_rewards"
+"""As many rewards as a search has in all, all of them first ones, as the paper's 16 samples without later rounds."""
+ARMS = (*METHODS, *PARTS, FIRST_REWARDS)
 
 
 def main() -> None:
     """Read the command line, search, judge, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/reward_methods"))
     parser.add_argument("--tasks", nargs="*", default=["lift_up", "uncover", "throw_into"])
-    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=METHODS)
+    parser.add_argument(
+        "--taught-rounds", nargs="*", type=int, default=[2, 2, 8], help="of imitation, per task"
+    )
+    parser.add_argument("--arms", nargs="*", default=list(METHODS), choices=ARMS)
     parser.add_argument("--seeds", nargs="*", type=int, default=[0, 1, 2])
     parser.add_argument("--start", choices=["taught", "nothing"], default="taught")
     parser.add_argument("--iterations", type=int, default=2)
     parser.add_argument("--candidates", type=int, default=2)
     parser.add_argument("--steps", type=int, default=16_384, help="of one candidate")
+    parser.add_argument("--rungs", nargs="*", type=float, default=[0.5, 1.0])
     parser.add_argument("--num-envs", type=int, default=128)
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--workers", type=int, default=1)
@@ -60,39 +70,28 @@ def main() -> None:
     if not args.table:
         with Jobs(workers=args.workers) as jobs:
             for seed in args.seeds:
-                for task in args.tasks:
-                    for method in args.methods:
-                        if (task, method, seed) not in {_key(r) for r in results_in(args.out)}:
-                            _one(task, method, seed, args, jobs)
+                for task, rounds in zip(args.tasks, args.taught_rounds, strict=True):
+                    for arm in args.arms:
+                        if (task, arm, seed) not in {_key(r) for r in results_in(args.out)}:
+                            _one(task, rounds, arm, seed, args, jobs)
     print(table(results_in(args.out)))
 
 
-def _one(task: str, method: str, seed: int, args: argparse.Namespace, jobs: Jobs) -> None:
+def _one(
+    task: str, taught_rounds: int, arm: str, seed: int, args: argparse.Namespace, jobs: Jobs
+) -> None:
     bundle = load_benchmark(task)
     began = time.monotonic()
     found: dict[str, Any] = {}
     judge_seed = seed_for(seed, "method-judge", task)
-    if method == "code_as_policy":
-        successes = judge(bundle, ProgramPolicy(), args.episodes, judge_seed)
+    if arm == "code_as_policy":
+        by_round = [judge(bundle, ProgramPolicy(), args.episodes, judge_seed)]
     else:
-        cfg = RewardConfig(
-            method=method,
-            iterations=args.iterations,
-            candidates=args.candidates,
-            steps=args.steps,
-            rungs=(0.5, 1.0),
-            start=args.start,
-            taught_rounds=TAUGHT_ROUNDS.get(task, 3),
-            num_envs=args.num_envs,
-            eval_worlds=48,
-            evaluations=2,
-            target_success=0.99,
-            confirm_seeds=1,
-        )
-        out = args.out / f"{task}-{method}-{seed}"
+        cfg = config_of(arm, taught_rounds, args)
+        out = args.out / f"{task}-{arm}-{seed}"
         taught = args.out / f"{task}-v2p-{seed}" / TAUGHT_FOLDER
         if not (out / TAUGHT_FOLDER).exists() and (taught / DONE_FILE).is_file():
-            shutil.copytree(taught, out / TAUGHT_FOLDER)  # all methods start from the same policy
+            shutil.copytree(taught, out / TAUGHT_FOLDER)  # all arms start from the same policy
         result = search_reward(
             bundle,
             cfg,
@@ -102,20 +101,51 @@ def _one(task: str, method: str, seed: int, args: argparse.Namespace, jobs: Jobs
             jobs=jobs,
         )
         found = result.as_dict()
-        successes = judge(
-            bundle, StateActor(Expert.load(result.policy).act), args.episodes, judge_seed
-        )
+        policies = best_by_round(out, cfg)
+        actors = {p: StateActor(Expert.load(p).act) for p in policies}
+        judged = {p: judge(bundle, a, args.episodes, judge_seed) for p, a in actors.items()}
+        by_round = [judged[p] for p in policies]
     row = {
         "task": task,
-        "method": method,
+        "arm": arm,
         "seed": seed,
-        "successes": successes,
+        "successes": by_round[-1],
+        "by_round": by_round,
         "episodes": args.episodes,
         "seconds": round(time.monotonic() - began, 1),
         "found": found,
     }
     append_result(args.out, row)
     print(json.dumps({k: v for k, v in row.items() if k != "found"}), flush=True)
+
+
+def config_of(arm: str, taught_rounds: int, args: argparse.Namespace) -> RewardConfig:
+    """Return what an arm searches: the same for all but what it stands for."""
+    cfg = RewardConfig(
+        iterations=args.iterations,
+        candidates=args.candidates,
+        steps=args.steps,
+        rungs=tuple(args.rungs),
+        start=args.start,
+        taught_rounds=taught_rounds,
+        num_envs=args.num_envs,
+        eval_worlds=48,
+        evaluations=2,
+        target_success=0.99,
+        confirm_seeds=1,
+    )
+    if arm == FIRST_REWARDS:
+        return replace(cfg, iterations=1, candidates=cfg.iterations * cfg.candidates)
+    without = tuple(part for part in get_args(Part) if arm == f"without_{part}")
+    return replace(cfg, without=without, method="v2p" if without else arm)
+
+
+def best_by_round(out: Path, cfg: RewardConfig) -> list[Path]:
+    """Return the policy of the best candidate so far after each round of a search."""
+    candidates = load_candidates(out)
+    rounds = range(1 + max(c.iteration for c in candidates))
+    so_far = [standings([c for c in candidates if c.iteration <= k], cfg) for k in rounds]
+    return [ordered[0].candidate.policy_folder() for ordered in so_far]
 
 
 def judge(bundle: TaskBundle, actor: Actor, episodes: int, seed: int) -> int:
@@ -132,38 +162,45 @@ def judge(bundle: TaskBundle, actor: Actor, episodes: int, seed: int) -> int:
 
 
 def _key(result: dict[str, Any]) -> tuple[str, str, int]:
-    return result["task"], result["method"], result["seed"]
+    return result["task"], result["arm"], result["seed"]
 
 
 def table(results: list[dict[str, Any]]) -> str:
-    """Return one Markdown row per task and method: success over all seeds with its interval, and what it took."""
+    """Return one Markdown row per task and arm: success over all seeds with its interval, by round, and what it took."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for result in results:
-        groups[result["task"], result["method"]].append(result)
-    tasks = list(dict.fromkeys(r["task"] for r in results))
+        groups[result["task"], result["arm"]].append(result)
     lines = [
-        "| task | method | success (referee) | 95 % interval | per seed | training says | control steps | s per seed |",
-        "|---|---|---|---|---|---|---|---|",
+        "| task | arm | success (referee) | 95 % interval | per seed | after each round | training says | less than v2p, paired (95 %) | control steps | s per seed |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for task in tasks:
-        for method in METHODS:
-            group = groups.get((task, method), [])
-            if group:
-                lines.append(_row(task, method, group))
+    for task in dict.fromkeys(r["task"] for r in results):
+        whole = {r["seed"]: r["successes"] / r["episodes"] for r in groups[task, "v2p"]}
+        lines += [_row(task, arm, group, whole) for arm in ARMS if (group := groups[task, arm])]
     return "\n".join(lines)
 
 
-def _row(task: str, method: str, group: list[dict[str, Any]]) -> str:
+def _row(task: str, arm: str, group: list[dict[str, Any]], whole: dict[int, float]) -> str:
     rate = wilson(sum(r["successes"] for r in group), sum(r["episodes"] for r in group))
-    seeds = " ".join(f"{r['successes'] / r['episodes']:.2f}" for r in group)
+    rates = {r["seed"]: r["successes"] / r["episodes"] for r in group}
+    rounds = zip_longest(*(r["by_round"] for r in group))
+    # A search that reached its target has no further rounds: its last policy stays the best so far.
+    means = [
+        np.mean([r["successes"] if s is None else s for r, s in zip(group, k, strict=True)])
+        for k in rounds
+    ]
+    by_round = " ".join(f"{m / group[0]['episodes']:.2f}" for m in means)
     found = [r["found"] for r in group if r["found"]]
     says = " ".join(f"{f['success']:.2f}" for f in found) or "-"
+    less = "-"
+    if arm != "v2p" and (pairs := whole.keys() & rates.keys()):
+        less = "{} ({})".format(*mean_over_seeds(whole[s] - rates[s] for s in sorted(pairs)))
     steps = [f["trained_steps"] + f["evaluated_steps"] + f["taught_steps"] for f in found]
     taken = f"{np.mean(steps) / 1000:.0f} k" if steps else "0"
     seconds = np.mean([r["seconds"] for r in group])
     return (
-        f"| {task} | {method} | {rate.value:.2f} | {rate.low:.2f}-{rate.high:.2f} | {seeds} | {says} | "
-        f"{taken} | {seconds:.0f} |"
+        f"| {task} | {arm} | {rate.value:.2f} | {rate.low:.2f}-{rate.high:.2f} | "
+        f"{' '.join(f'{r:.2f}' for r in rates.values())} | {by_round} | {says} | {less} | {taken} | {seconds:.0f} |"
     )
 
 

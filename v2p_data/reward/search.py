@@ -333,19 +333,14 @@ class _Search:
     # -- who is where
 
     def _standings(self, rounds: Sequence[Sequence[Candidate]]) -> list["Standing"]:
-        """Return the candidates of some rounds that trained, the best one first: to the end before stopped ones."""
-        standings = [
-            Standing(candidate=c, training=c.training(), cfg=self.cfg) for r in rounds for c in r
-        ]
-        trained = [s for s in standings if s.training.fault is None and s.training.evaluations]
-        return sorted(trained, key=lambda s: (not s.is_finished, -s.rank, s.candidate.number))
+        return standings([c for r in rounds for c in r], self.cfg)
 
     def _elites(self) -> list["Standing"]:
         return self._standings(self.rounds)[: self.cfg.elites]
 
     def _best(self) -> "Standing":
-        standings = self._standings(self.rounds)
-        if not standings:
+        ordered = self._standings(self.rounds)
+        if not ordered:
             reasons = [
                 f"{c.number}: {t.fault.kind}, {t.fault.reason}"
                 for c in self.rounds[-1]
@@ -355,7 +350,7 @@ class _Search:
                 f"none of {len(self.rounds[-1])} candidates in {self.out} could be trained; "
                 + "; ".join(reasons[:3])
             )
-        return standings[0]
+        return ordered[0]
 
     def _found(self, best: Candidate, per_seed: tuple[float, ...], stopped_by: str) -> Found:
         trained = evaluated = 0
@@ -426,6 +421,13 @@ class Standing:
     @property
     def success(self) -> float:
         return self.training.success(self.cfg.evaluations)
+
+
+def standings(candidates: Sequence[Candidate], cfg: RewardConfig) -> list[Standing]:
+    """Return the candidates that trained, the best one first: those trained to the end before those that were stopped."""
+    found = [Standing(candidate=c, training=c.training(), cfg=cfg) for c in candidates]
+    trained = [s for s in found if s.training.fault is None and s.training.evaluations]
+    return sorted(trained, key=lambda s: (not s.is_finished, -s.rank, s.candidate.number))
 
 
 def candidate_row(candidate: Candidate, cfg: RewardConfig) -> dict[str, Any]:
