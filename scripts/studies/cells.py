@@ -52,6 +52,7 @@ from .objects import (
     unseen_meshes,
     unseen_stage,
 )
+from .one_expert import one_expert_stage
 from .results import Row, letters_of
 from .stages import run_shown
 
@@ -294,6 +295,11 @@ class Study:
             reasons = Counter(rejected) + Counter(_why(s, outcomes) for s in bad)
             rejected = dict(reasons.most_common())
             demonstrations = [s for s in demonstrations if s not in bad]
+        if arm == "one_expert":
+            expert = one_expert_stage([s.inputs["task"] for s in demonstrations], pool)
+            learned = [episodes_stage(s.inputs["task"], expert, pool) for s in demonstrations]
+            outcomes = self.run(learned)
+            demonstrations = [s for s in learned if outcomes[s.folder_name].is_usable]
         trajectories = engine.episodes.num_episodes
         who = {"bc_cop": "cop"}.get(arm, arm if arm in WITH_COUSINS else source)
         repo = f"study/{who}_n{count}_s{seed}_t{trajectories}"
@@ -308,27 +314,29 @@ class Study:
             folder, of_dataset, engine, sources_of(folder, self.root) if distils else ()
         )
         of_policy = self.made(policy)
+        experts = {
+            e.folder_name: e for s in demonstrations if (e := s.inputs.get("expert")) is not None
+        }
         chains = {
             name: [record_of(stage.folder(self.root)) for stage in stages]
             for name, stages in {
                 "scene": [c.scene for c in found.candidates],
                 "task": [task.inputs["task"] for task in tasks],
-                "expert": [s.inputs["expert"] for s in demonstrations if "expert" in s.inputs]
-                or [c.expert for c in found.candidates],
+                "expert": list(experts.values()) or [c.expert for c in found.candidates],
                 "episodes": demonstrations,
             }.items()
         }
         single = {"dataset": of_dataset, "policy": of_policy} | {
             name: record_of(stage.folder(self.root)) for name, stage in policy.inputs.items()
         }
-        experts = [r.counts["success"]["rate"] for r in chains["expert"]]
+        rates = [r.counts["success"]["rate"] for r in chains["expert"]]
         return policy.folder(self.root) / POLICY_FOLDER, {
             "tasks": [task.item for task in tasks],
             "tried": found.tried,
             "rejected": rejected,
             "expert": {
-                "mean": round(float(np.mean(experts)), 4),
-                "least": round(min(experts), 4),
+                "mean": round(float(np.mean(rates)), 4),
+                "least": round(min(rates), 4),
             },
             "trajectories": trajectories,
             "episodes": of_dataset.counts["episodes"],

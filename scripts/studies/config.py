@@ -7,7 +7,16 @@ from v2p_data.policy.config import PolicyConfig
 from v2p_data.stages import CousinsConfig, EngineConfig
 
 Arm = Literal[
-    "videos", "fixed_total", "toys", "bc", "bc_cop", "paper", "cop", "cousins", "toys_cousins"
+    "videos",
+    "fixed_total",
+    "toys",
+    "bc",
+    "bc_cop",
+    "paper",
+    "cop",
+    "cousins",
+    "toys_cousins",
+    "one_expert",
 ]
 ARMS: dict[Arm, str] = {
     "videos": "objects from videos, distillation; data grow with N",
@@ -19,9 +28,10 @@ ARMS: dict[Arm, str] = {
     "cop": "Code-as-Policies with our primitives on the simulator's states; learns nothing, hence without N",
     "cousins": "objects from videos and stretched cousins of each, all labelled by the scripted program, distillation",
     "toys_cousins": "random toys and stretched cousins of each, all labelled by the scripted program, distillation",
+    "one_expert": "the same toys and cousins, all labelled by one network that imitation and PPO taught on all of them",
 }
 """What each arm trains on, and how."""
-WITH_COUSINS: tuple[Arm, ...] = ("cousins", "toys_cousins")
+WITH_COUSINS: tuple[Arm, ...] = ("cousins", "toys_cousins", "one_expert")
 Source = Literal["videos", "toys"]
 
 
@@ -173,4 +183,4 @@ class LiftingConfig:
 
 def source_of(arm: Arm) -> Source:
     """Return where an arm's training objects come from."""
-    return "toys" if arm in ("toys", "toys_cousins") else "videos"
+    return "toys" if arm in ("toys", "toys_cousins", "one_expert") else "videos"

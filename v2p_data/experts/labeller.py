@@ -8,6 +8,7 @@ from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import write_json_atomically
 
 if TYPE_CHECKING:  # they load torch and MuJoCo, and this file is read for listing too
+    from policies.ppo.policy import Expert
     from v2p_data.experts.learning import Worlds
     from v2p_data.experts.record import Learned
     from v2p_data.play import Actor
@@ -48,7 +49,14 @@ def labeller_of(folder: Path) -> "Actor":
     """Return who acts as the expert in a folder does: from any state, without memory."""
     from policies.ppo.policy import Expert
     from v2p_data.experts.actors import ProgramActor
+
+    if (name := program_in(folder)) is not None:
+        return ProgramActor(0, name)
+    return network_actor(Expert.load(folder))
+
+
+def network_actor(expert: "Expert") -> "Actor":
+    """Return an actor that sees what the expert was trained on: of several tasks, the base observation they begin with."""
     from v2p_data.play import StateActor
 
-    name = program_in(folder)
-    return StateActor(Expert.load(folder).act) if name is None else ProgramActor(0, name)
+    return StateActor(lambda obs: expert.act(obs[:, : expert.model.obs_dim]))

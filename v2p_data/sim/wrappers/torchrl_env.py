@@ -16,21 +16,25 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.wrappers.joined_worlds import JoinedWorlds
 
 if TYPE_CHECKING:
     from v2p_data.sim.env.warp_env import WarpBatchEnv
 
+ON_CPU = (BatchEnv, JoinedWorlds)
+"""Worlds of arrays; others take and give tensors on their device."""
+
 
 class TorchRLEnv(EnvBase):
-    """TorchRL's view of a `BatchEnv`, or of a `WarpBatchEnv`, whose device it has.
+    """TorchRL's view of a `BatchEnv`, of several as one, or of a `WarpBatchEnv`, whose device it has.
 
     Args:
         env: the worlds; `batch_size` is their number.
     """
 
-    def __init__(self, env: "BatchEnv | WarpBatchEnv") -> None:
+    def __init__(self, env: "BatchEnv | JoinedWorlds | WarpBatchEnv") -> None:
         n = env.num_envs
-        device = torch.device("cpu") if isinstance(env, BatchEnv) else env.device
+        device = torch.device("cpu") if isinstance(env, ON_CPU) else env.device
         super().__init__(device=device, batch_size=torch.Size([n]))
         self.worlds = env
         flag = Binary(1, torch.Size([n, 1]), dtype=torch.bool)
@@ -67,7 +71,7 @@ class TorchRLEnv(EnvBase):
         n = self.worlds.num_envs
         mask = None if tensordict is None else tensordict.get("_reset", None)
         ids = torch.arange(n) if mask is None else mask.reshape(n, -1).any(1).nonzero()[:, 0]
-        if isinstance(self.worlds, BatchEnv):
+        if isinstance(self.worlds, ON_CPU):
             self.worlds.reset(ids.numpy())
         else:
             self.worlds.reset(ids)
@@ -86,7 +90,7 @@ class TorchRLEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action").detach()
-        if isinstance(self.worlds, BatchEnv):
+        if isinstance(self.worlds, ON_CPU):
             result = self.worlds.step(action.numpy())
         else:
             result = self.worlds.step(action)
