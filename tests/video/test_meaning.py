@@ -27,7 +27,7 @@ REAL = [
     ("Putting red block into toy boat", "red block; toy boat", "insert", "red block", "toy boat: container"),
     ("Putting mug onto coaster and boxes into tray", "mug; coaster; tray", "place_onto", "mug", "coaster: reference; tray: container"),
     ("Lifting red cracker box up", "red cracker box", "lift_up", "red cracker box", ""),
-    ("Covering jar with red lid", "red lid; jar", "cover", "red lid", "jar: reference"),
+    ("Covering jar with red lid", "red lid; jar", "place_onto", "red lid", "jar: reference"),
     ("Putting bread into toaster", "bread; toaster", "insert", "bread", "toaster: container"),
     ("Uncovering green cup by lifting orange cup", "orange cup; green cup", "uncover", "orange cup", "green cup: reference"),
     ("Putting egg into orange pan", "egg; orange pan", "insert", "egg", "orange pan: container"),

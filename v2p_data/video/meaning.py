@@ -108,6 +108,7 @@ _OUTCOME = re.compile(
 """Where a caption begins to tell what came of it."""
 _BAD_OUTCOME = r"\bslight|\bfall|\bdrop|\bnot\b|n't\b|\bnothing\b"
 _LIDS = r"\b(?:lid|cover|cap|cloth|napkin|towel|top)(?: of .*)?$"
+_FLAT_LIDS = r"\b(?:lid|cap)$"
 _SURFACES = r"(?:flat |slanted )?(?:table|tabletop|desk|surface|floor|ground|counter|countertop|air|camera|side)$"
 _ARTICLES = r"^(?:a|an|the|some|his|her|its|my|your|their|one|another|of|again|slowly|gently|quickly|completely|carefully)\b"
 _PRONOUNS = {"", "it", "them", "everything"}
@@ -323,5 +324,7 @@ def _named(
     if manipulated not in objects and left:
         manipulated = left.pop(0)
     named.extend((unsaid, "reference") for unsaid in left)
+    if kind == "cover" and re.search(_FLAT_LIDS, manipulated):
+        kind = "place_onto"  # it rests on the rim: nothing fits into it, as into a cup that covers
     unnamed = "cover" if KINDS[kind].has_cover else _ANYTHING[0]
     return Meaning(kind=kind, manipulated=manipulated or unnamed, others=tuple(named))

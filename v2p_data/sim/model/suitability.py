@@ -137,11 +137,14 @@ def check_grasp(
     R = Rotation.from_quat(rest_quat, scalar_first=True).as_matrix()
     width = min(narrowest_m(points @ R.T) for points in corners)
     if width > opening_m - GRIP_MARGIN_M:
+        off = (
+            f" (its lengths may be off by {scene.scale_spread:.0%})" if scene.scale_spread else ""
+        )
         raise ItemRejectedError(
             "not_graspable",
             f"'{obj.name}' of scene '{scene.title}' is at least {width * 1000:.0f} mm wide from every side, and the "
-            f"gripper opens by {opening_m * 1000:.0f} mm; the task '{scene.kind}' must take hold of it: "
-            "is its size estimated too large?",
+            f"gripper opens by {opening_m * 1000:.0f} mm; the task '{scene.kind}' must take hold of it; if it "
+            f"is smaller in truth{off}, give its size_m in metres among the hints of the clip's caption",
             width,
         )
 
