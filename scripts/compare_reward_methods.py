@@ -28,9 +28,10 @@ from policies.ppo.policy import Expert
 from studies.programs import ProgramPolicy
 from studies.results import append_result, mean_over_seeds, results_in
 from v2p_data.play import Actor, StateActor, View, play
-from v2p_data.reward.candidate import DONE_FILE, load_candidates
+from v2p_data.reward.candidate import load_candidates
 from v2p_data.reward.config import Part, RewardConfig
 from v2p_data.reward.jobs import Jobs
+from v2p_data.reward.methods import writes_success
 from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward, standings
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env import ranges
@@ -90,8 +91,9 @@ def _one(
         cfg = config_of(arm, taught_rounds, args)
         out = args.out / f"{task}-{arm}-{seed}"
         taught = args.out / f"{task}-v2p-{seed}" / TAUGHT_FOLDER
-        if not (out / TAUGHT_FOLDER).exists() and (taught / DONE_FILE).is_file():
-            shutil.copytree(taught, out / TAUGHT_FOLDER)  # all arms start from the same policy
+        # All arms start from the same policy; where the code is written anew it may observe more, and is taught alike.
+        if not (writes_success(cfg) or (out / TAUGHT_FOLDER).exists()) and taught.is_dir():
+            shutil.copytree(taught, out / TAUGHT_FOLDER)
         result = search_reward(
             bundle,
             cfg,
