@@ -1,0 +1,133 @@
+"""An object that a hand brings: it is not on the table when the clip begins, and rests where the hand leaves it.
+
+Such a clip is seen backwards in time: there the object lies on the table first and is then carried off, as the network knows it. What it
+sees is turned back before anything follows from it.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from v2p_data.kinds import KINDS, Kind
+from v2p_data.scene.data_types import ObjectTrack
+from v2p_data.scene.frames.classes import MOVED
+from v2p_data.scene.frames.colour import (
+    histogram,
+    lab_distance,
+    lab_of,
+    shadow,
+    similarity,
+)
+from v2p_data.scene.frames.mask_ops import grow, iou, tidy
+from v2p_data.scene.frames.segmentation import Segmentation, hand_at, segment_clip
+from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.hint_masks import HintMask
+from v2p_data.scene.grounding.moved_by_change import Moved
+from v2p_data.scene.grounding.moved_by_network import find_brought_by_network
+from v2p_data.scene.grounding.tracking import carried
+from v2p_data.video.clip import Clip
+
+_PASSED_LAB = 12
+"""Distance in Lab between the first frame and the last still, from which a pixel shows something else."""
+_AS_LARGE, _AS_COLOURED = 0.3, 0.5
+"""Share of the object's outline, and similarity of colours, from which what vanished is the object itself."""
+_TOUCH_PX = 5
+"""Distance, in a picture 320 px wide, within which a hand holds something."""
+_AWAY = 0.2
+"""Overlap with its last outline, below which an object is still on its way."""
+
+
+def may_be_brought(kind: Kind) -> bool:
+    """Return whether the end alone says what a kind of task asks for: something is put down at another object."""
+    return KINDS[kind].is_put_down or kind == "push_next_to"
+
+
+def seen_backwards(clip: Clip, working: WorkingClip) -> Segmentation:
+    """Return what the network sees in the clip when it runs backwards, in the order of the clip."""
+    n = len(working.rgb)
+    backwards = replace(
+        working,
+        rgb=working.rgb[::-1],
+        lab=working.lab[::-1],
+        frame_idx=len(clip.frames) - 1 - working.frame_idx[::-1],
+        early=working.late,
+        late=working.early,
+    )
+    seen = segment_clip(replace(clip, frames=clip.frames[::-1]), backwards)
+    return replace(
+        seen,
+        idx=n - 1 - seen.idx[::-1],
+        shares=np.ascontiguousarray(seen.shares[::-1]),
+        early=seen.late,
+        late=seen.early,
+    )
+
+
+def find_brought(
+    working: WorkingClip, segmentation: Segmentation, phrase: str, mark: HintMask | None
+) -> Moved | None:
+    """Return the object where the hand leaves it, its first outline being empty.
+
+    None where nothing came to rest, or where what did lay elsewhere in the picture before.
+    """
+    given = None if mark is None else mark.mask
+    moved = find_brought_by_network(working, segmentation, phrase, given)
+    if moved is None or _lay_elsewhere(working, segmentation, moved.last):
+        return None
+    return moved
+
+
+def _lay_elsewhere(
+    working: WorkingClip, segmentation: Segmentation, last: Bool[np.ndarray, "h w"]
+) -> bool:
+    """Return whether something that looks like the object is seen at another place in the first frame, and no hand holds it."""
+    hand, here, bare = hand_at(segmentation, 0), working.lab[0], lab_of(working.late)
+    shaded = shadow(here, bare) | shadow(bare, here)
+    gone = (lab_distance(here, bare) > _PASSED_LAB) & ~shaded & ~hand
+    colours = histogram(working.late[last])
+
+    def is_it(place: Bool[np.ndarray, "h w"]) -> bool:
+        as_large = _AS_LARGE < place.sum() / last.sum() < 1 / _AS_LARGE
+        held = (grow(place, _TOUCH_PX) & hand).any()
+        look = histogram(working.rgb[0][place])
+        return bool(as_large and not held and similarity(look, colours) > _AS_COLOURED)
+
+    for changed in (segmentation.at(0)[MOVED] > 0.5, gone):
+        places = tidy(changed & ~grow(last, 3)).astype(np.uint8)
+        count, parts = cv2.connectedComponents(places)
+        if any(is_it(parts == k) for k in range(1, count)):
+            return True
+    return False
+
+
+def tracked_back(
+    thing: ObjectTrack,
+    working: WorkingClip,
+    segmentation: Segmentation,
+    moved: Moved,
+    every: int,
+) -> ObjectTrack:
+    """Return what was brought, followed from its last outline back into the hand as far as it is seen.
+
+    The track agrees as far as the network sees the same thing move on its way.
+    """
+    end = len(working.rgb) - 1
+    tracked = carried(
+        working, moved.last, end, every=every, moving=lambda i: segmentation.at(i)[MOVED]
+    )
+    on_its_way = [
+        iou(tracked.masks[i], segmentation.at(i)[MOVED] > 0.5)
+        for i in segmentation.idx.tolist()
+        if tracked.masks[i].any() and iou(tracked.masks[i], moved.last) < _AWAY
+    ]
+    return replace(
+        thing,
+        masks=tracked.masks,
+        quality=tracked.quality,
+        agreement=max(on_its_way, default=0.0),
+        moves=True,
+        at=end,
+        brought=True,
+    )
