@@ -54,7 +54,7 @@ def fit_both_ends(
     """
     options = fits_at_first(see, camera)
     if see.s.brought:
-        options = [_raised(fit, support, camera) for fit in options]
+        options = [raised(fit, support, camera) for fit in options]
     body = round_body(see.last_mask, see.last_hidden, see.s.noun)
     silhouette = Silhouette(*body, camera, see.last_image)
     found = [_fit_last(silhouette, see.s, plan, first, support, within) for first in options]
@@ -73,7 +73,7 @@ def fit_both_ends(
     )
 
 
-def _raised(fit: Fit, support: float, camera: Camera) -> Fit:
+def raised(fit: Fit, support: float, camera: Camera) -> Fit:
     """Return what covers the same pixels `support` above the table: smaller, and nearer to the camera."""
     nearer = 1 - support
     eye = camera.T_world_cam[:3, 3]

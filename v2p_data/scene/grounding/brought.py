@@ -20,7 +20,7 @@ from v2p_data.scene.frames.colour import (
     shadow,
     similarity,
 )
-from v2p_data.scene.frames.mask_ops import grow, iou, tidy
+from v2p_data.scene.frames.mask_ops import grow, solidity, tidy
 from v2p_data.scene.frames.segmentation import Segmentation, hand_at, segment_clip
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.hint_masks import HintMask
@@ -31,12 +31,12 @@ from v2p_data.video.clip import Clip
 
 _PASSED_LAB = 12
 """Distance in Lab between the first frame and the last still, from which a pixel shows something else."""
-_AS_LARGE, _AS_COLOURED = 0.3, 0.5
-"""Share of the object's outline, and similarity of colours, from which what vanished is the object itself."""
+_AS_LARGE, _AS_COLOURED = 0.3, 0.65
+"""Share of the object's outline, and similarity of colours, from which what is seen elsewhere is the object itself."""
+_SOLID = 0.6
+"""Share of its convex hull that a thing fills; edges of a person who sways fill less."""
 _TOUCH_PX = 5
 """Distance, in a picture 320 px wide, within which a hand holds something."""
-_AWAY = 0.2
-"""Overlap with its last outline, below which an object is still on its way."""
 
 
 def may_be_brought(kind: Kind) -> bool:
@@ -92,7 +92,8 @@ def _lay_elsewhere(
         as_large = _AS_LARGE < place.sum() / last.sum() < 1 / _AS_LARGE
         held = (grow(place, _TOUCH_PX) & hand).any()
         look = histogram(working.rgb[0][place])
-        return bool(as_large and not held and similarity(look, colours) > _AS_COLOURED)
+        alike = similarity(look, colours) > _AS_COLOURED
+        return bool(as_large and not held and alike and solidity(place) > _SOLID)
 
     for changed in (segmentation.at(0)[MOVED] > 0.5, gone):
         places = tidy(changed & ~grow(last, 3)).astype(np.uint8)
@@ -111,16 +112,18 @@ def tracked_back(
 ) -> ObjectTrack:
     """Return what was brought, followed from its last outline back into the hand as far as it is seen.
 
-    The track agrees as far as the network sees the same thing move on its way.
+    The track agrees as far as what the network sees move on its way there has the object's look.
     """
     end = len(working.rgb) - 1
     tracked = carried(
         working, moved.last, end, every=every, moving=lambda i: segmentation.at(i)[MOVED]
     )
+    arrived = grow(moved.last, 3)
     on_its_way = [
-        iou(tracked.masks[i], segmentation.at(i)[MOVED] > 0.5)
+        similarity(histogram(working.rgb[i][seen]), moved.colour_hist)
         for i in segmentation.idx.tolist()
-        if tracked.masks[i].any() and iou(tracked.masks[i], moved.last) < _AWAY
+        if (seen := (segmentation.at(i)[MOVED] > 0.5) & ~arrived).sum()
+        > _AS_LARGE * moved.last.sum()
     ]
     return replace(
         thing,
