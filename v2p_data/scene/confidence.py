@@ -27,10 +27,8 @@ _COLOURED = 0.25
 """Share of a thing's pixels that need its colour: few things are one colour all over."""
 _AWAY_PX = 4.0
 """An object so far from both its ends moves, in a picture 320 px wide."""
-_BROUGHT = 0.8
-"""Confidence in an object that a hand brings: only its end is seen at rest."""
 _OUT_OF_SIGHT = 0.8
-"""Confidence in an object that nobody sees at the end: in a bin, or in a fist."""
+"""Confidence in an object that nobody sees at one end: in a bin, in a fist, or on the table before a hand brings it."""
 _IN_THE_AIR = 0.6
 """Confidence in an object that does not rest on the table at first; it falls from 1 where half of what that needs is seen."""
 _GOOD, _LEAST_CUE = 0.95, 0.01
@@ -82,7 +80,7 @@ def _object_cues(
         yield _cue("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
         return
     if s.brought:
-        yield _cue("pose", f"{which} is brought, and seen at rest at the end alone", _BROUGHT)
+        yield _cue("pose", f"{which} is brought, and seen at rest at the end alone", _OUT_OF_SIGHT)
     covers = placed.last.iou / attainable_iou(placed.last_mask)
     value = max(0.1, 0.6 + (covers - 0.45) / 0.875)
     yield _cue("pose", f"outline of {which} at the end", value, box)
@@ -236,9 +234,10 @@ def check_motion(
         value, least = placement.upright_cost - placement.objects[0].last.cost, -0.03
         said = "fits the picture better tipped than upright"
     elif KINDS[kind].comes_near and several and grounded.objects[0].brought:
-        last = grounded.objects[0].last  # where it starts was chosen, and proves nothing
-        beside = grow(grounded.objects[1].first, round(float(np.sqrt(last.sum()))))
-        value, least, said = float(beside[last].mean()), 0.5, "ends beside the other"
+        # Where it starts was chosen, and proves nothing.
+        last, other = grounded.objects[0].last, grounded.objects[1].first
+        value = float(grow(other, round(float(np.sqrt(last.sum()))))[last].mean())
+        least, said = 0.5, "ends beside the other"
     elif KINDS[kind].comes_near and several and not grounded.objects[1].moves:
         gaps = [
             float(np.linalg.norm((T[:3, 3] - T_world_objs[1][0][:3, 3])[:2]))

@@ -27,7 +27,6 @@ from v2p_data.scene.fitting.noun_variants import with_noun_variants
 from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.fitting.start_place import with_start_place
 from v2p_data.scene.frames.prepare import PreparedClip, prepare
-from v2p_data.scene.grounding.brought import may_be_brought
 from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
 from v2p_data.scene.grounding.ground_objects import (
     ground_brought,
@@ -51,6 +50,8 @@ from v2p_data.video.meaning import Meaning
 
 _NOT_FOUND = ("object_not_found", "reference_not_found", "motion_contradicts_caption")
 """Rejections that a search in the mirror image may mend: the object is there, but something else was taken for it."""
+_MAY_BE_BROUGHT = ("place_onto", "insert", "cover", "drop_in_front_of", "push_next_to")
+"""Kinds of task whose end alone says what is asked for: something is put down at another object."""
 _NOT_SEEN_AT_FIRST = ("not_there_at_first", "low_confidence", *_NOT_FOUND)
 """Rejections of clips in which a hand may bring the object: the first says so, the others because something else was taken for it."""
 _SURE_AT_ONCE = 0.65
@@ -92,12 +93,16 @@ def reconstruct_prepared(
     try:
         return _reconstructed(prepared, meaning, cfg, rng)
     except ItemRejectedError as rejected:
-        if rejected.reason not in _NOT_SEEN_AT_FIRST or not _is_ours(cfg):
+        if not (
+            meaning.kind in _MAY_BE_BROUGHT
+            and rejected.reason in _NOT_SEEN_AT_FIRST
+            and _is_ours(cfg)
+        ):
             raise
-        scene = _with_what_is_brought(prepared, meaning, cfg, rng)
-        if scene is None:
-            raise
-        return scene
+        try:
+            return _with_what_is_brought(prepared, meaning, cfg, rng)
+        except ItemRejectedError:
+            raise rejected from None
 
 
 def _reconstructed(
@@ -128,17 +133,15 @@ def _reconstructed(
 
 def _with_what_is_brought(
     prepared: PreparedClip, meaning: Meaning, cfg: SceneConfig, rng: np.random.Generator
-) -> Reconstruction | None:
-    """Return the scene of a clip in which a hand brings the object; None where it shows none that is sure enough."""
-    if not may_be_brought(meaning.kind):
-        return None
-    try:
-        found = ground_brought(prepared.clip, prepared.working, meaning, cfg.min_found)
-        scene = None if found is None else _rebuilt(prepared, meaning, found, cfg, rng)
-        if scene is not None:
-            check_confidence(scene.cues, cfg.min_confidence)
-    except ItemRejectedError:
-        return None
+) -> Reconstruction:
+    """Return the scene of a clip in which a hand brings the object.
+
+    Raises:
+        ItemRejectedError: the clip does not show that surely enough.
+    """
+    found = ground_brought(prepared.clip, prepared.working, meaning, cfg.min_found)
+    scene = _rebuilt(prepared, meaning, found, cfg, rng)
+    check_confidence(scene.cues, cfg.min_confidence)
     return scene
 
 

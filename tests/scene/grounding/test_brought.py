@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.kinds import KINDS
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.frames.classes import HAND, MOVED
 from v2p_data.scene.frames.mask_ops import iou
-from v2p_data.scene.grounding.brought import find_brought, may_be_brought, seen_backwards
+from v2p_data.scene.frames.working_clip import working_clip_of
+from v2p_data.scene.grounding.brought import find_brought, seen_backwards
 from v2p_data.scene.grounding.moved_object import brought_object
 from v2p_data.scene.reconstruct import reconstruct
 from v2p_data.scene.scale.nouns import noun_for
@@ -54,19 +54,21 @@ def test_what_a_hand_brings_is_found_where_it_leaves_it(segmentation_of):
 def test_what_lay_elsewhere_before_is_not_brought(segmentation_of):
     working, segmentation = frames_of(segmentation_of, first=rectangle(60, 10))
 
-    assert find_brought(working, segmentation, "blue block", None) is None
+    with pytest.raises(ItemRejectedError, match="no hand brings"):
+        find_brought(working, segmentation, "blue block", None)
 
 
 def test_another_thing_that_vanishes_does_not_count(segmentation_of):
     green = frames_of(segmentation_of, first=rectangle(60, 10), look=(40, 160, 60))
 
-    assert find_brought(*green, "blue block", None) is not None
+    assert find_brought(*green, "blue block", None).last.any()
 
 
 def test_where_nothing_comes_to_rest_nothing_is_brought(segmentation_of):
     working, segmentation = segmentation_of([[(rectangle(0, 66), SKIN, HAND)]] * 12)
 
-    assert find_brought(working, segmentation, "blue block", None) is None
+    with pytest.raises(ItemRejectedError, match="no hand brings"):
+        find_brought(working, segmentation, "blue block", None)
 
 
 def test_its_track_ends_where_it_rests_and_agrees_with_what_the_hand_held(segmentation_of):
@@ -97,8 +99,6 @@ def test_its_track_ends_where_it_rests_and_agrees_with_what_the_hand_held(segmen
 
 def test_the_clip_run_backwards_is_turned_back(draw):
     clip = draw(num_frames=12)
-    from v2p_data.scene.frames.working_clip import working_clip_of
-
     working = working_clip_of(clip)
 
     seen = seen_backwards(clip, working)
@@ -110,12 +110,6 @@ def test_the_clip_run_backwards_is_turned_back(draw):
         np.argwhere(seen.early[MOVED] > 0.5).mean(0)[1]
         > 30 + (np.argwhere(seen.late[MOVED] > 0.5).mean(0)[1])
     )
-
-
-def test_only_kinds_that_put_something_down_may_begin_without_it():
-    assert {kind for kind in KINDS if may_be_brought(kind)} == {
-        *("place_onto", "insert", "drop_in_front_of", "cover", "push_next_to")
-    }
 
 
 def with_a_plate(clip):

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from v2p_data.kinds import KINDS, Kind
+from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.frames.classes import MOVED
 from v2p_data.scene.frames.colour import (
@@ -29,19 +29,12 @@ from v2p_data.scene.grounding.moved_by_network import find_brought_by_network
 from v2p_data.scene.grounding.tracking import carried
 from v2p_data.video.clip import Clip
 
-_PASSED_LAB = 12
-"""Distance in Lab between the first frame and the last still, from which a pixel shows something else."""
-_AS_LARGE, _AS_COLOURED = 0.3, 0.65
-"""Share of the object's outline, and similarity of colours, from which what is seen elsewhere is the object itself."""
-_SOLID = 0.6
-"""Share of its convex hull that a thing fills; edges of a person who sways fill less."""
-_TOUCH_PX = 5
-"""Distance, in a picture 320 px wide, within which a hand holds something."""
-
-
-def may_be_brought(kind: Kind) -> bool:
-    """Return whether the end alone says what a kind of task asks for: something is put down at another object."""
-    return KINDS[kind].is_put_down or kind == "push_next_to"
+_PASSED_LAB, _TOUCH_PX = 12, 5
+"""Distance in Lab between the first frame and the last still, from which a pixel shows something else; and distance in a picture 320 px
+wide, within which a hand holds something."""
+_AS_LARGE, _AS_COLOURED, _SOLID = 0.3, 0.65, 0.6
+"""Share of the object's outline, similarity of colours, and share of its convex hull that it fills, from which what is seen elsewhere is
+the object itself. Edges of a person who sways fill less."""
 
 
 def seen_backwards(clip: Clip, working: WorkingClip) -> Segmentation:
@@ -67,15 +60,19 @@ def seen_backwards(clip: Clip, working: WorkingClip) -> Segmentation:
 
 def find_brought(
     working: WorkingClip, segmentation: Segmentation, phrase: str, mark: HintMask | None
-) -> Moved | None:
+) -> Moved:
     """Return the object where the hand leaves it, its first outline being empty.
 
-    None where nothing came to rest, or where what did lay elsewhere in the picture before.
+    Raises:
+        ItemRejectedError: `object_not_found`, where nothing came to rest, or what did lay elsewhere in the picture before.
     """
-    given = None if mark is None else mark.mask
-    moved = find_brought_by_network(working, segmentation, phrase, given)
-    if moved is None or _lay_elsewhere(working, segmentation, moved.last):
-        return None
+    moved = find_brought_by_network(working, segmentation, phrase, mark and mark.mask)
+    if (
+        moved is None
+        or (mark is not None and not mark.at_end(working))
+        or _lay_elsewhere(working, segmentation, moved.last)
+    ):
+        raise ItemRejectedError("object_not_found", f"no hand brings '{phrase}'", None)
     return moved
 
 
@@ -84,22 +81,17 @@ def _lay_elsewhere(
 ) -> bool:
     """Return whether something that looks like the object is seen at another place in the first frame, and no hand holds it."""
     hand, here, bare = hand_at(segmentation, 0), working.lab[0], lab_of(working.late)
-    shaded = shadow(here, bare) | shadow(bare, here)
-    gone = (lab_distance(here, bare) > _PASSED_LAB) & ~shaded & ~hand
+    gone = (lab_distance(here, bare) > _PASSED_LAB) & ~hand
+    gone &= ~(shadow(here, bare) | shadow(bare, here))
     colours = histogram(working.late[last])
-
-    def is_it(place: Bool[np.ndarray, "h w"]) -> bool:
-        as_large = _AS_LARGE < place.sum() / last.sum() < 1 / _AS_LARGE
-        held = (grow(place, _TOUCH_PX) & hand).any()
-        look = histogram(working.rgb[0][place])
-        alike = similarity(look, colours) > _AS_COLOURED
-        return bool(as_large and not held and alike and solidity(place) > _SOLID)
-
     for changed in (segmentation.at(0)[MOVED] > 0.5, gone):
-        places = tidy(changed & ~grow(last, 3)).astype(np.uint8)
-        count, parts = cv2.connectedComponents(places)
-        if any(is_it(parts == k) for k in range(1, count)):
-            return True
+        count, parts = cv2.connectedComponents(tidy(changed & ~grow(last, 3)).astype(np.uint8))
+        for place in (parts == k for k in range(1, count)):
+            as_large = _AS_LARGE < place.sum() / last.sum() < 1 / _AS_LARGE
+            alike = similarity(histogram(working.rgb[0][place]), colours) > _AS_COLOURED
+            held = (grow(place, _TOUCH_PX) & hand).any()
+            if as_large and alike and not held and solidity(place) > _SOLID:
+                return True
     return False
 
 

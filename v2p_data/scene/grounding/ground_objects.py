@@ -135,25 +135,22 @@ def ground_brought(
     working: WorkingClip,
     meaning: Meaning,
     min_found: float,
-) -> GroundedObjects | None:
+) -> GroundedObjects:
     """Return the masks of all objects of a clip in which a hand brings the manipulated one.
 
-    None where nothing is brought, or not surely enough.
-
     Raises:
-        ItemRejectedError: `bad_hint` or `reference_not_found`.
+        ItemRejectedError: `bad_hint`, `object_not_found` or `reference_not_found`.
     """
     segmentation = with_marked_table(clip, working, seen_backwards(clip, working))
     working = _knowing_hand(working, segmentation)
     marked = hint_masks_of(clip, working, segmentation, {})
-    own = marked.get(meaning.manipulated)
-    if own is not None and not own.at_end(working):
-        return None
     thing = _unseen_object(clip, meaning.manipulated, "manipulated")
-    found = brought_object(thing, working, segmentation, own)
-    if found is None or found[0].sure < min_found:
-        return None
-    thing, moved = found
+    own = marked.get(meaning.manipulated)
+    thing, moved = brought_object(thing, working, segmentation, own)
+    if thing.sure < min_found:
+        raise ItemRejectedError(
+            "object_not_found", f"no hand surely brings '{thing.phrase}'", round(thing.sure, 3)
+        )
     table = find_table(working.always, table_seen(segmentation))
     scene = _Scene(clip, working, table, segmentation, meaning, moved, thing, min_found)
     others, warnings = _others(scene, marked, None)

@@ -194,9 +194,11 @@ def find_brought_by_network(
     if not stops:
         return None
     best = stops[0]
-    rivals = [blob.rating for blob in stops if not (blob.mask & best.mask).any()]
-    rivalry = float(1 / (1 + (max(rivals, default=0.0) / max(best.rating, 1e-6)) ** 2))
-    cues = {**{f"last {k}": v for k, v in best.parts.items()}, "no rival": rivalry}
+    rival = max((b.rating for b in stops if not (b.mask & best.mask).any()), default=0.0)
+    cues = {
+        **{f"last {k}": v for k, v in best.parts.items()},
+        "no rival": float(1 / (1 + (rival / max(best.rating, 1e-6)) ** 2)),
+    }
     return Moved(
         first=np.zeros_like(best.mask),
         last=best.mask,

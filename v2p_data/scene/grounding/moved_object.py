@@ -160,16 +160,18 @@ def _with_opinion(working: WorkingClip, phrase: str, moved: Moved, opinion: floa
 
 def brought_object(
     thing: ObjectTrack, working: WorkingClip, segmentation: Segmentation, mark: HintMask | None
-) -> tuple[ObjectTrack, Moved] | None:
-    """Return what a hand brings and leaves, with its outlines; None where nothing in the clip does that."""
+) -> tuple[ObjectTrack, Moved]:
+    """Return what a hand brings and leaves, with its outlines.
+
+    Raises:
+        ItemRejectedError: `object_not_found`, where nothing in the clip does that.
+    """
     moved = find_brought(working, segmentation, thing.phrase, mark)
-    if moved is None:
-        return None
     if mark is None:
         moved = _with_opinion(working, thing.phrase, moved, _NO_OPINION)
-    if mark is None and not moved.outlined:
-        bare = without_shadow(moved.last, segmentation.at(len(working.rgb) - 1))
-        moved = replace(moved, last=bare)
+        shares = segmentation.at(len(working.rgb) - 1)
+        last = moved.last if moved.outlined else without_shadow(moved.last, shares)
+        moved = replace(moved, last=last)
     sure, why = sureness_of(moved, segmentation, mark)
     thing = replace(thing, sure=sure, why=why, hinted=mark is not None)
     return tracked_back(thing, working, segmentation, moved, every_nth(working)), moved
