@@ -97,6 +97,7 @@ def reconstruct_prepared(
             meaning.kind in _MAY_BE_BROUGHT
             and rejected.reason in _NOT_SEEN_AT_FIRST
             and _is_ours(cfg)
+            and not cfg.pose.worker  # it would pose what is not there yet
         ):
             raise
         try:
