@@ -59,9 +59,9 @@ def test_what_lay_elsewhere_before_is_not_brought(segmentation_of):
 
 
 def test_another_thing_that_vanishes_does_not_count(segmentation_of):
-    green = frames_of(segmentation_of, first=rectangle(60, 10), look=(40, 160, 60))
+    working, segmentation = frames_of(segmentation_of, first=rectangle(60, 10), look=(40, 160, 60))
 
-    assert find_brought(*green, "blue block", None).last.any()
+    assert find_brought(working, segmentation, "blue block", None).last.any()
 
 
 def test_where_nothing_comes_to_rest_nothing_is_brought(segmentation_of):
