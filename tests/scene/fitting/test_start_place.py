@@ -90,7 +90,7 @@ def scene(segmentation_of):
 
 
 def test_it_starts_on_the_table_clear_of_its_goal_where_the_hand_came_from(scene):
-    started = with_start_place(*scene, "place_onto").objects[0]
+    started = with_start_place(scene[0], scene[1], "place_onto").objects[0]
 
     x, y, z = started.first.T_world_obj[:3, 3]
     assert z == pytest.approx(0.04)
@@ -154,4 +154,4 @@ def test_what_is_raised_covers_the_same_pixels_and_is_smaller():
         CAMERA.project(outline_points("box", fit.size) + fit.T_world_obj[:3, 3])
         for fit in (low, high)
     ]
-    np.testing.assert_allclose(*pixels, atol=1e-6)
+    np.testing.assert_allclose(pixels[0], pixels[1], atol=1e-6)
