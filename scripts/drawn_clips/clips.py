@@ -168,6 +168,8 @@ def random_spec(
     rng: np.random.Generator,
     others: int | None = None,
     beside: VideoSpec | None = None,
+    *,
+    brings: bool = False,
 ) -> VideoSpec:
     """Return a clip of this kind with everything else drawn at random.
 
@@ -178,6 +180,7 @@ def random_spec(
         others: things that stand around, at most; 0 to 4 by chance where None.
         beside: a clip of the same folder: the same person filmed this one too, in the same room with the same camera on the same stand,
             and things lie anywhere on the table that it sees.
+        brings: whether the hand comes with the thing that it puts down; of kinds in which a thing is carried.
 
     Raises:
         ValueError: no camera sees all of what was drawn, or that one does not.
@@ -192,7 +195,7 @@ def random_spec(
             )
         except ValueError:  # nothing of the drawn size fits the part: another cast
             continue
-        timing = _random_timing(rng, kind)
+        timing = replace(_random_timing(rng, kind), brings=brings)
         fps = int(rng.choice([12, 15, 24, 30], p=[0.15, 0.1, 0.35, 0.4]))
         spec = VideoSpec(
             name=name, story=story, hand=hand, timing=timing,
@@ -394,13 +397,10 @@ def _hide_m(motion: Motion, spec: VideoSpec, camera: Camera) -> float | None:
     worst = 0.0
     for i in (0, len(motion.gesture) - 1):
         points = _hand_points(motion, spec.hand, i)
-        if spec.kind == "push_with":
-            points = np.concatenate(
-                [
-                    points,
-                    apply(motion.T_world_things[1, i], _corners(spec.story.actors[1].extents_m)),
-                ]
-            )
+        held = [1] * (spec.kind == "push_with") + [0] * (spec.timing.brings and i == 0)
+        for k in held:
+            corners = _corners(spec.story.actors[k].extents_m)
+            points = np.concatenate([points, apply(motion.T_world_things[k, i], corners)])
         far = next(
             (d for d in np.arange(0.1, 1.9, 0.05) if not _seen(points + d * away, camera, 8.0)),
             None,

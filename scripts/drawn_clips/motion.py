@@ -27,6 +27,8 @@ class Timing:
     """Whether the hand prefers to reach around a thing rather than down on it."""
     push: str = "palm"
     """`palm` or `fingers`."""
+    brings: bool = False
+    """Whether the hand comes with the thing that it puts down, which never stood on the table before."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +79,8 @@ def animate(
     offset = (hide_m * ((1 - comes) + goes))[:, None] * arm + aside
     if story.kind == "push_with":  # the tool comes and goes in the hand
         things[1, :, :3, 3] += offset
+    if timing.brings:
+        things[0, :, :3, 3] += (hide_m * (1 - comes))[:, None] * arm
     anchors = anchors.copy()
     anchors[:, :3, 3] += offset
     hands = anchors @ T_anchor_hands[gesture]
@@ -105,6 +109,7 @@ def _carry(story, hand, timing, t, seconds, things, arm):  # noqa: ANN001, ANN20
     )
     across = ease(t, a0 + 0.22 * span, a1 - 0.22 * span)
     up, down = ease(t, a0, a0 + 0.4 * span), ease(t, a1 - 0.35 * span, a1)
+    up = np.ones(len(t)) if timing.brings else up
     turn = a.yaw_rad + story.turn_rad * across
     xy = np.array(a.xy_m) + across[:, None] * (np.array(story.target_xy_m) - a.xy_m)
     above = anchor0[2, 3] - (
@@ -155,13 +160,14 @@ def _carry(story, hand, timing, t, seconds, things, arm):  # noqa: ANN001, ANN20
         things[0, -1] = things[0, -2] = target if not (False) else track[-1]
     anchors = held @ hold.T_obj_anchor
     gestures = tuple(grip(min(hold.width_m + extra, 0.105)) for extra in (0.0, 0.014, 0.03))
-    closed = ease(t, *timing.close) - (ease(t, a1 + 0.01, a1 + 0.05) if released.any() else 0)
+    closed = np.ones(len(t)) if timing.brings else ease(t, *timing.close)
+    closed = closed - (ease(t, a1 + 0.01, a1 + 0.05) if released.any() else 0)
     gesture = np.where(closed > 0.8, 0, np.where(closed > 0.35, 1, 2))
     if timing.starts_in_view and not released[0]:
         gesture = np.where(t < timing.close[1], np.minimum(gesture, 1), gesture)
     fingers = anchor0[:3, 0]
     back = np.maximum(1 - ease(t, timing.come[1] - 0.08, timing.close[0]), 0.0)
-    if timing.starts_in_view:
+    if timing.starts_in_view or timing.brings:
         back = 0 * back
     back = back + (ease(t, a1 + 0.05, a1 + 0.14) if released.any() else 0)
     away = -fingers + (0.0 if fingers[2] < -0.5 else 0.15) * UP

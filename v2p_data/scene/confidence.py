@@ -4,6 +4,7 @@ A scene's confidence is the product of its cues; each cue belongs to one stage, 
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -27,7 +28,7 @@ _COLOURED = 0.25
 _AWAY_PX = 4.0
 """An object so far from both its ends moves, in a picture 320 px wide."""
 _OUT_OF_SIGHT = 0.8
-"""Confidence in an object that nobody sees at the end: in a bin, or in a fist."""
+"""Confidence in an object that nobody sees at one end: in a bin, in a fist, or on the table before a hand brings it."""
 _IN_THE_AIR = 0.6
 """Confidence in an object that does not rest on the table at first; it falls from 1 where half of what that needs is seen."""
 _GOOD, _LEAST_CUE = 0.95, 0.01
@@ -78,6 +79,8 @@ def _object_cues(
     if s.hidden_in_container or placed.hidden_in_hand:
         yield _cue("pose", f"{which} is out of sight at the end", _OUT_OF_SIGHT)
         return
+    if s.brought:
+        yield _cue("pose", f"{which} is brought, and seen at rest at the end alone", _OUT_OF_SIGHT)
     covers = placed.last.iou / attainable_iou(placed.last_mask)
     value = max(0.1, 0.6 + (covers - 0.45) / 0.875)
     yield _cue("pose", f"outline of {which} at the end", value, box)
@@ -97,12 +100,13 @@ def _scene_cues(grounded: GroundedObjects, placement: Placement, kind: Kind) -> 
         height_plausibility(placement.height_m),
         "measure the camera's height and give --scene.camera-height-m",
     )
-    on_table = _seen_on_table(grounded)
+    # What is brought may come to rest on something else than the table.
+    on_table = 1.0 if thing.brought and KINDS[kind].touches else _seen_on_table(grounded)
     if on_table < 1:
         on_table = max(0.0, 2 * on_table - 1)
         yield _cue(
             "grounding",
-            "standing on the table at first",
+            f"standing on the table at {'the end' if thing.brought else 'first'}",
             _IN_THE_AIR + (1 - _IN_THE_AIR) * on_table,
             f"begin the clip while '{thing.phrase}' stands on the table, or mark the table",
         )
@@ -134,11 +138,12 @@ def _touched_share(grounded: GroundedObjects) -> float | None:
 
 
 def _seen_on_table(grounded: GroundedObjects) -> float:
-    """Return how far the manipulated object is seen to rest on the table at first, 0 to 1."""
+    """Return how far the manipulated object is seen to rest on the table at first, or at the end where a hand brings it, 0 to 1."""
     gap_px = {} if grounded.working.outliner is None else {"gap_px": EXACT_GAP_PX}
-    return seen_on_table(
-        grounded.table, grounded.objects[0].first, grounded.segmentation, **gap_px
-    )
+    thing, seen = grounded.objects[0], grounded.segmentation
+    if thing.brought and seen is not None:
+        seen = replace(seen, early=seen.late)
+    return seen_on_table(grounded.table, thing.first, seen, **gap_px)
 
 
 def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:
@@ -228,6 +233,11 @@ def check_motion(
     elif kind == "tip_over":
         value, least = placement.upright_cost - placement.objects[0].last.cost, -0.03
         said = "fits the picture better tipped than upright"
+    elif KINDS[kind].comes_near and several and grounded.objects[0].brought:
+        # Where it starts was chosen, and proves nothing.
+        last, other = grounded.objects[0].last, grounded.objects[1].first
+        value = float(grow(other, round(float(np.sqrt(last.sum()))))[last].mean())
+        least, said = 0.5, "ends beside the other"
     elif KINDS[kind].comes_near and several and not grounded.objects[1].moves:
         gaps = [
             float(np.linalg.norm((T[:3, 3] - T_world_objs[1][0][:3, 3])[:2]))

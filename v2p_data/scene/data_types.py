@@ -48,6 +48,8 @@ class ObjectTrack:
     """Whether it was last seen going into what hides it at the end; the masks from then on repeat the last one seen."""
     in_hand: bool = False
     """Whether a hand brings it and takes it away: it never rests on the table."""
+    brought: bool = False
+    """Whether a hand brings it and leaves it: only its end is seen at rest."""
 
     @property
     def first(self) -> Bool[np.ndarray, "h w"]:

@@ -1,7 +1,8 @@
 """The order of steps from a clip to a scene.
 
 Frames, then grounding, then camera and poses in camera heights, then meshes in metres, then how sure all of it is. Where that is
-not sure, the objects are searched once more in the clip's mirror image, and the surer scene is kept.
+not sure, the objects are searched once more in the clip's mirror image, and the surer scene is kept. What is turned away all the same
+may show a hand that brings the object: then its end is searched alone.
 """
 
 from dataclasses import replace
@@ -24,9 +25,14 @@ from v2p_data.scene.fitting.camera_guess import camera_guess
 from v2p_data.scene.fitting.metric import clip_camera
 from v2p_data.scene.fitting.noun_variants import with_noun_variants
 from v2p_data.scene.fitting.placement import place
+from v2p_data.scene.fitting.start_place import with_start_place
 from v2p_data.scene.frames.prepare import PreparedClip, prepare
 from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
-from v2p_data.scene.grounding.ground_objects import ground_objects, without_asides
+from v2p_data.scene.grounding.ground_objects import (
+    ground_brought,
+    ground_objects,
+    without_asides,
+)
 from v2p_data.scene.grounding.hands_by_model import track_hands
 from v2p_data.scene.grounding.mirror_image import (
     as_filmed,
@@ -44,6 +50,10 @@ from v2p_data.video.meaning import Meaning
 
 _NOT_FOUND = ("object_not_found", "reference_not_found", "motion_contradicts_caption")
 """Rejections that a search in the mirror image may mend: the object is there, but something else was taken for it."""
+_MAY_BE_BROUGHT = ("place_onto", "insert", "cover", "drop_in_front_of", "push_next_to")
+"""Kinds of task whose end alone says what is asked for: something is put down at another object."""
+_NOT_SEEN_AT_FIRST = ("not_there_at_first", "low_confidence", *_NOT_FOUND)
+"""Rejections of clips in which a hand may bring the object: the first says so, the others because something else was taken for it."""
 _SURE_AT_ONCE = 0.65
 """Confidence from which the first search is taken as it is."""
 
@@ -80,6 +90,26 @@ def reconstruct_prepared(
     """Return the scene that a prepared clip shows, as `reconstruct` does of the clip."""
     cfg = with_preset(cfg)
     meaning = parse_caption(prepared.clip.caption, prepared.clip.objects)
+    try:
+        return _reconstructed(prepared, meaning, cfg, rng)
+    except ItemRejectedError as rejected:
+        if not (
+            meaning.kind in _MAY_BE_BROUGHT
+            and rejected.reason in _NOT_SEEN_AT_FIRST
+            and _is_ours(cfg)
+            and not cfg.pose.worker  # it would pose what is not there yet
+        ):
+            raise
+        try:
+            return _with_what_is_brought(prepared, meaning, cfg, rng)
+        except ItemRejectedError:
+            raise rejected from None
+
+
+def _reconstructed(
+    prepared: PreparedClip, meaning: Meaning, cfg: SceneConfig, rng: np.random.Generator
+) -> Reconstruction:
+    """Return the scene of a clip whose objects are all there at first."""
     scene, error = None, None
     try:
         scene = _rebuilt(prepared, meaning, _grounded(prepared, meaning, cfg), cfg, rng)
@@ -102,10 +132,28 @@ def reconstruct_prepared(
     return scene
 
 
+def _with_what_is_brought(
+    prepared: PreparedClip, meaning: Meaning, cfg: SceneConfig, rng: np.random.Generator
+) -> Reconstruction:
+    """Return the scene of a clip in which a hand brings the object.
+
+    Raises:
+        ItemRejectedError: the clip does not show that surely enough.
+    """
+    found = ground_brought(prepared.clip, prepared.working, meaning, cfg.min_found)
+    scene = _rebuilt(prepared, meaning, found, cfg, rng)
+    check_confidence(scene.cues, cfg.min_confidence)
+    return scene
+
+
 def _may_search_again(prepared: PreparedClip, cfg: SceneConfig) -> bool:
     """Return whether a search in the mirror image can find something else: with our network, and where nobody marked anything."""
-    ours = cfg.ground.backend == "network" and cfg.segment.backend == "flow"
-    return ours and not has_marks(prepared.clip)
+    return _is_ours(cfg) and not has_marks(prepared.clip)
+
+
+def _is_ours(cfg: SceneConfig) -> bool:
+    """Return whether our network searches the objects, and nothing else follows them."""
+    return cfg.ground.backend == "network" and cfg.segment.backend == "flow"
 
 
 def _is_unsure(scene: Reconstruction, cfg: SceneConfig) -> bool:
@@ -138,7 +186,8 @@ def _rebuilt(
     if cfg.depth.backend != "none":
         guess = camera_from_depth(clip, grounded.working, tracks, guess, cfg.depth, rng)
     placement = place(grounded.working, tracks, meaning.kind, guess, cfg.max_poses, segmentation)
-
+    if tracks[0].brought:
+        placement = with_start_place(grounded, placement, meaning.kind)
     placement, meshed = with_meshes(grounded, placement)
     objects = estimates_of(clip, grounded, placement, meshed, meaning.kind, cfg)
 

@@ -36,6 +36,12 @@ def remarks_on(
         out.append(
             f"nothing shows where '{phrase}' ends: it is taken to lie in the middle of '{goal}'"
         )
+    if grounded.objects[0].brought:
+        way_m = placement.height_m * (thing.T_world_objs[-1] - thing.T_world_objs[0])[:2, 3]
+        out.append(
+            f"a hand brings '{grounded.objects[0].phrase}': nothing shows it on the table at first; its first pose is a place that was chosen, "
+            f"{100 * np.linalg.norm(way_m):.0f} cm from where it ends"
+        )
     if held_at_first(grounded, placement):
         out.append(
             f"'{grounded.objects[0].phrase}' seems {np.expm1(thing.log_growth):.0%} larger at first than at the end, as if a hand held it in the "

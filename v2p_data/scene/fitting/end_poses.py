@@ -50,9 +50,11 @@ def fit_both_ends(
 ) -> EndPoses:
     """Return the pair of poses that costs least: one outline often fits a standing and a lying box alike, both ends seldom do.
 
-    The last pose is `support` above the table [camera heights], over the disc `within`.
+    The last pose is `support` above the table [camera heights], over the disc `within`. Of what is brought there is the last outline alone.
     """
     options = fits_at_first(see, camera)
+    if see.s.brought:
+        options = [raised(fit, support, camera) for fit in options]
     body = round_body(see.last_mask, see.last_hidden, see.s.noun)
     silhouette = Silhouette(*body, camera, see.last_image)
     found = [_fit_last(silhouette, see.s, plan, first, support, within) for first in options]
@@ -69,6 +71,14 @@ def fit_both_ends(
         as_before=as_before,
         unseen=unseen and within is not None,
     )
+
+
+def raised(fit: Fit, support: float, camera: Camera) -> Fit:
+    """Return what covers the same pixels `support` above the table: smaller, and nearer to the camera."""
+    nearer = 1 - support
+    eye = camera.T_world_cam[:3, 3]
+    T = transform(fit.T_world_obj[:3, :3], eye + nearer * (fit.T_world_obj[:3, 3] - eye))
+    return replace(fit, size=three(nearer * np.array(fit.size)), T_world_obj=T)
 
 
 def fits_at_first(see: ObjectView, camera: Camera, *, thorough: bool = True) -> list[Fit]:

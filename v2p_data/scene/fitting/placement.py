@@ -130,7 +130,7 @@ def _manipulated(
     out = fit_both_ends(see, plan, camera, support, within)
     if plan.starts_on_other and 1 in fits and is_lid(see.s.noun):
         out = fit_lifted_off(see, out, fits[1].first, camera)
-    if plan.end == "on_table" and not out.unseen:
+    if plan.end == "on_table" and not out.unseen and not see.s.brought:
         out = replace(out, log_growth=log_growth(see, out, camera))
     return out
 

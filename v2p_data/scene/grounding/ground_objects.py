@@ -19,11 +19,13 @@ from v2p_data.scene.frames.mask_ops import bounding_box, grow
 from v2p_data.scene.frames.segmentation import Segmentation, hand_at, table_seen
 from v2p_data.scene.frames.table import Table, find_table
 from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.brought import seen_backwards
 from v2p_data.scene.grounding.held_tool import HeldTool, find_tool
 from v2p_data.scene.grounding.hint_masks import Box, HintMask, hint_masks_of
 from v2p_data.scene.grounding.marked_table import with_marked_table
 from v2p_data.scene.grounding.moved_by_change import Moved
 from v2p_data.scene.grounding.moved_object import (
+    brought_object,
     check_there_at_first,
     every_nth,
     find_moved_object,
@@ -121,6 +123,39 @@ def ground_objects(
         objects[0] = hidden_in_container(segmentation, objects[0], objects[1])
     return GroundedObjects(
         objects=tuple(objects),
+        working=working,
+        table=table,
+        segmentation=segmentation,
+        warnings=(*warnings, *not_known(working, meaning.phrases)),
+    )
+
+
+def ground_brought(
+    clip: Clip,
+    working: WorkingClip,
+    meaning: Meaning,
+    min_found: float,
+) -> GroundedObjects:
+    """Return the masks of all objects of a clip in which a hand brings the manipulated one.
+
+    Raises:
+        ItemRejectedError: `bad_hint`, `object_not_found` or `reference_not_found`.
+    """
+    segmentation = with_marked_table(clip, working, seen_backwards(clip, working))
+    working = _knowing_hand(working, segmentation)
+    marked = hint_masks_of(clip, working, segmentation, {})
+    thing = _unseen_object(clip, meaning.manipulated, "manipulated")
+    own = marked.get(meaning.manipulated)
+    thing, moved = brought_object(thing, working, segmentation, own)
+    if thing.sure < min_found:
+        raise ItemRejectedError(
+            "object_not_found", f"no hand surely brings '{thing.phrase}'", round(thing.sure, 3)
+        )
+    table = find_table(working.always, table_seen(segmentation))
+    scene = _Scene(clip, working, table, segmentation, meaning, moved, thing, min_found)
+    others, warnings = _others(scene, marked, None)
+    return GroundedObjects(
+        objects=(thing, *others),
         working=working,
         table=table,
         segmentation=segmentation,

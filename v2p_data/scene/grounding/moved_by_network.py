@@ -174,6 +174,41 @@ def find_moved_by_network(
     return _moved(pairs, best), _moved(pairs, second)
 
 
+def find_brought_by_network(
+    working: WorkingClip,
+    segmentation: Segmentation,
+    phrase: str,
+    given: Bool[np.ndarray, "h w"] | None = None,
+) -> Moved | None:
+    """Return what a hand brought and left, by its last outline alone; None where nothing came to rest.
+
+    Args:
+        working: frames.
+        segmentation: what the network sees.
+        phrase: what the caption calls it.
+        given: its last outline, where a person marked it.
+    """
+    stops = _ends(working, segmentation, phrase, len(working.rgb) - 1, given)
+    if handling := handling_in(working.hands, segmentation):
+        stops = _by_hand(stops, "put down by a hand", handling.put_at)
+    if not stops:
+        return None
+    best = stops[0]
+    rival = max((b.rating for b in stops if not (b.mask & best.mask).any()), default=0.0)
+    cues = {
+        **{f"last {k}": v for k, v in best.parts.items()},
+        "no rival": float(1 / (1 + (rival / max(best.rating, 1e-6)) ** 2)),
+    }
+    return Moved(
+        first=np.zeros_like(best.mask),
+        last=best.mask,
+        score=float(np.prod(list(cues.values()))),
+        colour_hist=best.hist,
+        cues=cues,
+        outlined=(1,) if best.outlined else (),
+    )
+
+
 def mask_of_mover(
     working: WorkingClip, segmentation: Segmentation, i: int, blob: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:

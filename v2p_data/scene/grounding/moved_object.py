@@ -13,6 +13,7 @@ from v2p_data.scene.frames.mask_ops import grow, largest
 from v2p_data.scene.frames.segmentation import LEAST_SHARE, Segmentation, share_at_first
 from v2p_data.scene.frames.table import Table
 from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.brought import find_brought, tracked_back
 from v2p_data.scene.grounding.hint_masks import HintMask
 from v2p_data.scene.grounding.moved_by_change import Moved, find_moved_by_change
 from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network, rated
@@ -150,10 +151,30 @@ def _agreed(
 
 def _with_opinion(working: WorkingClip, phrase: str, moved: Moved, opinion: float) -> Moved:
     """Return what was found with a second opinion, or with what a model that knows things by sight says, where that is higher."""
-    known = known_by_sight(working, phrase, {0: moved.first, -1: moved.last})
+    ends = {i: mask for i, mask in ((0, moved.first), (-1, moved.last)) if mask.any()}
+    known = known_by_sight(working, phrase, ends)
     opinion = max(opinion, known or 0.0)
     cues = {**moved.cues, "second opinion": opinion}
     return replace(moved, score=moved.score * opinion, cues=cues)
+
+
+def brought_object(
+    thing: ObjectTrack, working: WorkingClip, segmentation: Segmentation, mark: HintMask | None
+) -> tuple[ObjectTrack, Moved]:
+    """Return what a hand brings and leaves, with its outlines.
+
+    Raises:
+        ItemRejectedError: `object_not_found`, where nothing in the clip does that.
+    """
+    moved = find_brought(working, segmentation, thing.phrase, mark)
+    if mark is None:
+        moved = _with_opinion(working, thing.phrase, moved, _NO_OPINION)
+        shares = segmentation.at(len(working.rgb) - 1)
+        last = moved.last if moved.outlined else without_shadow(moved.last, shares)
+        moved = replace(moved, last=last)
+    sure, why = sureness_of(moved, segmentation, mark)
+    thing = replace(thing, sure=sure, why=why, hinted=mark is not None)
+    return tracked_back(thing, working, segmentation, moved, every_nth(working)), moved
 
 
 def sureness_of(
