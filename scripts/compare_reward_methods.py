@@ -67,6 +67,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--table", action="store_true", help="print the results so far and stop")
     args = parser.parse_args()
+    if len(args.tasks) != len(args.taught_rounds):
+        parser.error(f"--taught-rounds takes a number for each of {', '.join(args.tasks)}")
     args.out.mkdir(parents=True, exist_ok=True)
     if not args.table:
         with Jobs(workers=args.workers) as jobs:
