@@ -35,7 +35,6 @@ MOST_TASKS = 75
 """Tasks that it learns from, evenly spread over those of the cell: each has worlds, whose number must not be small."""
 HIDDEN = (256, 256)
 """Twice as wide as the network of one object."""
-PPO_STEPS = 700_000
 EXAM_EPISODES, COMPARE_EPISODES = 3, 8
 """Per task."""
 
@@ -89,12 +88,7 @@ def make_one_expert(
     bonus = expert.taught_bonus_factor
     ppo = train_expert(
         TorchRLEnv(JoinedWorlds(worlds("ppo", each, SimConfig(fine=True, bonus_ratio=bonus)))),
-        replace(
-            expert.ppo,
-            total_steps=PPO_STEPS,
-            max_seconds=float("inf"),
-            actor=replace(expert.ppo.actor, hidden=HIDDEN),
-        ),
+        replace(expert.ppo, actor=replace(expert.ppo.actor, hidden=HIDDEN)),
         out,
         seed=seed,
         warm_start=taught,

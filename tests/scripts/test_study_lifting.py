@@ -12,10 +12,12 @@ import trimesh
 
 from policies.evaluation.rate import wilson
 from policies.ppo.config import ImitationConfig, PPOConfig
+from policies.ppo.policy import Expert
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import EpisodesConfig
 from v2p_data.errors import V2PError
 from v2p_data.experts.config import ExpertConfig
+from v2p_data.experts.labeller import labeller_of
 from v2p_data.pipeline.at_work import Event
 from v2p_data.pipeline.runner import (
     Outcome,
@@ -26,16 +28,21 @@ from v2p_data.pipeline.runner import (
     stored_outcome,
 )
 from v2p_data.pipeline.settings import load_settings
+from v2p_data.play import View
 from v2p_data.policy.config import PolicyConfig
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.stages import (
     CousinsConfig,
     EngineConfig,
+    Seeded,
     episodes_stage,
     reward_stage,
     task_stage,
     with_cousins,
 )
+from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.generate import TaskConfig
+from v2p_data.task.task import BASE_OBSERVATION_DIM
 
 ROOT = Path(__file__).parents[2]
 
@@ -465,6 +472,35 @@ def in_this_process(parts, monkeypatch):
 
 
 @pytest.mark.slow
+def test_one_expert_learns_several_tasks_and_acts_in_each_whatever_its_code_adds(tmp_path, study):
+    del study  # its folder is where the module is found
+    one = importlib.import_module("studies.one_expert")
+    bundle = load_benchmark("lift_up")
+    folders = {name: tmp_path / name for name in ("small", "large")}
+    for folder in folders.values():
+        folder.mkdir()
+        bundle.save(folder)
+    cfg = ExpertConfig(
+        num_envs=16,
+        imitation=ImitationConfig(rounds=2, least_rounds=1, round_steps=4),
+        ppo=PPOConfig(
+            total_steps=512, window_episodes=4, min_window_episodes=2, num_deterministic=4
+        ),
+    )
+
+    counts = one.make_one_expert(
+        Seeded(config=cfg, seed=0), folders, tmp_path / "expert", Runtime(root=tmp_path)
+    )
+    env = BatchEnv(bundle, num_envs=3, seed=0, num_threads=1)
+
+    assert counts["tasks"] == 2
+    assert counts["kept"] in ("taught", "best", "last")
+    assert counts["successes"].keys() == {"program", "taught", "best", "last"}
+    assert counts["successes"]["program"] > 0.8
+    assert env.obs_dim >= Expert.load(tmp_path / "expert").model.obs_dim == BASE_OBSERVATION_DIM
+    assert labeller_of(tmp_path / "expert").act(View(env)).shape == (3, 7)
+
+
 @pytest.mark.long
 @pytest.mark.e2e
 def test_a_cell_learns_from_a_toy_and_is_judged_on_an_unseen_object_that_nothing_was_trained_on(

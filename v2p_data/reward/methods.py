@@ -11,7 +11,6 @@ Simulation is the same for all: only what the writer is told differs. Templates 
 
 import ast
 import shutil
-import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -19,12 +18,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from v2p_data.reward.config import RewardConfig
-from v2p_data.scene.files import copy_folder
-from v2p_data.scene.scene import SCENE_FILE, Scene, SceneObject
+from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.llm.config import VlmConfig
 from v2p_data.task.sandbox.sandbox import class_name
 from v2p_data.task.sandbox.splice import REWARD, reward_part, with_reward
-from v2p_data.task.task import TaskBundle
+from v2p_data.task.task import SCENE_FOLDER, TaskBundle
 from v2p_data.task.templates.variants import NUM_VARIANTS
 from v2p_data.task.templates.write import write_samples
 
@@ -177,15 +175,8 @@ def save_bundle(bundle: TaskBundle, folder: Path) -> None:
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    with tempfile.TemporaryDirectory(prefix="v2p-scene-") as place:
-        source, made = bundle.scene.folder, Path(place) / "scene"
-        if (source / SCENE_FILE).is_file():
-            copy_folder(
-                source, made, ignore=shutil.ignore_patterns("record.json", "*.mp4", "*.partial")
-            )
-        made.mkdir(exist_ok=True)
-        bundle.scene.save(made)
-        replace(bundle, scene=replace(bundle.scene, folder=made)).save(partial)
+    bundle.save(partial)
+    bundle.scene.save(partial / SCENE_FOLDER)  # as it is here, whatever its folder says
     partial.rename(folder)
 
 

@@ -170,11 +170,13 @@ class TaskBundle:
         """
         from v2p_data.task.robot_files import ROBOT_FOLDER, copy_robot
 
-        copy_folder(
-            self.scene.folder,
-            folder / SCENE_FOLDER,
-            ignore=shutil.ignore_patterns("record.json", "*.mp4", "*.partial"),
-        )
+        place = folder / SCENE_FOLDER
+        if (self.scene.folder / SCENE_FILE).is_file():
+            left_out = shutil.ignore_patterns("record.json", "*.mp4", "*.partial")
+            copy_folder(self.scene.folder, place, ignore=left_out)
+        else:  # it was never on disk, and a folder without a name is the one where the process runs
+            place.mkdir(parents=True)
+            self.scene.save(place)
         robot = self.robot
         if robot:
             main = copy_robot(Path(robot["path"]), folder / ROBOT_FOLDER)
