@@ -28,12 +28,12 @@ from policies.ppo.policy import Expert
 from studies.programs import ProgramPolicy
 from studies.results import append_result, mean_over_seeds, results_in
 from v2p_data.play import Actor, StateActor, View, play
-from v2p_data.reward.candidate import load_candidates
+from v2p_data.reward.candidate import DONE_FILE, TRAIN_FOLDER, load_candidates
 from v2p_data.reward.config import Part, RewardConfig
 from v2p_data.reward.jobs import Jobs
-from v2p_data.reward.methods import writes_success
+from v2p_data.reward.methods import prepare
 from v2p_data.reward.search import TAUGHT_FOLDER, How, search_reward, standings
-from v2p_data.seeds import seed_for
+from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.verdict import RefereeRecord
@@ -93,14 +93,15 @@ def _one(
         cfg = config_of(arm, taught_rounds, args)
         out = args.out / f"{task}-{arm}-{seed}"
         taught = args.out / f"{task}-v2p-{seed}" / TAUGHT_FOLDER
-        # All arms start from the same policy; where the code is written anew it may observe more, and is taught alike.
-        if not (writes_success(cfg) or (out / TAUGHT_FOLDER).exists()) and taught.is_dir():
-            shutil.copytree(taught, out / TAUGHT_FOLDER)
+        search_seed = seed_for(seed, "reward-methods", task)
+        is_taught = (out / TAUGHT_FOLDER).exists() or not (taught / DONE_FILE).is_file()
+        if not is_taught and starts_from(taught, bundle, cfg, search_seed):
+            shutil.copytree(taught, out / TAUGHT_FOLDER)  # all arms start from the same policy
         result = search_reward(
             bundle,
             cfg,
             out,
-            seed=seed_for(seed, "reward-methods", task),
+            seed=search_seed,
             how=How(workers=args.workers),
             jobs=jobs,
         )
@@ -142,6 +143,13 @@ def config_of(arm: str, taught_rounds: int, args: argparse.Namespace) -> RewardC
         return replace(cfg, iterations=1, candidates=cfg.iterations * cfg.candidates)
     without = tuple(part for part in get_args(Part) if arm == f"without_{part}")
     return replace(cfg, without=without, method="v2p" if without else arm)
+
+
+def starts_from(taught: Path, bundle: TaskBundle, cfg: RewardConfig, seed: int) -> bool:
+    """Return whether an arm's code observes what a taught policy does; where not, the arm is taught its own start."""
+    own = prepare(bundle, cfg, rng_for(seed, "first rewards")).bundle
+    policy = Expert.load(taught / TRAIN_FOLDER)
+    return BatchEnv(own, num_envs=1, seed=0, num_threads=1).obs_dim == policy.model.obs_dim
 
 
 def best_by_round(out: Path, cfg: RewardConfig) -> list[Path]:

@@ -171,12 +171,14 @@ class TaskBundle:
         from v2p_data.task.robot_files import ROBOT_FOLDER, copy_robot
 
         place = folder / SCENE_FOLDER
-        if (self.scene.folder / SCENE_FILE).is_file():
+        if self.scene.folder == Path() and not Path(SCENE_FILE).is_file():
+            place.mkdir(
+                parents=True
+            )  # never on disk: the folder without a name is where the process runs
+            self.scene.save(place)
+        else:
             left_out = shutil.ignore_patterns("record.json", "*.mp4", "*.partial")
             copy_folder(self.scene.folder, place, ignore=left_out)
-        else:  # it was never on disk, and a folder without a name is the one where the process runs
-            place.mkdir(parents=True)
-            self.scene.save(place)
         robot = self.robot
         if robot:
             main = copy_robot(Path(robot["path"]), folder / ROBOT_FOLDER)
