@@ -6,7 +6,7 @@ Offline samples come from `templates`, with a model from `vlm_writer`; whoever e
 import json
 import logging
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -141,6 +141,42 @@ def hallucination(samples: Sequence[Sample]) -> dict[str, int | float]:
     }
 
 
+class CodeJudge:
+    """Tries task codes of one scene in the sandbox and audits them.
+
+    Args:
+        scene: what was understood of the video.
+        cfg: limits of the trial runs.
+        seed: of the audit's random probes.
+    """
+
+    def __init__(self, scene: Scene, cfg: TaskConfig, seed: int) -> None:
+        self._scene, self._cfg = scene, cfg
+        self._probes = build_probes(scene, rng_for(seed, "audit", scene.title))
+
+    def try_all(self, codes: list[str]) -> list[SmokeResult]:
+        """Return each code's trial run."""
+        return smoke_run_all(
+            codes,
+            self._scene,
+            probes=self._probes.states,
+            starts=self._probes.starts,
+            seconds_each=self._cfg.seconds_each,
+            timeout_s=self._cfg.timeout_s,
+        )
+
+    def judged(self, written: Sequence[tuple[str, SmokeResult]]) -> tuple[Sample, ...]:
+        """Return codes that were tried, with their audits."""
+        return tuple(
+            _sample(code, result, audit(self._scene, self._probes, result))
+            for code, result in written
+        )
+
+    def tried(self, codes: list[str]) -> tuple[Sample, ...]:
+        """Return codes with their trial runs and audits."""
+        return self.judged(list(zip(codes, self.try_all(codes), strict=True)))
+
+
 def generate_task(
     scene: Scene,
     cfg: TaskConfig,
@@ -164,27 +200,11 @@ def generate_task(
         ItemRejectedError: `no_acceptable_task`: no sample runs and passes the audit.
         V2PError: the model cannot be asked, or its budget is used up.
     """
-    probes = build_probes(scene, rng_for(seed, "audit", scene.title))
-
-    def try_all(codes: list[str]) -> list[SmokeResult]:
-        return smoke_run_all(
-            codes,
-            scene,
-            probes=probes.states,
-            starts=probes.starts,
-            seconds_each=cfg.seconds_each,
-            timeout_s=cfg.timeout_s,
-        )
-
-    def judged(written: Sequence[tuple[str, SmokeResult]]) -> tuple[Sample, ...]:
-        return tuple(
-            _sample(code, result, audit(scene, probes, result)) for code, result in written
-        )
-
+    judge = CodeJudge(scene, cfg, seed)
     if sources is None and cfg.writer == "vlm":
-        return _by_model(scene, cfg, seed, try_all, judged, calls, pool)
+        return _by_model(scene, cfg, seed, judge, calls, pool)
     codes = write_samples(scene, cfg.num_samples) if sources is None else sources
-    samples = judged(list(zip(codes, try_all(codes), strict=True)))
+    samples = judge.tried(codes)
     picked = _pick(scene, samples)
     return GeneratedTask(
         bundle=_bundle(scene, cfg, samples[picked]),
@@ -201,8 +221,7 @@ def _by_model(
     scene: Scene,
     cfg: TaskConfig,
     seed: int,
-    try_all: Callable[[list[str]], list[SmokeResult]],
-    judged: Callable[[Sequence[tuple[str, SmokeResult]]], tuple[Sample, ...]],
+    judge: CodeJudge,
     calls: Path | None,
     pool: Path | None,
 ) -> GeneratedTask:
@@ -213,7 +232,7 @@ def _by_model(
     from v2p_data.task.llm.prompts import audit_table
 
     def objections(written: Sequence[tuple[str, SmokeResult]]) -> list[str]:
-        audits = [s.audit for s in judged(written)]
+        audits = [s.audit for s in judge.judged(written)]
         return ["" if a.is_acceptable else audit_table(a) for a in audits]
 
     pools = [p for p in (pool, cfg.vlm.pool) if p is not None]
@@ -221,9 +240,9 @@ def _by_model(
     with tempfile.TemporaryDirectory(prefix="v2p-calls-") as kept_nowhere_else:
         client = VlmClient(cfg.vlm, calls or Path(kept_nowhere_else), seed)
         written = vlm_writer.write_samples(
-            client, scene, cfg.num_samples, examples, try_all, objections
+            client, scene, cfg.num_samples, examples, judge.try_all, objections
         )
-        samples = judged(written.final)
+        samples = judge.judged(written.final)
         audits_pick = _pick(scene, samples)
         pick = vlm_writer.pick_sample(
             client, scene, [(s.code, s.audit) for s in samples], audits_pick=audits_pick
@@ -232,7 +251,7 @@ def _by_model(
         bundle=_bundle(scene, cfg, samples[pick.index]),
         samples=samples,
         picked=pick.index,
-        first=judged(written.first),
+        first=judge.judged(written.first),
         about={
             "writer": "vlm",
             "pick": {**pick.as_dict(), "audits_pick": audits_pick},
@@ -270,11 +289,15 @@ def _sample(code: str, result: SmokeResult, verdict: Audit) -> Sample:
     )
 
 
-def _pick(scene: Scene, samples: tuple[Sample, ...]) -> int:
-    """Return the index of the best acceptable sample, the first among equals."""
+def best_acceptable(samples: Sequence[Sample]) -> int | None:
+    """Return the index of the best acceptable sample, the first among equals; None where none is acceptable."""
     acceptable = [i for i, s in enumerate(samples) if s.audit.is_acceptable]
-    if acceptable:
-        return max(acceptable, key=lambda i: (samples[i].score, -i))
+    return max(acceptable, key=lambda i: (samples[i].score, -i)) if acceptable else None
+
+
+def _pick(scene: Scene, samples: tuple[Sample, ...]) -> int:
+    if (index := best_acceptable(samples)) is not None:
+        return index
     best = max(samples, key=lambda s: (s.runnable, s.audit.score))
     asked = ", ".join(f"'{c.asks}'" for c in best.audit.checks if not c.passed)
     why = best.audit.vetoed or f"the answer is no to {asked}"

@@ -24,7 +24,7 @@ def task_code_in(text: str) -> str:
     Raises:
         FaultyAnswerError: there is no code, or parts of the six are missing from it.
     """
-    code = _code_with(text, "class ", "the whole file")
+    code = code_with(text, "class ", "the whole file")
     try:
         tree = ast.parse(code)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
@@ -53,7 +53,7 @@ def reward_code_in(text: str) -> str:
     Raises:
         FaultyAnswerError: there is none.
     """
-    return _code_with(text, f"def {REWARD}(", f"`{REWARD}`")
+    return code_with(text, f"def {REWARD}(", f"`{REWARD}`")
 
 
 def choice_in(text: str, allowed: list[int]) -> tuple[int, dict[str, str]]:
@@ -80,7 +80,12 @@ def choice_in(text: str, allowed: list[int]) -> tuple[int, dict[str, str]]:
     )
 
 
-def _code_with(text: str, needed: str, what: str) -> str:
+def code_with(text: str, needed: str, what: str) -> str:
+    """Return the last block of an answer that holds `needed`, or the answer itself where it is nothing but code.
+
+    Raises:
+        FaultyAnswerError: there is none; `what` names it.
+    """
     text = text.replace("\r\n", "\n")
     blocks = [m[2] for m in _BLOCK.finditer(text) if m[1].lower() in _PYTHON]
     whole = [b for b in blocks if needed in b]

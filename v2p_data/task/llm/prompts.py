@@ -43,7 +43,9 @@ You write tasks for a robot arm with a parallel gripper in a physics simulator. 
 The class derives from `Task` (`from factory.tasks.task import Task`) and its constructor is
 `def __init__(self, envs, urdf_assets_root): super().__init__(envs, urdf_assets_root, scene_info)`, followed by
 `self.task_description = "..."`.
+"""
 
+WORLD = """\
 Frame: metres, seconds, radians; z up, the table's top at z = table_height; x away from the robot, y to its left, as in the
 picture. Quaternions are wxyz. The gripper reaches x {x0} to {x1} and y {y0} to {y1}. Objects start at random places and
 headings, so never compare a position with a constant: compare with `<name>_start_pos`, with another object, or with a
@@ -97,11 +99,7 @@ def system_message(
     refinements: Sequence[Refinement] = (),
 ) -> Message:
     """Return the part that is the same for all samples of a scene: interface, states, rules, examples."""
-    (x0, y0), (x1, y1) = WORKSPACE_M
-    parts = [
-        INTERFACE.format(x0=x0, x1=x1, y0=y0, y1=y1, full=FULL_REWARD, states=states_table(list(object_names))),
-        rules(),
-    ]  # fmt: skip
+    parts = [f"{INTERFACE.format(full=FULL_REWARD)}\n{world_words(object_names)}", rules()]
     for number, example in enumerate(examples, 1):
         parts.append(
             f"Example {number}: {example.task}\n\nThoughts: {example.thoughts}\n\n```python\n{example.code.strip()}\n```"
@@ -119,6 +117,12 @@ def system_message(
             )
         )
     return {"role": "system", "content": "\n\n".join(parts)}
+
+
+def world_words(object_names: Sequence[str]) -> str:
+    """Return the frame, the workspace and the table of all states in words."""
+    (x0, y0), (x1, y1) = WORKSPACE_M
+    return WORLD.format(x0=x0, x1=x1, y0=y0, y1=y1, states=states_table(list(object_names)))
 
 
 def rules() -> str:
