@@ -20,6 +20,7 @@ from policies.ppo.policy import Expert
 from policies.ppo.train import train_expert
 from studies.results import append_result, commit, results_in
 from v2p_data.episodes.collect import judge_expert
+from v2p_data.episodes.rollouts import Lesson
 from v2p_data.play import StateActor
 from v2p_data.reward.candidate import LAST_POLICY
 from v2p_data.reward.worker import ppo_config
@@ -80,9 +81,9 @@ def measured(task: str, ratio: float, seed: int, settings: Settings) -> dict[str
             draws=False,
         )
         cpu = time.process_time() - cpu
+        actor = StateActor(Expert.load(folder / LAST_POLICY).act)
         judged = judge_expert(
-            bundle,
-            StateActor(Expert.load(folder / LAST_POLICY).act),
+            Lesson(bundle=bundle, expert=actor),
             episodes=settings.episodes,
             seed=seed_for(seed, "bonus ratio judge", task),
         )

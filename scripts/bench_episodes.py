@@ -52,7 +52,7 @@ from v2p_data.episodes.dataset.features import (
     features,
 )
 from v2p_data.episodes.dataset.writer import pack
-from v2p_data.episodes.rollouts import Rollouts, roll_out
+from v2p_data.episodes.rollouts import Lesson, Rollouts, roll_out
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.play import StateActor
 from v2p_data.seeds import rng_for, seed_for
@@ -137,9 +137,8 @@ def compare(cfg: BenchConfig) -> None:
         place = Path(folder)
         warm_up(bundle, place / "warm", cfg)
         started = time.perf_counter()
-        collected = collect(
-            bundle, StateActor(lift), recipe, place / "ours", SEED, num_threads=cfg.threads
-        )
+        lesson = Lesson(bundle=bundle, expert=StateActor(lift))
+        collected = collect(lesson, recipe, place / "ours", SEED, num_threads=cfg.threads)
         staged_s = time.perf_counter() - started
         staged = staged_episodes(place / "ours")
         pack(staged, "bench/ours", place / "dataset", num_threads=cfg.threads)
@@ -180,7 +179,7 @@ def compare(cfg: BenchConfig) -> None:
 def warm_up(bundle: TaskBundle, place: Path, cfg: BenchConfig) -> None:
     """Import, compile and open everything that both ways need, on two episodes."""
     small = EpisodesConfig(num_episodes=2, batch_worlds=4, max_batches=4, size_px=64)
-    collect(bundle, StateActor(lift), small, place, 0)
+    collect(Lesson(bundle=bundle, expert=StateActor(lift)), small, place, 0)
     staged = staged_episodes(place)
     pack(staged, "bench/warm", place / "dataset")
     lerobots_way(bundle, small, staged, place / "lerobot", None, seed=0)
@@ -250,8 +249,7 @@ def batches(bundle: TaskBundle, recipe: EpisodesConfig, seed: int) -> Iterator[R
     """Yield the rollouts that `collect` makes, with its seeds."""
     for number in range(recipe.max_batches):
         yield roll_out(
-            bundle,
-            StateActor(lift),
+            Lesson(bundle=bundle, expert=StateActor(lift)),
             SimConfig(fine=True, randomization=recipe.randomization),
             num_worlds=recipe.batch_worlds,
             seed=seed_for(seed, "batch", number),

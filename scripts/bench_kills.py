@@ -178,6 +178,7 @@ def all_phases() -> dict[str, Phase]:
     from v2p_data.episodes.dataset.edit import merge
     from v2p_data.episodes.dataset.writer import pack
     from v2p_data.episodes.hub.hub import push_dataset
+    from v2p_data.episodes.rollouts import Lesson
     from v2p_data.episodes.staging import staged_episodes
     from v2p_data.play import StateActor
     from v2p_data.task.benchmark import load_benchmark
@@ -192,7 +193,8 @@ def all_phases() -> dict[str, Phase]:
         return action
 
     def collecting(place: Path) -> None:
-        collect(bundle, StateActor(sometimes), recipe, place / "collected", SEED, num_threads=1)
+        lesson = Lesson(bundle=bundle, expert=StateActor(sometimes))
+        collect(lesson, recipe, place / "collected", SEED, num_threads=1)
 
     def packing(place: Path) -> None:
         if not (place / "packed").exists():

@@ -35,6 +35,7 @@ from policies.evaluation.rate import Rate, wilson
 from policies.ppo.policy import Expert
 from studies.results import Row, append_result, letters_of, mean_over_seeds, results_in
 from v2p_data.episodes.collect import judge_expert
+from v2p_data.episodes.rollouts import Lesson
 from v2p_data.experts.teacher import try_out
 from v2p_data.play import StateActor
 from v2p_data.reward.candidate import (
@@ -215,8 +216,7 @@ def compare_rounds(
             policies[arm] = (made.policy, _spent(made))
         policy, spent = policies[arm]
         judged = judge_expert(
-            bundle,
-            StateActor(Expert.load(policy).act),
+            Lesson(bundle=bundle, expert=StateActor(Expert.load(policy).act)),
             episodes=settings.episodes,
             seed=seed_for(seed, "later rounds", bundle.title),
         )

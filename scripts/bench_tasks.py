@@ -26,7 +26,7 @@ from policies.ppo.curve import CURVE_FILE, read_rows
 from policies.ppo.policy import Expert
 from studies.results import append_result, commit, results_in
 from v2p_data.episodes.collect import judge_expert
-from v2p_data.episodes.rollouts import Rollouts
+from v2p_data.episodes.rollouts import Lesson, Rollouts
 from v2p_data.experts.actors import ProgramActor
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, learn
@@ -107,8 +107,7 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
         actors["program"] = ProgramActor(seed, learned.teacher)
     judged = {
         who: judge_expert(
-            bundle,
-            actor,
+            Lesson(bundle=bundle, expert=actor),
             episodes=args.episodes,
             seed=seed_for(seed, "benchmark-judge", task),
             num_threads=args.threads,

@@ -29,7 +29,8 @@ from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
 from studies.results import append_result, results_in
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.distillation.rounds import Lesson, distill
+from v2p_data.distillation.rounds import Course, distill
+from v2p_data.episodes.rollouts import Lesson
 from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.pipeline.artifact import read_record
@@ -141,21 +142,23 @@ def _one(name: str, seed: int, args: argparse.Namespace) -> None:
         trained_s.append(trained.seconds)
 
     if variant.rounds:
-        distill(
-            {s.item: Lesson(bundle=bundles[s.item], expert=StateActor(Expert.load(s.expert).act)) for s in sources},
-            student,
-            train,
-            DistillationConfig(
+        experts = {s.item: StateActor(Expert.load(s.expert).act) for s in sources}
+        course = Course(
+            lessons={
+                item: Lesson(bundle=bundles[item], expert=expert)
+                for item, expert in experts.items()
+            },
+            cfg=DistillationConfig(
                 rounds=variant.rounds,
                 episodes=args.handovers,
                 first_steps=steps[0],
                 round_steps=steps[1] if variant.rounds > 1 else 1,
             ),
-            recorded_under(sources[0]),
-            folder,
-            seed_for(seed, "study"),
+            episodes=recorded_under(sources[0]),
+            seed=seed_for(seed, "study"),
             num_threads=args.threads,
-        )  # fmt: skip
+        )
+        distill(course, student, train, folder)
     train(steps[-1], folder / "last", seed_for(seed, "last") % 2**63, lambda share, words: None)
     student.save(folder / "policy")
     made_s = time.monotonic() - started

@@ -19,6 +19,7 @@ from policies.evaluation.paired import success_difference
 from policies.evaluation.rate import wilson
 from studies.results import commit, letters_of, make_missing, results_to_show
 from v2p_data.episodes.collect import judge_expert
+from v2p_data.episodes.rollouts import Lesson
 from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.labeller import labeller_of
 from v2p_data.scene.scene import SceneObject
@@ -64,7 +65,8 @@ def row_of(run: Path, item: str, expert: Path, episodes: int) -> dict[str, Any]:
     once: list[str | None] = []
     for each in (bundle, true):
         try:
-            played = judge_expert(each, labeller_of(expert), episodes=episodes, seed=SEED)
+            lesson = Lesson(bundle=each, expert=labeller_of(expert))
+            played = judge_expert(lesson, episodes=episodes, seed=SEED)
             once.append(letters_of(played.successes))
         except ItemRejectedError as error:
             print(f"{item}: {error}")

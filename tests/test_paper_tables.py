@@ -12,7 +12,7 @@ from policies.bc.configuration_v2p_bc import V2PBCConfig
 from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
 from results_table import ROOT
 from studies.programs import EVERY_STEPS
-from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.policy.config import PAPER_BATCH_SIZE, PAPER_EPOCHS
 from v2p_data.reward.config import RewardConfig
@@ -48,7 +48,7 @@ QUOTES = [
     ("v2p_data/reward/config.py", "the paper takes {recipe/iterations}, and {recipe/iterations self-collected} for hard"),
     ("v2p_data/task/task.py", "the paper gives {recipe/horizon} steps"),
     ("v2p_data/task/schema.py", "the paper's episodes have {recipe/horizon} steps"),
-    ("v2p_data/episodes/collect.py", "the paper's policies learn from {recipe/trajectories}"),
+    ("v2p_data/episodes/config.py", "the paper's policies learn from {recipe/trajectories}"),
     ("v2p_data/policy/config.py", "{recipe/epochs} epochs of batch {recipe/batch}"),
     ("configs/paper.yaml", "{recipe/epochs} epochs of batch {recipe/batch}"),
 ]  # fmt: skip

@@ -21,8 +21,10 @@ from typing import TYPE_CHECKING, Any
 from policies.evaluation.rate import wilson
 from v2p_data.craft_data import scene_data, task_data
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.collect import EpisodesConfig, collect, judge_expert, staged_episodes
+from v2p_data.episodes.collect import collect, judge_expert, staged_episodes
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.episodes.dataset.about import CARRIED_TASKS
+from v2p_data.episodes.rollouts import Lesson
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.judging import (
@@ -393,8 +395,7 @@ def make_expert(
     learned = _learned(bundle, cfg, out, runtime, warm_start=warm_start, bonus_ratio=bonus_ratio)
     runtime.progress(0.95, "judging at the fine step")
     judged = judge_expert(
-        bundle,
-        labeller_of(out),
+        Lesson(bundle=bundle, expert=labeller_of(out)),
         episodes=expert_cfg.eval_episodes,
         seed=seed_for(cfg.seed, "expert-evaluation", bundle.title),
         num_threads=runtime.num_threads,
@@ -473,8 +474,7 @@ def make_episodes(
     """Stage successful episodes one by one; list the failed ones."""
     bundle = TaskBundle.load(inputs["task"])
     collected = collect(
-        bundle,
-        labeller_of(inputs["expert"]),
+        Lesson(bundle=bundle, expert=labeller_of(inputs["expert"])),
         cfg.config,
         out,
         seed=seed_for(cfg.seed, "episodes", bundle.title),

@@ -442,11 +442,11 @@ def make_program_episodes(
 ) -> dict[str, Any]:
     """Collect demonstrations of Code-as-Policies, as an expert's are collected."""
     from v2p_data.episodes.collect import collect
+    from v2p_data.episodes.rollouts import Lesson
 
     bundle = TaskBundle.load(inputs["task"])
     collected = collect(
-        bundle,
-        ProgramPolicy(),
+        Lesson(bundle=bundle, expert=ProgramPolicy()),
         cfg.config,
         out,
         seed=seed_for(cfg.seed, "episodes", bundle.title),

@@ -151,10 +151,10 @@ def test_recorded_targets_bring_the_same_states_back_where_no_noise_is_on_them(a
             return steps_to(view.worlds, first.targets[view.t], actions)
 
     def played(actor):
+        lesson = toy_task.lesson(actor)
         return rollouts.roll_out(
-            toy_task.bundle(), actor, sim, num_worlds=8, seed=3, cut=CutConfig(), actions=actions,
-            task=toy_task.PushTask, referee=toy_task.agree,
-        )  # fmt: skip
+            lesson, sim, num_worlds=8, seed=3, cut=CutConfig(), actions=actions
+        )
 
     first = played(StateActor(toy_task.act))
     again = played(Follow(toy_task.act))

@@ -18,10 +18,13 @@ CFG = DistillationConfig(worlds=5, takeover=(0.1, 0.5))
 
 def run(student=None, *, cfg=CFG, seed: int = 3, num_threads: int = 1, expert=act) -> Handovers:
     return hand_over(
-        toy_run.bundle(), StateActor(expert), VisionActor(student or toy_run.Pupil()), cfg, seed=seed,
-        size_px=toy_run.SIZE_PX, randomization=toy_run.EPISODES.randomization,
-        cut=toy_run.EPISODES.cut, num_threads=num_threads,
-    )  # fmt: skip
+        rollouts.Lesson(bundle=toy_run.bundle(), expert=StateActor(expert)),
+        VisionActor(student or toy_run.Pupil()),
+        cfg,
+        toy_run.EPISODES,
+        seed=seed,
+        num_threads=num_threads,
+    )
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from toy_run import DISTILLATION, EPISODES, Pupil, contents
 from toy_task import act
 
 from v2p_data.distillation import rounds
-from v2p_data.distillation.rounds import Lesson, distill, handover_episodes, take_in
+from v2p_data.distillation.rounds import Course, distill, handover_episodes, take_in
 from v2p_data.episodes import rollouts
 from v2p_data.episodes.mask_noise import MaskNoiseConfig
 from v2p_data.episodes.staging import Episode
@@ -28,10 +28,9 @@ class Killed(Exception):  # noqa: N818 - it stands for a kill
 
 def run(out: Path, pupil: Pupil | None = None, *, train=None, episodes=EPISODES, num_threads=1, cfg=DISTILLATION):  # fmt: skip
     pupil = pupil or Pupil()
-    lessons = {"toy": Lesson(bundle=toy_run.bundle(), expert=StateActor(act))}
-    return distill(
-        lessons, pupil, train or pupil.train, cfg, episodes, out, 7, num_threads=num_threads
-    )  # fmt: skip
+    lessons = {"toy": rollouts.Lesson(bundle=toy_run.bundle(), expert=StateActor(act))}
+    course = Course(lessons=lessons, cfg=cfg, episodes=episodes, seed=7, num_threads=num_threads)
+    return distill(course, pupil, train or pupil.train, out)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import toy_task
 from policies.ppo.config import ActorConfig
 from policies.ppo.policy import ActorCritic, Expert
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.pipeline.artifact import Record, read_record
 from v2p_data.pipeline.runner import (
     Make,

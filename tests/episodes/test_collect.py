@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_task import PushTask, act, agree, bundle, collect_toys
+from toy_task import act, bundle, collect_toys, lesson
 
 from v2p_data.episodes.collect import (
     CutConfig,
@@ -15,21 +15,24 @@ from v2p_data.episodes.collect import (
     roll_out,
     staged_episodes,
 )
+from v2p_data.episodes.rollouts import Lesson, Rollouts
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.artifact import read_rejects
 from v2p_data.play import StateActor
 from v2p_data.sim.env.batch_env import HELD_STEPS, SimConfig
 
+
+def rolled_out(toy: Lesson) -> Rollouts:
+    return roll_out(toy, SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig())
+
+
 SMALL = EpisodesConfig(num_episodes=5, batch_worlds=6, max_batches=3, size_px=48)
 
 
 @pytest.fixture(scope="module")
 def rollouts():
-    return roll_out(
-        bundle(), StateActor(act), SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
-        task=PushTask, referee=agree,
-    )  # fmt: skip
+    return rolled_out(lesson(StateActor(act)))
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +53,7 @@ def test_who_acts_is_given_the_worlds_at_the_start_and_asked_at_every_step(rollo
         def reset(self, worlds):
             given.append(worlds.num_envs)
 
-    same = roll_out(
-        bundle(), Acting(act), SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
-        task=PushTask, referee=agree,
-    )  # fmt: skip
+    same = rolled_out(lesson(Acting(act)))
 
     assert given == [6]
     assert (same.action == rollouts.action).all()
@@ -95,10 +95,7 @@ def test_the_referee_sees_each_world_stand_still_after_its_cut():
         seen.update(trajectory)
         return np.ones(6, bool)
 
-    rollouts = roll_out(
-        bundle(), StateActor(act), SimConfig(fine=True), num_worlds=6, seed=4, cut=CutConfig(),
-        task=PushTask, referee=watch,
-    )  # fmt: skip
+    rollouts = rolled_out(lesson(StateActor(act), watch))
     world = int(rollouts.num_frames.argmin())
     end = int(rollouts.num_frames[world])
 
@@ -108,10 +105,9 @@ def test_the_referee_sees_each_world_stand_still_after_its_cut():
 
 
 def test_what_the_referee_denies_is_no_success():
-    judged = judge_expert(
-        bundle(), StateActor(act), episodes=6, seed=4, task=PushTask,
-        referee=lambda _, trajectory: np.arange(6) % 2 == 0,
-    )  # fmt: skip
+    toy = lesson(StateActor(act), lambda _, trajectory: np.arange(6) % 2 == 0)
+
+    judged = judge_expert(toy, episodes=6, seed=4)
 
     assert judged.task_successes.any()
     assert not judged.successes[1::2].any()
@@ -121,7 +117,7 @@ def test_what_the_referee_denies_is_no_success():
 
 def test_the_independent_referee_is_asked_unless_another_is_given():
     """Without a push the cube stays where it is: the task's success is wrong, and the referee says so."""
-    judged = judge_expert(bundle(), StateActor(act), episodes=6, seed=4, task=PushTask)
+    judged = judge_expert(lesson(StateActor(act), None), episodes=6, seed=4)
 
     assert judged.task_successes.any()
     assert not judged.referee.any()
@@ -194,11 +190,9 @@ def test_lost_episodes_come_back_the_same(collected: Path, tmp_path: Path):
 
 def test_a_task_that_is_never_done_is_rejected(tmp_path: Path):
     cfg = EpisodesConfig(num_episodes=2, batch_worlds=2, max_batches=1, size_px=48)
+    never = lesson(StateActor(act), lambda _, trajectory: np.zeros(2, bool))
 
     with pytest.raises(ItemRejectedError, match="0 of 2 episodes succeeded") as caught:
-        collect(
-            bundle(), StateActor(act), cfg, tmp_path, 0, task=PushTask,
-            referee=lambda _, trajectory: np.zeros(2, bool),
-        )  # fmt: skip
+        collect(never, cfg, tmp_path, 0)
 
     assert caught.value.reason == "too_few_episodes"

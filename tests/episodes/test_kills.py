@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from toy_task import collect_toys
 
-from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.episodes.dataset import shards
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode, staged_episodes

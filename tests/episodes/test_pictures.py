@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from toy_task import PushTask, act, agree, bundle, collect_toys
+from toy_task import act, bundle, collect_toys, lesson
 
 from v2p_data.episodes.collect import CutConfig, EpisodesConfig, roll_out
 from v2p_data.episodes.dataset.stream import decode_rgb
@@ -35,10 +35,8 @@ def plain(tmp_path_factory) -> list[Episode]:
 
 @pytest.fixture(scope="module")
 def rollouts():
-    return roll_out(
-        bundle(), StateActor(act), SimConfig(fine=True), num_worlds=3, seed=4, cut=CutConfig(),
-        task=PushTask, referee=agree,
-    )  # fmt: skip
+    toy = lesson(StateActor(act))
+    return roll_out(toy, SimConfig(fine=True), num_worlds=3, seed=4, cut=CutConfig())
 
 
 def needs_opengl() -> None:

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 
 from v2p_data.episodes.collect import Collected, EpisodesConfig, collect
+from v2p_data.episodes.rollouts import Lesson, Referee
 from v2p_data.geometry.camera import Camera
-from v2p_data.play import StateActor
+from v2p_data.play import Actor, StateActor
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.task import Task, TaskBundle
 
@@ -55,14 +56,9 @@ def agree(_: object, trajectory: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.ones(trajectory["eef_pos"].shape[1], bool)
 
 
+def lesson(expert: Actor, referee: Referee | None = agree) -> Lesson:
+    return Lesson(bundle=bundle(), expert=expert, task=PushTask, referee=referee)
+
+
 def collect_toys(out: Path, cfg: EpisodesConfig, num_threads: int = 1) -> Collected:
-    return collect(
-        bundle(),
-        StateActor(act),
-        cfg,
-        out,
-        11,
-        num_threads=num_threads,
-        task=PushTask,
-        referee=agree,
-    )
+    return collect(lesson(StateActor(act)), cfg, out, 11, num_threads=num_threads)

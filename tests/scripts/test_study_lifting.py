@@ -14,7 +14,7 @@ from policies.evaluation.rate import wilson
 from policies.ppo.config import ImitationConfig, PPOConfig
 from policies.ppo.policy import Expert
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.errors import V2PError
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.labeller import labeller_of

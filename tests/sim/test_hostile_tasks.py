@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from v2p_data.episodes.rollouts import CutConfig, roll_out
+from v2p_data.episodes.rollouts import CutConfig, Lesson, roll_out
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.play import StateActor
 from v2p_data.scene.scene import SceneObject
@@ -113,12 +113,12 @@ def test_no_idle_robot_gets_an_episode_that_counts(
     bodies: dict[str, str], make_bundle: Callable[..., TaskBundle]
 ):
     bundle = replace(make_bundle(horizon=14), code=code(**bodies), class_name="Lift")
+    idle = StateActor(lambda obs: np.zeros((len(obs), 7), np.float32))
 
     counted = 0
     with contextlib.suppress(StatesChangedError, ItemRejectedError):
         counted = roll_out(
-            bundle,
-            StateActor(lambda obs: np.zeros((len(obs), 7), np.float32)),
+            Lesson(bundle=bundle, expert=idle),
             SimConfig(),
             num_worlds=NUM_WORLDS,
             seed=0,

@@ -12,13 +12,11 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.rollouts import CutConfig, Rollouts, Telling, record_rollouts
+from v2p_data.episodes.config import EpisodesConfig
+from v2p_data.episodes.rollouts import Lesson, Rollouts, Telling, record_rollouts
 from v2p_data.play import Actor, View
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
-from v2p_data.sim.env.ranges import RandomizationConfig
-from v2p_data.sim.robot.action_names import Actions
-from v2p_data.task.task import TaskBundle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,49 +69,43 @@ class Handover:
 
 
 def hand_over(
-    bundle: TaskBundle,
-    expert: Actor,
+    lesson: Lesson,
     student: Actor,
     cfg: DistillationConfig,
+    episodes: EpisodesConfig,
     *,
     seed: int,
-    size_px: int,
-    randomization: RandomizationConfig,
-    cut: CutConfig,
-    actions: Actions = "delta_tool",
     num_threads: int = 1,
-    wrist: bool = False,
 ) -> Handovers:
     """Run one handover episode in each of `cfg.worlds` worlds.
 
     Args:
-        bundle: the task.
-        expert: the deterministic expert, or whoever acts in the worlds themselves.
+        lesson: the task and its deterministic expert, or whoever acts in the worlds themselves.
         student: the policy that begins.
         cfg: when the expert takes over, and how long an episode may last.
+        episodes: what the demonstrations were recorded under.
         seed: of everything that is drawn.
-        size_px: width and height of the label images.
-        randomization: what the demonstrations were recorded under.
-        cut: where an episode ends.
-        actions: what a dataset's `action` says.
         num_threads: for physics and masks; changes no result.
-        wrist: whether the wrist's picture comes below the table's.
     """
     env = BatchEnv(
-        bundle,
-        SimConfig(fine=True, randomization=randomization),
+        lesson.bundle,
+        SimConfig(fine=True, randomization=episodes.randomization),
         num_envs=cfg.worlds,
         seed=seed,
         num_threads=num_threads,
+        task=lesson.task,
     )
     earliest, latest = (round(share * env.horizon) for share in cfg.takeover)
     takeover = rng_for(seed, "takeover").integers(earliest, latest + 1, cfg.worlds)
     horizon = round(cfg.time_scale * env.horizon)
+    size_px, wrist = episodes.size_px, episodes.wrist
     pictures = np.empty((horizon, cfg.worlds, size_px * (1 + wrist), size_px), np.uint8)
-    telling = Telling(expert, actions, env)
+    telling = Telling(lesson.expert, episodes.actions, env)
     actor = Handover(student, telling, takeover, pictures)
     view = View(env, size_px, num_threads, wrist=wrist)
-    recorded = record_rollouts(view, actor, cut, seed=seed, horizon=horizon)
+    recorded = record_rollouts(
+        view, actor, episodes.cut, seed=seed, horizon=horizon, referee=lesson.referee
+    )
     columns: dict[str, Any] = vars(recorded) | {"action": np.stack(actor.answers)} | telling.told()
     return Handovers(
         **columns,

@@ -17,13 +17,14 @@ from jaxtyping import Float32, UInt8
 
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.handover import Handovers, hand_over
-from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
+from v2p_data.episodes.rollouts import Lesson
 from v2p_data.episodes.staging import Episode, refusals_told, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import write_json_atomically
-from v2p_data.play import Actor, Policy, VisionActor
+from v2p_data.play import Policy, VisionActor
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.task.task import TaskBundle
 
@@ -69,11 +70,19 @@ Train = Callable[[int, Path, int, Progress], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lesson:
-    """One task and who can do it."""
+class Course:
+    """What is distilled."""
 
-    bundle: TaskBundle
-    expert: Actor
+    lessons: Mapping[str, Lesson]
+    """The tasks by item."""
+    cfg: DistillationConfig
+    """The recipe."""
+    episodes: EpisodesConfig
+    """What the demonstrations were recorded under."""
+    seed: int
+    """Decides everything that is drawn."""
+    num_threads: int = 1
+    """For physics and masks; changes no result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,38 +107,27 @@ class Distilled:
 
 
 def distill(
-    lessons: Mapping[str, Lesson],
+    course: Course,
     student: LearningStudent,
     train: Train,
-    cfg: DistillationConfig,
-    episodes: EpisodesConfig,
     out: Path,
-    seed: int,
-    *,
-    num_threads: int = 1,
     on_progress: Progress = lambda share, words: None,
 ) -> Distilled:
-    """Train and collect `cfg.rounds` times; go on where an earlier call was stopped.
+    """Train and collect `course.cfg.rounds` times; go on where an earlier call was stopped.
 
     Args:
-        lessons: the tasks by item.
+        course: the tasks and the recipe.
         student: knows the demonstrations already; learns further in place.
         train: trains it.
-        cfg: the recipe.
-        episodes: what the demonstrations were recorded under.
         out: `rounds/`, `student/` and `training/` are written here.
-        seed: decides everything that is drawn.
-        num_threads: for physics and masks; changes no result.
         on_progress: told the share that is done and a few words.
 
     Raises:
         V2PError: the pictures are not masks, the disk is full, or `out` cannot be written to.
     """
-    demand_masks(episodes)
+    demand_masks(course.episodes)
     with refusals_told("distillation", out):
-        return _distill(
-            lessons, student, train, cfg, episodes, out, seed, num_threads, on_progress
-        )
+        return _distill(course, student, train, out, on_progress)
 
 
 def demand_masks(episodes: EpisodesConfig) -> None:
@@ -170,16 +168,9 @@ def take_in(student: LearningStudent, paths: Sequence[Path]) -> None:
 
 
 def _distill(
-    lessons: Mapping[str, Lesson],
-    student: LearningStudent,
-    train: Train,
-    cfg: DistillationConfig,
-    episodes: EpisodesConfig,
-    out: Path,
-    seed: int,
-    num_threads: int,
-    on_progress: Progress,
+    course: Course, student: LearningStudent, train: Train, out: Path, on_progress: Progress
 ) -> Distilled:
+    cfg, lessons = course.cfg, course.lessons
     final = out / STUDENT_FOLDER
     ledgers: list[list[dict[str, Any]]] = []
     for number in range(cfg.rounds):
@@ -200,15 +191,15 @@ def _distill(
             train(
                 steps,
                 out / TRAINING_FOLDER / str(number),
-                seed_for(seed, "training", number),
+                seed_for(course.seed, "training", number),
                 lambda share, words: tell(0.5 * share, words),
             )
             student.save(here)
         collected: list[dict[str, Any]] = []
-        for k, (item, lesson) in enumerate(lessons.items()):
+        for k, item in enumerate(lessons):
             folder = out / ROUNDS_FOLDER / f"{number:02d}" / item
             tell(0.5 + 0.5 * k / len(lessons), f"handing over {item}")
-            collected += _collect(lesson, student, cfg, episodes, folder, number, seed_for(seed, item, number), num_threads)  # fmt: skip
+            collected += _collect(course, item, number, student, folder)
             if not final.is_dir():
                 take_in(student, staged_episodes(folder))
         ledgers.append(collected)
@@ -230,16 +221,11 @@ def _distill(
 
 
 def _collect(
-    lesson: Lesson,
-    student: LearningStudent,
-    cfg: DistillationConfig,
-    episodes: EpisodesConfig,
-    folder: Path,
-    number: int,
-    seed: int,
-    num_threads: int,
+    course: Course, item: str, number: int, student: LearningStudent, folder: Path
 ) -> list[dict[str, Any]]:
     """Stage one task's handover episodes of one round; return the ledgers of its batches."""
+    lesson, cfg, episodes = course.lessons[item], course.cfg, course.episodes
+    seed = seed_for(course.seed, item, number)
     ledger_folder = folder / BATCHES_FOLDER
     ledger_folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob("*/*.tmp"):
@@ -249,17 +235,12 @@ def _collect(
         path = ledger_folder / f"{batch:03d}.json"
         if not path.is_file():
             handovers = hand_over(
-                lesson.bundle,
-                lesson.expert,
+                lesson,
                 VisionActor(student.for_task(lesson.bundle.description), actions=episodes.actions),
                 cfg,
+                episodes,
                 seed=seed_for(seed, "batch", batch),
-                size_px=episodes.size_px,
-                randomization=episodes.randomization,
-                cut=episodes.cut,
-                actions=episodes.actions,
-                num_threads=num_threads,
-                wrist=episodes.wrist,
+                num_threads=course.num_threads,
             )
             first = batch * cfg.worlds
             write_json_atomically(

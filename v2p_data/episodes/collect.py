@@ -13,18 +13,17 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from v2p_data.episodes.mask_noise import MaskNoiseConfig
-from v2p_data.episodes.pictures import Artist, Render
-from v2p_data.episodes.rollouts import CutConfig, Referee, Rollouts, roll_out
+from v2p_data.episodes.config import EpisodesConfig
+from v2p_data.episodes.pictures import Artist
+from v2p_data.episodes.rollouts import CutConfig, Lesson, Rollouts, roll_out
 from v2p_data.episodes.staging import (
     EPISODES_FOLDER,
-    RGB_CAMERA,
     Episode,
     refusals_told,
     save_arrays,
@@ -33,74 +32,17 @@ from v2p_data.episodes.staging import (
 from v2p_data.errors import ItemRejectedError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import REJECTS_FILE, write_json_atomically, write_rejects
-from v2p_data.pipeline.fingerprint import UNSAID_BY_DEFAULT
-from v2p_data.play import Actor
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.env.ranges import RandomizationConfig
-from v2p_data.sim.render.appearance import DistractorConfig, LookConfig
-from v2p_data.sim.render.masks import MASK_CAMERAS
-from v2p_data.sim.robot.action_names import Actions
-from v2p_data.task.task import Task, TaskBundle
+from v2p_data.task.task import TaskBundle
 
 logger = logging.getLogger(__name__)
 
 LEDGER_FOLDER = "batches"
 FAILED_FOLDER = "failed"
 Progress = Callable[[float, str], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class EpisodesConfig:
-    """How many demonstrations are collected, and under what."""
-
-    num_episodes: int = 100
-    """Successful episodes per task; the paper's policies learn from 100."""
-    batch_worlds: int = 64
-    """Worlds that run at the same time; part of the recipe, because it decides which world is which."""
-    max_batches: int = 10
-    """After this many the task makes do with what it has."""
-    min_episodes: int = 1
-    """With fewer the task is rejected."""
-    size_px: int = 256
-    """Width and height of the pictures; even, as video must be."""
-    render: Render = "masks"
-    """Pictures in the dataset: exact label masks, colour pictures (close but not equal), or each as a camera of its own."""
-    wrist: bool = False
-    """Masks of a second camera too, which the hand carries: `observation.images.mask_wrist`."""
-    actions: Actions = field(default="delta_tool", metadata=UNSAID_BY_DEFAULT)
-    """What `action` says: the tool's step, the tool's target after it, or the joint angles of that target."""
-    cut: CutConfig = field(default_factory=CutConfig)
-    randomization: RandomizationConfig = field(default_factory=ranges.recording)
-    distractors: DistractorConfig = field(default_factory=DistractorConfig)
-    """Things that stand about in the pictures; none by default."""
-    look: LookConfig = field(default_factory=LookConfig)
-    """Light and colours of RGB pictures; always the same by default."""
-    mask_noise: MaskNoiseConfig = field(default_factory=MaskNoiseConfig)
-    """Faults as a real segmenter makes them; none by default."""
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.min_episodes <= self.num_episodes:
-            raise ValueError(
-                f"need 1 <= min_episodes <= num_episodes, got {self.min_episodes} and {self.num_episodes}"
-            )
-        if self.batch_worlds < 1 or self.max_batches < 1:
-            raise ValueError("batch_worlds and max_batches must be at least 1")
-        if self.size_px < 16 or self.size_px % 2:
-            raise ValueError(f"size_px must be even and at least 16, got {self.size_px}")
-        if not self.look.is_off and self.render == "masks":
-            raise ValueError("look changes RGB pictures only; set render to rgb or both")
-        if self.wrist and (self.render == "rgb" or not self.mask_noise.is_off):
-            raise ValueError(
-                "the wrist's camera gives exact masks only; set render to masks or both and leave mask_noise off"
-            )
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras whose pictures are in the dataset."""
-        masks = () if self.render == "rgb" else MASK_CAMERAS[: 1 + self.wrist]
-        return masks if self.render == "masks" else (*masks, RGB_CAMERA)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,48 +70,39 @@ class Collected:
 
 
 def collect(
-    bundle: TaskBundle,
-    actor: Actor,
+    lesson: Lesson,
     cfg: EpisodesConfig,
     out: Path,
     seed: int,
     *,
     num_threads: int = 1,
     on_progress: Progress = lambda share, words: None,
-    task: type[Task] | None = None,
-    referee: Referee | None = None,
 ) -> Collected:
     """Stage `cfg.num_episodes` successful episodes under `out`; go on where an earlier call was stopped.
 
     Args:
-        bundle: the task.
-        actor: the deterministic expert.
+        lesson: the task and its deterministic expert.
         cfg: how many, and under what.
         out: `episodes/<id>.npz`, `failed/<batch>.npz`, `rejected.jsonl` and `batches/` are written here.
         seed: decides everything that is drawn.
         num_threads: for physics, masks and writing; changes no result.
         on_progress: told the share that is done and a few words.
-        task: the task, instead of `bundle.code`.
-        referee: the independent judge, instead of `task.referee`.
 
     Raises:
         ItemRejectedError: after `cfg.max_batches` there are fewer than `cfg.min_episodes`.
         V2PError: the disk is full, or `out` cannot be written to; what was staged is kept.
     """
     with refusals_told("collecting episodes", out):
-        return _collect(bundle, actor, cfg, out, seed, num_threads, on_progress, task, referee)
+        return _collect(lesson, cfg, out, seed, num_threads, on_progress)
 
 
 def _collect(
-    bundle: TaskBundle,
-    actor: Actor,
+    lesson: Lesson,
     cfg: EpisodesConfig,
     out: Path,
     seed: int,
     num_threads: int,
     on_progress: Progress,
-    task: type[Task] | None,
-    referee: Referee | None,
 ) -> Collected:
     folders = [out / name for name in (EPISODES_FOLDER, LEDGER_FOLDER, FAILED_FOLDER)]
     for folder in folders:
@@ -188,62 +121,53 @@ def _collect(
                 have / cfg.num_episodes, f"{have}/{cfg.num_episodes} episodes, batch {number + 1}"
             )
             rollouts = roll_out(
-                bundle,
-                actor,
+                lesson,
                 SimConfig(fine=True, randomization=cfg.randomization),
                 num_worlds=cfg.batch_worlds,
                 seed=seed_for(seed, "batch", number),
                 num_threads=num_threads,
                 cut=cfg.cut,
                 actions=cfg.actions,
-                task=task,
-                referee=referee,
             )
-            entry = _stage(bundle, rollouts, cfg, out, number, have, num_threads, on_progress)
+            artist = Artist(lesson.bundle, cfg, num_threads)
+            entry = _stage(artist, rollouts, out, number, have, on_progress)
             write_json_atomically(ledger, entry)
         batches.append(read_object(ledger, "delete it; its batch is made again"))
-    return _finish(bundle, cfg, out, batches)
+    return _finish(lesson.bundle, cfg, out, batches)
 
 
 def judge_expert(
-    bundle: TaskBundle,
-    actor: Actor,
+    lesson: Lesson,
     *,
     episodes: int,
     seed: int,
     num_threads: int = 1,
     randomization: RandomizationConfig | None = None,
-    task: type[Task] | None = None,
-    referee: Referee | None = None,
 ) -> Rollouts:
     """Return `episodes` fresh episodes at the fine time step under recording conditions, judged."""
     return roll_out(
-        bundle,
-        actor,
+        lesson,
         SimConfig(fine=True, randomization=randomization or ranges.recording()),
         num_worlds=episodes,
         seed=seed,
         num_threads=num_threads,
         cut=CutConfig(),
-        task=task,
-        referee=referee,
     )
 
 
 def _stage(
-    bundle: TaskBundle,
+    artist: Artist,
     rollouts: Rollouts,
-    cfg: EpisodesConfig,
     out: Path,
     batch: int,
     have: int,
-    num_threads: int,
     on_progress: Progress,
 ) -> dict[str, Any]:
     """Draw and write the successful episodes that are still wanted; return the batch's ledger."""
+    cfg = artist.cfg
 
     def name(world: int) -> str:
-        return f"{bundle.title}_{batch * cfg.batch_worlds + world:05d}"
+        return f"{artist.bundle.title}_{batch * cfg.batch_worlds + world:05d}"
 
     folder = out / EPISODES_FOLDER
     winners = [int(w) for w in np.flatnonzero(rollouts.successes)]
@@ -251,16 +175,6 @@ def _stage(
     kept = winners[: cfg.num_episodes - have]
     missing = [w for w in kept if not (folder / f"{name(w)}.npz").is_file()]
     done = have + len(kept) - len(missing)
-    artist = Artist(
-        bundle,
-        size_px=cfg.size_px,
-        render=cfg.render,
-        distractors=cfg.distractors,
-        look=cfg.look,
-        mask_noise=cfg.mask_noise,
-        num_threads=num_threads,
-        cameras=cfg.cameras,
-    )
     with _writer(folder) as write, artist:
         for world in missing:
             write(artist.episode(rollouts, world, name(world)))

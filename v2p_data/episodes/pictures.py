@@ -3,22 +3,21 @@
 Everything drawn at random has a stream of its own per episode, so switching one thing on changes no other.
 """
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.episodes.dataset import stream
-from v2p_data.episodes.mask_noise import MaskNoiseConfig, apply_faults, as_json, draw_faults
+from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
 from v2p_data.episodes.rollouts import Rollouts
 from v2p_data.episodes.staging import Episode
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import Snapshot
 from v2p_data.sim.model.world import World
-from v2p_data.sim.render.appearance import DistractorConfig, LookConfig, furnish
+from v2p_data.sim.render.appearance import furnish
 from v2p_data.sim.render.masks import BACKGROUND, WRIST_CAMERA, MaskRenderer
 from v2p_data.task.task import TaskBundle
-
-Render = Literal["masks", "rgb", "both"]
 
 
 class Artist:
@@ -26,32 +25,13 @@ class Artist:
 
     Args:
         bundle: the task.
-        size_px: width and height.
-        render: which pictures go into the dataset; masks are drawn in any case.
-        distractors: things that stand about.
-        look: light and colours.
-        mask_noise: faults of the masks.
+        cfg: what the pictures show; masks are drawn in any case.
         num_threads: for the masks, 0 for all cores; changes no result.
-        cameras: of the episode.
     """
 
-    def __init__(
-        self,
-        bundle: TaskBundle,
-        *,
-        size_px: int,
-        render: Render,
-        distractors: DistractorConfig,
-        look: LookConfig,
-        mask_noise: MaskNoiseConfig,
-        num_threads: int,
-        cameras: tuple[str, ...],
-    ) -> None:
-        self.bundle, self.size_px, self.render = bundle, size_px, render
-        self.distractors, self.look, self.mask_noise = distractors, look, mask_noise
-        self.num_threads, self.cameras = num_threads, cameras
-        self.wrist = WRIST_CAMERA in cameras
-        self.is_plain = distractors.count[1] == 0 and look.is_off
+    def __init__(self, bundle: TaskBundle, cfg: EpisodesConfig, num_threads: int) -> None:
+        self.bundle, self.cfg, self.num_threads = bundle, cfg, num_threads
+        self.is_plain = cfg.distractors.count[1] == 0 and cfg.look.is_off
         self.renderer: MaskRenderer | None = None
 
     def __enter__(self) -> "Artist":
@@ -63,12 +43,12 @@ class Artist:
 
     def episode(self, rollouts: Rollouts, world: int, episode_id: str) -> Episode:
         """Return the episode of a world with its pictures."""
-        bundle = self.bundle
+        bundle, cfg = self.bundle, self.cfg
         length = int(rollouts.num_frames[world])
         labels, rgb_mp4, drawn = self._pictures(rollouts, world, length, episode_id)
-        if not self.mask_noise.is_off:
+        if not cfg.mask_noise.is_off:
             rng = rng_for(rollouts.seed, "mask-noise", episode_id)
-            faults = draw_faults(labels, self.mask_noise, rng)
+            faults = draw_faults(labels, cfg.mask_noise, rng)
             labels = apply_faults(labels, faults)
             drawn["mask_faults"] = as_json(faults)
         return Episode(
@@ -81,11 +61,11 @@ class Artist:
             state=rollouts.state[:length, world].copy(),
             action=rollouts.told[:length, world].copy(),
             success=np.arange(length) >= rollouts.held_at[world],
-            simulated=rollouts.simulated(world, self.size_px),
+            simulated=rollouts.simulated(world, cfg.size_px),
             referee=bool(rollouts.referee[world]),
             objects=tuple(o.name for o in bundle.scene.objects),
             params=rollouts.params[world] | drawn,
-            cameras=self.cameras,
+            cameras=cfg.cameras,
             actions=rollouts.names,
             rgb_mp4=rgb_mp4,
         )
@@ -99,7 +79,7 @@ class Artist:
                 self.renderer = self._renderer(self.bundle)
             return *self._drawn(self.renderer, [(s, world) for s in course]), {}
         rng = rng_for(rollouts.seed, "furnish", episode_id)
-        scene = furnish(self.bundle, course, world, self.distractors, self.look, rng)
+        scene = furnish(self.bundle, course, world, self.cfg.distractors, self.cfg.look, rng)
         with self._renderer(scene.world) as renderer:
             if len(scene.sizes):  # the last geoms; before the first picture, which fixes labels
                 renderer.labels[-len(scene.sizes) :] = BACKGROUND
@@ -107,13 +87,18 @@ class Artist:
             return *self._drawn(renderer, moments), scene.drawn
 
     def _renderer(self, source: TaskBundle | World) -> MaskRenderer:
-        return MaskRenderer(source, self.size_px, num_threads=self.num_threads, wrist=self.wrist)
+        return MaskRenderer(
+            source,
+            self.cfg.size_px,
+            num_threads=self.num_threads,
+            wrist=WRIST_CAMERA in self.cfg.cameras,
+        )
 
     def _drawn(
         self, renderer: MaskRenderer, moments: list[tuple[Snapshot, int]]
     ) -> tuple[np.ndarray, bytes]:
         labels = renderer.draw_many(moments)
-        if self.render == "masks":
+        if self.cfg.render == "masks":
             return labels, b""
         pictures = np.stack([renderer.draw_rgb(*moment) for moment in moments])
         return labels, stream.encode_rgb(pictures).mp4

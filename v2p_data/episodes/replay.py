@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float32
 
-from v2p_data.episodes.collect import EpisodesConfig
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.episodes.dataset.about import CARRIED_TASKS, read_about
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
@@ -30,7 +30,7 @@ from v2p_data.episodes.dataset.features import (
 )
 from v2p_data.episodes.dataset.intake import demand_bounded
 from v2p_data.episodes.dataset.tables import DATA_GLOB, column, damage_told, read_info, row_spans
-from v2p_data.episodes.rollouts import Rollouts, roll_out
+from v2p_data.episodes.rollouts import Lesson, Rollouts, roll_out
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.settings import from_values
 from v2p_data.play import StateActor
@@ -222,8 +222,7 @@ def _played(
         actions[: len(e.action), e.world % cfg.batch_worlds] = e.action
     rows = iter(actions)
     return roll_out(
-        bundle,
-        StateActor(lambda obs: next(rows)),
+        Lesson(bundle=bundle, expert=StateActor(lambda obs: next(rows))),
         SimConfig(fine=True, randomization=cfg.randomization),
         num_worlds=cfg.batch_worlds,
         seed=seed,

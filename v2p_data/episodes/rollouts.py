@@ -38,6 +38,18 @@ Referee = Callable[[TaskBundle, Mapping[str, np.ndarray]], Bool[np.ndarray, "env
 
 
 @dataclass(frozen=True, kw_only=True)
+class Lesson:
+    """One task and who can do it."""
+
+    bundle: TaskBundle
+    expert: Actor
+    task: type[Task] | None = None
+    """The task, instead of `bundle.code`."""
+    referee: Referee | None = None
+    """The independent judge, instead of `task.referee`."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CutConfig:
     """Where an episode ends."""
 
@@ -213,8 +225,7 @@ class Telling:
 
 
 def roll_out(
-    bundle: TaskBundle,
-    actor: Actor,
+    lesson: Lesson,
     sim: SimConfig,
     *,
     num_worlds: int,
@@ -222,13 +233,18 @@ def roll_out(
     num_threads: int = 1,
     cut: CutConfig,
     actions: Actions = "delta_tool",
-    task: type[Task] | None = None,
-    referee: Referee | None = None,
 ) -> Rollouts:
     """Run one episode in every world until each has succeeded or its time is up."""
-    env = BatchEnv(bundle, sim, num_envs=num_worlds, seed=seed, num_threads=num_threads, task=task)
-    telling = Telling(actor, actions, env)
-    recorded = record_rollouts(View(env), telling, cut, seed=seed, referee=referee)
+    env = BatchEnv(
+        lesson.bundle,
+        sim,
+        num_envs=num_worlds,
+        seed=seed,
+        num_threads=num_threads,
+        task=lesson.task,
+    )
+    telling = Telling(lesson.expert, actions, env)
+    recorded = record_rollouts(View(env), telling, cut, seed=seed, referee=lesson.referee)
     return replace(recorded, **telling.told())
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.collect import EpisodesConfig, staged_episodes
+from v2p_data.episodes.collect import staged_episodes
+from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.episodes.dataset.features import Actions, actions_in
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import check_checkpoint
@@ -91,7 +92,8 @@ def make_distillation(
 ) -> dict[str, Any]:
     """Let a student act, the expert label and take over, and train on, in rounds."""
     from policies.bc.trainer import TrainerConfig
-    from v2p_data.distillation.rounds import Lesson, demand_masks, distill
+    from v2p_data.distillation.rounds import Course, demand_masks, distill
+    from v2p_data.episodes.rollouts import Lesson
     from v2p_data.experts.labeller import labeller_of
 
     del inputs
@@ -115,20 +117,17 @@ def make_distillation(
             )
             last.update(asdict(trained))
 
-        distilled = distill(
-            {
+        course = Course(
+            lessons={
                 s.item: Lesson(bundle=TaskBundle.load(s.task), expert=labeller_of(s.expert))
                 for s in sources
             },
-            student,
-            train,
-            recipe,
-            episodes,
-            out,
-            seed,
+            cfg=recipe,
+            episodes=episodes,
+            seed=seed,
             num_threads=runtime.num_threads,
-            on_progress=runtime.progress,
         )
+        distilled = distill(course, student, train, out, runtime.progress)
     return distilled.counts() | {"samples_per_s": round(last.get("samples_per_s", 0.0), 1)}
 
 
