@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.env.actions import steps_to
+from v2p_data.sim.env.actions import state_as_seen, steps_to
 from v2p_data.sim.env.batch_env import BatchEnv, Snapshot, StepResult
 from v2p_data.sim.render.masks import MaskRenderer
-from v2p_data.sim.robot.action_names import Actions
-from v2p_data.sim.wrappers.gym_env import STATE_HIGH, STATE_LOW
+from v2p_data.sim.robot.interface import STEPS, ArmInterface
+from v2p_data.sim.wrappers.gym_env import within_bounds
 
 
 @dataclass(kw_only=True)
@@ -130,7 +130,7 @@ class Policy(Protocol):
         ...
 
     def act(
-        self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n 11"]
+        self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n state"]
     ) -> Float32[np.ndarray, "n act"]:
         """Return the next action of every world."""
         ...
@@ -143,17 +143,28 @@ class VisionActor:
     policy: Policy
     wrist: bool = False
     """Whether it sees the wrist's picture too, below the table's."""
-    actions: Actions = "delta_tool"
-    """What its actions say."""
+    interface: ArmInterface = STEPS
+    """What it sees of the arm and tells it."""
+    num_states: int | None = None
+    """Length of the state that it knows; any if None."""
 
     def reset(self, worlds: BatchEnv) -> None:
         """Tell the policy that episodes begin."""
         self.policy.reset(worlds.num_envs)
 
     def act(self, view: View) -> Float[np.ndarray, "env 7"]:
-        """Return the steps to the policy's actions on what `V2PEnv` shows: the state is within bounds."""
-        state = np.clip(view.state, STATE_LOW, STATE_HIGH).astype(np.float32)
-        return steps_to(view.worlds, self.policy.act(view.labels, state), self.actions)
+        """Return the steps to the policy's actions on what `V2PEnv` shows: the state is within bounds.
+
+        Raises:
+            V2PError: the arm has not as many joints as the policy sees.
+        """
+        state = within_bounds(state_as_seen(view.state, view.worlds, self.interface))
+        if self.num_states not in (None, state.shape[1]):
+            raise V2PError(
+                f"the policy sees a state of {self.num_states} numbers, and the arm of task '{view.worlds.bundle.title}'"
+                f" gives {state.shape[1]}: evaluate the policy with the arm of its dataset"
+            )
+        return steps_to(view.worlds, self.policy.act(view.labels, state), self.interface.actions)
 
 
 @dataclass(frozen=True)

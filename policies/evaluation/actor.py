@@ -87,6 +87,7 @@ def load_actor(
     greys: Sequence[int],
     task: str = "",
     device: str | None = None,
+    num_states: int = 11,
     num_actions: int = 7,
 ) -> PolicyActor:
     """Read a checkpoint of any policy type LeRobot knows.
@@ -96,7 +97,8 @@ def load_actor(
         greys: grey (0 to 255) of each label of a picture.
         task: the task in words; see `PolicyActor.for_task`.
         device: where the policy runs; by default, where its settings say.
-        num_actions: entries of an action that the simulator is given.
+        num_states: entries of the state that the simulator gives.
+        num_actions: entries of an action that it is given.
 
     Raises:
         UnsuitablePolicyError: it cannot be opened, or wants to see or do what the simulator does not have.
@@ -104,7 +106,8 @@ def load_actor(
     from lerobot.envs.factory import make_env_pre_post_processors
 
     config = env_config(wrist=True)
-    config.features[ACTION_KEY] = replace(config.features[ACTION_KEY], shape=(num_actions,))
+    for key, count in (("agent_pos", num_states), (ACTION_KEY, num_actions)):
+        config.features[key] = replace(config.features[key], shape=(count,))
     try:
         height, width, cameras = check_features(folder, config)
         loaded = load_policy(folder, config, device)

@@ -17,14 +17,15 @@ from v2p_data.deployment.robot import ActionScale
 from v2p_data.episodes import rollouts
 from v2p_data.episodes.collect import staged_episodes
 from v2p_data.episodes.dataset.edit import merge
-from v2p_data.episodes.dataset.features import EXECUTED_KEY, METADATA_FILE
+from v2p_data.episodes.dataset.features import EXECUTED_KEY, METADATA_FILE, STATE_NAMES
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.replay import replay
 from v2p_data.episodes.rollouts import CutConfig
+from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.evaluation.facts import actions_of
+from v2p_data.evaluation.facts import interface_of
 from v2p_data.evaluation.judging import contestant
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import StateActor
@@ -33,7 +34,10 @@ from v2p_data.policy.training import POLICY_FOLDER, sources_of
 from v2p_data.sim.env import ranges, verdict
 from v2p_data.sim.env.actions import steps_to
 from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.model.world import build_world
 from v2p_data.sim.robot.action_names import DELTA_NAMES, action_names
+from v2p_data.sim.robot.interface import ArmInterface
+from v2p_data.sim.robot.robot import FINE, NUM_ARM_JOINTS
 from v2p_data.stages import (
     EVALUATION_FILE,
     ROOT_OF_TASKS,
@@ -47,10 +51,19 @@ pytestmark = pytest.mark.slow
 KINDS = ("absolute_tool", "joints")
 
 
+def interface_for(actions: str) -> ArmInterface:
+    """Return a kind's interface: those who hold joints see their angles."""
+    return ArmInterface(actions=actions, joint_state=actions == "joints")
+
+
+def num_states(actions: str) -> int:
+    return len(STATE_NAMES) + NUM_ARM_JOINTS * (actions == "joints")
+
+
 def engine(actions: str):
     return replace(
         ENGINE,
-        episodes=replace(EPISODES, actions=actions),
+        episodes=replace(EPISODES, **vars(interface_for(actions))),
         distillation=replace(DISTILLATION, rounds=1, episodes=3),
         policy=PolicyConfig(
             preset="small", steps=3, batch_size=8, checkpoints=3, judge_episodes=2
@@ -108,12 +121,15 @@ def test_steps_are_recorded_as_ever(roots):
     dataset = dataset_of(roots["delta_tool"])
 
     assert features(dataset)["action"]["names"] == list(DELTA_NAMES)
+    assert features(dataset)["observation.state"]["names"] == list(STATE_NAMES)
     assert EXECUTED_KEY not in features(dataset)
     # Nothing tells of an option at its default: recipes, and hence names of results, are those of earlier versions.
-    assert '"actions"' not in (dataset / METADATA_FILE).read_text()
+    told = (dataset / METADATA_FILE).read_text()
+    assert '"actions"' not in told
+    assert '"joint_state"' not in told
     for path in staged_episodes(next((roots["delta_tool"] / "episodes").glob("toy-*"))):
         with np.load(path) as data:
-            assert "actions" not in json.loads(str(data["about"]))
+            assert not {"actions", "num_joints"} & json.loads(str(data["about"])).keys()
 
 
 @pytest.mark.parametrize("actions", KINDS)
@@ -124,12 +140,36 @@ def test_the_same_is_done_and_told_otherwise(roots, actions):
     assert features(targets)["action"]["shape"] == [len(names)]
     assert features(targets)["action"]["names"] == names
     assert json.loads((targets / METADATA_FILE).read_text())["action"] == names
-    for column in ("observation.state", "next.reward", "privileged.object_pose"):
+    for column in ("next.reward", "privileged.object_pose"):
         np.testing.assert_array_equal(numbers(targets, column), numbers(steps, column))
+    of_tool = numbers(targets, "observation.state")[:, : len(STATE_NAMES)]
+    np.testing.assert_array_equal(of_tool, numbers(steps, "observation.state"))
     np.testing.assert_array_equal(numbers(targets, EXECUTED_KEY), numbers(steps, "action"))
     assert numbers(targets, "action").shape[1] == len(names)
     assert verify(targets).problems == ()
     assert "after this step" in (targets / "README.md").read_text()
+
+
+def test_joint_angles_follow_the_tool_in_the_state(roots):
+    dataset = dataset_of(roots["joints"])
+    state, column = numbers(dataset, "observation.state"), features(dataset)["observation.state"]
+    robot = build_world(toy_task.bundle().scene, FINE).robot
+    joints = state[:, len(STATE_NAMES) :].astype(float)
+
+    assert column["names"] == [*STATE_NAMES, *(f"joint_{k}.pos" for k in range(1, 8))]
+    assert json.loads((dataset / METADATA_FILE).read_text())["state"] == column["names"]
+    assert "joint_7.pos (rad)" in (dataset / "README.md").read_text()
+    # These angles hold the tool where the state says that it is.
+    tool = robot.tool_state(joints, np.zeros_like(joints))
+    np.testing.assert_allclose(tool.pos, state[:, :3], atol=1e-5)
+
+
+def test_states_with_and_without_joints_do_not_go_together(roots, tmp_path):
+    staged = [staged_episodes(next((roots[a] / "episodes").glob("toy-*")))[k] for k, a in enumerate(("delta_tool", "joints"))]  # fmt: skip
+    without = [replace(Episode.load(staged[1]), actions=()).save(tmp_path / "staged")]
+
+    with pytest.raises(V2PError, match=r"angles of 7 joints .* of 0; .*--episodes\.joint-state"):
+        pack([staged[0], *without], "me/both", tmp_path / "both")
 
 
 @pytest.mark.parametrize("actions", ["delta_tool", *KINDS])
@@ -153,7 +193,12 @@ def test_recorded_targets_bring_the_same_states_back_where_no_noise_is_on_them(a
     def played(actor):
         lesson = toy_task.lesson(actor)
         return rollouts.roll_out(
-            lesson, sim, num_worlds=8, seed=3, cut=CutConfig(), actions=actions
+            lesson,
+            sim,
+            num_worlds=8,
+            seed=3,
+            cut=CutConfig(),
+            interface=ArmInterface(actions=actions),
         )
 
     first = played(StateActor(toy_task.act))
@@ -222,9 +267,12 @@ def test_lerobots_evaluation_does_what_ours_does(agreed, trained):
     config = env_config(dataset, size_px=toy_run.SIZE_PX)  # the dataset tells of its actions
     count = len(action_names(actions))
     assert (config.actions, config.features["action"].shape) == (actions, (count,))
-    actor = load_actor(policy, greys=PALETTE, device="cpu", num_actions=count)
+    assert config.features["agent_pos"].shape == (num_states(actions),)
+    actor = load_actor(
+        policy, greys=PALETTE, device="cpu", num_states=num_states(actions), num_actions=count
+    )
     bundle = TaskBundle.load(dataset / ROOT_OF_TASKS / "toy")
-    seen = VisionActor(actor.for_task(bundle.description), actions=actions)
+    seen = VisionActor(actor.for_task(bundle.description), interface=interface_for(actions))
 
     ours = judge(bundle, seen, episodes=2, first_seed=5, cfg=EvaluationConfig(worlds=2), size_px=toy_run.SIZE_PX)  # fmt: skip
     loaded = load_policy(policy, config, "cpu")
@@ -236,15 +284,22 @@ def test_lerobots_evaluation_does_what_ours_does(agreed, trained):
 def test_what_a_policys_actions_say_is_found_without_its_dataset(trained, tmp_path):
     actions, _, policy = trained
     copied = Path(shutil.copytree(policy, tmp_path / "policy"))
-    assert f"--env.actions={actions}" in (copied / "README.md").read_text()
+    card = (copied / "README.md").read_text()
+    assert f"--env.actions={actions}" in card
+    assert ("--env.joint_state=true" in card) == (actions == "joints")
     for name in ("v2p.json", "train_config.json"):
         (copied / name).unlink()
 
-    assert actions_of(copied) == (actions, len(action_names(actions)))
+    assert interface_of(copied) == (
+        interface_for(actions),
+        num_states(actions),
+        len(action_names(actions)),
+    )
 
 
 def test_robots_refuse_a_policy_that_gives_targets(trained):
     actions, _, policy = trained
+    option = "joint-state" if actions == "joints" else f"actions={actions}"
 
-    with pytest.raises(V2PError, match=f"trained with --episodes.actions={actions}, and robots"):
+    with pytest.raises(V2PError, match=f"trained with --episodes.{option}, and robots"):
         check_meaning(policy, ActionScale())

@@ -21,8 +21,9 @@ from v2p_data.episodes.dataset.features import (
 )
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import PROCESSOR_FILES, Checkpoint, check_checkpoint
-from v2p_data.evaluation.facts import Facts, actions_of, read_facts
+from v2p_data.evaluation.facts import Facts, interface_of, read_facts
 from v2p_data.sim.render.masks import PALETTE
+from v2p_data.sim.robot.interface import STEPS
 
 HZ = round(1 / STEP_S)
 STATISTICS = {
@@ -76,11 +77,12 @@ def check_meaning(folder: Path, scale: ActionScale, task: str = "") -> Facts:
 
 def _opened(folder: Path) -> Checkpoint:
     found = check_checkpoint(folder)
-    actions, _ = actions_of(folder)
-    if actions != "delta_tool":
+    interface, *_ = interface_of(folder)
+    if interface != STEPS:
+        option = "joint-state" if interface.joint_state else f"actions={interface.actions}"
         raise V2PError(
-            f"the policy in {folder} was trained with --episodes.actions={actions}, and robots and the twin carry out 'delta_tool'"
-            " only; train one on episodes that were recorded without this option"
+            f"the policy in {folder} was trained with --episodes.{option}, and robots and the twin carry out 'delta_tool'"
+            " only and give no angles of joints; train one on episodes that were recorded without this option"
         )
     return found
 

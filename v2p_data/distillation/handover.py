@@ -100,7 +100,7 @@ def hand_over(
     horizon = round(cfg.time_scale * env.horizon)
     size_px, wrist = episodes.size_px, episodes.wrist
     pictures = np.empty((horizon, cfg.worlds, size_px * (1 + wrist), size_px), np.uint8)
-    telling = Telling(lesson.expert, episodes.actions, env)
+    telling = Telling(lesson.expert, episodes.interface, env)
     actor = Handover(student, telling, takeover, pictures)
     view = View(env, size_px, num_threads, wrist=wrist)
     recorded = record_rollouts(

@@ -48,7 +48,7 @@ class LearningStudent(Protocol):
     def add(
         self,
         labels: UInt8[np.ndarray, "frame h w"],
-        state: Float32[np.ndarray, "frame 11"],
+        state: Float32[np.ndarray, "frame state"],
         action: Float32[np.ndarray, "frame act"],
         task: str,
         lengths: Sequence[int],
@@ -236,7 +236,9 @@ def _collect(
         if not path.is_file():
             handovers = hand_over(
                 lesson,
-                VisionActor(student.for_task(lesson.bundle.description), actions=episodes.actions),
+                VisionActor(
+                    student.for_task(lesson.bundle.description), interface=episodes.interface
+                ),
                 cfg,
                 episodes,
                 seed=seed_for(seed, "batch", batch),

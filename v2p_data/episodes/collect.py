@@ -127,7 +127,7 @@ def _collect(
                 seed=seed_for(seed, "batch", number),
                 num_threads=num_threads,
                 cut=cfg.cut,
-                actions=cfg.actions,
+                interface=cfg.interface,
             )
             artist = Artist(lesson.bundle, cfg, num_threads)
             entry = _stage(artist, rollouts, out, number, have, on_progress)

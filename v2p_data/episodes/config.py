@@ -12,6 +12,7 @@ from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig
 from v2p_data.sim.render.masks import MASK_CAMERAS
 from v2p_data.sim.robot.action_names import Actions
+from v2p_data.sim.robot.interface import ArmInterface
 
 Render = Literal["masks", "rgb", "both"]
 
@@ -36,6 +37,8 @@ class EpisodesConfig:
     """Masks of a second camera too, which the hand carries: `observation.images.mask_wrist`."""
     actions: Actions = field(default="delta_tool", metadata=UNSAID_BY_DEFAULT)
     """What `action` says: the tool's step, the tool's target after it, or the joint angles of that target."""
+    joint_state: bool = field(default=False, metadata=UNSAID_BY_DEFAULT)
+    """Let the angles of the arm's joints [rad] follow the 11 numbers of `observation.state`."""
     cut: CutConfig = field(default_factory=CutConfig)
     randomization: RandomizationConfig = field(default_factory=ranges.recording)
     distractors: DistractorConfig = field(default_factory=DistractorConfig)
@@ -60,6 +63,11 @@ class EpisodesConfig:
             raise ValueError(
                 "the wrist's camera gives exact masks only; set render to masks or both and leave mask_noise off"
             )
+
+    @property
+    def interface(self) -> ArmInterface:
+        """What is seen of the arm and told it."""
+        return ArmInterface(actions=self.actions, joint_state=self.joint_state)
 
     @property
     def cameras(self) -> tuple[str, ...]:

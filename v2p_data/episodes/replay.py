@@ -8,7 +8,7 @@ holds the expert's labels.
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ class Recorded:
     """In the dataset."""
     world: int
     """In its batch."""
-    state: Float32[np.ndarray, "time 11"]
+    state: Float32[np.ndarray, "time state"]
     action: Float32[np.ndarray, "time 7"]
     success: Bool[np.ndarray, "time"]
     reward: Float32[np.ndarray, "time"] | None = None
@@ -228,6 +228,7 @@ def _played(
         seed=seed,
         num_threads=num_threads,
         cut=cfg.cut,
+        interface=replace(cfg.interface, actions="delta_tool"),
     )
 
 

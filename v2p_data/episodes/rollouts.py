@@ -25,10 +25,11 @@ from v2p_data.episodes.dataset.features import (
 from v2p_data.geometry.camera import intrinsics
 from v2p_data.geometry.rotation import product
 from v2p_data.play import Actor, Film, View, play
-from v2p_data.sim.env.actions import targets_of
+from v2p_data.sim.env.actions import state_as_seen, targets_of
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.verdict import RefereeRecord, referee_verdict
-from v2p_data.sim.robot.action_names import Actions, action_names
+from v2p_data.sim.robot.action_names import action_names
+from v2p_data.sim.robot.interface import STEPS, ArmInterface
 from v2p_data.task.task import Task, TaskBundle
 
 ABOUT_X = np.array([[0.0], [1.0], [0.0], [0.0]])
@@ -65,7 +66,7 @@ class Rollouts:
     """One batch of episodes, drawn later or never. Row `t` precedes action `t`."""
 
     seed: int
-    state: Float32[np.ndarray, "time env 11"]
+    state: Float32[np.ndarray, "time env state"]
     action: Float32[np.ndarray, "time env 7"]
     """Steps of the tool."""
     executed: Float32[np.ndarray, "time env 7"]
@@ -192,19 +193,19 @@ class EpisodeEnds:
 
 
 class Telling:
-    """An actor whose steps are told as targets, too.
+    """An actor whose steps are told as targets, too, and before each of them the state.
 
     Args:
         actor: who acts.
-        actions: what a dataset's `action` says.
+        interface: what a dataset's `action` says, and what its state shows.
         worlds: in which it acts.
     """
 
-    def __init__(self, actor: Actor, actions: Actions, worlds: BatchEnv) -> None:
-        self._actor = actor
-        self._actions: Actions = actions
+    def __init__(self, actor: Actor, interface: ArmInterface, worlds: BatchEnv) -> None:
+        self._actor, self._interface = actor, interface
+        self._states: list[np.ndarray] = []
         self._targets: list[np.ndarray] = []
-        self._names = action_names(actions, worlds.world.robot.num_joints)
+        self._num_joints = worlds.world.robot.num_joints
 
     def reset(self, worlds: BatchEnv) -> None:
         """Tell the actor that episodes begin."""
@@ -213,15 +214,19 @@ class Telling:
     def act(self, view: View) -> Float[np.ndarray, "env 7"]:
         """Return the actor's actions."""
         action = self._actor.act(view)
-        if self._actions != "delta_tool":
+        self._states.append(state_as_seen(view.state, view.worlds, self._interface))
+        if self._interface.actions != "delta_tool":
             step = np.clip(action, -1.0, 1.0).astype(np.float32)
-            self._targets.append(targets_of(view.worlds, step, self._actions))
+            self._targets.append(targets_of(view.worlds, step, self._interface.actions))
         return action
 
     def told(self) -> dict[str, Any]:
-        """Return `names` and `targets` of `Rollouts`."""
-        is_step = self._actions == "delta_tool"
-        return {} if is_step else {"names": self._names, "targets": np.stack(self._targets)}
+        """Return `state`, and of targets `names` and `targets` of `Rollouts`."""
+        told: dict[str, Any] = {"state": np.stack(self._states)}
+        if self._targets:
+            told["names"] = action_names(self._interface.actions, self._num_joints)
+            told["targets"] = np.stack(self._targets)
+        return told
 
 
 def roll_out(
@@ -232,7 +237,7 @@ def roll_out(
     seed: int,
     num_threads: int = 1,
     cut: CutConfig,
-    actions: Actions = "delta_tool",
+    interface: ArmInterface = STEPS,
 ) -> Rollouts:
     """Run one episode in every world until each has succeeded or its time is up."""
     env = BatchEnv(
@@ -243,7 +248,7 @@ def roll_out(
         num_threads=num_threads,
         task=lesson.task,
     )
-    telling = Telling(lesson.expert, actions, env)
+    telling = Telling(lesson.expert, interface, env)
     recorded = record_rollouts(View(env), telling, cut, seed=seed, referee=lesson.referee)
     return replace(recorded, **telling.told())
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from v2p_data.episodes.dataset.features import STATE_NAMES
 from v2p_data.errors import V2PError, write_refusal
 from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS
 
@@ -46,7 +47,7 @@ class Episode:
     seed: int
     labels: UInt8[np.ndarray, "time h w"]
     """0 background, 1 robot, 2 manipulated object, 3.. the others; of two cameras below each other."""
-    state: Float32[np.ndarray, "time 11"]
+    state: Float32[np.ndarray, "time state"]
     action: Float32[np.ndarray, "time act"]
     success: Bool[np.ndarray, "time"]
     """Whether success has held (0.25 s on end) by the end of the row's action; never falls back."""
@@ -175,6 +176,8 @@ class Heading:
     cameras: tuple[str, ...]
     actions: tuple[str, ...]
     """Names of the action's entries; empty: steps of the tool."""
+    num_joints: int
+    """Of how many joints the angles are in the state."""
     is_handover: bool
     """It holds who acted."""
     known: tuple[str, ...]
@@ -195,10 +198,9 @@ class Heading:
                 about = _about(data, path)
                 is_handover = INTERVENTION in data
                 known = _known(data)
-            with zipfile.ZipFile(path) as archive, archive.open("labels.npy") as member:
-                np.lib.format.read_magic(member)
-                shape, _, _ = np.lib.format.read_array_header_1_0(member)
-            count, height, width = shape
+            with zipfile.ZipFile(path) as archive:
+                count, height, width = _shape(archive, "labels")
+                _, num_states = _shape(archive, "state")
         except FileNotFoundError:
             raise V2PError(f"there is no staged episode {path}") from None
         except V2PError:
@@ -214,6 +216,7 @@ class Heading:
             size_px=(height, width),
             cameras=about.get("cameras", (MASK_CAMERA,)),
             actions=about.get("actions", ()),
+            num_joints=num_states - len(STATE_NAMES),
             is_handover=is_handover,
             known=known,
             digest=digest,
@@ -266,6 +269,13 @@ def _about(data: Any, path: Path) -> dict[str, Any]:
         raise V2PError(f"staged episode {path} was written by another version; remake it")
     named = ("objects", "cameras", "actions")
     return about | {name: tuple(about[name]) for name in named if name in about}
+
+
+def _shape(archive: zipfile.ZipFile, name: str) -> tuple[int, ...]:
+    with archive.open(f"{name}.npy") as member:
+        np.lib.format.read_magic(member)
+        shape, _, _ = np.lib.format.read_array_header_1_0(member)
+    return shape
 
 
 def _known(data: Any) -> tuple[str, ...]:

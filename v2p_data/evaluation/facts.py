@@ -12,7 +12,7 @@ from annotated_types import Gt
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from safetensors.numpy import load_file
 
-from v2p_data.episodes.dataset.features import ACTION_KEY, METADATA_FILE, STATE_KEY
+from v2p_data.episodes.dataset.features import ACTION_KEY, METADATA_FILE, STATE_KEY, STATE_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import read_record, write_json_atomically
@@ -24,6 +24,7 @@ from v2p_data.sim.robot.action_names import (
     action_names,
     actions_named,
 )
+from v2p_data.sim.robot.interface import ArmInterface
 from v2p_data.sim.robot.robot import TARGET_LOW_M
 from v2p_data.task.task import TASK_FILE
 
@@ -84,8 +85,8 @@ def facts_of_dataset(dataset: Path) -> Facts:
         ) from error
 
 
-def actions_of(policy: Path) -> tuple[Actions, int]:
-    """Return what a policy's actions say, and how many entries they have.
+def interface_of(policy: Path) -> tuple[ArmInterface, int, int]:
+    """Return what a policy sees of the arm and tells it, and how many entries its states and its actions have.
 
     Its dataset's names tell. Where nothing knows them the shape tells of joints, and the statistics of the tool's targets:
     all are in front of the arm, and no episode goes forward in every step.
@@ -93,17 +94,27 @@ def actions_of(policy: Path) -> tuple[Actions, int]:
     Raises:
         V2PError: its file is damaged.
     """
-    does = _told(policy / "config.json").get("output_features") or {}
-    count = int(does.get(ACTION_KEY, {}).get("shape", [len(DELTA_NAMES)])[0])
-    if names := read_facts(policy).action:
-        return actions_named(names) or "delta_tool", count
+    config, facts = _told(policy / "config.json"), read_facts(policy)
+    sees, does = config.get("input_features") or {}, config.get("output_features") or {}
+    num_states = int(sees.get(STATE_KEY, {}).get("shape", [len(STATE_NAMES)])[0])
+    num_actions = int(does.get(ACTION_KEY, {}).get("shape", [len(DELTA_NAMES)])[0])
+    is_ours = facts.state[: len(STATE_NAMES)] in ((), STATE_NAMES)
+    interface = ArmInterface(
+        actions=(actions_named(facts.action) or "delta_tool") if facts.action else _guessed_actions(policy, num_actions),
+        joint_state=is_ours and num_states > len(STATE_NAMES),
+    )  # fmt: skip
+    return interface, num_states, num_actions
+
+
+def _guessed_actions(policy: Path, count: int) -> Actions:
+    """Return what `count` entries of an action whose names nobody knows say."""
     if count == len(action_names("joints")):
-        return "joints", count
+        return "joints"
     for path in policy.glob("policy_postprocessor*.safetensors"):
         low = load_file(path).get(f"{ACTION_KEY}.min")
         if low is not None and low.shape == (count,) == (len(TOOL_NAMES),) and low[0] > NEAREST_M:
-            return "absolute_tool", count
-    return "delta_tool", count
+            return "absolute_tool"
+    return "delta_tool"
 
 
 def write_facts(policy: Path, dataset: Path) -> None:

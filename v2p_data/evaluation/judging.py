@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from policies.evaluation.rate import wilson
+from v2p_data.episodes.dataset.features import STATE_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.batch import Judged, judge
 from v2p_data.evaluation.checkpoint import WEIGHTS_FILE, check_checkpoint
 from v2p_data.evaluation.config import EvaluationConfig
-from v2p_data.evaluation.facts import actions_of
+from v2p_data.evaluation.facts import interface_of
 from v2p_data.experts.labeller import PROGRAM_FILE, program_in
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
@@ -146,18 +147,19 @@ def _policy(folder: Path, device: str) -> Play:
     from policies.evaluation.actor import UnsuitablePolicyError, load_actor
 
     try:
-        actions, count = actions_of(folder)
+        interface, num_states, num_actions = interface_of(folder)
         actor = load_actor(
             folder,
             greys=PALETTE,
             device=device,
-            num_actions=count if actions == "joints" else ACT_DIM,
+            num_states=num_states if interface.joint_state else len(STATE_NAMES),
+            num_actions=num_actions if interface.actions == "joints" else ACT_DIM,
         )
     except UnsuitablePolicyError as error:
         raise V2PError(str(error)) from error
     wrist = len(actor.cameras) > 1
     return lambda bundle: (
-        VisionActor(actor.for_task(bundle.description), wrist, actions),
+        VisionActor(actor.for_task(bundle.description), wrist, interface, num_states),
         actor.size_px,
     )
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import staged_episodes
 from v2p_data.episodes.config import EpisodesConfig
-from v2p_data.episodes.dataset.features import Actions, actions_in
+from v2p_data.episodes.dataset.features import interface_in
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import check_checkpoint
 from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
@@ -22,6 +22,7 @@ from v2p_data.pipeline.settings import from_values
 from v2p_data.play import VisionActor
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.seeds import seed_for
+from v2p_data.sim.robot.interface import STEPS, ArmInterface
 from v2p_data.task.task import TaskBundle
 
 if TYPE_CHECKING:
@@ -195,8 +196,8 @@ def make_policy(
         )
         judge = None
         if policy.checkpoints > 1 and judges:
-            actions, episodes = actions_in_dataset(dataset), policy.judge_episodes
-            judge = checkpoint_judge(student, judges, episodes, seed, runtime, actions)
+            interface, episodes = interface_of(dataset), policy.judge_episodes
+            judge = checkpoint_judge(student, judges, episodes, seed, runtime, interface)
         trained = student.train(
             recipe, out, seed=seed % 2**63, judge=judge, on_progress=runtime.progress
         )
@@ -250,15 +251,15 @@ def new_student(
         device=runtime.device,
         start_from=start_from,
         num_threads=runtime.num_threads,
-        action_limit=ACTION_LIMIT if actions_in_dataset(dataset) == "delta_tool" else None,
+        action_limit=ACTION_LIMIT if interface_of(dataset).actions == "delta_tool" else None,
     )
 
 
-def actions_in_dataset(dataset: Path) -> Actions:
-    """Return what the actions of a dataset say; those of others are taken for steps of the tool."""
+def interface_of(dataset: Path) -> ArmInterface:
+    """Return what a dataset holds of the arm."""
     from v2p_data.episodes.dataset.tables import read_info
 
-    return actions_in(read_info(dataset)) or "delta_tool"
+    return interface_in(read_info(dataset))
 
 
 def checkpoint_judge(
@@ -267,7 +268,7 @@ def checkpoint_judge(
     episodes: int,
     seed: int,
     runtime: Runtime,
-    actions: Actions = "delta_tool",
+    interface: ArmInterface = STEPS,
 ) -> Callable[[Any], float]:
     """Return what gives a policy's mean success rate over task folders, on seeds that no evaluation uses."""
     from v2p_data.evaluation.batch import judge
@@ -283,7 +284,7 @@ def checkpoint_judge(
                 VisionActor(
                     replace(student, policy=policy.eval(), task=bundle.description),
                     wrist=len(student.cameras) > 1,
-                    actions=actions,
+                    interface=interface,
                 ),
                 episodes=episodes,
                 first_seed=seed_for(seed, "checkpoints", item) % 2**31,

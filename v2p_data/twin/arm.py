@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, UInt8
 from v2p_data.sim.env.batch_env import SimConfig, StepResult
 from v2p_data.sim.env.targets import ToolPose, next_target
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
-from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_HIGH, STATE_LOW
+from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, within_bounds
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.control import tool_pose
 from v2p_data.twin.interface import RGB_PX
@@ -57,7 +57,7 @@ class TwinArm:
 
     def state(self) -> Float32[np.ndarray, "11"]:
         """Return `observation.state`, within the bounds of the training environment's."""
-        state = np.clip(self.tool.state(self.target), STATE_LOW, STATE_HIGH)
+        state = within_bounds(self.tool.state(self.target))
         return state.astype(np.float32)
 
     def picture(self) -> UInt8[np.ndarray, "h w 3"]:

@@ -14,7 +14,6 @@ from v2p_data.episodes.dataset.features import (
     INTERVENTION_KEY,
     METADATA_FILE,
     SIMULATED,
-    STATE_NAMES,
     WRIST_KEY,
 )
 from v2p_data.episodes.dataset.handovers import who_acted
@@ -172,8 +171,9 @@ def _frame(info: dict[str, Any]) -> str:
             meaning = "picture of the same camera at the same moment"
         elif key == "observation.state":
             # Datasets of earlier versions have the first seven.
-            shown = len(feature["names"])
-            meaning = _named(STATE_NAMES[:shown], STATE_UNITS[:shown])
+            names = tuple(feature["names"])
+            units = (*STATE_UNITS, *("rad",) * len(names))
+            meaning = _named(names, units[: len(names)])
         elif key == "action":
             meaning = _action(feature["names"])
         elif key == "next.success":

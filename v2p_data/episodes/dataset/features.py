@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from v2p_data.sim.robot.action_names import DELTA_NAMES as ACTION_NAMES
-from v2p_data.sim.robot.action_names import Actions, actions_named
+from v2p_data.sim.robot.action_names import Actions, actions_named, joint_names
+from v2p_data.sim.robot.interface import ArmInterface
 
 FPS = 20
 ROBOT_TYPE = "v2p_franka"
@@ -112,11 +113,26 @@ def actions_in(info: Mapping[str, Any]) -> Actions | None:
     return actions_named(info.get("features", {}).get(ACTION_KEY, {}).get("names"))
 
 
+def state_names(num_joints: int = 0) -> tuple[str, ...]:
+    """Return the names of the state's entries; the angles of so many joints follow."""
+    return (*STATE_NAMES, *joint_names(num_joints))
+
+
+def interface_in(info: Mapping[str, Any]) -> ArmInterface:
+    """Return what a dataset with this `meta/info.json` holds; the actions of others are taken for steps of the tool."""
+    names = info.get("features", {}).get(STATE_KEY, {}).get("names") or ()
+    return ArmInterface(
+        actions=actions_in(info) or "delta_tool",
+        joint_state=tuple(names) != STATE_NAMES == tuple(names[: len(STATE_NAMES)]),
+    )
+
+
 def features(
     size_px: int,
     cameras: tuple[str, ...] = ("mask",),
     *,
     actions: Sequence[str] = ACTION_NAMES,
+    states: Sequence[str] = STATE_NAMES,
     has_handovers: bool = False,
     is_simulated: bool = False,
 ) -> dict[str, dict[str, Any]]:
@@ -126,6 +142,7 @@ def features(
         size_px: width and height.
         cameras: which pictures there are.
         actions: names of the action's entries.
+        states: names of the state's.
         has_handovers: some episodes were acted by a student at first, so there is a column that says who acted.
         is_simulated: all episodes are a simulator's, so there is what only a simulator knows.
     """
@@ -140,8 +157,8 @@ def features(
         },
         STATE_KEY: {
             "dtype": "float32",
-            "shape": (len(STATE_NAMES),),
-            "names": list(STATE_NAMES),
+            "shape": (len(states),),
+            "names": list(states),
         },
         ACTION_KEY: {"dtype": "float32", "shape": (len(actions),), "names": list(actions)},
         SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},

@@ -38,9 +38,9 @@ from v2p_data.episodes.dataset.features import (
     ROBOT_TYPE,
     SIMULATED,
     STATE_KEY,
-    STATE_NAMES,
     SUCCESS_KEY,
     features,
+    state_names,
 )
 from v2p_data.episodes.dataset.repo_id import check_repo_id
 from v2p_data.episodes.dataset.shards import (
@@ -131,7 +131,7 @@ def pack(
                 "schema": METADATA_SCHEMA,
                 "repo_id": repo_id,
                 "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
-                "state": list(STATE_NAMES),
+                "state": list(state_names(headings[0].num_joints)),
                 "action": list(headings[0].actions or ACTION_NAMES),
                 "episodes": described,
                 "provenance": dict(provenance or {}),
@@ -176,6 +176,11 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
                 f"{heading.path} has actions of {', '.join(heading.actions or ACTION_NAMES)}, the first episode of "
                 f"{', '.join(first.actions or ACTION_NAMES)}; collect all episodes with one --episodes.actions and one arm"
             )
+        if heading.num_joints != first.num_joints:
+            raise V2PError(
+                f"{heading.path} has the angles of {heading.num_joints} joints in its state, the first episode of "
+                f"{first.num_joints}; collect all episodes with one --episodes.joint-state and one arm"
+            )
         if heading.num_frames < 2:
             raise V2PError(
                 f"{heading.path} has {heading.num_frames} frames; an episode has two at least"
@@ -201,6 +206,7 @@ def _write(
             first.size_px[1],
             first.cameras,
             actions=first.actions or ACTION_NAMES,
+            states=state_names(first.num_joints),
             has_handovers=has_handovers,
             is_simulated=is_simulated,
         ),

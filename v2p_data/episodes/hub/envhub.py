@@ -14,7 +14,13 @@ from pathlib import Path
 
 from v2p_data.episodes.dataset.about import CARRIED_TASKS
 from v2p_data.episodes.dataset.card import LICENSE
-from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES, actions_named
+from v2p_data.episodes.dataset.features import (
+    ACTION_KEY,
+    ACTION_NAMES,
+    STATE_KEY,
+    STATE_NAMES,
+    actions_named,
+)
 from v2p_data.episodes.dataset.repo_id import check_repo_id
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import demand_whole
@@ -58,11 +64,15 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
     check_repo_id(repo_id)
     if out.exists():
         raise V2PError(f"{out} exists already; choose another place")
-    from v2p_data.sim.wrappers.lerobot_env import actions_of_tasks
+    from v2p_data.sim.wrappers.lerobot_env import names_of_tasks
 
     folders = _tasks_in(source)
-    names = actions_of_tasks(source) or ACTION_NAMES
-    actions = actions_named(names) or "delta_tool"
+    names = names_of_tasks(source, ACTION_KEY) or ACTION_NAMES
+    states = names_of_tasks(source, STATE_KEY) or STATE_NAMES
+    settings = {
+        "actions": actions_named(names) or "delta_tool",
+        "joint_state": len(states) > len(STATE_NAMES),
+    }
     demand_whole(source, below=f"{CARRIED_TASKS.as_posix()}/")
     for folder in folders.values():
         demand_whole(folder)
@@ -90,9 +100,11 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
         into = partial / path.relative_to(SOURCE.parent)
         into.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, into)
-    (partial / "env.py").write_text(ENV_PY.replace("REPO_ID", repo_id).replace("ACTIONS", actions))
+    (partial / "env.py").write_text(
+        ENV_PY.replace("REPO_ID", repo_id).replace("SETTINGS", repr(settings))
+    )
     (partial / "requirements.txt").write_text("\n".join(requirements(modules)) + "\n")
-    (partial / "README.md").write_text(_card(repo_id, rows, names))
+    (partial / "README.md").write_text(_card(repo_id, rows, states, names))
     partial.rename(out)
     return EnvHub(folder=out, repo_id=repo_id, tasks=tuple(folders))
 
@@ -178,9 +190,9 @@ def _tasks_in(source: Path) -> dict[str, Path]:
     )
 
 
-def _card(repo_id: str, rows: list[str], actions: tuple[str, ...]) -> str:
+def _card(repo_id: str, rows: list[str], states: tuple[str, ...], actions: tuple[str, ...]) -> str:
     tasks = "\n".join(["| number | task | folder | steps |", "|---|---|---|---|", *rows])
-    state, action = (", ".join(f"`{n}`" for n in names) for names in (STATE_NAMES, actions))
+    state, action = (", ".join(f"`{n}`" for n in names) for names in (states, actions))
     return f"""---
 library_name: lerobot
 license: {LICENSE}
@@ -254,7 +266,7 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
 
     named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg", "horizon_scale", "wrist")
     given = {name: getattr(cfg, name) for name in named if hasattr(cfg, name)}
-    return V2PEnvConfig(tasks=str(folder / TASKS), actions="ACTIONS", **given).create_envs(n_envs, use_async_envs)
+    return V2PEnvConfig(tasks=str(folder / TASKS), **SETTINGS, **given).create_envs(n_envs, use_async_envs)
 
 
 def _whole_repository():

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.episodes.dataset.card import CARD_FILE, LICENSE, write_text
-from v2p_data.episodes.dataset.features import actions_named
+from v2p_data.episodes.dataset.features import STATE_NAMES, actions_named
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 
@@ -40,7 +40,7 @@ license: {license}
 
 ```bash
 {fetch}v2p eval POLICY --tasks {tasks}
-lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks={tasks}{wrist}{actions}
+lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks={tasks}{wrist}{actions}{joints}
 ```
 
 ## What it sees and does
@@ -74,7 +74,8 @@ def write_policy_card(folder: Path) -> None:
         words += f" for {recipe['steps']} steps of {recipe['batch_size']} frames"
     features = _features(config)
     facts = json_or_none(folder / "v2p.json")
-    actions = actions_named(facts.get("action")) if isinstance(facts, dict) else None
+    known: dict[str, Any] = facts if isinstance(facts, dict) else {}
+    actions, states = actions_named(known.get("action")), known.get("state") or ()
     text = CARD.format(
         license=LICENSE,
         head=f"datasets:\n- {dataset}\n" if dataset else "",
@@ -90,6 +91,7 @@ def write_policy_card(folder: Path) -> None:
         else "",
         tasks="dataset/v2p/tasks" if dataset else "TASKS",
         actions=f" --env.actions={actions}" if actions not in (None, "delta_tool") else "",
+        joints=" --env.joint_state=true" if len(states) > len(STATE_NAMES) else "",
         wrist=" --env.wrist=true" if any("mask_wrist" in name for name in features) else "",
         features="\n".join(f"| `{name}` | {shape} |" for name, shape in features.items()),
     )

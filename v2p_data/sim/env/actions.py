@@ -1,21 +1,32 @@
-"""What a dataset's or a policy's `action` says: the tool's step, or where tool or joints shall be after it.
+"""What a dataset's or a policy's `action` says, the tool's step or where tool or joints shall be after it, and its state.
 
 Worlds carry out steps of the tool alone (`delta_tool`). Targets are those of the controller after a step, leashes included,
 without the noise that randomisation adds; so each is turned back into the step that leads to it. World frame.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.rotation import conjugates, log, product, quats_from_down, rotvec_from_down
 from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.sim.robot.action_names import DELTA_NAMES, Actions, action_names
 from v2p_data.sim.robot.arms import Robot
+from v2p_data.sim.robot.interface import ArmInterface
 from v2p_data.sim.robot.robot import TARGET_HIGH_M, TARGET_LOW_M
 
 LARGEST_RAD = 2 * np.pi
 _NEWTON_STEPS, _NEAR, _LONGEST = 30, 1e-13, 0.3
+
+
+def state_as_seen(
+    state: Float32[np.ndarray, "env 11"], worlds: BatchEnv, interface: ArmInterface
+) -> Float32[np.ndarray, "env state"]:
+    """Return the robots' state, followed by the angles of their joints [rad] where the interface has them."""
+    if not interface.joint_state:
+        return state
+    joints = worlds.motion()[0][:, worlds.world.robot.arm]
+    return np.concatenate([state, joints], axis=1, dtype=np.float32)
 
 
 def targets_of(

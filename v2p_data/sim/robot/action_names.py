@@ -30,10 +30,15 @@ JOINT_NAME, OPENING_NAME = "joint_{}.pos", "gripper.pos"
 """The arm's joints from 1 on [rad; m of slides], then the gripper's opening 0 to 1."""
 
 
+def joint_names(num_joints: int) -> tuple[str, ...]:
+    """Return the names of the joints' angles, in order."""
+    return tuple(JOINT_NAME.format(k + 1) for k in range(num_joints))
+
+
 def action_names(actions: Actions, num_joints: int = NUM_ARM_JOINTS) -> tuple[str, ...]:
     """Return the names of an action's entries, in order."""
-    joints = tuple(JOINT_NAME.format(k + 1) for k in range(num_joints))
-    return {"delta_tool": DELTA_NAMES, "absolute_tool": TOOL_NAMES}.get(actions, (*joints, OPENING_NAME))  # fmt: skip
+    named = {"delta_tool": DELTA_NAMES, "absolute_tool": TOOL_NAMES}
+    return named.get(actions, (*joint_names(num_joints), OPENING_NAME))
 
 
 def actions_named(names: Any) -> Actions | None:

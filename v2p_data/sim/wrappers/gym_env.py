@@ -2,7 +2,7 @@
 
 | | |
 |---|---|
-| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `pixels/mask_wrist`: the same, if asked for; `agent_pos`: 11 float32, see `BatchEnv.robot_state` |
+| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `pixels/mask_wrist`: the same, if asked for; `agent_pos`: 11 float32, see `BatchEnv.robot_state`; with `joint_state` the angles of the arm's joints [rad] follow |
 | Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz; with `actions`, a target of the tool (7) or of the joints (8) |
 | Reward | the task's training reward |
 | Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
@@ -21,16 +21,17 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.env import ranges
-from v2p_data.sim.env.actions import bounds_of, steps_to
+from v2p_data.sim.env.actions import bounds_of, state_as_seen, steps_to
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.model.world import World
 from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS, MaskRenderer, labels_to_rgb
 from v2p_data.sim.robot.action_names import Actions
+from v2p_data.sim.robot.interface import ArmInterface
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
 
 ENV_ID = "v2p/Task-v0"
@@ -38,6 +39,18 @@ CONTROL_HZ = 20
 STATE_LOW = (-1.5, -1.5, -0.5, -np.pi, -np.pi, -np.pi, 0.0, -1.0, -1.0, -1.0, 0.0)
 STATE_HIGH = (1.5, 1.5, 1.5, np.pi, np.pi, np.pi, 1.0, 1.0, 1.0, 1.0, 1.0)
 """Bounds of `BatchEnv.robot_state`."""
+
+
+def state_bounds(num_joints: int) -> tuple[Float[np.ndarray, "state"], Float[np.ndarray, "state"]]:
+    """Return the lowest and highest values of a state in which the angles of so many joints follow."""
+    low, high = bounds_of("joints", num_joints)
+    return np.array([*STATE_LOW, *low[:-1]]), np.array([*STATE_HIGH, *high[:-1]])
+
+
+def within_bounds(state: Float[np.ndarray, "*env state"]) -> Float32[np.ndarray, "*env state"]:
+    """Return a state, or several, as the environment shows it: within the bounds of its space."""
+    low, high = state_bounds(state.shape[-1] - len(STATE_LOW))
+    return np.clip(state, low, high).astype(np.float32)
 
 
 def stream_seed(seed: int) -> int:
@@ -71,6 +84,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         horizon_scale: an episode lasts at most this multiple of the task's own horizon.
         wrist: whether masks of the camera that the hand carries are seen too.
         actions: what an action says: `delta_tool`, `absolute_tool`, `joints`; see `sim.env.actions`.
+        joint_state: whether the angles of the arm's joints [rad] follow in `agent_pos`.
 
     Raises:
         V2PError: the folder holds no task, or there is no such render mode.
@@ -91,6 +105,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         horizon_scale: float = POLICY_HORIZON_SCALE,
         wrist: bool = False,
         actions: Actions = "delta_tool",
+        joint_state: bool = False,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise V2PError(f"render_mode is 'rgb_array' or None, got {render_mode!r}")
@@ -113,16 +128,18 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         self._masks = MaskRenderer(self._world.world, size_px, wrist=wrist)
         self._cameras = MASK_CAMERAS[: 1 + wrist]
         mask = spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)
+        self._interface = ArmInterface(actions=actions, joint_state=joint_state)
+        num_joints = self.world.robot.num_joints
+        state_low, state_high = state_bounds(num_joints * joint_state)
         self.observation_space = spaces.Dict(
             {
                 "pixels": spaces.Dict(dict.fromkeys(self._cameras, mask)),
                 "agent_pos": spaces.Box(
-                    np.array(STATE_LOW, np.float32), np.array(STATE_HIGH, np.float32)
+                    state_low.astype(np.float32), state_high.astype(np.float32)
                 ),
             }
         )
-        self._actions: Actions = actions
-        low, high = bounds_of(actions, self.world.robot.num_joints)
+        low, high = bounds_of(actions, num_joints)
         self.action_space = spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
     def reset(
@@ -148,7 +165,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             V2PError: it has another number of entries.
         """
         target = np.asarray(action, float)[None]
-        result = self._world.step(steps_to(self._world, target, self._actions))
+        result = self._world.step(steps_to(self._world, target, self._interface.actions))
         self._referee.note()
         self._num_steps += 1
         broke = bool(result.terminated[0])
@@ -198,7 +215,9 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         self._masks.close()
 
     def _observe(self) -> dict[str, Any]:
-        state = np.clip(self._world.robot_state()[0], STATE_LOW, STATE_HIGH).astype(np.float32)
+        state = within_bounds(
+            state_as_seen(self._world.robot_state(), self._world, self._interface)[0]
+        )
         return {"pixels": self._pictures(), "agent_pos": state}
 
     def _pictures(self) -> dict[str, UInt8[np.ndarray, "h w 3"]]:

@@ -20,6 +20,7 @@ from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.sim.render.masks import MASK_CAMERAS
 from v2p_data.sim.robot.action_names import Actions, action_names, actions_named
+from v2p_data.sim.robot.robot import NUM_ARM_JOINTS
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_LOW, V2PEnv
 from v2p_data.task.sandbox.trial import demand_trial
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TASK_FILE, TaskBundle, told_of
@@ -49,15 +50,18 @@ def find_tasks(folder: Path) -> list[Path]:
     )
 
 
-def actions_of_tasks(folder: Path) -> tuple[str, ...]:
-    """Return the names of the actions of the dataset that carries these tasks, nothing where they lie in none of ours."""
+def names_of_tasks(folder: Path, key: str) -> tuple[str, ...]:
+    """Return the names of the entries of `action` or `observation.state` in the dataset that carries these tasks.
+
+    Nothing where they lie in no dataset of ours.
+    """
     for root in (folder, *folder.absolute().parents[:3]):
         if (root / TASKS_IN_DATASET).is_dir():
             info = json_or_none(root / "meta/info.json")
             features = info.get("features") if isinstance(info, dict) else None
-            action = features.get(ACTION) if isinstance(features, dict) else None
-            names = action.get("names") if isinstance(action, dict) else None
-            return tuple(names or ()) if actions_named(names) else ()
+            columns = features if isinstance(features, dict) else {}
+            names = {k: f.get("names") for k, f in columns.items() if isinstance(f, dict)}
+            return tuple(names.get(key) or ()) if actions_named(names.get(ACTION)) else ()
     return ()
 
 
@@ -81,6 +85,8 @@ class V2PEnvConfig(EnvConfig):
     """Masks of the camera that the hand carries too, for policies trained on datasets of `--episodes.wrist`."""
     actions: str = ""
     """What an action says: `delta_tool`, `absolute_tool` or `joints`; by default as in the dataset that carries the tasks."""
+    joint_state: bool = False
+    """The angles of the arm's joints follow in the state, as in datasets of `--episodes.joint-state`; on where such a one carries the tasks."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {
@@ -90,7 +96,14 @@ class V2PEnvConfig(EnvConfig):
     )
 
     def __post_init__(self) -> None:
-        told = actions_of_tasks(Path(self.tasks)) if self.tasks else ()
+        told, states = (
+            names_of_tasks(Path(self.tasks), key) if self.tasks else ()
+            for key in (ACTION, OBS_STATE)
+        )
+        num_joints = max(0, len(states) - len(STATE_LOW))
+        self.joint_state = self.joint_state or num_joints > 0
+        if self.joint_state:
+            num_joints = num_joints or NUM_ARM_JOINTS
         self.actions = self.actions or actions_named(told) or "delta_tool"
         if self.actions not in get_args(Actions):
             raise V2PError(
@@ -104,7 +117,7 @@ class V2PEnvConfig(EnvConfig):
         mask = PolicyFeature(FeatureType.VISUAL, (self.size_px, self.size_px, 3))
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (len(names),)),
-            "agent_pos": PolicyFeature(FeatureType.STATE, (len(STATE_LOW),)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (len(STATE_LOW) + num_joints,)),
         }
         for camera in MASK_CAMERAS[: 1 + self.wrist]:
             self.features[f"pixels/{camera}"] = mask
@@ -120,6 +133,7 @@ class V2PEnvConfig(EnvConfig):
             "horizon_scale": self.horizon_scale,
             "wrist": self.wrist,
             "actions": self.actions,
+            "joint_state": self.joint_state,
         }
 
     def create_envs(
