@@ -211,7 +211,6 @@ def _judged(student: Student, bundle: TaskBundle, seed: int, args: argparse.Name
     judged = judge(
         bundle,
         VisionActor(student.for_task(bundle.description)),
-        episodes=args.episodes,
         first_seed=seed_for(seed, "study-judge", bundle.title) % 2**31,
         cfg=EvaluationConfig(episodes=args.episodes),
         num_threads=args.threads,

@@ -285,7 +285,6 @@ def checkpoint_judge(
                     wrist=len(student.cameras) > 1,
                     actions=actions,
                 ),
-                episodes=episodes,
                 first_seed=seed_for(seed, "checkpoints", item) % 2**31,
                 cfg=cfg,
                 num_threads=runtime.num_threads,
