@@ -24,7 +24,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from policies.bc import trainer
 from policies.bc.configuration_v2p_bc import V2PBCConfig
 from policies.bc.frames import frames_of, moved
-from policies.bc.student import Student
+from policies.bc.student import DatasetPlace, Student
 from policies.bc.trainer import TrainerConfig, autocast_for, make_policy, normalised
 from v2p_data.pipeline.artifact import read_record
 
@@ -79,11 +79,14 @@ def main() -> None:
         if args.dataset is None:
             student = _student_of_random_frames(cfg, args)
         else:
+            place = DatasetPlace(
+                folder=args.dataset,
+                repo_id=_repo_id(args.dataset),
+                cache=args.cache / name.replace(" ", "_"),
+            )
             student = Student.of_dataset(
-                args.dataset,
-                _repo_id(args.dataset),
+                place,
                 cfg,
-                args.cache / name.replace(" ", "_"),
                 seed=0,
                 device=args.device,
                 num_threads=args.threads,

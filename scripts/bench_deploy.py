@@ -23,7 +23,7 @@ from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
 from policies.evaluation.rate import wilson
 from v2p_data.commands.deploy import loaded_policy
 from v2p_data.deployment.limits import Guard, LimitsConfig
-from v2p_data.deployment.loop import LoopConfig, Outcome, Run
+from v2p_data.deployment.loop import LoopConfig, Onlooker, Outcome, Run
 from v2p_data.deployment.robot import Reading, Rig
 from v2p_data.deployment.sight import Seen, Sight
 from v2p_data.errors import V2PError
@@ -173,10 +173,8 @@ def episode(
     policy.took = into.decide_ms
     policy.reset(1)
     cfg = LoopConfig(max_seconds=bundle.policy_steps() / CONTROL_HZ, slow=True)
-    run = Run(
-        rig, sight, policy, Guard(limits, rig.scale), cfg,
-        is_done=lambda: robot.has_succeeded, on_step=compare,
-    )  # fmt: skip
+    onlooker = Onlooker(is_done=lambda: robot.has_succeeded, on_step=compare)
+    run = Run(rig, sight, policy, Guard(limits, rig.scale), cfg, onlooker)
     try:
         outcome = run.go()
     except V2PError as error:

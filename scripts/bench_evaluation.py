@@ -71,9 +71,8 @@ def _compare(cfg: BenchConfig, task: Path, policy: Path) -> None:
         return judge(
             bundle,
             VisionActor(actor),
-            episodes=episodes,
             first_seed=cfg.first_seed,
-            cfg=EvaluationConfig(worlds=episodes, at_end=False),
+            cfg=EvaluationConfig(episodes=episodes, worlds=episodes, at_end=False),
             num_threads=cfg.threads,
             size_px=actor.size_px,
         )

@@ -146,7 +146,7 @@ def measure(
 ) -> Iterator[str]:
     """Yield the comparison, line by line."""
     seed = settings.seed
-    found = search_reward(bundle, cfg, out, seed=seed, how=How(workers=jobs.workers), jobs=jobs)
+    found = search_reward(bundle, cfg, out, seed=seed, how=How(jobs=jobs))
     yield json.dumps({k: v for k, v in found.as_dict().items() if k != "per_seed"})
     worlds = BatchEnv(
         bundle,
@@ -191,9 +191,9 @@ def compare_rounds(
     there = {r["arm"] for r in results_in(out) if (r["task"], r["seed"]) == (bundle.title, seed)}
     if there >= set(ARMS):
         return
-    place, how = out / f"{bundle.title}-{seed}", How(workers=jobs.workers)
+    place, how = out / f"{bundle.title}-{seed}", How(jobs=jobs)
     began = time.monotonic()
-    found = search_reward(bundle, cfg, place / "search", seed=seed, how=how, jobs=jobs)
+    found = search_reward(bundle, cfg, place / "search", seed=seed, how=how)
     steps = _spent(found)
     first = [c for c in load_candidates(place / "search") if c.iteration == 0]
     best = standings(first, cfg)[0].candidate
@@ -212,7 +212,7 @@ def compare_rounds(
             policies[arm] = (longer.folder / TRAIN_FOLDER / LAST_POLICY, spent)
         if arm == "wider":
             wider = _as_wide_as(cfg, steps, bundle)
-            made = search_reward(bundle, wider, place / "wider", seed=seed, how=how, jobs=jobs)
+            made = search_reward(bundle, wider, place / "wider", seed=seed, how=how)
             policies[arm] = (made.policy, _spent(made))
         policy, spent = policies[arm]
         judged = judge_expert(

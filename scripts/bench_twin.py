@@ -22,7 +22,7 @@ from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.judging import Contestant, contestant, play_of
 from v2p_data.task.task import TaskBundle
-from v2p_data.twin.judge import TwinJudged, judge_in_twin, true_labels
+from v2p_data.twin.judge import TwinJudged, TwinSetup, judge_in_twin, true_labels
 from v2p_data.twin.parameters import TwinParameters, changed
 
 
@@ -75,20 +75,19 @@ def main(cfg: BenchConfig) -> None:
 
     actor, size_px = load(bundle)
     start = time.perf_counter()
-    trained_in = judge(
-        bundle, actor, episodes=cfg.episodes, first_seed=cfg.first_seed, cfg=how, size_px=size_px
-    )
+    trained_in = judge(bundle, actor, first_seed=cfg.first_seed, cfg=how, size_px=size_px)
     _tell(
         "training simulator", trained_in.successes, trained_in.at_end, time.perf_counter() - start
     )
 
     start = time.perf_counter()
     seeds = range(cfg.first_seed, cfg.first_seed + cfg.episodes)
-    twin = judge_in_twin(
-        cfg.task, load, seeds=seeds, cfg=how, parameters=parameters, workers=cfg.workers,
+    setup = TwinSetup(
+        parameters=parameters,
         look=allowing_for_place if cfg.allow_for_camera else true_labels,
         waits=cfg.wait_for_gripper and who.kind == "policy",
-    )  # fmt: skip
+    )
+    twin = judge_in_twin(cfg.task, load, seeds=seeds, cfg=how, setup=setup, workers=cfg.workers)
     _tell("twin", twin.successes, twin.at_end if cfg.at_end else None, time.perf_counter() - start)
     print(f"failures in the twin: {twin.failure_counts()}")
     here, there = twin.successes, trained_in.successes

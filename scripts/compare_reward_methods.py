@@ -102,8 +102,7 @@ def _one(
             cfg,
             out,
             seed=search_seed,
-            how=How(workers=args.workers),
-            jobs=jobs,
+            how=How(jobs=jobs),
         )
         found = result.as_dict()
         policies = best_by_round(out, cfg)

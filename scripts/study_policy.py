@@ -23,7 +23,7 @@ import torch
 
 from policies.bc.configuration_v2p_bc import V2PBCConfig
 from policies.bc.frames import FrameTable
-from policies.bc.student import Student
+from policies.bc.student import DatasetPlace, Student
 from policies.bc.trainer import TrainerConfig
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
@@ -120,11 +120,14 @@ def _one(name: str, seed: int, args: argparse.Namespace) -> None:
     record = read_record(dataset)
     assert record is not None
     started = time.monotonic()
+    place = DatasetPlace(
+        folder=dataset,
+        repo_id=str(record.counts["repo_id"]),
+        cache=args.out / "cache" / name,
+    )
     student = Student.of_dataset(
-        dataset,
-        str(record.counts["repo_id"]),
+        place,
         V2PBCConfig(device="cpu", **variant.network, num_labels=3),
-        args.out / "cache" / name,
         seed=seed_for(seed, "weights") % 2**63,
         num_threads=args.threads,
         action_limit=ACTION_LIMIT,
@@ -211,7 +214,6 @@ def _judged(student: Student, bundle: TaskBundle, seed: int, args: argparse.Name
     judged = judge(
         bundle,
         VisionActor(student.for_task(bundle.description)),
-        episodes=args.episodes,
         first_seed=seed_for(seed, "study-judge", bundle.title) % 2**31,
         cfg=EvaluationConfig(episodes=args.episodes),
         num_threads=args.threads,

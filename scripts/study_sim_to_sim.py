@@ -26,7 +26,7 @@ from v2p_data.deployment.limits import LimitsConfig
 from v2p_data.deployment.view import allowing_for_place
 from v2p_data.errors import V2PError
 from v2p_data.task.task import TaskBundle
-from v2p_data.twin.judge import true_labels
+from v2p_data.twin.judge import TwinSetup, true_labels
 from v2p_data.twin.parameters import nominal
 
 PLACES = ("training", "twin", "twin_hasty", "twin_raw", "tracked")
@@ -134,10 +134,11 @@ def _played(asked: Asked, place: str, value: float | None) -> Row:
             parameters = sweep.parameters(value)
         else:
             look = FaultyLook(place, value, asked.first_seed)
-    row = in_twin(
-        asked.policy, asked.task, asked.seeds, at_end=place.startswith("twin"), parameters=parameters,
-        look=look, waits=place not in ("twin_raw", "twin_hasty"),
-    )  # fmt: skip
+    setup = TwinSetup(
+        parameters=parameters, look=look, waits=place not in ("twin_raw", "twin_hasty")
+    )
+    at_end = place.startswith("twin")
+    row = in_twin(asked.policy, asked.task, asked.seeds, at_end=at_end, setup=setup)
     if isinstance(look, FaultyLook):
         row["iou"] = round(float(np.mean(look.overlaps)), 4)
     return row

@@ -202,11 +202,12 @@ def test_lerobots_own_trainer_trains_a_policy_of_ours_anew(run_tool, dataset, tm
     from lerobot.scripts.lerobot_train import main
 
     from policies.bc.configuration_v2p_bc import V2PBCConfig
-    from policies.bc.student import Student
+    from policies.bc.student import DatasetPlace, Student
     from policies.bc.trainer import TrainerConfig, write_train_config
 
     cfg = V2PBCConfig(preset="small", device="cpu", push_to_hub=False)
-    student = Student.of_dataset(dataset, "v2p/dummy", cfg, tmp_path / "cache", seed=0)
+    place = DatasetPlace(folder=dataset, repo_id="v2p/dummy", cache=tmp_path / "cache")
+    student = Student.of_dataset(place, cfg, seed=0)
     recipe = TrainerConfig(steps=2, batch_size=2)
     student.train(recipe, tmp_path / "training", seed=0)
     student.save(tmp_path / "policy")

@@ -51,6 +51,7 @@ from v2p_data.pipeline.runner import Runtime, Stage, in_order
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.policy.training import (
     POLICY_FOLDER,
+    Demonstrations,
     Source,
     make_distillation,
     make_distilled_dataset,
@@ -567,12 +568,7 @@ def distillation_stage(
         sources={"dataset": f"{record.item}-{record.fingerprint}"},
         version=1,
         on_device=True,
-        make=partial(
-            make_distillation,
-            dataset=dataset,
-            repo_id=str(record.counts["repo_id"]),
-            sources=tuple(sources),
-        ),
+        make=partial(make_distillation, data=_demonstrations(dataset, record, sources)),
         resumes=True,
     )
 
@@ -621,12 +617,16 @@ def policy_stage(
         on_device=True,
         make=partial(
             make_policy,
-            dataset=dataset,
-            repo_id=str(record.counts["repo_id"]),
-            sources=tuple(sources),
+            data=_demonstrations(dataset, record, sources),
             judges=judges,
         ),
         resumes=True,
+    )
+
+
+def _demonstrations(dataset: Path, record: Record, sources: Sequence[Source]) -> Demonstrations:
+    return Demonstrations(
+        dataset=dataset, repo_id=str(record.counts["repo_id"]), sources=tuple(sources)
     )
 
 

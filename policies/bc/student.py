@@ -25,6 +25,7 @@ from policies.bc.trainer import (
     check_features,
     load_policy,
     make_policy,
+    normalised,
     save_policy,
     train,
 )
@@ -33,6 +34,17 @@ from policies.threads import torch_threads
 STATE = "observation.state"
 STATE_STD_FLOOR = 0.01
 """Least standard deviation of a state's entry [m, rad or share]: students visit states that no demonstration shows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetPlace:
+    """Where the frames of a LeRobot dataset are read from."""
+
+    folder: Path
+    repo_id: str
+    """The dataset's name."""
+    cache: Path
+    """Folder for decoded pictures."""
 
 
 @dataclass(kw_only=True)
@@ -47,10 +59,8 @@ class Student:
 
     @staticmethod
     def of_dataset(
-        dataset: Path,
-        repo_id: str,
+        place: DatasetPlace,
         cfg: V2PBCConfig,
-        cache: Path,
         *,
         seed: int,
         device: str = "cpu",
@@ -61,10 +71,8 @@ class Student:
         """Return a student that knows a dataset's frames and has not learned yet.
 
         Args:
-            dataset: folder of a LeRobot dataset.
-            repo_id: its name.
+            place: the dataset and its cache.
             cfg: the policy's settings; its features and number of labels are filled in from the dataset.
-            cache: folder for decoded pictures.
             seed: of the weights.
             device: where the network trains.
             start_from: a policy to go on from, with its own settings.
@@ -74,12 +82,12 @@ class Student:
         if start_from is not None:
             policy, processors = load_policy(start_from, device=device)
         else:
-            stats = fill_in_features(cfg, dataset, repo_id)
+            stats = fill_in_features(cfg, place.folder, place.repo_id)
             check_features(cfg, stats)
             policy, processors = make_policy(
                 cfg, widened(stats, cfg, action_limit), seed=seed, device=device
             )
-        table = read_frames(dataset, repo_id, policy.net, cache)
+        table = read_frames(place.folder, place.repo_id, policy.net, place.cache)
         return Student(policy=policy, processors=processors, table=table, num_threads=num_threads)
 
     # -- acting
@@ -138,17 +146,11 @@ class Student:
         on_progress: Progress = lambda share, words: None,
     ) -> Trained:
         """Train on all frames; see `trainer.train`."""
-        return train(
-            self.policy,
-            self.processors,
-            self.table,
-            cfg,
-            out,
-            seed=seed,
-            num_threads=self.num_threads,
-            judge=judge,
-            on_progress=on_progress,
-        )
+        with torch_threads(self.num_threads):
+            frames = normalised(self.table, self.processors)
+            return train(
+                self.policy, frames, cfg, out, seed=seed, judge=judge, on_progress=on_progress
+            )
 
     def save(self, folder: Path) -> None:
         """Write the policy so that it is whole or absent."""

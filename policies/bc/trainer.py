@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from policies.bc.configuration_v2p_bc import V2PBCConfig
 from policies.bc.frames import ACTION, DatasetError, FrameTable, moved
 from policies.bc.modeling_v2p_bc import V2PBCPolicy
-from policies.threads import torch_threads
 
 logger = logging.getLogger(__name__)
 
@@ -188,13 +187,11 @@ def normalised(table: FrameTable, processors: Processors) -> FrameTable:
 
 def train(
     policy: V2PBCPolicy,
-    processors: Processors,
     table: FrameTable,
     cfg: TrainerConfig,
     out: Path,
     *,
     seed: int,
-    num_threads: int = 1,
     judge: Judge | None = None,
     on_progress: Progress = lambda share, words: None,
 ) -> Trained:
@@ -202,12 +199,10 @@ def train(
 
     Args:
         policy: starts as it is; ends with the mean weights of the best checkpoint.
-        processors: normalise states and actions.
-        table: frames as recorded, prepared by this policy's encoders.
+        table: frames prepared by this policy's encoders and `normalised` by its processors.
         cfg: the recipe.
         out: folder of the state; a half-finished training in it is continued.
         seed: of the order of samples and of augmentation.
-        num_threads: of the linear algebra.
         judge: success rate of a policy in simulation.
         on_progress: told the share that is done and a few words.
 
@@ -215,9 +210,8 @@ def train(
         DatasetError: the loss is not finite, or the saved state cannot be read.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with torch_threads(num_threads), torch.random.fork_rng():
-        run = _Run(policy, normalised(table, processors), cfg, out, seed, judge, on_progress)
-        return run.to_the_end()
+    with torch.random.fork_rng():
+        return _Run(policy, table, cfg, out, seed, judge, on_progress).to_the_end()
 
 
 class _Run:

@@ -110,7 +110,7 @@ class PPOConfig:
     num_threads: int = 1
     """Threads of torch. Two cost a factor three when another process shares the cores."""
     eval_episodes: int = 128
-    """Fresh episodes in `eval_env` at the end."""
+    """Fresh episodes of the best expert, for a caller of `evaluate`; training plays none."""
     actor: ActorConfig = field(default_factory=ActorConfig)
 
     def __post_init__(self) -> None:

@@ -31,7 +31,6 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from policies.evaluation.paired import score
-from policies.evaluation.rate import Rate
 from policies.ppo.config import PPOConfig
 from policies.ppo.curve import (
     CURVE_FILE,
@@ -42,7 +41,7 @@ from policies.ppo.curve import (
     cut_after,
     plot_curve,
 )
-from policies.ppo.evaluate import evaluate, outcome
+from policies.ppo.evaluate import outcome
 from policies.ppo.policy import ActorCritic, Expert, load_weights, weights_of
 from policies.threads import torch_threads
 
@@ -75,8 +74,6 @@ class ExpertResult:
     steps: int
     seconds: float
     stopped_by: StoppedBy
-    evaluation: Rate | None = None
-    """Fresh episodes of the best expert in `eval_env`."""
 
 
 class NotFiniteError(RuntimeError):
@@ -158,7 +155,6 @@ def train_expert(
     out: Path,
     *,
     seed: int = 0,
-    eval_env: EnvBase | None = None,
     warm_start: Path | None = None,
     on_progress: Callable[[int, int, float], None] | None = None,
     draws: bool = True,
@@ -170,7 +166,6 @@ def train_expert(
         cfg: the recipe.
         out: folder of checkpoint, curve and experts; `Expert.load(out)` gives the best.
         seed: of weights, exploration and minibatches; the environment has its own.
-        eval_env: where the best expert plays fresh episodes at the end.
         warm_start: another expert's folder; its actor and normalisation are the starting point.
         on_progress: called after every batch with steps, total steps and deterministic success (NaN at first).
         draws: write the curve's picture and its mirror for TensorBoard too; a training that is stopped and gone
@@ -190,10 +185,6 @@ def train_expert(
         learner = _Learner(env, cfg, out, seed, warm_start, draws)
         stopped_by = learner.run(on_progress)
     progress = learner.progress
-    rate = None
-    if eval_env is not None:
-        rate = evaluate(eval_env, Expert.load(out).act, num_episodes=cfg.eval_episodes)
-        log.info("fresh episodes of the best expert: %s", rate)
     return ExpertResult(
         folder=out,
         success=max(progress.best_success, 0.0),
@@ -204,7 +195,6 @@ def train_expert(
         steps=progress.steps,
         seconds=progress.seconds,
         stopped_by=stopped_by,
-        evaluation=rate,
     )
 
 

@@ -377,7 +377,6 @@ class Study:
             judged = judge(
                 bundle,
                 actor,
-                episodes=cfg.episodes,
                 first_seed=first_start(name, seed),
                 cfg=EvaluationConfig(episodes=cfg.episodes),
                 num_threads=self.runtime.num_threads,

@@ -7,10 +7,13 @@ from v2p_data.evaluation.batch import judge
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.judging import contestant, play_of
 from v2p_data.task.task import TaskBundle
-from v2p_data.twin.judge import Look, judge_in_twin
-from v2p_data.twin.parameters import TwinParameters, nominal
+from v2p_data.twin.judge import TwinSetup, judge_in_twin
+from v2p_data.twin.parameters import nominal
 
 from .results import Row, letters_of
+
+AS_DEPLOYED = TwinSetup(look=allowing_for_place, waits=True)
+"""The nominal twin through all of `v2p deploy`."""
 
 
 def in_training(
@@ -28,7 +31,6 @@ def in_training(
     judged = judge(
         bundle,
         actor,
-        episodes=len(seeds),
         first_seed=seeds.start,
         cfg=EvaluationConfig(episodes=len(seeds), at_end=at_end),
         num_threads=num_threads,
@@ -45,21 +47,16 @@ def in_twin(
     *,
     at_end: bool,
     device: str = "cpu",
-    parameters: TwinParameters | None = None,
-    look: Look = allowing_for_place,
-    waits: bool = True,
+    setup: TwinSetup = AS_DEPLOYED,
 ) -> Row:
-    """Return what became of each episode in the twin, the nominal one through all of `v2p deploy` by default."""
-    twin = parameters or nominal()
+    """Return what became of each episode in the twin, by default the nominal one through all of `v2p deploy`."""
     judged = judge_in_twin(
         task,
         play_of(contestant(policy), seeds.start, device),
         seeds=seeds,
         cfg=EvaluationConfig(episodes=len(seeds), at_end=at_end),
-        parameters=twin,
-        look=look,
-        waits=waits,
+        setup=setup,
     )
     row: Row = {"once": letters_of(judged.successes), "failures": judged.failure_counts()}
-    row["twin"] = twin.digest()[:12]
+    row["twin"] = (setup.parameters or nominal()).digest()[:12]
     return row | {"at_end": letters_of(judged.at_end)} if at_end else row

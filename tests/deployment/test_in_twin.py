@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from v2p_data.deployment.limits import Guard, LimitsConfig
-from v2p_data.deployment.loop import LoopConfig, Run
+from v2p_data.deployment.loop import LoopConfig, Onlooker, Run
 from v2p_data.deployment.robot import ActionScale, Rig
 from v2p_data.deployment.sight import Sight
 from v2p_data.errors import V2PError
@@ -63,10 +63,15 @@ def test_the_twin_is_seen_from_one_click_and_kept_within_limits(task_folder, ste
 
     rig.read = noted
     limits = LimitsConfig(max_speed_m_s=0.2, max_silence_ms=60_000.0)
+
+    def note(reading, seen):
+        places.append(reading.tool_pos)
+        seen_labels.append(seen.in_picture)
+
+    cfg, noting = LoopConfig(max_seconds=0.6, slow=True), Onlooker(on_step=note)
     outcome = Run(
-        rig, sight, steady(0.3, 0, 1, 0, 0, 0, 0), Guard(limits, rig.scale), LoopConfig(max_seconds=0.6, slow=True),
-        on_step=lambda reading, seen: (places.append(reading.tool_pos), seen_labels.append(seen.in_picture)),
-    ).go()  # fmt: skip
+        rig, sight, steady(0.3, 0, 1, 0, 0, 0, 0), Guard(limits, rig.scale), cfg, noting
+    ).go()
     robot.disconnect()
 
     assert (outcome.ending, outcome.steps) == ("time", 12)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from v2p_data.deployment.limits import Guard, LimitsConfig, LimitStop, Watchdog
-from v2p_data.deployment.loop import LoopConfig, Run
+from v2p_data.deployment.loop import LoopConfig, Onlooker, Run
 from v2p_data.deployment.robot import ActionScale
 
 PATIENT = 60_000.0
@@ -23,7 +23,7 @@ def course(rig, policy, seconds=1.0, **limits):
 
     guard = Guard(LimitsConfig(max_silence_ms=PATIENT, **limits), rig.scale)
     cfg = LoopConfig(max_seconds=seconds, slow=True)
-    outcome = Run(rig, None, policy, guard, cfg, on_step=note).go()
+    outcome = Run(rig, None, policy, guard, cfg, Onlooker(on_step=note)).go()
     return outcome, np.array(places), np.array(turns)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from v2p_data.deployment.limits import Guard, LimitsConfig
-from v2p_data.deployment.loop import LoopConfig, Run
+from v2p_data.deployment.loop import LoopConfig, Onlooker, Run
 from v2p_data.deployment.recording import Recorder
 from v2p_data.deployment.sight import Sight
 from v2p_data.errors import V2PError
@@ -17,7 +17,7 @@ PATIENT = LimitsConfig(max_silence_ms=60_000.0)
 
 def run_of(rig, policy, seconds=0.5, sight=None, limits=PATIENT, slow=True, dry_run=False, **more):
     cfg = LoopConfig(max_seconds=seconds, slow=slow, dry_run=dry_run)
-    return Run(rig, sight, policy, Guard(limits, rig.scale), cfg, **more)
+    return Run(rig, sight, policy, Guard(limits, rig.scale), cfg, Onlooker(**more))
 
 
 def test_a_run_lasts_as_long_as_it_may_at_twenty_steps_a_second(blind_robot, restarted, steady):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from v2p_data.deployment.limits import Guard, LimitsConfig
-from v2p_data.deployment.loop import LoopConfig, Run
+from v2p_data.deployment.loop import LoopConfig, Onlooker, Run
 from v2p_data.deployment.protocol import LONGEST_LINE, Driver
 from v2p_data.deployment.robot import Rig
 from v2p_data.deployment.sight import Sight
@@ -104,10 +104,12 @@ def test_the_loop_runs_over_the_network_and_a_limit_holds_there_too(
     sight = Sight(robot.calibration(), [click_on(seeing_robot)])
     limits = LimitsConfig(max_silence_ms=60_000.0, max_speed_m_s=0.1)
 
+    cfg = LoopConfig(max_seconds=0.5, slow=True)
+    noting = Onlooker(on_step=lambda reading, seen: places.append(reading.tool_pos))
+
     outcome = Run(
-        rig, sight, steady(0, 0, 1, 0, 0, 0, 0), Guard(limits, rig.scale), LoopConfig(max_seconds=0.5, slow=True),
-        on_step=lambda reading, seen: places.append(reading.tool_pos),
-    ).go()  # fmt: skip
+        rig, sight, steady(0, 0, 1, 0, 0, 0, 0), Guard(limits, rig.scale), cfg, noting
+    ).go()
 
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) * 20
     assert (outcome.ending, outcome.acted["speed"]) == ("time", 10)
@@ -268,10 +270,10 @@ def test_a_driver_that_stops_answering_ends_the_run_with_one_sentence(
         if len(steps) == 5:
             os.kill(server.process.pid, signal.SIGSTOP)
 
+    cfg, freezing = LoopConfig(max_seconds=20.0, slow=True), Onlooker(on_step=freeze)
     outcome = Run(
-        rig, sight, steady(0, 0, 0, 0, 0, 0, 0), Guard(PATIENT, rig.scale), LoopConfig(max_seconds=20.0, slow=True),
-        on_step=freeze,
-    ).go()  # fmt: skip
+        rig, sight, steady(0, 0, 0, 0, 0, 0, 0), Guard(PATIENT, rig.scale), cfg, freezing
+    ).go()
     server.end()
 
     assert outcome.ending == "robot"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from v2p_data.deployment.limits import Guard, LimitsConfig
-from v2p_data.deployment.loop import LoopConfig, Run
+from v2p_data.deployment.loop import LoopConfig, Onlooker, Run
 from v2p_data.deployment.recording import Recorder
 from v2p_data.deployment.sight import Sight
 from v2p_data.errors import V2PError
@@ -22,10 +22,9 @@ def test_lerobot_reads_back_masks_pictures_states_and_the_actions_that_passed_th
     sight = Sight(seeing_robot.calibration(), [click_on(seeing_robot)])
     recorder, steps = Recorder("lifting the red box"), []
     limits = LimitsConfig(max_speed_m_s=0.3, max_silence_ms=60_000.0)
-    run = Run(
-        rig, sight, steady(1, 0, 0, 0, 0, 0, 0), Guard(limits, rig.scale),
-        LoopConfig(max_seconds=0.3, slow=True), recorder=recorder, on_step=lambda r, s: steps.append((r, s)),
-    )  # fmt: skip
+    cfg = LoopConfig(max_seconds=0.3, slow=True)
+    onlooker = Onlooker(recorder=recorder, on_step=lambda r, s: steps.append((r, s)))
+    run = Run(rig, sight, steady(1, 0, 0, 0, 0, 0, 0), Guard(limits, rig.scale), cfg, onlooker)
     run.go()
 
     packed = recorder.save(tmp_path / "run", "v2p/run", ("red box",), {"ending": "time"})

@@ -274,7 +274,8 @@ def test_lerobots_evaluation_does_what_ours_does(agreed, trained):
     bundle = TaskBundle.load(dataset / ROOT_OF_TASKS / "toy")
     seen = VisionActor(actor.for_task(bundle.description), interface=interface_for(actions))
 
-    ours = judge(bundle, seen, episodes=2, first_seed=5, cfg=EvaluationConfig(worlds=2), size_px=toy_run.SIZE_PX)  # fmt: skip
+    cfg = EvaluationConfig(episodes=2, worlds=2)
+    ours = judge(bundle, seen, first_seed=5, cfg=cfg, size_px=toy_run.SIZE_PX)
     loaded = load_policy(policy, config, "cpu")
     theirs = roll_out(loaded, config.create_envs(2), config, episodes=2, first_seed=5)
 

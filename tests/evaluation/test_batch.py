@@ -18,13 +18,17 @@ from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv
 from v2p_data.sim.env.observation import PROGRESS_COLUMN
 from v2p_data.task.audit.resets import has_own_reset
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.task import Task, TaskBundle
+from v2p_data.task.task import TaskBundle
 
 SIZE_PX = 32
 
 
+HIGH_TOOL = """
+from factory.tasks.task import Task
+
 class HighTool(Task):
-    """Success while the tool is above a height; the video's object rests, and so it does here."""
+    def __init__(self, envs, urdf_assets_root):
+        super().__init__(envs, urdf_assets_root, {})
 
     def compute_success(self, states):
         return states["eef_pos"][:, 2] > 0.27
@@ -32,6 +36,8 @@ class HighTool(Task):
     def compute_reward(self, actions, states):
         height = states["eef_pos"][:, 2]
         return height, {"height": height}
+"""
+"""Success while the tool is above a height; the video's object rests, and so it does here."""
 
 
 class Drive:
@@ -59,14 +65,13 @@ def bundle() -> TaskBundle:
     thing = found.scene.manipulated
     still = replace(thing, poses_world=thing.poses_world[:1] * 2, frames=(0, 1), confidences=(1.0, 1.0))  # fmt: skip
     scene = replace(found.scene, kind="generic", objects=(still,))
-    return replace(found, kind="generic", scene=scene, horizon_steps=12)
+    task = replace(found, code=HIGH_TOOL, class_name="HighTool")
+    return replace(task, kind="generic", scene=scene, horizon_steps=12)
 
 
-def judged(bundle, actor, episodes=5, **settings) -> Judged:
-    cfg = replace(EvaluationConfig(worlds=8), **settings)
-    return judge(
-        bundle, actor, episodes=episodes, first_seed=3, cfg=cfg, size_px=SIZE_PX, task=HighTool
-    )
+def judged(bundle, actor, **settings) -> Judged:
+    cfg = replace(EvaluationConfig(episodes=5, worlds=8), **settings)
+    return judge(bundle, actor, first_seed=3, cfg=cfg, size_px=SIZE_PX)
 
 
 RESET = """
@@ -88,9 +93,7 @@ def test_an_evaluation_may_begin_where_the_environment_says_and_shows_both_rates
 
     def first_places(bundle: TaskBundle, reset: Literal["task", "base"]) -> np.ndarray:
         how = replace(cfg, reset=reset)
-        played = judge(
-            bundle, VisionActor(Drive()), episodes=4, first_seed=3, cfg=how, size_px=SIZE_PX
-        )
+        played = judge(bundle, VisionActor(Drive()), first_seed=3, cfg=how, size_px=SIZE_PX)
         return played.shown.snapshots[0].qpos[:, -7:-4]
 
     assert np.array_equal(first_places(own, "base"), first_places(found, "task"))
@@ -207,9 +210,9 @@ def test_actions_that_are_no_numbers_are_turned_away(bundle):
 @pytest.mark.slow
 def test_scripted_programs_push_to_the_left():
     actor = ProgramActor(seed=0)
-    cfg = EvaluationConfig()
+    cfg = EvaluationConfig(episodes=8)
 
-    result = judge(load_benchmark("push_left"), actor, episodes=8, first_seed=0, cfg=cfg)
+    result = judge(load_benchmark("push_left"), actor, first_seed=0, cfg=cfg)
 
     assert actor.name == "push as in the video"
     assert result.successes.mean() >= 0.9

@@ -87,9 +87,8 @@ def test_the_same_seeds_give_the_same_actions_and_the_same_successes(
     judged = judge(
         bundle,
         VisionActor(actor, wrist=wrist),
-        episodes=EPISODES,
         first_seed=FIRST_SEED,
-        cfg=EvaluationConfig(worlds=EPISODES, at_end=at_end),
+        cfg=EvaluationConfig(episodes=EPISODES, worlds=EPISODES, at_end=at_end),
         size_px=actor.size_px,
     )
 

@@ -17,7 +17,7 @@ from small_dataset import (
 )
 
 from policies.bc.frames import DatasetError
-from policies.bc.student import STATE_STD_FLOOR, Student
+from policies.bc.student import STATE_STD_FLOOR, DatasetPlace, Student
 from policies.bc.trainer import TrainerConfig
 
 HOW = TrainerConfig(steps=3, batch_size=4, precision="float32")
@@ -32,7 +32,8 @@ def dataset(tmp_path_factory) -> Path:
 
 def student(dataset: Path, cache: Path, *, seed: int = 0, **settings) -> Student:
     cfg = config(num_labels=3, **{"preset": "small", **settings})
-    return Student.of_dataset(dataset, REPO_ID, cfg, cache, seed=seed, action_limit=1.0)
+    place = DatasetPlace(folder=dataset, repo_id=REPO_ID, cache=cache)
+    return Student.of_dataset(place, cfg, seed=seed, action_limit=1.0)
 
 
 def worlds(seed: int, n: int = 3) -> tuple[np.ndarray, np.ndarray]:
@@ -100,9 +101,8 @@ def test_a_saved_student_replaces_the_one_before(dataset: Path, tmp_path: Path):
 
     pupil.save(tmp_path / "saved")
 
-    again = Student.of_dataset(
-        dataset, REPO_ID, config(), tmp_path / "cache", seed=0, start_from=tmp_path / "saved"
-    )
+    place = DatasetPlace(folder=dataset, repo_id=REPO_ID, cache=tmp_path / "cache")
+    again = Student.of_dataset(place, config(), seed=0, start_from=tmp_path / "saved")
     assert are_equal(weights(again.policy), weights(pupil.policy))
     assert not (tmp_path / "saved.tmp").exists()
     assert not (tmp_path / "saved" / "left").exists()

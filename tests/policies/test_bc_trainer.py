@@ -69,7 +69,7 @@ def trained(
 ):
     """Return what a training ended with and its weights; `net` is the seed of the first weights."""
     net_, processors = policy(cfg, seed=net)
-    told = train(net_, processors, table(net_.net), how, out, seed=seed, **more)
+    told = train(net_, normalised(table(net_.net), processors), how, out, seed=seed, **more)
     return told, weights(net_)
 
 
@@ -126,7 +126,8 @@ def test_a_training_that_was_killed_while_it_saved_ends_in_the_same_files(
 
     def files(out: Path, net: int) -> dict[str, bytes]:
         policy_, processors = policy(small(encoder="conv", random_shift=0.2), seed=net)
-        train(policy_, processors, table(policy_.net), recipe(save_every_s=0.0), out, seed=5)
+        frames = normalised(table(policy_.net), processors)
+        train(policy_, frames, recipe(save_every_s=0.0), out, seed=5)
         save_policy(out / "policy", policy_, processors)
         return {path.name: path.read_bytes() for path in (out / "policy").iterdir()}
 
@@ -274,7 +275,7 @@ def test_every_frame_is_drawn_once_per_epoch_in_a_new_order(tmp_path: Path):
     watched = Watched(**vars(table(net.net)))
 
     # 9 steps of 4 are two epochs of 18 frames; the fifth step is in both.
-    train(net, processors, watched, recipe(steps=9), tmp_path, seed=1)
+    train(net, normalised(watched, processors), recipe(steps=9), tmp_path, seed=1)
 
     first, second = watched.drawn[:NUM_FRAMES], watched.drawn[NUM_FRAMES:]
     assert sorted(first) == sorted(second) == list(range(NUM_FRAMES))
@@ -286,7 +287,8 @@ def test_a_batch_larger_than_the_dataset_goes_round_it(tmp_path: Path):
     net, processors = policy(small())
     watched = Watched(**vars(table(net.net)))
 
-    train(net, processors, watched, recipe(steps=1, batch_size=2 * NUM_FRAMES), tmp_path, seed=1)
+    how = recipe(steps=1, batch_size=2 * NUM_FRAMES)
+    train(net, normalised(watched, processors), how, tmp_path, seed=1)
 
     assert sorted(watched.drawn) == sorted([*range(NUM_FRAMES)] * 2)
 
@@ -400,7 +402,7 @@ def test_lerobot_loads_the_saved_folder_and_acts_the_same(dataset: Path, tmp_pat
     cfg = config(num_labels=3, preset="small")
     net, processors = make_policy(cfg, fill_in_features(cfg, dataset, REPO_ID), seed=0)
     frames = read_frames(dataset, REPO_ID, net.net, tmp_path / "cache")
-    train(net, processors, frames, recipe(), tmp_path / "out", seed=0)
+    train(net, normalised(frames, processors), recipe(), tmp_path / "out", seed=0)
     save_policy(tmp_path / "policy", net, processors)
     rng = torch.Generator().manual_seed(0)
     seen = {
@@ -444,7 +446,8 @@ def test_a_gpu_that_holds_all_frames_learns_what_one_that_fetches_them_does(
         net_, processors = policy(small(encoder=encoder), device=device)
         # Frames are prepared on the CPU, as a dataset's are.
         frames = table(policy(small(encoder=encoder))[0].net)
-        train(net_, processors, frames, recipe(), tmp_path / f"{device}{share}", seed=5)
+        out = tmp_path / f"{device}{share}"
+        train(net_, normalised(frames, processors), recipe(), out, seed=5)
         return {name: value.cpu() for name, value in weights(net_).items()}
 
     held, fetched, on_cpu = (trained_on(d, s) for d, s in ((gpu, 0.5), (gpu, 0.0), ("cpu", 0.0)))

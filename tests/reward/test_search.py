@@ -62,7 +62,7 @@ def jobs() -> Iterator[Jobs]:
 @pytest.fixture(scope="module")
 def searched(bundle: TaskBundle, jobs: Jobs, tmp_path_factory) -> tuple[Found, Path]:
     out = tmp_path_factory.mktemp("search") / "undisturbed"
-    return search_reward(bundle, TINY, out, seed=7, jobs=jobs), out
+    return search_reward(bundle, TINY, out, seed=7, how=How(jobs=jobs)), out
 
 
 def last_weights(found: Found) -> dict[str, torch.Tensor]:
@@ -187,7 +187,7 @@ def test_a_finished_search_is_not_done_again(
     found, out = searched
 
     with Jobs() as idle:
-        assert search_reward(bundle, TINY, out, seed=7, jobs=idle) == found
+        assert search_reward(bundle, TINY, out, seed=7, how=How(jobs=idle)) == found
         assert idle._process is None
 
 
@@ -216,7 +216,7 @@ def test_a_search_that_is_killed_goes_on_to_the_same_answer(
     os.waitpid(pid, 0)
     assert not (out / "candidates" / "001" / "seed-0" / "done.json").is_file()
 
-    again = search_reward(bundle, TINY, out, seed=7, jobs=jobs)
+    again = search_reward(bundle, TINY, out, seed=7, how=How(jobs=jobs))
 
     assert replace(again, policy=found.policy) == found
     a, b = last_weights(found), last_weights(again)

@@ -26,7 +26,7 @@ from v2p_data.reward.feedback import Feedback
 from v2p_data.reward.jobs import HEARTBEAT_FILE, Jobs
 from v2p_data.reward.methods import in_place_of_reward, save_bundle, told
 from v2p_data.reward.reflect import proposals
-from v2p_data.reward.search import search_reward
+from v2p_data.reward.search import How, search_reward
 from v2p_data.reward.worker import run_job
 from v2p_data.stages import EngineConfig, chain
 from v2p_data.task.benchmark import load_benchmark
@@ -238,7 +238,7 @@ def test_a_round_is_full_also_where_its_parents_first_ideas_were_tried(
     (tmp_path / "rounds" / "0.json").write_text(json.dumps(list(range(1 + len(tried)))))
 
     played = Played(folder(two_rounds, two_rounds.elites[0]))
-    search_reward(bundle, cfg, tmp_path, seed=3, jobs=played)
+    search_reward(bundle, cfg, tmp_path, seed=3, how=How(jobs=played))
 
     made = load_candidates(tmp_path)
     children = [c for c in made if c.iteration == 1]
@@ -372,9 +372,8 @@ def test_a_method_that_hides_the_video_has_the_model_write_the_task_anew_without
     played = Played(folder(two_rounds, two_rounds.elites[0]))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NO_PROXY", "127.0.0.1")
-        search_reward(
-            bundle, cfg.reward, tmp_path / "search", seed=3, writer=ModelWriter(client=client), jobs=played
-        )  # fmt: skip
+        writer, how = ModelWriter(client=client), How(jobs=played)
+        search_reward(bundle, cfg.reward, tmp_path / "search", seed=3, how=how, writer=writer)
     server.close()
 
     candidates = load_candidates(tmp_path / "search")
@@ -412,7 +411,7 @@ def test_robogen_trains_one_reward_without_the_bonus_for_success(tmp_path: Path)
             "samples",
         ]
         cfg = parse(EngineConfig, [*TINY, *flags], "reward").reward
-        found = search_reward(bundle, cfg, tmp_path / method, seed=3, jobs=Here())
+        found = search_reward(bundle, cfg, tmp_path / method, seed=3, how=How(jobs=Here()))
         (candidate,) = load_candidates(tmp_path / method)
         assert found.chosen == candidate.number
         first[method] = first_batch(candidate.training_folder() / "train")

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 
-from v2p_data.task.sandbox.confine import confine, leave_the_network
+from v2p_data.task.sandbox.confine import Rights, confine, leave_the_network
 from v2p_data.task.sandbox.smoke_child import in_a_fork
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 MEGABYTE = 2**20
 
 
-def in_a_child(attempt: Callable[[], object], **limits) -> str:
+def in_a_child(attempt: Callable[[], object], *, give_up_root: bool = True, **limits) -> str:
     """Return how a forked process that confines itself ends: 'done', the name of an error, or of a signal."""
     read_end, write_end = os.pipe()
     parent_pid, pid = os.getpid(), os.fork()
@@ -29,10 +29,8 @@ def in_a_child(attempt: Callable[[], object], **limits) -> str:
         try:
             os.close(read_end)
             leave_the_network()
-            confine(
-                **{"parent_pid": parent_pid, "seconds": 5.0, "memory_bytes": 256 * MEGABYTE}
-                | limits
-            )
+            rights = Rights(**{"seconds": 5.0, "memory_bytes": 256 * MEGABYTE} | limits)
+            confine(rights, parent_pid=parent_pid, give_up_root=give_up_root)
             try:
                 attempt()
                 os.write(write_end, b"done")
@@ -193,7 +191,8 @@ def test_a_folder_of_its_own_is_no_way_to_others(canary, tmp_path_factory):
     read_end, write_end = os.pipe()
     parent_pid = os.getpid()
     if os.fork() == 0:
-        held = confine(5.0, None, parent_pid=parent_pid, open_files=9)
+        rights = Rights(seconds=5.0, memory_bytes=None, open_files=9)
+        held = confine(rights, parent_pid=parent_pid)
         os.write(write_end, ",".join(held).encode())
         os._exit(0)
     os.close(write_end)

@@ -12,7 +12,7 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.deployment.limits import Guard, LimitsConfig
-from v2p_data.deployment.loop import LoopConfig, Outcome, Run
+from v2p_data.deployment.loop import LoopConfig, Onlooker, Outcome, Run
 from v2p_data.deployment.recording import Recorder, check_free
 from v2p_data.deployment.robot import Reading, Rig, fingers_m
 from v2p_data.deployment.segmentation import ColourTracker, StreamTracker
@@ -116,16 +116,10 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
             " on those of the task only"
         )
     recorder = None if args.record is None else Recorder(task)
-    run = Run(
-        rig,
-        sight,
-        policy,
-        Guard(args.limits, rig.scale),
-        args.loop,
-        recorder=recorder,
-        is_done=lambda: bool(getattr(robot, "has_succeeded", False)),
+    onlooker = Onlooker(
+        recorder=recorder, is_done=lambda: bool(getattr(robot, "has_succeeded", False))
     )
-    outcome = run.go()
+    outcome = Run(rig, sight, policy, Guard(args.limits, rig.scale), args.loop, onlooker).go()
     if args.record is not None and recorder is not None:
         _record(args, recorder, sight, outcome)
     return outcome

@@ -69,6 +69,18 @@ class Outcome:
         return self.ending in ("time", "done")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Onlooker:
+    """Who looks on at a run, and may end it."""
+
+    recorder: Recorder | None = None
+    """Notes every step."""
+    is_done: Callable[[], bool] = lambda: False
+    """Asked after every step; true ends the run."""
+    on_step: Callable[[Reading, Seen], None] = lambda reading, seen: None
+    """Shown every step."""
+
+
 class Run:
     """One run of a policy on a robot.
 
@@ -78,9 +90,7 @@ class Run:
         policy: what decides.
         guard: the limits.
         cfg: how long, and whether for real.
-        recorder: notes every step, if given.
-        is_done: asked after every step; true ends the run.
-        on_step: shown every step.
+        onlooker: who looks on.
     """
 
     def __init__(
@@ -90,13 +100,10 @@ class Run:
         policy: Policy,
         guard: Guard,
         cfg: LoopConfig,
-        *,
-        recorder: Recorder | None = None,
-        is_done: Callable[[], bool] = lambda: False,
-        on_step: Callable[[Reading, Seen], None] = lambda reading, seen: None,
+        onlooker: Onlooker | None = None,
     ) -> None:
         self.rig, self.sight, self.policy, self.guard, self.cfg = rig, sight, policy, guard, cfg
-        self.recorder, self.is_done, self.on_step = recorder, is_done, on_step
+        self.onlooker = onlooker or Onlooker()
         self._is_started = False
         self._works_on = ""
         """What this side does at the moment; nothing while the robot is awaited."""
@@ -190,11 +197,11 @@ class Run:
             done = limited.action if self.cfg.dry_run else self.rig.act(limited.action)
             outcome.steps += 1
             outcome.acted.update(limited.acted)
-            if self.recorder is not None:
-                self.recorder.add(reading, seen, done, limited.acted)
-            self.on_step(reading, seen)
+            if self.onlooker.recorder is not None:
+                self.onlooker.recorder.add(reading, seen, done, limited.acted)
+            self.onlooker.on_step(reading, seen)
             outcome.work_ms.append(1000 * (time.perf_counter() - began))
-            if self.is_done():
+            if self.onlooker.is_done():
                 outcome.ending, outcome.sentence = "done", "the task succeeded"
                 return
             self._check_rate(outcome)

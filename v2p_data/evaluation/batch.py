@@ -19,10 +19,9 @@ from v2p_data.evaluation.failures import failure_kinds
 from v2p_data.play import Actor, Film, Stopwatch, View, VisionActor, play
 from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
-from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, stream_seed
-from v2p_data.task.task import Task, TaskBundle
+from v2p_data.task.task import TaskBundle
 
 NEVER = -1
 TAIL_STEPS = 6
@@ -98,56 +97,47 @@ def judge(
     bundle: TaskBundle,
     actor: Actor,
     *,
-    episodes: int,
     first_seed: int,
     cfg: EvaluationConfig,
     num_threads: int = 1,
     size_px: int | tuple[int, int] = 256,
-    randomization: RandomizationConfig | None = None,
-    task: type[Task] | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Judged:
-    """Play episodes of one task, `cfg.worlds` at a time, and judge them.
+    """Play `cfg.episodes` episodes of one task, `cfg.worlds` at a time, and judge them.
 
     Args:
         bundle: the task.
         actor: who acts.
-        episodes: how many, instead of `cfg.episodes`.
         first_seed: episode k starts from `first_seed + k`.
         cfg: how it is judged.
         num_threads: for physics and masks, 0 for all cores; changes no result.
         size_px: width and height of the pictures, or (height, width).
-        randomization: what episodes start under; by default, what they are recorded under.
-        task: the task, instead of `bundle.code`.
         on_progress: told the share that is done.
 
     Raises:
         V2PError: the actor's actions are not finite or have another shape.
     """
     start, watch = time.perf_counter(), Stopwatch()
-    sim = SimConfig(fine=True, randomization=randomization or ranges.recording())
     steps = bundle.policy_steps(cfg.horizon_scale)
     parts: list[tuple[np.ndarray, ...]] = []
     failures: list[str] = []
     shown: Shown | None = None
-    for first in range(0, episodes, cfg.worlds):
-        count = min(cfg.worlds, episodes - first)
+    for first in range(0, cfg.episodes, cfg.worlds):
+        count = min(cfg.worlds, cfg.episodes - first)
         with watch.on("physics"):
             seeds = [stream_seed(first_seed + first + k) for k in range(count)]
-            env = _begun(bundle, sim, seeds, num_threads, task, base_reset=cfg.reset == "base")
+            env = _begun(bundle, seeds, num_threads, base_reset=cfg.reset == "base")
             wrist = isinstance(actor, VisionActor) and actor.wrist
             view, film = View(env, size_px, num_threads, watch, wrist=wrist), Film(env)
             record = RefereeRecord(env)
             verdicts = Verdicts(record, count, steps, at_end=cfg.at_end)
 
         def note(view: View, begun: int = first) -> None:
-            on_progress((begun + len(view.going) * view.t / steps) / episodes)
+            on_progress((begun + len(view.going) * view.t / steps) / cfg.episodes)
 
         play(view, actor, [record.note, note, *([] if shown else [film.note])], verdicts, steps)
         if shown is None:
-            once, every = verdicts.success_step, len(record)
-            soon = np.where(once == NEVER, every, np.minimum(once + 2 + TAIL_STEPS, every))
-            shown = Shown(successes=once != NEVER, num_frames=soon, snapshots=film.snapshots())
+            shown = _shown(verdicts.success_step, film, len(record))
         parts.append((verdicts.success_step, verdicts.at_end, verdicts.broke))
         failures += verdicts.failures(bundle)
     assert shown is not None
@@ -165,23 +155,28 @@ def judge(
     )
 
 
+def _shown(success_step: Int[np.ndarray, "env"], film: Film, num_moments: int) -> Shown:
+    """Return the episodes of one batch, each up to a little after its success."""
+    is_won = success_step != NEVER
+    soon = np.minimum(success_step + 2 + TAIL_STEPS, num_moments)
+    return Shown(
+        successes=is_won,
+        num_frames=np.where(is_won, soon, num_moments),
+        snapshots=film.snapshots(),
+    )
+
+
 def _begun(
-    bundle: TaskBundle,
-    sim: SimConfig,
-    seeds: Sequence[int],
-    num_threads: int,
-    task: type[Task] | None,
-    *,
-    base_reset: bool,
+    bundle: TaskBundle, seeds: Sequence[int], num_threads: int, *, base_reset: bool
 ) -> BatchEnv:
     """Return worlds at the start of their episodes, one for each seed."""
+    sim = SimConfig(fine=True, randomization=ranges.recording())
     env = BatchEnv(
         bundle,
         sim,
         num_envs=len(seeds),
         seed=0,
         num_threads=num_threads,
-        task=task,
         base_reset=base_reset,
     )
     env.reset_seeded(np.arange(len(seeds)), seeds)

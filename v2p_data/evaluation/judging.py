@@ -107,7 +107,6 @@ def judge_task(
     return judge(
         bundle,
         actor,
-        episodes=cfg.episodes,
         first_seed=first_seed,
         cfg=cfg,
         num_threads=runtime.num_threads,

@@ -45,6 +45,18 @@ class Source:
     episodes: Path
 
 
+@dataclass(frozen=True, kw_only=True)
+class Demonstrations:
+    """A dataset that is trained on."""
+
+    dataset: Path
+    """Its folder."""
+    repo_id: str
+    """Its name."""
+    sources: Sequence[Source]
+    """Where its tasks came from; empty where that is not known."""
+
+
 def sources_of(dataset: Path, root: Path) -> list[Source]:
     """Return the tasks and experts behind a dataset of `v2p generate`; empty where they are not in the run folder."""
     record = read_record(dataset)
@@ -87,9 +99,7 @@ def make_distillation(
     out: Path,
     runtime: Runtime,
     *,
-    dataset: Path,
-    repo_id: str,
-    sources: Sequence[Source],
+    data: Demonstrations,
 ) -> dict[str, Any]:
     """Let a student act, the expert label and take over, and train on, in rounds."""
     from policies.bc.trainer import TrainerConfig
@@ -98,7 +108,8 @@ def make_distillation(
     from v2p_data.experts.labeller import labeller_of
 
     del inputs
-    demand_whole_sources(dataset, sources, runtime.root)
+    sources = data.sources
+    demand_whole_sources(data.dataset, sources, runtime.root)
     recipe: DistillationConfig = cfg.config["distillation"]
     policy: PolicyConfig = cfg.config["policy"]
     episodes = recorded_under(sources[0])
@@ -106,7 +117,7 @@ def make_distillation(
     seed = seed_for(cfg.seed, "distillation")
     runtime.progress(0.0, "reading the demonstrations")
     with bad_data_told():
-        student = new_student(dataset, repo_id, policy, seed, runtime)
+        student = new_student(data, policy, seed, runtime)
         last: dict[str, Any] = {}
 
         def train(steps: int, folder: Path, seed: int, progress: Any) -> None:
@@ -164,9 +175,7 @@ def make_policy(
     out: Path,
     runtime: Runtime,
     *,
-    dataset: Path,
-    repo_id: str,
-    sources: Sequence[Source],
+    data: Demonstrations,
     judges: Mapping[str, Path] | None = None,
 ) -> dict[str, Any]:
     """Train on all frames, from the distillation's student where there is one; keep what succeeds most."""
@@ -175,17 +184,16 @@ def make_policy(
     from v2p_data.episodes.hub.policy_card import write_policy_card
     from v2p_data.evaluation.facts import write_facts
 
-    demand_whole_sources(dataset, sources, runtime.root)
+    dataset = data.dataset
+    demand_whole_sources(dataset, data.sources, runtime.root)
     policy: PolicyConfig = cfg.config.resolved
-    judges = judges or {source.item: source.task for source in sources}
+    judges = judges or {source.item: source.task for source in data.sources}
     seed = seed_for(cfg.seed, "policy")
     distilled = inputs.get("distillation")
     runtime.progress(0.0, "reading the frames")
     with bad_data_told():
-        student = new_student(
-            dataset, repo_id, policy, seed, runtime,
-            start_from=distilled / STUDENT_FOLDER if distilled else None,
-        )  # fmt: skip
+        start_from = distilled / STUDENT_FOLDER if distilled else None
+        student = new_student(data, policy, seed, runtime, start_from=start_from)
         handovers = handover_episodes(distilled) if distilled else []
         # A task's at once: each call copies the whole table.
         for _, paths in itertools.groupby(handovers, key=lambda path: path.parent):
@@ -203,7 +211,7 @@ def make_policy(
         )
     student.save(out / POLICY_FOLDER)
     place = _seen_from(runtime.root.resolve(), dataset)
-    write_train_config(out / POLICY_FOLDER, student.policy, place, repo_id, recipe, seed)
+    write_train_config(out / POLICY_FOLDER, student.policy, place, data.repo_id, recipe, seed)
     write_facts(out / POLICY_FOLDER, dataset)
     write_policy_card(out / POLICY_FOLDER)
     return {
@@ -224,8 +232,7 @@ def _seen_from(root: Path, dataset: Path) -> Path:
 
 
 def new_student(
-    dataset: Path,
-    repo_id: str,
+    data: Demonstrations,
     policy: PolicyConfig,
     seed: int,
     runtime: Runtime,
@@ -234,24 +241,25 @@ def new_student(
 ) -> "Student":
     """Return a student that knows the demonstrations; `start_from` is a policy to go on from."""
     from policies.bc.configuration_v2p_bc import V2PBCConfig
-    from policies.bc.student import Student
+    from policies.bc.student import DatasetPlace, Student
 
     if start_from is not None:
         check_checkpoint(start_from)
     try:
-        network = V2PBCConfig(**policy.network(), num_labels=_num_labels(dataset), device="cpu")
+        network = V2PBCConfig(
+            **policy.network(), num_labels=_num_labels(data.dataset), device="cpu"
+        )
     except ValueError as error:
         raise V2PError(f"no such network can be made: {error}") from error
+    cache = runtime.root / CACHE_FOLDER / data.dataset.name
     return Student.of_dataset(
-        dataset,
-        repo_id,
+        DatasetPlace(folder=data.dataset, repo_id=data.repo_id, cache=cache),
         network,
-        runtime.root / CACHE_FOLDER / dataset.name,
         seed=seed % 2**63,
         device=runtime.device,
         start_from=start_from,
         num_threads=runtime.num_threads,
-        action_limit=ACTION_LIMIT if interface_of(dataset).actions == "delta_tool" else None,
+        action_limit=ACTION_LIMIT if interface_of(data.dataset).actions == "delta_tool" else None,
     )
 
 
@@ -286,7 +294,6 @@ def checkpoint_judge(
                     wrist=len(student.cameras) > 1,
                     interface=interface,
                 ),
-                episodes=episodes,
                 first_seed=seed_for(seed, "checkpoints", item) % 2**31,
                 cfg=cfg,
                 num_threads=runtime.num_threads,

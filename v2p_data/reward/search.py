@@ -68,6 +68,8 @@ class How:
     num_threads: int = 1
     """For the physics and torch of one candidate."""
     limits: Limits = field(default_factory=Limits)
+    jobs: Jobs | None = None
+    """Processes to use, instead of new ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +119,6 @@ def search_reward(
     seed: int,
     how: How | None = None,
     writer: RewardWriter | None = None,
-    jobs: Jobs | None = None,
     on_progress: Progress = lambda share, words: None,
 ) -> Found:
     """Return the best reward that the budget finds; go on with a search that was stopped.
@@ -130,7 +131,6 @@ def search_reward(
         how: processes, threads and limits.
         writer: a model, which writes all rewards; without it templates write the first ones and rules the later ones,
             as they do where it gives too few that can be used.
-        jobs: processes to use, instead of new ones.
         on_progress: told the share that is done and a few words.
 
     Raises:
@@ -146,10 +146,12 @@ def search_reward(
     out.mkdir(parents=True, exist_ok=True)
     with _alone_in(out):
         _check_recipe(bundle, cfg, seed, out)
-        if jobs is not None:
-            return _Search(bundle, cfg, out, seed, how, writer, jobs, on_progress).run()
-        with Jobs(workers=how.workers, limits=how.limits) as own:
-            return _Search(bundle, cfg, out, seed, how, writer, own, on_progress).run()
+        search = _Search(bundle, cfg, out, seed, how, writer, on_progress)
+        try:
+            return search.run()
+        finally:
+            if how.jobs is None:
+                search.jobs.close()
 
 
 class _Search:
@@ -161,11 +163,11 @@ class _Search:
         seed: int,
         how: How,
         writer: RewardWriter | None,
-        jobs: Jobs,
         on_progress: Progress,
     ) -> None:
         self.cfg, self.out, self.seed, self.how = cfg, out, seed, how
-        self.writer, self.jobs, self.on_progress = writer, jobs, on_progress
+        self.writer, self.on_progress = writer, on_progress
+        self.jobs = how.jobs or Jobs(workers=how.workers, limits=how.limits)
         made = TaskBundle.load(out / BUNDLE_FOLDER) if (out / BUNDLE_FOLDER).is_dir() else None
         self.prepared: Prepared = prepare(
             bundle, cfg, rng_for(seed, "first rewards"), writer, made

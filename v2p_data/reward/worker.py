@@ -57,7 +57,7 @@ from v2p_data.scene.scene import SceneObject
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
-from v2p_data.task.sandbox.confine import confine, leave_the_network
+from v2p_data.task.sandbox.confine import Rights, confine, leave_the_network
 
 POLL_S = 0.05
 FILE_BYTES = 2 * 1024**3
@@ -124,16 +124,15 @@ def _in_child(folder: Path, parent_pid: int) -> int:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
     request = json.loads((folder / REQUEST_FILE).read_text())
-    confine(
-        None,
-        int(request["memory_mb"]) * 1024**2,
-        parent_pid=parent_pid,
+    rights = Rights(
+        seconds=None,
+        memory_bytes=int(request["memory_mb"]) * 1024**2,
         file_bytes=FILE_BYTES,
         open_files=OPEN_FILES,
         processes=THREADS,
         folder=folder,
-        give_up_root=False,
     )
+    confine(rights, parent_pid=parent_pid, give_up_root=False)
     return run_job(request, folder)
 
 

@@ -41,6 +41,21 @@ def true_labels(arm: TwinArm) -> Callable[[], UInt8[np.ndarray, "h w"]]:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TwinSetup:
+    """A twin, and what lies between it and who acts."""
+
+    parameters: TwinParameters | None = None
+    """Of the twin; by default the nominal one."""
+    look: Look = true_labels
+    """How a policy sees the twin; picklable."""
+    waits: bool = False
+    """The arm waits while the gripper travels, as in `v2p deploy`."""
+
+
+NOMINAL = TwinSetup()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Played:
     """What became of one episode."""
 
@@ -121,10 +136,8 @@ def judge_in_twin(
     *,
     seeds: Sequence[int],
     cfg: EvaluationConfig,
-    parameters: TwinParameters | None = None,
+    setup: TwinSetup = NOMINAL,
     workers: int = 1,
-    look: Look = true_labels,
-    waits: bool = False,
 ) -> TwinJudged:
     """Play one episode per seed.
 
@@ -133,15 +146,13 @@ def judge_in_twin(
         load: makes who acts; called once per worker, and picklable where there is more than one.
         seeds: of the episodes.
         cfg: how long they last and whether they go on after a success.
-        parameters: of the twin; by default the nominal one.
+        setup: the twin; by default the nominal one, whose true labels are seen.
         workers: processes that share out the episodes; changes no result.
-        look: how a policy sees the twin; picklable.
-        waits: the arm waits while the gripper travels, as in `v2p deploy`.
 
     Raises:
         V2PError: the folder holds no task, or the actor does not suit the twin.
     """
-    settings = (task_folder, load, cfg, parameters, look, waits)
+    settings = (task_folder, load, cfg, setup)
     if workers == 1:
         table = _Table(*settings)
         try:
@@ -158,13 +169,7 @@ class _Table:
     """A twin and who acts in it."""
 
     def __init__(
-        self,
-        task_folder: Path,
-        load: Load,
-        cfg: EvaluationConfig,
-        parameters: TwinParameters | None,
-        look: Look,
-        waits: bool,
+        self, task_folder: Path, load: Load, cfg: EvaluationConfig, setup: TwinSetup
     ) -> None:
         bundle = TaskBundle.load(task_folder)
         self.actor, size_px = load(bundle)
@@ -175,9 +180,9 @@ class _Table:
             )
         self.cfg = cfg
         self.steps = bundle.policy_steps(cfg.horizon_scale)
-        self.arm = TwinArm(bundle, parameters, height)
-        self.labels = look(self.arm)
-        self.waits = waits
+        self.arm = TwinArm(bundle, setup.parameters, height)
+        self.labels = setup.look(self.arm)
+        self.waits = setup.waits
 
     def play(self, seed: int) -> Played:
         start = time.perf_counter()

@@ -11,12 +11,32 @@ import math
 import os
 import resource
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from v2p_data.processes import end_with_parent
 from v2p_data.task.sandbox import kernel_rules
 
 NOBODY = 65534
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rights:
+    """What a child may still use."""
+
+    seconds: float | None
+    """Of computing from now on, over all threads; None: no limit. The wall clock is the parent's business."""
+    memory_bytes: int | None
+    """Of address space on top of what is mapped now; None: no limit (CUDA maps far more than it uses)."""
+    file_bytes: int = 0
+    """Largest size of a file written."""
+    open_files: int = 0
+    """How many files may be open at once; 0: none can be opened any more."""
+    processes: int = 0
+    """How many more processes and threads may be started; 0: none."""
+    folder: Path | None = None
+    """The only folder in which files can be made or changed; None: nowhere. The GPU's device files and /dev/null can
+    be written with it."""
 
 
 def leave_the_network() -> bool:
@@ -33,30 +53,14 @@ def leave_the_network() -> bool:
     return False
 
 
-def confine(
-    seconds: float | None,
-    memory_bytes: int | None,
-    *,
-    parent_pid: int,
-    file_bytes: int = 0,
-    open_files: int = 0,
-    processes: int = 0,
-    folder: Path | None = None,
-    give_up_root: bool = True,
-) -> tuple[str, ...]:
+def confine(rights: Rights, *, parent_pid: int, give_up_root: bool = True) -> tuple[str, ...]:
     """Give up, for the rest of this process's life, everything that untrusted code should not have.
 
     No socket can be opened and no program started afterwards, whatever the arguments are. The process ends with its parent.
 
     Args:
-        seconds: of computing from now on, over all threads; None: no limit. The wall clock is the parent's business.
-        memory_bytes: of address space on top of what is mapped now; None: no limit (CUDA maps far more than it uses).
+        rights: what this process may still use.
         parent_pid: the process that this one ends with, as it was before this one was forked.
-        file_bytes: largest size of a file written.
-        open_files: how many files may be open at once; 0: none can be opened any more.
-        processes: how many more processes and threads may be started; 0: none.
-        folder: the only folder in which files can be made or changed; None: nowhere. The GPU's device files and
-            /dev/null can be written with it.
         give_up_root: become nobody where we are root. A child that writes into the caller's folder stays who it
             is, and loses the capabilities of root alone.
 
@@ -64,24 +68,10 @@ def confine(
         What took hold: `limits`, `nobody`, `capabilities`, `landlock`, `seccomp`.
     """
     held = ["limits"]
-    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    ours = _tasks_of_ours() if processes else 0
-    limits: list[tuple[int, int]] = [
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_FSIZE, file_bytes),
-        (resource.RLIMIT_NPROC, ours + processes),
-    ]
-    if memory_bytes is not None:
-        limits.append((resource.RLIMIT_AS, mapped + memory_bytes))
-    if seconds is not None:
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        limits.append(
-            (resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds) + 1)
-        )
+    limits = _limits(rights)
     kernel_rules.no_new_privileges()
-    if kernel_rules.write_only_in(folder):
+    if kernel_rules.write_only_in(rights.folder):
         held.append("landlock")
-    limits.append((resource.RLIMIT_NOFILE, open_files))
     for limit, value in limits:
         # The kernel sends SIGXCPU at the soft limit and SIGKILL at the hard one: only the first names the cause.
         hard = value + 1 if limit == resource.RLIMIT_CPU else value
@@ -94,9 +84,28 @@ def confine(
     if kernel_rules.drop_capabilities():
         held.append("capabilities")
     end_with_parent(parent_pid)  # becoming nobody makes the kernel forget an earlier call
-    if kernel_rules.refuse_calls(may_start_processes=processes > 0):
+    if kernel_rules.refuse_calls(may_start_processes=rights.processes > 0):
         held.append("seccomp")
     return tuple(held)
+
+
+def _limits(rights: Rights) -> list[tuple[int, int]]:
+    """Return the limits to set, each with its value."""
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    ours = _tasks_of_ours() if rights.processes else 0
+    limits = [
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_FSIZE, rights.file_bytes),
+        (resource.RLIMIT_NPROC, ours + rights.processes),
+    ]
+    if rights.memory_bytes is not None:
+        limits.append((resource.RLIMIT_AS, mapped + rights.memory_bytes))
+    if rights.seconds is not None:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        limits.append(
+            (resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + rights.seconds) + 1)
+        )
+    return [*limits, (resource.RLIMIT_NOFILE, rights.open_files)]
 
 
 def _tasks_of_ours() -> int:

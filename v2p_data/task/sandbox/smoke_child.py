@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from v2p_data.task.sandbox.confine import confine, leave_the_network
+from v2p_data.task.sandbox.confine import Rights, confine, leave_the_network
 from v2p_data.task.sandbox.guarded import Answers, GuardedTask, TaskOutputError, demand_equal
 from v2p_data.task.sandbox.reader.refusal import TaskCodeError
 from v2p_data.task.sandbox.sandbox import make_task
@@ -267,7 +267,8 @@ def in_a_fork(
         code = 1
         try:
             _leave_the_pipes()
-            confine(seconds, MEMORY_BYTES, parent_pid=parent_pid)
+            rights = Rights(seconds=seconds, memory_bytes=MEMORY_BYTES)
+            confine(rights, parent_pid=parent_pid)
             _send(write_end, (answer_to or answer)(source, request))
             code = 0
         finally:
