@@ -186,7 +186,7 @@ def push_with(m: Measured, v: Variant) -> Draft:
         goal=shifted("obj_start", z=0.0) + f" + goal_direction * {far + 0.02:.3f}",
         extras=[
             ("tool_near", "0.4 * contact * tool_low * closer"),
-            ("hands_off", "-0.3 * obj_touched"),
+            ("hands_off", "-1.5 * obj_touched"),
         ],
     )
 
