@@ -24,7 +24,8 @@ from v2p_data.experts.teacher import Teacher
 from v2p_data.kinds import KINDS
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.env import task_code
-from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv, SimConfig
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.task_code import HELD_STEPS
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.generate import TaskConfig, generate_task

@@ -65,7 +65,9 @@ def seen(env: "WarpBatchEnv | BatchEnv") -> dict[str, torch.Tensor]:
 
 def qpos_of(env: "WarpBatchEnv | BatchEnv") -> torch.Tensor:
     """Return the positions of all joints, to be written to."""
-    return torch.from_numpy(env._qpos) if isinstance(env, BatchEnv) else env._sim.state()["qpos"]
+    return (
+        torch.from_numpy(env._sim.qpos) if isinstance(env, BatchEnv) else env._sim.state()["qpos"]
+    )
 
 
 def play(pair: Pair, action: np.ndarray) -> tuple[float, float]:
@@ -84,7 +86,7 @@ def continue_from(pair: Pair) -> None:
     sim, cpu = pair[0]._sim, pair[1]
     state = sim.state()
     for name in ("qpos", "qvel", "qacc_warmstart"):
-        state[name].copy_(torch.from_numpy(np.array(cpu._batch.bind(name))))
+        state[name].copy_(torch.from_numpy(np.array(cpu._sim.batch.bind(name))))
     for name in ("_target_pos", "_target_quat", "_target_finger"):
         getattr(pair[0], name).copy_(torch.from_numpy(np.array(getattr(cpu, name))))
     sim.refresh()
@@ -427,7 +429,7 @@ def test_a_benchmark_task_has_the_same_observation_and_reward_on_both(name: str,
 def test_tensors_share_memory_with_warp(make_pair: Callable[..., Pair]):
     gpu, _ = make_pair()
 
-    gpu._object_qpos[3, 0, 2] = 0.7
+    gpu._sim.object_qpos[3, 0, 2] = 0.7
 
     assert gpu._sim._d.qpos.numpy()[3, gpu.world.objects[0].qpos_adr + 2] == np.float32(0.7)
     assert gpu._sim.qpos.data_ptr() == gpu._sim._d.qpos.ptr
