@@ -179,7 +179,7 @@ def unfair_reward(
     title: str,
     env: int,
     reward: float | np.floating,
-    parts: Mapping[str, Float32[torch.Tensor, "env"]],
+    parts: Mapping[str, torch.Tensor],
 ) -> V2PError:
     """Return the error for a reward beyond what is allowed in world `env`, whose state is sound."""
     return V2PError(
