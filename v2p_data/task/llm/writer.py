@@ -112,7 +112,23 @@ def write_samples(
         V2PError: the server cannot be asked.
     """
     cfg = client.cfg
-    drafts = _begun(client, scene, count, examples)
+    system = system_message([o.name for o in scene.objects], examples)
+    pictures = _pictures(client, scene)
+    drafts = [
+        _Draft(
+            talk=[
+                system,
+                scene_message(
+                    scene,
+                    pictures,
+                    tracking=cfg.tracking,
+                    shapes=cfg.tells_shapes,
+                    end=_end(i, count),
+                ),
+            ]
+        )
+        for i in range(count)
+    ]
     first: list[Written] = []
     answers = rounds = 0
     for turn in range(cfg.max_regenerations + 1):
@@ -140,29 +156,6 @@ def write_samples(
             broken, count, scene.title, cfg.max_regenerations,
         )  # fmt: skip
     return WrittenSamples(first=tuple(first), final=final, answers=answers)
-
-
-def _begun(
-    client: VlmClient, scene: Scene, count: int, examples: Sequence[Example]
-) -> list[_Draft]:
-    """Return drafts with the question that each of them begins with."""
-    system = system_message([o.name for o in scene.objects], examples)
-    pictures = _pictures(client, scene)
-    return [
-        _Draft(
-            talk=[
-                system,
-                scene_message(
-                    scene,
-                    pictures,
-                    tracking=client.cfg.tracking,
-                    shapes=client.cfg.tells_shapes,
-                    end=_end(i, count),
-                ),
-            ]
-        )
-        for i in range(count)
-    ]
 
 
 def _pictures(client: VlmClient, scene: Scene) -> list[Picture]:

@@ -15,12 +15,6 @@ from v2p_data.task.templates.phrases import (
 )
 from v2p_data.task.templates.variants import Variant, tolerance, way
 
-# Summed over the way it costs as much as it would earn at the goal, at whatever speed.
-DRAGGED = (
-    "-15.0 * torch.norm(obj_vel[:, :2], dim=-1).clamp(max=1.0)"
-    " * ((height < 0.02) & (to_goal < way - 0.03) & ~arrived).float()"
-)
-
 
 def lift(m: Measured, v: Variant) -> Draft:
     height = way(float(np.clip(0.7 * m.lift_m, 0.08, 0.12)), v)
@@ -282,14 +276,22 @@ def _carry(
         pays_contact=True,
         # Each stage pays more than the most that can be had by staying in the one before: 0 to 1 for raising, 1 to 2
         # for carrying, from 2.5 on over the goal. None is flat.
-        progress="torch.where(arrived, 2.5 + lowered + 0.8 * opened, raised * (1 + carried) * gripped * near)",
+        progress=(
+            "torch.where(arrived, 2.5 + lowered + 0.8 * opened,"
+            " raised * (1 + carried) * gripped * near)"
+        ),
         remaining="to_goal",
         goal="goal_point",
         direction="torch.nn.functional.normalize(goal_point - obj_pos, dim=-1)",
         extras=[
             LEAVE_REF,
             ("not_too_high", "-2.0 * (height - 0.12).clamp(0.0, 0.3)"),
-            ("dragged", DRAGGED),
+            # Summed over the way it costs as much as it would earn at the goal, at whatever speed.
+            (
+                "dragged",
+                "-15.0 * torch.norm(obj_vel[:, :2], dim=-1).clamp(max=1.0)"
+                " * ((height < 0.02) & (to_goal < way - 0.03) & ~arrived).float()",
+            ),
         ],
     )
 
