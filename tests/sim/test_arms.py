@@ -251,7 +251,7 @@ def test_observations_actions_and_states_are_laid_out_as_with_the_built_in_arm(
         k: v.shape for k, v in built_in.states().items()
     }
     np.testing.assert_allclose(ours.robot_state(), built_in.robot_state(), atol=1e-4)
-    assert ours._ctrl.shape == built_in._ctrl.shape
+    assert ours._sim._ctrl.shape == built_in._sim._ctrl.shape
 
 
 def test_the_gripper_reports_its_own_opening(six: RobotConfig, env_with: Callable[..., BatchEnv]):

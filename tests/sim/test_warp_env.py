@@ -87,8 +87,9 @@ def continue_from(pair: Pair) -> None:
     state = sim.state()
     for name in ("qpos", "qvel", "qacc_warmstart"):
         state[name].copy_(torch.from_numpy(np.array(cpu._sim.batch.bind(name))))
-    for name in ("_target_pos", "_target_quat", "_target_finger"):
-        getattr(pair[0], name).copy_(torch.from_numpy(np.array(getattr(cpu, name))))
+    for name in ("target_pos", "target_quat", "target_finger"):
+        there = torch.from_numpy(np.array(getattr(cpu._sim, name)))
+        getattr(pair[0], f"_{name}").copy_(there)
     sim.refresh()
 
 
@@ -429,7 +430,7 @@ def test_a_benchmark_task_has_the_same_observation_and_reward_on_both(name: str,
 def test_tensors_share_memory_with_warp(make_pair: Callable[..., Pair]):
     gpu, _ = make_pair()
 
-    gpu._sim.object_qpos[3, 0, 2] = 0.7
+    gpu._object_qpos[3, 0, 2] = 0.7
 
     assert gpu._sim._d.qpos.numpy()[3, gpu.world.objects[0].qpos_adr + 2] == np.float32(0.7)
     assert gpu._sim.qpos.data_ptr() == gpu._sim._d.qpos.ptr
