@@ -21,10 +21,14 @@ from typing import TYPE_CHECKING, Any
 from policies.evaluation.rate import wilson
 from v2p_data.craft_data import scene_data, task_data
 from v2p_data.distillation.config import DistillationConfig
-from v2p_data.episodes.collect import collect, judge_expert, staged_episodes
-from v2p_data.episodes.config import EpisodesConfig
+from v2p_data.episodes.collect import (
+    EpisodesConfig,
+    Lesson,
+    collect,
+    judge_expert,
+    staged_episodes,
+)
 from v2p_data.episodes.dataset.about import CARRIED_TASKS
-from v2p_data.episodes.rollouts import Lesson
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.judging import (
@@ -568,7 +572,12 @@ def distillation_stage(
         sources={"dataset": f"{record.item}-{record.fingerprint}"},
         version=1,
         on_device=True,
-        make=partial(make_distillation, data=_demonstrations(dataset, record, sources)),
+        make=partial(
+            make_distillation,
+            data=Demonstrations(
+                dataset=dataset, repo_id=str(record.counts["repo_id"]), sources=tuple(sources)
+            ),
+        ),
         resumes=True,
     )
 
@@ -617,16 +626,12 @@ def policy_stage(
         on_device=True,
         make=partial(
             make_policy,
-            data=_demonstrations(dataset, record, sources),
+            data=Demonstrations(
+                dataset=dataset, repo_id=str(record.counts["repo_id"]), sources=tuple(sources)
+            ),
             judges=judges,
         ),
         resumes=True,
-    )
-
-
-def _demonstrations(dataset: Path, record: Record, sources: Sequence[Source]) -> Demonstrations:
-    return Demonstrations(
-        dataset=dataset, repo_id=str(record.counts["repo_id"]), sources=tuple(sources)
     )
 
 

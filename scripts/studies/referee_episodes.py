@@ -9,7 +9,8 @@ from jaxtyping import Bool
 from v2p_data.experts.teacher import Teacher
 from v2p_data.kinds import KINDS
 from v2p_data.sim.env import task_code
-from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.env.task_code import HELD_STEPS
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.task.sandbox.sandbox import class_name
 

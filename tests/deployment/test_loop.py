@@ -59,7 +59,7 @@ def test_losing_the_object_stops_the_arm(seeing_robot, restarted, steady, click_
 
     def take_away(reading, seen):
         if arm.steps == 4:  # as a person would, out of the picture
-            arm.env._world._qpos[0, address : address + 2] = (-1.0, 1.0)
+            arm.env._world._sim.qpos[0, address : address + 2] = (-1.0, 1.0)
 
     outcome = run_of(
         rig, steady(0, 0, 0.1, 0, 0, 0, 0), seconds=2.0, sight=sight, on_step=take_away

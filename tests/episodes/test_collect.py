@@ -20,7 +20,8 @@ from v2p_data.episodes.staging import Episode
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.artifact import read_rejects
 from v2p_data.play import StateActor
-from v2p_data.sim.env.batch_env import HELD_STEPS, SimConfig
+from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.env.task_code import HELD_STEPS
 
 
 def rolled_out(toy: Lesson) -> Rollouts:

@@ -14,8 +14,9 @@ from v2p_data.evaluation.judging import own_reset_rate
 from v2p_data.experts.actors import ProgramActor
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import StateActor, View, VisionActor
-from v2p_data.sim.env.batch_env import HELD_STEPS, BatchEnv
+from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.sim.env.observation import PROGRESS_COLUMN
+from v2p_data.sim.env.task_code import HELD_STEPS
 from v2p_data.task.audit.resets import has_own_reset
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
@@ -168,7 +169,7 @@ def test_a_simulation_that_breaks_ends_its_episode_as_a_failure(bundle):
         def act(self, view: View) -> np.ndarray:
             self.steps += 1
             if self.steps == 2:
-                view.worlds._qvel[1] = np.nan
+                view.worlds._sim.qvel[1] = np.nan
             action = np.zeros((view.worlds.num_envs, 7))
             action[:, 2] = 0.5
             return action

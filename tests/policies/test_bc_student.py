@@ -1,5 +1,6 @@
 """A student acts in many worlds, takes episodes in, and goes on from what it saved."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +107,15 @@ def test_a_saved_student_replaces_the_one_before(dataset: Path, tmp_path: Path):
     assert are_equal(weights(again.policy), weights(pupil.policy))
     assert not (tmp_path / "saved.tmp").exists()
     assert not (tmp_path / "saved" / "left").exists()
+
+
+def test_another_number_of_threads_is_put_back(dataset: Path, tmp_path: Path):
+    before = torch.get_num_threads()
+    pupil = replace(student(dataset, tmp_path / "cache"), num_threads=before + 1)
+
+    pupil.train(HOW, tmp_path / "out", seed=1)
+
+    assert torch.get_num_threads() == before
 
 
 def test_actions_reach_their_limit_and_states_that_hardly_vary_stay_small(

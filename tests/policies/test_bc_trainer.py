@@ -338,14 +338,6 @@ def test_a_loss_that_is_not_finite_is_told_in_one_sentence(tmp_path: Path, head:
         trained(tmp_path, wild, recipe())
 
 
-def test_another_number_of_threads_is_put_back(tmp_path: Path):
-    before = torch.get_num_threads()
-
-    trained(tmp_path, small(), recipe(), num_threads=before + 1)
-
-    assert torch.get_num_threads() == before
-
-
 @pytest.mark.parametrize(
     ("stats", "said"),
     [

@@ -114,7 +114,7 @@ def env_with(make_bundle: Callable[..., TaskBundle], lift_task: type[Task]):
 
 def tilt_deg(env: BatchEnv) -> np.ndarray:
     """Angle between the gripper and straight down, per world."""
-    return np.degrees(np.arccos(np.clip(-env._tool.rotation[:, 2, 2], -1, 1)))
+    return np.degrees(np.arccos(np.clip(-env._sim.tool.rotation[:, 2, 2], -1, 1)))
 
 
 # --- kinematics --------------------------------------------------------------------------------------------------
@@ -188,7 +188,7 @@ def test_a_held_target_is_reached_to_a_tenth_of_a_millimetre_and_degree(
     for k in range(40):
         env.step(aim if k < 10 else np.zeros((8, 7)))
 
-    assert np.linalg.norm(env._tool.pos - env._target_pos, axis=1).max() < 1e-4
+    assert np.linalg.norm(env._sim.tool.pos - env._sim.target_pos, axis=1).max() < 1e-4
     assert tilt_deg(env).max() < 0.1
 
 
@@ -200,7 +200,7 @@ def test_a_moving_target_is_followed_with_the_servos_lag(six: RobotConfig, env_w
     lags, tilts = [], []
     for _ in range(16):
         env.step(aside)
-        lags.append(float(np.linalg.norm(env._target_pos - env._tool.pos, axis=1).max()))
+        lags.append(float(np.linalg.norm(env._sim.target_pos - env._sim.tool.pos, axis=1).max()))
         tilts.append(float(tilt_deg(env).max()))
 
     servo = ServoConfig()
@@ -251,7 +251,7 @@ def test_observations_actions_and_states_are_laid_out_as_with_the_built_in_arm(
         k: v.shape for k, v in built_in.states().items()
     }
     np.testing.assert_allclose(ours.robot_state(), built_in.robot_state(), atol=1e-4)
-    assert ours._ctrl.shape == built_in._ctrl.shape
+    assert ours._sim._ctrl.shape == built_in._sim._ctrl.shape
 
 
 def test_the_gripper_reports_its_own_opening(six: RobotConfig, env_with: Callable[..., BatchEnv]):
@@ -266,10 +266,10 @@ def test_what_is_wedged_between_this_grippers_open_fingers_is_not_grasped(
 ):
     env = env_with(six, num_envs=3)
     opening = np.array([0.08, 0.0794, 0.0786])  # it opens by 80 mm; the built-in one by 85 mm
-    env._qpos[:, env.world.robot.fingers] = opening[:, None] / 2
+    env._sim.qpos[:, env.world.robot.fingers] = opening[:, None] / 2
     env._touches[:] = 1.0
 
-    env._show(np.arange(3))
+    env._fill(np.arange(3), env._sim.look_at(np.arange(3)))
 
     assert env.states()["cube_grasped"].tolist() == [0.0, 0.0, 1.0]
 
@@ -297,7 +297,7 @@ def test_an_arm_that_stands_elsewhere_works_in_the_same_place(
 
     ours, there = env_with(six), env_with(moved)
 
-    np.testing.assert_allclose(ours._tool.pos, there._tool.pos, atol=1e-5)
+    np.testing.assert_allclose(ours._sim.tool.pos, there._sim.tool.pos, atol=1e-5)
 
 
 # --- bad files ---------------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def test_time_running_out_is_a_truncation_and_no_termination(env: TorchRLEnv):
 
 def test_a_broken_world_is_a_termination_and_no_truncation(env: TorchRLEnv):
     env.reset()
-    env.worlds._qvel[1, 0] = 1e13
+    env.worlds._sim.qvel[1, 0] = 1e13
 
     after = env.step(still(env))["next"]
 

@@ -65,7 +65,9 @@ def seen(env: "WarpBatchEnv | BatchEnv") -> dict[str, torch.Tensor]:
 
 def qpos_of(env: "WarpBatchEnv | BatchEnv") -> torch.Tensor:
     """Return the positions of all joints, to be written to."""
-    return torch.from_numpy(env._qpos) if isinstance(env, BatchEnv) else env._sim.state()["qpos"]
+    return (
+        torch.from_numpy(env._sim.qpos) if isinstance(env, BatchEnv) else env._sim.state()["qpos"]
+    )
 
 
 def play(pair: Pair, action: np.ndarray) -> tuple[float, float]:
@@ -84,9 +86,10 @@ def continue_from(pair: Pair) -> None:
     sim, cpu = pair[0]._sim, pair[1]
     state = sim.state()
     for name in ("qpos", "qvel", "qacc_warmstart"):
-        state[name].copy_(torch.from_numpy(np.array(cpu._batch.bind(name))))
-    for name in ("_target_pos", "_target_quat", "_target_finger"):
-        getattr(pair[0], name).copy_(torch.from_numpy(np.array(getattr(cpu, name))))
+        state[name].copy_(torch.from_numpy(np.array(cpu._sim.batch.bind(name))))
+    for name in ("target_pos", "target_quat", "target_finger"):
+        there = torch.from_numpy(np.array(getattr(cpu._sim, name)))
+        getattr(pair[0], f"_{name}").copy_(there)
     sim.refresh()
 
 

@@ -109,13 +109,12 @@ def _collect(
         folder.mkdir(parents=True, exist_ok=True)
         for leftover in folder.glob("*.tmp"):
             leftover.unlink()
-    ledgers = folders[1]
     batches: list[dict[str, Any]] = []
     for number in range(cfg.max_batches):
         have = sum(len(b["episodes"]) for b in batches)
         if have >= cfg.num_episodes:
             break
-        ledger = ledgers / f"{number:03d}.json"
+        ledger = out / LEDGER_FOLDER / f"{number:03d}.json"
         if not ledger.is_file():
             on_progress(
                 have / cfg.num_episodes, f"{have}/{cfg.num_episodes} episodes, batch {number + 1}"
@@ -130,8 +129,7 @@ def _collect(
                 interface=cfg.interface,
             )
             artist = Artist(lesson.bundle, cfg, num_threads)
-            entry = _stage(artist, rollouts, out, number, have, on_progress)
-            write_json_atomically(ledger, entry)
+            write_json_atomically(ledger, _stage(artist, rollouts, out, number, have, on_progress))
         batches.append(read_object(ledger, "delete it; its batch is made again"))
     return _finish(lesson.bundle, cfg, out, batches)
 

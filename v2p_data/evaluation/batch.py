@@ -158,10 +158,11 @@ def judge(
 def _shown(success_step: Int[np.ndarray, "env"], film: Film, num_moments: int) -> Shown:
     """Return the episodes of one batch, each up to a little after its success."""
     is_won = success_step != NEVER
-    soon = np.minimum(success_step + 2 + TAIL_STEPS, num_moments)
     return Shown(
         successes=is_won,
-        num_frames=np.where(is_won, soon, num_moments),
+        num_frames=np.where(
+            is_won, np.minimum(success_step + 2 + TAIL_STEPS, num_moments), num_moments
+        ),
         snapshots=film.snapshots(),
     )
 

@@ -108,11 +108,10 @@ def make_distillation(
     from v2p_data.experts.labeller import labeller_of
 
     del inputs
-    sources = data.sources
-    demand_whole_sources(data.dataset, sources, runtime.root)
+    demand_whole_sources(data.dataset, data.sources, runtime.root)
     recipe: DistillationConfig = cfg.config["distillation"]
     policy: PolicyConfig = cfg.config["policy"]
-    episodes = recorded_under(sources[0])
+    episodes = recorded_under(data.sources[0])
     demand_masks(episodes)
     seed = seed_for(cfg.seed, "distillation")
     runtime.progress(0.0, "reading the demonstrations")
@@ -132,7 +131,7 @@ def make_distillation(
         course = Course(
             lessons={
                 s.item: Lesson(bundle=TaskBundle.load(s.task), expert=labeller_of(s.expert))
-                for s in sources
+                for s in data.sources
             },
             cfg=recipe,
             episodes=episodes,

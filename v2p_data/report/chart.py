@@ -70,9 +70,8 @@ def line_chart(
             f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{_number(tick)}</text>'
         )
     for tick in ticks(x_low, x_high, 5):
-        x = x_px(tick)
         parts.append(
-            f'<text x="{x:.1f}" y="{height_px - _BOTTOM + 15}" text-anchor="middle">{_number(tick)}</text>'
+            f'<text x="{x_px(tick):.1f}" y="{height_px - _BOTTOM + 15}" text-anchor="middle">{_number(tick)}</text>'
         )
     parts.append(
         f'<text x="{width_px - _RIGHT}" y="{height_px - 5}" text-anchor="end">{escape(x_label)}</text>'
@@ -82,18 +81,21 @@ def line_chart(
         for x, y in _unbroken(line.x[::step], line.y[::step]):
             points = " ".join(f"{u:.1f},{v:.1f}" for u, v in zip(x_px(x), y_px(y), strict=True))
             parts.append(f'<polyline class="s{index % NUM_STYLES}" points="{points}"/>')
-    # One curve needs no legend: the title says what it is.
-    legend = "".join(
-        f'<li><svg class="key" viewBox="0 0 24 8" aria-hidden="true">'
-        f'<line class="s{i % NUM_STYLES}" x1="1" x2="23" y1="4" y2="4"/></svg>{escape(line.name)}</li>'
-        for i, line in enumerate(lines)
-        if len(lines) > 1
-    )
     return Markup(
         f'<figure class="chart"><figcaption>{escape(title)}</figcaption>'
         f'<svg viewBox="0 0 {width_px} {height_px}" role="img" aria-label="{escape(_in_words(title, lines))}">'
-        f'{"".join(parts)}</svg>{f'<ul class="legend">{legend}</ul>' if legend else ""}</figure>'
-    )  # fmt: skip
+        f"{''.join(parts)}</svg>{_legend(lines)}</figure>"
+    )
+
+
+def _legend(lines: Sequence[Line]) -> str:
+    """Return the list of the curves' names; nothing for one curve: the title says what it is."""
+    entries = "".join(
+        f'<li><svg class="key" viewBox="0 0 24 8" aria-hidden="true">'
+        f'<line class="s{i % NUM_STYLES}" x1="1" x2="23" y1="4" y2="4"/></svg>{escape(line.name)}</li>'
+        for i, line in enumerate(lines)
+    )
+    return f'<ul class="legend">{entries}</ul>' if len(lines) > 1 else ""
 
 
 def ticks(low: float, high: float, about: int) -> list[float]:

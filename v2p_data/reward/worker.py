@@ -124,15 +124,18 @@ def _in_child(folder: Path, parent_pid: int) -> int:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
     request = json.loads((folder / REQUEST_FILE).read_text())
-    rights = Rights(
-        seconds=None,
-        memory_bytes=int(request["memory_mb"]) * 1024**2,
-        file_bytes=FILE_BYTES,
-        open_files=OPEN_FILES,
-        processes=THREADS,
-        folder=folder,
+    confine(
+        Rights(
+            seconds=None,
+            memory_bytes=int(request["memory_mb"]) * 1024**2,
+            file_bytes=FILE_BYTES,
+            open_files=OPEN_FILES,
+            processes=THREADS,
+            folder=folder,
+        ),
+        parent_pid=parent_pid,
+        give_up_root=False,
     )
-    confine(rights, parent_pid=parent_pid, give_up_root=False)
     return run_job(request, folder)
 
 

@@ -52,9 +52,6 @@ class TwinSetup:
     """The arm waits while the gripper travels, as in `v2p deploy`."""
 
 
-NOMINAL = TwinSetup()
-
-
 @dataclass(frozen=True, kw_only=True)
 class Played:
     """What became of one episode."""
@@ -136,7 +133,7 @@ def judge_in_twin(
     *,
     seeds: Sequence[int],
     cfg: EvaluationConfig,
-    setup: TwinSetup = NOMINAL,
+    setup: TwinSetup | None = None,
     workers: int = 1,
 ) -> TwinJudged:
     """Play one episode per seed.
@@ -152,7 +149,7 @@ def judge_in_twin(
     Raises:
         V2PError: the folder holds no task, or the actor does not suit the twin.
     """
-    settings = (task_folder, load, cfg, setup)
+    settings = (task_folder, load, cfg, setup or TwinSetup())
     if workers == 1:
         table = _Table(*settings)
         try:

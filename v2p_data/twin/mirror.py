@@ -7,12 +7,14 @@ the states they know, the task's own success is asked, and the independent refer
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.env import ranges
-from v2p_data.sim.env.batch_env import BatchEnv, Followed, SimConfig, StepResult, robot_of
+from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, StepResult, robot_of
 from v2p_data.sim.env.targets import ToolPose
+from v2p_data.sim.env.task_code import FRESH
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.sim.wrappers.gym_env import stream_seed
@@ -50,6 +52,39 @@ class Truth:
     """The simulation broke down."""
 
 
+class FollowingEnv(BatchEnv):
+    """Worlds of the training simulator in which no physics runs: they are where another simulator says."""
+
+    def begin(self, truth: Truth, target: ToolPose) -> None:
+        """Take over the first moment of an episode, in all worlds."""
+        self._steps[:] = 0
+        self._judgement.held[:] = FRESH
+        self._last_action[:] = 0
+        self._start_pose[:] = truth.object_poses
+        self._take_over(truth, target)
+
+    def follow(self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]) -> StepResult:
+        """Take over the moment that an action led to, and judge it as `step` does."""
+        clipped = np.clip(np.nan_to_num(action[None]), -1.0, 1.0)
+        self._last_action[:] = clipped
+        self._steps += 1
+        self._take_over(truth, target)
+        return self._judged(torch.from_numpy(clipped.astype(np.float32)))
+
+    def _take_over(self, truth: Truth, target: ToolPose) -> None:
+        sim, robot = self._sim, self.world.robot
+        sim.qpos[:, robot.arm] = truth.joints
+        sim.qvel[:, robot.arm_dofs] = truth.joint_speeds
+        sim.qpos[:, robot.fingers] = truth.fingers
+        sim.object_qpos[:], sim.object_qvel[:] = truth.object_poses, truth.object_speeds
+        self._touches[:] = truth.touches
+        sim.target_pos[:] = target.pos
+        sim.target_quat[:] = target.rotation.as_quat(scalar_first=True)
+        sim.target_finger[:] = target.opening * FINGER_TRAVEL_M
+        self.broken_count += sim.look()
+        self._fill(slice(None), sim.tool)
+
+
 class Mirror:
     """One world of the training simulator that follows the twin.
 
@@ -70,7 +105,7 @@ class Mirror:
                 "gripper, so make the task again without --robot.path"
             )
         self.bundle = bundle
-        self.env = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
+        self.env = FollowingEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
         self.referee = RefereeRecord(self.env)
 
     def start(self, seed: int) -> Start:
@@ -89,29 +124,14 @@ class Mirror:
     def begin(self, world: TwinWorld, truth: Truth, target: ToolPose) -> None:
         """Take over the first moment of an episode."""
         self.env.randomizer.size_m[0] = world.size_m
-        self.env.begin_following(_followed(truth, target))
+        self.env.begin(truth, target)
         self.referee.restart()
 
     def follow(self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]) -> StepResult:
         """Take over the moment that an action led to, and say what the task's own success says of it."""
-        result = self.env.follow(_followed(truth, target), action[None])
+        result = self.env.follow(truth, target, action)
         self.referee.note()
         return result
-
-
-def _followed(truth: Truth, target: ToolPose) -> Followed:
-    quat = target.rotation.as_quat(scalar_first=True)
-    return Followed(
-        arm_qpos=truth.joints[None],
-        arm_qvel=truth.joint_speeds[None],
-        fingers=truth.fingers[None],
-        object_qpos=truth.object_poses[None],
-        object_qvel=truth.object_speeds[None],
-        touches=truth.touches[None],
-        target_pos=target.pos[None],
-        target_quat=quat[None],
-        target_finger=np.array([target.opening * FINGER_TRAVEL_M]),
-    )
 
 
 def placed(start: Start, world: TwinWorld) -> Float[np.ndarray, "object 7"]:

@@ -49,8 +49,7 @@ def merge_captions(folder: Path, addition: Path) -> Merged:
         addition: a `captions.json`, or a `review.json` (`{"clips": [{"video", "hints"}]}`).
 
     Raises:
-        V2PError: no such file, the folder's own captions, a clip or an object that is not known, or a hint that
-            cannot be used.
+        V2PError: no such file, the folder's own captions, an unknown clip or object, or a hint of no use.
     """
     items = {video.path.name: video for video in find_videos(folder)}
     path = folder / CAPTIONS_FILE

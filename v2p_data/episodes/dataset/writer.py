@@ -126,16 +126,7 @@ def pack(
         on_progress(0.9, "writing the tables")
         described = _write(shards, partial / "shards", repo_id, growing)
         write_json_atomically(
-            growing / METADATA_FILE,
-            {
-                "schema": METADATA_SCHEMA,
-                "repo_id": repo_id,
-                "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
-                "state": list(state_names(headings[0].num_joints)),
-                "action": list(headings[0].actions or ACTION_NAMES),
-                "episodes": described,
-                "provenance": dict(provenance or {}),
-            },
+            growing / METADATA_FILE, _about(repo_id, headings, described, provenance or {})
         )
         _check_tables(growing, shards)
         _flush(growing)
@@ -145,6 +136,23 @@ def pack(
     num_frames = sum(h.num_frames for h in headings)
     logger.info("packed %d episodes, %d frames, at %s", len(headings), num_frames, root)
     return Packed(root=root, repo_id=repo_id, num_episodes=len(headings), num_frames=num_frames)
+
+
+def _about(
+    repo_id: str,
+    headings: Sequence[Heading],
+    described: Sequence[dict[str, Any]],
+    provenance: Mapping[str, Any],
+) -> dict[str, Any]:
+    return {
+        "schema": METADATA_SCHEMA,
+        "repo_id": repo_id,
+        "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
+        "state": list(state_names(headings[0].num_joints)),
+        "action": list(headings[0].actions or ACTION_NAMES),
+        "episodes": described,
+        "provenance": dict(provenance),
+    }
 
 
 def _headings(staged: Sequence[Path]) -> list[Heading]:

@@ -82,8 +82,19 @@ def check_poses(
                 f"objects must start apart: {ADVICE}",
                 depth,
             )
-    if (low <= IN_THE_AIR_M).all():
-        return
+    if not (low <= IN_THE_AIR_M).all():
+        _check_carried(objects, size_m, poses, extents, task)
+
+
+def _check_carried(
+    objects: tuple[ObjectModel, ...],
+    size_m: Float[np.ndarray, "n object 3"],
+    poses: Float[np.ndarray, "n object 7"],
+    extents: list[tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]],
+    task: str,
+) -> None:
+    """Demand that what is not on the table lies on another object; `extents` are lowest and highest points."""
+    low = np.array([lowest for lowest, _ in extents])
     fall = low.copy()
     reach = np.linalg.norm(size_m, axis=2).T / 2
     for a in range(len(objects)):

@@ -23,17 +23,12 @@ from v2p_data.errors import V2PError
 from v2p_data.geometry.rotation import quats_pointing_down
 from v2p_data.seeds import rng_for, torch_rng_for
 from v2p_data.sim.env import task_code
-from v2p_data.sim.env.batch_env import (
-    ACT_DIM,
-    BEGAN_SOLVED,
-    FRESH,
-    HELD_STEPS,
-    SimConfig,
-    robot_of,
-)
+from v2p_data.sim.env.batch_env import ACT_DIM, robot_of
+from v2p_data.sim.env.cpu_physics import SimConfig
 from v2p_data.sim.env.randomize import Randomizer
 from v2p_data.sim.env.start_check import check_poses, check_solved
 from v2p_data.sim.env.states import named_states
+from v2p_data.sim.env.task_code import BEGAN_SOLVED, FRESH, HELD_STEPS
 from v2p_data.sim.env.tensor_states import (
     SeenTensors,
     base_observation,
@@ -90,12 +85,7 @@ class WarpBatchEnv:
         device: str = "cuda:0",
         task: type[Task] | None = None,
     ) -> None:
-        self.device = torch.device("cuda:0" if device == "cuda" else device)
-        if self.device.type == "cuda" and not torch.cuda.is_available():
-            raise V2PError(
-                f"the backend 'warp' was asked for {device}, but this machine has no CUDA device; use the "
-                "backend 'cpu', or device 'cpu' to try the GPU's model slowly"
-            )
+        self.device = _present(device)
         self.cfg = cfg or SimConfig()
         robot = robot_of(bundle, self.cfg)
         if robot.path is not None:
@@ -187,7 +177,7 @@ class WarpBatchEnv:
 
     def observe(self) -> Float32[torch.Tensor, "env obs"]:
         """Return the observation of all worlds as they are."""
-        return self._observation(self.task.observe(self.task_states))
+        return _finite(self.task.observe(self.task_states))
 
     def step(self, action: Float[torch.Tensor, "env 7"]) -> TensorStepResult:
         """Carry out one action of 50 ms in every world; actions are clipped to [-1, 1]."""
@@ -203,8 +193,7 @@ class WarpBatchEnv:
         self._sim.step()
         self._last_action.copy_(clipped)
         self._steps += 1
-        touching = self._sim.sensordata.reshape(self.num_envs, -1, 2) > 0
-        self._touches.copy_(touching)
+        self._touches.copy_(self._sim.sensordata.reshape(self.num_envs, -1, 2) > 0)
         broken = self._sim.broken()
         self._broken_count += (broken & ~self._broken).sum()
         self._broken.copy_(broken)
@@ -270,30 +259,12 @@ class WarpBatchEnv:
         return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(self.device)
 
     def _state(self) -> dict[str, torch.Tensor]:
-        names = (
-            "_target_pos",
-            "_target_quat",
-            "_target_finger",
-            "_object_size",
-            "_start_pose",
-            "_touches",
-            "_steps",
-            "_held",
-            "_last_action",
-            "_broken",
-            "_broken_count",
-            "_num_starts",
-            "_num_solved",
-        )
         drawn = self.randomizer.drawn_arrays() | self.randomizer.fields()
         return {
             **{f"physics.{key}": value for key, value in self._sim.state().items()},
             **{f"drawn.{key}": torch.from_numpy(value) for key, value in drawn.items()},
-            **{f"env.{name}": getattr(self, name) for name in names},
+            **{f"env.{name}": getattr(self, name) for name in _ENV_STATE},
         }
-
-    def _observation(self, obs: torch.Tensor) -> Float32[torch.Tensor, "env obs"]:
-        return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0)
 
     def _move_targets(self, action: torch.Tensor) -> None:
         cfg, sim, scale = self.cfg, self._sim, self.bundle.motion_scale
@@ -353,12 +324,12 @@ class WarpBatchEnv:
 
     def _judge(self, action: torch.Tensor) -> TensorStepResult:
         said = self.task.judge(self.task_states, action)
-        obs, total, parts = self._observation(said.observation), said.reward, said.components
+        obs, total, parts = _finite(said.observation), said.reward, said.components
         ok = ~self._broken
         success = said.success & ok
         zero = torch.zeros_like(total)
         task_reward = torch.where(ok, total.detach(), zero).float()
-        self._check(task_reward, parts)
+        _check(self.bundle.title, task_reward, parts, self._sim.dropped_contacts())
         self._count_held(success)
         reward = task_reward / FULL_REWARD + self.cfg.bonus_ratio * success
         return TensorStepResult(
@@ -381,22 +352,61 @@ class WarpBatchEnv:
         self._num_starts += is_fresh.sum()
         self._num_solved += (is_fresh & success).sum()
 
-    def _check(self, task_reward: torch.Tensor, parts: dict[str, torch.Tensor]) -> None:
-        bad = ~(task_reward.abs() <= MAX_REWARD)  # of NaN too
-        flags = torch.stack([bad.any(), self._sim.dropped_contacts()]).tolist()
-        if flags[0]:
-            env = int(bad.nonzero()[0])
-            raise V2PError(
-                f"the reward of task '{self.bundle.title}' is {float(task_reward[env])} in world {env} although "
-                f"its state is finite; rewards lie within +-{MAX_REWARD:g}, a full one is {FULL_REWARD:g}; "
-                f"parts: { {k: float(v[env]) for k, v in parts.items()} }"
-            )
-        if flags[1]:
-            raise V2PError(
-                f"the worlds of task '{self.bundle.title}' have more contacts than the backend 'warp' has room "
-                f"for ({CONTACTS_PER_WORLD} a world on average); raise CONTACTS_PER_WORLD in sim/env/warp_physics.py "
-                "or simplify the scene's objects"
-            )
+
+def _present(name: str) -> torch.device:
+    """Return a device.
+
+    Raises:
+        V2PError: the machine has none like it.
+    """
+    device = torch.device("cuda:0" if name == "cuda" else name)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise V2PError(
+            f"the backend 'warp' was asked for {name}, but this machine has no CUDA device; use the "
+            "backend 'cpu', or device 'cpu' to try the GPU's model slowly"
+        )
+    return device
+
+
+def _check(
+    title: str,
+    task_reward: Float32[torch.Tensor, "env"],
+    parts: dict[str, torch.Tensor],
+    dropped_contacts: torch.Tensor,
+) -> None:
+    """Demand fair rewards and room for all contacts."""
+    bad = ~(task_reward.abs() <= MAX_REWARD)  # of NaN too
+    flags = torch.stack([bad.any(), dropped_contacts]).tolist()
+    if flags[0]:
+        env = int(bad.nonzero()[0])
+        raise task_code.unfair_reward(title, env, float(task_reward[env]), parts)
+    if flags[1]:
+        raise V2PError(
+            f"the worlds of task '{title}' have more contacts than the backend 'warp' has room "
+            f"for ({CONTACTS_PER_WORLD} a world on average); raise CONTACTS_PER_WORLD in sim/env/warp_physics.py "
+            "or simplify the scene's objects"
+        )
+
+
+def _finite(obs: torch.Tensor) -> Float32[torch.Tensor, "env obs"]:
+    return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+_ENV_STATE = (
+    "_target_pos",
+    "_target_quat",
+    "_target_finger",
+    "_object_size",
+    "_start_pose",
+    "_touches",
+    "_steps",
+    "_held",
+    "_last_action",
+    "_broken",
+    "_broken_count",
+    "_num_starts",
+    "_num_solved",
+)
 
 
 class _HostFields:

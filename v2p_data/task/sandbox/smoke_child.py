@@ -267,8 +267,7 @@ def in_a_fork(
         code = 1
         try:
             _leave_the_pipes()
-            rights = Rights(seconds=seconds, memory_bytes=MEMORY_BYTES)
-            confine(rights, parent_pid=parent_pid)
+            confine(Rights(seconds=seconds, memory_bytes=MEMORY_BYTES), parent_pid=parent_pid)
             _send(write_end, (answer_to or answer)(source, request))
             code = 0
         finally:
