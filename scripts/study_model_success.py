@@ -82,7 +82,8 @@ def row_of(name: str, told: str, client: VlmClient, args: argparse.Namespace) ->
     """Return a task's samples with what the sandbox, the audit and the referee's episodes say of each."""
     bundle = load_benchmark(name)
     template = write_samples(bundle.scene, 1)[0]
-    judge = CodeJudge(bundle.scene, TaskConfig(), seed_for(args.seed, "task", name))
+    seed = seed_for(args.seed, "task", name)
+    judge = CodeJudge(bundle.scene, TaskConfig(), seed, reference=template)
     turns = _written(client, bundle.scene, told, template, judge, args)
     env = BatchEnv(
         bundle,

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.task.audit.audit import audit
+from v2p_data.task.audit.audit import Audit, audit
 from v2p_data.task.audit.moments import build_probes
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
-from v2p_data.task.generate import TaskConfig, generate_task
+from v2p_data.task.generate import CodeJudge, TaskConfig, generate_task
 from v2p_data.task.sandbox.probes import rest_height
 from v2p_data.task.sandbox.smoke import SmokeResult, trial_request
 from v2p_data.task.sandbox.smoke_child import answer
@@ -91,6 +91,18 @@ def test_noise_at_the_end_costs_points_but_is_no_veto(scene_of):
     assert failed(verdict) == {"last_pose", "accepts_end"}
     assert 0.5 < verdict.score < 0.9
     assert verdict.is_acceptable
+
+
+def test_a_success_is_held_to_what_the_words_say_where_that_is_true_at_the_end(scene_of):
+    scene = scene_of("lift_up")
+    too_high = lift("(height > 0.2) & (speed < 0.1)")  # the video ends 17.5 cm up
+
+    def tried(reference: str) -> Audit:
+        return CodeJudge(scene, TaskConfig(), 0, reference).tried([too_high])[0].audit
+
+    assert tried("").is_acceptable
+    assert "false at the video's end" in tried(write_samples(scene, 1)[0]).vetoed
+    assert tried(too_high).is_acceptable  # the trusted one says that the end was measured wrongly
 
 
 def test_what_does_not_run_is_vetoed(scene_of):

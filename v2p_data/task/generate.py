@@ -148,11 +148,15 @@ class CodeJudge:
         scene: what was understood of the video.
         cfg: limits of the trial runs.
         seed: of the audit's random probes.
+        reference: a trusted code, which others are held to; see `Audit.held_to`.
     """
 
-    def __init__(self, scene: Scene, cfg: TaskConfig, seed: int) -> None:
+    def __init__(self, scene: Scene, cfg: TaskConfig, seed: int, reference: str = "") -> None:
         self._scene, self._cfg = scene, cfg
         self._probes = build_probes(scene, rng_for(seed, "audit", scene.title))
+        self._reference = Audit()
+        if reference:
+            self._reference = self.tried([reference])[0].audit
 
     def try_all(self, codes: list[str]) -> list[SmokeResult]:
         """Return each code's trial run."""
@@ -168,7 +172,9 @@ class CodeJudge:
     def judged(self, written: Sequence[tuple[str, SmokeResult]]) -> tuple[Sample, ...]:
         """Return codes that were tried, with their audits."""
         return tuple(
-            _sample(code, result, audit(self._scene, self._probes, result))
+            _sample(
+                code, result, audit(self._scene, self._probes, result).held_to(self._reference)
+            )
             for code, result in written
         )
 
@@ -200,8 +206,11 @@ def generate_task(
         ItemRejectedError: `no_acceptable_task`: no sample runs and passes the audit.
         V2PError: the model cannot be asked, or its budget is used up.
     """
-    judge = CodeJudge(scene, cfg, seed)
-    if sources is None and cfg.writer == "vlm":
+    asks_model = sources is None and cfg.writer == "vlm"
+    # Templates are sure of the words, a model is sure of nothing.
+    reference = write_samples(scene, 1)[0] if asks_model else ""
+    judge = CodeJudge(scene, cfg, seed, reference)
+    if asks_model:
         return _by_model(scene, cfg, seed, judge, calls, pool)
     codes = write_samples(scene, cfg.num_samples) if sources is None else sources
     samples = judge.tried(codes)

@@ -10,7 +10,7 @@ of the sample's own reset; and that reset may not begin near the goal, at one pl
 (`reset_audit`). A success that hangs on other worlds does not pass the trial run (`smoke`).
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,9 @@ VETO_WORDS = {
     "starts_like_video": "its own reset leaves out where the video itself begins",
 }
 ALWAYS_TRUE = "its success is always true"
+FALSE_AT_END = "its success is false at the video's end, where a condition made from the caption's words is true"
+LEAST_OF_REFERENCE = 0.5
+"""Of the disturbed ends at which a trusted success is true, another one must be true at so many."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +82,19 @@ class Audit:
     @property
     def is_acceptable(self) -> bool:
         return not self.vetoed and self.score >= ACCEPTABLE_SCORE
+
+    @property
+    def end_share(self) -> float:
+        """Share of the video's disturbed ends at which success is true."""
+        return next((c.share for c in self.checks if c.name == "accepts_end"), 0.0)
+
+    def held_to(self, reference: "Audit") -> "Audit":
+        """Return it with a veto where its success is false at ends at which a trusted one is true.
+
+        A trusted success that is false there too says that the video's end was measured wrongly.
+        """
+        is_false = self.end_share < LEAST_OF_REFERENCE * reference.end_share
+        return replace(self, vetoed=FALSE_AT_END) if is_false and not self.vetoed else self
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON."""
