@@ -11,7 +11,7 @@ from v2p_data.play import StateActor
 from v2p_data.reward.feedback import Feedback, Trajectories, feedback_of, ranking
 from v2p_data.reward.record import record_trajectories
 from v2p_data.reward.trajectories import HELD_STEPS
-from v2p_data.sim.env import batch_env
+from v2p_data.sim.env import task_code
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
@@ -66,7 +66,7 @@ def test_success_must_be_held_at_the_end_as_in_the_simulator():
     early = np.zeros((10, 2), bool)
     early[:8, 1] = True
 
-    assert HELD_STEPS == batch_env.HELD_STEPS
+    assert HELD_STEPS == task_code.HELD_STEPS
     assert not two_episodes(success=late).succeeded.any()
     assert not two_episodes(success=early).succeeded.any()
     assert feedback_of(two_episodes(success=early), 0.05).ever_success == 0.5

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from v2p_data.episodes.dataset.features import STATE_NAMES
 from v2p_data.errors import V2PError, write_refusal
 from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS
 
@@ -176,8 +175,8 @@ class Heading:
     cameras: tuple[str, ...]
     actions: tuple[str, ...]
     """Names of the action's entries; empty: steps of the tool."""
-    num_joints: int
-    """Of how many joints the angles are in the state."""
+    num_states: int
+    """Entries of the state."""
     is_handover: bool
     """It holds who acted."""
     known: tuple[str, ...]
@@ -216,7 +215,7 @@ class Heading:
             size_px=(height, width),
             cameras=about.get("cameras", (MASK_CAMERA,)),
             actions=about.get("actions", ()),
-            num_joints=num_states - len(STATE_NAMES),
+            num_states=num_states,
             is_handover=is_handover,
             known=known,
             digest=digest,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import staged_episodes
 from v2p_data.episodes.config import EpisodesConfig
-from v2p_data.episodes.dataset.features import interface_in
+from v2p_data.episodes.dataset.features import ArmInterface, interface_in
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import check_checkpoint
 from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
@@ -22,7 +22,6 @@ from v2p_data.pipeline.settings import from_values
 from v2p_data.play import VisionActor
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.seeds import seed_for
-from v2p_data.sim.robot.interface import STEPS, ArmInterface
 from v2p_data.task.task import TaskBundle
 
 if TYPE_CHECKING:
@@ -275,7 +274,7 @@ def checkpoint_judge(
     episodes: int,
     seed: int,
     runtime: Runtime,
-    interface: ArmInterface = STEPS,
+    interface: ArmInterface,
 ) -> Callable[[Any], float]:
     """Return what gives a policy's mean success rate over task folders, on seeds that no evaluation uses."""
     from v2p_data.evaluation.batch import judge

@@ -113,9 +113,9 @@ def actions_in(info: Mapping[str, Any]) -> Actions | None:
     return actions_named(info.get("features", {}).get(ACTION_KEY, {}).get("names"))
 
 
-def state_names(num_joints: int = 0) -> tuple[str, ...]:
-    """Return the names of the state's entries; the angles of so many joints follow."""
-    return (*STATE_NAMES, *joint_names(num_joints))
+def state_names(num_states: int) -> tuple[str, ...]:
+    """Return the names of a state of so many entries: those after the tool's are the angles of joints."""
+    return (*STATE_NAMES, *joint_names(num_states - len(STATE_NAMES)))
 
 
 def interface_in(info: Mapping[str, Any]) -> ArmInterface:

@@ -148,7 +148,7 @@ def _about(
         "schema": METADATA_SCHEMA,
         "repo_id": repo_id,
         "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
-        "state": list(state_names(headings[0].num_joints)),
+        "state": list(state_names(headings[0].num_states)),
         "action": list(headings[0].actions or ACTION_NAMES),
         "episodes": described,
         "provenance": dict(provenance),
@@ -184,10 +184,10 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
                 f"{heading.path} has actions of {', '.join(heading.actions or ACTION_NAMES)}, the first episode of "
                 f"{', '.join(first.actions or ACTION_NAMES)}; collect all episodes with one --episodes.actions and one arm"
             )
-        if heading.num_joints != first.num_joints:
+        if heading.num_states != first.num_states:
             raise V2PError(
-                f"{heading.path} has the angles of {heading.num_joints} joints in its state, the first episode of "
-                f"{first.num_joints}; collect all episodes with one --episodes.joint-state and one arm"
+                f"{heading.path} has states of {heading.num_states} numbers, the first episode of "
+                f"{first.num_states}; collect all episodes with one --episodes.joint-state and one arm"
             )
         if heading.num_frames < 2:
             raise V2PError(
@@ -214,7 +214,7 @@ def _write(
             first.size_px[1],
             first.cameras,
             actions=first.actions or ACTION_NAMES,
-            states=state_names(first.num_joints),
+            states=state_names(first.num_states),
             has_handovers=has_handovers,
             is_simulated=is_simulated,
         ),
