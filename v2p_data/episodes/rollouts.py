@@ -193,7 +193,7 @@ class EpisodeEnds:
 
 
 class Telling:
-    """An actor whose steps are told as targets, too, and before each of them the state.
+    """An actor whose steps are noted as targets, and whose state is noted with the angles of the joints.
 
     Args:
         actor: who acts.
@@ -214,15 +214,16 @@ class Telling:
     def act(self, view: View) -> Float[np.ndarray, "env 7"]:
         """Return the actor's actions."""
         action = self._actor.act(view)
-        self._states.append(state_as_seen(view.state, view.worlds, self._interface))
+        if self._interface.joint_state:
+            self._states.append(state_as_seen(view.state, view.worlds, self._interface))
         if self._interface.actions != "delta_tool":
             step = np.clip(action, -1.0, 1.0).astype(np.float32)
             self._targets.append(targets_of(view.worlds, step, self._interface.actions))
         return action
 
     def told(self) -> dict[str, Any]:
-        """Return `state`, and of targets `names` and `targets` of `Rollouts`."""
-        told: dict[str, Any] = {"state": np.stack(self._states)}
+        """Return fields of `Rollouts`: `state` where joints are in it, `names` and `targets` where actions are targets."""
+        told: dict[str, Any] = {"state": np.stack(self._states)} if self._states else {}
         if self._targets:
             told["names"] = action_names(self._interface.actions, self._num_joints)
             told["targets"] = np.stack(self._targets)

@@ -42,7 +42,7 @@ def true_labels(arm: TwinArm) -> Callable[[], UInt8[np.ndarray, "h w"]]:
 
 @dataclass(frozen=True, kw_only=True)
 class TwinSetup:
-    """A twin, and what lies between it and who acts."""
+    """Parameters of the twin, what its camera shows to the policy, and how its gripper delays the arm."""
 
     parameters: TwinParameters | None = None
     """Of the twin; by default the nominal one."""

@@ -86,7 +86,7 @@ class V2PEnvConfig(EnvConfig):
     actions: str = ""
     """What an action says: `delta_tool`, `absolute_tool` or `joints`; by default as in the dataset that carries the tasks."""
     joint_state: bool = False
-    """The angles of the arm's joints follow in the state, as in datasets of `--episodes.joint-state`; on where such a one carries the tasks."""
+    """Add the angles of the arm's joints to the state. A dataset that was made with `--episodes.joint-state` and carries the tasks turns this on."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {
