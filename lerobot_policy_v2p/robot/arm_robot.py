@@ -9,21 +9,26 @@ from jaxtyping import Float
 from lerobot.robots import Robot
 
 from lerobot_policy_v2p.robot.config_arm import ArmRobotConfig
+from lerobot_policy_v2p.robot.unattended import Unattended
+from v2p_data.deployment.checks import names_of
 from v2p_data.deployment.robot import MASK_NAME
-from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
+from v2p_data.episodes.dataset.features import ACTION_NAMES, state_names
 from v2p_data.errors import V2PError
+from v2p_data.sim.robot.interface import STEPS
 from v2p_data.twin.interface import RGB_NAME, RGB_PX
 
 MASK_PX = 256
 
 
-class Closable(Protocol):
+class StatefulArm(Protocol):
     """What stands behind a robot."""
+
+    def state(self) -> Float[np.ndarray, "11"]: ...
 
     def close(self) -> None: ...
 
 
-class ArmRobot[Arm: Closable](Robot):
+class ArmRobot[Arm: StatefulArm](Robot):
     """A robot of LeRobot's whose arm speaks in the dataset's states and actions."""
 
     picture_name: str
@@ -35,17 +40,23 @@ class ArmRobot[Arm: Closable](Robot):
         super().__init__(config)
         sees = config.pictures == "rgb"
         self.picture_name, self.picture_px = (RGB_NAME, RGB_PX) if sees else (MASK_NAME, MASK_PX)
+        # `v2p deploy`, which looks at the pictures, makes steps of targets itself.
+        self.interface = STEPS if sees else config.interface
         del self.calibration  # LeRobot's dict of motors, which would hide the method
         self.arm: Arm | None = None
+        self._unattended: Unattended | None = None
 
     @property
     def observation_features(self) -> dict[str, Any]:
         size = self.picture_px
-        return {**dict.fromkeys(STATE_NAMES, float), self.picture_name: (size, size, 3)}
+        return {
+            **dict.fromkeys(names_of(self.interface)[0], float),
+            self.picture_name: (size, size, 3),
+        }
 
     @property
     def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(ACTION_NAMES, float)
+        return dict.fromkeys(names_of(self.interface)[1], float)
 
     @property
     def cameras(self) -> dict[str, Any]:
@@ -78,22 +89,27 @@ class ArmRobot[Arm: Closable](Robot):
             self.disconnect()
             raise
 
+    def _named_state(self, arm: StatefulArm) -> dict[str, Any]:
+        """Ask the arm and return `observation.state` by name."""
+        state = arm.state()
+        if self.interface.joint_state:
+            state = np.concatenate([state, self.joints()])
+        return dict(zip(state_names(len(state)), state.tolist(), strict=True))
+
+    def _step(self, action: dict[str, Any], state: dict[str, Any]) -> Float[np.ndarray, "7"]:
+        """Return the step of the tool that an action asks for, in [-1, 1]; with masks, what the limits leave of it."""
+        asked = np.array([float(action[name]) for name in self.action_features])
+        if self._unattended is not None:
+            asked = self._unattended.step(asked, state)
+        return np.clip(asked, -1.0, 1.0)
+
+    def _sent(self, action: dict[str, Any], step: Float[np.ndarray, "7"]) -> dict[str, Any]:
+        """Return an action as LeRobot records it: a step as carried out, a target as asked."""
+        if self.interface.actions != "delta_tool":
+            return action
+        return dict(zip(ACTION_NAMES, step.tolist(), strict=True))
+
     def _connected(self) -> Arm:
         if self.arm is None:
             raise V2PError(f"the robot {self.name} is not connected; call connect() first")
         return self.arm
-
-
-def action_of(named: dict[str, Any]) -> Float[np.ndarray, "7"]:
-    """Return an action by name as an array."""
-    return np.array([float(named[name]) for name in ACTION_NAMES])
-
-
-def named_action(action: Float[np.ndarray, "7"]) -> dict[str, float]:
-    """Return an action's entries by name."""
-    return dict(zip(ACTION_NAMES, action.tolist(), strict=True))
-
-
-def named_state(state: Float[np.ndarray, "11"]) -> dict[str, Any]:
-    """Return a state's entries by name."""
-    return dict(zip(STATE_NAMES, state.tolist(), strict=True))

@@ -6,6 +6,8 @@ from typing import Literal
 from lerobot.robots import RobotConfig
 
 from v2p_data.deployment.limits import LimitsConfig
+from v2p_data.sim.robot.action_names import Actions
+from v2p_data.sim.robot.interface import ArmInterface
 
 Pictures = Literal["mask", "rgb"]
 
@@ -22,6 +24,10 @@ class ArmRobotConfig(RobotConfig):
     training_view: bool = True
     """`mask` only: masks are carried over from the robot's camera to that of the training. Off only for a policy that was
     trained with the robot's camera."""
+    actions: Actions = "delta_tool"
+    """`mask` only: what the policy says, as its dataset's `--episodes.actions`. `v2p deploy` knows it from the policy."""
+    joint_state: bool = False
+    """`mask` only: the angles of the arm's joints follow in the state, as with `--episodes.joint-state`."""
     limits: LimitsConfig = field(default_factory=LimitsConfig)
     """`mask` only: what `send_action` lets through, waiting for the gripper included; not on the simulated arm, whose gripper
     is that of the training. `v2p deploy` has limits of its own instead."""
@@ -30,3 +36,8 @@ class ArmRobotConfig(RobotConfig):
     By default the `--policy.path` of the LeRobot tool that connects it."""
     check_policy: bool = True
     """Off connects whatever the policy was trained for."""
+
+    @property
+    def interface(self) -> ArmInterface:
+        """What the policy sees of the arm and tells it."""
+        return ArmInterface(actions=self.actions, joint_state=self.joint_state)

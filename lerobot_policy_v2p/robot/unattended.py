@@ -12,8 +12,9 @@ from lerobot.configs import parser
 from lerobot_policy_v2p.robot.config_arm import ArmRobotConfig
 from v2p_data.deployment.checks import check_meaning
 from v2p_data.deployment.limits import Guard
-from v2p_data.deployment.robot import ActionScale, Rig
+from v2p_data.deployment.robot import ActionScale, Reading, Rig
 from v2p_data.deployment.sight import LOST_AFTER, Sight, clicks_from
+from v2p_data.deployment.steps import StepMaker
 from v2p_data.errors import V2PError
 from v2p_data.sim.render.masks import labels_to_rgb
 from v2p_data.twin.interface import RGB_NAME
@@ -51,6 +52,7 @@ class Unattended:
             clicks = clicks_from(config.clicks.split())
             self._sight = Sight(robot.calibration(), clicks, training_view=config.training_view)
         self._guard = Guard(config.limits, self._rig.scale) if is_limited else None
+        self._maker = StepMaker(config.interface, self._rig.scale)
         self._has_seen = self._has_acted = False
 
     def mask(self, state: dict[str, Any]) -> UInt8[np.ndarray, "h w 3"]:
@@ -75,25 +77,32 @@ class Unattended:
             )
         return labels_to_rgb(seen.labels)
 
-    def allowed(
-        self, action: Float[np.ndarray, "7"], state: dict[str, Any]
+    def step(
+        self, action: Float[np.ndarray, " act"], state: dict[str, Any]
     ) -> Float[np.ndarray, "7"]:
-        """Return what of an action may be done.
+        """Return the step of the tool that an action asks for, and may be done.
 
         Args:
-            action: wanted.
+            action: wanted, as the policy says it.
             state: of the last observation, by name.
 
         Raises:
             LimitStop: a limit ends the run; the robot then holds its position.
         """
-        if self._guard is None:
-            return action
         reading = self._rig.reading_of(state)
+        step = self._maker.step(action, reading)
+        if self._guard is not None:
+            step = self._limited(self._guard, step, reading)
+        self._maker.sent(step, reading)
+        return step
+
+    def _limited(
+        self, guard: Guard, step: Float[np.ndarray, "7"], reading: Reading
+    ) -> Float[np.ndarray, "7"]:
         try:
-            (self._guard.look if self._has_acted else self._guard.check_start)(reading)
+            (guard.look if self._has_acted else guard.check_start)(reading)
             self._has_acted = True
-            return self._guard.limit(action, reading).action
+            return guard.limit(step, reading).action
         except V2PError:
             self._rig.hold()
             raise
@@ -121,4 +130,4 @@ def check_policy_of(config: ArmRobotConfig, scale: ActionScale, task: str) -> No
             path,
         )  # fmt: skip
         return
-    check_meaning(Path(path), scale, parser.parse_arg("task") or task)
+    check_meaning(Path(path), scale, parser.parse_arg("task") or task, config.interface)

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from lerobot_policy_v2p.robot.arm_robot import ArmRobot, action_of, named_action, named_state
+from lerobot_policy_v2p.robot.arm_robot import ArmRobot
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
 from lerobot_policy_v2p.robot.franky import FrankyArm
 from lerobot_policy_v2p.robot.network import NetworkArm
@@ -79,7 +79,6 @@ class V2PFranka(ArmRobot[Arm]):
     def __init__(self, config: V2PFrankaConfig) -> None:
         super().__init__(config)
         self.config = config
-        self._unattended: Unattended | None = None
         self._state: dict[str, Any] | None = None
 
     @property
@@ -106,22 +105,20 @@ class V2PFranka(ArmRobot[Arm]):
         Raises:
             V2PError: the arm does not answer, or what was clicked is lost; the arm then holds its position.
         """
-        self._state = named_state(self._connected().state())
+        self._state = self._named_state(self._connected())
         if self._unattended is None:
             return {**self._state, self.picture_name: self._seeing().picture()}
         return {**self._state, self.picture_name: self._unattended.mask(self._state)}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Carry out an action and return it as it was carried out: clipped to [-1, 1] and, on real arms, to the limits.
+        """Carry out an action and return a step as it was carried out: clipped to [-1, 1] and, on real arms, to the limits.
 
         Raises:
             V2PError: a limit ends the run, and the arm holds its position; or it does not answer.
         """
         arm = self._connected()
-        wanted = action_of(action)
-        if self._unattended is not None:
-            wanted = self._unattended.allowed(wanted, self._state or named_state(arm.state()))
-        return named_action(arm.act(np.clip(wanted, -1.0, 1.0)))
+        step = self._step(action, self._state or self._named_state(arm))
+        return self._sent(action, arm.act(step))
 
     def calibration(self) -> Camera:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Return the camera of `rgb`."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lerobot_policy_v2p.robot.arm_robot import ArmRobot, action_of, named_action, named_state
+from lerobot_policy_v2p.robot.arm_robot import ArmRobot
 from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
 from lerobot_policy_v2p.robot.unattended import Unattended, check_policy_of
 from v2p_data.deployment.robot import ActionScale
@@ -37,7 +37,6 @@ class V2PTwin(ArmRobot[TwinArm]):
         self.config = config
         self._steps = 0
         self._has_succeeded = False
-        self._unattended: Unattended | None = None
 
     def connect(self, calibrate: bool = True) -> None:
         """Start the episode; the camera is calibrated already."""
@@ -78,29 +77,26 @@ class V2PTwin(ArmRobot[TwinArm]):
             V2PError: there is no OpenGL for pictures, or what was clicked is lost.
         """
         arm = self._connected()
-        state = named_state(arm.state())
+        state = self._named_state(arm)
         if self._unattended is None:
             return {**state, self.picture_name: arm.picture()}
         return {**state, self.picture_name: self._unattended.mask(state)}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Carry out an action for 50 ms; return it as carried out: clipped to [-1, 1] and, with masks, to the limits.
+        """Carry out an action for 50 ms; return a step as carried out: clipped to [-1, 1] and, with masks, to the limits.
 
         Raises:
             V2PError: a limit ends the run.
         """
         arm = self._connected()
-        wanted = action_of(action)
-        if self._unattended is not None:
-            wanted = self._unattended.allowed(wanted, named_state(arm.state()))
-        clipped = np.clip(wanted, -1.0, 1.0)
-        outcome = arm.act(clipped)
+        step = self._step(action, self._named_state(arm))
+        outcome = arm.act(step)
         self._steps += 1
         if outcome.held[0] and not self._has_succeeded and arm.mirror.referee.verdict()[0]:
             self._has_succeeded = True
             title = arm.mirror.bundle.title
             logger.info("task '%s' succeeded in the twin after %d steps", title, self._steps)
-        return named_action(clipped)
+        return self._sent(action, step)
 
     def calibration(self) -> Camera:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Return the camera of `rgb` as calibrated, in the arm's base frame."""

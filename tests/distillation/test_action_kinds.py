@@ -300,9 +300,10 @@ def test_what_a_policys_actions_say_is_found_without_its_dataset(trained, tmp_pa
     )
 
 
-def test_robots_refuse_a_policy_that_gives_targets(trained):
+def test_a_robot_that_is_set_to_other_actions_says_how_to_connect_it(trained):
     actions, _, policy = trained
-    option = "joint-state" if actions == "joints" else f"actions={actions}"
+    joints = str(actions == "joints").lower()
 
-    with pytest.raises(V2PError, match=f"trained with --episodes.{option}, and robots"):
+    with pytest.raises(V2PError, match=f"--robot.actions={actions} --robot.joint_state={joints}"):
         check_meaning(policy, ActionScale())
+    check_meaning(policy, ActionScale(), interface=interface_for(actions))

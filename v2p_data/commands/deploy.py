@@ -18,6 +18,7 @@ from v2p_data.deployment.robot import Reading, Rig, fingers_m
 from v2p_data.deployment.segmentation import ColourTracker, StreamTracker
 from v2p_data.deployment.sight import Sight, clicks_from
 from v2p_data.deployment.silhouette import Silhouette
+from v2p_data.deployment.steps import StepMaker
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.sim.render.masks import PALETTE
 
@@ -91,6 +92,7 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
         V2PError: anything that forbids to begin.
     """
     from v2p_data.deployment.checks import Offer, check_policy, unknowns
+    from v2p_data.evaluation.facts import interface_of
 
     rig = Rig(robot)
     reading = rig.read()
@@ -99,7 +101,10 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
         raise V2PError("the robot gives neither a picture nor a mask, so the policy cannot see")
     task = args.task or str(getattr(robot, "task_description", ""))
     height, width = picture.shape[:2]
-    facts = check_policy(args.policy, Offer(size_px=(height, width), scale=rig.scale), task)
+    offer = Offer(
+        size_px=(height, width), scale=rig.scale, gives_joints=reading.joints_rad is not None
+    )
+    facts = check_policy(args.policy, offer, task)
     if unknowns(facts):
         print(f"The policy does not say {unknowns(facts)}")  # noqa: T201
     policy = loaded_policy(args.policy, task, args.device)
@@ -119,7 +124,11 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
     onlooker = Onlooker(
         recorder=recorder, is_done=lambda: bool(getattr(robot, "has_succeeded", False))
     )
-    outcome = Run(rig, sight, policy, Guard(args.limits, rig.scale), args.loop, onlooker).go()
+    interface, *_ = interface_of(args.policy)
+    maker = StepMaker(interface, rig.scale)
+    outcome = Run(
+        rig, sight, policy, Guard(args.limits, rig.scale), args.loop, onlooker, maker
+    ).go()
     if args.record is not None and recorder is not None:
         _record(args, recorder, sight, outcome)
     return outcome
@@ -234,9 +243,18 @@ def loaded_policy(folder: Path, task: str, device: str) -> Any:
         V2PError: LeRobot cannot load it, or it needs to be told the task.
     """
     from policies.evaluation.actor import UnsuitablePolicyError, load_actor
+    from v2p_data.evaluation.facts import interface_of
 
     try:
-        actor = load_actor(folder, greys=PALETTE, task=task, device=device)
+        _, num_states, num_actions = interface_of(folder)
+        actor = load_actor(
+            folder,
+            greys=PALETTE,
+            task=task,
+            device=device,
+            num_states=num_states,
+            num_actions=num_actions,
+        )
     except UnsuitablePolicyError as error:
         raise V2PError(str(error)) from error
     if getattr(actor.loaded.policy.config, "use_task", False) and not task:

@@ -18,12 +18,15 @@ from v2p_data.episodes.dataset.features import (
     RGB_KEY,
     STATE_KEY,
     STATE_NAMES,
+    state_names,
 )
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import PROCESSOR_FILES, Checkpoint, check_checkpoint
 from v2p_data.evaluation.facts import Facts, interface_of, read_facts
 from v2p_data.sim.render.masks import PALETTE
-from v2p_data.sim.robot.interface import STEPS
+from v2p_data.sim.robot.action_names import action_names
+from v2p_data.sim.robot.interface import STEPS, ArmInterface
+from v2p_data.sim.robot.robot import NUM_ARM_JOINTS
 
 HZ = round(1 / STEP_S)
 STATISTICS = {
@@ -46,6 +49,8 @@ class Offer:
     scale: ActionScale
     camera: str = "mask"
     """What the policy would see: `mask` or `rgb`."""
+    gives_joints: bool = False
+    """Whether it gives the angles of its arm's joints."""
 
 
 def check_policy(folder: Path, offer: Offer, task: str = "") -> Facts:
@@ -54,12 +59,19 @@ def check_policy(folder: Path, offer: Offer, task: str = "") -> Facts:
     Raises:
         V2PError: it does not, or its checkpoint is damaged.
     """
-    found = _opened(folder)
-    _check_features(folder, found, offer)
-    return _check_meaning(folder, found, offer.scale, task)
+    found = check_checkpoint(folder)
+    interface, *_ = interface_of(folder)
+    if interface.joint_state and not offer.gives_joints:
+        raise V2PError(
+            f"the policy in {folder} was trained with --episodes.joint-state, and this robot gives no angles of joints"
+        )
+    _check_features(folder, found, offer, interface)
+    return _check_meaning(folder, found, offer.scale, task, interface)
 
 
-def check_meaning(folder: Path, scale: ActionScale, task: str = "") -> Facts:
+def check_meaning(
+    folder: Path, scale: ActionScale, task: str = "", interface: ArmInterface = STEPS
+) -> Facts:
     """Demand that a policy's masks, states and actions mean what a robot's do; return what is known of its training.
 
     LeRobot's own tools compare shapes, and no more.
@@ -68,30 +80,34 @@ def check_meaning(folder: Path, scale: ActionScale, task: str = "") -> Facts:
         folder: the policy.
         scale: what an action of 1 means on the robot.
         task: in words; decides where the policy knows several scales.
+        interface: what the robot gives and takes.
 
     Raises:
         V2PError: they do not, or the policy's files are damaged.
     """
-    return _check_meaning(folder, _opened(folder), scale, task)
-
-
-def _opened(folder: Path) -> Checkpoint:
     found = check_checkpoint(folder)
-    interface, *_ = interface_of(folder)
-    if interface != STEPS:
-        option = "joint-state" if interface.joint_state else f"actions={interface.actions}"
+    wanted, *_ = interface_of(folder)
+    if wanted != interface:
         raise V2PError(
-            f"the policy in {folder} was trained with --episodes.{option}, and robots and the twin carry out 'delta_tool'"
-            " only and give no angles of joints; train one on episodes that were recorded without this option"
+            f"the policy in {folder} sees and says {_in_words(wanted)}, and the robot is set to {_in_words(interface)};"
+            f" connect it with --robot.actions={wanted.actions} --robot.joint_state={str(wanted.joint_state).lower()}"
         )
-    return found
+    return _check_meaning(folder, found, scale, task, interface)
 
 
-def _check_meaning(folder: Path, found: Checkpoint, scale: ActionScale, task: str) -> Facts:
+def _in_words(interface: ArmInterface) -> str:
+    return (
+        f"'{interface.actions}' {'with' if interface.joint_state else 'without'} angles of joints"
+    )
+
+
+def _check_meaning(
+    folder: Path, found: Checkpoint, scale: ActionScale, task: str, interface: ArmInterface
+) -> Facts:
     facts = read_facts(folder)
     _check_palette(folder, found, facts)
-    _check_statistics(folder, found)
-    _check_names(folder, facts)
+    _check_statistics(folder, found, is_steps=interface.actions == "delta_tool")
+    _check_names(folder, facts, interface)
     _check_scale(folder, facts, scale, task)
     if facts.fps is not None and abs(facts.fps - HZ) > 0.01:
         raise V2PError(
@@ -115,13 +131,22 @@ def unknowns(facts: Facts) -> str:
     return ", ".join(missing)
 
 
-def _check_features(folder: Path, found: Checkpoint, offer: Offer) -> None:
+def names_of(interface: ArmInterface) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of a Franka arm's states and actions."""
+    num_states = len(STATE_NAMES) + NUM_ARM_JOINTS * interface.joint_state
+    return state_names(num_states), action_names(interface.actions)
+
+
+def _check_features(
+    folder: Path, found: Checkpoint, offer: Offer, interface: ArmInterface
+) -> None:
+    states, actions = names_of(interface)
     sees, does = (
         {key: feature.shape for key, feature in (features or {}).items()}
         for features in (found.config.input_features, found.config.output_features)
     )
     picture_key = MASK_KEY if offer.camera == "mask" else RGB_KEY
-    given = {picture_key: (3, *offer.size_px), STATE_KEY: (len(STATE_NAMES),)}
+    given = {picture_key: (3, *offer.size_px), STATE_KEY: (len(states),)}
     names = ", ".join(f"'{key}' {shape}" for key, shape in given.items())
     for key, shape in sees.items():
         if key not in given and "empty_camera" not in key:
@@ -143,10 +168,10 @@ def _check_features(folder: Path, found: Checkpoint, offer: Offer) -> None:
             f"the policy in {folder} wants '{STATE_KEY}' of shape {sees[STATE_KEY]}, and the robot gives"
             f" {given[STATE_KEY]}: it was trained on a dataset of another version or another robot"
         )
-    if does.get(ACTION_KEY) != (len(ACTION_NAMES),):
+    if does.get(ACTION_KEY) != (len(actions),):
         raise V2PError(
             f"the policy in {folder} gives '{ACTION_KEY}' of shape {does.get(ACTION_KEY)}, and the robot takes"
-            f" ({len(ACTION_NAMES)},): {', '.join(ACTION_NAMES)}"
+            f" ({len(actions)},): {', '.join(actions)}"
         )
 
 
@@ -164,7 +189,7 @@ def _check_palette(folder: Path, found: Checkpoint, facts: Facts) -> None:
             )
 
 
-def _check_statistics(folder: Path, found: Checkpoint) -> None:
+def _check_statistics(folder: Path, found: Checkpoint, *, is_steps: bool) -> None:
     from safetensors.numpy import load_file
 
     modes = found.config.normalization_mapping
@@ -181,7 +206,8 @@ def _check_statistics(folder: Path, found: Checkpoint) -> None:
                     continue  # nobody gives it actions
                 for statistic in STATISTICS.get(mode, ()):
                     _check_statistic(state, stats, key, statistic, feature.shape)
-            _check_range(folder, stats)
+            if is_steps:
+                _check_range(folder, stats)
 
 
 def _check_statistic(
@@ -217,10 +243,11 @@ def _check_range(folder: Path, stats: dict[str, np.ndarray]) -> None:
         )
 
 
-def _check_names(folder: Path, facts: Facts) -> None:
+def _check_names(folder: Path, facts: Facts, interface: ArmInterface) -> None:
+    states, actions = names_of(interface)
     for what, theirs, ours in (
-        ("states", facts.state, STATE_NAMES),
-        ("actions", facts.action, ACTION_NAMES),
+        ("states", facts.state, states),
+        ("actions", facts.action, actions),
     ):
         if theirs and tuple(theirs) != tuple(ours):
             strange = [name for name in theirs if name not in ours] or [

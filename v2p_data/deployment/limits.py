@@ -274,7 +274,7 @@ class Watchdog:
 
 def _pointing(reading: Reading) -> Float[np.ndarray, "3"]:
     """Return the direction in which the gripper points, in the world."""
-    return (DOWN * Rotation.from_rotvec(reading.state[3:6])).apply([0.0, 0.0, 1.0])
+    return reading.rotation.apply([0.0, 0.0, 1.0])
 
 
 def _from_down(axis: Float[np.ndarray, "3"]) -> float:

@@ -16,6 +16,7 @@ from v2p_data.deployment.limits import STEP_S, Guard, LimitStop, Watchdog
 from v2p_data.deployment.recording import Recorder
 from v2p_data.deployment.robot import Reading, Rig
 from v2p_data.deployment.sight import LOST_AFTER, Seen, Sight
+from v2p_data.deployment.steps import StepMaker
 from v2p_data.errors import V2PError
 from v2p_data.play import Policy
 
@@ -91,6 +92,7 @@ class Run:
         guard: the limits.
         cfg: how long, and whether for real.
         onlooker: who looks on.
+        maker: what the policy sees of the arm and tells it; steps of the tool by default.
     """
 
     def __init__(
@@ -101,9 +103,10 @@ class Run:
         guard: Guard,
         cfg: LoopConfig,
         onlooker: Onlooker | None = None,
+        maker: StepMaker | None = None,
     ) -> None:
         self.rig, self.sight, self.policy, self.guard, self.cfg = rig, sight, policy, guard, cfg
-        self.onlooker = onlooker or Onlooker()
+        self.onlooker, self.maker = onlooker or Onlooker(), maker or StepMaker(scale=rig.scale)
         self._is_started = False
         self._works_on = ""
         """What this side does at the moment; nothing while the robot is awaited."""
@@ -195,6 +198,7 @@ class Run:
             if watchdog.has_bitten:
                 return
             done = limited.action if self.cfg.dry_run else self.rig.act(limited.action)
+            self.maker.sent(done, reading)
             outcome.steps += 1
             outcome.acted.update(limited.acted)
             if self.onlooker.recorder is not None:
@@ -222,8 +226,8 @@ class Run:
         return seen
 
     def _decide(self, seen: Seen, reading: Reading) -> np.ndarray:
-        state = reading.state[None].astype(np.float32)
-        return self.policy.act(seen.labels[None], state)[0].astype(float)
+        state = self.maker.state(reading)[None].astype(np.float32)
+        return self.maker.step(self.policy.act(seen.labels[None], state)[0].astype(float), reading)
 
     def _check_seen(self, seen: Seen, step: int) -> None:
         if max(seen.missed, default=0) >= LOST_AFTER:

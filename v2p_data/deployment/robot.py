@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.env.targets import DOWN
 from v2p_data.sim.render.masks import rgb_to_labels
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.twin.interface import RGB_NAME, RobotWithCamera
@@ -57,6 +59,16 @@ class Reading:
     def target_pos(self) -> Float[np.ndarray, "3"]:
         """Where the controller is told to bring the tool [m]."""
         return self.state[:3] + self.state[7:10]
+
+    @property
+    def target_opening(self) -> float:
+        """What the gripper is told to open to, 0 to 1."""
+        return float(self.state[10])
+
+    @property
+    def rotation(self) -> Rotation:
+        """How the tool is turned."""
+        return DOWN * Rotation.from_rotvec(self.state[3:6])
 
 
 class Rig:

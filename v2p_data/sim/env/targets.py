@@ -63,7 +63,7 @@ def next_target(
     pos = np.clip(pos, measured.pos - cfg.position_leash_m, measured.pos + cfg.position_leash_m)
     pos = np.clip(pos, TARGET_LOW_M, TARGET_HIGH_M)
     rotation = Rotation.from_rotvec(action[3:6] * cfg.rotation_step_rad) * target.rotation
-    rotation = _near(rotation, measured.rotation, cfg.rotation_leash_rad)
+    rotation = near(rotation, measured.rotation, cfg.rotation_leash_rad)
     opening = max(
         target.opening - action[6] * cfg.finger_step_m / finger_travel_m,
         measured.opening - cfg.finger_leash_m / finger_travel_m,
@@ -75,7 +75,7 @@ def next_target(
     )
 
 
-def _near(rotation: Rotation, anchor: Rotation, limit_rad: float) -> Rotation:
+def near(rotation: Rotation, anchor: Rotation, limit_rad: float) -> Rotation:
     """Return `rotation`, turned back towards `anchor` where it is further away than the limit."""
     apart = (rotation * anchor.inv()).as_rotvec()
     angle = float(np.linalg.norm(apart))
