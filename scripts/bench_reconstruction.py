@@ -49,6 +49,7 @@ from drawn_clips.truth import Truth, load_truth, write
 from paper_tables import failure
 from policies.evaluation.rate import wilson
 from studies.results import commit
+from studies.scene_gate import gate
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import apply, transform_from_pose
@@ -542,7 +543,8 @@ def reconstructed(
         row["sentence"] = f"{type(error).__name__}: {error} ({Path(at.filename).name}:{at.lineno})"
     row["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
     if made is not None and clip is not None:
-        row["accepted"], row["gate_slug"] = _accepted(made)
+        row["gate_slug"] = gate(made) or None
+        row["accepted"] = row["gate_slug"] is None
     score = rejected(true, slug or "unknown") if found is None else score_clip(true, found)
     row |= {
         "slug": score.slug,
@@ -555,16 +557,6 @@ def reconstructed(
     if clip is not None:
         _draw(row, true, found, made, clip, pictures)
     return row
-
-
-def _accepted(made: Reconstruction) -> tuple[bool, str | None]:
-    """Return whether the default gate lets through what was made without one, and why not."""
-    cfg = SceneConfig()
-    if made.least_found < cfg.min_found:
-        return False, "object_not_found"
-    if made.contradiction is not None:
-        return False, "motion_contradicts_caption"
-    return (True, None) if made.confidence >= cfg.min_confidence else (False, "low_confidence")
 
 
 @contextmanager

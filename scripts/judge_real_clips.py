@@ -32,6 +32,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from policies.evaluation.rate import wilson
+from studies.scene_gate import gate
 from v2p_data.cli import parse
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.camera import between_centres
@@ -71,6 +72,10 @@ class Verdict:
     number: float | None = None
     """What decided the rejection."""
     confidence: float | None = None
+    stages: dict[str, float] = field(default_factory=dict[str, float])
+    """Confidence of each stage; `confidence` is their product."""
+    gate: str = ""
+    """Slug with which the default settings turn away what `--no-gate` accepted; empty where they accept it."""
     kind: str = ""
     ious: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
     """By object, then `first` and `last`. An object that is left out has no entry."""
@@ -157,6 +162,8 @@ def judge(
     verdict.seconds = round(time.monotonic() - start, 2)
     if clip is not None and scene is not None:
         verdict.kind, verdict.confidence = scene.kind, round(scene.confidence, 3)
+        verdict.stages = {stage: round(sure, 4) for stage, (sure, _) in scene.stages.items()}
+        verdict.gate = gate(scene)
         _compare(verdict, clip, scene, drawn)
     return verdict, _picture(verdict, clip, scene, drawn)
 

@@ -1,0 +1,167 @@
+"""Ask how far a scene's confidence can be trusted: each clip is judged by a fit to the clips of all other sources.
+
+Takes the files that `judge_real_clips.py --no-gate --out` (`judged.json`) and `bench_reconstruction.py --out` (`results.json`) write.
+Clips that ended before they had a confidence are counted and left out. Three rules are compared:
+
+| rule | probability that the scene is right |
+|---|---|
+| `shipped` | the confidence itself, accepted by the default gate |
+| `calibrated` | logistic regression (ridge) on the confidence's logarithm, accepted from 0.5 |
+| `stages` | the same on the logarithm of each stage's confidence, no weight negative |
+
+    python scripts/calibrate_confidence.py outputs/judged/judged.json outputs/more/judged.json
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
+from scipy.special import expit
+from scipy.stats import rankdata
+
+from policies.evaluation.rate import wilson
+
+LEAST = 1e-3
+"""Confidences below count as this one: their logarithm says no more."""
+RIDGE = 0.1
+ACCEPTED_FROM = 0.5
+EDGES = (0.0, 0.3, 0.52, 0.7, 0.85, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """A clip with a confidence, and whether its scene is right."""
+
+    clip: str
+    source: str
+    """Clips of one source are never on both sides of a fit."""
+    stages: dict[str, float]
+    confidence: float
+    accepted: bool
+    """By the default gate."""
+    right: bool
+
+
+def main() -> None:
+    """Read the command line and print one table of rules and one of confidences."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("judged", type=Path, nargs="+", help="judged.json or results.json")
+    rows = [row for path in parser.parse_args().judged for row in _rows(path)]
+    clips = [judged for row in rows if (judged := judged_of(row)) is not None]
+    print(f"{len(clips)} of {len(rows)} clips have a confidence; sources: {len(sources(clips))}")
+    print(rules_table(clips))
+    print(bins_table(clips))
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    read = json.loads(path.read_text())
+    return read["rows"] if isinstance(read, dict) else read
+
+
+def judged_of(row: dict[str, Any]) -> Judged | None:
+    """Return a clip of either file; None where it ended without a confidence."""
+    if row["confidence"] is None:
+        return None
+    name = row.get("clip") or row["name"]
+    stages = {k: v[0] if isinstance(v, list) else v for k, v in row["stages"].items()}
+    gate = row["gate"] if "gate" in row else row["gate_slug"]
+    return Judged(
+        clip=name,
+        source=name.rsplit("__", 1)[-1],
+        stages=stages,
+        confidence=row["confidence"],
+        accepted=not gate,
+        right=row["right"] if "right" in row else row["usable"],
+    )
+
+
+def sources(clips: Sequence[Judged]) -> list[str]:
+    """Return the clips' sources, each once."""
+    return sorted({clip.source for clip in clips})
+
+
+def fitted(
+    x: Float[np.ndarray, "clip feature"], right: Bool[np.ndarray, " clip"]
+) -> Float[np.ndarray, "weights"]:
+    """Return the weights of a logistic regression, the constant last; none but the constant is negative."""
+
+    def loss(w: np.ndarray) -> float:
+        score = x @ w[:-1] + w[-1]
+        return float(
+            np.logaddexp(0, np.where(right, -score, score)).sum() + RIDGE * w[:-1] @ w[:-1]
+        )
+
+    bounds = [(0.0, None)] * x.shape[1] + [(None, None)]
+    return minimize(loss, np.zeros(x.shape[1] + 1), bounds=bounds, method="L-BFGS-B").x
+
+
+def left_out(
+    x: Float[np.ndarray, "clip feature"], clips: Sequence[Judged]
+) -> Float[np.ndarray, " clip"]:
+    """Return each clip's probability of being right by a fit to the clips of the other sources."""
+    right, where = np.array([c.right for c in clips]), np.array([c.source for c in clips])
+    out = np.empty(len(clips))
+    for source in sources(clips):
+        held = where == source
+        weights = fitted(x[~held], right[~held])
+        out[held] = expit(x[held] @ weights[:-1] + weights[-1])
+    return out
+
+
+def rules_table(clips: Sequence[Judged]) -> str:
+    """Return what each rule accepts, how much of it is right, how well it ranks, and its Brier score."""
+    right = np.array([c.right for c in clips])
+    sure = np.array([c.confidence for c in clips])
+    names = sorted({name for c in clips for name in c.stages})
+    logs = np.log(np.maximum([[c.stages.get(n, 1.0) for n in names] for c in clips], LEAST))
+    of_all, of_each = (
+        left_out(np.log(np.maximum(sure, LEAST))[:, None], clips),
+        left_out(logs, clips),
+    )
+    rules = {
+        "shipped": (sure, np.array([c.accepted for c in clips])),
+        "calibrated": (of_all, of_all >= ACCEPTED_FROM),
+        "stages": (of_each, of_each >= ACCEPTED_FROM),
+    }
+    lines = [
+        "| rule | accepted and right | accepted and wrong | AUC | Brier |",
+        "|---|---|---|---|---|",
+    ]
+    for name, (p, taken) in rules.items():
+        brier = float(((p - right) ** 2).mean())
+        lines.append(
+            f"| {name} | {(taken & right).sum()} of {right.sum()} | {(taken & ~right).sum()} of {(~right).sum()}"
+            f" | {auc(p, right):.2f} | {brier:.3f} |"
+        )
+    weights = dict(zip([*names, "constant"], fitted(logs, right).round(2).tolist(), strict=True))
+    return "\n".join([*lines, f"weights of `stages` on all clips: {weights}"])
+
+
+def auc(p: Float[np.ndarray, " clip"], right: Bool[np.ndarray, " clip"]) -> float:
+    """Return how often a right clip is surer than a wrong one, ties half; NaN without both."""
+    good, bad = int(right.sum()), int((~right).sum())
+    if not good or not bad:
+        return float("nan")
+    return float((rankdata(p)[right].sum() - good * (good + 1) / 2) / (good * bad))
+
+
+def bins_table(clips: Sequence[Judged]) -> str:
+    """Return the share of right scenes by confidence, with Wilson intervals."""
+    lines = ["| confidence | right |", "|---|---|"]
+    for low, high in itertools.pairwise(EDGES):
+        inside = [
+            c.right for c in clips if low <= c.confidence < high or c.confidence == high == 1
+        ]
+        if inside:
+            lines.append(f"| {low:g} to {high:g} | {wilson(sum(inside), len(inside))} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
