@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from policies.evaluation.rate import wilson
 from policies.ppo.policy import Expert
@@ -66,6 +68,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--table", action="store_true", help="print the results so far and stop")
+    parser.add_argument("--figure", type=Path, help="draw success by round into this file")
     args = parser.parse_args()
     if len(args.tasks) != len(args.taught_rounds):
         parser.error(f"--taught-rounds takes a number for each of {', '.join(args.tasks)}")
@@ -77,7 +80,10 @@ def main() -> None:
                     for arm in args.arms:
                         if (task, arm, seed) not in {_key(r) for r in results_in(args.out)}:
                             _one(task, rounds, arm, seed, args, jobs)
-    print(table(results_in(args.out)))
+    results = results_in(args.out)
+    if args.figure:
+        draw_by_round([r for r in results if r["task"] in args.tasks], args.figure)
+    print(table(results))
 
 
 def _one(
@@ -194,13 +200,7 @@ def table(results: list[dict[str, Any]]) -> str:
 def _row(task: str, arm: str, group: list[dict[str, Any]], whole: dict[int, float]) -> str:
     rate = wilson(sum(r["successes"] for r in group), sum(r["episodes"] for r in group))
     rates = {r["seed"]: r["successes"] / r["episodes"] for r in group}
-    rounds = zip_longest(*(r["by_round"] for r in group))
-    # A search that reached its target has no further rounds: its last policy stays the best so far.
-    means = [
-        np.mean([r["successes"] if s is None else s for r, s in zip(group, k, strict=True)])
-        for k in rounds
-    ]
-    by_round = " ".join(f"{m / group[0]['episodes']:.2f}" for m in means)
+    by_round = " ".join(f"{m:.2f}" for m in rates_by_round(group).mean(1))
     found = [r["found"] for r in group if r["found"]]
     says = " ".join(f"{f['success']:.2f}" for f in found) or "-"
     less = "-"
@@ -213,6 +213,50 @@ def _row(task: str, arm: str, group: list[dict[str, Any]], whole: dict[int, floa
         f"| {task} | {arm} | {rate.value:.2f} | {rate.low:.2f}-{rate.high:.2f} | "
         f"{' '.join(f'{r:.2f}' for r in rates.values())} | {by_round} | {says} | {less} | {taken} | {seconds:.0f} |"
     )
+
+
+def rates_by_round(group: list[dict[str, Any]]) -> Float[np.ndarray, "round seed"]:
+    """Return the success of the best policy so far after each round.
+
+    A search that reached its target has no further rounds: its last policy stays the best so far.
+    """
+    rounds = zip_longest(*(r["by_round"] for r in group))
+    return np.array(
+        [
+            [
+                (r["successes"] if s is None else s) / r["episodes"]
+                for r, s in zip(group, k, strict=True)
+            ]
+            for k in rounds
+        ]
+    )
+
+
+def draw_by_round(results: list[dict[str, Any]], path: Path) -> None:
+    """Draw success after each round, the mean over seeds as a line and each seed as a point; a panel per task."""
+    tasks = list(dict.fromkeys(r["task"] for r in results))
+    figure = Figure(figsize=(4.5 * len(tasks), 3.6), layout="constrained")
+    for axes, task in zip(figure.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
+        groups = {
+            arm: [r for r in results if (r["task"], r["arm"]) == (task, arm)] for arm in ARMS
+        }
+        shown = [arm for arm in ARMS if groups[arm]]
+        for at, arm in enumerate(shown):
+            rates = rates_by_round(groups[arm])
+            x = 1 + np.arange(len(rates)) + 0.03 * (at - (len(shown) - 1) / 2)
+            axes.plot(
+                x,
+                rates.mean(1),
+                "o-",
+                color=f"C{ARMS.index(arm)}",
+                label=f"{arm} ({rates.shape[1]})",
+            )
+            axes.plot(x, rates, ".", color=f"C{ARMS.index(arm)}", alpha=0.4)
+        axes.set(title=task, xlabel="round", ylim=(0, 1), xticks=[1, 2, 3])
+        axes.legend(fontsize="x-small", title="arm (seeds)", title_fontsize="x-small")
+    figure.supylabel("success (referee)")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 if __name__ == "__main__":
