@@ -6,13 +6,14 @@ Clips that ended before they had a confidence are counted and left out. Three ru
 | rule | probability that the scene is right |
 |---|---|
 | `shipped` | the confidence itself, accepted by the default gate |
-| `calibrated` | logistic regression (ridge) on the confidence's logarithm, accepted from 0.5 |
-| `stages` | the same on the logarithm of each stage's confidence, no weight negative |
+| `calibrated` | logistic regression (ridge, no negative weight) on the confidence's logarithm, accepted from 0.5 |
+| `stages` | the same on the logarithm of each stage's confidence |
 
     python scripts/calibrate_confidence.py outputs/judged/judged.json outputs/more/judged.json
 """
 
 import argparse
+import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,6 +55,8 @@ def main() -> None:
     parser.add_argument("judged", type=Path, nargs="+", help="judged.json or results.json")
     rows = [row for path in parser.parse_args().judged for row in _rows(path)]
     clips = [judged for row in rows if (judged := judged_of(row)) is not None]
+    if len(sources(clips)) < 2:
+        parser.error("a fit to the clips of all other sources needs clips of two sources at least")
     print(f"{len(clips)} of {len(rows)} clips have a confidence; sources: {len(sources(clips))}")
     print(rules_table(clips))
     print(bins_table(clips))
@@ -101,7 +104,7 @@ def fitted(
     return minimize(loss, np.zeros(x.shape[1] + 1), bounds=bounds, method="L-BFGS-B").x
 
 
-def left_out(
+def held_out_probability(
     x: Float[np.ndarray, "clip feature"], clips: Sequence[Judged]
 ) -> Float[np.ndarray, " clip"]:
     """Return each clip's probability of being right by a fit to the clips of the other sources."""
@@ -121,8 +124,8 @@ def rules_table(clips: Sequence[Judged]) -> str:
     names = sorted({name for c in clips for name in c.stages})
     logs = np.log(np.maximum([[c.stages.get(n, 1.0) for n in names] for c in clips], LEAST))
     of_all, of_each = (
-        left_out(np.log(np.maximum(sure, LEAST))[:, None], clips),
-        left_out(logs, clips),
+        held_out_probability(np.log(np.maximum(sure, LEAST))[:, None], clips),
+        held_out_probability(logs, clips),
     )
     rules = {
         "shipped": (sure, np.array([c.accepted for c in clips])),

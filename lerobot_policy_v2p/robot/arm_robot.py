@@ -1,5 +1,6 @@
 """What the robot types of this plugin share: the dataset's names, and one arm that needs no calibration by LeRobot."""
 
+from abc import abstractmethod
 from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -38,10 +39,10 @@ class ArmRobot[Arm: StatefulArm](Robot):
 
     def __init__(self, config: ArmRobotConfig) -> None:
         super().__init__(config)
-        sees = config.pictures == "rgb"
-        self.picture_name, self.picture_px = (RGB_NAME, RGB_PX) if sees else (MASK_NAME, MASK_PX)
-        # `v2p deploy`, which looks at the pictures, makes steps of targets itself.
-        self.interface = STEPS if sees else config.interface
+        is_rgb = config.pictures == "rgb"
+        self.picture_name, self.picture_px = (RGB_NAME, RGB_PX) if is_rgb else (MASK_NAME, MASK_PX)
+        # With colour pictures it is `v2p deploy` that acts, which makes steps of targets itself.
+        self.interface = STEPS if is_rgb else config.interface
         del self.calibration  # LeRobot's dict of motors, which would hide the method
         self.arm: Arm | None = None
         self._unattended: Unattended | None = None
@@ -57,6 +58,10 @@ class ArmRobot[Arm: StatefulArm](Robot):
     @property
     def action_features(self) -> dict[str, Any]:
         return dict.fromkeys(names_of(self.interface)[1], float)
+
+    @abstractmethod
+    def joints(self) -> Float[np.ndarray, "7"]:
+        """Return the joint angles of the last observation [rad]."""
 
     @property
     def cameras(self) -> dict[str, Any]:
@@ -76,9 +81,9 @@ class ArmRobot[Arm: StatefulArm](Robot):
     def configure(self) -> None: ...
 
     def disconnect(self) -> None:
-        if self.arm is not None:
-            self.arm.close()
-            self.arm = None
+        arm, self.arm, self._unattended = self.arm, None, None
+        if arm is not None:
+            arm.close()
 
     @contextmanager
     def closed_on_error(self) -> Generator[None]:
@@ -99,6 +104,8 @@ class ArmRobot[Arm: StatefulArm](Robot):
     def _step(self, action: dict[str, Any], state: dict[str, Any]) -> Float[np.ndarray, "7"]:
         """Return the step of the tool that an action asks for, in [-1, 1]; with masks, what the limits leave of it."""
         asked = np.array([float(action[name]) for name in self.action_features])
+        if not np.isfinite(asked).all():
+            raise V2PError(f"an action holds a value that is no number: {action}")
         if self._unattended is not None:
             asked = self._unattended.step(asked, state)
         return np.clip(asked, -1.0, 1.0)

@@ -26,7 +26,7 @@ class Unattended:
     """Sees and limits for one connected robot, from its first observation to its last.
 
     Args:
-        robot: it; can be told to hold.
+        robot: the connected one; can be told to hold.
         config: its settings.
         own_mask: returns the label greys of now, h x w x 3 uint8, where nothing is clicked.
         picture: returns the colour picture of the last state, where something is clicked.

@@ -155,6 +155,6 @@ class V2PFranka(ArmRobot[Arm]):
         arm = self._connected()
         if not isinstance(arm, SeeingArm):
             raise V2PError(
-                f"the backend '{self.config.backend}' gives no pictures; use 'sim' or 'network'"
+                f"the backend '{self.config.backend}' gives no pictures and no angles of joints; use 'sim' or 'network'"
             )
         return arm

@@ -16,9 +16,9 @@ from hub_server import TOKEN, Hub
 
 from v2p_data.episodes.dataset import shards, writer
 from v2p_data.episodes.dataset.card import dataset_card, write_card
+from v2p_data.episodes.dataset.encoding import encode_rgb
 from v2p_data.episodes.dataset.episode_stats import rgb_stats
 from v2p_data.episodes.dataset.features import EPISODE_COLUMN, features
-from v2p_data.episodes.dataset.stream import encode_rgb
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode, Heading

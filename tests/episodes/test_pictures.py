@@ -9,7 +9,7 @@ import pytest
 from toy_task import act, bundle, collect_toys, lesson
 
 from v2p_data.episodes.collect import CutConfig, EpisodesConfig, roll_out
-from v2p_data.episodes.dataset.stream import decode_rgb
+from v2p_data.episodes.dataset.encoding import decode_rgb
 from v2p_data.episodes.mask_noise import Fault, MaskNoiseConfig, apply_faults
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from v2p_data.cli import run
-from v2p_data.episodes.dataset.stream import encode_rgb
+from v2p_data.episodes.dataset.encoding import encode_rgb
 from v2p_data.episodes.dataset.tables import read_info
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack

@@ -15,7 +15,6 @@ from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     ACTION_NAMES,
     MASK_KEY,
-    RGB_KEY,
     STATE_KEY,
     STATE_NAMES,
     state_names,
@@ -47,8 +46,6 @@ class Offer:
     size_px: tuple[int, int]
     """Height and width of its pictures."""
     scale: ActionScale
-    camera: str = "mask"
-    """What the policy would see: `mask` or `rgb`."""
     gives_joints: bool = False
     """Whether it gives the angles of its arm's joints."""
 
@@ -145,20 +142,19 @@ def _check_features(
         {key: feature.shape for key, feature in (features or {}).items()}
         for features in (found.config.input_features, found.config.output_features)
     )
-    picture_key = MASK_KEY if offer.camera == "mask" else RGB_KEY
-    given = {picture_key: (3, *offer.size_px), STATE_KEY: (len(states),)}
+    given = {MASK_KEY: (3, *offer.size_px), STATE_KEY: (len(states),)}
     names = ", ".join(f"'{key}' {shape}" for key, shape in given.items())
     for key, shape in sees.items():
         if key not in given and "empty_camera" not in key:
             raise V2PError(
                 f"the policy in {folder} wants '{key}' {shape}, which the robot does not give; it gives {names}"
             )
-    if picture_key not in sees:
+    if MASK_KEY not in sees:
         raise V2PError(
-            f"the policy in {folder} does not look at '{picture_key}'; it wants {', '.join(sees) or 'nothing'}"
+            f"the policy in {folder} does not look at '{MASK_KEY}'; it wants {', '.join(sees) or 'nothing'}"
         )
-    if sees[picture_key] != given[picture_key]:
-        _, height, width = (*sees[picture_key], 0, 0, 0)[:3]
+    if sees[MASK_KEY] != given[MASK_KEY]:
+        _, height, width = (*sees[MASK_KEY], 0, 0, 0)[:3]
         raise V2PError(
             f"the policy in {folder} was trained on pictures of {width} x {height} pixels, and the robot gives"
             f" {offer.size_px[1]} x {offer.size_px[0]}; train it on a dataset of that size"
@@ -268,7 +264,7 @@ def _check_scale(folder: Path, facts: Facts, scale: ActionScale, task: str) -> N
         ("finger travel [m]", {facts.finger_step_m} - {None}, scale.finger_step_m),  # type: ignore[arg-type]
     )
     for what, theirs, ours in wanted:
-        if theirs and not any(abs(value - ours) <= 0.01 * ours for value in theirs):
+        if not all(abs(value - ours) <= 0.01 * ours for value in theirs):
             numbers = ", ".join(f"{value:g}" for value in sorted(theirs))
             raise V2PError(
                 f"the policy in {folder} was trained with another action scale: an action of 1 was a {what} of {numbers}"

@@ -17,10 +17,9 @@ from v2p_data.deployment.robot import ActionScale, Reading
 from v2p_data.errors import V2PError
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.robot.gripper_wait import GripperWait
-from v2p_data.sim.robot.robot import QUAT_DOWN, TARGET_HIGH_M, TARGET_LOW_M
+from v2p_data.sim.robot.robot import TARGET_HIGH_M, TARGET_LOW_M
 
 STEP_S = 0.05
-DOWN = Rotation.from_quat(QUAT_DOWN, scalar_first=True)
 LAG_S = 0.1
 """The target runs ahead of the tool by at most what the speed limit covers in this time, so that an arm that was held
 up does not shoot forward."""

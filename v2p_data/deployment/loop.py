@@ -197,8 +197,10 @@ class Run:
             self._works_on = ""
             if watchdog.has_bitten:
                 return
-            done = limited.action if self.cfg.dry_run else self.rig.act(limited.action)
-            self.maker.sent(done, reading)
+            done = limited.action
+            if not self.cfg.dry_run:
+                done = self.rig.act(done)
+                self.maker.sent(done, reading)
             outcome.steps += 1
             outcome.acted.update(limited.acted)
             if self.onlooker.recorder is not None:

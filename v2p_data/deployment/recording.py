@@ -13,7 +13,7 @@ import numpy as np
 
 from v2p_data.deployment.robot import Reading
 from v2p_data.deployment.sight import Seen
-from v2p_data.episodes.dataset import stream
+from v2p_data.episodes.dataset import encoding
 from v2p_data.episodes.dataset.writer import Packed, pack
 from v2p_data.episodes.staging import RGB_CAMERA, Episode, refusals_told
 from v2p_data.errors import V2PError
@@ -92,7 +92,7 @@ class Recorder:
                     "confidences": np.round(np.array(self._confidences), 3).tolist(),
                 },
                 cameras=(MASK_CAMERA, RGB_CAMERA) if has_rgb else (MASK_CAMERA,),
-                rgb_mp4=stream.encode_rgb(np.stack(self._pictures)).mp4 if has_rgb else b"",
+                rgb_mp4=encoding.encode_rgb(np.stack(self._pictures)).mp4 if has_rgb else b"",
             )
             path = episode.save(staged)
             packed = pack([path], repo_id, out, provenance=json.loads(json.dumps(dict(about))))

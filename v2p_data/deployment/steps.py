@@ -18,7 +18,7 @@ from v2p_data.twin.control import tool_pose
 
 
 class StepMaker:
-    """Knows what a policy sees of the arm and tells it.
+    """Translates readings into a policy's states, and a policy's actions into steps of the tool.
 
     Args:
         interface: the policy's.
@@ -46,7 +46,7 @@ class StepMaker:
     def step(self, action: Float[np.ndarray, " act"], reading: Reading) -> Float[np.ndarray, "7"]:
         """Return the step, each entry in [-1, 1], that leads to what an action says, or as near as one step can.
 
-        An action that is a step is returned as it is; one that holds a value that is no number is a step of none.
+        An action that is a step already is returned as it is. A target that is not finite gives a step of NaN.
         """
         if self.interface.actions == "delta_tool":
             return action
@@ -68,6 +68,8 @@ class StepMaker:
 
     def sent(self, step: Float[np.ndarray, "7"], reading: Reading) -> None:
         """Note the step that was sent after a reading."""
+        if self.interface.actions == "delta_tool":
+            return
         turn = Rotation.from_rotvec(step[3:6] * self.scale.rotation_step_rad)
         target = turn * self._turned(reading)
         self._target = near(target, reading.rotation, SimConfig.rotation_leash_rad)

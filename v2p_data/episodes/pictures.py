@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from v2p_data.episodes.config import EpisodesConfig
-from v2p_data.episodes.dataset import stream
+from v2p_data.episodes.dataset import encoding
 from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
 from v2p_data.episodes.rollouts import Rollouts
 from v2p_data.episodes.staging import Episode
@@ -101,4 +101,4 @@ class Artist:
         if self.cfg.render == "masks":
             return labels, b""
         pictures = np.stack([renderer.draw_rgb(*moment) for moment in moments])
-        return labels, stream.encode_rgb(pictures).mp4
+        return labels, encoding.encode_rgb(pictures).mp4

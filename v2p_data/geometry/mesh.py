@@ -88,13 +88,13 @@ def lathe_parts(
         turn = way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0]
         cuts = [0, *(np.flatnonzero(turn < -1e-12) + 1).tolist(), len(coarse) - 1]
         return tuple(
-            _hull(_rings(coarse[a : b + 1], 0.0, 2 * np.pi, _PART_SECTIONS))
+            trimesh.convex.convex_hull(_rings(coarse[a : b + 1], 0.0, 2 * np.pi, _PART_SECTIONS))
             for a, b in pairwise(cuts)
         )
     inside = _inside(profile, wall)
     floor = float(inside[0, 1])
     under = np.concatenate([profile[profile[:, 1] < floor], [_at(profile, floor)]])
-    parts = [_hull(_rings(under, 0.0, 2 * np.pi, _PART_SECTIONS))]
+    parts = [trimesh.convex.convex_hull(_rings(under, 0.0, 2 * np.pi, _PART_SECTIONS))]
     levels = [floor, *coarse[coarse[:, 1] > floor + 1e-9, 1].tolist()]
     step = 2 * np.pi / _PART_WALLS
     # Straight chords cannot follow the inner circle: half of what they miss is left open, half juts in.
@@ -254,7 +254,7 @@ def _sectors(
     """Return the wall between two profiles, cut into convex sectors."""
     step = 2 * np.pi / _PART_WALLS
     return [
-        _hull(
+        trimesh.convex.convex_hull(
             np.concatenate(
                 [
                     _rings(inner, k * step, (k + 1) * step, 1),
@@ -280,7 +280,3 @@ def _simplified(profile: Float[np.ndarray, "k 2"], tolerance: float) -> Float[np
     unit = 1000 / max(float(np.abs(profile).max()), 1e-9)  # OpenCV computes in single precision
     line = (profile * unit).astype(np.float32)[:, None]
     return cv2.approxPolyDP(line, tolerance * unit, closed=False)[:, 0].astype(float) / unit
-
-
-def _hull(points: Float[np.ndarray, "n 3"]) -> trimesh.Trimesh:
-    return trimesh.convex.convex_hull(points)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2p_data.episodes.dataset import stream
+from v2p_data.episodes.dataset import encoding
 from v2p_data.episodes.dataset.episode_stats import Stats, mask_stats, rgb_stats
 from v2p_data.episodes.staging import Episode, Heading
 from v2p_data.errors import V2PError
@@ -100,7 +100,7 @@ def make_shards(
                 done += 1
                 on_progress(done / total, f"packed {done}/{total} episodes")
             for camera in shard.episodes[0].cameras:
-                stream.join([p.videos[camera] for p in parts], shard.file(folder, camera))
+                encoding.join([p.videos[camera] for p in parts], shard.file(folder, camera))
             said = [
                 {c: {k: v.tolist() for k, v in s.items()} for c, s in p.stats.items()}
                 for p in parts
@@ -143,9 +143,9 @@ def write_file(shards: Sequence[Shard], folder: Path, camera: str, path: Path) -
     """Write what finished shards hold of a camera, one after the other, as the file `path`; the shards stay."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if len(shards) > 1:
-        stream.join(
+        encoding.join(
             (
-                stream.Encoded(mp4=s.file(folder, camera).read_bytes(), num_frames=s.num_frames)
+                encoding.Encoded(mp4=s.file(folder, camera).read_bytes(), num_frames=s.num_frames)
                 for s in shards
             ),
             path,
@@ -160,7 +160,7 @@ def write_file(shards: Sequence[Shard], folder: Path, camera: str, path: Path) -
 
 @dataclass(frozen=True, kw_only=True)
 class _Encoded:
-    videos: dict[str, stream.Encoded]
+    videos: dict[str, encoding.Encoded]
     stats: dict[str, Stats]
 
 
@@ -168,17 +168,19 @@ def _encode(heading: Heading) -> _Encoded:
     episode = Episode.load(heading.path)
     if episode.labels.shape != (heading.num_frames, *heading.size_px):
         raise V2PError(f"{heading.path} changed while it was packed; run the same command again")
-    videos: dict[str, stream.Encoded] = {}
+    videos: dict[str, encoding.Encoded] = {}
     stats: dict[str, Stats] = {}
     try:
         for camera in heading.cameras:
             if camera in MASK_CAMERAS:
                 labels = np.ascontiguousarray(episode.labels_of(camera))
-                videos[camera] = stream.encode_masks(labels)
+                videos[camera] = encoding.encode_masks(labels)
                 stats[camera] = mask_stats(labels)
             else:
-                videos[camera] = stream.Encoded(mp4=episode.rgb_mp4, num_frames=episode.num_frames)
-                stats[camera] = rgb_stats(stream.decode_rgb(episode.rgb_mp4))
+                videos[camera] = encoding.Encoded(
+                    mp4=episode.rgb_mp4, num_frames=episode.num_frames
+                )
+                stats[camera] = rgb_stats(encoding.decode_rgb(episode.rgb_mp4))
     except ValueError as error:
         raise V2PError(f"{heading.path} cannot be packed: {error}") from error
     return _Encoded(videos=videos, stats=stats)

@@ -15,7 +15,7 @@ from typing import Any
 from v2p_data.episodes.dataset.about import CARRIED_TASKS, about_problems, as_in_table, read_about
 from v2p_data.episodes.dataset.edited import changed_files
 from v2p_data.episodes.dataset.features import INTERVENTION_KEY, METADATA_FILE
-from v2p_data.episodes.dataset.frames import Checks, Said
+from v2p_data.episodes.dataset.frame_checks import Checks, Said
 from v2p_data.episodes.dataset.intake import demand_bounded
 from v2p_data.episodes.dataset.reading import Rows, same
 from v2p_data.episodes.dataset.tables import (

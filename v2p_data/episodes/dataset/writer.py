@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from v2p_data.episodes.dataset.cut import write_stats
 from v2p_data.episodes.dataset.edited import number_digest
+from v2p_data.episodes.dataset.encoding import MASK_CRF, RGB_CRF, encoder_config
 from v2p_data.episodes.dataset.episode_stats import number_stats
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
@@ -51,7 +52,6 @@ from v2p_data.episodes.dataset.shards import (
     stats_of,
     write_file,
 )
-from v2p_data.episodes.dataset.stream import MASK_CRF, RGB_CRF, encoder_config
 from v2p_data.episodes.staging import (
     Episode,
     Heading,

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import outline_points
-from v2p_data.geometry.pose import transform
+from v2p_data.geometry.pose import apply, transform
 from v2p_data.scene.data_types import Fit
 from v2p_data.scene.fitting.silhouette import Silhouette
 from v2p_data.scene.scale.nouns import Noun
@@ -72,19 +72,19 @@ class _Fitting:
     def place(self, v: np.ndarray) -> np.ndarray:
         """Return the outline's points in the world."""
         size, T = self.posed(v)
-        return _moved(self.outline(size), T)
+        return apply(self.outline(size), T)
 
     def cost(self, v: np.ndarray) -> float:
         size, T = self.posed(v)
         appearance = self.silhouette.appearance_cost(self.noun.form, size, T)
-        iou = self.silhouette.iou(_moved(self.outline(size), T), _HIDDEN_WEIGHT)
+        iou = self.silhouette.iou(apply(self.outline(size), T), _HIDDEN_WEIGHT)
         return 1 - iou + self.held(v, T) + appearance
 
     def best(self, starts: list[np.ndarray], step: np.ndarray, kept: int = 2) -> Fit:
         """Return the fit that a search from these numbers ends in."""
         v = search(self.cost, starts, step, kept)
         size, T = self.posed(v)
-        points = _moved(outline_points(self.noun.form, three(size), self.noun.taper), T)
+        points = apply(outline_points(self.noun.form, three(size), self.noun.taper), T)
         return Fit(
             size=three(size),
             T_world_obj=T,
@@ -213,12 +213,6 @@ def fit_lifted(
     )
     starts = [np.zeros(3), np.array([0, 0, 0.5]), np.array([0, 0, -0.5])]
     return fitting.best(starts, np.array([0.2, 0.2, 0.2]))
-
-
-def _moved(
-    points: Float[np.ndarray, "n 3"], T: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "n 3"]:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def three(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from v2p_data.episodes.dataset.encoding import decode_rgb
 from v2p_data.episodes.dataset.episode_stats import QUANTILES
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
@@ -28,7 +29,6 @@ from v2p_data.episodes.dataset.features import (
     SUCCESS_KEY,
     actions_in,
 )
-from v2p_data.episodes.dataset.stream import decode_rgb
 from v2p_data.episodes.dataset.tables import BOOKKEEPING, STATS_FILE, Found
 from v2p_data.episodes.staging import Episode
 from v2p_data.sim.render.masks import PALETTE, rgb_to_labels
