@@ -7,6 +7,7 @@ hand. Run with `v2p deploy`, or with `lerobot-rollout`, always with `--return_to
 displacements, so positions must not be played back as actions.
 """
 
+import time
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,6 +20,7 @@ from lerobot_policy_v2p.robot.franky import FrankyArm
 from lerobot_policy_v2p.robot.network import NetworkArm
 from lerobot_policy_v2p.robot.simulated import SimulatedArm
 from lerobot_policy_v2p.robot.unattended import Unattended, check_policy_of
+from v2p_data.deployment.limits import STEP_S
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
@@ -80,6 +82,8 @@ class V2PFranka(ArmRobot[Arm]):
         super().__init__(config)
         self.config = config
         self._state: dict[str, Any] | None = None
+        self._next_s = 0.0
+        """When the next action may be sent."""
 
     @property
     def action_scale(self) -> ActionScale:
@@ -118,6 +122,10 @@ class V2PFranka(ArmRobot[Arm]):
         """
         arm = self._connected()
         step = self._step(action, self._state or self._named_state(arm))
+        if self._unattended is not None and self.config.backend != "sim":
+            # LeRobot sends 30 actions a second unless it is told otherwise, and the arm would be faster than its limits.
+            time.sleep(max(0.0, self._next_s - time.monotonic()))
+            self._next_s = time.monotonic() + STEP_S
         return self._sent(action, arm.act(step))
 
     def calibration(self) -> Camera:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -117,6 +117,24 @@ def test_the_loop_runs_over_the_network_and_a_limit_holds_there_too(
     robot.disconnect()
 
 
+def test_a_real_arm_takes_no_more_than_twenty_actions_a_second_from_lerobots_tools(
+    server, seeing_robot, restarted, click_on, tmp_path
+):
+    restarted(seeing_robot)
+    u, v = click_on(seeing_robot)
+    robot = robot_at(server.address, tmp_path, pictures="mask", clicks=f"{u:g},{v:g}")
+    robot.get_observation()
+    still = dict.fromkeys(robot.action_features, 0.0)
+    began = time.monotonic()
+    for _ in range(5):
+        robot.send_action(still)
+
+    assert time.monotonic() - began > 4 * 0.05
+    with pytest.raises(V2PError, match="no number"):
+        robot.send_action(still | {"delta_z.pos": float("nan")})
+    robot.disconnect()
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [
