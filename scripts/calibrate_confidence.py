@@ -49,11 +49,11 @@ class Judged:
     right: bool
 
 
-def main() -> None:
+def main(args: Sequence[str] | None = None) -> None:
     """Read the command line and print one table of rules and one of confidences."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("judged", type=Path, nargs="+", help="judged.json or results.json")
-    rows = [row for path in parser.parse_args().judged for row in _rows(path)]
+    rows = [row for path in parser.parse_args(args).judged for row in _rows(path)]
     clips = [judged for row in rows if (judged := judged_of(row)) is not None]
     if len(sources(clips)) < 2:
         parser.error("a fit to the clips of all other sources needs clips of two sources at least")

@@ -1,0 +1,79 @@
+"""A confidence is judged by fits that have not seen the clip, nor another one of its source."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="module")
+def script(load_script):
+    return load_script("calibrate_confidence")
+
+
+def judged(name: str, confidence: float, *, right: bool, gate: str = "") -> dict:
+    stages = {"camera": 1.0, "grounding": confidence, "pose": 1.0}
+    return {"clip": name, "confidence": confidence, "stages": stages, "gate": gate, "right": right}
+
+
+def many(right_when):
+    at = np.linspace(0.05, 0.95, 24).tolist()
+    return [judged(f"a__{k % 8}", c, right=right_when(k, c)) for k, c in enumerate(at)]
+
+
+def table_of(script, rows, tmp_path, capsys):
+    path = tmp_path / "judged.json"
+    path.write_text(json.dumps(rows))
+    script.main([str(path)])
+    return capsys.readouterr().out
+
+
+def test_a_confidence_that_tells_right_from_wrong_ranks_and_accepts(script, tmp_path, capsys):
+    rows = [
+        *many(lambda k, c: c > 0.5),
+        judged("gone__x", 0.5, right=False) | {"confidence": None},
+    ]
+    out = table_of(script, rows, tmp_path, capsys)
+
+    assert "24 of 25 clips have a confidence; sources: 8" in out
+    accepted, wrong = re.search(r"calibrated \| (\d+) of 12 \| (\d+) of 12", out).groups()
+    assert (int(accepted) >= 11, int(wrong) <= 1) == (True, True)
+    assert "| 0.85 to 1 | 100.0 %" in out
+    weights = out[out.index("weights") :]
+    assert "'camera': 0.0" in weights
+    assert "'grounding': 0.0" not in weights
+
+
+def test_one_that_tells_nothing_is_not_calibrated_into_something(script, tmp_path, capsys):
+    clips = [script.judged_of(row) for row in many(lambda k, c: k % 2 == 0)]
+    right = np.array([c.right for c in clips])
+    p = script.held_out_probability(np.log([[c.confidence] for c in clips]), clips)
+
+    assert script.auc(p, right) < 0.6
+    assert np.abs(p - 0.5).max() < 0.3
+
+
+def test_a_source_is_never_on_both_sides(script):
+    rows = [judged("a__left", 0.9, right=True), judged("b__left", 0.8, right=True)]
+    rows += [judged("c__right", 0.2, right=False), judged("d__right", 0.3, right=False)]
+    clips = [script.judged_of(row) for row in rows]
+    p = script.held_out_probability(np.zeros((4, 1)), clips)
+
+    # Only the constant is left: each side is told what the other one is.
+    assert (p[:2] < 0.01).all()
+    assert (p[2:] > 0.99).all()
+
+
+def test_clips_of_one_source_are_refused(script, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        table_of(script, [judged("a__x", 0.9, right=True)], tmp_path, capsys)
+    assert "two sources" in capsys.readouterr().err
+
+
+def test_rows_of_the_bench_are_read_too(script):
+    row = {
+        "name": "lift_up_0001", "confidence": 0.6, "stages": {"pose": [0.6, "why"]}, "gate_slug": "low_confidence", "usable": True
+    }  # fmt: skip
+    clip = script.judged_of(row)
+    assert (clip.stages, clip.accepted, clip.right) == ({"pose": 0.6}, False, True)
