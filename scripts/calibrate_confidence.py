@@ -8,6 +8,9 @@ Clips that ended before they had a confidence are counted and left out. Three ru
 | `shipped` | the confidence itself, accepted by the default gate |
 | `calibrated` | logistic regression (ridge, no negative weight) on the confidence's logarithm, accepted from 0.5 |
 | `stages` | the same on the logarithm of each stage's confidence |
+| `threshold` | the confidence itself, accepted from the least value from which nine of ten others are right |
+
+A clip that the default gate turns away for another reason than its confidence is accepted by `shipped` and `threshold` never.
 
     python scripts/calibrate_confidence.py outputs/judged/judged.json outputs/more/judged.json
 """
@@ -32,6 +35,8 @@ LEAST = 1e-3
 """Confidences below count as this one: their logarithm says no more."""
 RIDGE = 0.1
 ACCEPTED_FROM = 0.5
+RIGHT_OF_ACCEPTED = 0.9
+"""The goal for scenes of clips that nobody looked at."""
 EDGES = (0.0, 0.3, 0.52, 0.7, 0.85, 1.0)
 
 
@@ -44,8 +49,8 @@ class Judged:
     """Clips of one source are never on both sides of a fit."""
     stages: dict[str, float]
     confidence: float
-    accepted: bool
-    """By the default gate."""
+    gate: str
+    """Slug of the rejection by the default gate; empty where it accepts."""
     right: bool
 
 
@@ -79,7 +84,7 @@ def judged_of(row: dict[str, Any]) -> Judged | None:
         source=name.rsplit("__", 1)[-1],
         stages=stages,
         confidence=row["confidence"],
-        accepted=not gate,
+        gate=gate or "",
         right=row["right"] if "right" in row else row["usable"],
     )
 
@@ -117,6 +122,28 @@ def held_out_probability(
     return out
 
 
+def held_out_accepted(clips: Sequence[Judged]) -> Bool[np.ndarray, " clip"]:
+    """Return which clips pass the threshold that the clips of the other sources ask for, and the rest of the gate."""
+    out = [
+        c.confidence >= least_threshold([o for o in clips if o.source != c.source]) for c in clips
+    ]
+    return np.array(out) & passes_otherwise(clips)
+
+
+def passes_otherwise(clips: Sequence[Judged]) -> Bool[np.ndarray, " clip"]:
+    """Return which clips the default gate would accept if they were sure enough."""
+    return np.array([c.gate in ("", "low_confidence") for c in clips])
+
+
+def least_threshold(clips: Sequence[Judged]) -> float:
+    """Return the least confidence from which nine of ten scenes are right; 1 where there is none."""
+    clips = [c for c, passes in zip(clips, passes_otherwise(clips), strict=True) if passes]
+    at_least = [
+        (c.confidence, [o.right for o in clips if o.confidence >= c.confidence]) for c in clips
+    ]
+    return min((t for t, right in at_least if np.mean(right) >= RIGHT_OF_ACCEPTED), default=1.0)
+
+
 def rules_table(clips: Sequence[Judged]) -> str:
     """Return what each rule accepts, how much of it is right, how well it ranks, and its Brier score."""
     right = np.array([c.right for c in clips])
@@ -128,9 +155,10 @@ def rules_table(clips: Sequence[Judged]) -> str:
         held_out_probability(logs, clips),
     )
     rules = {
-        "shipped": (sure, np.array([c.accepted for c in clips])),
+        "shipped": (sure, np.array([not c.gate for c in clips])),
         "calibrated": (of_all, of_all >= ACCEPTED_FROM),
         "stages": (of_each, of_each >= ACCEPTED_FROM),
+        "threshold": (sure, held_out_accepted(clips)),
     }
     lines = [
         "| rule | accepted and right | accepted and wrong | AUC | Brier |",
@@ -143,7 +171,12 @@ def rules_table(clips: Sequence[Judged]) -> str:
             f" | {auc(p, right):.2f} | {brier:.3f} |"
         )
     weights = dict(zip([*names, "constant"], fitted(logs, right).round(2).tolist(), strict=True))
-    return "\n".join([*lines, f"weights of `stages` on all clips: {weights}"])
+    return "\n".join(
+        [
+            *lines,
+            f"weights of `stages` on all clips: {weights}; threshold: {least_threshold(clips):.2f}",
+        ]
+    )
 
 
 def auc(p: Float[np.ndarray, " clip"], right: Bool[np.ndarray, " clip"]) -> float:

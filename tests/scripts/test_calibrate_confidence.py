@@ -76,4 +76,17 @@ def test_rows_of_the_bench_are_read_too(script):
         "name": "lift_up_0001", "confidence": 0.6, "stages": {"pose": [0.6, "why"]}, "gate_slug": "low_confidence", "usable": True
     }  # fmt: skip
     clip = script.judged_of(row)
-    assert (clip.stages, clip.accepted, clip.right) == ({"pose": 0.6}, False, True)
+    assert (clip.stages, clip.gate, clip.right) == ({"pose": 0.6}, "low_confidence", True)
+
+
+def test_the_bar_is_the_least_from_which_nine_of_ten_are_right_and_asks_no_clip_about_itself(
+    script,
+):
+    rows = [judged(f"x__{k}", 0.5 + 0.04 * k, right=True) for k in range(10)]
+    rows += [judged("low__y", 0.3, right=False), judged("gone__z", 0.95, right=True, gate="x")]
+    clips = [script.judged_of(row) for row in rows]
+
+    assert script.least_threshold(clips) == 0.3
+    assert script.least_threshold([*clips, clips[-2]]) == 0.5
+    # Without the wrong one the others ask for 0.5: it is turned away by them.
+    assert script.held_out_accepted(clips).tolist() == [True] * 10 + [False, False]
