@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from v2p_data.deployment.robot import ActionScale, Reading
+from v2p_data.deployment.robot import ActionScale, Reading, Rig
 from v2p_data.deployment.steps import StepMaker
 from v2p_data.errors import V2PError
 from v2p_data.sim.env.actions import joints_near
@@ -64,6 +64,7 @@ def test_targets_move_the_twin_as_the_steps_do_that_lead_to_them(twin, actions):
     seen = by_targets.get_observation()
     assert [seen[f"joint_{k}.pos"] for k in range(1, 8)] == by_targets.joints().tolist()
     assert set(by_targets.observation_features) == set(seen)
+    assert Rig(by_targets).read().joints_rad.tolist() == by_targets.joints().tolist()
 
 
 def test_a_target_out_of_reach_of_one_step_is_approached_as_fast_as_a_step_may():

@@ -60,7 +60,8 @@ def check_policy(folder: Path, offer: Offer, task: str = "") -> Facts:
     interface, *_ = interface_of(folder)
     if interface.joint_state and not offer.gives_joints:
         raise V2PError(
-            f"the policy in {folder} was trained with --episodes.joint-state, and this robot gives no angles of joints"
+            f"the policy in {folder} was trained with --episodes.joint-state, and this robot gives no angles of joints;"
+            " one that segments by itself gives them with --robot.joint_state=true"
         )
     _check_features(folder, found, offer, interface)
     return _check_meaning(folder, found, offer.scale, task, interface)

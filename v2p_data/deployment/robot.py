@@ -17,9 +17,11 @@ from v2p_data.errors import V2PError
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.env.targets import DOWN
 from v2p_data.sim.render.masks import rgb_to_labels
-from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
+from v2p_data.sim.robot.action_names import joint_names
+from v2p_data.sim.robot.robot import FINGER_TRAVEL_M, NUM_ARM_JOINTS
 from v2p_data.twin.interface import RGB_NAME, RobotWithCamera
 
+JOINTS = joint_names(NUM_ARM_JOINTS)
 MASK_NAME = "mask"
 """Key of the label greys in the observation of a robot that segments by itself."""
 
@@ -107,13 +109,18 @@ class Rig:
             bad = STATE_NAMES[int(np.flatnonzero(~np.isfinite(state))[0])]
             raise V2PError(f"the robot reports '{bad}' = {seen[bad]}, which is no finite number")
         picture, mask = seen.get(RGB_NAME), seen.get(MASK_NAME)
+        joints = None
+        if picture is not None:
+            joints = np.asarray(self.robot.joints(), float)
+        elif JOINTS[0] in seen:
+            joints = np.array([float(seen[name]) for name in JOINTS])
         ask_force = getattr(self.robot, "force_n", None)
         force = None if ask_force is None else ask_force()
         return Reading(
             state=state,
             picture=None if picture is None else np.asarray(picture, np.uint8),
             labels=None if mask is None else rgb_to_labels(np.asarray(mask, np.uint8)),
-            joints_rad=None if picture is None else np.asarray(self.robot.joints(), float),
+            joints_rad=joints,
             opening=float(state[6]) if picture is None else float(self.robot.opening()),
             force_n=None if force is None else float(force),
             time_s=time.monotonic() if asked is None else asked,
