@@ -72,19 +72,19 @@ class _Fitting:
     def place(self, v: np.ndarray) -> np.ndarray:
         """Return the outline's points in the world."""
         size, T = self.posed(v)
-        return apply(self.outline(size), T)
+        return apply(T, self.outline(size))
 
     def cost(self, v: np.ndarray) -> float:
         size, T = self.posed(v)
         appearance = self.silhouette.appearance_cost(self.noun.form, size, T)
-        iou = self.silhouette.iou(apply(self.outline(size), T), _HIDDEN_WEIGHT)
+        iou = self.silhouette.iou(apply(T, self.outline(size)), _HIDDEN_WEIGHT)
         return 1 - iou + self.held(v, T) + appearance
 
     def best(self, starts: list[np.ndarray], step: np.ndarray, kept: int = 2) -> Fit:
         """Return the fit that a search from these numbers ends in."""
         v = search(self.cost, starts, step, kept)
         size, T = self.posed(v)
-        points = apply(outline_points(self.noun.form, three(size), self.noun.taper), T)
+        points = apply(T, outline_points(self.noun.form, three(size), self.noun.taper))
         return Fit(
             size=three(size),
             T_world_obj=T,
