@@ -103,6 +103,24 @@ def make_robot(tmp_path_factory) -> Callable[..., Any]:
     return make
 
 
+@pytest.fixture
+def twin(task_folder, tmp_path):
+    """Return a maker of twins; each is disconnected in the end."""
+    from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
+    from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
+
+    made = []
+
+    def make(**settings):
+        config = V2PTwinConfig(task_folder=str(task_folder), calibration_dir=tmp_path, **settings)
+        made.append(V2PTwin(config))
+        return made[-1]
+
+    yield make
+    for robot in made:
+        robot.disconnect()
+
+
 @pytest.fixture(scope="session")
 def blind_robot(make_robot, task_folder) -> Any:
     """Return an arm that gives true masks; `restarted` before use."""

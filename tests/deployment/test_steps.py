@@ -19,28 +19,12 @@ def reading(joints=None) -> Reading:
     )  # fmt: skip
 
 
-@pytest.fixture
-def twin(task_folder, tmp_path):
-    from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
-    from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
-
-    made = []
-
-    def make(**settings):
-        config = V2PTwinConfig(task_folder=str(task_folder), calibration_dir=tmp_path, **settings)
-        made.append(V2PTwin(config))
-        made[-1].connect()
-        return made[-1]
-
-    yield make
-    for robot in made:
-        robot.disconnect()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("actions", ["absolute_tool", "joints"])
 def test_targets_move_the_twin_as_the_steps_do_that_lead_to_them(twin, actions):
     by_steps, by_targets = twin(), twin(actions=actions, joint_state=True)
+    by_steps.connect()
+    by_targets.connect()
     names, robot = action_names(actions), by_steps.arm.mirror.env.world.robot
     assert list(by_targets.action_features) == list(names)
     rng = np.random.default_rng(2)

@@ -15,24 +15,6 @@ from v2p_data.sim.render.masks import rgb_to_labels
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def twin(task_folder, tmp_path):
-    """Return a maker of twins; each is disconnected in the end."""
-    from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
-    from lerobot_policy_v2p.robot.v2p_twin import V2PTwin
-
-    made = []
-
-    def make(**settings):
-        config = V2PTwinConfig(task_folder=str(task_folder), calibration_dir=tmp_path, **settings)
-        made.append(V2PTwin(config))
-        return made[-1]
-
-    yield make
-    for robot in made:
-        robot.disconnect()
-
-
 def action(**entries: float) -> dict[str, float]:
     return dict.fromkeys(ACTION_NAMES, 0.0) | {f"{k}.pos": v for k, v in entries.items()}
 
