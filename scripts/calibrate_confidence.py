@@ -1,7 +1,8 @@
 """Ask how far a scene's confidence can be trusted: each clip is judged by a fit to the clips of all other sources.
 
 Takes the files that `judge_real_clips.py --no-gate --out` (`judged.json`) and `bench_reconstruction.py --out` (`results.json`) write.
-Clips that ended before they had a confidence are counted and left out. Three rules are compared:
+Clips that ended before they had a confidence are counted and left out. The source is what follows the last `__` in a clip's name; a
+name without is a source of its own. Four rules are compared:
 
 | rule | probability that the scene is right |
 |---|---|
