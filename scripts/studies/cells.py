@@ -273,6 +273,7 @@ class Study:
                 "meshes": {name: path.stat().st_size for name, path in meshes.items()},
                 "least": self.cfg.counts[0],
                 "max_training": self.cfg.max_training,
+                "cousins": [self.cfg.cousins, self.cfg.jointed],
                 "videos": [v.item for v in self._real],
             }
         )

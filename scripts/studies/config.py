@@ -93,6 +93,8 @@ class LiftingConfig:
     unseen: UnseenConfig = field(default_factory=UnseenConfig)
     cousins: int = 4
     """Of each object, in the arms with cousins; an object and its cousins share the trajectories of one object."""
+    jointed: float = 0.0
+    """Share of those cousins that have several pieces: `CousinsConfig.jointed`."""
     max_training: float = 4.0
     """Gradient steps grow with the data up to this multiple of `engine`'s, which are those of the smallest N."""
     paper_policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(preset="paper"))
@@ -176,7 +178,7 @@ class LiftingConfig:
         return replace(
             engine,
             episodes=self.episodes_for(arm, self.counts[0]),
-            cousins=CousinsConfig(count=self.cousins),
+            cousins=CousinsConfig(count=self.cousins, jointed=self.jointed),
             expert=replace(engine.expert, teacher="as_expert"),
         )
 
