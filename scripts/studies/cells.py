@@ -42,10 +42,10 @@ from .objects import (
     Candidate,
     candidate_of,
     clip_stage,
+    clips_of_kind,
     demand_apart,
     draw_unseen,
     instructed_stage,
-    lifting_clips,
     masses_in,
     scene_of_clip,
     toy_stage,
@@ -133,10 +133,12 @@ class Study:
             V2PError: a mesh is missing, or the robot cannot do the task.
         """
         folder, names, meshes = self._unseen_meshes
-        masses = masses_in(folder)
+        masses, kind = masses_in(folder), self.cfg.pool.kind
         root = self.out / "unseen"
         tasks = {
-            name: instructed_stage(_task_of(unseen_stage(name, path, masses.get(name)), self.cfg))
+            name: instructed_stage(
+                _task_of(unseen_stage(name, path, masses.get(name), kind), self.cfg), kind
+            )
             for name, path in meshes.items()
         }
         outcomes = self.run(list(tasks.values()), root)
@@ -168,7 +170,7 @@ class Study:
     def _real(self):  # noqa: ANN202 - the engine's own type
         if self.videos is None:
             return []
-        taken, refused = lifting_clips(self.videos, self.cfg.pool)
+        taken, refused = clips_of_kind(self.videos, self.cfg.pool)
         self.tell(f"{len(taken)} real clips join, {len(refused)} do not: {refused}")
         return taken
 
@@ -176,17 +178,20 @@ class Study:
         self, source: Source, numbers: Sequence[int], engine: EngineConfig
     ) -> list[Candidate | str]:
         """Return candidates by their places in the pool; a word where not even the clip could be drawn."""
+        kind = self.cfg.pool.kind
         if source == "toys":
-            return [candidate_of(toy_stage(k, self.cfg.pool), engine) for k in numbers]
+            return [candidate_of(toy_stage(k, self.cfg.pool), engine, kind) for k in numbers]
         real = self._real
         drawn = {k: clip_stage(k - len(real), self.cfg.pool) for k in numbers if k >= len(real)}
         outcomes = self.run(list(drawn.values()))
         out: list[Candidate | str] = []
         for k in numbers:
             if k < len(real):
-                out.append(candidate_of(scene_stage(real[k], engine), engine))
+                out.append(candidate_of(scene_stage(real[k], engine), engine, kind))
             elif outcomes[drawn[k].folder_name].is_usable:
-                out.append(candidate_of(scene_of_clip(drawn[k].folder(self.root), engine), engine))
+                out.append(
+                    candidate_of(scene_of_clip(drawn[k].folder(self.root), engine), engine, kind)
+                )
             else:
                 out.append("clip: not drawn")
         return out

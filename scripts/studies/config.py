@@ -1,8 +1,9 @@
-"""Settings of the study of lifting: arms, numbers of tasks, and sizes."""
+"""Settings of the study of lifting, or of another kind of task: arms, numbers of tasks, and sizes."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from v2p_data.kinds import Kind
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.stages import CousinsConfig, EngineConfig
 
@@ -37,8 +38,10 @@ Source = Literal["videos", "toys"]
 
 @dataclass(frozen=True, kw_only=True)
 class PoolConfig:
-    """Where training objects come from."""
+    """Where training objects come from, and what is done with them."""
 
+    kind: Kind = "lift_up"
+    """Of clips and tasks, unseen objects' too: a key of `ASKED` in `objects.py`."""
     clips: int = 90
     """Clips that may be drawn, at most; a clip whose scene, task or expert is rejected counts."""
     toys: int = 60

@@ -22,6 +22,7 @@ from drawn_clips.truth import write
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import Size, mesh_for, parts_for, write_obj
+from v2p_data.kinds import Kind
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.scene.scene import Scene, SceneObject
@@ -33,9 +34,6 @@ from v2p_data.video.meaning import parse_caption
 
 from .config import PoolConfig, UnseenConfig
 
-INSTRUCTION = "lift it up"
-LIFT_M = 0.15
-"""As in the sample clips: how far an object that no clip showed is to be lifted."""
 MESH_FILE = "textured.obj"
 MASSES_FILES = "*mass.json"
 DENSITY_KG_M3 = 300.0
@@ -44,6 +42,36 @@ FRICTION = 0.6
 """Of objects that no clip showed; the middle of the engine's table of nouns."""
 SAME_MESH = 1e-4
 """Relative: what writing coordinates as text changes is far less."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """What is asked of an object that no clip showed, as in the sample clips."""
+
+    instruction: str
+    """Of every task of the study."""
+    caption: str
+    move_m: tuple[float, float, float]
+    """From its first pose to its last."""
+    onto_m: Size | None = None
+    """Full extents of a block that stands under the last pose."""
+
+
+ASKED: dict[Kind, Asked] = {
+    "lift_up": Asked(instruction="lift it up", caption="Lifting {} up", move_m=(0.0, 0.0, 0.15)),
+    "push_left": Asked(
+        instruction="push it to the left",
+        caption="Pushing {} to the left",
+        move_m=(0.01, 0.16, 0.0),
+    ),
+    "place_onto": Asked(
+        instruction="put it onto the other one",
+        caption="Putting {} onto a block",
+        move_m=(0.02, 0.18, 0.03),
+        onto_m=(0.13, 0.13, 0.03),
+    ),
+}
+"""Kinds of task that can be studied."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,18 +88,18 @@ class Candidate:
         return self.task.item
 
 
-def candidate_of(scene: Stage, engine: EngineConfig) -> Candidate:
-    """Return the stages that make a lifting expert of a scene."""
-    task = instructed_stage(task_stage(scene, engine))
+def candidate_of(scene: Stage, engine: EngineConfig, kind: Kind) -> Candidate:
+    """Return the stages that make an expert of a scene."""
+    task = instructed_stage(task_stage(scene, engine), kind)
     return Candidate(scene=scene, task=task, expert=expert_stage(task, engine))
 
 
-def instructed_stage(task: Stage) -> Stage:
+def instructed_stage(task: Stage, kind: Kind) -> Stage:
     """Return the stage that gives a task the study's instruction."""
     return Stage(
-        name="lift",
+        name="instruction",
         item=task.item,
-        config={"instruction": INSTRUCTION},
+        config={"kind": kind, "instruction": ASKED[kind].instruction},
         inputs={"task": task},
         make=make_instructed,
     )
@@ -80,14 +108,14 @@ def instructed_stage(task: Stage) -> Stage:
 def make_instructed(
     cfg: dict[str, str], inputs: Mapping[str, Path], out: Path, runtime: Runtime
 ) -> dict[str, Any]:
-    """Write the task with other words; a task that is no lift is refused."""
+    """Write the task with other words; a task of another kind is refused."""
     from v2p_data.errors import ItemRejectedError
     from v2p_data.task.task import TaskBundle
 
     del runtime
     bundle = TaskBundle.load(inputs["task"])
-    if bundle.kind != "lift_up":
-        raise ItemRejectedError("not_a_lift", f"'{bundle.description}' is '{bundle.kind}'")
+    if bundle.kind != cfg["kind"]:
+        raise ItemRejectedError("other_kind", f"'{bundle.description}' is '{bundle.kind}'")
     replace(bundle, description=cfg["instruction"]).save(out)
     return {"caption": bundle.description}
 
@@ -102,11 +130,16 @@ def is_held_out(words: str, held_out: Iterable[str]) -> str | None:
 
 
 def clip_stage(number: int, pool: PoolConfig) -> Stage:
-    """Return the stage that draws one lifting clip: noun, shape, texture, room, hand and camera at random."""
+    """Return the stage that draws one clip: noun, shape, texture, room, hand and camera at random."""
     return Stage(
         name="clip",
         item=f"clip_{number:04d}",
-        config={"seed": pool.seed, "fps": pool.fps, "held_out": list(pool.held_out)},
+        config={
+            "seed": pool.seed,
+            "fps": pool.fps,
+            "held_out": list(pool.held_out),
+            "kind": pool.kind,
+        },
         sources={"drawing": drawing_code()},
         make=make_clip,
     )
@@ -121,7 +154,7 @@ def make_clip(
     for attempt in range(100):
         rng = rng_for(cfg["seed"], "study_lifting", item, attempt)
         try:
-            spec = random_spec(item, "lift_up", rng)
+            spec = random_spec(item, cfg["kind"], rng)
         except ValueError:  # no camera sees all of it: other draws
             continue
         if is_held_out(spec.story.actors[0].prop.noun, cfg["held_out"]) is None:
@@ -141,8 +174,8 @@ def scene_of_clip(folder: Path, engine: EngineConfig) -> Stage:
     return scene_stage(video, engine)
 
 
-def lifting_clips(folder: Path, pool: PoolConfig) -> tuple[list[VideoItem], dict[str, str]]:
-    """Return the clips of a folder whose captions tell of lifting one thing, and why others are not taken.
+def clips_of_kind(folder: Path, pool: PoolConfig) -> tuple[list[VideoItem], dict[str, str]]:
+    """Return the clips of a folder whose captions tell of the pool's kind of task, and why others are not taken.
 
     Raises:
         V2PError: there is no such folder, or its captions cannot be used.
@@ -151,8 +184,8 @@ def lifting_clips(folder: Path, pool: PoolConfig) -> tuple[list[VideoItem], dict
     refused: dict[str, str] = {}
     for video in find_videos(folder):
         word = is_held_out(video.caption, pool.held_out)
-        if parse_caption(video.caption).kind != "lift_up":
-            refused[video.path.name] = "not_a_lift"
+        if parse_caption(video.caption).kind != pool.kind:
+            refused[video.path.name] = "other_kind"
         elif word is not None:
             refused[video.path.name] = f"held_out: {word}"
         else:
@@ -172,8 +205,8 @@ def toy_stage(number: int, pool: PoolConfig) -> Stage:
     return Stage(
         name="scene",
         item=f"toy_{number:04d}",
-        config={"seed": pool.seed, "kind": "chain" if is_chain else "toy"},
-        version=2,
+        config={"seed": pool.seed, "form": "chain" if is_chain else "stack", "kind": pool.kind},
+        version=3,
         make=make_toy,
     )
 
@@ -185,7 +218,7 @@ def make_toy(
     del inputs, runtime
     item = out.name.split("-")[0]
     rng = rng_for(cfg["seed"], "study_lifting", item)
-    forms, meshes, parts = (_chain if cfg["kind"] == "chain" else _stack)(rng)
+    forms, meshes, parts = (_chain if cfg["form"] == "chain" else _stack)(rng)
     whole = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
     assert isinstance(whole, trimesh.Trimesh)
     middle = whole.bounds.mean(0)
@@ -203,7 +236,7 @@ def make_toy(
         friction=float(rng.uniform(0.4, 0.8)),
         source={"size": "drawn", "mass": "drawn", "friction": "drawn"},
     )
-    _write_scene(thing, whole, parts, out, "Lifting toy up")
+    _write_scene(thing, whole, parts, out, cfg["kind"])
     return {"forms": forms}
 
 
@@ -318,12 +351,12 @@ def unseen_meshes(folder: Path, cfg: UnseenConfig) -> dict[str, Path]:
     return found
 
 
-def unseen_stage(name: str, mesh: Path, mass_kg: float | None) -> Stage:
+def unseen_stage(name: str, mesh: Path, mass_kg: float | None, kind: Kind) -> Stage:
     """Return the stage that makes a scene of a scanned mesh, which stands on the table as it stands in its file."""
     return Stage(
         name="scene",
         item=f"unseen_{name}",
-        config={"mass_kg": mass_kg, "friction": FRICTION},
+        config={"mass_kg": mass_kg, "friction": FRICTION, "kind": kind},
         sources={"mesh": file_digest(mesh)},
         make=partial(make_unseen, mesh=mesh),
     )
@@ -352,7 +385,7 @@ def make_unseen(
             "friction": "estimate",
         },
     )
-    _write_scene(thing, whole, [], out, f"Lifting {thing.label} up")
+    _write_scene(thing, whole, [], out, cfg["kind"])
     return {"size_m": list(thing.size_m), "mass_kg": thing.mass_kg}
 
 
@@ -410,33 +443,31 @@ def _write_scene(
     mesh: trimesh.Trimesh,
     parts: list[trimesh.Trimesh],
     out: Path,
-    caption: str,
+    kind: Kind,
 ) -> None:
+    asked = ASKED[kind]
     (out / "meshes").mkdir(parents=True)
     file = f"meshes/{thing.name}.obj"
     write_obj(mesh, out / file)
     files = tuple(f"meshes/{thing.name}_part_{k:02d}.obj" for k in range(len(parts)))
     for part, path in zip(parts, files, strict=True):
         write_obj(part, out / path)
-    z = thing.size_m[2] / 2
-    thing = replace(
-        thing,
-        mesh=file,
-        parts=files if len(files) > 1 else (),
-        frames=(0, 1),
-        poses_world=(
-            (0.0, 0.0, z, 1.0, 0.0, 0.0, 0.0),
-            (0.0, 0.0, z + LIFT_M, 1.0, 0.0, 0.0, 0.0),
-        ),
-        confidences=(1.0, 1.0),
-        observed=("full", "full"),
-    )
+    thing = _between(thing, (0.0, 0.0, 0.0), asked.move_m)
+    thing = replace(thing, mesh=file, parts=files if len(files) > 1 else ())
+    things = [thing]
+    if asked.onto_m is not None:
+        block = SceneObject(
+            name="block", label="block", role="reference", shape="box", size_m=asked.onto_m,
+            mass_kg=0.4, friction=FRICTION, source=dict.fromkeys(("size", "mass", "friction"), "stated"),
+        )  # fmt: skip
+        under = (*asked.move_m[:2], 0.0)
+        things.append(_between(block, under, under))
     Scene(
         title=out.name.split("-")[0],
         video="",
-        description=caption,
-        kind="lift_up",
-        objects=(thing,),
+        description=asked.caption.format(thing.label),
+        kind=kind,
+        objects=tuple(things),
         camera=Camera(
             width_px=640,
             height_px=480,
@@ -448,6 +479,18 @@ def _write_scene(
         confidence=1.0,
         folder=out,
     ).save(out)
+
+
+def _between(thing: SceneObject, *bottoms_m: tuple[float, float, float]) -> SceneObject:
+    """Return the object as seen upright with the middle of its bottom at these points."""
+    up = thing.size_m[2] / 2
+    return replace(
+        thing,
+        frames=tuple(range(len(bottoms_m))),
+        poses_world=tuple((x, y, z + up, 1.0, 0.0, 0.0, 0.0) for x, y, z in bottoms_m),
+        confidences=(1.0,) * len(bottoms_m),
+        observed=("full",) * len(bottoms_m),
+    )
 
 
 def _size(extents: np.ndarray) -> Size:

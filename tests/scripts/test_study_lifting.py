@@ -30,6 +30,7 @@ from v2p_data.pipeline.runner import (
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.play import View
 from v2p_data.policy.config import PolicyConfig
+from v2p_data.scene.scene import Scene
 from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.stages import (
     CousinsConfig,
@@ -41,8 +42,9 @@ from v2p_data.stages import (
     with_cousins,
 )
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.generate import TaskConfig
+from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.task import BASE_OBSERVATION_DIM
+from v2p_data.video.meaning import parse_caption
 
 ROOT = Path(__file__).parents[2]
 
@@ -148,9 +150,30 @@ def test_an_object_and_its_cousins_share_the_data_of_one_object_and_one_labeller
     assert cfg.pool_engine_of("videos") == cfg.pool_engine
 
 
+@pytest.mark.parametrize("kind", ["lift_up", "push_left", "place_onto"])
+def test_a_toys_scene_is_of_the_kind_that_is_studied_and_its_task_passes_the_audit(
+    kind, parts, tmp_path
+):
+    out = tmp_path / "toy_0004-x"
+    asked = parts.objects.ASKED[kind]
+
+    parts.objects.make_toy({"seed": 0, "form": "stack", "kind": kind}, {}, out, Runtime(root=tmp_path))  # fmt: skip
+
+    scene = Scene.load(out)
+    toy = scene.manipulated
+    first, last = np.array(toy.poses_world)[[0, -1], :3]
+    assert scene.kind == kind == parse_caption(scene.description).kind
+    assert last - first == pytest.approx(asked.move_m)
+    for block in scene.others:  # it stands under the toy's last place
+        top = block.poses_world[-1][2] + block.size_m[2] / 2
+        assert top == pytest.approx(last[2] - toy.size_m[2] / 2)
+    assert len(scene.others) == (asked.onto_m is not None)
+    assert generate_task(scene, TaskConfig(num_samples=1), 0).bundle.kind == kind
+
+
 def test_each_cousin_goes_through_the_same_stages_as_its_scene(parts):
     cfg = replace(EngineConfig(), cousins=CousinsConfig(count=2))
-    candidate = parts.objects.candidate_of(parts.objects.toy_stage(4, parts.config.PoolConfig()), cfg)  # fmt: skip
+    candidate = parts.objects.candidate_of(parts.objects.toy_stage(4, parts.config.PoolConfig()), cfg, "lift_up")  # fmt: skip
 
     own, *cousins = with_cousins(episodes_stage(candidate.task, candidate.expert, cfg), cfg)
 
@@ -159,7 +182,7 @@ def test_each_cousin_goes_through_the_same_stages_as_its_scene(parts):
         names = [(stage.name, stage.item) for stage in in_order([cousin])]
         assert names == [
             ("scene", "toy_0004"),
-            *((n, cousin.item) for n in ("cousin", "task", "lift", "expert", "episodes")),
+            *((n, cousin.item) for n in ("cousin", "task", "instruction", "expert", "episodes")),
         ]
         lift = cousin.inputs["task"]
         assert cousin.inputs["expert"].inputs["task"].folder_name == lift.folder_name
