@@ -167,12 +167,13 @@ def throw_into(m: Measured, v: Variant) -> Draft:
         "drop = (obj_pos[:, 2] - rim).clamp(min=0.0)",
         "airtime = (obj_vel[:, 2] + (obj_vel[:, 2] ** 2 + 19.62 * drop).sqrt()) / 9.81",
         "landing = obj_pos[:, :2] + obj_vel[:, :2] * airtime.unsqueeze(-1)",
-        # Where it would come down if it were let go now, or where it lies. In flight this does not change.
+        # Where it would come down if it were let go now. In flight this does not change; what lies on the table has none, or it
+        # is rolled to the container.
         "aim = 1 - torch.tanh(3.0 * torch.norm(goal_point[:, :2] - landing, dim=-1))",
     ]
     draft.progress = (
         "torch.where(arrived, 2.5 + lowered,"
-        " raised * (0.4 + 0.6 * aim) * gripped * near + 1.2 * aim * (1 - obj_touched))"
+        " raised * (0.4 + 0.6 * aim) * gripped * near + 1.2 * aim * (1 - obj_touched) * (height > 0.02).float())"
     )
     draft.extras = draft.extras[:1]
     return draft
@@ -286,11 +287,12 @@ def _carry(
         extras=[
             LEAVE_REF,
             ("not_too_high", "-2.0 * (height - 0.12).clamp(0.0, 0.3)"),
-            # Summed over the way it costs as much as it would earn at the goal, at whatever speed.
+            # Summed over the way it costs as much as it would earn at the goal, at whatever speed. It grows along the way and
+            # is paid for what the pads drag, not for what fell: where it began at once, everything was held before that line.
             (
                 "dragged",
-                "-15.0 * torch.norm(obj_vel[:, :2], dim=-1).clamp(max=1.0)"
-                " * ((height < 0.02) & (to_goal < way - 0.03) & ~arrived).float()",
+                "-30.0 * carried.clamp(min=0.0) * obj_touched * torch.norm(obj_vel[:, :2], dim=-1).clamp(max=1.0)"
+                " * ((height < 0.02) & ~arrived).float()",
             ),
         ],
     )

@@ -20,6 +20,10 @@ _FINGERS = (
 not fit over it. Fingers that have closed above it are narrower than it. Paid for a box of 4 x 6 cm too, it teaches to keep
 the fingers open: the box was in them half as often after 0.12 million steps."""
 
+_SIDEWAYS_FIRST = "distance = torch.norm(torch.cat([way_there[:, :2] * (1 + 1.5 * snug).unsqueeze(-1), way_there[:, 2:]], dim=-1), dim=-1)"
+"""The point to reach sinks as the gripper comes over a tall object, and open fingers can follow it only over the middle of one
+that nearly fills them. Counted once, the last three centimetres to the middle lead away from the point: covering ended there."""
+
 
 def docstring_lines(v: Variant, d: Draft) -> list[str]:
     """Return the docstring as the paper's rewards have it: the steps of the task, the names of the components."""
@@ -37,8 +41,10 @@ def docstring_lines(v: Variant, d: Draft) -> list[str]:
 def reward_lines(v: Variant, d: Draft) -> list[str]:
     """Return the function's lines after its docstring, in terms of what the draft defines."""
     return [
-        f"distance = torch.norm({d.target} - eef_pos, dim=-1)",
+        f"way_there = {d.target} - eef_pos",
+        "distance = torch.norm(way_there, dim=-1)",
         "near = (distance < 0.045).float()",
+        *([_SIDEWAYS_FIRST] if v.contact and d.pays_contact else []),
         f"reach = {_near(v)}",
         f"contact = {d.contact}",
         f"progress = {d.progress}",
