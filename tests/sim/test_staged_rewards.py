@@ -32,14 +32,15 @@ class Moments:
     def narrowest(self, thing: str) -> float:
         return float(self.states[f"{thing}_size"][0, :2].min())
 
-    def pay(self, moments: list[dict[str, Any]]) -> list[float]:
-        """Return the rewards of moments, each of which says what differs from the start."""
+    def pay(self, moments: list[dict[str, Any]], component: str = "") -> list[float]:
+        """Return the rewards of moments, or one component; each moment says what differs from the start."""
         states = {key: value.clone() for key, value in self.states.items()}
         for world, moment in enumerate(moments):
             for key, value in moment.items():
                 states[key][world] = torch.as_tensor(value, dtype=torch.float32)
         said = self.env.task.judge(lambda: dict(states), torch.zeros(WORLDS, 7))
-        return said.reward[: len(moments)].tolist()
+        paid = said.components[component] if component else said.reward
+        return paid[: len(moments)].tolist()
 
 
 @pytest.mark.parametrize(
@@ -87,21 +88,59 @@ def test_each_stage_of_carrying_pays_more_than_the_one_before(name, thing, other
     assert all(np.diff(paid) > 0), paid
 
 
-def test_dragging_a_thing_along_the_table_costs_while_carrying_it_pays():
-    moments = Moments("drop_in_front_of")
-    start, mug = moments.start("matchbox"), moments.start("mug")
-    midway = start + np.append(0.5 * (mug - start)[:2], 0.0)
-    moving = {"matchbox_vel_linear": [0.0, 0.2, 0.0], "matchbox_grasped": 1.0}
+@pytest.mark.parametrize(
+    ("name", "thing", "other"),
+    [("drop_in_front_of", "matchbox", "mug"), ("insert", "fork", "container")],
+)
+def test_dragging_costs_more_the_nearer_the_goal_and_what_falls_or_is_carried_costs_nothing(
+    name, thing, other
+):
+    moments = Moments(name)
+    start, goal = moments.start(thing), moments.start(other)
+    way = np.append((goal - start)[:2], 0.0)
+    along = [start + share * way for share in (0.0, 0.15, 0.3, 0.45)]
 
-    dragged, left, carried = moments.pay(
-        [
-            moving | {"matchbox_pos": midway, "eef_pos": midway},
-            {},
-            moving | {"matchbox_pos": midway + [0, 0, 0.06], "eef_pos": midway + [0, 0, 0.06]},  # noqa: RUF005
-        ]
-    )
+    def moving(pos: np.ndarray, *, touched: bool) -> dict[str, Any]:
+        return {
+            f"{thing}_vel_linear": 0.3 * way / np.linalg.norm(way),
+            f"{thing}_pos": pos,
+            "eef_pos": pos,
+            f"{thing}_grasped": float(touched),
+            f"{thing}_touched": float(touched),
+        }
 
-    assert dragged < left < carried
+    dragged = [moving(pos, touched=True) for pos in along]
+    carried = moving(along[2] + np.array([0, 0, 0.06]), touched=True)
+    price = moments.pay([*dragged, moving(along[2], touched=False), carried], "dragged")
+    here, left, up = moments.pay([dragged[2], {}, carried])
+
+    assert price[0] == pytest.approx(0, abs=1e-4)
+    assert all(np.diff(price[:4]) < 0)
+    assert price[4:] == [0, 0]
+    assert here < left < up
+
+
+@pytest.mark.parametrize("name", ["cover", "uncover"])
+def test_above_a_cup_that_fills_the_gripper_every_centimetre_towards_its_middle_pays(name):
+    moments = Moments(name)
+    cup = moments.start("cup")
+
+    # Just above its rim, where fingers beside its middle cannot go down.
+    paid = moments.pay([{"eef_pos": cup + [-x, 0, 0.057]} for x in (0.03, 0.02, 0.01, 0.0)])  # noqa: RUF005
+
+    assert all(np.diff(paid) > 0), paid
+
+
+def test_a_thing_to_be_thrown_earns_by_flying_and_not_by_rolling_to_the_container():
+    moments = Moments("throw_into")
+    start, bowl = moments.start("garlic"), moments.start("bowl")
+    rolled = [start + share * np.append((bowl - start)[:2], 0.0) for share in (0.0, 0.3, 0.6)]
+    flying = [pos + np.array([0, 0, 0.1]) for pos in rolled]
+
+    paid = moments.pay([{"garlic_pos": pos} for pos in (*rolled, *flying)], "progress")
+
+    assert paid[:3] == [0, 0, 0]
+    assert 0 < paid[3] < paid[4] < paid[5]
 
 
 def test_fingers_that_close_around_a_wide_thing_earn_more_and_more_and_those_closed_above_it_do_not():
