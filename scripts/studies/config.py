@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from v2p_data.geometry.mesh import Size
 from v2p_data.kinds import Kind
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.stages import CousinsConfig, EngineConfig
@@ -37,11 +38,41 @@ Source = Literal["videos", "toys"]
 
 
 @dataclass(frozen=True, kw_only=True)
+class Asked:
+    """What is asked of an object that no clip showed, as in the sample clips."""
+
+    instruction: str
+    """Of every task of the study."""
+    caption: str
+    move_m: tuple[float, float, float]
+    """From its first pose to its last."""
+    onto_m: Size | None = None
+    """Full extents of a block that stands under the last pose."""
+
+
+ASKED: dict[Kind, Asked] = {
+    "lift_up": Asked(instruction="lift it up", caption="Lifting {} up", move_m=(0.0, 0.0, 0.15)),
+    "push_left": Asked(
+        instruction="push it to the left",
+        caption="Pushing {} to the left",
+        move_m=(0.01, 0.16, 0.0),
+    ),
+    "place_onto": Asked(
+        instruction="put it onto the other one",
+        caption="Putting {} onto a block",
+        move_m=(0.02, 0.18, 0.03),
+        onto_m=(0.13, 0.13, 0.03),
+    ),
+}
+"""Kinds of task that can be studied."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PoolConfig:
     """Where training objects come from, and what is done with them."""
 
     kind: Kind = "lift_up"
-    """Of clips and tasks, unseen objects' too: a key of `ASKED` in `objects.py`."""
+    """Of clips and tasks, unseen objects' too: a key of `ASKED`."""
     clips: int = 90
     """Clips that may be drawn, at most; a clip whose scene, task or expert is rejected counts."""
     toys: int = 60
@@ -57,6 +88,10 @@ class PoolConfig:
     """Categories of the evaluation: no training clip may be about one."""
     seed: int = 0
     """Of clips, toys, experts and demonstrations, which all seeds of the study share."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ASKED:
+            raise ValueError(f"kind must be one of {', '.join(ASKED)}, got {self.kind}")
 
 
 @dataclass(frozen=True, kw_only=True)

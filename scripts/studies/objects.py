@@ -32,7 +32,7 @@ from v2p_data.stages import EngineConfig, expert_stage, scene_stage, task_stage
 from v2p_data.video.captions import CAPTIONS_FILE, VideoItem, find_videos
 from v2p_data.video.meaning import parse_caption
 
-from .config import PoolConfig, UnseenConfig
+from .config import ASKED, PoolConfig, UnseenConfig
 
 MESH_FILE = "textured.obj"
 MASSES_FILES = "*mass.json"
@@ -42,36 +42,6 @@ FRICTION = 0.6
 """Of objects that no clip showed; the middle of the engine's table of nouns."""
 SAME_MESH = 1e-4
 """Relative: what writing coordinates as text changes is far less."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Asked:
-    """What is asked of an object that no clip showed, as in the sample clips."""
-
-    instruction: str
-    """Of every task of the study."""
-    caption: str
-    move_m: tuple[float, float, float]
-    """From its first pose to its last."""
-    onto_m: Size | None = None
-    """Full extents of a block that stands under the last pose."""
-
-
-ASKED: dict[Kind, Asked] = {
-    "lift_up": Asked(instruction="lift it up", caption="Lifting {} up", move_m=(0.0, 0.0, 0.15)),
-    "push_left": Asked(
-        instruction="push it to the left",
-        caption="Pushing {} to the left",
-        move_m=(0.01, 0.16, 0.0),
-    ),
-    "place_onto": Asked(
-        instruction="put it onto the other one",
-        caption="Putting {} onto a block",
-        move_m=(0.02, 0.18, 0.03),
-        onto_m=(0.13, 0.13, 0.03),
-    ),
-}
-"""Kinds of task that can be studied."""
 
 
 @dataclass(frozen=True, kw_only=True)

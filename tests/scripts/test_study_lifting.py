@@ -155,7 +155,7 @@ def test_a_toys_scene_is_of_the_kind_that_is_studied_and_its_task_passes_the_aud
     kind, parts, tmp_path
 ):
     out = tmp_path / "toy_0004-x"
-    asked = parts.objects.ASKED[kind]
+    asked = parts.config.ASKED[kind]
 
     parts.objects.make_toy({"seed": 0, "form": "stack", "kind": kind}, {}, out, Runtime(root=tmp_path))  # fmt: skip
 
@@ -169,6 +169,11 @@ def test_a_toys_scene_is_of_the_kind_that_is_studied_and_its_task_passes_the_aud
         assert top == pytest.approx(last[2] - toy.size_m[2] / 2)
     assert len(scene.others) == (asked.onto_m is not None)
     assert generate_task(scene, TaskConfig(num_samples=1), 0).bundle.kind == kind
+
+
+def test_a_kind_that_cannot_be_studied_is_named_with_those_that_can(parts):
+    with pytest.raises(ValueError, match="one of lift_up, push_left, place_onto, got insert"):
+        parts.config.PoolConfig(kind="insert")
 
 
 def test_each_cousin_goes_through_the_same_stages_as_its_scene(parts):

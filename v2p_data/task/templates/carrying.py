@@ -167,10 +167,10 @@ def throw_into(m: Measured, v: Variant) -> Draft:
         "drop = (obj_pos[:, 2] - rim).clamp(min=0.0)",
         "airtime = (obj_vel[:, 2] + (obj_vel[:, 2] ** 2 + 19.62 * drop).sqrt()) / 9.81",
         "landing = obj_pos[:, :2] + obj_vel[:, :2] * airtime.unsqueeze(-1)",
-        # Where it would come down if it were let go now. In flight this does not change; what lies on the table has none, or it
-        # is rolled to the container.
+        # The point of landing after a release at this moment. It is constant in flight.
         "aim = 1 - torch.tanh(3.0 * torch.norm(goal_point[:, :2] - landing, dim=-1))",
     ]
+    # A release pays in the air only. When it paid on the table too, PPO rolled the ball to the container.
     draft.progress = (
         "torch.where(arrived, 2.5 + lowered,"
         " raised * (0.4 + 0.6 * aim) * gripped * near + 1.2 * aim * (1 - obj_touched) * (height > 0.02).float())"
