@@ -1,8 +1,9 @@
 """Cousins of a scene's manipulated object: stretched, flattened, thinned, lengthened, leaning, on another side.
 
 A cousin is an affine map of mesh and convex parts, so closed meshes stay closed and convex parts convex. It may be
-`jointed`: two or three such maps of the object in a row, as a spoon is a handle and a bowl. Mass and friction are drawn too. In turn a cousin is `alike`, `low` (under 15 mm) and `tall` (over 150 mm); the gripper can take
-each. Cousin `k` follows from the seed, the scene and `k` alone, so that asking for more keeps those that are there.
+`jointed`: two or three such maps of the object in a row, as a spoon is a handle and a bowl. Mass and friction are drawn
+too. In turn a cousin is `alike`, `low` (under 15 mm) and `tall` (over 150 mm); the gripper can take each.
+Cousin `k` follows from the seed, the scene and `k` alone, so that asking for more keeps those that are there.
 """
 
 from dataclasses import dataclass, replace
