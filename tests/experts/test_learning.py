@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,8 +14,17 @@ from policies.ppo.policy import ActorCritic, Expert, weights_of
 from policies.ppo.train import ExpertResult
 from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
-from v2p_data.experts.learning import TAUGHT_FOLDER, Worlds, keep_better, learn, success_of
+from v2p_data.experts.learning import (
+    TAUGHT_FOLDER,
+    Worlds,
+    better_of_ppo,
+    keep_better,
+    learn,
+    success_of,
+)
 from v2p_data.experts.record import Comparison, Judged, Learned
+from v2p_data.experts.teacher import Played
+from v2p_data.play import StateActor
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
@@ -52,6 +62,23 @@ def weights_in(folder: Path) -> dict[str, torch.Tensor]:
 
 def actor_in(folder: Path) -> dict[str, torch.Tensor]:
     return {k: v for k, v in weights_in(folder).items() if k.startswith("actor.net")}
+
+
+def save_random_expert(folder: Path, obs_dim: int, *, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    Expert(ActorCritic(obs_dim, 7, ActorConfig(), generator)).save(folder)
+
+
+def improved_in(folder: Path) -> ExpertResult:
+    return ExpertResult(
+        folder=folder,
+        success=1.0,
+        actor_updates=7,
+        last_actor_updates=9,
+        steps=1,
+        seconds=1.0,
+        stopped_by="steps",
+    )
 
 
 def are_equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -116,26 +143,33 @@ def test_a_policy_that_meets_itself_on_the_same_episodes_is_exactly_as_good(
     cfg = replace(TINY, compare_worlds=16)
     worlds = Worlds(bundle=bundle, seed=3)
     for name in ("taught", "ppo", "ppo/last"):
-        model = ActorCritic(
-            worlds.make(1, "shape").obs_dim, 7, ActorConfig(), torch.Generator().manual_seed(1)
-        )
-        Expert(model).save(tmp_path / name)
-
-    improved = ExpertResult(
-        folder=tmp_path / "ppo",
-        success=1.0,
-        actor_updates=7,
-        last_actor_updates=9,
-        steps=1,
-        seconds=1.0,
-        stopped_by="steps",
-    )
+        save_random_expert(tmp_path / name, worlds.make(1, "shape").obs_dim, seed=1)
+    improved = improved_in(tmp_path / "ppo")
 
     compared, updates = keep_better(worlds, cfg, tmp_path / "taught", tmp_path / "ppo", improved)
 
     assert updates == 0
     assert compared.taught == compared.ppo
     assert (compared.success_gain.value, compared.moved) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("better", "updates"), [("ppo", 7), ("ppo/last", 9)])
+def test_of_the_best_in_training_and_the_last_policy_the_one_that_does_better_on_fresh_episodes_is_kept(
+    better: str, updates: int, tmp_path: Path
+):
+    for seed, name in enumerate(("ppo", "ppo/last")):
+        save_random_expert(tmp_path / name, 5, seed=seed)
+    obs = np.ones((16, 5), np.float32)
+    wanted = Expert.load(tmp_path / better).act(obs)
+
+    def play(actor: StateActor) -> Played:
+        succeeds = np.full(16, np.array_equal(actor.function(obs), wanted))
+        return Played(at_end=succeeds, steps=np.where(succeeds, 10, 101), horizon=100)
+
+    kept = better_of_ppo(play, tmp_path / "ppo", improved_in(tmp_path / "ppo"))
+
+    assert np.array_equal(kept[0].act(obs), wanted)
+    assert kept[1] == updates
 
 
 @pytest.mark.parametrize(

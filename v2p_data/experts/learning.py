@@ -6,7 +6,7 @@
 * `improve_by_ppo`: PPO goes on from the taught policy, from another task's expert, or from nothing. After a taught
   policy it trains at the fine time step, at which episodes are recorded;
 * `keep_better`: the taught policy and PPO's play the same episodes at the fine time step, and PPO's is kept if it
-  is surely better.
+  is surely better. Where nobody taught, the better one of PPO's best and its last policy is kept.
 
 The result is a neural network; it is called PPO's only if PPO changed it. Where a program is to act itself, see `labeller`.
 """
@@ -14,6 +14,7 @@ The result is a neural network; it is called PPO's only if PPO changed it. Where
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +27,12 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.record import Comparison, Judged, Learned
 from v2p_data.experts.solved import Solved, rank_solved
-from v2p_data.experts.teacher import Teacher, Trial, try_out
+from v2p_data.experts.teacher import Played, Teacher, Trial, try_out
 from v2p_data.play import StateActor
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env.backends import make_batch_env
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.robot.robot import FINE
 from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.task import TaskBundle
 
@@ -136,6 +138,9 @@ def learn(
         _say_unchanged(worlds.bundle.title, improved, student)
     elif student is not None:
         comparison, updates = keep_better(worlds, cfg, student, out, improved)
+    else:
+        expert, updates, _ = better_of_ppo(_exams(worlds, cfg), out, improved)
+        expert.save(out)
     return Learned(
         steps=steps + improved.steps,
         seconds=seconds + improved.seconds,
@@ -230,24 +235,17 @@ def keep_better(
     time step. Of PPO's two the one with the higher score is compared with the taught one. Where no difference shows, the
     taught one is the better teacher: it saw more states, and policies cloned from it lift unseen objects more often.
     """
-    env = worlds.make(cfg.compare_worlds, "which is better", fine=True)
-    dt_s, seed = env.physics.control_dt_s, worlds.seed_of("episodes that compare")
+    play = _exams(worlds, cfg)
     before, seen = Expert.load(taught), list[np.ndarray]()
 
     def watched(obs: np.ndarray) -> np.ndarray:
         seen.append(obs.copy())
         return before.act(obs)
 
-    of_taught = try_out(env, StateActor(watched), seed)
-    candidates = (
-        (Expert.load(out), improved.actor_updates),
-        (Expert.load(out / LAST_FOLDER), improved.last_actor_updates),
-    )
-    played = [try_out(env, StateActor(expert.act), seed) for expert, _ in candidates]
-    chosen = int(np.argmax([p.score for p in played]))
-    (after, updates), of_ppo = candidates[chosen], played[chosen]
+    of_taught = play(StateActor(watched))
+    after, updates, of_ppo = better_of_ppo(play, out, improved)
     both = of_taught.once & of_ppo.once
-    states = np.concatenate(seen)
+    states, dt_s = np.concatenate(seen), FINE.control_dt_s
     comparison = Comparison(
         taught=Judged.of(of_taught, dt_s),
         ppo=Judged.of(of_ppo, dt_s),
@@ -257,6 +255,26 @@ def keep_better(
     )
     (after if comparison.is_better else before).save(out)
     return comparison, updates if comparison.is_better else 0
+
+
+def _exams(worlds: Worlds, cfg: ExpertConfig) -> Callable[[StateActor], Played]:
+    """Return what plays the same episodes, at the fine time step, with every policy that it is given."""
+    env = worlds.make(cfg.compare_worlds, "which is better", fine=True)
+    return partial(try_out, env, seed=worlds.seed_of("episodes that compare"))
+
+
+def better_of_ppo(
+    play: Callable[[StateActor], Played], out: Path, improved: ExpertResult
+) -> tuple[Expert, int, Played]:
+    """Return the better one of PPO's two policies, its gradient steps and its episodes.
+
+    The best in training had the highest of many noisy rates; the last one is often better.
+    """
+    updates = (improved.actor_updates, improved.last_actor_updates)
+    experts = (Expert.load(out), Expert.load(out / LAST_FOLDER))
+    played = [play(StateActor(expert.act)) for expert in experts]
+    chosen = int(np.argmax([p.score for p in played]))
+    return experts[chosen], updates[chosen], played[chosen]
 
 
 def _say_unchanged(title: str, improved: ExpertResult, student: Path | None) -> None:
