@@ -175,3 +175,24 @@ def test_going_straight_at_the_side_of_a_tall_thing_pays_less_than_being_above_i
     beside, above = moments.pay([{"eef_pos": grasp + np.array([0.06, 0, z])} for z in (0.0, 0.06)])
 
     assert above > beside
+
+
+def test_the_way_down_to_a_fork_leads_around_the_container_and_not_over_its_rim():
+    moments = Moments("insert")
+    fork, container = moments.start("fork"), moments.start("container")
+    side = (fork - container)[:2] / np.linalg.norm((fork - container)[:2])
+    rim = moments.widest("container") / 2
+
+    def at(beside: float, above: float) -> dict[str, Any]:
+        """The tool so far from the container's middle towards the fork, and so high above its rim."""
+        return {"eef_pos": np.append(container[:2] + beside * side, 2 * container[2] + above)}
+
+    around = [at(0, 0.07), at(rim, 0.07), at(rim + 0.05, 0.07), {"eef_pos": fork}]
+    low, on_rim = at(0.5 * rim, 0.03), at(rim, 0.01)
+    with_fork = on_rim | {"fork_pos": on_rim["eef_pos"], "fork_grasped": 1.0}
+
+    paid = moments.pay(around)
+    price = moments.pay([*around, low, on_rim, with_fork], "clear_of_other")
+
+    assert price == [0, 0, 0, 0, pytest.approx(-0.5, abs=0.02), pytest.approx(-0.83, abs=0.02), 0]
+    assert all(np.diff(paid) > 0), paid

@@ -287,6 +287,8 @@ def _carry(
         extras=[
             LEAVE_REF,
             ("not_too_high", "-2.0 * (height - 0.12).clamp(0.0, 0.3)"),
+            # The straight way down to the object may lead through the other one: fingers knocked over its rim.
+            ("clear_of_other", "-1.0 * low_over_other * (1 - gripped) * (1 - arrived.float())"),
             # Summed over the way it costs as much as it would earn at the goal, at whatever speed. It grows along the way and
             # is paid for what the pads drag, not for what fell: where it began at once, everything was held before that line.
             (
@@ -307,4 +309,7 @@ def _carry_stages(falls_m: float) -> list[str]:
         # From any height: with a slope that ended at 15 cm, a matchbox was held 20 cm above its goal for good.
         "lowered = 0.5 * (1 - above_goal / 0.4).clamp(0.0, 1.0) + 0.5 * (1 - above_goal / 0.1).clamp(0.0, 1.0)",
         f"opened = (gripper_width / 0.085).clamp(0.0, 1.0) * (1 - above_goal / {falls_m}).clamp(0.0, 1.0)",
+        "from_other = torch.norm((eef_pos - ref_pos)[:, :2], dim=-1) - torch.maximum(ref_size[:, 0], ref_size[:, 1]) / 2",
+        "too_low = ((ref_pos[:, 2] + ref_size[:, 2] / 2 + 0.06 - eef_pos[:, 2]) / 0.06).clamp(0.0, 1.0)",
+        "low_over_other = too_low * (1 - from_other / 0.05).clamp(0.0, 1.0)",
     ]
