@@ -268,7 +268,7 @@ def better_of_ppo(
 ) -> tuple[Expert, int, Played]:
     """Return the better one of PPO's two policies, its gradient steps and its episodes.
 
-    The best in training had the highest of many noisy rates; the last one is often better.
+    The best in training had the highest of many noisy rates; the last one is as often the better one.
     """
     updates = (improved.actor_updates, improved.last_actor_updates)
     experts = (Expert.load(out), Expert.load(out / LAST_FOLDER))
