@@ -108,21 +108,18 @@ def learn(
         on_progress: told the share that is done and a few words.
     """
     taught = None
-    steps, seconds = 0, 0.0
     if cfg.teacher == "programs":
         trial_env = worlds.make(cfg.trial_worlds, "trials")
         taught = teach(
             worlds, trial_env, cfg, out / TAUGHT_FOLDER,
             on_progress=lambda share, words: on_progress(PROGRESS_TAUGHT * share, words),
         )  # fmt: skip
-        steps, seconds = taught.steps, taught.seconds
         del trial_env
     student = taught.folder if taught else None
     env = _training_worlds(worlds, cfg, device, is_taught=student is not None)
     ranked = rank_solved(worlds.bundle, env.worlds.obs_dim, solved) if student is None else []
     other = ranked[0].folder if ranked else None
-    if other is not None:
-        logger.info("PPO starts from %s", other)
+    logger.info("PPO starts from %s", student or other or "nothing")
     begun = PROGRESS_TAUGHT if student else 0.0
     improved = improve_by_ppo(
         env,
@@ -139,11 +136,11 @@ def learn(
     elif student is not None:
         comparison, updates = keep_better(worlds, cfg, student, out, improved)
     else:
-        expert, updates, _ = better_of_ppo(_exams(worlds, cfg), out, improved)
-        expert.save(out)
+        best, updates, _ = better_of_ppo(_exams(worlds, cfg), out, improved)
+        best.save(out)
     return Learned(
-        steps=steps + improved.steps,
-        seconds=seconds + improved.seconds,
+        steps=improved.steps + (taught.steps if taught else 0),
+        seconds=improved.seconds + (taught.seconds if taught else 0.0),
         actor_updates=updates,
         teacher=taught.program if taught and student else "",
         trials=taught.trials if taught else (),
