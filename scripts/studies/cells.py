@@ -250,6 +250,7 @@ class Study:
         """
         began = time.monotonic()
         row: Row = {"arm": arm, "n": count, "seed": seed, "study": self.identity}
+        row["kind"] = self.cfg.pool.kind
         if arm == "cop":
             play: Play = _programs
             row["seconds"] = {}

@@ -18,6 +18,7 @@ from .fits import (
     fit_laws,
     rate,
 )
+from .table import is_lifting
 
 COLOURS = (
     "#0072b2",
@@ -69,12 +70,9 @@ def _success(axes: Axes, rows: list[Row]) -> None:
         axes.errorbar(n, value, yerr=spread, marker="o", capsize=3, **_style(arm))
         end = [r.value for cells in found.values() if (r := rate(cells, "at_end"))]
         axes.plot(n, end, linestyle="--", linewidth=1, color=_style(arm)["color"])
-    axes.plot(
-        [papers_value("recipe/lifting videos")],
-        [papers_value("figure 5/BC-V2P")],
-        "k*",
-        label="paper (other scenes, other robot)",
-    )
+    if is_lifting(rows):
+        at = papers_value("recipe/lifting videos"), papers_value("figure 5/BC-V2P")
+        axes.plot(*at, "k*", label="paper (other scenes, other robot)")
     axes.set(
         title="Ten unseen objects: once (solid, 95 %), at the end (dashed)",
         xlabel="training tasks N", ylabel="success", ylim=(0, 1.02),

@@ -8,7 +8,6 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup, escape
 
-from paper_tables import lifting_text
 from v2p_data.report.media import MediaBudget, film_uri
 
 from .cells import FILMS_FOLDER
@@ -21,6 +20,7 @@ from .table import (
     failures_table,
     laws_text,
     objects_table,
+    paper_text,
     rates_table,
 )
 
@@ -29,7 +29,7 @@ FILM_PX, FILM_FRAMES = 160, 120
 _TEMPLATE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'">
-<title>Lifting what nobody trained on</title>
+<title>What nobody trained on</title>
 <style>
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
 .wide { overflow-x: auto } table { border-collapse: collapse; font-size: 13px; margin: 1rem 0 }
@@ -37,8 +37,8 @@ td, th { border: 1px solid #8888; padding: .2rem .5rem; text-align: left } img {
 .films { display: flex; flex-wrap: wrap; gap: .8rem } figure { margin: 0; width: 160px; font-size: 12px }
 video { width: 160px; image-rendering: pixelated }
 </style></head><body>
-<h1>Lifting what nobody trained on</h1>
-<p>Policies learned to lift N objects and were judged on ten others. {{ paper }}</p>
+<h1>What nobody trained on</h1>
+<p>Policies learned on N objects and were judged on ten others. {{ paper }}</p>
 <ul>{% for arm, words in arms.items() %}<li><b>{{ arm }}</b>: {{ words }}</li>{% endfor %}</ul>
 <img src="{{ figure }}" alt="Success and failure against N, success per object, kinds of failure: see the tables">
 {% for title, part in parts %}<h2>{{ title }}</h2><div class="wide">{{ part }}</div>{% endfor %}
@@ -87,7 +87,7 @@ def write_page(rows: list[Row], out: Path, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
         page.render(
-            paper=lifting_text(),
+            paper=paper_text(rows),
             arms=ARMS,
             figure=Markup(figure),
             parts=[(title, as_html(text)) for title, text in parts.items() if text],

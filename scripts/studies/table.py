@@ -23,8 +23,18 @@ def table(rows: list[Row]) -> str:
     """Return all tables, one after the other."""
     parts = [rates_table(rows), objects_table(rows), laws_text(rows), differences_table(rows)]
     return "\n\n".join(
-        [p for p in (*parts, failures_table(rows), costs_table(rows), lifting_text()) if p]
+        [p for p in (*parts, failures_table(rows), costs_table(rows), paper_text(rows)) if p]
     )
+
+
+def is_lifting(rows: list[Row]) -> bool:
+    """Tell whether the study asks for what the paper's figures are about; lines without a kind do."""
+    return {row.get("kind", "lift_up") for row in rows} == {"lift_up"}
+
+
+def paper_text(rows: list[Row]) -> str:
+    """Return what the paper says of unseen objects; nothing where the study does not lift."""
+    return lifting_text() if is_lifting(rows) else ""
 
 
 def rates_table(rows: list[Row]) -> str:

@@ -391,6 +391,20 @@ def test_tables_figure_and_page_hold_every_arm_and_need_nothing_from_outside(par
     assert (tmp_path / "figure.png").stat().st_size > 20_000
 
 
+def test_a_study_of_another_kind_of_task_shows_none_of_the_papers_figures_on_lifting(
+    parts, tmp_path
+):
+    shown = {}
+    for kind in ("lift_up", "place_onto"):
+        rows = [{**row("videos", 5, 0, "1110"), "kind": kind}]
+        parts.page.write_page(rows, tmp_path, tmp_path / "study.html")
+        parts.figure.write_figure(rows, tmp_path / "figure.svg")
+        texts = parts.table.table(rows), *(p.read_text() for p in sorted(tmp_path.glob("*.*")))
+        shown[kind] = ["other robot" in text for text in texts]
+
+    assert shown == {"lift_up": [True] * 3, "place_onto": [False] * 3}
+
+
 def test_table_cells_with_markup_do_not_reach_the_page_as_markup(parts):
     html = parts.page.as_html("| a |\n|---|\n| <script>x</script> |")
 
