@@ -301,7 +301,7 @@ def _carry(
 
 
 def _carry_stages(falls_m: float) -> list[str]:
-    """Return lines for the reward that measure raising, carrying, lowering and opening."""
+    """Return lines for the reward that measure raising, carrying, lowering, opening, and being low over the other object."""
     return [
         "raised = (height / 0.08).clamp(0.0, 1.0)",
         "way = torch.norm((goal_point - obj_start)[:, :2], dim=-1).clamp(min=0.05)",
