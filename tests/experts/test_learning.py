@@ -1,5 +1,6 @@
 """A task becomes an expert: by a teacher and PPO, or by PPO alone."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from policies.ppo.config import ActorConfig, ImitationConfig, PPOConfig
 from policies.ppo.policy import ActorCritic, Expert, weights_of
 from policies.ppo.train import ExpertResult
 from v2p_data.errors import ItemRejectedError
+from v2p_data.experts import learning
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import (
     TAUGHT_FOLDER,
@@ -79,6 +81,16 @@ def improved_in(folder: Path) -> ExpertResult:
         seconds=1.0,
         stopped_by="steps",
     )
+
+
+def who_acts_so(obs: np.ndarray, wanted: np.ndarray) -> Callable[[StateActor], Played]:
+    """Return what plays 16 episodes, which succeed with the policy that answers `obs` with `wanted` only."""
+
+    def play(actor: StateActor) -> Played:
+        succeeds = np.full(16, np.array_equal(actor.function(obs), wanted))
+        return Played(at_end=succeeds, steps=np.where(succeeds, 10, 101), horizon=100)
+
+    return play
 
 
 def are_equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -162,14 +174,30 @@ def test_of_the_best_in_training_and_the_last_policy_the_one_that_does_better_on
     obs = np.ones((16, 5), np.float32)
     wanted = Expert.load(tmp_path / better).act(obs)
 
-    def play(actor: StateActor) -> Played:
-        succeeds = np.full(16, np.array_equal(actor.function(obs), wanted))
-        return Played(at_end=succeeds, steps=np.where(succeeds, 10, 101), horizon=100)
-
-    kept = better_of_ppo(play, tmp_path / "ppo", improved_in(tmp_path / "ppo"))
+    kept = better_of_ppo(who_acts_so(obs, wanted), tmp_path / "ppo", improved_in(tmp_path / "ppo"))
 
     assert np.array_equal(kept[0].act(obs), wanted)
     assert kept[1] == updates
+
+
+@pytest.mark.parametrize(("better", "updates"), [("", 7), ("last", 9)])
+def test_without_a_teacher_the_expert_is_the_better_one_of_ppos_two_policies(
+    better: str, updates: int, bundle: TaskBundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    worlds = Worlds(bundle=bundle, seed=3)
+    dim = worlds.make(1, "shape").obs_dim
+    for seed, name in enumerate(("", "last")):
+        save_random_expert(tmp_path / name, dim, seed=seed)
+    obs = np.ones((16, dim), np.float32)
+    wanted = Expert.load(tmp_path / better).act(obs)
+    play = who_acts_so(obs, wanted)
+    monkeypatch.setattr(learning, "try_out", lambda env, actor, seed: play(actor))
+    monkeypatch.setattr(learning, "improve_by_ppo", lambda *_, **__: improved_in(tmp_path))
+
+    learned = learn(worlds, replace(TINY, teacher="none"), tmp_path)
+
+    assert np.array_equal(Expert.load(tmp_path).act(obs), wanted)
+    assert learned.actor_updates == updates
 
 
 @pytest.mark.parametrize(
