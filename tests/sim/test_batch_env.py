@@ -13,6 +13,7 @@ from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.env.task_code import HELD_STEPS
+from v2p_data.sim.env.verdict import GRIPPER_KEYS, outer_sides
 from v2p_data.sim.model.world import CAMERA
 from v2p_data.sim.render.masks import FIRST_OBJECT, MaskRenderer
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
@@ -551,3 +552,23 @@ def test_episode_parameters_are_those_of_the_world(make_env: Callable[..., Batch
         env.states()["cube_start_pos"][4].tolist(), abs=1e-5
     )
     assert env._sim.qpos[4, 7] == FINGER_TRAVEL_M
+
+
+def test_the_fingers_end_where_the_referee_takes_their_outer_sides(
+    make_env: Callable[..., BatchEnv],
+):
+    env = make_env(cfg=CALM, num_envs=2)
+    data = mujoco.MjData(env.world.model)
+    data.qpos[:] = env.motion()[0][0]
+    mujoco.mj_forward(env.world.model, data)
+
+    states = env.states()
+    sides = outer_sides(*(states[key].numpy().astype(float) for key in GRIPPER_KEYS))[0]
+
+    tool, hand = data.site("tcp").xpos, data.site("tcp").xmat.reshape(3, 3)
+    for side, pad in zip(sides, ("pad_left", "pad_right"), strict=True):
+        geom = data.geom(pad)
+        half = env.world.model.geom(pad).size[1]
+        outside = abs(hand.T @ (geom.xpos - tool))[1] + half
+        np.testing.assert_allclose(abs(hand.T @ (side - tool)), [0.0, outside, 0.0], atol=1e-6)
+        assert np.linalg.norm(side - geom.xpos) < 0.03

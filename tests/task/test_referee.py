@@ -3,6 +3,7 @@ import pytest
 
 from v2p_data.geometry.camera import Camera, intrinsics, look_at
 from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.sim.robot.robot import FINGER_THICKNESS_M
 from v2p_data.task.referee import RULES, ObjectTrack, Trajectory, referee_success
 
 STEPS = 20
@@ -48,6 +49,7 @@ def verdict(kind, tracks, *objects) -> bool:
     trajectory = Trajectory(
         objects=dict(zip([o.name for o in objects], tracks, strict=True)),
         eef_pos=np.zeros((STEPS, 1, 3)),
+        finger_pos=np.zeros((STEPS, 1, 2, 3)),
     )
     return bool(referee_success(kind, scene(kind, *objects), trajectory)[0])
 
@@ -197,10 +199,15 @@ def test_what_moves_by_itself_is_no_success_and_a_finger_beside_it_is_enough():
     alone = track(HERE, (0.5, 0.1, 0.02), touched_before=False)
     objects = {"box": alone}
 
-    def judged(tool_at) -> bool:
-        course = Trajectory(objects=objects, eef_pos=np.tile(tool_at, (STEPS, 1, 1)))
+    def judged(tool_at, half_open_m=0.0) -> bool:
+        tool = np.tile(tool_at, (STEPS, 1, 1))
+        side = np.array([0.0, half_open_m + FINGER_THICKNESS_M, 0.0])
+        fingers = np.stack([tool + side, tool - side], axis=2)
+        course = Trajectory(objects=objects, eef_pos=tool, finger_pos=fingers)
         return bool(referee_success("push_left", scene("push_left", BOX), course)[0])
 
     # The box's right side is at y = -2 cm when it starts.
     assert not judged((0.5, -0.07, 0.02))
     assert judged((0.5, -0.05, 0.02))
+    assert judged((0.5, -0.07, 0.02), half_open_m=0.0425)
+    assert not judged((0.5, -0.1, 0.02), half_open_m=0.0425)

@@ -35,6 +35,9 @@ STEADY_M = 0.05
 REACHED_M = 0.04
 """The gripper was at a thing if its tool centre came this near its box: fingers also push with their sides, which no
 pad feels. Pushes without a pad came within 2.2 cm in 64 episodes; arms start at least 5 cm away."""
+FINGER_REACHED_M = 0.02
+"""The same for the outer side of a finger, 5.5 cm beside the tool's centre if the gripper is open: its tip is 1.5 cm lower.
+What it hits may be gone at the next sample, so the thing is taken where it was one sample before."""
 FALLEN_RAD = np.deg2rad(60)
 STANDS_RAD = np.deg2rad(25)
 
@@ -75,6 +78,12 @@ class ObjectTrack:
         flat = Rotation.from_quat(self.quat_wxyz.reshape(-1, 4), scalar_first=True).as_matrix()
         return flat.reshape(*self.quat_wxyz.shape[:2], 3, 3)
 
+    def outside(self, point: Float[np.ndarray, "step env 3"]) -> Float[np.ndarray, "step env"]:
+        """Return how far points are from the object's box at the first samples, as many as there are points [m]."""
+        n = len(point)
+        local = np.einsum("tejk,tej->tek", self.axes[:n], point - self.pos[:n])
+        return np.linalg.norm(np.maximum(np.abs(local) - self.size_m / 2, 0.0), axis=-1)
+
     def leaned(self) -> Float[np.ndarray, "env"]:
         """Return the angle between its own z axis at the start and at the end [rad]."""
         z = self.axes[..., 2]
@@ -87,6 +96,8 @@ class Trajectory:
 
     objects: dict[str, ObjectTrack]
     eef_pos: Float[np.ndarray, "time env 3"]
+    finger_pos: Float[np.ndarray, "time env 2 3"]
+    """Outer sides of the two fingers, at the height of the tool's centre."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,14 +163,12 @@ class Case:
 
     def was_reached(self) -> Bool[np.ndarray, "env"]:
         """Tell whether the robot has been at the object that moved, or has touched the tool that pushed it."""
-        thing = self.thing
-        away = np.einsum(
-            "tejk,tej->tek", thing.axes, self.trajectory.eef_pos - thing.pos
-        )  # in the object's own frame
-        outside = np.maximum(np.abs(away) - thing.size_m / 2, 0.0)
+        thing, fingers = self.thing, self.trajectory.finger_pos
         reached = np.linalg.norm(np.ptp(thing.pos, axis=0), axis=-1) < REST_M  # then nothing moved
         reached |= thing.touched.any(axis=(0, 2))
-        reached |= (np.linalg.norm(outside, axis=-1) < REACHED_M).any(axis=0)
+        reached |= (thing.outside(self.trajectory.eef_pos) < REACHED_M).any(axis=0)
+        for side in (fingers[1:, :, 0], fingers[1:, :, 1]):
+            reached |= (thing.outside(side) < FINGER_REACHED_M).any(axis=0)
         if KINDS[self.scene.kind].grasps == "tool":
             reached |= self.other.touched.any(axis=(0, 2))
         return reached

@@ -3,11 +3,15 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.robot.robot import FINGER_THICKNESS_M
 from v2p_data.task.referee import ObjectTrack, Trajectory, referee_success
 from v2p_data.task.task import TaskBundle
+
+GRIPPER_KEYS = ("eef_pos", "eef_quat", "gripper_width")
 
 
 def referee_verdict(
@@ -26,8 +30,25 @@ def referee_verdict(
         )
         for obj in bundle.scene.objects
     }
-    trajectory = Trajectory(objects=objects, eef_pos=history["eef_pos"].astype(float))
+    trajectory = Trajectory(
+        objects=objects,
+        eef_pos=history["eef_pos"].astype(float),
+        finger_pos=outer_sides(*(history[key].astype(float) for key in GRIPPER_KEYS)),
+    )
     return referee_success(bundle.kind, bundle.scene, trajectory)
+
+
+def outer_sides(
+    eef_pos: Float[np.ndarray, "*n 3"],
+    eef_quat: Float[np.ndarray, "*n 4"],
+    gripper_width: Float[np.ndarray, "*n"],
+) -> Float[np.ndarray, "*n 2 3"]:
+    """Return where the outer sides of the two fingers are, at the height of the tool's centre [m]."""
+    apart = np.zeros_like(eef_pos)
+    apart[..., 1] = gripper_width / 2 + FINGER_THICKNESS_M
+    turn = Rotation.from_quat(eef_quat.reshape(-1, 4), scalar_first=True)
+    turned = turn.apply(apart.reshape(-1, 3)).reshape(apart.shape)
+    return np.stack([eef_pos + turned, eef_pos - turned], axis=-2)
 
 
 class RefereeRecord:
@@ -39,7 +60,7 @@ class RefereeRecord:
 
     def __init__(self, env: BatchEnv) -> None:
         self._env = env
-        self._keys = ["eef_pos"] + [
+        self._keys = [*GRIPPER_KEYS] + [
             f"{name}_{key}"
             for name in env.object_names
             for key in ("pos", "quat", "size", "touched", "grasped")
