@@ -227,7 +227,7 @@ def test_mujoco_loads_every_file_without_a_warning(folder, scene):
     assert said == []
 
 
-def test_models_weigh_what_the_scene_says(folder, scene):
+def test_models_weigh_and_slide_as_the_scene_says(folder, scene):
     together = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     for thing in scene.objects:
         models = [mujoco.MjModel.from_xml_path(str(folder / f)) for f in (thing.mjcf, thing.urdf)]
@@ -236,6 +236,7 @@ def test_models_weigh_what_the_scene_says(folder, scene):
             body = model.body(thing.name)
             assert body.mass[0] == pytest.approx(thing.mass_kg, rel=1e-4)
             assert body.inertia.max() < thing.mass_kg * max(thing.size_m) ** 2
+    assert together.geom("table").friction[0] < min(thing.friction for thing in scene.objects)
 
 
 def test_the_moments_of_a_box_are_those_of_the_school_book(folder, scene):

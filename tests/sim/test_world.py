@@ -124,6 +124,21 @@ def test_a_container_fills_its_size_and_is_open(is_round: bool, upside_down: boo
         assert max(corners) <= 0.0601
 
 
+@pytest.mark.parametrize("friction", [0.3, 1.2])
+def test_an_object_slides_on_the_table_with_its_own_friction(
+    friction: float, make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]
+):
+    world = build_world(make_scene(replace(make_object("thing"), friction=friction)), FINE)
+    data = mujoco.MjData(world.model)
+    data.qpos[world.objects[0].qpos_adr :][:3] = 0.5, 0.5, 0.02
+
+    mujoco.mj_step(world.model, data, nstep=50)
+
+    touching = [c for c in data.contact if world.model.geom("table").id in c.geom]
+    assert touching
+    np.testing.assert_allclose([c.friction[0] for c in touching], friction)
+
+
 @pytest.mark.parametrize("physics", [COARSE, FINE], ids=["coarse", "fine"])
 def test_a_ball_dropped_into_a_bowl_comes_to_rest_on_its_floor(
     physics, make_object: Callable[..., SceneObject], make_scene: Callable[..., Scene]

@@ -21,7 +21,13 @@ from v2p_data.geometry.pose import pose_from_transform
 from v2p_data.scene.data_types import Estimate, Reconstruction
 from v2p_data.scene.files import own_file
 from v2p_data.scene.overlay import write_overlay
-from v2p_data.scene.scene import Scene, SceneObject, StageConfidence, write_masks
+from v2p_data.scene.scene import (
+    Scene,
+    SceneObject,
+    StageConfidence,
+    friction_attribute,
+    write_masks,
+)
 from v2p_data.scene.schema import MAX_FILE_BYTES, Shape
 
 MJCF_FILE = "scene.xml"
@@ -87,8 +93,15 @@ def _scene_mjcf(scene: Scene, bodies: list[_Body]) -> ET.Element:
     )
     asset, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
     ET.SubElement(world, "light", pos="0 0 2", dir="0 0 -1")
-    table = {"name": "table", "type": "plane", "size": "1 1 0.1", "rgba": "0.8 0.75 0.7 1"}
-    ET.SubElement(world, "geom", table)
+    ET.SubElement(
+        world,
+        "geom",
+        name="table",
+        type="plane",
+        size="1 1 0.1",
+        friction=friction_attribute(0.0),
+        rgba="0.8 0.75 0.7 1",
+    )
     ET.SubElement(
         world,
         "camera",
@@ -131,12 +144,19 @@ def _add_body(
         fullinertia=_numbers([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]),
     )
     look = {"rgba": _numbers(thing.rgba)}
-    touch = {"friction": f"{thing.friction:.4g} 0.005 0.0001"}
-    half = np.array(thing.size_m) / 2
-    sizes = {"box": half, "sphere": half[:1], "cylinder": half[[0, 2]]}
+    touch = {"friction": friction_attribute(thing.friction)}
     if thing.shape != "mesh":
-        form = {"type": thing.shape, "size": _numbers(sizes[thing.shape])}
-        ET.SubElement(element, "geom", {"name": thing.name, **form, **look, **touch})
+        half = np.array(thing.size_m) / 2
+        size = {"box": half, "sphere": half[:1], "cylinder": half[[0, 2]]}[thing.shape]
+        ET.SubElement(
+            element,
+            "geom",
+            name=thing.name,
+            type=thing.shape,
+            size=_numbers(size),
+            **look,
+            **touch,
+        )
         return
     for file in dict.fromkeys((thing.mesh, *thing.parts)):
         # The body's own inertia counts; MuJoCo refuses thin solids unless it takes them for shells.

@@ -72,6 +72,7 @@ class SceneObject:
     """Full extents along the object's own x, y, z. Cylinders: (diameter, diameter, height), axis z."""
     mass_kg: float
     friction: float
+    """Sliding friction on a wooden table."""
     hollow: bool = False
     """Open at the top: a bowl, a cup, a box without a lid."""
     mesh: str = ""
@@ -188,6 +189,11 @@ def _check_unpacked(path: Path) -> None:
 def hollow_floor_m(height_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Return how thick the floor of a hollow object is simulated, given its height [m]."""
     return np.clip(0.2 * height_m, FLOOR_MIN_M, FLOOR_MAX_M)
+
+
+def friction_attribute(sliding: float) -> str:
+    """Return MuJoCo's `friction` of an object; the table's with 0, because the larger one of two geoms counts."""
+    return f"{sliding:.6g} 0.005 0.0001"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS
-from v2p_data.scene.scene import Scene, SceneObject, hollow_floor_m
+from v2p_data.scene.scene import Scene, SceneObject, friction_attribute, hollow_floor_m
 from v2p_data.sim.model.solids import solids_of
 from v2p_data.sim.model.suitability import check_grasp, check_names, checked_size
 from v2p_data.sim.robot.arms import BUILT_IN, Robot, RobotConfig, read_arm, sensor_ends
@@ -151,7 +151,7 @@ def build_world(
         f"<asset>{''.join(d.form.asset_xml for d in drafts)}</asset>"
         f'<worldbody><light pos="0.5 -0.5 2" dir="0 0.2 -1" castshadow="false"/>{_camera_xml()}'
         '<geom name="table" type="plane" size="1.5 1.5 0.1" contype="1" conaffinity="3" condim="4" '
-        f'friction="0.8 0.005 0.0001" solref="{physics.solref_s} 1" rgba="0.55 0.5 0.45 1"/>'
+        f'friction="{friction_attribute(0.0)}" solref="{physics.solref_s} 1" rgba="0.55 0.5 0.45 1"/>'
         f"{bodies}{''.join(d.body_xml(physics) for d in drafts)}</worldbody>"
         f"{driven}<sensor>{sensors}</sensor></mujoco>"
     )
@@ -284,7 +284,7 @@ class _Draft:
                 form = f'type="{part.kind}" size="{xml_row(size)}" pos="{xml_row(part.pos)}" euler="0 0 {part.yaw_rad:.9g}"'
             geoms += (
                 f'<geom name="{o.name}_{k}" {form} contype="1" conaffinity="3" condim="4" '
-                f'friction="{o.friction:.6g} 0.005 0.0001" solref="{physics.solref_s} 1" rgba="{xml_row(o.rgba)}"/>'
+                f'friction="{friction_attribute(o.friction)}" solref="{physics.solref_s} 1" rgba="{xml_row(o.rgba)}"/>'
             )
         return (
             f'<body name="{o.name}" pos="0.5 0 {self.form.size_m[2] / 2:.6g}"><freejoint name="{o.name}"/>'
