@@ -241,7 +241,7 @@ def task_stage(scene: Stage, cfg: EngineConfig) -> Stage:
         config=Seeded(config=cfg.task.recipe(), seed=cfg.seed),
         inputs={"scene": scene},
         sources=_robot_digests(robot) | task_data(asks_model=cfg.task.writer == "vlm"),
-        version=3,
+        version=4,
         make=partial(make_task, robot=robot, how=cfg.task),
     )
 
@@ -664,7 +664,7 @@ def evaluation_stage(
             **who.sources,
             **{f"task {name}": _code_digest(path) for name, path in tasks.items()},
         },
-        version=3,
+        version=4,
         on_device=True,
         make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=tuple(seen)),
     )
