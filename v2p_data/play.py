@@ -235,10 +235,10 @@ def play(
             view.action = _carried_out(actor.act(view), view)
         with view.watch.on("physics"):
             view.result = view.step(view.action)
-            view.obs = view.result.obs
-            view.t += 1
-            for note in observers:
-                note(view)
+        view.obs = view.result.obs
+        view.t += 1
+        for note in observers:
+            note(view)
         if until is not None:
             view.going &= ~until(view)
             if not view.going.any():
