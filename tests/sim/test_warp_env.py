@@ -220,7 +220,7 @@ def test_a_pushed_object_moves_as_on_the_cpu_from_step_to_step(
     apart = []
     for _ in range(16):
         action = np.zeros((8, 7))
-        action[:, 1], action[:, 6] = -0.25, 1.0
+        action[:, 1], action[:, 6] = -0.2, 1.0
         continue_from(pair)
         play(pair, action)
         away = seen(pair[0])["cube_pos"] - seen(pair[1])["cube_pos"]

@@ -99,7 +99,7 @@ def _scene_mjcf(scene: Scene, bodies: list[_Body]) -> ET.Element:
         name="table",
         type="plane",
         size="1 1 0.1",
-        friction=friction_attribute(0.0),
+        friction=friction_attribute(),
         rgba="0.8 0.75 0.7 1",
     )
     ET.SubElement(

@@ -191,8 +191,8 @@ def hollow_floor_m(height_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]
     return np.clip(0.2 * height_m, FLOOR_MIN_M, FLOOR_MAX_M)
 
 
-def friction_attribute(sliding: float) -> str:
-    """Return MuJoCo's `friction` of an object; the table's with 0, because the larger one of two geoms counts."""
+def friction_attribute(sliding: float = 1e-5) -> str:
+    """Return MuJoCo's `friction` of an object; by default the table's, the least that MuJoCo takes: the larger one of two geoms counts."""
     return f"{sliding:.6g} 0.005 0.0001"
 
 

@@ -151,7 +151,7 @@ def build_world(
         f"<asset>{''.join(d.form.asset_xml for d in drafts)}</asset>"
         f'<worldbody><light pos="0.5 -0.5 2" dir="0 0.2 -1" castshadow="false"/>{_camera_xml()}'
         '<geom name="table" type="plane" size="1.5 1.5 0.1" contype="1" conaffinity="3" condim="4" '
-        f'friction="{friction_attribute(0.0)}" solref="{physics.solref_s} 1" rgba="0.55 0.5 0.45 1"/>'
+        f'friction="{friction_attribute()}" solref="{physics.solref_s} 1" rgba="0.55 0.5 0.45 1"/>'
         f"{bodies}{''.join(d.body_xml(physics) for d in drafts)}</worldbody>"
         f"{driven}<sensor>{sensors}</sensor></mujoco>"
     )
