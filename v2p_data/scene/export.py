@@ -146,17 +146,9 @@ def _add_body(
     look = {"rgba": _numbers(thing.rgba)}
     touch = {"friction": friction_attribute(thing.friction)}
     if thing.shape != "mesh":
-        half = np.array(thing.size_m) / 2
-        size = {"box": half, "sphere": half[:1], "cylinder": half[[0, 2]]}[thing.shape]
-        ET.SubElement(
-            element,
-            "geom",
-            name=thing.name,
-            type=thing.shape,
-            size=_numbers(size),
-            **look,
-            **touch,
-        )
+        axes = {"box": [0, 1, 2], "sphere": [0], "cylinder": [0, 2]}[thing.shape]
+        form = {"type": thing.shape, "size": _numbers(np.array(thing.size_m)[axes] / 2)}
+        ET.SubElement(element, "geom", {"name": thing.name, **form, **look, **touch})
         return
     for file in dict.fromkeys((thing.mesh, *thing.parts)):
         # The body's own inertia counts; MuJoCo refuses thin solids unless it takes them for shells.
