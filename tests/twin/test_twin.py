@@ -1,7 +1,6 @@
 """The twin: its mechanisms, what it tells and hides, and that it is fixed."""
 
 from dataclasses import fields, replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -339,12 +338,3 @@ def test_the_nominal_kinematics_are_those_of_the_training_simulator():
     np.testing.assert_allclose(pose.pos, tool.pos[0])
     turn = pose.rotation * Rotation.from_quat(tool.quat_wxyz[0], scalar_first=True).inv()
     assert turn.magnitude() < 1e-9
-
-
-def test_the_page_on_the_twin_has_every_parameter_as_it_was_drawn():
-    page = (Path(__file__).parents[2] / "docs" / "twin.md").read_text()
-    for f in fields(nominal()):
-        value = np.atleast_1d(getattr(nominal(), f.name))
-        low, high = f.metadata["low"], f.metadata["high"]
-        shown = ", ".join(f"{v:.3g}" for v in value)
-        assert f"| `{f.name}` | {low:g} to {high:g} | {shown} | {f.metadata['source']} |" in page
