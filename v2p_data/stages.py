@@ -42,7 +42,6 @@ from v2p_data.evaluation.judging import (
 )
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.labeller import choose_program, labeller_of
-from v2p_data.experts.solved import find_solved, solved_digests
 from v2p_data.pipeline.artifact import (
     Record,
     demand_whole,
@@ -371,14 +370,13 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
     return Stage(
         name="expert",
         item=task.item,
-        config=Seeded(config=replace(cfg.expert, warm_start=None), seed=cfg.seed),
+        config=Seeded(config=cfg.expert, seed=cfg.seed),
         inputs={"task": task},
-        sources=solved_digests(cfg.expert.warm_start) | named,
+        sources=named,
         version=6,
         on_device=True,
         make=partial(
             make_expert,
-            warm_start=cfg.expert.warm_start,
             teaches_model=cfg.task.writer == "vlm",
             bonus_ratio=bonus,
         ),
@@ -391,7 +389,6 @@ def make_expert(
     out: Path,
     runtime: Runtime,
     *,
-    warm_start: Path | None,
     teaches_model: bool,
     bonus_ratio: float,
 ) -> dict[str, Any]:
@@ -404,7 +401,7 @@ def make_expert(
     bundle = TaskBundle.load(inputs["task"])
     check_task(bundle, num_threads=runtime.num_threads)
     check_reward(bundle)
-    learned = _learned(bundle, cfg, out, runtime, warm_start=warm_start, bonus_ratio=bonus_ratio)
+    learned = _learned(bundle, cfg, out, runtime, bonus_ratio=bonus_ratio)
     runtime.progress(0.95, "judging at the fine step")
     judged = judge_expert(
         Lesson(bundle=bundle, expert=labeller_of(out)),
@@ -440,7 +437,6 @@ def _learned(
     out: Path,
     runtime: Runtime,
     *,
-    warm_start: Path | None,
     bonus_ratio: float,
 ) -> "Learned":
     """Let an expert learn the task, or choose the program that acts in its place."""
@@ -459,7 +455,6 @@ def _learned(
         cfg.config,
         out,
         device=runtime.device,
-        solved=find_solved(warm_start) if warm_start else (),
         on_progress=lambda share, words: runtime.progress(0.95 * share, words),
     )
 

@@ -109,7 +109,7 @@ def test_the_papers_settings_are_the_papers_numbers():
     assert (cfg.reward.method, cfg.reward.without, cfg.reward.start) == ("v2p", (), "nothing")
     assert cfg.reward.paid_bonus_ratio == 100
     assert cfg.reward.steps_at_most() < cfg.reward.steps_without_halving()
-    assert (cfg.expert.teacher, cfg.expert.warm_start) == ("none", None)
+    assert cfg.expert.teacher == "none"
     assert (cfg.episodes.num_episodes, cfg.distillation.rounds) == (100, 0)
     # What `v2p train` reads of it is the preset, whatever stands before the dataset.
     assert cfg.policy == PolicyConfig(preset="paper")

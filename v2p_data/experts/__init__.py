@@ -5,7 +5,6 @@ training, and `taught/`, the policy that imitation gave. Reading order:
 
     primitives   scripted motions: reach, grasp, carry, push, throw
     teacher      scripted policies made of them, and the search for the best one
-    solved       experts of other tasks as starting points
     labeller     who demonstrates and labels: the network, or a program itself
     learning     the three steps: teach, improve by PPO, keep the better one
 """

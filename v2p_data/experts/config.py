@@ -1,7 +1,6 @@
 """Settings of the expert stage, without the libraries that train."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 from policies.ppo.config import ImitationConfig, PPOConfig
@@ -21,9 +20,6 @@ class ExpertConfig:
     """Worlds in which programs and taught policies are tried."""
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    warm_start: Path | None = None
-    """A folder of finished runs: if no program succeeds, PPO starts from the expert of the most similar task there.
-    All its experts are part of the recipe, so name another folder than the one that is written to."""
     num_envs: int = 512
     """Worlds that learn at the same time; the flat optimum on two cores is 256 to 1024."""
     backend: Backend = "cpu"

@@ -3,7 +3,7 @@
 `learn` does three steps, each a function with a frozen result:
 
 * `teach`: scripted programs are tried; the one that the task's own success function likes best is imitated (DAgger);
-* `improve_by_ppo`: PPO goes on from the taught policy, from another task's expert, or from nothing. After a taught
+* `improve_by_ppo`: PPO goes on from the taught policy, or from nothing. After a taught
   policy it trains at the fine time step, at which episodes are recorded;
 * `keep_better`: the taught policy and PPO's play the same episodes at the fine time step, and PPO's is kept if it
   is surely better. Where nobody taught, the better one of PPO's best and its last policy is kept.
@@ -12,7 +12,7 @@ The result is a neural network; it is called PPO's only if PPO changed it. Where
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,6 @@ from policies.ppo.train import LAST_FOLDER, ExpertResult, train_expert
 from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.record import Comparison, Judged, Learned
-from v2p_data.experts.solved import Solved, rank_solved
 from v2p_data.experts.teacher import Played, Teacher, Trial, try_out
 from v2p_data.play import StateActor
 from v2p_data.seeds import seed_for
@@ -94,7 +93,6 @@ def learn(
     out: Path,
     *,
     device: str = "cuda:0",
-    solved: Sequence[Solved] = (),
     on_progress: Progress = lambda share, words: None,
 ) -> Learned:
     """Write the task's expert into `out`, with the curve of its training.
@@ -104,7 +102,6 @@ def learn(
         cfg: the recipe.
         out: folder; `taught/` in it is the policy that imitation gave.
         device: of the backend `warp`.
-        solved: experts of other tasks, see `ExpertConfig.warm_start`.
         on_progress: told the share that is done and a few words.
     """
     taught = None
@@ -117,16 +114,14 @@ def learn(
         del trial_env
     student = taught.folder if taught else None
     env = _training_worlds(worlds, cfg, device, is_taught=student is not None)
-    ranked = rank_solved(worlds.bundle, env.worlds.obs_dim, solved) if student is None else []
-    other = ranked[0].folder if ranked else None
-    logger.info("PPO starts from %s", student or other or "nothing")
+    logger.info("PPO starts from %s", student or "nothing")
     begun = PROGRESS_TAUGHT if student else 0.0
     improved = improve_by_ppo(
         env,
         cfg,
         out,
         seed=worlds.seed_of("ppo"),
-        start=student or other,
+        start=student,
         on_progress=lambda share, words: on_progress(begun + (1 - begun) * share, words),
     )
     del env
@@ -146,7 +141,6 @@ def learn(
         trials=taught.trials if taught else (),
         comparison=comparison,
         stopped_by=improved.stopped_by,
-        started_from=other.name if other is not None else "",
     )
 
 

@@ -67,8 +67,6 @@ class Learned:
     comparison: Comparison | None
     """Comparison of the taught policy with PPO's; None where nobody taught or PPO changed nothing."""
     stopped_by: str
-    started_from: str = ""
-    """Folder of another task's expert, if PPO started from one."""
     is_program: bool = False
     """No network was trained: the program acts itself."""
 

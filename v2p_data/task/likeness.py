@@ -1,4 +1,4 @@
-"""How alike two tasks are. Experts start from the most similar task's expert; a model is shown similar tasks.
+"""How alike two tasks are: a model that writes a task is shown similar ones.
 
 Likeness is counted in points, by what decides how the arm moves: the family of the kind (carrying, pushing,
 tipping, throwing), the kind itself, the number of objects, and their shapes and sizes.

@@ -1,10 +1,8 @@
 import functools
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from v2p_data.experts.solved import Solved, rank_solved
 from v2p_data.kinds import KINDS, Kind
 from v2p_data.task.benchmark import benchmark_names
 from v2p_data.task.benchmark import load_benchmark as load
@@ -13,14 +11,10 @@ from v2p_data.task.likeness import likeness
 load_benchmark = functools.cache(load)
 
 
-def solved(name: str, *, obs_dim: int = 90, **changes: object) -> Solved:
-    bundle = replace(load_benchmark(name), **changes)
-    return Solved(bundle=bundle, folder=Path(f"{name}-0000"), obs_dim=obs_dim)
-
-
 def nearest_to(name: str) -> Kind:
-    others = [solved(other) for other in benchmark_names() if other != name]
-    return rank_solved(load_benchmark(name), 90, others)[0].bundle.kind
+    task = load_benchmark(name)
+    others = [load_benchmark(other) for other in benchmark_names() if other != name]
+    return max(others, key=lambda other: likeness(task, other)).kind
 
 
 @pytest.mark.parametrize(
@@ -54,25 +48,3 @@ def test_the_same_task_with_other_sizes_counts_less():
 
     assert likeness(lift, lift) == pytest.approx(9.0)
     assert likeness(lift, larger) == pytest.approx(8.5)  # exp(-log 2) = 1/2
-
-
-def test_experts_whose_weights_mean_something_else_are_left_out():
-    task = load_benchmark("push_left")
-    fitting = solved("push_right")
-    others = [
-        solved("push_right", obs_dim=91),
-        solved("push_right", motion_scale=2.0),
-        solved("push_right", robot={"path": "other_arm.xml"}),
-    ]
-
-    assert rank_solved(task, 90, [*others, fitting]) == [fitting]
-
-
-def test_the_order_does_not_depend_on_the_order_in_which_experts_are_found():
-    task = load_benchmark("push_left")
-    found = [solved(name) for name in benchmark_names()]
-    twins = [replace(found[0], folder=Path(f"twin-{k}")) for k in range(3)]
-
-    ranked = rank_solved(task, 90, [*found, *twins])
-
-    assert ranked == rank_solved(task, 90, [*reversed(twins), *reversed(found)])
