@@ -70,7 +70,7 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
         "distill": run.Distill, "deploy": deploy.Deploy,
         "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
         "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify, "replay": share.Replay,
-        "status": show.Status, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.Review, "scene models": models.Models, "scene hands": models.Hands,
+        "status": show.Status, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.ReviewRun, "scene models": models.Models, "scene hands": models.Hands,
         "scene outlines": models.Outlines, "scene detectors": models.Detectors,
         "reward": run.FromVideos, "task show": task.ShowTask, "reward search": reward.Search,
         "reward show": reward.ShowReward, "explain": share.Explain, "merge": edit.Merge, "drop": edit.Drop, "gc": gc.Gc,

@@ -63,6 +63,21 @@ class Request(BaseHTTPRequestHandler):
         self.head(HTTPStatus.OK, kind, len(body), {})
         self.wfile.write(body)
 
+    def answer_part(self, kind: str, body: bytes) -> None:
+        """Answer with a body of a media type, or with the part of it that a player asks for."""
+        asked = re.fullmatch(r"bytes=([0-9]{1,15})-([0-9]{0,15})", self.headers.get("Range", ""))
+        if asked is None:
+            self.head(HTTPStatus.OK, kind, len(body), {"Accept-Ranges": "bytes"})
+            self.wfile.write(body)
+            return
+        first, last = int(asked[1]), min(int(asked[2] or len(body)), len(body) - 1)
+        if first > last:
+            self.refuse(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE)
+            return
+        place = {"Content-Range": f"bytes {first}-{last}/{len(body)}"}
+        self.head(HTTPStatus.PARTIAL_CONTENT, kind, last + 1 - first, place)
+        self.wfile.write(body[first : last + 1])
+
     def head(self, status: HTTPStatus, kind: str, size: int, more: dict[str, str]) -> None:
         """Send the head of an answer whose body of `size` bytes follows."""
         self.send_response(status)

@@ -16,7 +16,7 @@ from v2p_data.video.captions import (
 )
 from v2p_data.video.checked import words
 from v2p_data.video.hints import check_hints
-from v2p_data.video.save_hints import merge_captions, write_captions
+from v2p_data.video.save_hints import save_hint
 
 
 @pytest.fixture
@@ -214,12 +214,10 @@ def test_marks_at_the_border_of_the_picture_are_in_it():
     check_hints(hints, (64, 48), 12, "b.mp4")
 
 
-def merged(folder, addition):
-    """Write another caption file, merge it, and return what the folder says then."""
-    write(folder, addition, "downloaded.txt")
-    result = merge_captions(folder, folder / "downloaded.txt")
-    write_captions(result)
-    return result
+def save(folder, name, phrase, hint):
+    """Save a hint for the video of this name, and return all hints that it has then."""
+    (video,) = [v for v in find_videos(folder) if v.path.name == name]
+    return save_hint(video, phrase, hint, keeps_old=True)
 
 
 CUP = {"caption": "Pushing cup next to can", "objects": ["cup", "red can"]}
@@ -229,33 +227,21 @@ def test_hints_are_added_and_nothing_else_changes(folder):
     can = {"frame": 2, "box": [1, 2, 3, 4]}
     write(folder, {"a.MOV": "Lifting   box up", "b.mp4": {**CUP, "hints": {"red can": can}}})
 
-    result = merged(folder, {"b.mp4": {**CUP, "hints": {"cup": {"name": "mug"}}}})
+    hints = save(folder, "b.mp4", "cup", {"name": "mug"})
 
     assert json.loads((folder / "captions.json").read_text()) == {
         "a.MOV": "Lifting   box up",
         "b.mp4": {**CUP, "hints": {"red can": can, "cup": {"name": "mug"}}},
     }
-    assert result.added == ("b.mp4, 'cup': name",)
-    assert find_videos(folder)[1].hints["red can"] == can
-
-
-def test_a_new_box_replaces_the_marks_of_its_object_and_keeps_its_size(folder):
-    old = {"frame": 2, "points": [[5, 5]], "size_m": [0.1, 0.1, 0.1]}
-    write(folder, {"b.mp4": {**CUP, "hints": {"cup": old}}})
-
-    new = {"frame": 7, "box": [1, 2, 3, 4]}
-    merged(folder, {"clips": [{"item": "b", "video": "b.mp4", "hints": {"cup": new}}]})
-
-    hint = find_videos(folder)[1].hints["cup"]
-    assert hint == {"frame": 7, "box": [1, 2, 3, 4], "size_m": [0.1, 0.1, 0.1]}
+    assert hints == {"red can": can, "cup": {"frame": 0, "name": "mug"}}
+    assert find_videos(folder)[1].hints == hints
 
 
 def test_the_first_hint_of_a_folder_without_captions_keeps_what_the_file_names_say(folder):
     before = find_videos(folder)
     hint = {"frame": 0, "box": [1, 2, 3, 4]}
 
-    name = "push_left_to_right__red_box.webm"
-    merged(folder, {name: {"caption": before[2].caption, "hints": {"red box": hint}}})
+    save(folder, "push_left_to_right__red_box.webm", "red box", hint)
 
     after = find_videos(folder)
     assert [(v.caption, v.objects) for v in after] == [(v.caption, v.objects) for v in before]
@@ -268,42 +254,27 @@ def test_the_old_caption_file_is_kept_beside_the_new_one_each_time(folder):
     first = (folder / "captions.json").read_bytes()
 
     for name in ("mug", "beaker"):
-        merged(folder, {"b.mp4": {**CUP, "hints": {"cup": {"name": name}}}})
+        save(folder, "b.mp4", "cup", {"name": name})
 
     assert (folder / "captions.json.bak").read_bytes() == first
     assert "mug" in (folder / "captions.json.bak2").read_text()
     assert find_videos(folder)[1].hints["cup"]["name"] == "beaker"
 
 
-def test_another_caption_in_the_added_file_is_reported_and_not_taken(folder):
-    write(folder, {"b.mp4": CUP})
-
-    result = merged(folder, {"b.mp4": {**CUP, "caption": "Throwing cup"}})
-
-    assert (result.added, result.hints) == ((), {})
-    assert "caption stays 'Pushing cup next to can'" in result.kept[0]
-
-
 @pytest.mark.parametrize(
-    ("addition", "said"),
+    ("phrase", "hint", "said"),
     [
-        ({"c.mp4": "x"}, "no such video"),
-        ({"B.mp4": "x"}, "Did you mean 'b.mp4'"),
-        ({"b.mp4": {"hints": {"cap": {"name": "x"}}}}, "Did you mean 'cup'"),
-        ({"b.mp4": {"hints": {"cup": {"box": [9, 0, 0, 9]}}}}, "x0 < x1"),
-        ({"b.mp4": {"hints": {"cup": 3}}}, "must be an object"),
-        ({"b.mp4": {"hints": 3}}, "name -> hint"),
-        ({"clips": [{"hints": {"cup": {"name": "x"}}}]}, "no such video"),
-        ([], "neither a caption file nor a review"),
-        ('{"b.mp4"', "not valid JSON"),
+        ("cap", {"name": "x"}, "Did you mean 'cup'"),
+        ("cup", {"box": [9, 0, 0, 9]}, "x0 < x1"),
+        ("cup", {}, "says nothing"),
     ],
 )
-def test_additions_that_cannot_be_used_are_named_and_change_nothing(folder, addition, said):
+def test_hints_that_cannot_be_used_are_named_and_change_nothing(folder, phrase, hint, said):
     write(folder, {"b.mp4": CUP})
     before = (folder / "captions.json").read_bytes()
 
     with pytest.raises(V2PError) as error:
-        merged(folder, addition)
+        save(folder, "b.mp4", phrase, hint)
 
     assert said in str(error.value)
     assert (folder / "captions.json").read_bytes() == before
@@ -330,9 +301,8 @@ def test_hints_for_a_name_in_another_form_go_to_its_only_entry(tmp_path):
     (tmp_path / apart).write_bytes(b"x")
     write(tmp_path, {composed: CUP})
 
-    result = merged(tmp_path, {composed: {**CUP, "hints": {"cup": {"name": "mug"}}}})
+    save(tmp_path, apart, "cup", {"name": "mug"})
 
-    assert list(result.hints) == [apart]
     assert list(json.loads((tmp_path / "captions.json").read_text())) == [apart]
     assert find_videos(tmp_path)[0].hints["cup"]["name"] == "mug"
 
@@ -453,7 +423,7 @@ def test_the_object_has_the_word_where_the_table_says_otherwise(folder):
 def test_hints_for_a_video_of_the_table_keep_its_caption(folder):
     write(folder, "b.mp4,Lifting cup up\n", "captions.csv")
 
-    merged(folder, {"b.mp4": {"hints": {"cup": {"name": "mug"}}}})
+    save(folder, "b.mp4", "cup", {"name": "mug"})
 
     video = find_videos(folder)[1]
     assert (video.caption, video.hints["cup"]["name"]) == ("Lifting cup up", "mug")

@@ -6,7 +6,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import TextIO
 
 import rich.progress
 from rich.console import Console
@@ -150,22 +150,6 @@ def cost_line(outcomes: Sequence[Outcome]) -> str:
     shares = ", ".join(f"{stage} {seconds / total:.0%}" for stage, seconds in dearest)
     each = f", {total / 60 / usable:.1f} each" if usable else ""
     return f"{total / 60:.1f} minutes of worker time for {usable} usable tasks{each}: {shares}"
-
-
-def outcomes_json(outcomes: Iterable[Outcome]) -> list[dict[str, Any]]:
-    """Return the outcomes as they are kept in `run.json`, without paths of this machine."""
-    return [
-        {
-            "stage": o.stage,
-            "item": o.item,
-            "status": o.status,
-            "folder": o.folder.name,
-            "seconds": round(o.seconds, 2),
-            "reason": o.reason,
-            "detail": o.detail,
-        }
-        for o in outcomes
-    ]
 
 
 def exit_code(outcomes: Iterable[Outcome], *, is_made: bool) -> int:

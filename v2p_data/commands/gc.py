@@ -11,9 +11,10 @@ from v2p_data.commands.show import Shown, run_folder
 from v2p_data.errors import UnusableError, V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import Record, read_record
+from v2p_data.pipeline.run_file import RUN_FILE
 from v2p_data.pipeline.store import FETCHING_FOLDER, MARK
 from v2p_data.pipeline.workers import only_run_in
-from v2p_data.report.reading import PARTIAL_SUFFIX, RUN_FILE
+from v2p_data.report.reading import PARTIAL_SUFFIX
 
 FINAL = ("dataset", "policy", "evaluation")
 """Stages whose results are wanted for themselves."""

@@ -19,7 +19,6 @@ from v2p_data.commands.display import (
     describe,
     exit_code,
     outcome_table,
-    outcomes_json,
     tally,
     telling,
 )
@@ -33,6 +32,7 @@ from v2p_data.pipeline.artifact import Record, read_record, write_json_atomicall
 from v2p_data.pipeline.contents import list_files, memory_of
 from v2p_data.pipeline.fingerprint import fingerprint
 from v2p_data.pipeline.ray_engine import demand_ray
+from v2p_data.pipeline.run_file import RUN_FILE, outcomes_json
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, stored_outcome
 from v2p_data.pipeline.settings import load_settings
 from v2p_data.pipeline.workers import Key, only_run_in, run_stages
@@ -57,8 +57,6 @@ from v2p_data.stages import (
 )
 from v2p_data.task.task import TASK_FILE, TaskBundle
 from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, read_footage
-
-RUN_FILE = "run.json"
 
 
 @dataclass(frozen=True, kw_only=True)

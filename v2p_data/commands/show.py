@@ -15,7 +15,8 @@ from v2p_data.errors import UnusableError, V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import RECORD_FILE, read_record
 from v2p_data.pipeline.contents import damaged, damages, demand_no
-from v2p_data.report.reading import PARTIAL_SUFFIX, RUN_FILE
+from v2p_data.pipeline.run_file import RUN_FILE
+from v2p_data.report.reading import PARTIAL_SUFFIX
 
 Row = tuple[str, str, str, str]
 """Stage, item, what became of it, more."""

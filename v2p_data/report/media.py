@@ -79,11 +79,16 @@ def picture_uri(path: Path, max_width_px: int) -> str | None:
 
 def jpeg_uri(image: UInt8[np.ndarray, "h w 3"], max_width_px: int) -> str:
     """Return an RGB image as a JPEG."""
+    return _uri("image/jpeg", jpeg_bytes(image, max_width_px))
+
+
+def jpeg_bytes(image: UInt8[np.ndarray, "h w 3"], max_width_px: int) -> bytes:
+    """Return an RGB image as a JPEG file."""
     small = _narrower(image, max_width_px)
     _, data = cv2.imencode(
         ".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     )
-    return _uri("image/jpeg", data.tobytes())
+    return data.tobytes()
 
 
 def png_uri(image: UInt8[np.ndarray, "h w c"]) -> str:

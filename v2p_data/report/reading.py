@@ -17,12 +17,12 @@ from v2p_data.errors import UnusableError
 from v2p_data.json_files import MAX_BYTES, json_or_none
 from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record, read_rejects
 from v2p_data.pipeline.contents import damages
+from v2p_data.pipeline.run_file import RUN_FILE
 
 ITEM_STAGES = ("scene", "task", "reward", "expert", "episodes")
 """Stages that each video goes through by itself."""
 JOINT_STAGES = ("dataset", "distillation", "policy", "evaluation")
 STAGES = ITEM_STAGES + JOINT_STAGES
-RUN_FILE = "run.json"
 PARTIAL_SUFFIX = ".partial"
 MAX_SIZE = 1e30
 """Numbers beyond it are treated as not finite: charts subtract them from each other."""
