@@ -2,7 +2,7 @@
 
 Training tasks come from drawn clips, and real ones where `--videos` gives some, through the engine; ten objects that no
 training sees are judged, from the scans in `--unseen` or drawn. A cell (arm, N, seed) is one line in `results.jsonl`; a
-stopped study goes on. `--table`, `--figure` and `--page` show what is there. `docs/study_lifting.md` explains arms and results.
+stopped study goes on. `--table` shows what is there. `docs/study_lifting.md` explains arms and results.
 
     python scripts/study_lifting.py --config configs/studies/lifting_laptop.yaml --out outputs/study_lifting --unseen MESHES
 """
@@ -32,7 +32,7 @@ def main() -> None:
     os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads get in each other's way
     logging.basicConfig(level=logging.ERROR)
     try:
-        if not (args.table or args.figure or args.page):
+        if not args.table:
             make_cells(args)
         show(args)
     except V2PError as error:
@@ -87,7 +87,7 @@ def make_cells(args: argparse.Namespace) -> None:
 
 
 def show(args: argparse.Namespace) -> None:
-    """Print the table, and write figure and page where they are asked for.
+    """Print the table.
 
     Raises:
         V2PError: there is no result yet.
@@ -96,16 +96,6 @@ def show(args: argparse.Namespace) -> None:
 
     rows = results_to_show(args.out)
     print(table(rows))
-    if args.figure:
-        from studies.figure import write_figure
-
-        write_figure(rows, args.figure)
-        print(f"\nfigure: {args.figure}")
-    if args.page:
-        from studies.page import write_page
-
-        write_page(rows, args.out, args.page)
-        print(f"\npage: {args.page}")
 
 
 def _arguments() -> argparse.Namespace:
@@ -128,8 +118,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=1, help="of one stage")
     parser.add_argument("--device", default="cpu", help="where policies train")
     parser.add_argument("--table", action="store_true", help="print the results so far and stop")
-    parser.add_argument("--figure", type=Path, help="write the figure (.svg or .png) and stop")
-    parser.add_argument("--page", type=Path, help="write the page (.html) and stop")
     return parser.parse_args()
 
 

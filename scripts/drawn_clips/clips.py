@@ -22,7 +22,6 @@ from jaxtyping import Bool, Float, UInt8
 
 from drawn_clips.camera import Drawer, Sensor, View, developed, random_sensor
 from drawn_clips.hand import WRIST, Hand
-from drawn_clips.handheld import Handheld, HandheldCamera, handheld_camera
 from drawn_clips.motion import Motion, Timing, animate
 from drawn_clips.room import LABEL_HAND, Room, build, labels_of, random_room
 from drawn_clips.room import LABEL_TABLE as LABEL_TABLE
@@ -52,8 +51,6 @@ class VideoSpec:
     view: View = field(default_factory=View)
     room: Room = field(default_factory=Room)
     sensor: Sensor = field(default_factory=Sensor)
-    handheld: Handheld | None = None
-    """How a hand moves the camera; None where it is on a stand."""
     seconds: float = 3.6
     fps: int = 30
     hide_m: float = 0.8
@@ -85,15 +82,12 @@ class SyntheticVideo:
     """Which of the clip's frames these are."""
     frames: UInt8[np.ndarray, "time h w 3"] = field(repr=False)
     camera: Camera
-    """At the first frame."""
-    cameras: tuple[Camera, ...] = field(default=(), repr=False)
-    """At every frame of the clip, where a hand moves it."""
     poses_world: Float[np.ndarray, "thing all_time 7"] = field(repr=False)
     """`[x, y, z, qw, qx, qy, qz]` of the bounding boxes' middles in every frame of the clip."""
     mask_idx: tuple[int, ...]
     """The clip's frames that have masks."""
     masks: UInt8[np.ndarray, "some_time h w"] = field(repr=False)
-    """Labels: 0 background, 1 hand and arm, 2 and on the things in their order, 255 the bare table. Seen from the first frame's camera."""
+    """Labels: 0 background, 1 hand and arm, 2 and on the things in their order, 255 the bare table."""
     hand_in_view: Bool[np.ndarray, "all_time"] = field(repr=False)
 
 
@@ -131,7 +125,7 @@ def render(spec: VideoSpec, *, frames: Sequence[int] | None = None) -> Synthetic
     return SyntheticVideo(
         spec=spec, frame_idx=chosen, frames=np.stack(pictures), camera=camera,
         poses_world=np.stack([[pose_from_transform(T) for T in track] for track in motion.T_world_things]),
-        mask_idx=masked, masks=np.stack(masks), hand_in_view=seen, cameras=tuple(stage.cameras),
+        mask_idx=masked, masks=np.stack(masks), hand_in_view=seen,
     )  # fmt: skip
 
 
@@ -424,7 +418,6 @@ class _Stage:
         )  # fmt: skip
         self.data = mujoco.MjData(self.model)
         self.camera = view.camera()
-        self.way = _way_of(spec, len(motion.gesture))
         self.drawer = Drawer(self.model, labels_of(self.model))
         names = [self.model.geom(k).name for k in range(self.model.ngeom)]
         self.hands = [names.index(f"hand{k}") for k in range(len(motion.gestures))]
@@ -441,15 +434,13 @@ class _Stage:
         for k in range(parts):
             at = i + sensor.exposure * ((k + 0.5) / parts - 0.5)
             self._pose(at)
-            if self.way is not None:
-                self._put_camera(self.way.at(at / self.spec.fps))
             total += self.drawer.picture(self.data)
         return developed(
             total / parts, sensor, i / max(n - 1, 1), rng_for(self.spec.seed, "noise", i)
         )
 
     def mask(self, i: int) -> UInt8[np.ndarray, "h w"]:
-        """Return the labels of frame i, as the first frame's camera would see them."""
+        """Return the labels of frame i."""
         self._pose(float(i))
         return self.drawer.mask(self.data)
 
@@ -461,14 +452,7 @@ class _Stage:
         ]
         uv = np.stack([np.nan_to_num(self.camera.project(track)) for track in tracks])
         uv = uv.clip(-200, 1200)
-        speeds = np.linalg.norm(np.gradient(uv, axis=1), axis=2).max(0)
-        return speeds if self.way is None else speeds + _table_speeds(self.cameras)
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """Return the camera at every frame; nothing where it is on a stand."""
-        times = np.arange(len(self.motion.gesture)) / self.spec.fps
-        return [] if self.way is None else [self.way.at(float(t)) for t in times]
+        return np.linalg.norm(np.gradient(uv, axis=1), axis=2).max(0)
 
     def _pose(self, at: float) -> None:
         m, n = self.motion, len(self.motion.gesture)
@@ -535,20 +519,6 @@ class _Stage:
         mocap = self.model.body(name).mocapid[0]
         self.data.mocap_pos[mocap] = place
         self.data.mocap_quat[mocap] = quat_from_matrix(R)
-
-
-def _way_of(spec: VideoSpec, frames: int) -> HandheldCamera | None:
-    if spec.handheld is None:
-        return None
-    return handheld_camera(spec.view.camera(), spec.handheld, max(frames - 1, 1) / spec.fps)
-
-
-def _table_speeds(cameras: list[Camera]) -> Float[np.ndarray, "time"]:
-    """Return how fast the table's place in the first picture's middle goes through the picture [px per frame]."""
-    first = cameras[0]
-    spot = first.on_plane(np.array([[first.width_px / 2, 0.6 * first.height_px]]))
-    uv = np.concatenate([camera.project(spot) for camera in cameras])
-    return np.linalg.norm(np.gradient(uv, axis=0), axis=1)
 
 
 @contextmanager

@@ -51,9 +51,6 @@ class Truth:
     fps: float
     num_frames: int
     camera: Camera
-    """At the first frame."""
-    cameras: tuple[Camera, ...] = field(repr=False)
-    """At every frame, where a hand moved it; nothing where it was on a stand."""
     hand_in_view: Bool[np.ndarray, "time"] = field(repr=False)
     things: tuple[TrueThing, ...]
     mask_idx: Int[np.ndarray, "some_time"]
@@ -114,7 +111,6 @@ def write(video: SyntheticVideo, folder: Path) -> Path:
         "fps": spec.fps,
         "num_frames": len(video.frames),
         "camera": _said(camera),
-        **({"cameras": [_said(c) for c in video.cameras]} if video.cameras else {}),
         "table": {"normal": [0.0, 0.0, 1.0], "height_m": 0.0},
         "hand_in_view": video.hand_in_view.tolist(),
         "masks": f"{spec.name}_masks.npz",
@@ -161,7 +157,6 @@ def load_truth(folder: Path, name: str) -> Truth:
         fps=float(said["fps"]),
         num_frames=said["num_frames"],
         camera=_camera(said["camera"]),
-        cameras=tuple(_camera(one) for one in said.get("cameras", ())),
         hand_in_view=np.array(said["hand_in_view"]),
         things=things,
         mask_idx=mask_idx,

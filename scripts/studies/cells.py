@@ -27,7 +27,6 @@ from v2p_data.policy.training import POLICY_FOLDER, sources_of
 from v2p_data.seeds import rng_for, seed_for
 from v2p_data.stages import (
     EngineConfig,
-    Seeded,
     dataset_stage,
     episodes_stage,
     policy_stage,
@@ -52,7 +51,6 @@ from .objects import (
     unseen_meshes,
     unseen_stage,
 )
-from .one_expert import one_expert_stage
 from .results import Row, letters_of
 from .stages import run_shown
 
@@ -279,7 +277,7 @@ class Study:
                 "meshes": {name: path.stat().st_size for name, path in meshes.items()},
                 "least": self.cfg.counts[0],
                 "max_training": self.cfg.max_training,
-                "cousins": [self.cfg.cousins, self.cfg.jointed],
+                "cousins": self.cfg.cousins,
                 "videos": [v.item for v in self._real],
             }
         )
@@ -290,25 +288,21 @@ class Study:
         pool = self.cfg.pool_engine_of(arm)
         found = self.find(source, count, seed, pool)
         engine = self.cfg.engine_for(arm, count, seed)
+        of_arm = replace(pool, episodes=self.cfg.episodes_for(arm))
         demonstrations = [
             stage
             for c in found.candidates
-            for stage in with_cousins(self._demonstrations(arm, count, c), pool)
+            for stage in with_cousins(episodes_stage(c.task, c.expert, of_arm), pool)
         ]
         rejected = dict(found.rejected)
-        if arm == "bc_cop" or arm in WITH_COUSINS:
+        if arm in WITH_COUSINS:
             outcomes = self.run(demonstrations)
             bad = [s for s in demonstrations if not outcomes[s.folder_name].is_usable]
             reasons = Counter(rejected) + Counter(_why(s, outcomes) for s in bad)
             rejected = dict(reasons.most_common())
             demonstrations = [s for s in demonstrations if s not in bad]
-        if arm == "one_expert":
-            expert = one_expert_stage([s.inputs["task"] for s in demonstrations], pool)
-            learned = [episodes_stage(s.inputs["task"], expert, pool) for s in demonstrations]
-            outcomes = self.run(learned)
-            demonstrations = [s for s in learned if outcomes[s.folder_name].is_usable]
         trajectories = engine.episodes.num_episodes
-        who = {"bc_cop": "cop"}.get(arm, arm if arm in WITH_COUSINS else source)
+        who = arm if arm in WITH_COUSINS else source
         repo = f"study/{who}_n{count}_s{seed}_t{trajectories}"
         tasks = [stage.inputs["task"] for stage in demonstrations]
         trained = [task.folder(self.root) for task in tasks]
@@ -357,21 +351,6 @@ class Study:
                 **{name: round(r.seconds, 1) for name, r in single.items()},
             },
         }
-
-    def _demonstrations(self, arm: Arm, count: int, candidate: Candidate) -> Stage:
-        """Return the stage of one task's demonstrations."""
-        engine = replace(self.cfg.pool_engine_of(arm), episodes=self.cfg.episodes_for(arm, count))
-        if arm != "bc_cop":
-            return episodes_stage(candidate.task, candidate.expert, engine)
-        return Stage(
-            name="episodes",
-            item=candidate.item,
-            config=Seeded(config=engine.episodes, seed=engine.seed),
-            inputs={"task": candidate.task},
-            sources={"player": "programs"},
-            make=make_program_episodes,
-            resumes=True,
-        )
 
     def _judged(self, play: Play, arm: str, count: int, seed: int) -> Row:
         from v2p_data.report.films import FilmConfig, write_films
@@ -441,22 +420,3 @@ def _why(stage: Stage, outcomes: Mapping[str, Outcome]) -> str:
 def _programs(bundle: TaskBundle) -> tuple[Any, int]:
     del bundle
     return ProgramPolicy(), UNSEEN_PX
-
-
-def make_program_episodes(
-    cfg: Seeded, inputs: Mapping[str, Path], out: Path, runtime: Runtime
-) -> dict[str, Any]:
-    """Collect demonstrations of Code-as-Policies, as an expert's are collected."""
-    from v2p_data.episodes.collect import collect
-    from v2p_data.episodes.rollouts import Lesson
-
-    bundle = TaskBundle.load(inputs["task"])
-    collected = collect(
-        Lesson(bundle=bundle, expert=ProgramPolicy()),
-        cfg.config,
-        out,
-        seed=seed_for(cfg.seed, "episodes", bundle.title),
-        num_threads=runtime.num_threads,
-        on_progress=runtime.progress,
-    )
-    return collected.counts()

@@ -10,30 +10,24 @@ from v2p_data.stages import CousinsConfig, EngineConfig
 
 Arm = Literal[
     "videos",
-    "fixed_total",
     "toys",
     "bc",
-    "bc_cop",
     "paper",
     "cop",
     "cousins",
     "toys_cousins",
-    "one_expert",
 ]
 ARMS: dict[Arm, str] = {
     "videos": "objects from videos, distillation; data grow with N",
-    "fixed_total": "objects from videos, distillation; all data and all training together as at the smallest N",
     "toys": "random primitive toys, distillation; data grow with N",
     "bc": "objects from videos, behaviour cloning only, same network",
-    "bc_cop": "objects from videos, demonstrations of Code-as-Policies, behaviour cloning only, same network",
     "paper": "objects from videos, behaviour cloning only, ResNet18 on two frames",
     "cop": "Code-as-Policies with our primitives on the simulator's states; learns nothing, hence without N",
     "cousins": "objects from videos and stretched cousins of each, all labelled by the scripted program, distillation",
     "toys_cousins": "random toys and stretched cousins of each, all labelled by the scripted program, distillation",
-    "one_expert": "the same toys and cousins, all labelled by one network that imitation and PPO taught on all of them",
 }
 """What each arm trains on, and how."""
-WITH_COUSINS: tuple[Arm, ...] = ("cousins", "toys_cousins", "one_expert")
+WITH_COUSINS: tuple[Arm, ...] = ("cousins", "toys_cousins")
 Source = Literal["videos", "toys"]
 
 
@@ -77,8 +71,6 @@ class PoolConfig:
     """Clips that may be drawn, at most; a clip whose scene, task or expert is rejected counts."""
     toys: int = 60
     """Toys that may be made, at most."""
-    chains: float = 0.0
-    """Share of the toys that are bars, balls and rings one after another in a curve; the others are stacks."""
     fps: int = 12
     """Of drawn clips, as of Something-Something-v2."""
     held_out: tuple[str, ...] = (
@@ -122,7 +114,7 @@ class UnseenConfig:
 class LiftingConfig:
     """The whole study."""
 
-    arms: tuple[Arm, ...] = ("cop", "videos", "fixed_total", "toys", "bc", "bc_cop")
+    arms: tuple[Arm, ...] = ("cop", "videos", "toys", "bc")
     counts: tuple[int, ...] = (5, 10, 20, 40)
     """Numbers of training tasks N; the tasks of a smaller N are among those of a larger one."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -131,8 +123,6 @@ class LiftingConfig:
     unseen: UnseenConfig = field(default_factory=UnseenConfig)
     cousins: int = 4
     """Of each object, in the arms with cousins; an object and its cousins share the trajectories of one object."""
-    jointed: float = 0.0
-    """Share of those cousins that have several pieces: `CousinsConfig.jointed`."""
     max_training: float = 4.0
     """Gradient steps grow with the data up to this multiple of `engine`'s, which are those of the smallest N."""
     paper_policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(preset="paper"))
@@ -154,28 +144,25 @@ class LiftingConfig:
         """Return the engine's settings of a cell: what scales with N, and how its policy learns."""
         least = self.counts[0]
         engine, grown = self.engine, min(count / least, self.max_training)
-        share = 1.0
-        if arm == "fixed_total":
-            share, grown = least / count, 1.0
-        elif arm in WITH_COUSINS:
-            share = 1 / (1 + self.cousins)
-        if share < 1:
+        if arm in WITH_COUSINS:
+            wanted = max(1, round(engine.distillation.episodes / (1 + self.cousins)))
             engine = replace(
                 engine,
-                episodes=self.episodes_for(arm, count),
+                episodes=self.episodes_for(arm),
                 distillation=replace(
                     engine.distillation,
-                    episodes=max(1, round(engine.distillation.episodes * share)),
-                    worlds=max(1, min(engine.distillation.worlds, round(engine.distillation.episodes * share))),
+                    episodes=wanted,
+                    worlds=min(engine.distillation.worlds, wanted),
                 ),
-            )  # fmt: skip
+            )
         policy = self.paper_policy if arm == "paper" else engine.policy
         distillation = engine.distillation
-        if arm in ("bc", "bc_cop", "paper"):
+        if arm in ("bc", "paper"):
             # Cloning only takes the gradient steps that distillation has in all.
             steps = policy.steps
             if arm != "paper" and distillation.rounds:
-                steps += distillation.first_steps + (distillation.rounds - 1) * distillation.round_steps  # fmt: skip
+                steps += distillation.first_steps
+                steps += (distillation.rounds - 1) * distillation.round_steps
             policy = replace(policy, steps=steps)
             distillation = replace(distillation, rounds=0)
         return replace(
@@ -189,16 +176,12 @@ class LiftingConfig:
             policy=replace(policy, steps=round(policy.steps * grown)),
         )
 
-    def episodes_for(self, arm: Arm, count: int):  # noqa: ANN201 - the engine's own type
+    def episodes_for(self, arm: Arm):  # noqa: ANN201 - the engine's own type
         """Return how demonstrations of one task are collected; a smaller number is the beginning of a larger one."""
         episodes = self.engine.episodes
-        if arm in WITH_COUSINS:
-            share = 1 / (1 + self.cousins)
-        elif arm == "fixed_total":
-            share = self.counts[0] / count
-        else:
+        if arm not in WITH_COUSINS:
             return episodes
-        wanted = max(1, round(episodes.num_episodes * share))
+        wanted = max(1, round(episodes.num_episodes / (1 + self.cousins)))
         return replace(
             episodes, num_episodes=wanted, min_episodes=min(episodes.min_episodes, wanted)
         )
@@ -215,12 +198,12 @@ class LiftingConfig:
             return engine
         return replace(
             engine,
-            episodes=self.episodes_for(arm, self.counts[0]),
-            cousins=CousinsConfig(count=self.cousins, jointed=self.jointed),
+            episodes=self.episodes_for(arm),
+            cousins=CousinsConfig(count=self.cousins),
             expert=replace(engine.expert, teacher="as_expert"),
         )
 
 
 def source_of(arm: Arm) -> Source:
     """Return where an arm's training objects come from."""
-    return "toys" if arm in ("toys", "toys_cousins", "one_expert") else "videos"
+    return "toys" if arm in ("toys", "toys_cousins") else "videos"

@@ -1,12 +1,10 @@
-"""What the lines of a study say together: rates with intervals, paired differences, and laws of failure against N."""
+"""What the lines of a study say together: rates with intervals and paired differences."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
-from scipy.optimize import minimize
 
 from policies.evaluation.paired import success_difference
 from policies.evaluation.rate import Rate, wilson
@@ -14,8 +12,6 @@ from policies.evaluation.rate import Rate, wilson
 Row = dict[str, Any]
 When = Literal["once", "at_end"]
 Group = Literal["all", "shape", "category"]
-PARAMETERS = 2
-"""Of either law; a fit of as many points says nothing."""
 
 
 def letters(rows: Iterable[Row], when: When = "once", group: Group = "all") -> str:
@@ -74,79 +70,6 @@ def paired(ours: Sequence[Row], others: Sequence[Row], when: When = "once") -> D
         **asdict(difference),
         seeds=tuple(float(mine.mean() - its.mean()) for mine, its in pairs),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Law:
-    """Failure as a function of the number of training tasks, fitted to counts by maximum likelihood."""
-
-    name: str
-    formula: str
-    parameters: tuple[float, float]
-    log_likelihood: float
-    failure: Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
-    num_points: int
-
-    @property
-    def is_determined(self) -> bool:
-        """More values of N than parameters."""
-        return self.num_points > PARAMETERS
-
-    def __str__(self) -> str:
-        a, b = self.parameters
-        return f"{self.name}: {self.formula.format(a, b)}"
-
-
-def fit_laws(counts: Sequence[int], rates: Sequence[Rate]) -> list[Law]:
-    """Return a power law and a Michaelis-Menten law of failure against N, the likelier first; none for a single N.
-
-    Power law: `failure = a N^-b`. Michaelis-Menten: `success = a N / (b + N)`.
-    """
-    if len(set(counts)) < PARAMETERS:
-        return []
-    n = np.asarray(counts, float)
-    trials = np.array([r.trials for r in rates], float)
-    failed = trials - np.array([r.successes for r in rates], float)
-
-    def power(p: np.ndarray, at: np.ndarray) -> np.ndarray:
-        return np.exp(p[0]) * at ** -p[1]
-
-    def saturating(p: np.ndarray, at: np.ndarray) -> np.ndarray:
-        return 1 - at / (np.exp(p[1]) + at) / (1 + np.exp(-p[0]))
-
-    def likelihood(law: Callable[..., np.ndarray], p: np.ndarray) -> float:
-        f = law(p, n).clip(1e-6, 1 - 1e-6)
-        return float((failed * np.log(f) + (trials - failed) * np.log(1 - f)).sum())
-
-    laws: list[Law] = []
-    for name, law, starts, formula in (
-        ("power law", power, ((-0.5, 0.5), (-1.0, 0.1), (0.5, 1.0)), "failure = {:.3f} N^-{:.3f}"),
-        ("Michaelis-Menten", saturating, ((1.0, 1.0), (3.0, 2.0), (6.0, 0.0)), "success = {:.3f} N / ({:.2f} + N)"),
-    ):  # fmt: skip
-        best = min(
-            (
-                minimize(lambda p, f=law: -likelihood(f, p), s, method="Nelder-Mead")
-                for s in starts
-            ),
-            key=lambda found: found.fun,
-        )
-        p = best.x
-        told = (
-            (float(np.exp(p[0])), float(p[1]))
-            if law is power
-            else (float(1 / (1 + np.exp(-p[0]))), float(np.exp(p[1])))
-        )
-        laws.append(
-            Law(
-                name=name,
-                formula=formula,
-                parameters=told,
-                log_likelihood=-float(best.fun),
-                failure=lambda at, f=law, p=p: f(p, np.asarray(at, float)).clip(0, 1),
-                num_points=len(set(counts)),
-            )
-        )
-    return sorted(laws, key=lambda law: -law.log_likelihood)
 
 
 def failure_counts(rows: Iterable[Row]) -> dict[str, int]:

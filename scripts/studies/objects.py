@@ -170,12 +170,11 @@ TOY_FORMS = ("box", "cylinder", "sphere", "ring", "cup")
 
 
 def toy_stage(number: int, pool: PoolConfig) -> Stage:
-    """Return the stage that makes a random toy: a cup, one to three boxes, cylinders, balls and rings on each other, or a chain."""
-    is_chain = rng_for(pool.seed, "study_lifting", "chain", number).random() < pool.chains
+    """Return the stage that makes a random toy: a cup, or one to three boxes, cylinders, balls and rings on each other."""
     return Stage(
         name="scene",
         item=f"toy_{number:04d}",
-        config={"seed": pool.seed, "form": "chain" if is_chain else "stack", "kind": pool.kind},
+        config={"seed": pool.seed, "kind": pool.kind},
         version=3,
         make=make_toy,
     )
@@ -188,7 +187,7 @@ def make_toy(
     del inputs, runtime
     item = out.name.split("-")[0]
     rng = rng_for(cfg["seed"], "study_lifting", item)
-    forms, meshes, parts = (_chain if cfg["form"] == "chain" else _stack)(rng)
+    forms, meshes, parts = _stack(rng)
     whole = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
     assert isinstance(whole, trimesh.Trimesh)
     middle = whole.bounds.mean(0)
@@ -229,36 +228,6 @@ def _stack(
         meshes.append(mesh_for(kind, size, **shape).apply_translation(lift))
         parts += [p.apply_translation(lift) for p in parts_for(kind, size, **shape)]
         top += size[2]
-    return forms, meshes, parts
-
-
-def _chain(
-    rng: np.random.Generator,
-) -> tuple[list[str], list[trimesh.Trimesh], list[trimesh.Trimesh]]:
-    """Return the same of two to four pieces that lie one after another, each turned against the one before."""
-    forms = [str(f) for f in rng.choice(("box", "sphere", "ring"), rng.integers(2, 5))]
-    parts: list[trimesh.Trimesh] = []
-    meshes: list[trimesh.Trimesh] = []
-    end, heading, bend = np.zeros(2), 0.0, float(rng.uniform(-0.7, 0.7))
-    for form in forms:
-        long, wide, high = (
-            float(np.exp(rng.uniform(np.log(low), np.log(top))))
-            for low, top in ((0.03, 0.09), (0.012, 0.035), (0.011, 0.03))
-        )
-        size = (long, wide, high) if form != "ring" else (min(long, 0.05), min(long, 0.05), high)
-        unit = (1.0, 1.0, 1.0) if form == "sphere" else size
-        kind, bore = ("cylinder", 0.6) if form == "ring" else (form, 0.0)
-        way = np.array([np.cos(heading), np.sin(heading)])
-        place = trimesh.transformations.rotation_matrix(heading, [0.0, 0.0, 1.0])
-        place[:3, :3] @= np.diag(np.array(size) / unit)
-        place[:3, 3] = [*(end + way * size[0] / 2), high / 2]
-        meshes.append(mesh_for(kind, unit, bore=bore).apply_transform(place))
-        parts += [p.apply_transform(place) for p in parts_for(kind, unit, bore=bore)]
-        end = end + 0.85 * size[0] * way
-        heading += bend + float(rng.uniform(-0.2, 0.2))
-    T_square = square_turn(trimesh.util.concatenate(meshes))
-    for piece in (*meshes, *parts):
-        piece.apply_transform(T_square)
     return forms, meshes, parts
 
 

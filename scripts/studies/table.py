@@ -9,19 +9,18 @@ from .config import ARMS
 from .fits import (
     by_count,
     failure_counts,
-    fit_laws,
     paired,
     rate,
 )
 
 Row = dict[str, Any]
-COMPARED = (("videos", "toys"), ("videos", "fixed_total"), ("videos", "bc"), ("bc", "bc_cop"), ("bc", "paper"))  # fmt: skip
+COMPARED = (("videos", "toys"), ("videos", "bc"), ("bc", "paper"))
 """Which arms are compared, from the same starts."""
 
 
 def table(rows: list[Row]) -> str:
     """Return all tables, one after the other."""
-    parts = [rates_table(rows), objects_table(rows), laws_text(rows), differences_table(rows)]
+    parts = [rates_table(rows), objects_table(rows), differences_table(rows)]
     return "\n\n".join(
         [p for p in (*parts, failures_table(rows), costs_table(rows), paper_text(rows)) if p]
     )
@@ -70,20 +69,6 @@ def objects_table(rows: list[Row]) -> str:
             for _, found in columns.values()
         ]
         lines.append(f"| {name} | new {judged['group']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def laws_text(rows: list[Row]) -> str:
-    """Return the fits of failure against N, one line an arm and law."""
-    lines: list[str] = []
-    for arm in ARMS:
-        found = {n: r for n, cells in by_count(rows, arm).items() if n and (r := rate(cells))}
-        laws = fit_laws(list(found), list(found.values()))
-        for law in laws:
-            trust = (
-                "" if law.is_determined else " (as many parameters as points: no test of the law)"
-            )
-            lines.append(f"- {arm}, {law}, log-likelihood {law.log_likelihood:.1f}{trust}")
     return "\n".join(lines)
 
 
