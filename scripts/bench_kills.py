@@ -13,8 +13,7 @@ the time the phase takes. What must hold right after the kill:
 - collect: every finished episode is there, byte by byte as in the undisturbed run, and every one can be read;
 - pack, merge: the dataset is absent, or it is there whole, byte by byte;
 - push: the version that loads is absent or whole, file by file;
-- run, distill, train: every finished result is there, byte by byte. What started the workers is killed; `bench_faults.py`
-  kills single workers.
+- run, distill, train: every finished result is there, byte by byte. What started the workers is killed.
 
 Names of event files, seconds and times are no bytes that count.
 

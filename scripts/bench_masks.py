@@ -3,15 +3,14 @@
     python scripts/bench_masks.py            # 12 turns
     python scripts/bench_masks.py --quick    # 3 turns, within 45 s; the same 200 states
 
-The states are 20 each of ten scenes: four benchmark tasks, and six with meshes (a convex one, a concave angle, a mug of
-twelve convex parts, random ones). Half of them come out of the batched environment after random actions, under the randomisation
+The states are 20 each of ten scenes: six random toys, which are meshes of convex parts, and four benchmark tasks. Half of them come out of the batched environment after random actions, under the randomisation
 of recording with a moving camera; in the other half the objects float in random orientations. `mujoco.Renderer` draws
 segmentation of the same models in the same states, put there in the same way; turning its ids into labels is not counted.
 
 All take turns at all states, in processes of their own that are ready beforehand. "all cores": our threads against as many
 renderer processes as there are cores. "one core": one of each, held on the same core. The engine's models ask for no
-multisampling, which makes the renderer faster than with MuJoCo's default of 4 samples, also shown. Software OpenGL keeps its own
-number of threads: setting `LP_NUM_THREADS` to 0 or 1 changed nothing.
+multisampling, which makes the renderer faster than with MuJoCo's default of 4 samples. Software OpenGL keeps its own number of
+threads: setting `LP_NUM_THREADS` to 0 or 1 changed nothing.
 
 The last line, `masks_over_renderer: X`, is the median over the turns of the renderer's seconds per frame over ours, all cores.
 """
@@ -30,26 +29,26 @@ os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "")
 
 import mujoco
 import numpy as np
-import trimesh
 import tyro
 from jaxtyping import UInt8
 from scipy.spatial.transform import Rotation
 
-from v2p_data.geometry.camera import Camera
-from v2p_data.scene.scene import Scene, SceneObject
+from studies.objects import make_toy
+from v2p_data.pipeline.runner import Runtime
+from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.model.world import CAMERA, World
 from v2p_data.sim.render.masks import BACKGROUND, GL_HINT, MaskRenderer, geom_labels
 from v2p_data.task.benchmark import load_benchmark
+from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates.write import write_samples
 
 STATES = 20
 """Of each scene."""
 WARMUP_STEPS = 12
-MESH_SCENES = ("mug", "angle", "pebble", "random 1", "random 2", "random 3")
+TOYS = tuple(f"toy_{k:04d}" for k in range(6))
 TASKS = ("insert", "throw_into", "push_next_to", "cover")
 
 
@@ -58,9 +57,9 @@ class BenchConfig:
     """What is measured, and for how long."""
 
     quick: bool = False
-    """Three turns, or fewer if time runs out, and no multisampling."""
+    """Three turns, or fewer if time runs out."""
     size_px: int = 256
-    scenes: int = len(MESH_SCENES) + len(TASKS)
+    scenes: int = len(TOYS) + len(TASKS)
     """The first so many, those with meshes first."""
     turns: int = 12
     seconds: float = 240.0
@@ -99,10 +98,6 @@ def main(cfg: BenchConfig) -> None:
         "renderer, all cores": Rival("renderer", stages, cfg.size_px, processes=_cores()),
         "renderer, one core": Rival("renderer", stages, cfg.size_px, one_core=True),
     }
-    if not cfg.quick:
-        rivals["renderer, 4 samples, all cores"] = Rival(
-            "renderer", stages, cfg.size_px, processes=_cores(), samples=4
-        )
     try:
         first_s = {name: rival.ready() for name, rival in rivals.items()}
         images = {
@@ -145,9 +140,6 @@ def show_speed(seconds: dict[str, list[float]], busy: dict[str, list[float]]) ->
         ratio = _ratio(seconds[f"renderer, {cores}"], seconds[f"ours, {cores}"])
         spent = _ratio(busy[f"renderer, {cores}"], busy[f"ours, {cores}"])
         print(f"ours over renderer, {cores}: {ratio:.2f}; by CPU time {spent:.2f}")
-    if "renderer, 4 samples, all cores" in seconds:
-        ratio = _ratio(seconds["renderer, 4 samples, all cores"], seconds["ours, all cores"])
-        print(f"ours over renderer with 4 samples, all cores: {ratio:.2f}")
 
 
 def show_agreement(
@@ -215,11 +207,10 @@ class Ours:
 class Theirs:
     """`mujoco.Renderer` with segmentation."""
 
-    def __init__(self, stages: list[Stage], size_px: int, samples: int) -> None:
+    def __init__(self, stages: list[Stage], size_px: int) -> None:
         self.stages = stages
         self.models = [s.world.model.__copy__() for s in stages]
         for model in self.models:
-            model.vis.quality.offsamples = samples
             model.vis.global_.offwidth = model.vis.global_.offheight = size_px
         self.data = [mujoco.MjData(m) for m in self.models]
         self.renderers = [mujoco.Renderer(m, size_px, size_px) for m in self.models]
@@ -257,7 +248,6 @@ class Rival:
         *,
         processes: int = 1,
         one_core: bool = False,
-        samples: int = 0,
     ) -> None:
         # Forked, so that the scenes need not be sent; this process itself never opens OpenGL.
         context = multiprocessing.get_context("fork")
@@ -265,7 +255,7 @@ class Rival:
         self.workers = []
         for _ in range(processes):
             end, far_end = context.Pipe()
-            arguments = (far_end, kind, stages, size_px, one_core, samples)
+            arguments = (far_end, kind, stages, size_px, one_core)
             self.workers.append(context.Process(target=_serve, args=arguments, daemon=True))
             self.workers[-1].start()
             far_end.close()
@@ -307,15 +297,12 @@ def _serve(
     stages: list[Stage],
     size_px: int,
     one_core: bool,
-    samples: int,
 ) -> None:
     if one_core:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     started = time.perf_counter()
     try:
-        painter: Painter = (
-            Ours(stages, size_px) if kind == "ours" else Theirs(stages, size_px, samples)
-        )
+        painter: Painter = Ours(stages, size_px) if kind == "ours" else Theirs(stages, size_px)
     except Exception as error:  # noqa: BLE001 - whatever OpenGL has to say is told by the parent
         end.send(RuntimeError(repr(error)))
         return
@@ -334,7 +321,7 @@ def _serve(
 
 def make_stages(folder: Path, count: int, seed: int) -> list[Stage]:
     """Return the first `count` scenes with their states; mesh files are written to `folder`."""
-    names = [*MESH_SCENES, *TASKS][:count]
+    names = [*TOYS, *TASKS][:count]
     return [
         Stage(name=n, **_states(_bundle(folder, n, seed), rng_for(seed, "states", n)))
         for n in names
@@ -342,28 +329,17 @@ def make_stages(folder: Path, count: int, seed: int) -> list[Stage]:
 
 
 def _bundle(folder: Path, name: str, seed: int) -> TaskBundle:
-    """Return one of the scenes by its name.
+    """Return the task of a toy or of the benchmark by its name.
 
     Raises:
         V2PError: there is no such benchmark task.
     """
-    rng = rng_for(seed, "scene", name)
-    if name == "mug":
-        file, parts = mug(folder)
-        cup = _object("mug", "mesh", (0.07, 0.07, 0.09), mesh=file, parts=parts)
-        return _task(folder, cup, _object("can", "cylinder", (0.06, 0.06, 0.1)))
-    if name == "angle":
-        file, parts = angle(folder)
-        corner = _object("angle", "mesh", (0.08, 0.06, 0.04), mesh=file, parts=parts)
-        return _task(folder, corner, _object("box", "box", (0.04, 0.08, 0.1)))
-    if name == "pebble":
-        size_m = (0.07, 0.05, 0.04)
-        stone = _object("pebble", "mesh", size_m, mesh=pebble(folder, rng, name, size_m))
-        bowl = _object("bowl", "cylinder", (0.15, 0.15, 0.06), role="container", hollow=True)
-        return _task(folder, stone, bowl)
-    if name in MESH_SCENES:
-        return _task(folder, *random_objects(folder, name, rng))
-    return load_benchmark(name)
+    if name not in TOYS:
+        return load_benchmark(name)
+    out = folder / name
+    out.mkdir()
+    make_toy({"seed": seed, "kind": "lift_up"}, {}, out, Runtime(root=folder))
+    return generate_task(Scene.load(out), TaskConfig(num_samples=1), seed).bundle
 
 
 def _states(bundle: TaskBundle, rng: np.random.Generator) -> dict[str, Any]:
@@ -384,115 +360,6 @@ def _states(bundle: TaskBundle, rng: np.random.Generator) -> dict[str, Any]:
         turns = Rotation.random(len(floating), rng=rng).as_quat(scalar_first=True)
         moments.qpos[floating, at + 3 : at + 7] = turns
     return {"world": env.world, "moments": moments}
-
-
-def pebble(
-    folder: Path, rng: np.random.Generator, name: str, size_m: tuple[float, float, float]
-) -> str:
-    """Write the hull of random points in a ball, brought to size; return the file's name."""
-    points = rng.normal(size=(60, 3))
-    points /= np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 0.5)
-    hull = trimesh.convex.convex_hull(points * np.divide(size_m, np.ptp(points, axis=0)))
-    hull.export(folder / f"{name}.obj")
-    return f"{name}.obj"
-
-
-def angle(folder: Path) -> tuple[str, tuple[str, ...]]:
-    """Write an L of two legs, whole and as its two convex parts; return the files' names."""
-    outline = np.array([(0, 0), (8, 0), (8, 2), (2, 2), (2, 6), (0, 6)], float) / 100
-    n = len(outline)
-    vertices = np.concatenate([np.c_[outline, np.full(n, z)] for z in (0.0, 0.04)])
-    after = [(k, (k + 1) % n) for k in range(n)]
-    sides = [f for i, j in after for f in [(i, j, j + n), (i, j + n, i + n)]]
-    lid = [(0, 1, 2), (0, 2, 3), (0, 3, 5), (3, 4, 5)]
-    lids = [(a + n, b + n, c + n) for a, b, c in lid] + [(c, b, a) for a, b, c in lid]
-    whole = trimesh.Trimesh(vertices, sides + lids, process=False)
-    corners = ([0, 1, 2, 3], [0, 3, 4, 5])
-    hulls = [vertices[[*c, *(k + n for k in c)]] for c in corners]
-    return _written(folder, "angle", whole, hulls)
-
-
-def mug(folder: Path, sectors: int = 12) -> tuple[str, tuple[str, ...]]:
-    """Write a mug without a handle, whole and as its floor and sectors of its wall; return the files' names."""
-    outer, inner, height, floor = 0.035, 0.029, 0.09, 0.008
-    profile = np.array(
-        [(0, 0), (outer, 0), (outer, height), (inner, height), (inner, floor), (0, floor)]
-    )
-    whole = trimesh.creation.revolve(profile, sections=2 * sectors)
-
-    def ring(radius: float, z: float, ends: tuple[float, float]) -> np.ndarray:
-        turn = np.pi / sectors * np.arange(*ends)
-        return np.c_[radius * np.cos(turn), radius * np.sin(turn), np.full(len(turn), z)]
-
-    hulls = [np.concatenate([ring(outer, z, (0, 2 * sectors)) for z in (0.0, floor)])]
-    for k in range(sectors):
-        part = [ring(r, z, (2 * k, 2 * k + 3)) for r in (inner, outer) for z in (floor, height)]
-        hulls.append(np.concatenate(part))
-    return _written(folder, "mug", whole, hulls)
-
-
-def _written(
-    folder: Path, name: str, whole: trimesh.Trimesh, hulls: list[np.ndarray]
-) -> tuple[str, tuple[str, ...]]:
-    whole.export(folder / f"{name}.obj")
-    files = tuple(f"{name}_{k}.obj" for k in range(len(hulls)))
-    for file, points in zip(files, hulls, strict=True):
-        trimesh.convex.convex_hull(points).export(folder / file)
-    return f"{name}.obj", files
-
-
-def random_objects(folder: Path, name: str, rng: np.random.Generator) -> list[SceneObject]:
-    """Return a mesh, and a primitive and a hollow thing of random kinds and sizes."""
-    x, y, z = (float(v) for v in rng.uniform(0.03, 0.075, 3))
-    side, height, depth = (float(v) for v in rng.uniform((0.1, 0.05, 0.04), (0.16, 0.14, 0.08)))
-    shape, around = rng.choice(("box", "cylinder", "sphere")), rng.choice(("box", "cylinder"))
-    return [
-        _object("stone", "mesh", (x, y, z), mesh=pebble(folder, rng, name.replace(" ", "_"), (x, y, z))),
-        _object("thing", str(shape), (0.05, 0.05, height)),
-        _object("tray", str(around), (side, side, depth), role="container", hollow=True),
-    ]  # fmt: skip
-
-
-def _object(
-    name: str, shape: Any, size_m: tuple[float, ...], *, role: Any = "manipulated", **more: Any
-) -> SceneObject:
-    x, y, z = (float(v) for v in size_m)
-    return SceneObject(
-        name=name, label=name, role=role, shape=shape, size_m=(x, y, z), mass_kg=0.12, friction=0.8,
-        frames=(0,), poses_world=((0.0, 0.0, z / 2, 1.0, 0.0, 0.0, 0.0),), **more,
-    )  # fmt: skip
-
-
-def _task(folder: Path, first: SceneObject, *others: SceneObject) -> TaskBundle:
-    """Return the task to lift the first object, beside the others."""
-    x, y, z, *quat = first.poses_world[0]
-    lifted = replace(
-        first, frames=(0, 10), poses_world=(first.first_pose, (x, y, z + 0.15, *quat))
-    )
-    placed = [
-        replace(o, role=o.role if o.role == "container" else "reference", poses_world=((0.02, 0.2 * side, *o.first_pose[2:]),))
-        for o, side in zip(others, (1, -1), strict=False)
-    ]  # fmt: skip
-    scene = Scene(
-        title="masks",
-        video="",
-        description=f"lifting a {first.name}",
-        kind="lift_up",
-        objects=(lifted, *placed),
-        camera=Camera(width_px=64, height_px=48, K=np.eye(3), T_world_cam=np.eye(4)),
-        fps=20.0,
-        num_frames=11,
-        confidence=1.0,
-        folder=folder,
-    )
-    return TaskBundle(
-        title=scene.title,
-        description=scene.description,
-        kind=scene.kind,
-        class_name="Task",
-        code=write_samples(scene, 1)[0],
-        scene=scene,
-    )
 
 
 if __name__ == "__main__":

@@ -36,8 +36,11 @@ from training import (
     compressed,
     disc_at,
     draw_all,
+    drawn_scene,
     learn,
     recoloured,
+    resized_view,
+    view_towards,
 )
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import outline_points
@@ -63,9 +66,7 @@ SPECS, SPECS_ALONG = 4, 16
 """Drawn for each scene; the one with most boxes is kept, or with most ducks and oval bottles."""
 KEPT_PX, KEPT_SHARE = 112, 2.0
 """What is kept of a picture: so many pixels, for so many longer sides of the outline."""
-SIZES = ((480, 360), (480, 360), (480, 270), (360, 480))
-"""(width, height) [px] of what is drawn."""
-HEIGHTS_M, PITCHES_RAD = (0.25, 0.9), (float(np.radians(18)), float(np.radians(64)))
+PITCHES_RAD = (float(np.radians(18)), float(np.radians(64)))
 MOST_HEADING_RAD = float(np.radians(50))
 """Cameras of clips look along +x, and many things there stand along it too."""
 LEAST_SIDES_PX = (5, 10)
@@ -101,28 +102,18 @@ def make_scene(along: bool, job: tuple[int, Path]) -> str:
 
     With `along`, one with ducks or oval bottles.
     """
-    number, out = job
-    path = out / f"{number:05d}.npz"
-    if path.is_file():
-        return ""
-    rng = rng_for(number, "box network")
-    try:
-        kind = MOTION_KINDS[number % len(MOTION_KINDS)]
-        specs = [
-            random_spec(f"clip{number}", kind, rng, int(rng.integers(2, 6)))
-            for _ in range(SPECS_ALONG if along else SPECS)
-        ]
-        spec = max(specs, key=lambda spec: (along * _count_along(spec), len(_boxes(spec))))
-        w, h = SIZES[int(rng.integers(len(SIZES)))]
-        fovy_rad = float(np.radians(rng.uniform(35, 60)))
-        spec = replace(spec, view=replace(spec.view, width_px=w, height_px=h, fovy_rad=fovy_rad))
-        rows = views_of(spec, rng) if _boxes(spec) else []
-    except (ValueError, RuntimeError) as error:
-        return f"{number}: {type(error).__name__} {error}"
-    if not rows:
-        return f"{number}: no box is seen"
-    np.savez(path, **{key: np.stack([row[key] for row in rows]) for key in rows[0]})
-    return ""
+    return drawn_scene(job, "box network", partial(_rows_of, along), "no box is seen")
+
+
+def _rows_of(along: bool, number: int, rng: np.random.Generator) -> list[dict[str, np.ndarray]]:
+    kind = MOTION_KINDS[number % len(MOTION_KINDS)]
+    specs = [
+        random_spec(f"clip{number}", kind, rng, int(rng.integers(2, 6)))
+        for _ in range(SPECS_ALONG if along else SPECS)
+    ]
+    spec = max(specs, key=lambda spec: (along * _count_along(spec), len(_boxes(spec))))
+    spec = resized_view(spec, rng)
+    return views_of(spec, rng) if _boxes(spec) else []
 
 
 def _boxes(spec: VideoSpec) -> list[int]:
@@ -148,16 +139,7 @@ def views_of(spec: VideoSpec, rng: np.random.Generator) -> list[dict[str, np.nda
     views = []
     for i in frames:
         aim = motion.T_world_things[rng.choice(boxes), i, :2, 3] + rng.normal(0, 0.12, 2)
-        height = float(np.exp(rng.uniform(*np.log(HEIGHTS_M))))
-        pitch = float(rng.uniform(*PITCHES_RAD))
-        view = replace(
-            spec.view,
-            height_m=height,
-            pitch_rad=pitch,
-            roll_rad=float(np.radians(rng.normal(0, 0.9))),
-            back_m=float(height / np.tan(pitch) - aim[0]),
-            side_m=float(aim[1]),
-        )
+        view = view_towards(spec.view, aim, PITCHES_RAD, rng)
         heading = float(rng.uniform(-MOST_HEADING_RAD, MOST_HEADING_RAD))
         views.append(Turned(**_values(view), heading_rad=heading, about_m=(aim[0], aim[1])))
     pictures, labels = render_views(spec, frames, with_hand=True, views=views)

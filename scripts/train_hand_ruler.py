@@ -10,7 +10,6 @@ from seeds of their own (`hand network`), so that no clip of `bench_reconstructi
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -36,8 +35,11 @@ from training import (
     compressed,
     disc_at,
     draw_all,
+    drawn_scene,
     learn,
     recoloured,
+    resized_view,
+    view_towards,
 )
 from v2p_data.scene.fitting.hand_scale import (
     GUESS_SPREAD,
@@ -57,10 +59,8 @@ KINDS = tuple(kind for kind in MOTION_KINDS if kind != "push_with")
 """A hand that pushes with something touches nothing that rests."""
 CAMERAS = 12
 KEPT_M, KEPT_PX = 0.52, 208
-SIZES = ((480, 360), (480, 360), (480, 270), (360, 480))
-"""(width, height) [px] of what is drawn."""
 MOST_TRIES = CAMERAS + 4
-HEIGHTS_M, PITCHES_RAD = (0.25, 0.9), (float(np.radians(20)), float(np.radians(62)))
+PITCHES_RAD = (float(np.radians(20)), float(np.radians(62)))
 AT_REST_M, SAME_HEIGHT_M, NEAR_M = 0.015, 0.01, 0.2
 LEAST_PX, LEAST_SIDE_PX = 12, 40
 HAND, THING, MOST_THINGS = 1, 2, 8
@@ -73,27 +73,16 @@ TAIL = 4.0
 
 def make_scene(job: tuple[int, Path]) -> str:
     """Draw one scene through some cameras and write what training needs; return an error's words, or nothing."""
-    number, out = job
-    path = out / f"{number:05d}.npz"
-    if path.is_file():
-        return ""
-    rng = rng_for(number, "hand network")
-    kind = KINDS[number % len(KINDS)]
-    try:
-        spec = random_spec(f"clip{number}", kind, rng)
-        w, h = SIZES[int(rng.integers(len(SIZES)))]
-        fovy_rad = float(np.radians(rng.uniform(35, 60)))
-        view = replace(spec.view, width_px=w, height_px=h, fovy_rad=fovy_rad)
-        spec = replace(spec, view=view)
-        motion = motion_of(spec)
-        moments = touching(motion)
-        rows = views_of(spec, motion, moments, rng) if len(moments) else []
-    except (ValueError, RuntimeError) as error:
-        return f"{number} {kind}: {type(error).__name__} {error}"
-    if not rows:
-        return f"{number} {kind}: no hand is seen that touches the thing at rest"
-    np.savez(path, **{key: np.stack([row[key] for row in rows]) for key in rows[0]})
-    return ""
+    nothing = "no hand is seen that touches the thing at rest"
+    return drawn_scene(job, "hand network", _rows_of, nothing)
+
+
+def _rows_of(number: int, rng: np.random.Generator) -> list[dict[str, np.ndarray]]:
+    spec = random_spec(f"clip{number}", KINDS[number % len(KINDS)], rng)
+    spec = resized_view(spec, rng)
+    motion = motion_of(spec)
+    moments = touching(motion)
+    return views_of(spec, motion, moments, rng) if len(moments) else []
 
 
 def touching(motion: Motion) -> Int[np.ndarray, "n"]:
@@ -114,17 +103,7 @@ def views_of(
     for i in frames:
         hand, thing = motion.T_world_hand[i, :2, 3], motion.T_world_things[0, i, :2, 3]
         aim = 0.5 * (hand + thing) + rng.normal(0, 0.12, 2)
-        height, pitch = float(np.exp(rng.uniform(*np.log(HEIGHTS_M)))), rng.uniform(*PITCHES_RAD)
-        views.append(
-            replace(
-                spec.view,
-                height_m=height,
-                pitch_rad=float(pitch),
-                roll_rad=float(np.radians(rng.normal(0, 0.9))),
-                back_m=float(height / np.tan(pitch) - aim[0]),
-                side_m=float(aim[1]),
-            )
-        )
+        views.append(view_towards(spec.view, aim, PITCHES_RAD, rng))
     pictures, labels = render_views(spec, frames, with_hand=True, views=views)
     rows = []
     for i, view, rgb, own in zip(frames, views, pictures, labels, strict=True):

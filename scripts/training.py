@@ -6,18 +6,25 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from safetensors.torch import load_file, save_file
 
+from drawn_clips.camera import View
+from drawn_clips.clips import VideoSpec
 from v2p_data.seeds import rng_for
 
 HELD_OUT = 20
 """One scene in so many is held out for measuring."""
+SIZES = ((480, 360), (480, 360), (480, 270), (360, 480))
+"""(width, height) [px] of what is drawn."""
+HEIGHTS_M = (0.25, 0.9)
+"""Of drawn cameras above the table."""
 Scene = dict[str, np.ndarray]
 
 
@@ -55,6 +62,60 @@ def draw_all(
                 print(f"left out {words}", file=sys.stderr)
             if done % 50 == 0:
                 print(f"{done} drawn, {(time.time() - began) / done:.2f} s each", flush=True)
+
+
+def drawn_scene(
+    job: tuple[int, Path],
+    stream: str,
+    rows_of: Callable[[int, np.random.Generator], list[dict[str, np.ndarray]]],
+    nothing: str,
+) -> str:
+    """Write what training needs of one scene; return an error's words, or nothing.
+
+    Args:
+        job: the scene's number and the folder; a scene that is there is not drawn again.
+        stream: name of the random stream.
+        rows_of: draws the scene of a number and returns what each camera sees.
+        nothing: what is said where no camera sees anything of use.
+    """
+    number, out = job
+    path = out / f"{number:05d}.npz"
+    if path.is_file():
+        return ""
+    try:
+        rows = rows_of(number, rng_for(number, stream))
+    except (ValueError, RuntimeError) as error:
+        return f"{number}: {type(error).__name__} {error}"
+    if not rows:
+        return f"{number}: {nothing}"
+    np.savez(path, **{key: np.stack([row[key] for row in rows]) for key in rows[0]})
+    return ""
+
+
+def resized_view(spec: VideoSpec, rng: np.random.Generator) -> VideoSpec:
+    """Return a clip in another picture size and another field of view."""
+    w, h = SIZES[int(rng.integers(len(SIZES)))]
+    fovy_rad = float(np.radians(rng.uniform(35, 60)))
+    return replace(spec, view=replace(spec.view, width_px=w, height_px=h, fovy_rad=fovy_rad))
+
+
+def view_towards(
+    view: View,
+    aim_m: Float[np.ndarray, "2"],
+    pitches_rad: tuple[float, float],
+    rng: np.random.Generator,
+) -> View:
+    """Return a camera of random height and pitch that looks at a point of the table."""
+    height = float(np.exp(rng.uniform(*np.log(HEIGHTS_M))))
+    pitch = float(rng.uniform(*pitches_rad))
+    return replace(
+        view,
+        height_m=height,
+        pitch_rad=pitch,
+        roll_rad=float(np.radians(rng.normal(0, 0.9))),
+        back_m=float(height / np.tan(pitch) - aim_m[0]),
+        side_m=float(aim_m[1]),
+    )
 
 
 def compressed(
