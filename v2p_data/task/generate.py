@@ -102,7 +102,7 @@ class GeneratedTask:
         """Return how many samples are of no use, before and after sending back (the paper's table 8).
 
         What is picked has passed the same audit: asking it again measures nothing. What a pick gains is measured
-        against the referee (`scripts/bench_pick.py`).
+        against the referee (`docs/lab/pick.md`).
         """
         return {
             "first_answers": hallucination(self.first or self.samples),
