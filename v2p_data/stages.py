@@ -102,14 +102,10 @@ class CousinsConfig:
 
     count: int = 0
     """Cousins of each scene; 0: none. A third is under 15 mm thick, a third over 150 mm high."""
-    jointed: float = 0.0
-    """Share of the cousins that are two or three stretched copies of the object in a row, as a spoon is a handle and a bowl."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.count <= 300:
             raise ValueError(f"count must be between 0 and 300, got {self.count}")
-        if not 0 <= self.jointed <= 1:
-            raise ValueError(f"jointed must be between 0 and 1, got {self.jointed}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,13 +196,11 @@ def make_scene(
 
 def cousin_stage(scene: Stage, number: int, cfg: EngineConfig) -> Stage:
     """Return the stage that makes another scene of one: with a relative of its manipulated object."""
-    robot, jointed = cfg.sim.robot, cfg.cousins.jointed
+    robot = cfg.sim.robot
     return Stage(
         name="cousin",
         item=f"{scene.item}{COUSIN_MARK}{number:03d}",
-        config=Seeded(
-            config={"number": number} | ({"jointed": jointed} if jointed else {}), seed=cfg.seed
-        ),
+        config=Seeded(config={"number": number}, seed=cfg.seed),
         inputs={"scene": scene},
         sources=_robot_digests(robot),
         make=partial(make_cousin, robot=robot),
@@ -222,8 +216,7 @@ def make_cousin(
 
     del runtime
     scene, number = Scene.load(inputs["scene"]), cfg.config["number"]
-    jointed = cfg.config.get("jointed", 0.0)
-    thing, mesh, parts = cousin_of(scene, number, cfg.seed, opening_m_of(robot), jointed)
+    thing, mesh, parts = cousin_of(scene, number, cfg.seed, opening_m_of(robot))
     write_relative(scene, f"{scene.title}{COUSIN_MARK}{number:03d}", thing, mesh, parts, out)
     return {"size_m": list(thing.size_m), "mass_kg": round(thing.mass_kg, 4)}
 

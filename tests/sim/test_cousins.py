@@ -114,42 +114,6 @@ def test_a_stretched_box_is_a_box_whose_inertia_is_the_formulas(
     assert np.sort(model.body("cube").inertia) == pytest.approx(np.sort(diagonal), rel=1e-4)
 
 
-@pytest.mark.parametrize("number", range(6))
-def test_a_jointed_cousin_has_two_or_three_times_the_pieces_and_lies_where_the_object_lay(
-    bottle: Scene, tmp_path: Path, number: int
-):
-    thing, mesh, parts = cousin_of(bottle, number, 0, jointed=1.0)
-    write_relative(bottle, "lift_bottle_cousin_000", thing, mesh, parts, tmp_path)
-
-    single = len(cousin_of(bottle, number, 0)[2])
-    assert mesh.is_watertight
-    assert mesh.body_count in (2, 3)
-    assert len(parts) == single * mesh.body_count
-    assert mesh.extents == pytest.approx(thing.size_m, rel=1e-6)
-    corners = np.concatenate([p.vertices for p in parts])
-    assert (np.abs(corners) <= np.array(thing.size_m) / 2 + 1e-6).all()
-    assert thing.poses_world[0][2] == pytest.approx(thing.size_m[2] / 2)
-    build_world(Scene.load(tmp_path), COARSE)  # the gripper can take it
-
-
-def test_the_pieces_of_a_jointed_cousin_touch_and_half_the_share_are_jointed(bottle: Scene):
-    family = [cousin_of(bottle, number, 0, jointed=0.5)[1] for number in range(40)]
-
-    jointed = [mesh for mesh in family if mesh.body_count > 1]
-    assert 10 <= len(jointed) <= 30
-    for mesh in jointed:
-        low, high = zip(*(piece.bounds for piece in mesh.split()), strict=True)
-        gaps = np.array(low)[1:] - np.array(high)[:-1], np.array(low)[:-1] - np.array(high)[1:]
-        assert max(gap.max() for gap in gaps) < 0
-
-
-def test_a_hollow_object_has_no_jointed_cousins(bottle: Scene):
-    (thing,) = bottle.objects
-    cup = replace(bottle, objects=(replace(thing, hollow=True),))
-
-    assert cousin_of(cup, 0, 0, jointed=1.0)[0] == cousin_of(cup, 0, 0)[0]
-
-
 def test_what_was_drawn_does_not_depend_on_how_many_are_asked_for(bottle: Scene):
     again = cousin_of(bottle, 4, 0)[0]
 

@@ -1,5 +1,6 @@
-"""Masks drawn in three ways, palettes against the codec's arithmetic."""
+"""Masks drawn in two ways and by rays, palettes against the codec's arithmetic."""
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from mujoco.batch import Batch
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
@@ -17,6 +19,7 @@ from v2p_data.sim.render.masks import (
     FIRST_OBJECT,
     PALETTE,
     MaskRenderer,
+    geom_labels,
     label_names,
     labels_to_rgb,
     rgb_to_labels,
@@ -146,14 +149,28 @@ def test_the_z_buffer_draws_what_opengl_draws(
     assert least_overlap(drawn, peers) >= 0.998
 
 
+def labels_by_rays(world: World, moments: Moments, index: int) -> np.ndarray:
+    """Return the label of what MuJoCo's ray through each pixel's centre hits first."""
+    model = copy.copy(world.model)
+    data, batch = mujoco.MjData(model), Batch(model, 1, 1)
+    moments.write(model, data, index)
+    batch.set_models(model)
+    batch.bind("qpos")[0] = data.qpos
+    camera = model.camera("view").id
+    rows, columns = np.mgrid[0:SIZE_PX, 0:SIZE_PX] + 0.5 - SIZE_PX / 2
+    focal_px = SIZE_PX / 2 / np.tan(np.radians(model.cam_fovy[camera]) / 2)
+    beams = np.stack([columns, -rows, np.full_like(rows, -focal_px)], axis=-1).reshape(-1, 3)
+    _, geoms = batch.ray(data.cam_xpos[camera], beams @ data.cam_xmat[camera].reshape(3, 3).T)
+    return np.append(geom_labels(world), np.uint8(0))[geoms[0]].reshape(SIZE_PX, SIZE_PX)
+
+
 def test_the_z_buffer_draws_what_rays_hit(world: World, drawn: np.ndarray, moments: Moments):
-    with MaskRenderer(world, SIZE_PX, backend="rays") as rays:
-        peers = np.stack([rays.draw(moments, k) for k in range(len(drawn))])
+    peers = np.stack([labels_by_rays(world, moments, k) for k in range(len(drawn))])
 
     assert least_overlap(drawn, peers) >= 0.995
 
 
-@pytest.mark.parametrize("backend", ["zbuffer", "gl", "rays"])
+@pytest.mark.parametrize("backend", ["zbuffer", "gl"])
 def test_images_need_not_be_square(world: World, moments: Moments, drawn: np.ndarray, backend):
     try:
         renderer = MaskRenderer(world, (128, 64), backend=backend)

@@ -1,9 +1,8 @@
 """Cousins of a scene's manipulated object: stretched, flattened, thinned, lengthened, leaning, on another side.
 
-A cousin is an affine map of mesh and convex parts, so closed meshes stay closed and convex parts convex. It may be
-`jointed`: two or three such maps of the object in a row, as a spoon is a handle and a bowl. Mass and friction are drawn
-too. In turn a cousin is `alike`, `low` (under 15 mm) and `tall` (over 150 mm); the gripper can take each.
-Cousin `k` follows from the seed, the scene and `k` alone, so that asking for more keeps those that are there.
+A cousin is an affine map of mesh and convex parts, so closed meshes stay closed and convex parts convex. Mass and
+friction are drawn too. In turn a cousin is `alike`, `low` (under 15 mm) and `tall` (over 150 mm); the gripper can take
+each. Cousin `k` follows from the seed, the scene and `k` alone, so that asking for more keeps those that are there.
 """
 
 from dataclasses import dataclass, replace
@@ -42,12 +41,6 @@ TURNED, LEANING = 0.3, 0.3
 """Shares of cousins that lie on another side, and whose upright lines lean."""
 LEAN = 0.35
 """Sideways per upward, at most."""
-PIECE = (0.35, 1.0)
-"""Factors of each extent of a piece of a jointed cousin, before the whole is brought to size."""
-BEND = 0.5
-"""Turn of each piece against the one before, about the upright axis [rad], at most."""
-OVERLAP = 0.15
-"""Share of a piece's length that the next one reaches into."""
 TRIES = 40
 
 
@@ -148,45 +141,8 @@ def mapped(
     return mesh.copy().apply_transform(T), tuple(p.copy().apply_transform(T) for p in parts)
 
 
-def jointed_from(
-    mesh: trimesh.Trimesh, parts: tuple[trimesh.Trimesh, ...], up: int, rng: np.random.Generator
-) -> tuple[trimesh.Trimesh, tuple[trimesh.Trimesh, ...]]:
-    """Return two or three stretched copies of mesh and parts in a row along one axis, bent if it is level.
-
-    Args:
-        mesh: in the object's frame, about its middle.
-        parts: its convex solids.
-        up: the object's upright axis; where along it lower pieces lie is one draw.
-        rng: of the draws.
-    """
-    axis, count = int(rng.integers(3)), int(rng.integers(2, 4))
-    level, bend = float(rng.uniform(-0.5, 0.5)), float(rng.uniform(-BEND, BEND))
-    meshes: list[trimesh.Trimesh] = []
-    solids: list[trimesh.Trimesh] = []
-    end = np.zeros(3)
-    for k in range(count):
-        factor = np.exp(rng.uniform(*np.log(PIECE), size=3))
-        turn = 0.0 if axis == up else (k - (count - 1) / 2) * bend
-        T = trimesh.transformations.rotation_matrix(turn, np.eye(3)[up])
-        way = T[:3, axis] * factor[axis] * mesh.extents[axis]
-        T[:3, :3] *= factor
-        T[:3, 3] = end + way / 2
-        if axis != up:
-            T[up, 3] = level * (1 - factor[up]) * mesh.extents[up]
-        end = end + (1 - OVERLAP) * way
-        meshes.append(mesh.copy().apply_transform(T))
-        solids += [p.copy().apply_transform(T) for p in parts]
-    whole = trimesh.util.concatenate(meshes)
-    assert isinstance(whole, trimesh.Trimesh)
-    return whole, tuple(solids)
-
-
 def cousin_of(
-    scene: Scene,
-    number: int,
-    seed: int,
-    opening_m: float = 2 * FINGER_TRAVEL_M,
-    jointed: float = 0.0,
+    scene: Scene, number: int, seed: int, opening_m: float = 2 * FINGER_TRAVEL_M
 ) -> tuple[SceneObject, trimesh.Trimesh, tuple[trimesh.Trimesh, ...]]:
     """Return cousin `number` of a scene's manipulated object, with mesh and convex parts, in the object's frame.
 
@@ -195,7 +151,6 @@ def cousin_of(
         number: from 0; decides the form.
         seed: of the draws.
         opening_m: distance between the open pads.
-        jointed: share of cousins of several pieces; hollow objects have none.
 
     Raises:
         ItemRejectedError: `no_cousins` of this kind, `open_mesh`, or `too_few_shapes` that the gripper takes.
@@ -214,11 +169,6 @@ def cousin_of(
     must_fit = KINDS[scene.kind].must_grasp and not thing.hollow
     form = FORMS[number % len(FORMS)]
     rng = rng_for(seed, "cousin", scene.title, number)
-    joints = rng_for(seed, "jointed cousin", scene.title, number)
-    old_volume = mesh.volume
-    if not thing.hollow and joints.random() < jointed:
-        thing = replace(thing, shape="mesh")
-        mesh, parts = jointed_from(mesh, parts, upright_axis(thing), joints)
     width = NARROWEST_M
     for _ in range(TRIES if opening_m > NARROWEST_M + 2 * GRIP_MARGIN_M else 0):
         cousin = draw(thing, form, rng, opening_m)
@@ -233,7 +183,7 @@ def cousin_of(
             f"{opening_m * 1000:.0f} mm",
             width,
         )
-    return _described(thing, cousin, new_mesh.volume / old_volume, R), new_mesh, new_parts
+    return _described(thing, cousin, new_mesh.volume / mesh.volume, R), new_mesh, new_parts
 
 
 def _solid(

@@ -1,7 +1,7 @@
 """Segmentation masks of saved moments, from the camera `view`.
 
 A label image is uint8: 0 background and table, 1 robot, 2 the manipulated object, 3.. the others in scene
-order. A z-buffer on all cores draws it (`zbuffer`); OpenGL (EGL, also in software) and rays draw the same but for
+order. A z-buffer on all cores draws it (`zbuffer`). OpenGL (EGL, also in software) draws the same but for
 a few border pixels, slower. Pictures for people need OpenGL. As video, labels become greys: with R = G = B the
 chroma is constant, so 4:2:0 loses nothing, and each grey below survives the way through limited-range luma unchanged.
 """
@@ -18,7 +18,6 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import mujoco
 import numpy as np
 from jaxtyping import UInt8
-from mujoco.batch import Batch
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.model.world import CAMERA, World, build_world
@@ -37,7 +36,7 @@ GL_HINT = "install it with 'apt-get install libegl1 libgl1-mesa-dri'"
 _GREYS = np.asarray(PALETTE, np.uint8)
 _LABELS = np.abs(np.arange(256)[:, None] - np.asarray(PALETTE)[None]).argmin(1).astype(np.uint8)
 
-Backend = Literal["auto", "zbuffer", "gl", "rays"]
+Backend = Literal["zbuffer", "gl"]
 WRIST_POS_M = np.array([0.11, 0.0, -0.07])
 """Of the wrist's camera in the tool's frame: x to the side, y from finger to finger, z where the fingers point."""
 WRIST_TARGET_M = np.array([0.0, 0.0, 0.05])
@@ -120,7 +119,7 @@ class MaskRenderer:
     Args:
         source: the task, or its world where it is built already.
         size_px: width and height of the image, or (height, width).
-        backend: what draws the masks; `auto` is `zbuffer`.
+        backend: what draws the masks.
         num_threads: for the z-buffer, 0 for all cores; changes no result.
         wrist: below the label image of the table's camera comes that of the wrist's, of the same size; by the z-buffer only.
 
@@ -133,13 +132,13 @@ class MaskRenderer:
         source: TaskBundle | World,
         size_px: int | tuple[int, int] = 256,
         *,
-        backend: Backend = "auto",
+        backend: Backend = "zbuffer",
         num_threads: int = 0,
         wrist: bool = False,
     ) -> None:
         world = source if isinstance(source, World) else _world_of(source)
         self.size_px = size_px
-        self.backend: Backend = "zbuffer" if backend == "auto" else backend
+        self.backend: Backend = backend
         self.labels = geom_labels(world)
         self._model = world.model
         self._shape = (size_px, size_px) if isinstance(size_px, int) else size_px
@@ -157,25 +156,18 @@ class MaskRenderer:
 
     def draw_many(self, moments: Sequence[tuple[Moment, int]]) -> UInt8[np.ndarray, "n h w"]:
         """Return the label images of worlds of snapshots; several at once keep all cores busy."""
-        if (
-            self._painter is None
-        ):  # late, because whoever wants pictures only needs nothing compiled
-            if self.backend == "rays":
-                self._painter = _RayPainter(self._model, self.labels, self._shape)
-            else:
-                self._painter = _ZPainter(
-                    self._model, self.labels, self._shape, self._num_threads, self._wrist
-                )
+        if self._painter is None:  # late: who wants pictures alone needs nothing compiled
+            self._painter = _ZPainter(
+                self._model, self.labels, self._shape, self._num_threads, self._wrist
+            )
         return self._painter.draw(moments)
 
     def draw_rgb(self, snapshot: Moment, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """Return a picture for people.
 
         Raises:
-            V2PError: there is no OpenGL, or rays were asked for, which give masks only.
+            V2PError: there is no OpenGL.
         """
-        if self.backend == "rays":
-            raise V2PError("rays give masks only; pictures need OpenGL")
         return self._gl("pictures need OpenGL and there is none").rgb(snapshot, index)
 
     def close(self) -> None:
@@ -307,36 +299,6 @@ class _GLPainter:
         self.context.make_current()
         self.drawer.free()
         self.context.free()
-
-
-class _RayPainter:
-    def __init__(self, model: mujoco.MjModel, labels: np.ndarray, shape: tuple[int, int]) -> None:
-        self.labels = np.append(labels, np.uint8(BACKGROUND))  # the last, -1, is what hits nothing
-        self.model = copy.copy(model)
-        self.data = mujoco.MjData(self.model)
-        self.batch = Batch(self.model, 1, 1)
-        self.qpos = self.batch.bind("qpos")
-        self.camera = self.model.camera(CAMERA).id
-        self.height_px, self.width_px = shape
-        rows, columns = np.mgrid[0 : self.height_px, 0 : self.width_px] + 0.5
-        across = columns - self.width_px / 2
-        down = rows - self.height_px / 2
-        self.pixels = np.stack([across, -down], axis=-1).reshape(-1, 2)
-
-    def draw(self, moments: Sequence[tuple[Moment, int]]) -> np.ndarray:
-        images = [self.labels[self._geoms(snapshot, index)] for snapshot, index in moments]
-        return np.array(images, np.uint8).reshape(-1, self.height_px, self.width_px)
-
-    def _geoms(self, snapshot: Moment, index: int) -> np.ndarray:
-        snapshot.write(self.model, self.data, index)
-        self.batch.set_models(self.model)
-        self.qpos[0] = self.data.qpos
-        fovy_rad = np.radians(self.model.cam_fovy[self.camera])
-        focal_px = self.height_px / 2 / np.tan(fovy_rad / 2)
-        beams = np.concatenate([self.pixels / focal_px, -np.ones((len(self.pixels), 1))], axis=1)
-        R_world_cam = self.data.cam_xmat[self.camera].reshape(3, 3)
-        _, geoms = self.batch.ray(self.data.cam_xpos[self.camera], beams @ R_world_cam.T)
-        return np.asarray(geoms[0]).reshape(self.height_px, self.width_px)
 
 
 def _gl_context(width_px: int, height_px: int) -> Any:
