@@ -20,6 +20,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 import tyro
 
@@ -53,21 +54,21 @@ class Settings:
 
 def speed(num_envs: int, settings: Settings) -> tuple[float, float]:
     """Return control steps per second of the environment and of its physics alone."""
-    from v2p_data.sim.env.warp_env import WarpBatchEnv
-
-    env = WarpBatchEnv(
-        load_benchmark("lift_up"), num_envs=num_envs, seed=settings.seed, device=settings.device
+    env = BatchEnv(
+        load_benchmark("lift_up"),
+        SimConfig(backend="warp", device=settings.device),
+        num_envs=num_envs,
+        seed=settings.seed,
     )
     env.stagger()
-    generator = torch.Generator(env.device).manual_seed(settings.seed)
+    rng = np.random.default_rng(settings.seed)
 
     def step() -> None:
-        action = torch.rand(num_envs, env.act_dim, generator=generator, device=env.device) * 2 - 1
-        result = env.step(action)
-        env.reset((result.truncated | result.terminated).nonzero()[:, 0])
+        result = env.step(rng.uniform(-1, 1, (num_envs, env.act_dim)))
+        env.reset(np.flatnonzero(result.truncated | result.terminated))
 
     rates = []
-    for work in (step, env._sim.step):
+    for work in (step, lambda: env._sim._advance(None)):
         for _ in range(3):
             work()
         _wait(env.device)
@@ -81,10 +82,9 @@ def speed(num_envs: int, settings: Settings) -> tuple[float, float]:
 
 def learn(settings: Settings) -> None:
     """Train lifting and print steps, seconds and success in fresh episodes at the fine time step."""
-    from v2p_data.sim.env.warp_env import WarpBatchEnv
-
     bundle, n = load_benchmark("lift_up"), settings.learn_worlds
-    env = WarpBatchEnv(bundle, num_envs=n, seed=settings.seed, device=settings.device)
+    sim = SimConfig(backend="warp", device=settings.device)
+    env = BatchEnv(bundle, sim, num_envs=n, seed=settings.seed)
     cfg = PPOConfig()
     cfg = replace(
         cfg,

@@ -12,7 +12,9 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env import ranges
+from v2p_data.sim.env.cpu_physics import CpuPhysics
 from v2p_data.sim.env.layout import OBJECT_HIGH_M, OBJECT_LOW_M, PUSH_ROOM_M
+from v2p_data.sim.env.physics import SimConfig
 from v2p_data.sim.env.randomize import Randomizer
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.model.world import build_world
@@ -26,9 +28,10 @@ def worlds_of(
 ) -> tuple[Randomizer, Batch, np.ndarray]:
     """Return drawn worlds with the objects placed and the arm at a start pose."""
     world = build_world(scene, FINE)
-    batch = Batch(world.model, NUM_ENVS, 2)
+    physics = CpuPhysics(world, SimConfig(), 1.0, NUM_ENVS, 2)
+    batch = physics.batch
     batch.reset(stage=0)
-    randomizer = Randomizer(world, batch, cfg or ranges.training(), rng_for(0, "bank"))
+    randomizer = Randomizer(world, physics, cfg or ranges.training(), rng_for(0, "bank"))
     rng, ids = rng_for(0, "test"), np.arange(NUM_ENVS)
     randomizer.draw(ids, rng)
     poses = randomizer.place(ids, rng)

@@ -171,15 +171,8 @@ def _begun(
     bundle: TaskBundle, seeds: Sequence[int], num_threads: int, *, base_reset: bool
 ) -> BatchEnv:
     """Return worlds at the start of their episodes, one for each seed."""
-    sim = SimConfig(fine=True, randomization=ranges.recording())
-    env = BatchEnv(
-        bundle,
-        sim,
-        num_envs=len(seeds),
-        seed=0,
-        num_threads=num_threads,
-        base_reset=base_reset,
-    )
+    sim = SimConfig(fine=True, randomization=ranges.recording(), base_reset=base_reset)
+    env = BatchEnv(bundle, sim, num_envs=len(seeds), seed=0, num_threads=num_threads)
     env.reset_seeded(np.arange(len(seeds)), seeds)
     return env
 

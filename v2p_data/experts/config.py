@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from policies.ppo.config import ImitationConfig, PPOConfig
-from v2p_data.sim.env.backends import Backend
+from v2p_data.sim.env.physics import Backend
 
 
 @dataclass(frozen=True, kw_only=True)

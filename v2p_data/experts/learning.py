@@ -29,7 +29,6 @@ from v2p_data.experts.record import Comparison, Judged, Learned
 from v2p_data.experts.teacher import Played, Teacher, Trial, try_out
 from v2p_data.play import StateActor
 from v2p_data.seeds import seed_for
-from v2p_data.sim.env.backends import make_batch_env
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.robot.robot import FINE
 from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
@@ -292,14 +291,12 @@ def _training_worlds(
 ) -> TorchRLEnv:
     """Return the worlds of PPO; a taught policy goes on at the fine time step."""
     bonus = worlds.bonus_ratio * (cfg.taught_bonus_factor if is_taught else 1.0)
-    env = make_batch_env(
+    env = BatchEnv(
         worlds.bundle,
-        SimConfig(fine=is_taught, bonus_ratio=bonus),
+        SimConfig(fine=is_taught, bonus_ratio=bonus, backend=cfg.backend, device=device),
         num_envs=cfg.num_envs,
         seed=seed_for(worlds.seed, "worlds"),
         num_threads=worlds.num_threads,
-        backend=cfg.backend,
-        device=device,
     )
     return TorchRLEnv(env)
 

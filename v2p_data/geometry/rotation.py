@@ -1,7 +1,6 @@
 """Quaternion arithmetic for many worlds in numpy. Worlds come last, along which numpy is fastest.
 
-Quaternions are `wxyz` unit quaternions of shape (4, n), rotation vectors (3, n) [rad]. `rotation_torch` has the same
-functions for torch tensors, with worlds first.
+Quaternions are `wxyz` unit quaternions of shape (4, n), rotation vectors (3, n) [rad].
 """
 
 import numpy as np

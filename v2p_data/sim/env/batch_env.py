@@ -1,7 +1,8 @@
 """Thousands of worlds of one task in step: actions in, observations, rewards and successes out.
 
-A numpy core on `mujoco.batch.Batch`. There is no automatic reset: worlds that have ended go on until `reset` is called
-for them. Results depend on the seed only, not on the number of threads.
+A numpy core over one of two physics: MuJoCo on CPU cores, or MuJoCo Warp on a GPU for training. There is no automatic
+reset: worlds that have ended go on until `reset` is called for them. Results depend on the seed only, not on the number
+of threads.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -17,9 +18,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int
 
+from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env import task_code
-from v2p_data.sim.env.cpu_physics import CpuPhysics, SimConfig, Targets
+from v2p_data.sim.env.cpu_physics import CpuPhysics
+from v2p_data.sim.env.physics import Physics, SimConfig, Targets
 from v2p_data.sim.env.randomize import Randomizer
 from v2p_data.sim.env.start_check import check_poses, check_start
 from v2p_data.sim.env.states import Observed, StateBlock
@@ -74,15 +77,16 @@ class BatchEnv:
     Args:
         bundle: code and scene of the task.
         cfg: how it is simulated.
-        num_envs: number of worlds; 256 to 1024 are fastest.
+        num_envs: number of worlds; 256 to 1024 are fastest on a CPU, a large GPU takes 8,192.
         seed: everything drawn follows from it.
-        num_threads: 0 for all cores; changes no result.
+        num_threads: of the backend `cpu`; 0 for all cores; changes no result.
         task: the task, instead of `bundle.code`.
-        base_reset: place objects as the environment does, whatever the task's own reset says.
+
 
     Raises:
         ItemRejectedError: an object does not suit the robot, or the objects do not fit on the table.
-        V2PError: the task's observation is not what it says.
+        V2PError: the task's observation is not what it says; MuJoCo Warp or the device is missing, or it is another arm's
+            task.
     """
 
     act_dim = ACT_DIM
@@ -96,22 +100,27 @@ class BatchEnv:
         seed: int,
         num_threads: int = 0,
         task: type[Task] | None = None,
-        base_reset: bool = False,
     ) -> None:
-        self._base_reset = base_reset
         self.cfg = cfg or SimConfig()
         self.bundle = bundle
         self.num_envs = num_envs
         self.horizon = bundle.horizon_steps
-        self.physics = FINE if self.cfg.fine else COARSE
         robot = robot_of(bundle, self.cfg)
-        self.world: World = build_world(bundle.scene, self.physics, robot=robot)
+        if self.cfg.backend == "warp" and robot.path is not None:
+            raise V2PError(
+                f"the backend 'warp' has the built-in arm only; simulate {robot.path} with the backend 'cpu'"
+            )
+        self.world: World = build_world(
+            bundle.scene, FINE if self.cfg.fine else COARSE, robot=robot
+        )
         self.object_names = [o.name for o in self.world.objects]
         self.broken_count = 0
         """Worlds whose simulation broke down since the environment was made."""
-        self._sim = CpuPhysics(self.world, self.cfg, bundle.motion_scale, num_envs, num_threads)
+        self._sim = _physics_of(self.world, self.cfg, bundle.motion_scale, num_envs, num_threads)
+        self.device = self._sim.device
+        """Where who learns in these worlds computes; arrays are numpy's anyway."""
         self.randomizer = Randomizer(
-            self.world, self._sim.batch, self.cfg.randomization, rng_for(seed, "start-poses")
+            self.world, self._sim, self.cfg.randomization, rng_for(seed, "start-poses")
         )
         self._rng = rng_for(seed, "worlds")
         self._own_rngs: dict[int, np.random.Generator] = {}
@@ -180,7 +189,7 @@ class BatchEnv:
         rows = torch.from_numpy(ids)
         poses = (
             self.sample_object_poses(rows)
-            if self._base_reset
+            if self.cfg.base_reset
             else self.task.reset_poses(rows, self.object_names)
         )
         for k, name in enumerate(self.object_names):
@@ -217,7 +226,7 @@ class BatchEnv:
         np.minimum(np.maximum(clipped, -1.0, out=clipped), 1.0, out=clipped)
         noise = self.cfg.randomization.action_noise
         moved = clipped + self._action_noise(noise) if noise else clipped
-        self.broken_count += self._sim.step(moved, moving, self.physics.substeps)
+        self.broken_count += self._sim.step(moved, moving)
         self._last_action[:] = clipped.T
         self._steps += 1
         self._touches[:] = self._sim.sensordata.reshape(self.num_envs, -1, 2) > 0
@@ -236,7 +245,7 @@ class BatchEnv:
         return self._block.copies()
 
     def robot_state(self) -> Float32[np.ndarray, "env 11"]:
-        """Return `observation.state`; see `CpuPhysics.robot_state`."""
+        """Return `observation.state`; see `Physics.robot_state`."""
         return self._sim.robot_state()
 
     @property
@@ -261,7 +270,7 @@ class BatchEnv:
 
         They are kept from the first call on, so that call itself returns those of no step.
         """
-        return self._sim.batch.bind("qfrc_constraint")[:, self.world.robot.arm_dofs].copy()
+        return self._sim.contact_torques()
 
     def motion(self) -> tuple[Float[np.ndarray, "env q"], Float[np.ndarray, "env v"]]:
         """Return copies of all worlds' positions and velocities: what changes in a `Snapshot` during an episode."""
@@ -304,7 +313,7 @@ class BatchEnv:
         self.broken_count = int(state["broken_count"])
         said = self._judgement
         said.num_starts, said.num_solved = int(state["num_starts"]), int(state["num_solved"])
-        self._sim.tool = self._sim.tool_of(slice(None))
+        self._sim.resume()
         self._fill(slice(None), self._sim.tool)
 
     # -- inside
@@ -312,7 +321,7 @@ class BatchEnv:
     def _arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that the next step depends on, live, by their names in `state_dict`."""
         sim = self._sim
-        arrays = {f"batch.{name}": sim.batch.bind(name) for name in _BATCH_STATE}
+        arrays = sim.state()
         arrays |= {f"model.{name}": array for name, array in self.randomizer.fields().items()}
         arrays |= {f"drawn.{name}": a for name, a in self.randomizer.drawn_arrays().items()}
         return arrays | {
@@ -360,7 +369,19 @@ class BatchEnv:
         )
 
 
-_BATCH_STATE = ("time", "qpos", "qvel", "ctrl", "history", "qacc_warmstart")
+def _physics_of(
+    world: World, cfg: SimConfig, motion_scale: float, num_envs: int, num_threads: int
+) -> Physics:
+    """Return what simulates a world many times.
+
+    Raises:
+        V2PError: MuJoCo Warp or the device is missing.
+    """
+    if cfg.backend == "cpu":
+        return CpuPhysics(world, cfg, motion_scale, num_envs, num_threads)
+    from v2p_data.sim.env.warp_physics import WarpPhysics
+
+    return WarpPhysics(world, cfg, motion_scale, num_envs)
 
 
 def robot_of(bundle: TaskBundle, cfg: SimConfig) -> RobotConfig:

@@ -4,8 +4,6 @@ Every value drawn is kept per world (`Randomizer.drawn`), so that an episode can
 under. Values are written into the batch's per-simulation model fields; nothing is recompiled.
 """
 
-from typing import Protocol, runtime_checkable
-
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
@@ -15,6 +13,7 @@ from v2p_data.geometry.rotation import product, quats_about_z
 from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import FLOOR_MAX_M
 from v2p_data.sim.env.layout import drawn_layouts
+from v2p_data.sim.env.physics import Physics
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.env.scaling import Draw, FieldWriter
 from v2p_data.sim.model.suitability import GRIP_MARGIN_M
@@ -26,24 +25,12 @@ PREPARED = 128
 """Draws made at once: a few worlds start anew at most steps, and drawing for a few costs as much as for many."""
 
 
-@runtime_checkable
-class PerWorldFields(Protocol):
-    """Who keeps the model's fields per world: `mujoco.batch.Batch`, or a host copy of a GPU's."""
-
-    @property
-    def nsim(self) -> int: ...
-
-    def expand(self, name: str, /) -> np.ndarray:
-        """Return a model field with a leading axis of worlds, to be written to."""
-        ...
-
-
 class Randomizer:
-    """Draws values for worlds and writes them into a batch.
+    """Draws values for worlds and writes them into their physics.
 
     Args:
         world: the model.
-        batch: the simulations; the fields that vary are expanded here, once.
+        physics: of the worlds; the fields that vary are expanded here, once.
         cfg: the ranges.
         rng: fills the bank of start poses; later draws get their own generator.
 
@@ -58,13 +45,13 @@ class Randomizer:
     def __init__(
         self,
         world: World,
-        batch: PerWorldFields,
+        physics: Physics,
         cfg: RandomizationConfig,
         rng: np.random.Generator,
     ) -> None:
         self.world = world
         self.cfg = cfg
-        n, objects = batch.nsim, world.objects
+        n, objects = physics.num_envs, world.objects
         self.size_m = np.tile(np.array([o.size_m for o in objects]), (n, 1, 1))
         self.mass_kg = np.tile(np.array([o.mass_kg for o in objects]), (n, 1))
         self.friction = np.tile(np.array([o.friction for o in objects]), (n, 1))
@@ -82,7 +69,7 @@ class Randomizer:
         self._height_above_table = np.zeros((n, len(objects)))
         self._radius = np.zeros((n, len(objects)))
         self._fields = {
-            name: batch.expand(name)
+            name: physics.expand(name)
             for name in [
                 "geom_size",
                 "geom_pos",

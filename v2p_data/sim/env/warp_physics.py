@@ -1,7 +1,9 @@
-"""The same worlds on MuJoCo Warp: one model, thousands of worlds, arrays that torch shares. The only file that imports Warp.
+"""The physics of thousands of worlds on MuJoCo Warp, for training on a GPU. The only file that imports Warp.
 
-Needs the extra `gpu` (mujoco-warp 4.0, warp-lang 1.19 go with mujoco 4.0). All arrays are float32 and live on
-one device, `cuda:0` or `cpu`; on CUDA a whole control step is one captured graph.
+Needs the extra `gpu` (mujoco-warp 4.0, warp-lang 1.19 go with mujoco 4.0). Warp's arrays are float32 and live on one
+device, `cuda:0` or `cpu`; on CUDA a control step is one captured graph. Each control step copies positions, velocities
+and commands there, and positions, velocities and touches back: 50 numbers a world. Model fields go there when a world
+starts anew. For a seed starts and noise are those of the CPU's worlds.
 
 What our model uses, and what becomes of it here:
 
@@ -13,7 +15,7 @@ What our model uses, and what becomes of it here:
 | sizes, masses, friction, meshes (`geom_dataid`), servo gains per world | yes | as they are |
 | `orientation` servo | no (`mjTRN_SO3`) | three rotational position servos, see `_control` |
 | delayed controls | yes, in float32 time | the command of the control step before, until the delay is over: the same time steps |
-| reset of a world that diverges | no | `WarpBatchEnv` ends it |
+| reset of a world that diverges | no | `BatchEnv` ends it |
 | double precision | no | rounding, see below |
 
 The orientation servo's law is `torque = kp log(R_wanted R^T) - kv w`, no longer than its limit; the `discrete`
@@ -46,9 +48,10 @@ from typing import no_type_check
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from v2p_data.errors import V2PError
+from v2p_data.sim.env.physics import Physics, SimConfig
 from v2p_data.sim.model.world import World
 from v2p_data.sim.robot.robot import NUM_CONTROLS
 
@@ -159,158 +162,154 @@ def _control(
         forcerange[world, turn + k] = free
 
 
-class WarpPhysics:
-    """Worlds on one device. Attributes are torch tensors that share memory with Warp's arrays.
+class WarpPhysics(Physics):
+    """Worlds on one device: a CUDA device, or `cpu` to check the GPU's model (slowly).
 
     Args:
-        world: the model, as on the CPU.
-        num_envs: number of worlds.
-        device: `cpu` or a CUDA device.
+        world, cfg, motion_scale, num_envs: see `Physics`.
 
-    Attributes:
-        qpos, qvel: `(env, q)`, `(env, v)`.
-        sensordata: `(env, sensor)`, of the last time step.
-        command: `(env, 8)`, the controls of `robot`: `[x, y, z, qw, qx, qy, qz, finger]`.
-        overflow: `(env,)`, bits of what did not fit since the world's reset.
+    Raises:
+        V2PError: there is no such device.
     """
 
-    def __init__(self, world: World, num_envs: int, device: torch.device) -> None:
-        self.device = device
-        self.num_envs = num_envs
-        self.physics = world.physics
-        self._wp_device = wp.get_device(str(device))
-        self.model = _without_orientation_servo(world)
-        with wp.ScopedDevice(self._wp_device):
-            self._m = mjw.put_model(
-                self.model,
-                batch_sizes=dict.fromkeys((*PER_WORLD_FIELDS, "actuator_forcerange"), num_envs),
-            )
-            self._m.opt.warn_overflow = 0
-            self._d = mjw.make_data(
-                self.model,
-                nworld=num_envs,
-                nconmax=CONTACTS_PER_WORLD,
-                njmax=4 * CONTACTS_PER_WORLD + 20,
-            )
-            self._to_reset = wp.zeros(num_envs, dtype=bool)
-        d = self._d
-        self.qpos, self.qvel = wp.to_torch(d.qpos), wp.to_torch(d.qvel)
-        self.sensordata = wp.to_torch(d.sensordata)
-        self.overflow = wp.to_torch(d.overflow)
-        self.command = torch.zeros(num_envs, NUM_CONTROLS, device=device)
-        self._command_before = torch.zeros_like(self.command)
-        self._first_substep = torch.zeros(num_envs, dtype=torch.int32, device=device)
-        self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in PER_WORLD_FIELDS}
+    def __init__(self, world: World, cfg: SimConfig, motion_scale: float, num_envs: int) -> None:
+        self.device = _present(cfg.device)
+
+        self._scene, self._substeps = world.scene.title, world.physics.substeps
+        self._timestep_s, self._original = world.physics.timestep_s, world.model
+        self._expanded: dict[str, np.ndarray] = {}
+        self.qpos = np.tile(world.model.qpos0, (num_envs, 1))
+        self.qvel = np.zeros((num_envs, world.model.nv))
+        self.ctrl = np.zeros((num_envs, NUM_CONTROLS))
+        self._ctrl_before = np.zeros_like(self.ctrl)
+        self.sensordata = np.zeros((num_envs, world.model.nsensordata))
+        self._is_fresh = np.ones(num_envs, bool)
+        """Which worlds were reset since the last step: the device does not know it yet."""
+        self._model = _without_orientation_servo(world)
         self._servo_ids = np.array([world.model.actuator(name).id for name in SERVOS])
-        self._reset_mask = wp.to_torch(self._to_reset)
-        self._xpos, self._xmat = wp.to_torch(d.site_xpos), wp.to_torch(d.site_xmat)
-        self._xquat, self._cvel = wp.to_torch(d.xquat), wp.to_torch(d.cvel)
-        self._subtree_com = wp.to_torch(d.subtree_com)
-        self._tcp = int(self.model.site("tcp").id)
-        self._hand = int(self.model.site_bodyid[self._tcp])
-        self._root = int(self.model.body_rootid[self._hand])
-        self._m.callback.control = self._control_law(world.model)
-        self._graphs: dict[str, wp.Graph] = {}
-        if self._wp_device.is_cuda:
-            self._capture()
+        self._wp_device = wp.get_device(str(self.device))
+        self._graph: wp.Graph | None = None
+        with wp.ScopedDevice(self._wp_device):
+            self._allocate(num_envs)
+        super().__init__(world, cfg, motion_scale, num_envs)
 
-    def step(self) -> None:
-        """Go on by one control step under `command`, and compute the tool's pose of its end."""
-        self._run("step", self._control_step)
-        self._command_before.copy_(self.command)
+    def expand(self, name: str) -> np.ndarray:
+        value = np.asarray(getattr(self._original, name))
+        self._expanded[name] = np.repeat(value[None], self.num_envs, axis=0)
+        return self._expanded[name]
 
-    def refresh(self) -> None:
-        """Compute the tool's pose from `qpos` and `qvel`; they may have been written to."""
-        self._run("refresh", self._kinematics)
+    def reset(self, ids: Int[np.ndarray, "n"]) -> None:
+        self.qpos[ids] = self._original.qpos0
+        self.qvel[ids] = 0
+        self.sensordata[ids] = 0
+        self.broken[ids] = False
+        self._is_fresh[ids] = True
 
-    def reset(self, ids: Int[torch.Tensor, "n"], delay_s: Float[np.ndarray, "n"]) -> None:
-        """Clear the worlds `ids`; their `qpos` and `command` are to be written next, then `settle` is due."""
-        self._reset_mask.zero_()
-        self._reset_mask[ids] = True
-        self._run("reset", self._clear)
-        # A command takes effect from the first time step that begins no earlier than its delay after it.
-        first = np.ceil(delay_s / self.physics.timestep_s - 1e-6).astype(np.int32)
-        self._first_substep[ids] = torch.from_numpy(first).to(self.device)
-
-    def settle(self, ids: Int[torch.Tensor, "n"]) -> None:
-        """Make the command of the worlds `ids` the one they had before, so that a delay does not move them."""
-        self._command_before[ids] = self.command[ids]
-
-    def write_fields(
-        self,
-        fields: dict[str, np.ndarray],
-        ids: Int[torch.Tensor, "n"],
-        rows: Int[np.ndarray, "n"],
-    ) -> None:
-        """Copy `rows` of the host's model fields into the worlds `ids`, which are the same."""
-        for name, shared in self._fields.items():
-            values = fields[name][rows]
-            if name.startswith("actuator_"):
-                values = values[:, self._servo_ids]
-            values = torch.from_numpy(values).to(self.device, shared.dtype)
-            shared[ids] = values.reshape(len(ids), *shared.shape[1:])
-
-    @property
-    def tool_pos(self) -> Float[torch.Tensor, "env 3"]:
-        return self._xpos[:, self._tcp]
-
-    @property
-    def tool_rotation(self) -> Float[torch.Tensor, "env 3 3"]:
-        return self._xmat[:, self._tcp]
-
-    @property
-    def tool_quat(self) -> Float[torch.Tensor, "env 4"]:
-        """`wxyz`; `tcp` is parallel to the hand."""
-        return self._xquat[:, self._hand]
-
-    @property
-    def tool_vel_angular(self) -> Float[torch.Tensor, "env 3"]:
-        return self._cvel[:, self._hand, :3]
-
-    @property
-    def tool_vel_linear(self) -> Float[torch.Tensor, "env 3"]:
-        """MuJoCo gives velocities at the robot's centre of mass."""
-        arm = self.tool_pos - self._subtree_com[:, self._root]
-        return self._cvel[:, self._hand, 3:] + torch.linalg.cross(self.tool_vel_angular, arm)
-
-    def state(self) -> dict[str, torch.Tensor]:
-        """Return the live tensors on which the next step depends."""
-        d = self._d
+    def state(self) -> dict[str, np.ndarray]:
+        for name, there in self._kept.items():
+            self._kept_here[name][:] = there.cpu().numpy()
         return {
-            "time": wp.to_torch(d.time),
-            "qpos": self.qpos,
-            "qvel": self.qvel,
-            "qacc_warmstart": wp.to_torch(d.qacc_warmstart),
-            "command": self.command,
-            "command_before": self._command_before,
-            "first_substep": self._first_substep,
-            **{f"model.{name}": value for name, value in self._fields.items()},
+            "warp.qpos": self.qpos,
+            "warp.qvel": self.qvel,
+            "warp.ctrl_before": self._ctrl_before,
+            "warp.sensordata": self.sensordata,
+            "warp.is_fresh": self._is_fresh,
+            **{f"warp.{name}": array for name, array in self._kept_here.items()},
         }
 
-    def dropped_contacts(self) -> torch.Tensor:
-        """Return whether contacts of any world were dropped because the shared buffers were full."""
-        bits = mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE | mjw.OverflowType.CCD
-        return ((self.overflow & int(bits)) != 0).any()
+    def resume(self) -> None:
+        for name, there in self._kept.items():
+            there.copy_(torch.from_numpy(self._kept_here[name]))
+        self._write_fields(np.arange(self.num_envs))
+        super().resume()
 
-    def broken(self) -> torch.Tensor:
-        """Return the worlds whose state is not finite, or whose constraints did not fit."""
-        apart = (self.qpos.abs() < DIVERGED).all(1) & (self.qvel.abs() < DIVERGED).all(1)
-        bits = mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ
-        return ~apart | ((self.overflow & int(bits)) != 0)
+    def contact_torques(self) -> Float[np.ndarray, "env joint"]:
+        forces = wp.to_torch(self._d.qfrc_constraint).cpu().numpy()
+        return forces[:, self._robot.arm_dofs].astype(float)
 
     # -- inside
 
-    def _control_law(self, original: mujoco.MjModel):  # noqa: ANN202
-        servo = int(original.actuator("servo_rotation").id)
+    def _allocate(self, num_envs: int) -> None:
+        per_world = dict.fromkeys((*PER_WORLD_FIELDS, "actuator_forcerange"), num_envs)
+        self._m = mjw.put_model(self._model, batch_sizes=per_world)
+        self._m.opt.warn_overflow = 0
+        self._d = mjw.make_data(
+            self._model,
+            nworld=num_envs,
+            nconmax=CONTACTS_PER_WORLD,
+            njmax=4 * CONTACTS_PER_WORLD + 20,
+        )
+        self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in PER_WORLD_FIELDS}
+        self._commands = torch.zeros(2, num_envs, NUM_CONTROLS, device=self.device)
+        """Of the control step before, and of this one."""
+        self._first_substep = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
+        kept = ("time", "qacc_warmstart")
+        self._kept = {name: wp.to_torch(getattr(self._d, name)) for name in kept}
+        self._kept_here = {name: array.cpu().numpy().copy() for name, array in self._kept.items()}
+        self._overflow = wp.to_torch(self._d.overflow)
+        self._m.callback.control = self._control_law()
+
+    def _advance(self, moving: Int[np.ndarray, "n"] | None) -> None:
+        del moving  # time passes in all of them
+        with wp.ScopedDevice(self._wp_device):
+            self._begin(np.flatnonzero(self._is_fresh))
+            self._commands.copy_(torch.from_numpy(np.stack([self._ctrl_before, self.ctrl])))
+            for name in ("qpos", "qvel"):
+                there = wp.to_torch(getattr(self._d, name))
+                there.copy_(torch.from_numpy(getattr(self, name)))
+            self._run()
+            for name in ("qpos", "qvel", "sensordata"):
+                there = wp.to_torch(getattr(self._d, name))
+                getattr(self, name)[:] = there.cpu().numpy()
+        self._ctrl_before[:] = self.ctrl
+        dropped = mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE | mjw.OverflowType.CCD
+        if bool((self._overflow & int(dropped)).any()):
+            raise V2PError(
+                f"the worlds of scene '{self._scene}' have more contacts than the backend 'warp' has room "
+                f"for ({CONTACTS_PER_WORLD} a world on average); raise CONTACTS_PER_WORLD in sim/env/warp_physics.py "
+                "or simplify the scene's objects"
+            )
+
+    def _warned(self) -> Bool[np.ndarray, "env"]:
+        bits = int(mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ)
+        near = (np.abs(self.qpos) < DIVERGED).all(1) & (np.abs(self.qvel) < DIVERGED).all(1)
+        return ~near | ((self._overflow & bits) != 0).cpu().numpy()
+
+    def _settle(self, ids: Int[np.ndarray, "n"]) -> None:
+        self._ctrl_before[ids] = self.ctrl[ids]
+
+    def _begin(self, ids: Int[np.ndarray, "n"]) -> None:
+        """Clear worlds on the device, and write there what was drawn for them."""
+        if not len(ids):
+            return
+        cleared = torch.from_numpy(self._is_fresh).to(self.device)
+        mjw.reset_data(self._m, self._d, reset=wp.from_torch(cleared))
+        self._is_fresh[:] = False
+        self._write_fields(ids)
+
+    def _write_fields(self, ids: Int[np.ndarray, "n"]) -> None:
+        rows = torch.from_numpy(ids).to(self.device)
+        for name, there in self._fields.items():
+            values = self._expanded[name][ids]
+            if name.startswith("actuator_"):
+                values = values[:, self._servo_ids]
+            values = torch.from_numpy(values).to(self.device, there.dtype)
+            there[rows] = values.reshape(len(ids), *there.shape[1:])
+        # A command takes effect from the first time step that begins no earlier than its delay after it.
+        delay = self._expanded["actuator_delay"][ids, 0] / self._timestep_s
+        first = torch.from_numpy(np.ceil(delay - 1e-6).astype(np.int32))
+        self._first_substep[rows] = first.to(self.device)
+
+    def _control_law(self):  # noqa: ANN202
+        servo = int(self._original.actuator("servo_rotation").id)
+        before, now = (wp.from_torch(command) for command in self._commands)
         constants = (
-            self._hand,
-            int(self.model.actuator("servo_turn_0").id),
-            float(original.actuator_forcerange[servo, 1]),
+            int(self._model.site_bodyid[self._model.site("tcp").id]),
+            int(self._model.actuator("servo_turn_0").id),
+            float(self._original.actuator_forcerange[servo, 1]),
             wp.from_torch(self._fields["actuator_gainprm"]),
             wp.from_torch(self._fields["actuator_biasprm"]),
         )
-        self._substep = 0
-        before, now = wp.from_torch(self._command_before), wp.from_torch(self.command)
         first = wp.from_torch(self._first_substep)
 
         def control(m: mjw.Model, d: mjw.Data) -> None:
@@ -324,41 +323,36 @@ class WarpPhysics:
 
         return no_type_check(control)
 
-    def _control_step(self) -> None:
-        for substep in range(self.physics.substeps):
+    def _run(self) -> None:
+        """Do all time steps of a control step; on CUDA they are recorded, after a run that compiles the kernels."""
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+            return
+        self._time_steps()
+        if self._wp_device.is_cuda:
+            with wp.ScopedCapture() as capture:
+                self._time_steps()
+            self._graph = capture.graph
+
+    def _time_steps(self) -> None:
+        for substep in range(self._substeps):
             self._substep = substep  # read by the control law; a captured graph keeps each value
             mjw.step(self._m, self._d)
-        self._kinematics()
 
-    def _kinematics(self) -> None:
-        mjw.kinematics(self._m, self._d)
-        mjw.com_pos(self._m, self._d)
-        mjw.com_vel(self._m, self._d)
 
-    def _clear(self) -> None:
-        mjw.reset_data(self._m, self._d, reset=self._to_reset)
+def _present(name: str) -> torch.device:
+    """Return a device.
 
-    def _capture(self) -> None:
-        """Record the three things that are done as CUDA graphs, each after a run that compiles its kernels."""
-        for name, work in (
-            ("step", self._control_step),
-            ("refresh", self._kinematics),
-            ("reset", self._clear),
-        ):
-            with wp.ScopedDevice(self._wp_device):
-                work()
-                with wp.ScopedCapture() as capture:
-                    work()
-            if capture.graph is None:
-                raise RuntimeError(f"Warp captured no graph of '{name}'")
-            self._graphs[name] = capture.graph
-
-    def _run(self, name: str, work) -> None:  # noqa: ANN001
-        with wp.ScopedDevice(self._wp_device):
-            if name in self._graphs:
-                wp.capture_launch(self._graphs[name])
-            else:
-                work()
+    Raises:
+        V2PError: the machine has none like it.
+    """
+    device = torch.device("cuda:0" if name == "cuda" else name)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise V2PError(
+            f"the backend 'warp' was asked for {name}, but this machine has no CUDA device; use the "
+            "backend 'cpu', or device 'cpu' to try the GPU's model slowly"
+        )
+    return device
 
 
 def _without_orientation_servo(world: World) -> mujoco.MjModel:

@@ -1,13 +1,13 @@
 """The batched worlds as a TorchRL environment, for its collectors and losses.
 
 Keys: `observation` and, after a step, `reward`, its `components`, `success` and `held` (see
-`batch_env.StepResult`), `terminated` (the simulation broke down), `truncated` (time is up) and `done`. Its
+`task_code.StepResult`), `terminated` (the simulation broke down), `truncated` (time is up) and `done`. Its
 `state_dict` holds the worlds' whole state, so a training can go on exactly. Partial resets follow TorchRL's
 `_reset` mask. Actions are not bounded by the specification; the environment clips them.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,26 +16,20 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from v2p_data.sim.env.batch_env import BatchEnv
-from v2p_data.sim.wrappers.joined_worlds import JoinedWorlds
 
-if TYPE_CHECKING:
-    from v2p_data.sim.env.warp_env import WarpBatchEnv
-
-ON_CPU = (BatchEnv, JoinedWorlds)
-"""Worlds of arrays; others take and give tensors on their device."""
+FLAGS = ("success", "held", "done", "terminated", "truncated")
 
 
 class TorchRLEnv(EnvBase):
-    """TorchRL's view of a `BatchEnv`, of several as one, or of a `WarpBatchEnv`, whose device it has.
+    """TorchRL's view of a `BatchEnv`; its tensors are on the worlds' device.
 
     Args:
         env: the worlds; `batch_size` is their number.
     """
 
-    def __init__(self, env: "BatchEnv | JoinedWorlds | WarpBatchEnv") -> None:
+    def __init__(self, env: BatchEnv) -> None:
         n = env.num_envs
-        device = torch.device("cpu") if isinstance(env, ON_CPU) else env.device
-        super().__init__(device=device, batch_size=torch.Size([n]))
+        super().__init__(device=env.device, batch_size=torch.Size([n]))
         self.worlds = env
         flag = Binary(1, torch.Size([n, 1]), dtype=torch.bool)
         self.observation_spec = Composite(
@@ -71,29 +65,21 @@ class TorchRLEnv(EnvBase):
         n = self.worlds.num_envs
         mask = None if tensordict is None else tensordict.get("_reset", None)
         ids = torch.arange(n) if mask is None else mask.reshape(n, -1).any(1).nonzero()[:, 0]
-        if isinstance(self.worlds, ON_CPU):
-            self.worlds.reset(ids.numpy())
-        else:
-            self.worlds.reset(ids)
-        no = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
-        flags = {key: no.clone() for key in ("success", "held", "done", "terminated", "truncated")}
-        parts = {name: torch.zeros(n, device=self.device) for name in self.worlds.component_names}
+        self.worlds.reset(ids.cpu().numpy())
+        no = torch.zeros(n, 1, dtype=torch.bool)
+        parts = {name: torch.zeros(n) for name in self.worlds.component_names}
         return TensorDict(
             {
-                "observation": torch.as_tensor(self.worlds.observe()),
+                "observation": torch.from_numpy(self.worlds.observe()),
                 "components": TensorDict(parts, [n]),
-                **flags,
+                **{flag: no.clone() for flag in FLAGS},
             },
             [n],
             device=self.device,
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict.get("action").detach()
-        if isinstance(self.worlds, ON_CPU):
-            result = self.worlds.step(action.numpy())
-        else:
-            result = self.worlds.step(action)
+        result = self.worlds.step(tensordict.get("action").detach().cpu().numpy())
         columns = {
             "reward": result.reward,
             "success": result.success,
@@ -102,13 +88,13 @@ class TorchRLEnv(EnvBase):
             "truncated": result.truncated,
             "done": result.terminated | result.truncated,
         }
-        parts = {name: torch.as_tensor(value) for name, value in result.components.items()}
+        parts = {name: torch.from_numpy(value) for name, value in result.components.items()}
         n = self.worlds.num_envs
         return TensorDict(
             {
-                "observation": torch.as_tensor(result.obs),
+                "observation": torch.from_numpy(result.obs),
                 "components": TensorDict(parts, [n]),
-                **{key: torch.as_tensor(value)[:, None] for key, value in columns.items()},
+                **{key: torch.from_numpy(value)[:, None] for key, value in columns.items()},
             },
             [n],
             device=self.device,
