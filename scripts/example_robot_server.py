@@ -81,7 +81,7 @@ class Arm:
             action[3:6] = (rotation * self.turned.inv()).as_rotvec() / scale.rotation_step_rad
             action[6] = (state[10] - opening) * travel / scale.finger_step_m
             self.turned = rotation
-        self.arm.act(np.clip(action, -1, 1))
+        self.arm.carry_out(np.clip(action, -1, 1))
 
     def hold(self) -> None:
         self.goal = None

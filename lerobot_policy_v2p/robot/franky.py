@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +21,8 @@ GRIPPER_TOLERANCE = 0.05
 class FrankyArm:
     """A real arm. Never run by us; see the first lines of `v2p_franka`."""
 
-    action_scale = ActionScale()
+    is_real = is_limited = True
+    action_scale, has_succeeded, task_description = ActionScale(), False, ""
 
     def __init__(self, config: V2PFrankaConfig) -> None:
         try:
@@ -49,15 +50,24 @@ class FrankyArm:
     def mask(self) -> np.ndarray:
         return labels_to_rgb(np.asarray(self.labels(), np.uint8))
 
-    def act(self, action: np.ndarray) -> np.ndarray:
+    def _lacks(self) -> NoReturn:
+        raise V2PError(
+            "the backend 'franky' gives no pictures and no angles of joints; use 'sim' or 'network'"
+        )
+
+    picture = calibration = joints = opening = _lacks
+
+    def force_n(self) -> None:
+        """Return nothing: it is not reported."""
+
+    def carry_out(self, step: np.ndarray) -> None:
         self.target = next_target(
-            self.target, self._measure(), action, self.cfg, self.max_width_m / 2
+            self.target, self._measure(), step, self.cfg, self.max_width_m / 2
         )
         flange = self.target.pos - self.target.rotation.apply([0, 0, self.config.tool_offset_m])
         goal = self.franky.Affine(flange.tolist(), self.target.rotation.as_quat().tolist())
         self.robot.move(self.franky.CartesianMotion(goal), asynchronous=True)
         self._move_gripper()
-        return action
 
     def hold(self) -> None:
         self.robot.stop()

@@ -20,7 +20,8 @@ from v2p_data.twin.interface import RGB_PX
 class NetworkArm:
     """A driver's arm."""
 
-    action_scale = ActionScale()
+    is_real = is_limited = True
+    action_scale, has_succeeded, task_description = ActionScale(), False, ""
 
     def __init__(self, config: V2PFrankaConfig) -> None:
         self.cfg = SimConfig()
@@ -58,14 +59,13 @@ class NetworkArm:
     def force_n(self) -> float | None:
         return self.seen.force_n
 
-    def act(self, action: np.ndarray) -> np.ndarray:
-        """Send the target after one action."""
+    def carry_out(self, step: Float[np.ndarray, "7"]) -> None:
+        """Send the target after one step."""
         self.target = next_target(
-            self.target, self._measured(), action, self.cfg, self.hello.finger_travel_m
+            self.target, self._measured(), step, self.cfg, self.hello.finger_travel_m
         )
         quat = self.target.rotation.as_quat(canonical=True, scalar_first=True)
         self.driver.target(self.target.pos, quat, self.target.opening)
-        return action
 
     def hold(self) -> None:
         """Tell the driver to stay."""

@@ -22,18 +22,24 @@ logger = logging.getLogger("lerobot_policy_v2p.robot.v2p_franka")
 class SimulatedArm:
     """One episode of a task."""
 
+    is_real = is_limited = False  # its gripper is that of the training
+
     def __init__(self, config: V2PFrankaConfig) -> None:
         self.env = V2PEnv(config.task_folder)
         scale = TaskBundle.load(Path(config.task_folder)).motion_scale
         self.action_scale = ActionScale(position_step_m=ActionScale.position_step_m * scale)
         self.restart(config.seed)
 
+    @property
+    def task_description(self) -> str:
+        return self.env.task_description
+
     def restart(self, seed: int) -> None:
         """Start the episode of a seed."""
         self.seen, _ = self.env.reset(seed=seed)
         self.env.contact_torques()  # from now on they are kept
         self.steps = 0
-        self.ended = self.succeeded = False
+        self.ended = self.has_succeeded = False
 
     def state(self) -> Float[np.ndarray, "11"]:
         """Return `observation.state`."""
@@ -78,16 +84,15 @@ class SimulatedArm:
         force, *_ = np.linalg.lstsq(lever, self.env.contact_torques())
         return float(np.linalg.norm(force))
 
-    def act(self, action: np.ndarray) -> np.ndarray:
-        """Carry out an action in [-1, 1] and let 50 ms pass."""
-        self.seen, _, terminated, truncated, info = self.env.step(action)
+    def carry_out(self, step: Float[np.ndarray, "7"]) -> None:
+        """Carry out a step of the tool and let 50 ms pass."""
+        self.seen, _, terminated, truncated, info = self.env.step(step)
         self.steps += 1
-        self.succeeded |= bool(info["is_success"])
+        self.has_succeeded |= bool(info["is_success"])
         if (terminated or truncated) and not self.ended:
             self.ended = True
             outcome = "succeeded" if info["is_success"] else "ended without success"
             logger.info("task '%s' %s after %d steps", self.env.task, outcome, self.steps)
-        return action
 
     def hold(self) -> None:
         """Do nothing: time stands still."""

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from v2p_data.deployment.robot import Reading, Rig
+from v2p_data.deployment.rig import Rig
+from v2p_data.deployment.robot import Reading
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.scene.scene import Scene, SceneObject

@@ -8,7 +8,8 @@ import pytest
 
 from v2p_data.deployment.limits import Guard, LimitsConfig
 from v2p_data.deployment.loop import LoopConfig, Onlooker, Run
-from v2p_data.deployment.robot import ActionScale, Rig
+from v2p_data.deployment.rig import Rig
+from v2p_data.deployment.robot import ActionScale
 from v2p_data.deployment.sight import Sight
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.segment import points_inside
@@ -30,7 +31,7 @@ def test_the_twin_says_the_action_scale_of_its_task(task_folder, tmp_path):
 
     scale = Rig(robot).scale
     before = robot.arm.target.pos[2]
-    robot.arm.act(np.array([0, 0, 1.0, 0, 0, 0, 0]))
+    robot.arm.carry_out(np.array([0, 0, 1.0, 0, 0, 0, 0]))
     moved = robot.arm.target.pos[2] - before
     robot.disconnect()
 
@@ -69,9 +70,8 @@ def test_the_twin_is_seen_from_one_click_and_kept_within_limits(task_folder, ste
         seen_labels.append(seen.in_picture)
 
     cfg, noting = LoopConfig(max_seconds=0.6, slow=True), Onlooker(on_step=note)
-    outcome = Run(
-        rig, sight, steady(0.3, 0, 1, 0, 0, 0, 0), Guard(limits, rig.scale), cfg, noting
-    ).go()
+    rig.sight, rig.guard = sight, Guard(limits, rig.scale)
+    outcome = Run(rig, steady(0.3, 0, 1, 0, 0, 0, 0), cfg, noting).go()
     robot.disconnect()
 
     assert (outcome.ending, outcome.steps) == ("time", 12)

@@ -21,9 +21,9 @@ def course(rig, policy, seconds=1.0, **limits):
         places.append(reading.tool_pos)
         turns.append(reading.state[3:6])
 
-    guard = Guard(LimitsConfig(max_silence_ms=PATIENT, **limits), rig.scale)
+    rig.guard = Guard(LimitsConfig(max_silence_ms=PATIENT, **limits), rig.scale)
     cfg = LoopConfig(max_seconds=seconds, slow=True)
-    outcome = Run(rig, None, policy, guard, cfg, Onlooker(on_step=note)).go()
+    outcome = Run(rig, policy, cfg, Onlooker(on_step=note)).go()
     return outcome, np.array(places), np.array(turns)
 
 

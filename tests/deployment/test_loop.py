@@ -17,7 +17,8 @@ PATIENT = LimitsConfig(max_silence_ms=60_000.0)
 
 def run_of(rig, policy, seconds=0.5, sight=None, limits=PATIENT, slow=True, dry_run=False, **more):
     cfg = LoopConfig(max_seconds=seconds, slow=slow, dry_run=dry_run)
-    return Run(rig, sight, policy, Guard(limits, rig.scale), cfg, Onlooker(**more))
+    rig.sight, rig.guard = sight, Guard(limits, rig.scale)
+    return Run(rig, policy, cfg, Onlooker(**more))
 
 
 def test_a_run_lasts_as_long_as_it_may_at_twenty_steps_a_second(blind_robot, restarted, steady):
@@ -67,7 +68,7 @@ def test_losing_the_object_stops_the_arm(seeing_robot, restarted, steady, click_
 
     assert outcome.ending == "lost"
     assert 6 <= outcome.steps <= 11
-    assert "object 1 was lost from sight at step" in outcome.sentence
+    assert "object 1 was lost from sight" in outcome.sentence
     assert outcome.sentence.endswith("the robot holds its position")
 
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from v2p_data.deployment.limits import Guard, LimitsConfig
+from v2p_data.deployment.limits import LimitsConfig
 from v2p_data.deployment.loop import LoopConfig, Onlooker, Run
 from v2p_data.deployment.protocol import LONGEST_LINE, Driver
-from v2p_data.deployment.robot import Rig
+from v2p_data.deployment.rig import Rig
 from v2p_data.deployment.sight import Sight
 from v2p_data.errors import V2PError
 
@@ -99,7 +99,7 @@ def test_the_loop_runs_over_the_network_and_a_limit_holds_there_too(
     server, seeing_robot, restarted, click_on, steady, tmp_path
 ):
     robot = robot_at(server.address, tmp_path)
-    rig, places = Rig(robot), []
+    places = []
     restarted(seeing_robot)
     sight = Sight(robot.calibration(), [click_on(seeing_robot)])
     limits = LimitsConfig(max_silence_ms=60_000.0, max_speed_m_s=0.1)
@@ -107,9 +107,8 @@ def test_the_loop_runs_over_the_network_and_a_limit_holds_there_too(
     cfg = LoopConfig(max_seconds=0.5, slow=True)
     noting = Onlooker(on_step=lambda reading, seen: places.append(reading.tool_pos))
 
-    outcome = Run(
-        rig, sight, steady(0, 0, 1, 0, 0, 0, 0), Guard(limits, rig.scale), cfg, noting
-    ).go()
+    rig = Rig(robot, limits, sight)
+    outcome = Run(rig, steady(0, 0, 1, 0, 0, 0, 0), cfg, noting).go()
 
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) * 20
     assert (outcome.ending, outcome.acted["speed"]) == ("time", 10)
@@ -277,7 +276,7 @@ def test_a_driver_that_stops_answering_ends_the_run_with_one_sentence(
 ):
     """The last test: it ends the server that all others talk to."""
     robot = robot_at(server.address, tmp_path)
-    rig, steps = Rig(robot), []
+    steps = []
     restarted(seeing_robot)
     sight = Sight(robot.calibration(), [click_on(seeing_robot)])
     robot.arm.driver.timeout_s = 4.0
@@ -289,9 +288,8 @@ def test_a_driver_that_stops_answering_ends_the_run_with_one_sentence(
             os.kill(server.process.pid, signal.SIGSTOP)
 
     cfg, freezing = LoopConfig(max_seconds=20.0, slow=True), Onlooker(on_step=freeze)
-    outcome = Run(
-        rig, sight, steady(0, 0, 0, 0, 0, 0, 0), Guard(PATIENT, rig.scale), cfg, freezing
-    ).go()
+    rig = Rig(robot, PATIENT, sight)
+    outcome = Run(rig, steady(0, 0, 0, 0, 0, 0, 0), cfg, freezing).go()
     server.end()
 
     assert outcome.ending == "robot"

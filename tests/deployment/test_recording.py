@@ -24,8 +24,8 @@ def test_lerobot_reads_back_masks_pictures_states_and_the_actions_that_passed_th
     limits = LimitsConfig(max_speed_m_s=0.3, max_silence_ms=60_000.0)
     cfg = LoopConfig(max_seconds=0.3, slow=True)
     onlooker = Onlooker(recorder=recorder, on_step=lambda r, s: steps.append((r, s)))
-    run = Run(rig, sight, steady(1, 0, 0, 0, 0, 0, 0), Guard(limits, rig.scale), cfg, onlooker)
-    run.go()
+    rig.sight, rig.guard = sight, Guard(limits, rig.scale)
+    Run(rig, steady(1, 0, 0, 0, 0, 0, 0), cfg, onlooker).go()
 
     packed = recorder.save(tmp_path / "run", "v2p/run", ("red box",), {"ending": "time"})
 

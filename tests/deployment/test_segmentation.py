@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from v2p_data.deployment.robot import Rig
+from v2p_data.deployment.rig import Rig
 from v2p_data.deployment.segmentation import ColourTracker
 from v2p_data.deployment.sight import LOST_AFTER, Sight, clicks_from
 from v2p_data.errors import V2PError

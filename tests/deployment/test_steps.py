@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from v2p_data.deployment.robot import ActionScale, Reading, Rig
+from v2p_data.deployment.rig import Rig
+from v2p_data.deployment.robot import ActionScale, Reading
 from v2p_data.deployment.steps import StepMaker
 from v2p_data.errors import V2PError
 from v2p_data.sim.env.actions import joints_near

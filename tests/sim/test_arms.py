@@ -251,7 +251,7 @@ def test_observations_actions_and_states_are_laid_out_as_with_the_built_in_arm(
         k: v.shape for k, v in built_in.states().items()
     }
     np.testing.assert_allclose(ours.robot_state(), built_in.robot_state(), atol=1e-4)
-    assert ours._sim._ctrl.shape == built_in._sim._ctrl.shape
+    assert ours._sim.ctrl.shape == built_in._sim.ctrl.shape
 
 
 def test_the_gripper_reports_its_own_opening(six: RobotConfig, env_with: Callable[..., BatchEnv]):
@@ -425,7 +425,7 @@ def test_a_task_for_another_robot_is_simulated_and_drawn_with_it(
     bundle = replace(make_bundle(), robot=robot_to_json(six))
 
     env = BatchEnv(bundle, CALM, num_envs=1, seed=0, num_threads=1, task=lift_task)
-    with MaskRenderer(bundle, 64, backend="rays") as renderer:
+    with MaskRenderer(bundle, 64) as renderer:
         image = renderer.draw(env.snapshot(np.arange(1)), 0)
 
     assert env.world.robot.finger_travel_m == 0.04

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, make_dataclass
 from pathlib import Path
@@ -11,15 +10,16 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from v2p_data.cli import parse
-from v2p_data.deployment.limits import Guard, LimitsConfig
+from v2p_data.deployment.limits import LimitsConfig
 from v2p_data.deployment.loop import LoopConfig, Onlooker, Outcome, Run
 from v2p_data.deployment.recording import Recorder, check_free
-from v2p_data.deployment.robot import Reading, Rig, fingers_m
+from v2p_data.deployment.rig import Rig
+from v2p_data.deployment.robot import Reading, fingers_m
 from v2p_data.deployment.segmentation import ColourTracker, StreamTracker
 from v2p_data.deployment.sight import Sight, clicks_from
 from v2p_data.deployment.silhouette import Silhouette
-from v2p_data.deployment.steps import StepMaker
 from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.geometry.camera import Camera
 from v2p_data.sim.render.masks import PALETTE
 
 ROBOT_PREFIX = "--robot."
@@ -94,7 +94,7 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
     from v2p_data.deployment.checks import Offer, check_policy, unknowns
     from v2p_data.evaluation.facts import interface_of
 
-    rig = Rig(robot)
+    rig = Rig(robot, args.limits)
     reading = rig.read()
     picture = reading.picture if reading.picture is not None else reading.labels
     if picture is None:
@@ -110,8 +110,8 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
     policy = loaded_policy(args.policy, task, args.device)
     sight = None
     if reading.picture is not None:
-        clicks = _clicks(args, rig, reading)
-        sight = Sight(rig.robot.calibration(), clicks, _tracker_maker(args))
+        clicks = _clicks(args, robot.calibration(), reading)
+        sight = Sight(robot.calibration(), clicks, _tracker_maker(args))
     elif args.click:
         raise V2PError("this robot segments by itself; leave --click away")
     num_labels = getattr(policy.loaded.policy.config, "num_labels", None)
@@ -125,10 +125,7 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
         recorder=recorder, is_done=lambda: bool(getattr(robot, "has_succeeded", False))
     )
     interface, *_ = interface_of(args.policy)
-    maker = StepMaker(interface, rig.scale)
-    outcome = Run(
-        rig, sight, policy, Guard(args.limits, rig.scale), args.loop, onlooker, maker
-    ).go()
+    outcome = Run(Rig(robot, args.limits, sight, interface), policy, args.loop, onlooker).go()
     if args.record is not None and recorder is not None:
         _record(args, recorder, sight, outcome)
     return outcome
@@ -221,7 +218,7 @@ def robot_config(words: Sequence[str]) -> Any:
         with contextlib.redirect_stderr(told):
             return draccus.parse(_holder(RobotConfig), args=list(words)).robot
     except SystemExit as error:
-        wrong = re.sub(r"\s+", " ", told.getvalue().rpartition("error:")[2]).strip()
+        wrong = " ".join(told.getvalue().rpartition("error:")[2].split())
         raise V2PError(f"the robot's settings are wrong: {wrong}") from error
     except Exception as error:
         cause = error.__cause__ or error.__context__ or error
@@ -262,7 +259,7 @@ def loaded_policy(folder: Path, task: str, device: str) -> Any:
     return actor
 
 
-def _clicks(args: Deploy, rig: Rig, reading: Reading) -> Sequence[tuple[float, float]]:
+def _clicks(args: Deploy, camera: Camera, reading: Reading) -> Sequence[tuple[float, float]]:
     """Return a pixel per object, from the command line or from the page."""
     from v2p_data.deployment.click_page import ClickPage
 
@@ -270,9 +267,7 @@ def _clicks(args: Deploy, rig: Rig, reading: Reading) -> Sequence[tuple[float, f
         return clicks_from(args.click)
     assert reading.picture is not None
     assert reading.joints_rad is not None
-    drawn = Silhouette(rig.robot.calibration()).draw(
-        reading.joints_rad, fingers_m(reading.opening)
-    )
+    drawn = Silhouette(camera).draw(reading.joints_rad, fingers_m(reading.opening))
     new_tracker, shown = _tracker_maker(args), reading.picture
     with ClickPage(
         shown, args.objects, lambda click: new_tracker().start(shown, click, drawn)

@@ -12,11 +12,11 @@ from typing import Literal
 
 import numpy as np
 
-from v2p_data.deployment.limits import STEP_S, Guard, LimitStop, Watchdog
+from v2p_data.deployment.limits import STEP_S, LimitStop, Watchdog
 from v2p_data.deployment.recording import Recorder
-from v2p_data.deployment.robot import Reading, Rig
-from v2p_data.deployment.sight import LOST_AFTER, Seen, Sight
-from v2p_data.deployment.steps import StepMaker
+from v2p_data.deployment.rig import LostError, Rig
+from v2p_data.deployment.robot import Reading
+from v2p_data.deployment.sight import Seen
 from v2p_data.errors import V2PError
 from v2p_data.play import Policy
 
@@ -25,11 +25,24 @@ REHEARSALS = 8
 WINDOW = 20
 """Steps whose mean decides whether the rate holds during the run."""
 
+
+class TooSlowError(V2PError):
+    """20 Hz cannot be kept."""
+
+
 FASTER = "stop other programs, use a GPU (--device cuda) or a smaller policy"
 
 Ending = Literal[
     "time", "done", "limit", "lost", "silence", "robot", "slow", "interrupted", "policy"
 ]
+
+
+ENDINGS: dict[type[V2PError], Ending] = {
+    LimitStop: "limit",
+    LostError: "lost",
+    TooSlowError: "slow",
+}
+"""What these errors mean; any other one is the robot's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,28 +99,20 @@ class Run:
     """One run of a policy on a robot.
 
     Args:
-        rig: the connected robot.
-        sight: what it sees; None for a robot that segments by itself.
+        rig: the connected robot with its sight and its limits.
         policy: what decides.
-        guard: the limits.
         cfg: how long, and whether for real.
         onlooker: who looks on.
-        maker: what the policy sees of the arm and tells it; steps of the tool by default.
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        sight: Sight | None,
-        policy: Policy,
-        guard: Guard,
-        cfg: LoopConfig,
-        onlooker: Onlooker | None = None,
-        maker: StepMaker | None = None,
+        self, rig: Rig, policy: Policy, cfg: LoopConfig, onlooker: Onlooker | None = None
     ) -> None:
-        self.rig, self.sight, self.policy, self.guard, self.cfg = rig, sight, policy, guard, cfg
-        self.onlooker, self.maker = onlooker or Onlooker(), maker or StepMaker(scale=rig.scale)
-        self._is_started = False
+        if rig.guard is None:
+            raise ValueError("a run needs limits")
+        self.rig, self.policy, self.cfg = rig, policy, cfg
+        self.max_silence_ms = rig.guard.cfg.max_silence_ms
+        self.onlooker = onlooker or Onlooker()
         self._works_on = ""
         """What this side does at the moment; nothing while the robot is awaited."""
 
@@ -119,7 +124,7 @@ class Run:
         """
         self.rehearse()
         outcome = Outcome(ending="time", sentence="")
-        silence = self.guard.cfg.max_silence_ms
+        silence = self.max_silence_ms
         late = ""
 
         def bite() -> None:
@@ -134,12 +139,8 @@ class Run:
                 self._steps(outcome, watchdog)
             except KeyboardInterrupt:
                 outcome.ending, outcome.sentence = "interrupted", "stopped by Ctrl-C"
-            except _StopRunError as stop:
-                outcome.ending, outcome.sentence = stop.ending, str(stop)
-            except LimitStop as stop:
-                outcome.ending, outcome.sentence = "limit", str(stop)
             except V2PError as error:
-                outcome.ending, outcome.sentence = "robot", str(error)
+                outcome.ending, outcome.sentence = ENDINGS.get(type(error), "robot"), str(error)
             except BaseException:
                 self._hold()  # a bug of ours, or the policy's: it is shown, with the arm at rest
                 raise
@@ -167,16 +168,14 @@ class Run:
         Raises:
             V2PError: it does not, a click is on no object, or the arm stands where it may not.
         """
-        first = self.rig.read()
-        self.guard.check_start(first)
+        self.rig.check(self.rig.read())
         took: list[float] = []
         for _ in range(REHEARSALS):
             began = time.perf_counter()
             reading = self.rig.read()
-            seen = self._see(reading)
-            self._decide(seen, reading)
+            self._decide(self.rig.see(reading), reading)
             took.append(time.perf_counter() - began)
-        self._is_started = False
+        self.rig.look_anew()
         self.policy.reset(1)
         mean = float(np.median(took[2:]))
         if mean > STEP_S and not self.cfg.slow:
@@ -184,23 +183,22 @@ class Run:
 
     def _steps(self, outcome: Outcome, watchdog: Watchdog) -> None:
         due = time.perf_counter()
-        for step in range(max(1, round(self.cfg.max_seconds / STEP_S))):
+        for _ in range(max(1, round(self.cfg.max_seconds / STEP_S))):
             began = time.perf_counter()
             reading = self.rig.read()
             watchdog.heard()
-            self.guard.look(reading)
+            self.rig.check(reading)
             self._works_on = "finding the objects"
-            seen = self._see(reading)
-            self._check_seen(seen, step)
+            seen = self.rig.see(reading)
             self._works_on = "the policy"
-            limited = self.guard.limit(self._decide(seen, reading), reading)
+            limited = self.rig.limited(self._decide(seen, reading), reading)
             self._works_on = ""
             if watchdog.has_bitten:
                 return
             done = limited.action
             if not self.cfg.dry_run:
                 done = self.rig.act(done)
-                self.maker.sent(done, reading)
+                self.rig.maker.sent(done, reading)
             outcome.steps += 1
             outcome.acted.update(limited.acted)
             if self.onlooker.recorder is not None:
@@ -216,45 +214,19 @@ class Run:
             time.sleep(max(0.0, due - time.perf_counter()))
         outcome.sentence = f"the {self.cfg.max_seconds:g} s are up"
 
-    def _see(self, reading: Reading) -> Seen:
-        if self.sight is None:
-            if reading.labels is None:
-                raise V2PError("the robot gives pictures; click on the objects with --click X,Y")
-            return Seen(
-                labels=reading.labels, confidences=(), missed=(), in_picture=reading.labels
-            )
-        seen = self.sight.see(reading) if self._is_started else self.sight.start(reading)
-        self._is_started = True
-        return seen
-
     def _decide(self, seen: Seen, reading: Reading) -> np.ndarray:
-        state = self.maker.state(reading)[None].astype(np.float32)
-        return self.maker.step(self.policy.act(seen.labels[None], state)[0].astype(float), reading)
-
-    def _check_seen(self, seen: Seen, step: int) -> None:
-        if max(seen.missed, default=0) >= LOST_AFTER:
-            number = int(np.argmax(seen.missed)) + 1
-            raise _StopRunError(
-                "lost",
-                f"object {number} was lost from sight at step {step}: it is hidden or has left the picture; put it back"
-                " and start again",
-            )
+        state = self.rig.maker.state(reading)[None].astype(np.float32)
+        return self.policy.act(seen.labels[None], state)[0].astype(float)
 
     def _check_rate(self, outcome: Outcome) -> None:
         recent = outcome.work_ms[-WINDOW:]
         mean = float(np.mean(recent)) / 1000
         if len(recent) == WINDOW and mean > STEP_S and not self.cfg.slow:
-            raise _StopRunError("slow", _too_slow(mean, "the run was stopped"))
+            raise TooSlowError(_too_slow(mean, "the run was stopped"))
 
     def _hold(self) -> None:
         if not self.cfg.dry_run:
             self.rig.hold()
-
-
-class _StopRunError(Exception):
-    def __init__(self, ending: Ending, sentence: str) -> None:
-        super().__init__(sentence)
-        self.ending: Ending = ending
 
 
 def _too_slow(seconds: float, consequence: str) -> str:

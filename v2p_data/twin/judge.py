@@ -53,7 +53,7 @@ class TwinSetup:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Played:
+class TwinEpisode:
     """What became of one episode."""
 
     seed: int
@@ -71,7 +71,7 @@ class Played:
 class TwinJudged:
     """What became of the episodes of one task, in the order of their seeds."""
 
-    episodes: tuple[Played, ...]
+    episodes: tuple[TwinEpisode, ...]
 
     @property
     def success_step(self) -> Int[np.ndarray, "episode"]:
@@ -151,18 +151,18 @@ def judge_in_twin(
     """
     settings = (task_folder, load, cfg, setup or TwinSetup())
     if workers == 1:
-        table = _Table(*settings)
+        player = _Player(*settings)
         try:
-            return TwinJudged(episodes=tuple(table.play(seed) for seed in seeds))
+            return TwinJudged(episodes=tuple(player.play(seed) for seed in seeds))
         finally:
-            table.arm.close()
+            player.arm.close()
     with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_sit_down, initargs=settings
+        workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=settings
     ) as pool:
         return TwinJudged(episodes=tuple(pool.map(_play_here, seeds)))
 
 
-class _Table:
+class _Player:
     """A twin and who acts in it."""
 
     def __init__(
@@ -181,7 +181,7 @@ class _Table:
         self.labels = setup.look(self.arm)
         self.waits = setup.waits
 
-    def play(self, seed: int) -> Played:
+    def play(self, seed: int) -> TwinEpisode:
         start = time.perf_counter()
         self.arm.reset(seed)
         mirror, at_end = self.arm.mirror, self.cfg.at_end
@@ -189,7 +189,7 @@ class _Table:
         play(
             TwinView(self.arm, self.labels, waits=self.waits), self.actor, (), verdicts, self.steps
         )
-        return Played(
+        return TwinEpisode(
             seed=seed,
             success_step=int(verdicts.success_step[0]),
             at_end=bool(verdicts.at_end[0]),
@@ -199,18 +199,18 @@ class _Table:
         )
 
 
-_table: _Table | None = None
-"""The table of this worker process."""
+_player: _Player | None = None
+"""Of this worker process."""
 
 
-def _sit_down(*settings: Any) -> None:
-    global _table
+def _start_worker(*settings: Any) -> None:
+    global _player
     import torch
 
     torch.set_num_threads(1)
-    _table = _Table(*settings)
+    _player = _Player(*settings)
 
 
-def _play_here(seed: int) -> Played:
-    assert _table is not None, "the initializer comes first"
-    return _table.play(seed)
+def _play_here(seed: int) -> TwinEpisode:
+    assert _player is not None, "the initializer comes first"
+    return _player.play(seed)

@@ -1,7 +1,7 @@
 """The twin as its robot: joint angles, gripper opening and a picture come out, tool poses go in, all of them late.
 
 Time passes in `step` only. Commands and readings go through delay lines of physics steps. The truth is for the referee,
-for experts and for true masks; nothing in a `Reading` depends on it but through sensors.
+for experts and for true masks; nothing that is measured depends on it but through sensors.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -19,7 +19,7 @@ from v2p_data.sim.env.targets import ToolPose
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M, NUM_ARM_JOINTS
 from v2p_data.task.task import TaskBundle
 from v2p_data.twin.camera import Optics, TwinCamera
-from v2p_data.twin.control import ArmController, Gripper, reported_opening, tool_pose
+from v2p_data.twin.control import ArmController, Gripper, reported_opening
 from v2p_data.twin.interface import RGB_PX
 from v2p_data.twin.mirror import Mirror, Truth, placed
 from v2p_data.twin.parameters import TwinParameters, episode_rng, nominal
@@ -37,19 +37,6 @@ class Measured:
     """By the encoders [rad]."""
     opening: float
     """By the gripper's register, 0 closed, 1 open."""
-    time_s: float
-    """Time of the report since the episode began; what it reports is older by the latency."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reading:
-    """All that a user of the robot gets at one time."""
-
-    rgb: UInt8[np.ndarray, "h w 3"]
-    """Rectified picture."""
-    joints: Float[np.ndarray, "7"]
-    opening: float
-    time_s: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,18 +96,11 @@ class TwinRobot:
         self._past.clear()
         self._keep()
 
-    @property
-    def time_s(self) -> float:
-        """Since the episode began."""
-        return self._steps * TIMESTEP_S
-
     def measure(self) -> Measured:
         """Return what the arm and the gripper report now, without a picture."""
         p = self.parameters
         seen = self._late(p.reading_latency_s, p.latency_jitter_s)
-        return Measured(
-            joints=seen.joints.copy(), opening=reported_opening(seen.travel_m), time_s=self.time_s
-        )
+        return Measured(joints=seen.joints.copy(), opening=reported_opening(seen.travel_m))
 
     def picture(self) -> UInt8[np.ndarray, "h w 3"]:
         """Return the latest picture that has arrived, rectified.
@@ -129,22 +109,6 @@ class TwinRobot:
             V2PError: there is no OpenGL.
         """
         return self.camera.picture(self._shown())
-
-    def read(self) -> Reading:
-        """Return what arm, gripper and camera report now.
-
-        Raises:
-            V2PError: there is no OpenGL.
-        """
-        now = self.measure()
-        return Reading(
-            rgb=self.picture(), joints=now.joints, opening=now.opening, time_s=now.time_s
-        )
-
-    def tool(self) -> ToolPose:
-        """Return the tool's pose from what the joints report, by the nominal kinematics."""
-        now = self.measure()
-        return tool_pose(now.joints, now.opening)
 
     def command(self, target: ToolPose) -> None:
         """Send a tool pose and an opening; they reach the controllers after the command latency."""
@@ -197,11 +161,6 @@ class TwinRobot:
             deepest_m=float(-data.contact.dist.min(initial=0.0)),
             is_broken=not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()),
         )
-
-    def tool_truth(self) -> Float[np.ndarray, "3"]:
-        """Return where the tool really is, world frame [m]."""
-        mujoco.mj_forward(self.world.model, self._data)
-        return self._data.site_xpos[self.world.tool_site].copy()
 
     def close(self) -> None:
         """Free the graphics memory."""

@@ -63,7 +63,6 @@ class TwinWorld:
     object_dofs: Int[np.ndarray, "object 6"]
     pad_geoms: tuple[int, int]
     object_of_geom: dict[int, int]
-    tool_site: int
 
 
 def build_twin(scene: Scene, parameters: TwinParameters, camera: Camera) -> TwinWorld:
@@ -160,7 +159,6 @@ def _located(base: World, model: mujoco.MjModel, p: TwinParameters) -> TwinWorld
         object_dofs=np.array([o.dof_adr for o in objects])[:, None] + np.arange(6),
         pad_geoms=(int(model.geom(PADS[0]).id), int(model.geom(PADS[1]).id)),
         object_of_geom=owner,
-        tool_site=int(model.site("tcp").id),
     )
 
 
