@@ -1,4 +1,4 @@
-"""Masks drawn in two ways and by rays, palettes against the codec's arithmetic."""
+"""Masks against OpenGL and rays, palettes against the codec's arithmetic."""
 
 import copy
 from dataclasses import dataclass
@@ -19,6 +19,8 @@ from v2p_data.sim.render.masks import (
     FIRST_OBJECT,
     PALETTE,
     MaskRenderer,
+    _GLPainter,
+    _NoGLError,
     geom_labels,
     label_names,
     labels_to_rgb,
@@ -89,16 +91,6 @@ def moments(world: World) -> Moments:
     return Moments(qpos=qpos, geom_size=sizes)
 
 
-@pytest.fixture(scope="module")
-def gl(world: World):
-    try:
-        renderer = MaskRenderer(world, SIZE_PX, backend="gl")
-    except V2PError as error:
-        pytest.skip(str(error))
-    with renderer:
-        yield renderer
-
-
 def test_every_label_survives_the_way_to_grey_and_back():
     labels = np.arange(len(PALETTE), dtype=np.uint8).reshape(1, 3, 3)
 
@@ -141,10 +133,26 @@ def least_overlap(a: np.ndarray, b: np.ndarray) -> float:
     )
 
 
-def test_the_z_buffer_draws_what_opengl_draws(
-    drawn: np.ndarray, moments: Moments, gl: MaskRenderer
-):
-    peers = np.stack([gl.draw(moments, k) for k in range(len(drawn))])
+def labels_by_opengl(world: World, painter: _GLPainter, moments: Moments, k: int) -> np.ndarray:
+    """Return the label of the geom whose number OpenGL draws as a colour."""
+    for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+        painter.scene.flags[flag] = True
+    shown = painter.draw(moments, k).astype(np.int32) @ [1, 1 << 8, 1 << 16]
+    labels = np.zeros(painter.scene.ngeom + 1, np.uint8)
+    for geom in painter.scene.geoms[: painter.scene.ngeom]:
+        if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+            labels[geom.segid + 1] = geom_labels(world)[geom.objid]
+    return labels[shown]
+
+
+def test_the_z_buffer_draws_what_opengl_draws(world: World, drawn: np.ndarray, moments: Moments):
+    try:
+        painter = _GLPainter(world.model, (SIZE_PX, SIZE_PX))
+    except _NoGLError as error:
+        pytest.skip(str(error))
+
+    peers = np.stack([labels_by_opengl(world, painter, moments, k) for k in range(len(drawn))])
+    painter.close()
 
     assert least_overlap(drawn, peers) >= 0.998
 
@@ -170,15 +178,8 @@ def test_the_z_buffer_draws_what_rays_hit(world: World, drawn: np.ndarray, momen
     assert least_overlap(drawn, peers) >= 0.995
 
 
-@pytest.mark.parametrize("backend", ["zbuffer", "gl"])
-def test_images_need_not_be_square(world: World, moments: Moments, drawn: np.ndarray, backend):
-    try:
-        renderer = MaskRenderer(world, (128, 64), backend=backend)
-    except V2PError as error:
-        pytest.skip(str(error))
-
-    image = renderer.draw(moments, 0)
-    renderer.close()
+def test_images_need_not_be_square(world: World, moments: Moments, drawn: np.ndarray):
+    image = MaskRenderer(world, (128, 64)).draw(moments, 0)
 
     # As high as wide is the whole; half as wide is its middle.
     assert image.shape == (128, 64)
@@ -191,13 +192,14 @@ def test_several_images_are_those_drawn_one_by_one(
     assert (np.stack([renderer.draw(moments, k) for k in range(len(drawn))]) == drawn).all()
 
 
-def test_pictures_are_drawn_beside_masks(
-    renderer: MaskRenderer, gl: MaskRenderer, moments: Moments
-):
-    picture = renderer.draw_rgb(moments, 0)
+def test_pictures_are_drawn_beside_masks(renderer: MaskRenderer, moments: Moments):
+    try:
+        picture = renderer.draw_rgb(moments, 0)
+    except V2PError as error:
+        pytest.skip(str(error))
 
     assert picture.shape == (SIZE_PX, SIZE_PX, 3)
-    assert (picture == gl.draw_rgb(moments, 0)).all()
+    assert picture.std() > 10
 
 
 def test_a_moment_looks_the_same_whatever_was_drawn_before(

@@ -1,8 +1,8 @@
 """Segmentation masks of saved moments, from the camera `view`.
 
 A label image is uint8: 0 background and table, 1 robot, 2 the manipulated object, 3.. the others in scene
-order. A z-buffer on all cores draws it (`zbuffer`). OpenGL (EGL, also in software) draws the same but for
-a few border pixels, slower. Pictures for people need OpenGL. As video, labels become greys: with R = G = B the
+order. A z-buffer on all cores draws it (`zbuffer`). Pictures for people need OpenGL (EGL, also in software). As video,
+labels become greys: with R = G = B the
 chroma is constant, so 4:2:0 loses nothing, and each grey below survives the way through limited-range luma unchanged.
 """
 
@@ -13,7 +13,7 @@ import copy
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -36,7 +36,6 @@ GL_HINT = "install it with 'apt-get install libegl1 libgl1-mesa-dri'"
 _GREYS = np.asarray(PALETTE, np.uint8)
 _LABELS = np.abs(np.arange(256)[:, None] - np.asarray(PALETTE)[None]).argmin(1).astype(np.uint8)
 
-Backend = Literal["zbuffer", "gl"]
 WRIST_POS_M = np.array([0.11, 0.0, -0.07])
 """Of the wrist's camera in the tool's frame: x to the side, y from finger to finger, z where the fingers point."""
 WRIST_TARGET_M = np.array([0.0, 0.0, 0.05])
@@ -119,12 +118,8 @@ class MaskRenderer:
     Args:
         source: the task, or its world where it is built already.
         size_px: width and height of the image, or (height, width).
-        backend: what draws the masks.
         num_threads: for the z-buffer, 0 for all cores; changes no result.
-        wrist: below the label image of the table's camera comes that of the wrist's, of the same size; by the z-buffer only.
-
-    Raises:
-        V2PError: `gl` was asked for and there is none.
+        wrist: below the label image of the table's camera comes that of the wrist's, of the same size.
     """
 
     def __init__(
@@ -132,23 +127,19 @@ class MaskRenderer:
         source: TaskBundle | World,
         size_px: int | tuple[int, int] = 256,
         *,
-        backend: Backend = "zbuffer",
         num_threads: int = 0,
         wrist: bool = False,
     ) -> None:
         world = source if isinstance(source, World) else _world_of(source)
         self.size_px = size_px
-        self.backend: Backend = backend
         self.labels = geom_labels(world)
         self._model = world.model
         self._shape = (size_px, size_px) if isinstance(size_px, int) else size_px
         self._num_threads = num_threads
         self._wrist = WristCamera(world.robot) if wrist else None
-        self._painter: _Painter | None = None
+        self._painter: _ZPainter | None = None
         self._pictures: _GLPainter | None = None
         self._no_gl = ""
-        if self.backend == "gl":
-            self._painter = self._gl("OpenGL cannot draw here")
 
     def draw(self, snapshot: Moment, index: int) -> UInt8[np.ndarray, "h w"]:
         """Return the label image of world `index` of the snapshot."""
@@ -168,7 +159,18 @@ class MaskRenderer:
         Raises:
             V2PError: there is no OpenGL.
         """
-        return self._gl("pictures need OpenGL and there is none").rgb(snapshot, index)
+        if self._pictures is None and not self._no_gl:
+            try:
+                self._pictures = _GLPainter(self._model, self._shape)
+            except _NoGLError as error:
+                self._no_gl = str(error)
+        if self._pictures is None:
+            asked = os.environ.get("MUJOCO_GL")
+            unset = f"unset MUJOCO_GL, which asks for '{asked}', or " if asked else ""
+            raise V2PError(
+                f"pictures need OpenGL and there is none ({self._no_gl}); {unset}{GL_HINT}"
+            )
+        return self._pictures.draw(snapshot, index)
 
     def close(self) -> None:
         """Free the graphics memory."""
@@ -182,23 +184,6 @@ class MaskRenderer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _gl(self, complaint: str) -> "_GLPainter":
-        """Return what draws by OpenGL, made at the first call.
-
-        Raises:
-            V2PError: there is no OpenGL.
-        """
-        if self._pictures is None and not self._no_gl:
-            try:
-                self._pictures = _GLPainter(self._model, self.labels, self._shape)
-            except _NoGLError as error:
-                self._no_gl = str(error)
-        if self._pictures is None:
-            asked = os.environ.get("MUJOCO_GL")
-            unset = f"unset MUJOCO_GL, which asks for '{asked}', or " if asked else ""
-            raise V2PError(f"{complaint} ({self._no_gl}); {unset}{GL_HINT}")
-        return self._pictures
-
 
 def _world_of(bundle: TaskBundle) -> World:
     return build_world(bundle.scene, FINE, robot=robot_from_json(bundle.robot))
@@ -206,10 +191,6 @@ def _world_of(bundle: TaskBundle) -> World:
 
 class _NoGLError(Exception):
     pass
-
-
-class _Painter(Protocol):
-    def draw(self, moments: Sequence[tuple[Moment, int]]) -> np.ndarray: ...
 
 
 class _ZPainter:
@@ -243,14 +224,11 @@ class _ZPainter:
 
 
 class _GLPainter:
-    def __init__(self, model: mujoco.MjModel, labels: np.ndarray, shape: tuple[int, int]) -> None:
+    def __init__(self, model: mujoco.MjModel, shape: tuple[int, int]) -> None:
         self.height_px, self.width_px = shape
-        self.labels = np.append(
-            labels, np.uint8(BACKGROUND)
-        )  # the last, -1, is what no geom shows
         self.model = copy.copy(model)
         self.model.vis.global_.offheight, self.model.vis.global_.offwidth = shape
-        self.model.vis.quality.offsamples = 0  # blended borders would be labels that nothing has
+        self.model.vis.quality.offsamples = 0
         self.data = mujoco.MjData(self.model)
         self.context = _gl_context(self.width_px, self.height_px)
         self.context.make_current()
@@ -263,33 +241,13 @@ class _GLPainter:
         self.camera.fixedcamid = self.model.camera(CAMERA).id
         self.rect = mujoco.MjrRect(0, 0, self.width_px, self.height_px)
 
-    def draw(self, moments: Sequence[tuple[Moment, int]]) -> np.ndarray:
-        images = [self.labels[self._geoms(snapshot, index)] for snapshot, index in moments]
-        return np.array(images, np.uint8).reshape(-1, self.height_px, self.width_px)
-
-    def _geoms(self, snapshot: Moment, index: int) -> np.ndarray:
-        codes = self._pixels(snapshot, index, segmentation=True).astype(np.int32)
-        shown = codes[..., 0] + (codes[..., 1] << 8) + (codes[..., 2] << 16)
-        is_geom = int(mujoco.mjtObj.mjOBJ_GEOM)
-        ids = np.full(self.scene.ngeom + 1, -1, np.int32)
-        for k in range(self.scene.ngeom):
-            geom = self.scene.geoms[k]
-            if geom.objtype == is_geom:
-                ids[geom.segid + 1] = geom.objid
-        return ids[shown]
-
-    def rgb(self, snapshot: Moment, index: int) -> np.ndarray:
-        return self._pixels(snapshot, index, segmentation=False)
-
-    def _pixels(self, snapshot: Moment, index: int, *, segmentation: bool) -> np.ndarray:
+    def draw(self, snapshot: Moment, index: int) -> np.ndarray:
         self.context.make_current()
         snapshot.write(self.model, self.data, index)
         mujoco.mjv_updateScene(
             self.model, self.data, self.option, None, self.camera,
             mujoco.mjtCatBit.mjCAT_ALL.value, self.scene,
         )  # fmt: skip
-        self.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = segmentation
-        self.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = segmentation
         mujoco.mjr_render(self.rect, self.scene, self.drawer)
         pixels = np.empty((self.height_px, self.width_px, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self.rect, self.drawer)

@@ -107,7 +107,7 @@ class ZBuffer:
         if unknown:
             names = ", ".join(sorted(_TYPE(k).name.removeprefix("mjGEOM_") for k in unknown))
             raise V2PError(
-                f"the z-buffer cannot draw geoms of type {names}; draw these masks with the backend 'gl'"
+                f"masks cannot show geoms of type {names}; make them of boxes, cylinders, spheres or meshes"
             )
 
     def draw(self, views: Views) -> UInt8[np.ndarray, "n h w"]:
