@@ -30,7 +30,6 @@ from v2p_data.pipeline.artifact import read_record
 
 NETWORKS: dict[str, tuple[int, dict[str, Any]]] = {
     "small (moments)": (256, {"preset": "small"}),
-    "conv at 64 px": (128, {"encoder": "conv", "input_size_px": 64, "mask_moments": False}),
     "ResNet18 at 64 px": (64, {"encoder": "resnet18", "input_size_px": 64, "mask_moments": False, "pretrained_backbone_weights": None}),
 }  # fmt: skip
 """Batch size and settings."""

@@ -55,7 +55,6 @@ class Variant:
 
 SMALL: dict[str, Any] = {"preset": "small"}
 RESNET: dict[str, Any] = {"encoder": "resnet18", "input_size_px": 64, "pretrained_backbone_weights": None}  # fmt: skip
-CONV: dict[str, Any] = {"encoder": "conv", "input_size_px": 64, "optimizer_lr": 1e-3}
 VARIANTS = {
     "small": Variant(network=SMALL),
     "one_round": Variant(network=SMALL, rounds=1),
@@ -72,8 +71,6 @@ VARIANTS = {
     "chunk_4_do_2": Variant(network=SMALL | {"chunk_size": 4, "n_action_steps": 2}),
     "head_256": Variant(network=SMALL | {"head_dim": 256}),
     "batch_64": Variant(network=SMALL, batch_size=64),
-    "conv": Variant(network=CONV | {"mask_moments": False}, batch_size=128),
-    "conv_and_moments": Variant(network=CONV, batch_size=128),
     "resnet18": Variant(network=RESNET | {"mask_moments": False}, batch_size=64),
     "resnet18_and_moments": Variant(network=RESNET, batch_size=64),
     "resnet18_papers": Variant(

@@ -16,7 +16,7 @@ BACKBONE_WEIGHTS = "ResNet18_Weights.IMAGENET1K_V1"
 LONGEST_TRAINING = 1_000_000_000
 """Steps, more than anyone trains for: LeRobot shortens a schedule to fit, but never stretches one."""
 CameraInput = Literal["auto", "mask", "rgb"]
-Encoder = Literal["resnet18", "conv", "none"]
+Encoder = Literal["resnet18", "none"]
 PRESETS: dict[str, dict[str, Any]] = {
     "custom": {},
     "paper": {
@@ -69,8 +69,8 @@ class V2PBCConfig(PreTrainedConfig):
     cost less: our trainer sets it to the labels that occur."""
 
     encoder: Encoder = "resnet18"
-    """`resnet18`: the paper's, pooled by averaging. `conv`: four strided convolutions and a flatten, which keep
-    positions. `none`: masks are seen by their moments only (other cameras still get `conv`)."""
+    """`resnet18`: the paper's, pooled by averaging. `none`: masks are seen by their moments only; other cameras still
+    get a ResNet18."""
     mask_moments: bool = True
     """Give the head area, centroid, extent and bounding box of each label, measured at full resolution."""
     head: Literal["bins", "regression"] = "bins"

@@ -20,7 +20,6 @@ from policies.bc.configuration_v2p_bc import V2PBCConfig
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 BACKBONE_DIM = 512
-CONV_WIDTHS = (32, 64, 96, 128)
 NUM_SUMS = 6
 """Area, first and second moments."""
 DIRECTION_LENGTH = 1024
@@ -298,21 +297,17 @@ class CameraEncoder(nn.Module):
         self.has_moments = is_mask and cfg.mask_moments
         self.mask_jitter_px, self.moments_dropout = cfg.mask_jitter_px, cfg.moments_dropout
         self.longer_side_px = max(shape)
-        channels = (self.num_labels if is_mask else 3) * cfg.n_obs_steps
         self.backbone: nn.Module | None = None
         self.dim = 0
         self.standardise: Standardiser | None = None
         if self.has_moments:
             self.dim += cfg.n_obs_steps * (self.num_labels - 1) * NUM_MOMENTS
             self.standardise = Standardiser(self.dim)
-        if cfg.encoder == "resnet18":
+        if cfg.encoder == "resnet18" or not self.has_moments:
             self.backbone = _resnet18(
                 cfg.n_obs_steps, self.greys[: self.num_labels] if is_mask else None, weights
             )
             self.dim += BACKBONE_DIM
-        elif cfg.encoder == "conv" or not self.has_moments:
-            self.backbone, width = _strided_convolutions(channels, shape, cfg.input_size_px)
-            self.dim += width
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
@@ -386,18 +381,3 @@ def _resnet18(
         nn.AdaptiveAvgPool2d(1),
         nn.Flatten(),
     )
-
-
-def _strided_convolutions(
-    channels: int, shape: tuple[int, int], longer_side_px: int
-) -> tuple[nn.Sequential, int]:
-    """Return four convolutions of stride two and a flatten, which keeps positions, and its width."""
-    layers: list[nn.Module] = []
-    before = channels
-    for width in CONV_WIDTHS:
-        layers += [nn.Conv2d(before, width, 3, 2, 1), nn.GroupNorm(8, width), nn.ReLU()]
-        before = width
-    net = nn.Sequential(*layers, nn.Flatten())
-    with torch.no_grad():
-        picture = shrink(torch.zeros(1, channels, *shape), longer_side_px)
-        return net, net(picture).shape[1]

@@ -18,7 +18,6 @@ def config(image=(3, 48, 64), cameras=(MASK,), **settings) -> V2PBCConfig:
     settings = {
         "pretrained_backbone_weights": None,
         "input_size_px": 32,
-        "encoder": "conv",
         **settings,
     }
     cfg = V2PBCConfig(device="cpu", **settings)
@@ -151,7 +150,7 @@ def test_any_mix_of_cameras_works_and_only_masks_are_split_into_labels():
 
 
 def test_a_picture_of_bytes_acts_as_the_same_one_of_floats():
-    for settings in ({"encoder": "resnet18"}, {"encoder": "conv"}, {"preset": "small"}):
+    for settings in ({"encoder": "resnet18"}, {"preset": "small"}):
         net = policy(**settings)
         floats = observation()
         one_channel = (floats[MASK][:, :1] * 255).round().to(torch.uint8)
@@ -163,7 +162,7 @@ def test_a_picture_of_bytes_acts_as_the_same_one_of_floats():
 
 
 def test_the_papers_preset_is_the_papers_network():
-    cfg = V2PBCConfig(device="cpu", preset="paper", encoder="conv", head="bins")
+    cfg = V2PBCConfig(device="cpu", preset="paper", encoder="none", head="bins")
 
     assert (cfg.encoder, cfg.head, cfg.input_size_px, cfg.n_obs_steps) == (
         "resnet18",
@@ -221,7 +220,7 @@ def test_without_pretrained_weights_at_hand_the_policy_starts_anyway_and_says_so
 ):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
 
-    net = policy(encoder="resnet18", pretrained_backbone_weights=BACKBONE_WEIGHTS)
+    net = policy(pretrained_backbone_weights=BACKBONE_WEIGHTS)
 
     assert "random weights" in caplog.text
     assert {group.get("lr") for group in net.get_optim_params()} == {None, net.config.optimizer_lr}
@@ -235,7 +234,6 @@ def test_pretrained_weights_at_hand_are_used_and_trained_ten_times_slower(tmp_pa
     torch.save(given, path)
 
     net = policy(
-        encoder="resnet18",
         pretrained_backbone_weights=BACKBONE_WEIGHTS,
         cameras=("observation.images.front",),
     )
@@ -248,16 +246,14 @@ def test_pretrained_weights_at_hand_are_used_and_trained_ten_times_slower(tmp_pa
     heads, backbones = net.get_optim_params()
     assert "lr" not in heads
     assert backbones["lr"] == 3e-5
-    assert (
-        policy(encoder="resnet18", optimizer_lr_backbone=1e-6).get_optim_params()[1]["lr"] == 1e-6
-    )
+    assert policy(optimizer_lr_backbone=1e-6).get_optim_params()[1]["lr"] == 1e-6
 
 
 def test_a_saved_policy_loads_without_looking_for_pretrained_weights(
     tmp_path, monkeypatch, caplog
 ):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "empty"))
-    net = policy(encoder="resnet18", pretrained_backbone_weights=BACKBONE_WEIGHTS)
+    net = policy(pretrained_backbone_weights=BACKBONE_WEIGHTS)
     net.save_pretrained(tmp_path / "saved")
     caplog.clear()
 

@@ -94,14 +94,13 @@ def test_the_same_seed_gives_the_same_weights_and_another_one_others(tmp_path: P
 
 @pytest.mark.parametrize("step", [2, 5])
 @pytest.mark.parametrize(
-    ("encoder", "random_shift", "lr_schedule"),
-    [("none", 0.0, "cosine"), ("conv", 0.2, "cosine"), ("conv", 0.0, "constant")],
+    ("moments_dropout", "lr_schedule"), [(0.0, "cosine"), (0.2, "cosine"), (0.0, "constant")]
 )
 def test_a_training_that_was_stopped_ends_in_the_weights_of_an_undisturbed_one(
-    tmp_path: Path, step: int, encoder: str, random_shift: float, lr_schedule: str
+    tmp_path: Path, step: int, moments_dropout: float, lr_schedule: str
 ):
     def cfg() -> V2PBCConfig:
-        return small(encoder=encoder, random_shift=random_shift, lr_schedule=lr_schedule)
+        return small(moments_dropout=moments_dropout, lr_schedule=lr_schedule)
 
     how = recipe(save_every_s=0.0)
     _, calm = trained(tmp_path / "calm", cfg(), recipe())
@@ -125,7 +124,7 @@ def test_a_training_that_was_killed_while_it_saved_ends_in_the_same_files(
     preceded by none, so that the first weights matter."""
 
     def files(out: Path, net: int) -> dict[str, bytes]:
-        policy_, processors = policy(small(encoder="conv", random_shift=0.2), seed=net)
+        policy_, processors = policy(small(moments_dropout=0.2), seed=net)
         frames = normalised(table(policy_.net), processors)
         train(policy_, frames, recipe(save_every_s=0.0), out, seed=5)
         save_policy(out / "policy", policy_, processors)
@@ -169,7 +168,7 @@ def test_a_stopped_training_keeps_the_checkpoint_that_an_undisturbed_one_keeps(
 
     calls: list[int] = []
     how = recipe(checkpoints=3, steps=STEPS, save_every_s=0.0)
-    cfg = {"encoder": "conv", "random_shift": 0.2}
+    cfg = {"moments_dropout": 0.2}
     calm, expected = trained(tmp_path / "calm", small(**cfg), how, judge=judge)
     assert [at for at, _ in calm.judged] == [4, 5, 6]
 
@@ -361,7 +360,9 @@ def dataset(tmp_path_factory) -> Path:
     return root
 
 
-@pytest.mark.parametrize("settings", [{"encoder": "conv"}, {"preset": "small"}, {"chunk_size": 3}])
+@pytest.mark.parametrize(
+    "settings", [{"encoder": "resnet18"}, {"preset": "small"}, {"chunk_size": 3}]
+)
 def test_the_loss_of_a_batch_is_the_one_that_lerobots_loader_and_processors_give(
     dataset: Path, tmp_path: Path, settings: dict[str, Any]
 ):
@@ -429,7 +430,7 @@ def test_frames_move_to_a_device_whole_and_give_the_same_batches():
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("encoder", ["none", "conv"])
+@pytest.mark.parametrize("encoder", ["none", "resnet18"])
 def test_a_gpu_that_holds_all_frames_learns_what_one_that_fetches_them_does(
     tmp_path: Path, monkeypatch, encoder: str, gpu: str
 ):

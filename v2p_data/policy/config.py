@@ -31,7 +31,7 @@ class PolicyConfig:
     """Folder of tasks that judge checkpoints instead of the dataset's own: of objects that nobody trains on, and that no
     evaluation reports."""
 
-    encoder: Literal["resnet18", "conv", "none"] = "resnet18"
+    encoder: Literal["resnet18", "none"] = "resnet18"
     """Encoder of the whole picture; see `policies/bc/configuration_v2p_bc.py`, as the next ones."""
     input_size_px: int = 256
     """Pictures are scaled to this before the network; less is faster."""

@@ -4,7 +4,8 @@ The student of the distillation is the LeRobot policy itself, so the last traini
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,7 +115,7 @@ def make_distillation(
     demand_masks(episodes)
     seed = seed_for(cfg.seed, "distillation")
     runtime.progress(0.0, "reading the demonstrations")
-    with bad_data_told():
+    with dataset_errors_explained():
         student = new_student(data, policy, seed, runtime)
         last: dict[str, Any] = {}
 
@@ -189,7 +190,7 @@ def make_policy(
     seed = seed_for(cfg.seed, "policy")
     distilled = inputs.get("distillation")
     runtime.progress(0.0, "reading the frames")
-    with bad_data_told():
+    with dataset_errors_explained():
         start_from = distilled / STUDENT_FOLDER if distilled else None
         student = new_student(data, policy, seed, runtime, start_from=start_from)
         handovers = handover_episodes(distilled) if distilled else []
@@ -311,13 +312,12 @@ def _num_labels(dataset: Path) -> int | None:
     return max((1 + int(label) for e in (about or {}).get("episodes", ()) for label in e["labels"]), default=None)  # fmt: skip
 
 
-class bad_data_told:  # noqa: N801 - used as a context manager
-    """Turns complaints about a dataset or a training into errors of ours, one sentence each."""
+@contextmanager
+def dataset_errors_explained() -> Iterator[None]:
+    """Turn complaints about a dataset or a training into errors of ours, one sentence each."""
+    from policies.bc.frames import DatasetError
 
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        from policies.bc.frames import DatasetError
-
-        if isinstance(error, DatasetError):
-            raise V2PError(str(error)) from error
+    try:
+        yield
+    except DatasetError as error:
+        raise V2PError(str(error)) from error
