@@ -130,9 +130,6 @@ EXEMPT = {
     "gym_env.V2PEnv.__init__",
     # Its keywords are the entries of a task's YAML file; a wrong one is refused by name.
     "benchmark._object",
-    # Digests of these files are part of what a task is: a change would have every task made anew.
-    "carrying._carry",
-    "writer.write_samples",
 }
 """What may be larger than other functions are."""
 

@@ -1,9 +1,10 @@
-"""Files of this package that stages read beside their inputs: tables, networks, templates and prompts.
+"""What stages read beside their inputs: tables, networks, prompts, and the text that templates write.
 
 Who edits one of them wants other results, so their digests are part of what a stage is.
 """
 
 import functools
+import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from v2p_data.pipeline.fingerprint import file_digest
 PACKAGE = Path(__file__).parent
 SCENE_DATA = ("*.tsv", "*.json", "*.safetensors")
 """Nouns, how likely a thing is meant, and the networks; they lie in the rooms of `scene`."""
-PROMPTS = ("prompts.py", "example_refinements.py", "example_tasks.py", "writer.py")
+PROMPTS = ("prompts.py", "example_refinements.py", "example_tasks.py")
 """Files in `task/llm` with what a model is told."""
 
 
@@ -24,9 +25,20 @@ def scene_data() -> dict[str, str]:
 
 
 def task_data(*, asks_model: bool) -> dict[str, str]:
-    """Return the digest of each template of task code, and of the prompts where a model writes it."""
-    folder = PACKAGE / "task"
-    return _digests((folder / "templates").glob("*.py")) | (prompt_data() if asks_model else {})
+    """Return the digest of what templates write, and of the prompts where a model writes task code."""
+    return {"task templates": _templates_digest()} | (prompt_data() if asks_model else {})
+
+
+@functools.cache
+def _templates_digest() -> str:
+    """Return the digest of what templates write: all samples of the paper's tasks."""
+    from v2p_data.task.benchmark import benchmark_names, load_benchmark
+    from v2p_data.task.templates.write import write_samples
+
+    texts = [
+        code for name in benchmark_names() for code in write_samples(load_benchmark(name).scene)
+    ]
+    return hashlib.sha256("".join(texts).encode()).hexdigest()
 
 
 def prompt_data() -> dict[str, str]:

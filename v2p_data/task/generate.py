@@ -1,11 +1,12 @@
-"""From a scene to its task: eight samples, each tried and audited, the best one picked.
+"""From a scene to its task: samples of task code, each tried and audited; one that the audit accepts becomes the task.
 
-Offline samples come from `templates`, with a model from `vlm_writer`; whoever else writes code passes it in as `sources`.
+Offline samples come from `templates`. The first one is taken where the audit accepts it: in the twelve tasks of the paper
+it does as well as the best of eight by the audit's score (`docs/lab/pick.md`). A model writes all its samples (`llm`), and
+one is picked. Whoever else writes code passes it in as `sources`.
 """
 
 import json
 import logging
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +18,6 @@ from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
 from v2p_data.task.audit.audit import Audit, audit
 from v2p_data.task.audit.moments import build_probes
-from v2p_data.task.llm.calls import Call
 from v2p_data.task.llm.config import VlmConfig
 from v2p_data.task.sandbox.sandbox import class_name
 from v2p_data.task.sandbox.smoke import SmokeResult, smoke_run_all
@@ -27,8 +27,6 @@ from v2p_data.task.templates.write import write_samples
 
 AUDIT_FILE = "audit.json"
 SAMPLES_FOLDER = "samples"
-CALLS_FOLDER = "calls"
-"""In the samples' folder: every call to a model that had a part in this task."""
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +38,8 @@ class TaskConfig:
     writer: Literal["templates", "vlm"] = "templates"
     """Who writes the codes: our templates, offline and free, or a model that is asked over the network."""
     num_samples: int = 8
-    """Codes to choose from (the paper's number)."""
+    """Codes to choose from (the paper's number). Of templates the later ones are tried only where the audit refuses the
+    first."""
     horizon_steps: int = 100
     """Control steps (20 Hz) per episode, for kinds that need more than a push or a lift."""
     seconds_each: float = 10.0
@@ -95,8 +94,6 @@ class GeneratedTask:
     """The samples as they were before any was sent back; empty where none was."""
     about: dict[str, Any] = field(default_factory=dict[str, Any])
     """Who wrote and who picked, and what it took."""
-    calls: tuple[Call, ...] = field(default=(), repr=False)
-    """Every call to a model that had a part in it."""
 
     def rates(self) -> dict[str, Any]:
         """Return how many samples are of no use, before and after sending back (the paper's table 8).
@@ -110,16 +107,12 @@ class GeneratedTask:
         }
 
     def save(self, folder: Path) -> None:
-        """Write the bundle, `samples/<i>.py`, `samples/calls/<key>.json` and `audit.json`."""
+        """Write the bundle, `samples/<i>.py` and `audit.json`."""
         self.bundle.save(folder)
         samples = folder / SAMPLES_FOLDER
         samples.mkdir()
         for i, sample in enumerate(self.samples):
             (samples / f"{i}.py").write_text(sample.code)
-        for call in self.calls:
-            (samples / CALLS_FOLDER).mkdir(exist_ok=True)
-            path = samples / CALLS_FOLDER / f"{call.key}.json"
-            path.write_text(json.dumps(call.as_dict(), indent=1))
         table = {
             "picked": self.picked,
             **self.about,
@@ -189,7 +182,7 @@ def generate_task(
     seed: int,
     *,
     sources: list[str] | None = None,
-    calls: Path | None = None,
+    calls: Path = Path("vlm"),
     pool: Path | None = None,
 ) -> GeneratedTask:
     """Return the scene's task.
@@ -199,30 +192,28 @@ def generate_task(
         cfg: who writes, how many samples, and limits.
         seed: of the audit's random probes; with a model, another one asks anew instead of taking stored answers.
         sources: task codes to choose from, instead of the templates' or the model's.
-        calls: folder in which calls to a model are stored; without one they are kept with the task only.
+        calls: folder in which calls to a model are stored.
         pool: folder of tasks solved so far, which a model is shown as examples.
 
     Raises:
         ItemRejectedError: `no_acceptable_task`: no sample runs and passes the audit.
         V2PError: the model cannot be asked, or its budget is used up.
     """
-    asks_model = sources is None and cfg.writer == "vlm"
-    # Templates are sure of the words, a model is sure of nothing.
-    reference = write_samples(scene, 1)[0] if asks_model else ""
-    judge = CodeJudge(scene, cfg, seed, reference)
-    if asks_model:
+    if sources is None and cfg.writer == "vlm":
+        # Templates are sure of the words, a model is sure of nothing.
+        judge = CodeJudge(scene, cfg, seed, reference=write_samples(scene, 1)[0])
         return _by_model(scene, cfg, seed, judge, calls, pool)
+    judge = CodeJudge(scene, cfg, seed)
     codes = write_samples(scene, cfg.num_samples) if sources is None else sources
-    samples = judge.tried(codes)
+    samples = judge.tried(codes[:1])
+    if not samples[0].audit.is_acceptable:
+        samples += judge.tried(codes[1:])
     picked = _pick(scene, samples)
     return GeneratedTask(
         bundle=_bundle(scene, cfg, samples[picked]),
         samples=samples,
         picked=picked,
-        about={
-            "writer": "templates" if sources is None else "given",
-            "pick": {"by": "audit", "reasons": {}},
-        },
+        about={"writer": "templates" if sources is None else "given"},
     )
 
 
@@ -231,7 +222,7 @@ def _by_model(
     cfg: TaskConfig,
     seed: int,
     judge: CodeJudge,
-    calls: Path | None,
+    calls: Path,
     pool: Path | None,
 ) -> GeneratedTask:
     """Let a model write the samples and choose among those that the audit accepts."""
@@ -246,16 +237,15 @@ def _by_model(
 
     pools = [p for p in (pool, cfg.vlm.pool) if p is not None]
     examples = examples_for(scene, read_pool(*pools), cfg.vlm.num_examples)
-    with tempfile.TemporaryDirectory(prefix="v2p-calls-") as kept_nowhere_else:
-        client = VlmClient(cfg.vlm, calls or Path(kept_nowhere_else), seed)
-        written = vlm_writer.write_samples(
-            client, scene, cfg.num_samples, examples, judge.try_all, objections
-        )
-        samples = judge.judged(written.final)
-        audits_pick = _pick(scene, samples)
-        pick = vlm_writer.pick_sample(
-            client, scene, [(s.code, s.audit) for s in samples], audits_pick=audits_pick
-        )
+    client = VlmClient(cfg.vlm, calls, seed)
+    written = vlm_writer.write_samples(
+        client, scene, cfg.num_samples, examples, judge.try_all, objections
+    )
+    samples = judge.judged(written.final)
+    audits_pick = _pick(scene, samples)
+    pick = vlm_writer.pick_sample(
+        client, scene, [(s.code, s.audit) for s in samples], audits_pick=audits_pick
+    )
     return GeneratedTask(
         bundle=_bundle(scene, cfg, samples[pick.index]),
         samples=samples,
@@ -269,7 +259,6 @@ def _by_model(
             "codes_asked_for": written.answers,
             "spent": client.spent.as_dict(),
         },
-        calls=tuple(client.used.values()),
     )
 
 

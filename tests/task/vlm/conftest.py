@@ -118,8 +118,7 @@ def secret():
 def settings_for(server, **changes) -> VlmConfig:
     return VlmConfig(
         **{
-            "base_url": server.url, "model": "small", "key_env": "V2P_TEST_KEY", "first_backoff_s": 0.001,
-            "max_backoff_s": 0.5, "max_retries": 2, "timeout_s": 20.0, "price_in_per_million": 2.0,
+            "base_url": server.url, "model": "small", "key_env": "V2P_TEST_KEY", "max_retries": 2, "timeout_s": 20.0, "price_in_per_million": 2.0,
             "price_out_per_million": 8.0,
         }
         | changes

@@ -1,8 +1,8 @@
 """Every question to a model is an artefact: what was asked, what came back, what it cost; and can be asked again offline.
 
-A call is named by the hash of what was asked. A folder of calls holds `<key>.json` per answered call, the pictures
-once each in `images/`, and `ledger.jsonl`, one line per call, from which a budget for the whole folder is
-reckoned, whichever processes spent it. Picture data stands in the request as its hash.
+A call is named by the hash of what was asked. A folder of calls holds `<key>.json` per answered call and the pictures
+once each in `images/`. A budget for the whole folder is reckoned from its calls, whichever processes made them. Picture
+data stands in the request as its hash.
 """
 
 import base64
@@ -10,9 +10,6 @@ import hashlib
 import json
 import os
 import tempfile
-import threading
-from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +18,6 @@ from v2p_data.errors import V2PError
 from v2p_data.json_files import read_json
 
 IMAGES_FOLDER = "images"
-LEDGER_FILE = "ledger.jsonl"
 KEY_LENGTH = 24
 DATA_URL = "data:image/jpeg;base64,"
 
@@ -71,16 +67,6 @@ class Call:
     model: str = ""
     """What the server said it is."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
-        return asdict(self) | {"usage": self.usage.as_dict()}
-
-    @staticmethod
-    def from_dict(data: dict[str, Any]) -> "Call":
-        """Read what `as_dict` gave."""
-        usage = Usage(**data["usage"])
-        return Call(**{k: v for k, v in data.items() if k != "usage"}, usage=usage)
-
 
 def call_key(request: dict[str, Any], purpose: str) -> str:
     """Return the name of a call: the hash of what is asked and what for, pictures by their content."""
@@ -88,28 +74,24 @@ def call_key(request: dict[str, Any], purpose: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
 
-def without_pictures(value: Any) -> Any:
-    """Return a request with every JPEG data URL replaced by the file that the picture is stored in."""
+def without_pictures(value: Any, found: dict[str, bytes] | None = None) -> Any:
+    """Return a request with every JPEG data URL replaced by the file that the picture is stored in.
+
+    Args:
+        value: a request, or a part of one.
+        found: takes the pictures, by the names of their files.
+    """
     if isinstance(value, dict):
-        return {k: without_pictures(v) for k, v in value.items()}
+        return {k: without_pictures(v, found) for k, v in value.items()}
     if isinstance(value, list):
-        return [without_pictures(v) for v in value]
+        return [without_pictures(v, found) for v in value]
     if isinstance(value, str) and value.startswith(DATA_URL):
-        return _picture_name(value)
+        data = base64.b64decode(value.removeprefix(DATA_URL))
+        name = f"{IMAGES_FOLDER}/{hashlib.sha256(data).hexdigest()}.jpg"
+        if found is not None:
+            found[name] = data
+        return name
     return value
-
-
-def _picture_name(url: str) -> str:
-    data = base64.b64decode(url.removeprefix(DATA_URL))
-    return f"{IMAGES_FOLDER}/{hashlib.sha256(data).hexdigest()}.jpg"
-
-
-def _pictures(value: Any) -> Iterator[str]:
-    if isinstance(value, dict | list):
-        for part in value.values() if isinstance(value, dict) else value:
-            yield from _pictures(part)
-    elif isinstance(value, str) and value.startswith(DATA_URL):
-        yield value
 
 
 class CallStore:
@@ -123,8 +105,6 @@ class CallStore:
     def __init__(self, folder: Path, *, hide: str = "") -> None:
         self.folder = folder
         self.hide = hide
-        self._lock = threading.Lock()
-        self._known: dict[str, Path] | None = None
 
     def find(self, key: str) -> Call | None:
         """Return the stored call of this key, in the folder or anywhere below it, None if there is none.
@@ -134,56 +114,42 @@ class CallStore:
         """
         path = self.folder / f"{key}.json"
         if not path.is_file():
-            with self._lock:
-                if self._known is None:  # a folder of runs may be large: looked through once
-                    self._known = {
-                        p.stem: p for p in self.folder.rglob("*.json") if len(p.stem) == KEY_LENGTH
-                    }
-            path = self._known.get(key)
-        if path is None:
-            return None
-        try:
-            return Call.from_dict(read_json(path))
-        except (V2PError, ValueError, TypeError, KeyError) as error:
-            raise V2PError(
-                f"{path} holds no stored call ({type(error).__name__}); delete it, and it is asked again"
-            ) from error
+            path = next(self.folder.rglob(path.name), None)
+        return _read(path) if path else None
 
     def write(self, call: Call, request: dict[str, Any]) -> None:
-        """Store a call that was answered, with its pictures, and enter it in the ledger.
+        """Store a call that was answered, with its pictures.
 
         Args:
             call: the call.
             request: what was sent, with the pictures' data.
         """
-        images = self.folder / IMAGES_FOLDER
-        images.mkdir(parents=True, exist_ok=True)
-        for url in _pictures(request):
-            path = self.folder / _picture_name(url)
-            if not path.exists():
-                _write_whole(path, base64.b64decode(url.removeprefix(DATA_URL)))
-        text = self._shown(json.dumps(call.as_dict(), indent=1))
-        _write_whole(self.folder / f"{call.key}.json", text.encode())
-        line = json.dumps({"key": call.key, "purpose": call.purpose, **call.usage.as_dict()})
-        with self._lock, (self.folder / LEDGER_FILE).open("a") as stream:
-            stream.write(
-                self._shown(line) + "\n"
-            )  # one short write: lines of processes do not mix
+        (self.folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
+        pictures: dict[str, bytes] = {}
+        without_pictures(request, pictures)
+        for name, data in pictures.items():
+            _write_whole(self.folder / name, data)
+        text = json.dumps(asdict(call) | {"usage": call.usage.as_dict()}, indent=1)
+        _write_whole(self.folder / f"{call.key}.json", self.shown(text).encode())
 
     def spent(self) -> Usage:
-        """Return what all calls that were written to this folder took together."""
-        path = self.folder / LEDGER_FILE
-        total = Usage()
-        if path.is_file():
-            names = asdict(total)
-            for line in path.read_text().splitlines():
-                with suppress(ValueError):  # a process that was killed may leave half a line
-                    entry = json.loads(line)
-                    total += Usage(**{k: entry[k] for k in names})
-        return total
+        """Return what all calls of this folder took together."""
+        stored = (p for p in self.folder.glob("*.json") if len(p.stem) == KEY_LENGTH)
+        return sum((_read(path).usage for path in stored), Usage())
 
-    def _shown(self, text: str) -> str:
+    def shown(self, text: str) -> str:
+        """Return a text without the secret."""
         return text.replace(self.hide, "***") if self.hide else text
+
+
+def _read(path: Path) -> Call:
+    try:
+        data = read_json(path)
+        return Call(**data | {"usage": Usage(**data["usage"])})
+    except (V2PError, ValueError, TypeError, KeyError) as error:
+        raise V2PError(
+            f"{path} holds no stored call ({type(error).__name__}); delete it, and it is asked again"
+        ) from error
 
 
 def _write_whole(path: Path, data: bytes) -> None:

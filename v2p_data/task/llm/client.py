@@ -1,12 +1,11 @@
 """The client for any server that speaks the chat-completions protocol: GPT-4o, vLLM, Ollama and the like.
 
-`VlmClient.ask` returns an answer or raises one sentence. It waits and tries again where a server is busy or a
-line breaks, asks again with the fault told where an answer is of no use, counts tokens, money and time, stops at a
-budget, and stores every call (`calls`), so that a run can be repeated without network. The key of the API is read
-from the environment, sent, and written nowhere.
+`VlmClient.ask` returns an answer or raises one sentence. The `openai` package waits and tries again where a server is
+busy or a line breaks. The client asks again with the fault told where an answer is of no use, counts tokens, money and
+time, stops at a budget, and stores every call (`calls`), so that a run can be repeated without network. The key of the
+API is read from the environment, sent, and written nowhere.
 """
 
-import email.utils
 import functools
 import json
 import logging
@@ -14,12 +13,11 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError
-from v2p_data.seeds import rng_for
 from v2p_data.task.llm.calls import Call, CallStore, Usage, call_key, without_pictures
 from v2p_data.task.llm.config import VlmConfig
 
@@ -29,8 +27,6 @@ Message = dict[str, Any]
 """`{"role": ..., "content": text or a list of text and picture parts}`."""
 SHORTEST_SECRET = 8
 """Shorter values of the key's variable (`none`, `EMPTY`) are placeholders for servers that want no key."""
-RETRIED = {408, 409, 425, 429}
-"""Statuses below 500 after which the same request may succeed."""
 LETTERS_PER_TOKEN = 4
 TOKENS_PER_PICTURE = 800
 
@@ -70,9 +66,6 @@ class VlmClient:
         self.store = CallStore(cfg.calls or calls, hide=key if len(key) >= SHORTEST_SECRET else "")
         self.spent = Usage()
         """By this client, stored answers not counted."""
-        self.used: dict[str, Call] = {}
-        """All calls of this client by key, asked or stored."""
-        self._rng = rng_for(seed, "vlm", "waits")
         self._lock = threading.Lock()
         self._openai = _connect(cfg, key) if cfg.mode == "live" else None
 
@@ -127,81 +120,57 @@ class VlmClient:
                     f"replay: {self.store.folder} holds no answer to '{purpose}' (call {key}); replay needs the calls "
                     "of the same code, scene, settings and seed, or take --task.vlm.mode=live to ask the model"
                 )
+            self._check_budget()
             call = self._asked(request, key, purpose)
             self.store.write(call, request)
-        with self._lock:
-            self.used[key] = call
+            with self._lock:
+                self.spent += call.usage
         return call
 
     def _asked(self, request: dict[str, Any], key: str, purpose: str) -> Call:
-        begin = time.monotonic()
-        for attempt in range(self.cfg.max_retries + 1):
-            self._check_budget()
-            try:
-                data = self._post(request)
-            except _TransientError as fault:
-                wait = self._wait_s(attempt, fault.retry_after_s)
-                if attempt == self.cfg.max_retries:
-                    raise V2PError(
-                        f"{self.cfg.base_url} gave no answer in {attempt + 1} tries; the last time {fault}. "
-                        "Is the server up? --task.vlm.max-retries and --task.vlm.timeout-s give it more time"
-                    ) from fault
-                logger.info("%s: %s; trying again in %.1f s", purpose, fault, wait)
-                time.sleep(wait)
-                continue
-            seconds = time.monotonic() - begin
-            call = _call_of(
-                data, request, key, purpose, attempt + 1, self._usage(data, request, seconds)
-            )
-            with self._lock:
-                self.spent += call.usage
-            return call
-        raise AssertionError("unreachable")
-
-    def _post(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Send once; return the answer's JSON, checked to hold a choice."""
+        """Send the question, and return the answer once it has come and holds a choice."""
         import openai
 
         assert self._openai is not None
+        begin = time.monotonic()
         try:
             reply = self._openai.chat.completions.with_raw_response.create(**request)
-        except openai.APITimeoutError as error:
-            raise _TransientError(f"it took more than {self.cfg.timeout_s:g} s") from error
-        except openai.APIConnectionError as error:
-            raise _TransientError(f"the connection failed ({_cause(error)})") from error
         except openai.APIStatusError as error:
-            words = f"it answered {error.status_code}: {self._hidden(_words(error.body))}"
-            code = error.body.get("code") if isinstance(error.body, dict) else None
-            if code != "insufficient_quota" and (
-                error.status_code in RETRIED or error.status_code >= 500
-            ):
-                raise _TransientError(words, _retry_after_s(error.response.headers)) from error
+            body = error.body
+            words = str(body.get("message") or body) if isinstance(body, dict) else str(body)
             raise V2PError(
-                f"{self.cfg.base_url} refuses the request for model '{self.cfg.model}'; {words}"
+                f"{self.cfg.base_url} refuses the request for model '{self.cfg.model}'; it answered {error.status_code}: "
+                f"{self.store.shown(' '.join(words.split())[:300])}"
+            ) from error
+        except openai.APIConnectionError as error:
+            cause = error.__cause__ or error
+            raise V2PError(
+                f"{self.cfg.base_url} gave no answer in {self.cfg.max_retries + 1} tries ({type(cause).__name__}). "
+                "Is the server up? --task.vlm.max-retries and --task.vlm.timeout-s give it more time"
             ) from error
         try:
             data = json.loads(reply.text)
-            data["choices"][0]["message"].get("content")
+            choice = data["choices"][0]
+            message = choice["message"]
+            content = message.get("content")
         except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-            raise _TransientError(
-                f"what came back is no chat completion ({type(error).__name__}: {error})"
-            ) from error
-        return data
-
-    def _hidden(self, text: str) -> str:
-        return text.replace(self.store.hide, "***") if self.store.hide else text
-
-    def _wait_s(self, attempt: int, retry_after_s: float | None) -> float:
-        if retry_after_s is not None and retry_after_s > self.cfg.max_backoff_s:
             raise V2PError(
-                f"{self.cfg.base_url} asks to wait {retry_after_s:.0f} s, more than the {self.cfg.max_backoff_s:g} s of "
-                "--task.vlm.max-backoff-s; run again later, what was answered is kept"
-            )
-        with self._lock:
-            extra = float(self._rng.uniform(0, 1))
-        backoff = min(self.cfg.first_backoff_s * 2**attempt, self.cfg.max_backoff_s)
-        wait = min(backoff * (1 + extra), self.cfg.max_backoff_s)
-        return wait if retry_after_s is None else max(wait, retry_after_s)
+                f"what came back from {self.cfg.base_url} is no chat completion ({type(error).__name__}); does the "
+                "address lead to such a server? --task.vlm.base-url names it"
+            ) from error
+        if isinstance(content, list):  # some servers send parts
+            content = "".join(str(p.get("text", "")) for p in content if isinstance(p, dict))
+        return Call(
+            key=key,
+            purpose=purpose,
+            request=without_pictures(request),
+            answer=content if isinstance(content, str) else "",
+            finish_reason=str(choice.get("finish_reason") or ""),
+            refusal=str(message.get("refusal") or ""),
+            usage=self._usage(data, request, time.monotonic() - begin),
+            attempts=1 + reply.retries_taken,
+            model=str(data.get("model") or ""),
+        )
 
     # -- what it takes
 
@@ -235,14 +204,6 @@ class VlmClient:
                 )
 
 
-class _TransientError(Exception):
-    """A fault that may be gone at the next try."""
-
-    def __init__(self, words: str, retry_after_s: float | None = None) -> None:
-        super().__init__(words)
-        self.retry_after_s = retry_after_s
-
-
 def _key(cfg: VlmConfig) -> str:
     if cfg.mode == "replay" or not cfg.key_env:
         return ""
@@ -266,7 +227,7 @@ def _connect(cfg: VlmConfig, key: str) -> Any:
         base_url=cfg.base_url,
         api_key=key or "not-needed",
         timeout=openai.Timeout(cfg.timeout_s, connect=cfg.connect_timeout_s),
-        max_retries=0,  # waiting is done here, where it is counted and stops at the budget
+        max_retries=cfg.max_retries,
         http_client=_connections(),
     )
 
@@ -277,32 +238,6 @@ def _connections() -> Any:
     import openai
 
     return openai.DefaultHttpxClient()
-
-
-def _call_of(
-    data: dict[str, Any],
-    request: dict[str, Any],
-    key: str,
-    purpose: str,
-    attempts: int,
-    usage: Usage,
-) -> Call:
-    choice = data["choices"][0]
-    message = choice["message"]
-    content = message.get("content")
-    if isinstance(content, list):  # some servers send parts
-        content = "".join(str(p.get("text", "")) for p in content if isinstance(p, dict))
-    return Call(
-        key=key,
-        purpose=purpose,
-        request=without_pictures(request),
-        answer=content if isinstance(content, str) else "",
-        finish_reason=str(choice.get("finish_reason") or ""),
-        refusal=str(message.get("refusal") or ""),
-        usage=usage,
-        attempts=attempts,
-        model=str(data.get("model") or ""),
-    )
 
 
 def _useful_text(call: Call) -> str:
@@ -331,25 +266,3 @@ def _said(call: Call) -> Message:
     """Return the answer as a turn; of a cut-off one its beginning, which is not worth paying for twice."""
     text = call.answer if call.finish_reason != "length" else call.answer[:200] + " ..."
     return {"role": "assistant", "content": text or call.refusal or "(nothing)"}
-
-
-def _retry_after_s(headers: Mapping[str, str]) -> float | None:
-    """Return how long a server asks to wait, as seconds or as a date (RFC 9110, 10.2.3)."""
-    said = headers.get("retry-after", "").strip()
-    if not said:
-        return None
-    try:
-        return max(0.0, float(said))
-    except ValueError:
-        date = email.utils.parsedate_tz(said)
-        return max(0.0, email.utils.mktime_tz(date) - time.time()) if date else None
-
-
-def _words(body: object) -> str:
-    text = str(body.get("message") or body) if isinstance(body, dict) else str(body)
-    return " ".join(text.split())[:300]
-
-
-def _cause(error: BaseException) -> str:
-    cause = error.__cause__ or error
-    return " ".join(f"{type(cause).__name__}: {cause}".split())[:200]

@@ -7,8 +7,7 @@ from typing import Literal
 from urllib.parse import urlsplit
 
 HOW = (
-    "base_url", "key_env", "token_limit_name", "connect_timeout_s", "timeout_s", "max_retries", "first_backoff_s",
-    "max_backoff_s", "parallel", "max_money", "max_total_tokens", "max_total_s", "price_in_per_million",
+    "base_url", "key_env", "token_limit_name", "connect_timeout_s", "timeout_s", "max_retries", "parallel", "max_money", "max_total_tokens", "max_total_s", "price_in_per_million",
     "price_out_per_million", "mode", "calls",
 )  # fmt: skip
 """Settings that change nothing about what is asked."""
@@ -35,11 +34,7 @@ class VlmConfig:
     timeout_s: float = 180.0
     """The longest silence of the server: answers come in one piece, so until the answer."""
     max_retries: int = 6
-    """Further tries of one request after a busy server or a broken line."""
-    first_backoff_s: float = 1.0
-    """Wait before the first of them; doubles each time, with up to as much again at random."""
-    max_backoff_s: float = 60.0
-    """The longest wait; a server that asks for a longer one ends the run."""
+    """Further tries of one request after a busy server or a broken line, with waits as the `openai` package has them."""
     max_reasks: int = 2
     """Times a cut-off, empty, refused or code-free answer is asked for again."""
     max_regenerations: int = 3
@@ -107,8 +102,7 @@ class VlmConfig:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in ("max_retries", "max_reasks", "max_regenerations", "num_examples",
-                     "first_backoff_s", "max_backoff_s", "price_in_per_million",
-                     "price_out_per_million"):  # fmt: skip
+                     "price_in_per_million", "price_out_per_million"):  # fmt: skip
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         if not (self.timeout_s > 0 and self.connect_timeout_s > 0):

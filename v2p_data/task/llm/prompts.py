@@ -85,6 +85,8 @@ The code is read by a guard that refuses whatever is not on its list, with the l
 FORMAT = """\
 Answer with your thoughts, then with the whole file in one block fenced by ```python and ```. Nothing after it."""
 
+TASK_QUESTION = f"{QUESTIONS}\n\n{FORMAT}"
+
 REWARD_FORMAT = """\
 Answer with your thoughts, then with one block fenced by ```python and ``` that holds `reward_function` with its docstring,
 and the helper functions or constants that it needs, at module level. Everything else of the task stays as it is: you cannot
@@ -148,7 +150,7 @@ def scene_message(
     *,
     tracking: bool,
     shapes: bool,
-    then: str = f"{QUESTIONS}\n\n{FORMAT}",
+    then: str,
     end: str,
 ) -> Message:
     """Return the question: the scene in words, what to do, pictures, then `end`, which alone differs between samples."""
@@ -214,6 +216,14 @@ def scene_words(scene: Scene, *, tracking: bool, shapes: bool) -> str:
                 f"turned by {np.linalg.norm(turn):.0f} degrees, axis times angle {_numbers(turn, 0)} |"
             )
     return "\n".join(lines)
+
+
+def sample_words(index: int, count: int, idea: str) -> str:
+    """Return what is said to one sample alone, so that the samples differ."""
+    return (
+        f"This is sample {index + 1} of {count}. So that the samples differ, let this one's reward follow this idea if it suits "
+        f"the task: {idea}"
+    )
 
 
 def fault_message(fault: str, code: str) -> Message:

@@ -16,15 +16,17 @@ from v2p_data.task.llm.answers import choice_in, reward_code_in, task_code_in
 from v2p_data.task.llm.client import FaultyAnswerError, UnusableAnswersError, VlmClient
 from v2p_data.task.llm.example_refinements import REFINEMENTS
 from v2p_data.task.llm.example_tasks import Example
-from v2p_data.task.llm.pictures import Picture, scene_pictures
+from v2p_data.task.llm.pictures import scene_pictures
 from v2p_data.task.llm.pool import examples_for, read_pool
 from v2p_data.task.llm.prompts import (
+    TASK_QUESTION,
     Message,
     better_reward_question,
     fault_message,
     first_reward_question,
     objection_message,
     pick_message,
+    sample_words,
     scene_message,
     system_message,
 )
@@ -40,8 +42,6 @@ TryAll = Callable[[list[str]], list[SmokeResult]]
 Written = tuple[str, SmokeResult]
 Objections = Callable[[Sequence[Written]], list[str]]
 """Says of each code what an audit has against it; empty where it is acceptable."""
-MAX_OBJECTIONS = 1
-"""Times all samples go back with their audits where none is acceptable."""
 STRONGER = "Try a stronger model, or --task.vlm.max-regenerations"
 IDEAS = tuple(v.idea for v in VARIANTS if not v.is_naive)
 """For variety among samples: what each reward may be like."""
@@ -77,11 +77,16 @@ class Pick:
 class _Draft:
     """One sample on its way: the conversation about it and where it stands."""
 
+    number: int
     talk: list[Message]
     code: str = ""
     result: SmokeResult = field(
         default_factory=lambda: SmokeResult(runnable=False, error="no code was written")
     )
+
+    @property
+    def written(self) -> Written:
+        return self.code, self.result
 
 
 # --- task codes ----------------------------------------------------------------------------------------------
@@ -113,83 +118,83 @@ def write_samples(
     """
     cfg = client.cfg
     system = system_message([o.name for o in scene.objects], examples)
-    pictures = _pictures(client, scene)
-    drafts = [
-        _Draft(
-            talk=[
-                system,
-                scene_message(
-                    scene,
-                    pictures,
-                    tracking=cfg.tracking,
-                    shapes=cfg.tells_shapes,
-                    end=_end(i, count),
-                ),
-            ]
-        )
-        for i in range(count)
-    ]
-    first: list[Written] = []
-    answers = rounds = 0
+    drafts = _drafts(client, scene, system, count, TASK_QUESTION)
+    first: tuple[Written, ...] = ()
+    answers, is_objected = 0, False
     for turn in range(cfg.max_regenerations + 1):
-        open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
+        ahead = _not_running(drafts)
         # The audit speaks of the video.
-        if not open_ones and rounds < MAX_OBJECTIONS and cfg.tells_shapes:
-            rounds += 1
-            faults = objections([(d.code, d.result) for d in drafts])
-            if all(faults):
-                for draft, fault in zip(drafts, faults, strict=True):
-                    draft.talk = [*draft.talk, objection_message(fault)]
-                open_ones = list(range(count))
-        if not open_ones:
+        if not ahead and not is_objected and cfg.tells_shapes:
+            is_objected = True
+            ahead = _objected_to(drafts, objections)
+        if not ahead:
             break
-        purpose = f"task {scene.title}, turn {turn}, sample "
-        _ask_all(client, {f"{purpose}{i}": drafts[i] for i in open_ones}, task_code_in, try_all)
-        answers += len(open_ones)
-        if turn == 0:
-            first = [(d.code, d.result) for d in drafts]
-    final = tuple((d.code, d.result) for d in drafts)
-    broken = sum(not r.runnable for _, r in final)
+        _ask_all(client, ahead, f"task {scene.title}, turn {turn}", task_code_in, try_all)
+        answers += len(ahead)
+        first = first or tuple(d.written for d in drafts)
+    broken = len(_not_running(drafts))
     if broken:
         logger.warning(
             "%d of %d samples for '%s' still do not run after %d regenerations",
-            broken, count, scene.title, cfg.max_regenerations,
-        )  # fmt: skip
-    return WrittenSamples(first=tuple(first), final=final, answers=answers)
+            *(broken, count, scene.title, cfg.max_regenerations),
+        )
+    return WrittenSamples(first=first, final=tuple(d.written for d in drafts), answers=answers)
 
 
-def _pictures(client: VlmClient, scene: Scene) -> list[Picture]:
+def _drafts(
+    client: VlmClient, scene: Scene, system: Message, count: int, question: str
+) -> list[_Draft]:
+    """Return the samples' conversations, each begun with the question about the scene."""
     cfg = client.cfg
-    return scene_pictures(scene, cfg.image_side_px, cfg.sheet_frames) if cfg.images else []
+    pictures = scene_pictures(scene, cfg.image_side_px, cfg.sheet_frames) if cfg.images else []
+    asked = [
+        scene_message(
+            scene,
+            pictures,
+            tracking=cfg.tracking,
+            shapes=cfg.tells_shapes,
+            then=question,
+            end=sample_words(i, count, IDEAS[i % len(IDEAS)]),
+        )
+        for i in range(count)
+    ]
+    return [_Draft(number=i, talk=[system, asked[i]]) for i in range(count)]
 
 
-def _end(index: int, count: int) -> str:
-    idea = IDEAS[index % len(IDEAS)]
-    return (
-        f"This is sample {index + 1} of {count}. So that the samples differ, let this one's reward follow this idea if it suits "
-        f"the task: {idea}"
-    )
+def _not_running(drafts: list[_Draft]) -> list[_Draft]:
+    return [d for d in drafts if not d.result.runnable]
+
+
+def _objected_to(drafts: list[_Draft], objections: Objections) -> list[_Draft]:
+    """Tell each sample what the audit has against it, where it has something against all; return those to ask again."""
+    faults = objections([d.written for d in drafts])
+    if not all(faults):
+        return []
+    for draft, fault in zip(drafts, faults, strict=True):
+        draft.talk = [*draft.talk, objection_message(fault)]
+    return drafts
 
 
 def _ask_all(
     client: VlmClient,
-    drafts: dict[str, _Draft],
+    drafts: list[_Draft],
+    what_for: str,
     read: Callable[[str], str],
     try_all: TryAll,
 ) -> None:
     """Ask for each draft's code at the same time, try them all, and add what is wrong to their conversations."""
 
-    def asked(item: tuple[str, _Draft]) -> None:
-        purpose, draft = item
+    def ask(draft: _Draft) -> None:
         try:
+            purpose = f"{what_for}, sample {draft.number}"
             draft.code, draft.talk = client.ask(draft.talk, purpose, read)
             draft.result = SmokeResult(runnable=True)
         except FaultyAnswerError as fault:
             draft.result = SmokeResult(runnable=False, error=f"no usable answer: {fault}")
 
     with ThreadPoolExecutor(max_workers=client.cfg.parallel) as threads:
-        list(threads.map(asked, drafts.items()))
-    written = [d for d in drafts.values() if d.result.runnable]
+        list(threads.map(ask, drafts))
+    written = [d for d in drafts if d.result.runnable]
     for draft, result in zip(written, try_all([d.code for d in written]), strict=True):
         draft.result = result
         if not result.runnable:
@@ -218,18 +223,17 @@ def pick_sample(
         BudgetError: the budget is used up.
         V2PError: the server cannot be asked.
     """
-    candidates = {i: s for i, s in enumerate(samples) if s[1].is_acceptable}
+    acceptable = {i: s for i, s in enumerate(samples) if s[1].is_acceptable}
+    why = ""
     if client.cfg.pick == "audit":
-        return Pick(
-            index=audits_pick, by="audit", reasons={"why": "the settings leave it to the audit"}
-        )
-    if len(candidates) == 1:
-        return Pick(
-            index=audits_pick, by="audit", reasons={"why": "no other sample is acceptable"}
-        )
+        why = "the settings leave it to the audit"
+    elif len(acceptable) == 1:
+        why = "no other sample is acceptable"
+    if why:
+        return Pick(index=audits_pick, by="audit", reasons={"why": why})
     cfg = client.cfg
-    question = pick_message(scene, candidates, tracking=cfg.tracking, shapes=cfg.tells_shapes)
-    allowed = list(candidates)
+    question = pick_message(scene, acceptable, tracking=cfg.tracking, shapes=cfg.tells_shapes)
+    allowed = list(acceptable)
     try:
         (index, reasons), _ = client.ask(
             [question],
@@ -328,23 +332,7 @@ class ModelWriter:
             [replace(e, code=reward_source(e.code)) for e in self._examples(bundle)],
             REFINEMENTS,
         )
-        pictures = _pictures(client, scene)
-        drafts = [
-            _Draft(
-                talk=[
-                    system,
-                    scene_message(
-                        scene,
-                        pictures,
-                        tracking=client.cfg.tracking,
-                        shapes=client.cfg.tells_shapes,
-                        then=question,
-                        end=_end(i, count),
-                    ),
-                ]
-            )
-            for i in range(count)
-        ]
+        drafts = _drafts(client, scene, system, count, question)
 
         def read(text: str) -> str:
             try:
@@ -353,14 +341,11 @@ class ModelWriter:
                 raise FaultyAnswerError(str(fault)) from fault
 
         for turn in range(client.cfg.max_regenerations + 1):
-            open_ones = [i for i, d in enumerate(drafts) if not d.result.runnable]
-            if not open_ones:
+            ahead = _not_running(drafts)
+            if not ahead:
                 break
-            purpose = f"{what} for {bundle.title}, turn {turn}, sample "
-            _ask_all(
-                client, {f"{purpose}{i}": drafts[i] for i in open_ones}, read,
-                lambda codes: smoke_run_all(codes, scene),
-            )  # fmt: skip
+            purpose = f"{what} for {bundle.title}, turn {turn}"
+            _ask_all(client, ahead, purpose, read, lambda codes: smoke_run_all(codes, scene))
             _send_back_twins(drafts)
         made = [d.code for d in drafts if d.result.runnable]
         if not made:

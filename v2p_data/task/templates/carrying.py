@@ -15,6 +15,25 @@ from v2p_data.task.templates.phrases import (
 )
 from v2p_data.task.templates.variants import Variant, tolerance, way
 
+_CARRY_PROGRESS = (
+    "torch.where(arrived, 2.5 + lowered + 0.8 * opened, raised * (1 + carried) * gripped * near)"
+)
+"""Each stage pays more than the most that can be had by staying in the one before: 0 to 1 for raising, 1 to 2 for
+carrying, from 2.5 on over the goal. None is flat."""
+_CARRY_EXTRAS = (
+    LEAVE_REF,
+    ("not_too_high", "-2.0 * (height - 0.12).clamp(0.0, 0.3)"),
+    # The straight way down to the object may lead through the other one: fingers knocked over its rim.
+    ("clear_of_other", "-1.0 * low_over_other * (1 - gripped) * (1 - arrived.float())"),
+    # Summed over the way it costs as much as it would earn at the goal, at whatever speed. It grows along the way and
+    # is paid for what the pads drag, not for what fell: where it began at once, everything was held before that line.
+    (
+        "dragged",
+        "-30.0 * carried.clamp(min=0.0) * obj_touched * torch.norm(obj_vel[:, :2], dim=-1).clamp(max=1.0)"
+        " * ((height < 0.02) & ~arrived).float()",
+    ),
+)
+
 
 def lift(m: Measured, v: Variant) -> Draft:
     height = way(float(np.clip(0.7 * m.lift_m, 0.08, 0.12)), v)
@@ -275,28 +294,11 @@ def _carry(
         target="grasp_point",
         contact="torch.maximum(gripped * near, arrived.float())",
         pays_contact=True,
-        # Each stage pays more than the most that can be had by staying in the one before: 0 to 1 for raising, 1 to 2
-        # for carrying, from 2.5 on over the goal. None is flat.
-        progress=(
-            "torch.where(arrived, 2.5 + lowered + 0.8 * opened,"
-            " raised * (1 + carried) * gripped * near)"
-        ),
+        progress=_CARRY_PROGRESS,
         remaining="to_goal",
         goal="goal_point",
         direction="torch.nn.functional.normalize(goal_point - obj_pos, dim=-1)",
-        extras=[
-            LEAVE_REF,
-            ("not_too_high", "-2.0 * (height - 0.12).clamp(0.0, 0.3)"),
-            # The straight way down to the object may lead through the other one: fingers knocked over its rim.
-            ("clear_of_other", "-1.0 * low_over_other * (1 - gripped) * (1 - arrived.float())"),
-            # Summed over the way it costs as much as it would earn at the goal, at whatever speed. It grows along the way and
-            # is paid for what the pads drag, not for what fell: where it began at once, everything was held before that line.
-            (
-                "dragged",
-                "-30.0 * carried.clamp(min=0.0) * obj_touched * torch.norm(obj_vel[:, :2], dim=-1).clamp(max=1.0)"
-                " * ((height < 0.02) & ~arrived).float()",
-            ),
-        ],
+        extras=list(_CARRY_EXTRAS),
     )
 
 
