@@ -18,6 +18,7 @@ def config(image=(3, 48, 64), cameras=(MASK,), **settings) -> V2PBCConfig:
     settings = {
         "pretrained_backbone_weights": None,
         "input_size_px": 32,
+        "encoder": "none",
         **settings,
     }
     cfg = V2PBCConfig(device="cpu", **settings)
@@ -136,14 +137,16 @@ def test_the_task_changes_the_action_and_can_be_ignored():
 
 def test_any_mix_of_cameras_works_and_only_masks_are_split_into_labels():
     cameras = (MASK, "observation.images.wrist")
-    net = policy(cameras=cameras)
+    net = policy(cameras=cameras, encoder="resnet18")
 
     action = net.select_action(observation(cameras=cameras))
 
     assert action.shape == (2, 7)
     assert [camera.backbone[0].in_channels for camera in net.net.cameras] == [2 * 9, 2 * 3]
-    assert policy(camera_input="rgb").net.cameras[0].backbone[0].in_channels == 6
-    assert policy(num_labels=3).net.cameras[0].backbone[0].in_channels == 2 * 3
+    assert (
+        policy(camera_input="rgb", encoder="resnet18").net.cameras[0].backbone[0].in_channels == 6
+    )
+    assert policy(num_labels=3, encoder="resnet18").net.cameras[0].backbone[0].in_channels == 2 * 3
     small = policy(cameras=cameras, preset="small")  # colours need a backbone in any case
     assert [camera.backbone is None for camera in small.net.cameras] == [True, False]
     assert small.select_action(observation(cameras=cameras)).shape == (2, 7)
@@ -220,7 +223,7 @@ def test_without_pretrained_weights_at_hand_the_policy_starts_anyway_and_says_so
 ):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
 
-    net = policy(pretrained_backbone_weights=BACKBONE_WEIGHTS)
+    net = policy(encoder="resnet18", pretrained_backbone_weights=BACKBONE_WEIGHTS)
 
     assert "random weights" in caplog.text
     assert {group.get("lr") for group in net.get_optim_params()} == {None, net.config.optimizer_lr}
@@ -234,6 +237,7 @@ def test_pretrained_weights_at_hand_are_used_and_trained_ten_times_slower(tmp_pa
     torch.save(given, path)
 
     net = policy(
+        encoder="resnet18",
         pretrained_backbone_weights=BACKBONE_WEIGHTS,
         cameras=("observation.images.front",),
     )
@@ -246,14 +250,16 @@ def test_pretrained_weights_at_hand_are_used_and_trained_ten_times_slower(tmp_pa
     heads, backbones = net.get_optim_params()
     assert "lr" not in heads
     assert backbones["lr"] == 3e-5
-    assert policy(optimizer_lr_backbone=1e-6).get_optim_params()[1]["lr"] == 1e-6
+    assert (
+        policy(encoder="resnet18", optimizer_lr_backbone=1e-6).get_optim_params()[1]["lr"] == 1e-6
+    )
 
 
 def test_a_saved_policy_loads_without_looking_for_pretrained_weights(
     tmp_path, monkeypatch, caplog
 ):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "empty"))
-    net = policy(pretrained_backbone_weights=BACKBONE_WEIGHTS)
+    net = policy(encoder="resnet18", pretrained_backbone_weights=BACKBONE_WEIGHTS)
     net.save_pretrained(tmp_path / "saved")
     caplog.clear()
 
