@@ -12,7 +12,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-import torch
 
 from v2p_data.cli import run
 from v2p_data.errors import V2PError
@@ -26,12 +25,7 @@ from v2p_data.task.audit.audit import Audit
 from v2p_data.task.robot_files import robot_files
 from v2p_data.task.sandbox import time_limit, trial
 from v2p_data.task.sandbox.smoke import smoke_run_all
-from v2p_data.task.sandbox.time_limit import (
-    TaskCallError,
-    TaskCodeTooSlowError,
-    guard_calls,
-    limited,
-)
+from v2p_data.task.sandbox.time_limit import TaskCallError, TaskCodeTooSlowError, in_time
 from v2p_data.task.schema import AuditEntry, RobotEntry, TaskFile
 from v2p_data.task.task import TaskBundle
 
@@ -171,18 +165,16 @@ def test_a_call_that_raises_late_is_a_sentence_with_its_line(spoiled: Path):
         BatchEnv(bundle, num_envs=3, seed=0).step(np.zeros((3, 7)))
 
 
-class Slow:
-    def compute_success(self, states: dict[str, torch.Tensor]) -> int:
-        return sum(1 for _ in iter(int, 1))
+def loop() -> int:
+    return sum(1 for _ in iter(int, 1))
 
 
 def test_the_limit_holds_in_any_thread_and_spares_what_comes_next(impatient: None):
-    guard_calls(Slow)
     said: list[str] = []
 
     def call() -> None:
         with pytest.raises(TaskCodeTooSlowError) as caught:
-            Slow().compute_success({})
+            in_time(loop)
         said.append(str(caught.value))
         for _ in range(200_000):  # an exception that came late would hit here
             pass
@@ -193,19 +185,16 @@ def test_the_limit_holds_in_any_thread_and_spares_what_comes_next(impatient: Non
     thread.join()
 
     assert len(said) == 2
-    with limited("loading"):
-        pass
+    assert in_time(lambda: "done") == "done"
 
 
 def test_the_limit_holds_in_a_fork(impatient: None):
-    with limited("loading"):
-        pass  # starts the watching thread, which a fork does not have
-    guard_calls(Slow)
+    in_time(int)  # starts the watching thread, which a fork does not have
     pid = os.fork()
     if pid == 0:
         code = 1
         try:
-            Slow().compute_success({})
+            in_time(loop)
         except TaskCodeTooSlowError:
             code = 0
         finally:

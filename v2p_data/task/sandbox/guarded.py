@@ -8,17 +8,24 @@ observation is always made first.
 """
 
 import contextlib
+import functools
 import re
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Concatenate
 
 import torch
 from jaxtyping import Bool, Float, Int
 
 from v2p_data.errors import V2PError
 from v2p_data.task.sandbox.source_text import shown
+from v2p_data.task.sandbox.time_limit import (
+    TaskCallError,
+    in_time,
+    line_in_task_code,
+    method_in_task_code,
+)
 from v2p_data.task.task import Placer, Task
 
 States = dict[str, torch.Tensor]
@@ -139,6 +146,35 @@ class PlacerView:
             self._ids = None
 
 
+def _guarded[**P, T](
+    question: Callable[Concatenate["GuardedTask", P], T],
+) -> Callable[Concatenate["GuardedTask", P], T]:
+    """Let a question to a task end in time, with a result or an error of ours that names the task."""
+
+    @functools.wraps(question)
+    def ask(self: "GuardedTask", *args: P.args, **kwargs: P.kwargs) -> T:
+        asked = functools.partial(question, self, *args, **kwargs)
+        try:
+            return in_time(asked) if self._is_limited else asked()
+        except TaskOutputError as error:
+            if not self._title:
+                raise
+            raise type(error)(f"task '{self._title}': {error}") from error
+        except (V2PError, MemoryError):
+            raise
+        except Exception as error:
+            if not self._is_limited:
+                raise
+            line, method = line_in_task_code(error), method_in_task_code(error)
+            where = f"line {line} of the task's code, {method}," if line else "the task's code"
+            words = " ".join(str(error).split())[:300]
+            raise TaskCallError(
+                f"{where} raises {type(error).__name__}: {words}; correct it in its task.py"
+            ) from error
+
+    return ask
+
+
 class GuardedTask:
     """A task and the checks on all that it answers.
 
@@ -146,16 +182,26 @@ class GuardedTask:
         task: the task; nothing else may call its methods.
         view: what the task knows of the environment; None for a task of our own that knows the environment itself.
         title: for messages.
+        is_limited: end calls that take too long, and say in one sentence what they raise.
     """
 
-    def __init__(self, task: Task, view: PlacerView | None = None, title: str = "") -> None:
+    def __init__(
+        self,
+        task: Task,
+        view: PlacerView | None = None,
+        title: str = "",
+        *,
+        is_limited: bool = False,
+    ) -> None:
         self._task = task
         self._view = view
         self._title = title
+        self._is_limited = is_limited
         self._component_names: tuple[str, ...] | None = None
         # Not from a seed: it decides when to look, never what is made, and task code may not foresee it.
         self._until_twice = self._draw_until_twice()
 
+    @_guarded
     def reset_poses(
         self, env_ids: Int[torch.Tensor, "n"], names: Sequence[str]
     ) -> dict[str, Float[torch.Tensor, "n 7"]]:
@@ -168,53 +214,55 @@ class GuardedTask:
         during = (
             self._view.during_reset(env_ids.clone()) if self._view else contextlib.nullcontext()
         )
-        with self._named(), during:
+        with during:
             poses = self._task.reset_objects_states(env_ids.clone())
-            if not isinstance(poses, dict) or set(poses) != set(names):
+        if not isinstance(poses, dict) or set(poses) != set(names):
+            raise TaskOutputError(
+                f"reset_objects_states must return a pose per object: {', '.join(names)}"
+            )
+        for name in names:
+            pose = poses[name]
+            if not isinstance(pose, torch.Tensor) or tuple(pose.shape) != (n, 7):
+                shape = tuple(getattr(pose, "shape", ()))
                 raise TaskOutputError(
-                    f"reset_objects_states must return a pose per object: {', '.join(names)}"
+                    f"the reset pose of {name} must be a tensor of shape ({n}, 7), not {shape}"
                 )
-            for name in names:
-                pose = poses[name]
-                if not isinstance(pose, torch.Tensor) or tuple(pose.shape) != (n, 7):
-                    shape = tuple(getattr(pose, "shape", ()))
-                    raise TaskOutputError(
-                        f"the reset pose of {name} must be a tensor of shape ({n}, 7), not {shape}"
-                    )
-                if pose.is_meta or pose.has_names():
-                    raise TaskOutputError(
-                        f"the reset pose of {name} must be a plain tensor with numbers in it"
-                    )
-                if not pose.is_floating_point() or not bool(pose.isfinite().all()):
-                    raise TaskOutputError(f"the reset pose of {name} is not finite")
-                if bool(((pose[:, 3:].norm(dim=1) - 1).abs() > UNIT_TOLERANCE).any()):
-                    raise TaskOutputError(
-                        f"the quaternion of the reset pose of {name} is not of length 1"
-                    )
+            if pose.is_meta or pose.has_names():
+                raise TaskOutputError(
+                    f"the reset pose of {name} must be a plain tensor with numbers in it"
+                )
+            if not pose.is_floating_point() or not bool(pose.isfinite().all()):
+                raise TaskOutputError(f"the reset pose of {name} is not finite")
+            if bool(((pose[:, 3:].norm(dim=1) - 1).abs() > UNIT_TOLERANCE).any()):
+                raise TaskOutputError(
+                    f"the quaternion of the reset pose of {name} is not of length 1"
+                )
         return {name: poses[name] for name in names}
 
+    @_guarded
     def observation_size(self) -> int:
         """Return the length of the observation, as the task says it."""
-        with self._named():
-            said = self._task.get_observation_space()
-            if isinstance(said, bool) or not isinstance(said, int):
-                raise TaskOutputError("get_observation_space must return a whole number")
+        said = self._task.get_observation_space()
+        if isinstance(said, bool) or not isinstance(said, int):
+            raise TaskOutputError("get_observation_space must return a whole number")
         return said
 
+    @_guarded
     def observe(self, show: Show) -> Float[torch.Tensor, "env obs"]:
         """Return the observation; it may share memory with what `show` gave."""
-        states = show()
-        with self._named(), torch.inference_mode():
+        states = show()  # before `inference_mode`, in which torch does not count writes
+        with torch.inference_mode():
             return _observation(self._keys(_Watch(states)), states)
 
+    @_guarded
     def succeeds(self, show: Show) -> Bool[torch.Tensor, "env"]:
         """Return the task's success."""
-        states = show()
-        with self._named(), torch.inference_mode():
-            watch = _Watch(states)
+        watch = _Watch(show())
+        with torch.inference_mode():
             self._keys(watch)
             return self._success(watch)
 
+    @_guarded
     def judge(self, show: Show, actions: Float[torch.Tensor, "env act"]) -> Answers:
         """Return all that the task says of a moment.
 
@@ -229,36 +277,28 @@ class GuardedTask:
         if self._until_twice < 1:
             self._until_twice = self._draw_until_twice()
             answers = answers.cloned()
-            again = self._asked(show(), actions)
-            with self._named():
-                demand_equal(answers, again)
+            demand_equal(answers, self._asked(show(), actions))
         return answers
 
     # -- inside
 
+    @torch.inference_mode()
     def _asked(self, states: States, actions: torch.Tensor) -> Answers:
-        with self._named(), torch.inference_mode():
-            watch = _Watch(states)
-            observation = _observation(self._keys(watch), states)
-            success = self._success(watch)
-            count = actions._version  # pyright: ignore[reportAttributeAccessIssue]
-            result = self._task.compute_reward(actions, states)
-            watch.check("compute_reward")
-            if actions._version != count:  # pyright: ignore[reportAttributeAccessIssue]
-                raise StatesChangedError(
-                    "compute_reward changes the actions in place; work on a copy"
-                )
-            if (
-                not isinstance(result, tuple)
-                or len(result) != 2
-                or not isinstance(result[1], dict)
-            ):
-                raise TaskOutputError(
-                    "compute_reward must return the reward and a dict of its components"
-                )
-            reward, parts = result
-            check_tensor("the reward", reward, watch.num_envs, watch.device, kind=torch.float32)
-            self._check_parts(parts, watch)
+        watch = _Watch(states)
+        observation = _observation(self._keys(watch), states)
+        success = self._success(watch)
+        count = _count(actions)
+        result = self._task.compute_reward(actions, states)
+        watch.check("compute_reward")
+        if _count(actions) != count:
+            raise StatesChangedError("compute_reward changes the actions in place; work on a copy")
+        if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
+            raise TaskOutputError(
+                "compute_reward must return the reward and a dict of its components"
+            )
+        reward, parts = result
+        check_tensor("the reward", reward, watch.num_envs, watch.device, kind=torch.float32)
+        self._check_parts(parts, watch)
         return Answers(observation=observation, success=success, reward=reward, components=parts)
 
     def _keys(self, watch: "_Watch") -> list[str]:
@@ -302,16 +342,6 @@ class GuardedTask:
     def _draw_until_twice() -> int:
         return 1 + secrets.randbelow(2 * ASKED_TWICE_ONCE_IN)
 
-    @contextlib.contextmanager
-    def _named(self) -> Iterator[None]:
-        """Let messages name the task."""
-        try:
-            yield
-        except TaskOutputError as error:
-            if not self._title:
-                raise
-            raise type(error)(f"task '{self._title}': {error}") from error
-
 
 def check_tensor(
     what: str,
@@ -353,10 +383,8 @@ def demand_equal(first: Answers, second: Answers) -> None:
     Raises:
         TaskOutputError: it did not.
     """
-    one, other = first.named(), second.named()
-    if one.keys() != other.keys():
-        raise TaskOutputError("the names of the reward components change from call to call")
-    for what, value in one.items():
+    other = second.named()
+    for what, value in first.named().items():
         if value.shape != other[what].shape or not torch.equal(
             value.nan_to_num(), other[what].nan_to_num()
         ):

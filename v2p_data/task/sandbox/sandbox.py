@@ -36,7 +36,7 @@ from v2p_data.task.sandbox import allowed
 from v2p_data.task.sandbox.guarded import GuardedTask, PlacerView
 from v2p_data.task.sandbox.reader.check import checked_tree
 from v2p_data.task.sandbox.reader.refusal import TaskCodeError
-from v2p_data.task.sandbox.time_limit import CODE_NAME, guard_calls, limited, line_in_task_code
+from v2p_data.task.sandbox.time_limit import CODE_NAME, in_time, line_in_task_code
 from v2p_data.task.task import Placer, Task
 
 MAX_RANGE = 1_000
@@ -55,10 +55,8 @@ def load_task(source: str, envs: Placer, scene: Scene, title: str = "") -> Guard
         TaskCodeError: the code is refused, or it does not load.
         TaskCodeTooSlowError: loading it takes too long.
     """
-    with limited("loading"):
-        task, view = _made(source, envs, str(scene.folder))
-    guard_calls(type(task))
-    return GuardedTask(task, view, title or scene.title)
+    task, view = in_time(lambda: _made(source, envs, str(scene.folder)), "loading")
+    return GuardedTask(task, view, title or scene.title, is_limited=True)
 
 
 def make_task(source: str, envs: Placer, urdf_assets_root: str) -> GuardedTask:

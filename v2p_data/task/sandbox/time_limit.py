@@ -1,7 +1,7 @@
-"""Every call of loaded task code ends in time, with a result or one sentence, at the cost of a microsecond a call.
+"""What is done with loaded task code ends in time, with a result or one sentence.
 
-One watching thread per process counts its own ticks. A call that lasts too many of them gets an exception between two
-of its bytecodes, which task code cannot catch. A stopped or suspended process is not taken for a slow one, because
+One watching thread per process counts its own ticks. Who is in task code for too many of them gets an exception between
+two of its bytecodes, which task code cannot catch. A stopped or suspended process is not taken for a slow one, because
 the watching thread stands still with it. A single tensor operation cannot be interrupted: the exception waits for its end.
 """
 
@@ -10,9 +10,8 @@ import functools
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from typing import Any
+from collections.abc import Callable
+from contextlib import suppress
 
 from v2p_data.errors import V2PError
 
@@ -21,15 +20,6 @@ CODE_NAME = "<task code>"
 LIMIT_S = 20.0
 """A call takes milliseconds; a machine that is busy with other things makes it a hundred times as long."""
 TICK_S = 0.25
-HASTY_TICKS = 3
-"""Calls of fewer ticks are far from being sent anything, so they end without a lock; `LIMIT_S` is many more."""
-METHODS = (
-    "reset_objects_states",
-    "compute_observation_key",
-    "get_observation_space",
-    "compute_success",
-    "compute_reward",
-)
 
 
 class TaskCallError(V2PError):
@@ -37,7 +27,7 @@ class TaskCallError(V2PError):
 
 
 class TaskCodeTooSlowError(V2PError):
-    """A call of task code did not end in time."""
+    """Task code did not end in time."""
 
 
 class _TimeIsUpError(BaseException):
@@ -45,45 +35,33 @@ class _TimeIsUpError(BaseException):
 
 
 class _Watchman:
-    """Knows which thread is in a call, and since which tick."""
+    """Counts for each thread in task code for how many ticks it has been there."""
 
     def __init__(self) -> None:
-        self.calls: dict[int, int] = {}
-        """Per thread the tick at which its call began."""
-        self.tick = 0
-        self._ended: set[int] = set()
+        self.ticks: dict[int, int] = {}
         self._lock = threading.Lock()
-        self.thread: threading.Thread | None = None
+        with suppress(RuntimeError):  # a confined child may start none; others limit its time
+            threading.Thread(target=self._watch, name="task-code-time", daemon=True).start()
 
-    def start(self) -> None:
-        """Start the watching thread; where none may be started (a confined child) others limit the time."""
+    def begin(self, thread: int) -> None:
         with self._lock:
-            if self.thread is None:
-                thread = threading.Thread(target=self._watch, name="task-code-time", daemon=True)
-                with suppress(RuntimeError):
-                    thread.start()
-                self.thread = thread
+            self.ticks[thread] = 0
 
-    def forget(self, thread: int) -> bool:
-        """End the watch over a thread's call; return whether it was sent an exception."""
+    def end(self, thread: int) -> bool:
+        """End the watch over a thread; return whether it was sent an exception."""
         with self._lock:
-            self.calls.pop(thread, None)
-            if thread not in self._ended:
-                return False
-            self._ended.discard(thread)
-            _send(thread, None)  # one that has not arrived yet shall not hit what comes next
-            return True
+            is_late = self.ticks.pop(thread, 0) * TICK_S > LIMIT_S
+            if is_late:
+                _send(thread, None)  # one that has not arrived yet shall not hit what comes next
+            return is_late
 
     def _watch(self) -> None:
         while True:
             time.sleep(TICK_S)
-            self.tick += 1
-            if not self.calls:
-                continue
             with self._lock:
-                for thread, since in list(self.calls.items()):
-                    if (self.tick - since) * TICK_S > LIMIT_S and thread not in self._ended:
-                        self._ended.add(thread)
+                for thread in self.ticks:
+                    self.ticks[thread] += 1
+                    if LIMIT_S < self.ticks[thread] * TICK_S <= LIMIT_S + TICK_S:  # once
                         _send(thread, _TimeIsUpError)
 
 
@@ -93,103 +71,63 @@ def _send(thread: int, kind: type[BaseException] | None) -> None:
     ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), what)
 
 
-_watchman = _Watchman()
+@functools.cache
+def _watchman() -> _Watchman:
+    return _Watchman()
 
 
-def _renew() -> None:
-    global _watchman
-    _watchman = _Watchman()
+os.register_at_fork(after_in_child=_watchman.cache_clear)
 
 
-os.register_at_fork(after_in_child=_renew)
-
-
-@contextmanager
-def limited(what: str) -> Iterator[None]:
-    """Let what is done inside raise `TaskCodeTooSlowError` when it does not end in time; inside another limit, that one's.
+def in_time[T](function: Callable[[], T], what: str = "a call") -> T:
+    """Return what a function returns that calls task code; inside another limit, that one holds.
 
     Args:
-        what: of the task is called, for the sentence.
+        function: what to do.
+        what: names it in the sentence where the time is up outside of the task's code.
+
+    Raises:
+        TaskCodeTooSlowError: it does not end in time.
     """
-    watchman, me = _watchman, threading.get_ident()
-    if me in watchman.calls:
-        yield
-        return
-    watchman.start()
-    late = False
-    watchman.calls[me] = watchman.tick
+    watchman, me = _watchman(), threading.get_ident()
+    if me in watchman.ticks:
+        return function()
+    is_late, result = False, None
     try:
         try:
-            yield
+            watchman.begin(me)
+            result = function()
         finally:
-            late = watchman.forget(me)
-    except _TimeIsUpError:
-        watchman.forget(me)
-        late = True
-    if late:
-        raise TaskCodeTooSlowError(_sentence(what))
-
-
-def guard_calls(kind: type) -> None:
-    """Let every call of a task class's methods, inherited ones too, end in time, with a result or a `V2PError`."""
-    for name in METHODS:
-        if hasattr(kind, name):
-            setattr(kind, name, _guarded(name, getattr(kind, name)))
-
-
-def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the method with what `limited` does, written out: as a context manager it takes ten times as long."""
-    me_of = threading.get_ident
-
-    @functools.wraps(method)
-    def call(*given: Any) -> Any:
-        watchman, me = _watchman, me_of()
-        calls = watchman.calls
-        if me in calls:
-            return method(*given)
-        if watchman.thread is None:
-            watchman.start()
-        late = False
-        calls[me] = began = watchman.tick
-        try:
-            try:
-                result = method(*given)
-            finally:
-                if watchman.tick - began < HASTY_TICKS:
-                    del calls[me]
-                else:
-                    late = watchman.forget(me)
-        except _TimeIsUpError:
-            watchman.forget(me)
-            late, result = True, None
-        except (V2PError, MemoryError):
-            raise
-        except Exception as error:
-            line = line_in_task_code(error)
-            where = f"line {line} of the task's code, " if line else "the task's code, "
-            words = " ".join(str(error).split())[:300]
-            raise TaskCallError(
-                f"{where}{name}, raises {type(error).__name__}: {words}; correct it in its task.py"
-            ) from error
-        if late:
-            raise TaskCodeTooSlowError(_sentence(name))
-        return result
-
-    return call
+            is_late = watchman.end(me)
+    except _TimeIsUpError as error:
+        watchman.end(me)
+        is_late, what = True, method_in_task_code(error) or what
+    if is_late:
+        raise TaskCodeTooSlowError(
+            f"{what} of the task's code took more than {LIMIT_S:g} s and was ended; does it loop, or make huge tensors? "
+            "Correct it in its task.py, or take another task"
+        )
+    return result  # pyright: ignore[reportReturnType]
 
 
 def line_in_task_code(error: BaseException) -> int | None:
     """Return the line of the loaded task code at which an exception was raised."""
-    line, at = None, error.__traceback__
+    places = _places(error)
+    return places[-1][1] if places else None
+
+
+def method_in_task_code(error: BaseException) -> str:
+    """Return the name of the task's method in which an exception was raised; nothing where it is none of the task's."""
+    places = _places(error)
+    return places[0][0] if places and not places[0][0].startswith("<") else ""
+
+
+def _places(error: BaseException) -> list[tuple[str, int]]:
+    """Return the functions of task code on an exception's way, with their lines, the outermost first."""
+    found: list[tuple[str, int]] = []
+    at = error.__traceback__
     while at is not None:
         if at.tb_frame.f_code.co_filename == CODE_NAME:
-            line = at.tb_lineno
+            found.append((at.tb_frame.f_code.co_name, at.tb_lineno))
         at = at.tb_next
-    return line
-
-
-def _sentence(what: str) -> str:
-    return (
-        f"{what} of the task's code took more than {LIMIT_S:g} s and was ended; does it loop, or make huge tensors? "
-        "Correct it in its task.py, or take another task"
-    )
+    return found
