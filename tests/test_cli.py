@@ -10,15 +10,17 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from v2p_data import cli
-from v2p_data.cli import run
+from v2p_data.cli import parse, run
 from v2p_data.commands import display
-from v2p_data.commands.run import _settings_in
+from v2p_data.commands.run import FromVideos, changed_flags
 from v2p_data.errors import V2PError
+from v2p_data.stages import EngineConfig
 from v2p_data.task.cache import cache_folder
 
 SAMPLES = Path(__file__).parents[1] / "datasets" / "sample_videos"
@@ -123,28 +125,25 @@ def test_the_next_command_keeps_the_settings(capsys, tmp_path):
     run(["task", "--seed", "3", f"{videos}/", "--out", str(out), "--scene.fov-rad=1.0"])
 
     after = shlex.split(capsys.readouterr().out.split("Next: ")[1])
-    assert after == [
-        "v2p",
-        "expert",
-        str(videos),
-        "--out",
-        str(out),
-        "--seed",
-        "3",
-        "--scene.fov-rad=1.0",
-    ]
+    flags = ["--scene.fov-rad=1.0", "--seed=3"]
+    assert after == ["v2p", "expert", str(videos), "--out", str(out), *flags]
 
 
-@pytest.mark.parametrize(
-    ("line", "kept"),
-    [
-        ("videos --out run --repo-id a/b --config my.yaml", "--config my.yaml"),
-        ("--repo_id=a/b --out=run --policy.steps 50 videos/", "--policy.steps 50"),
-        ("videos --out videos --repo-id a/b", ""),
-    ],
-)
-def test_what_generate_was_told_is_what_train_and_eval_are_told(line, kept):
-    assert _settings_in(line.split(), Path("videos")) == kept.split()
+def test_what_a_command_was_told_is_what_the_next_one_is_told():
+    usual = EngineConfig()
+    told = replace(
+        usual,
+        seed=3,
+        policy=replace(usual.policy, steps=50),
+        distillation=replace(usual.distillation, takeover=(0.1, 0.5)),
+    )
+
+    flags = changed_flags(told, usual)
+
+    takeover = ["--distillation.takeover", "0.1", "0.5"]
+    assert flags == [*takeover, "--policy.steps=50", "--seed=3"]
+    line = ["videos", "--out", "run", *flags, "--workers", "2"]
+    assert parse(FromVideos, line, "scene").engine == told
 
 
 def test_videos_that_nobody_describes_are_named(capsys, videos, tmp_path):

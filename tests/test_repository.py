@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from v2p_data.cli import COMMANDS, SUBCOMMANDS
+from v2p_data.cli import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 LARGEST = 5_000_000
@@ -56,29 +56,42 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
         deploy,
         edit,
         gc,
-        models,
         review,
         reward,
         run,
+        setup,
         share,
         show,
-        task,
+        status,
     )
 
     kinds = {
-        "generate": run.Generate, "train": run.Train, "eval": run.Evaluate, "demo": run.Demo,
-        "distill": run.Distill, "deploy": deploy.Deploy,
-        "scene": run.FromVideos, "task": run.FromVideos, "expert": run.FromVideos,
-        "episodes": run.FromVideos, "push": share.Push, "verify": share.Verify, "replay": share.Replay,
-        "status": show.Status, "report": show.Shown, "scene camera": camera.OneCamera, "scene review": review.ReviewRun, "scene models": models.Models, "scene hands": models.Hands,
-        "scene outlines": models.Outlines, "scene detectors": models.Detectors,
-        "reward": run.FromVideos, "task show": task.ShowTask, "reward search": reward.Search,
-        "reward show": reward.ShowReward, "explain": share.Explain, "merge": edit.Merge, "drop": edit.Drop, "gc": gc.Gc,
-    }  # fmt: skip
-    assert set(kinds) == {*COMMANDS, *SUBCOMMANDS}
+        "generate": run.Generate,
+        "distill": run.Train,
+        "train": run.Train,
+        "eval": run.Evaluate,
+        "deploy": deploy.Deploy,
+        "push": share.Push,
+        **dict.fromkeys(("scene", "task", "reward", "expert", "episodes"), run.FromVideos),
+        "scene camera": camera.OneCamera,
+        "scene review": review.ReviewRun,
+        "reward search": reward.Search,
+        "verify": share.Verify,
+        "replay": share.Replay,
+        "explain": share.Explain,
+        "merge": edit.Merge,
+        "drop": edit.Drop,
+        "status": status.Status,
+        "report": status.Shown,
+        "show": show.Show,
+        "gc": gc.Gc,
+        "setup": setup.Setup,
+        "demo": run.Demo,
+    }
+    assert set(kinds) == set(COMMANDS)
     for words in map(shlex.split, shown_commands(page)):
         if words[0] == "v2p":
-            name = " ".join(words[1:3]) if " ".join(words[1:3]) in SUBCOMMANDS else words[1]
+            name = " ".join(words[1:3]) if " ".join(words[1:3]) in COMMANDS else words[1]
             rest = words[1 + len(name.split()) :]
             parse(kinds[name], deploy.robot_settings(rest)[1] if name == "deploy" else rest, name)
 

@@ -3,16 +3,14 @@
 Only light modules are imported here, so that `v2p --help` answers at once; each command imports what it needs.
 """
 
-import contextlib
 import difflib
-import io
 import logging
 import os
-import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from v2p_data.errors import NOT_ALL, NOTHING, NotAllError, V2PError, did_you_mean, write_refusal
 
@@ -27,8 +25,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "deploy": ("deploy", "run a policy on a robot, from one click per object, within limits"),
     "push": ("share", "push a dataset, a policy or tasks (--envhub) to the Hub"),
     "scene": ("run", "videos -> scenes only: objects, meshes, sizes, poses"),
+    "scene camera": ("camera", "what all scenes of a run say of the one camera that filmed them"),
+    "scene review": ("review", "a page to judge a run's scenes on and to mark what was not found"),
     "task": ("run", "up to the task code and its audit"),
     "reward": ("reward", "up to the rewards: rounds of them, trained against each other"),
+    "reward search": ("reward", "search for one task's reward"),
     "expert": ("run", "up to the trained experts"),
     "episodes": ("run", "up to the episodes, without packing them"),
     "verify": ("share", "reopen a dataset with LeRobot and check every frame"),
@@ -39,30 +40,15 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "explain": ("share", "where a dataset, an episode or a result comes from, or how two differ"),
     "merge": ("edit", "several datasets become one"),
     "drop": ("edit", "a dataset without some of its tasks"),
-    "status": ("show", "what a run folder holds, and what failed and why"),
-    "report": ("show", "write a run's page again"),
+    "status": ("status", "what a run folder holds, and what failed and why"),
+    "report": ("status", "write a run's page again"),
+    "show": ("show", "a task's code and audit; what a reward search tried, and why"),
     "gc": ("gc", "what can be deleted of a run folder, and what making it again would cost"),
+    "setup": ("setup", "which learned models are set up here; with a name, set one up"),
     "demo": ("run", "the whole chain on three sample clips"),
 }
-"""Command -> module of `v2p_data.commands` that holds it, and what it does."""
-SUBCOMMANDS: dict[str, tuple[str, str]] = {
-    "scene camera": ("camera", "what all scenes of a run say of the one camera that filmed them"),
-    "scene detectors": (
-        "models",
-        "whether everyday things are known by sight here, and the model's download",
-    ),
-    "scene hands": ("models", "whether hands are found by a model here, and its installation"),
-    "scene models": ("models", "which learned models a preset takes here, and their download"),
-    "scene outlines": (
-        "models",
-        "whether objects are outlined by a model here, and its download",
-    ),
-    "scene review": ("review", "a page to judge a run's scenes on and to mark what was not found"),
-    "task show": ("task", "a task's code, and the audit's answers"),
-    "reward search": ("reward", "search for one task's reward"),
-    "reward show": ("reward", "what a search tried, with curves, analysis and differences"),
-}
-"""The same for commands of two words; a folder of the second word's name is given as `./review`."""
+"""Command -> module of `v2p_data.commands` that holds it, and what it does; a folder that is named as a command's second
+word is given as `./review`."""
 EXIT_CODES = {
     0: "made; videos that were rejected are listed, with reasons",
     1: "a check found something wrong (verify, status --check)",
@@ -97,12 +83,11 @@ def run(argv: Sequence[str]) -> int:
 
         print(f"v2p {version('lerobot_policy_v2p')}")
         return 0
-    name = " ".join(argv[:2]) if " ".join(argv[:2]) in SUBCOMMANDS else argv[0]
+    name = " ".join(argv[:2]) if " ".join(argv[:2]) in COMMANDS else argv[0]
     try:
         return _command(name)(list(argv[len(name.split()) :]))
     except V2PError as error:
-        known = name in COMMANDS or name in SUBCOMMANDS
-        print(f"v2p {name}: {error}" if known else f"v2p: {error}", file=sys.stderr)
+        print(f"v2p {name}: {error}" if name in COMMANDS else f"v2p: {error}", file=sys.stderr)
         return NOT_ALL if isinstance(error, NotAllError) else NOTHING
     except OSError as error:
         if (refusal := write_refusal(error)) is None:
@@ -121,27 +106,24 @@ def parse[T](kind: type[T], argv: list[str], command: str, default: T | None = N
     """Return the arguments as the dataclass `kind`; field docstrings are the help.
 
     Raises:
-        V2PError: an argument is wrong; tyro's own words in one sentence.
+        V2PError: an argument is wrong.
     """
     import tyro
+    from tyro._errors import ParseErrorEvent, on_parse_error
 
-    wants_help = any(a in ("-h", "--help") for a in argv)
-    words = io.StringIO()
+    def refuse(event: ParseErrorEvent) -> None:
+        if wrong := _sentence(event, kind, argv):
+            raise V2PError(f"{wrong}{_meant(argv, command)} See 'v2p {command} --help'")
+
     keywords: dict[str, Any] = {} if default is None else {"default": default}
-    try:
-        with contextlib.redirect_stderr(words):
-            return tyro.cli(
-                kind,
-                args=argv,
-                prog=f"v2p {command}",
-                description=(COMMANDS | SUBCOMMANDS)[command][1],
-                **keywords,
-            )
-    except SystemExit as error:
-        if wants_help or not error.code:
-            raise
-        wrong = _by_option(_one_sentence(words.getvalue()), argv)
-        raise V2PError(f"{wrong}.{_meant(argv, command)} See 'v2p {command} --help'") from error
+    with on_parse_error(refuse):
+        return tyro.cli(
+            kind,
+            args=argv,
+            prog=f"v2p {command}",
+            description=COMMANDS[command][1],
+            **keywords,
+        )
 
 
 def command_of(provenances: Sequence[Mapping[str, Any]]) -> list[str] | None:
@@ -155,52 +137,68 @@ def _meant(argv: list[str], command: str) -> str:
     """Return the command of two words that may have been meant, where the first argument is no path."""
     if not argv or argv[0].startswith("-") or Path(argv[0]).exists():
         return ""
-    close = difflib.get_close_matches(f"{command} {argv[0]}", SUBCOMMANDS, n=1, cutoff=0.8)
-    return f" Did you mean 'v2p {close[0]}'?" if close else ""
+    close = difflib.get_close_matches(f"{command} {argv[0]}", COMMANDS, n=1, cutoff=0.8)
+    return f" Did you mean 'v2p {close[0]}'?" if close and " " in close[0] else ""
 
 
-def _one_sentence(box: str) -> str:
-    text = re.sub(r"[╭╮╰╯│─]+|[+|]?-{3,}[+|]?|^\||\|$", " ", box, flags=re.M)
-    text = re.sub(r"\s+", " ", text).strip()
-    text = re.sub(r"^(Unrecognized options|Parsing error|Required options)\s+", "", text)
-    text = re.sub(r"For full helptext, (run|see):? .*$", "", text)
-    return text.strip().removesuffix(".")
+def _sentence(event: Any, kind: type, argv: list[str]) -> str:
+    """Return in a sentence what tyro found wrong; empty for what tyro says itself."""
+    from tyro import _errors as wrong
+
+    match event:
+        case wrong.MissingArgs():
+            unknown = "".join(f", and {word} is unknown" for word in event.unrecognized_tokens[:1])
+            return f"missing: {', '.join(a.arg.display_name() for a in event.missing_arguments)}{unknown}."
+        case wrong.UnrecognizedArgs():
+            word = event.tokens[0].partition("=")[0]
+            close = difflib.get_close_matches(word, _options(kind), n=1)
+            return f"{word} is unknown.{f' Did you mean {close[0]}?' if close else ''}"
+        case wrong.InvalidChoice():
+            return f"{event.argument.display_name()} is {' or '.join(sorted(event.choices))}, not '{event.value}'."
+        case wrong.BadValue():
+            return f"{event.argument.display_name()} lacks a value."
+        case wrong.InstantiationFailure() if event.argument is not None:
+            return f"{event.argument.display_name()}: {event.message}."
+        case wrong.InstantiationFailure():
+            # A class's own words begin with the name of the field that it refuses.
+            field, _, rest = event.message.partition(" ")
+            options = [word.partition("=")[0] for word in argv if word.startswith("--")]
+            typed = [o for o in options if _field(o) == field]
+            return f"{typed[0]} {rest}." if typed else f"{event.message}."
+    return ""
 
 
-def _by_option(wrong: str, argv: list[str]) -> str:
-    """Return a setting's own words about its value with the option as it was typed, not by its inner name."""
-    found = re.fullmatch(r"(?:Value error )?Error parsing ([\w.]+): (\w+)( must .*)", wrong)
-    if found is None:
-        return wrong
-    inner, field, must = found.groups()
-    for word in argv:
-        option = word.split("=")[0]
-        name = option.removeprefix("--").replace("-", "_")
-        if option.startswith("--") and f".{inner}.{field}".endswith(f".{name}"):
-            return option + must
-    return f"{field}{must}"
+def _field(option: str) -> str:
+    """Return the name of the field that an option sets."""
+    return option.removeprefix("--").rpartition(".")[2].replace("-", "_")
+
+
+def _options(kind: type, prefix: str = "--") -> Iterator[str]:
+    """Yield the options of a command's dataclass."""
+    hints = get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        notes = getattr(hints[field.name], "__metadata__", ())
+        inner = get_args(hints[field.name])[0] if notes else hints[field.name]
+        is_nameless = any(getattr(note, "name", None) == "" for note in notes)
+        name = prefix if is_nameless else f"{prefix}{field.name.replace('_', '-')}"
+        if is_dataclass(inner):
+            yield from _options(inner, name if is_nameless else f"{name}.")
+        else:
+            yield name
 
 
 def _command(name: str) -> Callable[[list[str]], int]:
-    known = COMMANDS | SUBCOMMANDS
-    if name not in known:
+    if name not in COMMANDS:
         raise V2PError(f"there is no command '{name}'.{did_you_mean(name, COMMANDS)}")
     from importlib import import_module
 
-    module = import_module(f"v2p_data.commands.{known[name][0]}")
+    module = import_module(f"v2p_data.commands.{COMMANDS[name][0]}")
     return getattr(module, f"{name.split()[-1]}_command")
 
 
 def _help() -> str:
-    width = max(map(len, (*COMMANDS, *SUBCOMMANDS)))
-    lines = [
-        f"  {name:<{width}}  {words}"
-        for command, what in COMMANDS.items()
-        for name, (_, words) in [
-            (command, what),
-            *(pair for pair in SUBCOMMANDS.items() if pair[0].split()[0] == command),
-        ]
-    ]
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {words}" for name, (_, words) in COMMANDS.items()]
     return "\n".join(
         [
             "usage: v2p COMMAND ...",

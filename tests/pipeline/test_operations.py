@@ -5,7 +5,7 @@ import pytest
 
 from v2p_data.commands.gc import gc_command
 from v2p_data.commands.progress import Progress, progress_of
-from v2p_data.commands.show import MANY, status_command
+from v2p_data.commands.status import MANY, status_command
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.pipeline.at_work import Event

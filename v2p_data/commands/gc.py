@@ -7,7 +7,7 @@ from pathlib import Path
 
 from v2p_data.cli import parse
 from v2p_data.commands.display import STAGE_ORDER
-from v2p_data.commands.show import Shown, run_folder
+from v2p_data.commands.status import Shown, run_folder
 from v2p_data.errors import UnusableError, V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import Record, read_record

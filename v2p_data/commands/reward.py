@@ -49,18 +49,10 @@ class Search:
     limits: Limits = field(default_factory=Limits)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShowReward:
-    run: tyro.conf.Positional[Path]
-    """Folder of a search, of one candidate in it, or of a run with rewards."""
-    candidate: int | None = None
-    """Number of the candidate to show; by default the chosen one."""
-
-
 def reward_command(argv: list[str]) -> int:
     from v2p_data.commands.run import _up_to
 
-    return _up_to("reward", argv, _stage_of, "v2p expert")
+    return _up_to("reward", argv, _stage_of, "expert")
 
 
 def _stage_of(video: Any, cfg: Any) -> Any:
@@ -98,7 +90,7 @@ def search_command(argv: list[str]) -> int:
     print(  # noqa: T201
         f"\nMade {args.out / SEARCH_FILE}\nCandidate {found.chosen} succeeds in {found.success:.0%} (per seed {seeds}); "
         f"the search took {found.cost_share:.0%} of the steps of training every candidate to the end"
-        f"{f'; without a result: {lost}' if lost else ''}\nNext: v2p reward show {shlex.quote(str(args.out))}"
+        f"{f'; without a result: {lost}' if lost else ''}\nNext: v2p show {shlex.quote(str(args.out))}"
     )
     return 0
 
@@ -108,19 +100,15 @@ def _is_by_model(task: Path) -> bool:
     return isinstance(about, dict) and about.get("writer") == "vlm"
 
 
-def show_command(argv: list[str]) -> int:
-    args = parse(ShowReward, argv, "reward show")
-    print(shown(args.run, args.candidate))  # noqa: T201
-    return 0
-
-
 def shown(run: Path, number: int | None) -> str:
     """Return a search in words: its table, and of one candidate curves, analysis, difference to its parent and code."""
     if (run / CANDIDATE_FILE).is_file():
         run, number = run.parents[1], Candidate.load(run).number
     searches = searches_in(run)
     if not searches:
-        raise V2PError(f"{run} holds no reward search; make one with 'v2p reward search TASK'")
+        raise V2PError(
+            f"{run} holds neither a task nor a reward search; make them with 'v2p task VIDEOS' and 'v2p reward search TASK'"
+        )
     return "\n\n\n".join(_search(search, number) for search in searches)
 
 

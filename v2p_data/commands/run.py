@@ -1,12 +1,13 @@
 """Commands that make things: the whole chain, or up to one stage."""
 
+import argparse
 import math
 import os
 import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +24,7 @@ from v2p_data.commands.display import (
     telling,
 )
 from v2p_data.commands.progress import Progress
+from v2p_data.commands.setup import fetch_preset
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.episodes.hub.policy_card import note_results
@@ -111,15 +113,21 @@ Running = Annotated[How, tyro.conf.arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FromVideos:
-    videos: tyro.conf.Positional[Path]
-    """Folder of videos, or one video; captions in captions.json beside them, or in the file names."""
-    out: Path
-    """Run folder; running again keeps what is done."""
+class Settings:
+    """What all commands that make things are told."""
+
     config: Path | None = None
     """YAML file with settings; flags go over it."""
     engine: Engine = field(default_factory=EngineConfig)
     how: Running = field(default_factory=How)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromVideos(Settings):
+    videos: tyro.conf.Positional[Path]
+    """Folder of videos, or one video; captions in captions.json beside them, or in the file names."""
+    out: Path
+    """Run folder; running again keeps what is done."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,34 +137,21 @@ class Generate(FromVideos):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train:
+class Train(Settings):
     dataset: tyro.conf.Positional[Path]
     """Folder of a dataset that `v2p generate` made."""
     out: Path | None = None
     """Run folder; by default the one the dataset lies in."""
-    config: Path | None = None
-    """YAML file with settings; flags go over it."""
-    engine: Engine = field(default_factory=EngineConfig)
-    how: Running = field(default_factory=How)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Distill(Train):
-    """The same words as of `v2p train`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluate:
+class Evaluate(Settings):
     policy: tyro.conf.Positional[Path]
     """Folder of a policy or of an expert, or a policy's USER/NAME on the Hub; `programs` for the scripted programs."""
     tasks: tuple[Path, ...] = ()
     """More task folders (or folders of tasks) to try: these count as unseen."""
     out: Path | None = None
     """Run folder; by default the one the policy lies in, and outputs/NAME of a policy on the Hub."""
-    config: Path | None = None
-    """YAML file with settings; flags go over it."""
-    engine: Engine = field(default_factory=EngineConfig)
-    how: Running = field(default_factory=How)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,19 +165,19 @@ class Demo:
 
 
 def scene_command(argv: list[str]) -> int:
-    return _up_to("scene", argv, lambda video, cfg: scene_stage(video, cfg), "v2p task")
+    return _up_to("scene", argv, lambda video, cfg: scene_stage(video, cfg), "task")
 
 
 def task_command(argv: list[str]) -> int:
-    return _up_to("task", argv, lambda v, cfg: task_stage(scene_stage(v, cfg), cfg), "v2p expert")
+    return _up_to("task", argv, lambda v, cfg: task_stage(scene_stage(v, cfg), cfg), "expert")
 
 
 def expert_command(argv: list[str]) -> int:
-    return _up_to("expert", argv, lambda v, cfg: chain(v, cfg).inputs["expert"], "v2p episodes")
+    return _up_to("expert", argv, lambda v, cfg: chain(v, cfg).inputs["expert"], "episodes")
 
 
 def episodes_command(argv: list[str]) -> int:
-    return _up_to("episodes", argv, chain, "v2p generate")
+    return _up_to("episodes", argv, chain, "generate")
 
 
 def generate_command(argv: list[str]) -> int:
@@ -200,7 +195,7 @@ def generate_command(argv: list[str]) -> int:
     _say(
         f"Made {dataset}",
         f"{counts['episodes']} episodes, {counts['frames']} frames; page: {page}",
-        shlex.join(["v2p", "train", str(dataset), *_settings_in(argv, args.videos)]),
+        _goes_on("train", dataset, args),
     )
     return code
 
@@ -215,13 +210,13 @@ def train_command(argv: list[str]) -> int:
     _say(
         f"Made {policy}",
         f"loss {counts['final_loss']:.3f} after {counts['steps']} steps; page: {page}",
-        shlex.join(["v2p", "eval", str(policy), *_settings_in(argv, args.dataset)]),
+        _goes_on("eval", policy, args),
     )
     return 0
 
 
 def distill_command(argv: list[str]) -> int:
-    args = _with_config(Distill, argv, "distill")
+    args = _with_config(Train, argv, "distill")
     root = _run_folder(args.out or args.dataset.resolve().parent.parent)
     if not args.engine.distillation.rounds:
         raise V2PError("--distillation.rounds=0 leaves nothing to do; it is 1 or more")
@@ -246,7 +241,7 @@ def distill_command(argv: list[str]) -> int:
         f"Made {packed.folder(root)}",
         f"{counts['episodes']} handover episodes, {counts['frames']} frames; the expert recovered {recovered} of each"
         f" round's; page: {page}",
-        shlex.join(["v2p", "train", str(args.dataset), *_settings_in(argv, args.dataset)]),
+        _goes_on("train", args.dataset, args),
     )
     return 0
 
@@ -314,7 +309,7 @@ def generate(
 
     A new dataset takes those whose scene, task and expert are still as they were made.
     """
-    _fetch_learned(cfg)
+    fetch_preset(cfg.scene)
     chains = [c for video in _videos(videos) for c in with_cousins(chain(video, cfg), cfg)]
     outcomes = _run(chains, runtime)
     good = [c for c in chains if outcomes[(c.name, c.folder_name)].is_usable]
@@ -528,7 +523,7 @@ def _up_to(
 ) -> int:
     args = _with_config(FromVideos, argv, name)
     root = _run_folder(args.out)
-    _fetch_learned(args.engine)
+    fetch_preset(args.engine.scene)
     with only_run_in(root):
         stages = [stage_of(video, args.engine) for video in _videos(args.videos)]
         family = [s for stage in stages for s in with_cousins(stage, args.engine)]
@@ -539,18 +534,15 @@ def _up_to(
     stages = stages if name == "scene" else family
     counts = tally(list(outcomes.values()), name)
     rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
-    out = shlex.quote(str(args.out))
-    goes_on = shlex.join(
-        [*then.split(), str(args.videos), "--out", str(args.out), *_settings_in(argv, args.videos)]
-    )
     if name == "scene" and not counts["usable"]:
-        goes_on = f"v2p scene review {out}   (to mark what was not found)"
-    elif then == "v2p generate":
-        goes_on += " --repo-id USER/NAME"
+        then = f"v2p scene review {shlex.quote(str(args.out))}   (to mark what was not found)"
+    else:
+        repo = " --repo-id USER/NAME" if then == "generate" else ""
+        then = _goes_on(then, args.videos, args, "--out", str(args.out)) + repo
     _say(
         f"Made {root / name}",
         f"{counts['usable']} of {len(stages)} {'videos' if len(family) == len(stages) else 'tasks of videos and cousins'}{f' ({rest})' if rest else ''}; page: {page}",
-        goes_on,
+        then,
     )
     return exit_code(outcomes.values(), is_made=bool(counts["usable"]))
 
@@ -574,32 +566,28 @@ def _tell_cousins(outcomes: Iterable[Outcome]) -> None:
         )
 
 
-def _settings_in(argv: Sequence[str], source: Path) -> list[str]:
-    """Return what a command line says beside what it begins with and where it goes: without it the next command would do all anew."""
-    words = list(argv)
-    words.remove(next(word for word in words if Path(word) == source))
-    for flag in ("--out", "--repo-id", "--repo_id"):
-        for k, word in enumerate(words):
-            if word == flag or word.startswith(flag + "="):
-                del words[k : k + (1 if "=" in word else 2)]
-                break
-    return words
+def changed_flags(settings: Any, usual: Any, prefix: str = "--") -> list[str]:
+    """Return the flags that make these settings of the usual ones: without them the next command would do all anew."""
+    flags: list[str] = []
+    for each in fields(settings):
+        value, was = getattr(settings, each.name), getattr(usual, each.name)
+        name = prefix + each.name.replace("_", "-")
+        if is_dataclass(value):
+            flags += changed_flags(value, was, f"{name}.")
+        elif isinstance(value, bool) and value != was:
+            flags.append(name if value else f"{name[: len(prefix)]}no-{name[len(prefix) :]}")
+        elif isinstance(value, tuple) and value != was:
+            flags += [name, *map(str, value)]
+        elif value != was:
+            flags.append(f"{name}={value}")
+    return flags
 
 
-def _fetch_learned(cfg: EngineConfig) -> None:
-    """Download the models of the preset `learned` before any work begins, and say so first.
-
-    Raises:
-        V2PError: one cannot be downloaded.
-    """
-    if cfg.scene.preset != "learned":
-        return
-    from v2p_data.commands.models import fetch_learned
-    from v2p_data.scene.preset import checkpoints_of, missing, with_preset
-
-    absent = missing(checkpoints_of(with_preset(cfg.scene)))
-    if absent:
-        fetch_learned(absent)
+def _goes_on(command: str, source: Path, args: Settings, *more: str) -> str:
+    """Return a command line on `source` with the settings of this one."""
+    file = ["--config", str(args.config)] if args.config else []
+    flags = changed_flags(args.engine, _usual(args.config)) + changed_flags(args.how, How())
+    return shlex.join(["v2p", *command.split(), str(source), *more, *file, *flags])
 
 
 def _videos(folder: Path) -> list[VideoItem]:
@@ -658,27 +646,24 @@ def _record(folder: Path) -> Record:
     return record
 
 
-def _with_config[T: FromVideos | Train | Evaluate](kind: type[T], argv: list[str], name: str) -> T:
-    """Parse twice: once for --config, then with the file's values as the defaults of the flags."""
-    path = _flag(argv, "--config")
+def _with_config[T: Settings](kind: type[T], argv: list[str], name: str) -> T:
+    """Parse with the values of the file that --config names, if one is named, as the defaults of the flags."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--config", type=Path, nargs="?")
+    path = parser.parse_known_args(argv)[0].config
     if path is None:
         return parse(kind, argv, name)
-    engine = load_settings(Path(path), EngineConfig)
     missing = {
-        field_name: tyro.MISSING
-        for field_name, f in kind.__dataclass_fields__.items()
-        if f.default is f.default_factory  # both MISSING: required
+        field.name: tyro.MISSING
+        for field in fields(kind)
+        if field.default is field.default_factory  # both MISSING: required
     }
-    return parse(kind, argv, name, default=kind(engine=engine, **missing))
+    return parse(kind, argv, name, default=kind(engine=_usual(path), **missing))
 
 
-def _flag(argv: Sequence[str], flag: str) -> str | None:
-    for index, word in enumerate(argv):
-        if word == flag and index + 1 < len(argv):
-            return argv[index + 1]
-        if word.startswith(flag + "="):
-            return word.split("=", 1)[1]
-    return None
+def _usual(config: Path | None) -> EngineConfig:
+    """Return the settings where no flag is given."""
+    return load_settings(config, EngineConfig) if config else EngineConfig()
 
 
 def check_device(name: str) -> None:

@@ -23,7 +23,7 @@ class SceneConfig:
 
     preset: Preset = "builtin"
     """`builtin` downloads nothing. `learned` takes Grounding DINO, SAM 2 and a metric depth model in sizes that fit this machine,
-    for each stage whose backend is not set; 'v2p scene models' lists them."""
+    for each stage whose backend is not set; 'v2p setup' lists them."""
     min_confidence: float = 0.52
     """Scenes below are rejected."""
     min_found: float = 0.5

@@ -127,7 +127,7 @@ def test_the_real_worker_finds_no_hand_in_an_empty_picture(monkeypatch: pytest.M
     monkeypatch.delenv("V2P_CACHE")
     command = hands_setup.installed_worker()
     if not command:
-        pytest.skip("MediaPipe is not set up here: v2p scene hands --setup")
+        pytest.skip("MediaPipe is not set up here: v2p setup hands")
     images = np.full((3, 120, 160, 3), 127, np.uint8)
 
     answer = run_worker(command, WorkerRequest(kind="hands", arrays={"images": images}), 120.0)

@@ -149,7 +149,7 @@ def test_a_file_that_is_not_mobile_sam_is_one_sentence(weights, tmp_path, name: 
     elif content is not None:
         path.write_bytes(content)
 
-    with pytest.raises(V2PError, match=r"does not hold MobileSAM's weights .* run 'v2p scene outlines --setup'"):  # fmt: skip
+    with pytest.raises(V2PError, match=r"does not hold MobileSAM's weights .* run 'v2p setup outlines'"):  # fmt: skip
         MobileSam(path)
 
 
@@ -204,7 +204,7 @@ def test_the_real_model_outlines_a_box_on_a_table(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delenv("V2P_CACHE")
     weights = mobile_sam_setup.installed_weights()
     if weights is None:
-        pytest.skip("MobileSAM is not set up here: v2p scene outlines --setup")
+        pytest.skip("MobileSAM is not set up here: v2p setup outlines")
     model = MobileSam(weights)
     image = np.full((240, 320, 3), 190, np.uint8)
     truth = np.zeros((240, 320), bool)

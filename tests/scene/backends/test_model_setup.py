@@ -5,10 +5,9 @@ from pathlib import Path
 import pytest
 
 from v2p_data.cli import run
-from v2p_data.commands.models import not_set_up
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends import hands_setup, mobile_sam_setup, nanodet_setup
-from v2p_data.scene.backends.config import GroundConfig, HandsConfig, OutlineConfig, ThingsConfig
+from v2p_data.scene.backends import hands_setup, mobile_sam_setup
+from v2p_data.scene.backends.config import GroundConfig, HandsConfig, OutlineConfig
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import with_preset
 from v2p_data.scene.reconstruct import prepared_for
@@ -19,14 +18,8 @@ SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
 SETTINGS = {
     "hands": HandsConfig(backend="mediapipe"),
     "outline": OutlineConfig(backend="mobile_sam"),
-    "things": ThingsConfig(backend="nanodet"),
 }
-COMMANDS = {"hands": "hands", "outline": "outlines", "things": "detectors"}
-LISTED = {
-    "hands": "MediaPipe for hands (130 MB)",
-    "outline": "MobileSAM for outlines (38 MB)",
-    "things": "NanoDet for things (145 MB)",
-}
+COMMANDS = {"hands": "hands", "outline": "outlines"}
 pytestmark = pytest.mark.usefixtures("cache")
 each_model = pytest.mark.parametrize("model", SETTINGS)
 
@@ -36,7 +29,6 @@ def set_up(model: str) -> None:
     kept = {
         "hands": hands_setup.hands_folder() / "ready",
         "outline": mobile_sam_setup.weights_folder() / "mobile_sam.safetensors",
-        "things": nanodet_setup.weights_file(),
     }[model]
     kept.parent.mkdir(parents=True)
     kept.touch()
@@ -47,7 +39,6 @@ def test_auto_takes_a_model_where_it_was_set_up_and_the_recipe_says_so(model: st
     video, chosen = find_videos(SAMPLES)[0], SETTINGS[model]
     without = scene_stage(video, EngineConfig()).fingerprint
     assert getattr(with_preset(SceneConfig()), model).backend == "none"
-    assert list(not_set_up(SceneConfig())) == [*LISTED.values()]
 
     set_up(model)
 
@@ -55,7 +46,6 @@ def test_auto_takes_a_model_where_it_was_set_up_and_the_recipe_says_so(model: st
     assert scene_stage(video, EngineConfig()).fingerprint != without
     left_out = SceneConfig(**{model: type(chosen)(backend="none")})
     assert scene_stage(video, EngineConfig(scene=left_out)).fingerprint == without
-    assert list(not_set_up(SceneConfig())) == [LISTED[m] for m in LISTED if m != model]
 
 
 @each_model
@@ -63,15 +53,15 @@ def test_without_setup_auto_asks_nobody_and_a_model_by_name_says_what_to_do(
     model: str, draw, capsys: pytest.CaptureFixture[str]
 ):
     clip, ground = draw(num_frames=12), GroundConfig(backend="heuristic")
-    setup = f"v2p scene {COMMANDS[model]} --setup"
+    setup = f"v2p setup {COMMANDS[model]}"
 
     working = prepared_for(clip, SceneConfig(ground=ground)).working
 
     assert (working.hands, working.outliner, working.sightings) == (None, None, None)
     with pytest.raises(V2PError, match=f"run '{setup}'"):
         prepared_for(clip, SceneConfig(ground=ground, **{model: SETTINGS[model]}))
-    assert run(["scene", COMMANDS[model]]) == 0
-    assert setup in capsys.readouterr().out
+    assert run(["setup"]) == 0
+    assert f"{COMMANDS[model]:<10}" in capsys.readouterr().out
 
 
 @each_model
@@ -80,7 +70,7 @@ def test_a_cache_folder_that_cannot_be_made_is_one_sentence(
 ):
     cache.touch()
 
-    assert run(["scene", COMMANDS[model], "--setup"]) == 2
+    assert run(["setup", COMMANDS[model]]) == 2
     assert "V2P_CACHE names another folder" in capsys.readouterr().err
 
 

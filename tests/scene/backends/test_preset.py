@@ -127,7 +127,7 @@ def test_what_is_missing_is_named_and_downloaded_once(
 def test_a_model_that_cannot_be_had_is_one_sentence_with_what_to_do(
     checkpoint, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
-    from v2p_data.commands.models import fetch_learned
+    from v2p_data.commands.setup import fetch_learned
 
     with running_hub() as hub:
         monkeypatch.setenv("HF_ENDPOINT", hub.url)

