@@ -45,15 +45,6 @@ def test_a_confidence_that_tells_right_from_wrong_ranks_and_accepts(script, tmp_
     assert "'grounding': 0.0" not in weights
 
 
-def test_one_that_tells_nothing_is_not_calibrated_into_something(script, tmp_path, capsys):
-    clips = [script.judged_of(row) for row in many(lambda k, c: k % 2 == 0)]
-    right = np.array([c.right for c in clips])
-    p = script.held_out_probability(np.log([[c.confidence] for c in clips]), clips)
-
-    assert script.auc(p, right) < 0.6
-    assert np.abs(p - 0.5).max() < 0.3
-
-
 def test_a_source_is_never_on_both_sides(script):
     rows = [judged("a__left", 0.9, right=True), judged("b__left", 0.8, right=True)]
     rows += [judged("c__right", 0.2, right=False), judged("d__right", 0.3, right=False)]
@@ -63,20 +54,6 @@ def test_a_source_is_never_on_both_sides(script):
     # Only the constant is left: each side is told what the other one is.
     assert (p[:2] < 0.01).all()
     assert (p[2:] > 0.99).all()
-
-
-def test_clips_of_one_source_are_refused(script, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        table_of(script, [judged("a__x", 0.9, right=True)], tmp_path, capsys)
-    assert "two sources" in capsys.readouterr().err
-
-
-def test_rows_of_the_bench_are_read_too(script):
-    row = {
-        "name": "lift_up_0001", "confidence": 0.6, "stages": {"pose": [0.6, "why"]}, "gate_slug": "low_confidence", "usable": True
-    }  # fmt: skip
-    clip = script.judged_of(row)
-    assert (clip.stages, clip.gate, clip.right) == ({"pose": 0.6}, "low_confidence", True)
 
 
 def test_the_bar_is_the_least_from_which_nine_of_ten_are_right_and_asks_no_clip_about_itself(

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import check_gpu
 from check_gpu import CHECKS, Check, run_check
 from results_table import ROOT
 
@@ -95,53 +94,7 @@ def test_a_check_that_hangs_is_ended():
     assert "longer than 1 s" in outcome.error
 
 
-TESTS = """
-import pytest
-def test_good(): pass
-def test_bad(): assert 1 + 1 == 3
-@pytest.mark.skip(reason="no such device")
-def test_elsewhere(): pass
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("which", "ran", "passed", "words"),
-    [
-        ("good", True, True, ""),
-        ("good or bad", True, False, "test_bad: assert (1 + 1) == 3"),
-        ("elsewhere", False, False, "no such device"),
-    ],
-)
-def test_tests_are_counted_and_those_that_were_skipped_did_not_run(
-    tmp_path: Path, which: str, ran: bool, passed: bool, words: str
-):
-    (tmp_path / "test_three.py").write_text(TESTS)
-    words_ = ["-m", "pytest", "-q", "-c", "/dev/null", str(tmp_path), "-k", which]
-
-    outcome = run_check("t", Check(what="", command=lambda d, q: words_), "cpu", quick=True)
-
-    assert (outcome.ran, outcome.passed) == (ran, passed)
-    assert words in outcome.error
-
-
-def test_every_check_names_files_that_are_there():
-    for name, check in CHECKS.items():
-        for quick in (False, True):
-            files = [w for w in check.command("cpu", quick) if "/" in w]
-            assert files, name
-            assert all((ROOT / file).exists() for file in files)
-
-
 def test_the_page_lists_the_checks_in_their_order():
     page = (ROOT / "docs" / "gpu.md").read_text()
 
     assert re.findall(r"^\| `(\w+)` \|", page, re.M) == [*CHECKS]
-
-
-def test_a_gpu_s_checks_hold_worlds_trainers_and_backends():
-    commands = {name: check.command("cuda", False) for name, check in check_gpu.CHECKS.items()}
-
-    assert "8192" in commands["bc_speed"]
-    assert all("--quick" not in words for words in commands.values())
-    assert all(any("cuda" in w for w in words) for words in commands.values())

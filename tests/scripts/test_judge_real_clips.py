@@ -23,28 +23,12 @@ def film(path: Path, frames: int) -> Path:
     return path
 
 
-def test_a_box_at_the_first_frame_is_the_hint(judge, tmp_path):
-    thing = {"first": [1, 2, 30, 40], "last": [5, 6, 20, 30]}
-
-    assert judge.hint_of(thing, tmp_path / "none.mp4") == {
-        "frame": 0,
-        "box": [1, 2, 30, 40],
-    }
-
-
 def test_what_is_seen_at_the_end_only_is_hinted_in_the_last_frame(judge, tmp_path):
     path = film(tmp_path / "clip.mp4", 7)
 
     hint = judge.hint_of({"first": None, "last": [5, 6, 20, 30]}, path)
 
     assert hint == {"frame": 6, "box": [5, 6, 20, 30]}
-
-
-def test_an_own_hint_goes_before_the_boxes(judge, tmp_path):
-    own = {"frame": 3, "box": [1, 1, 9, 9]}
-    thing = {"first": [1, 2, 30, 40], "last": None, "hint": own}
-
-    assert judge.hint_of(thing, tmp_path / "none.mp4") == own
 
 
 def test_overlap_of_boxes_is_that_of_their_areas(judge):

@@ -89,38 +89,6 @@ def test_every_size_of_the_study_can_be_loaded_and_asks_for_the_arms_of_the_ques
     assert {"cop", "videos", "toys", "bc"} <= set(cfg.arms)
 
 
-def test_cloning_takes_as_many_gradient_steps_as_distillation_has_in_all(parts):
-    engine = EngineConfig(
-        distillation=DistillationConfig(rounds=3, first_steps=10, round_steps=20),
-        policy=PolicyConfig(steps=100),
-    )
-    cfg = parts.config.LiftingConfig(counts=(5, 10), engine=engine)
-
-    cloned, distilled = cfg.engine_for("bc", 10, 0), cfg.engine_for("videos", 10, 0)
-
-    assert cloned.distillation.rounds == 0
-    assert distilled.distillation.rounds == 3
-    assert cloned.policy.steps == 2 * (10 + 2 * 20 + 100)
-    assert cfg.engine_for("paper", 10, 0).policy.preset == "paper"
-
-
-def test_an_object_and_its_cousins_share_the_data_of_one_object_and_one_labeller(parts):
-    engine = EngineConfig(
-        episodes=EpisodesConfig(num_episodes=100),
-        distillation=DistillationConfig(episodes=128, worlds=128),
-    )
-    cfg = parts.config.LiftingConfig(counts=(5, 10), cousins=3, engine=engine)
-
-    family, alone = cfg.engine_for("toys_cousins", 10, 0), cfg.engine_for("toys", 10, 0)
-
-    assert parts.config.source_of("toys_cousins") == "toys"
-    assert (family.episodes.num_episodes, family.distillation.episodes) == (25, 32)
-    assert family.policy.steps == alone.policy.steps
-    pool = cfg.pool_engine_of("cousins")
-    assert (pool.cousins.count, pool.expert.teacher) == (3, "as_expert")
-    assert cfg.pool_engine_of("videos") == cfg.pool_engine
-
-
 @pytest.mark.parametrize("kind", ["lift_up", "push_left", "place_onto"])
 def test_a_toys_scene_is_of_the_kind_that_is_studied_and_its_task_passes_the_audit(
     kind, parts, tmp_path
@@ -140,11 +108,6 @@ def test_a_toys_scene_is_of_the_kind_that_is_studied_and_its_task_passes_the_aud
         assert top == pytest.approx(last[2] - toy.size_m[2] / 2)
     assert len(scene.others) == (asked.onto_m is not None)
     assert generate_task(scene, TaskConfig(num_samples=1), 0).bundle.kind == kind
-
-
-def test_a_kind_that_cannot_be_studied_is_named_with_those_that_can(parts):
-    with pytest.raises(ValueError, match="one of lift_up, push_left, place_onto, got insert"):
-        parts.config.PoolConfig(kind="insert")
 
 
 def test_each_cousin_goes_through_the_same_stages_as_its_scene(parts):
@@ -179,11 +142,6 @@ def test_templates_write_one_code_for_a_cousin_and_a_searched_reward_is_its_fami
     assert (searched.name, searched.inputs["family"]) == ("task", reward)
 
 
-def test_counts_that_do_not_grow_are_refused(parts):
-    with pytest.raises(ValueError, match="counts must grow"):
-        parts.config.LiftingConfig(counts=(10, 5))
-
-
 def test_the_tasks_of_a_smaller_n_come_first_in_the_order_of_a_larger_one(parts, tmp_path):
     cfg = parts.config.LiftingConfig(counts=(2, 4))
     made = parts.cells.Study(cfg=cfg, out=tmp_path, runtime=Runtime(root=tmp_path))
@@ -202,19 +160,6 @@ def test_all_arms_start_from_the_same_states_and_other_seeds_from_others(parts):
 
 
 # --- nothing unseen is trained on -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
-        ("Lifting bananas up", "banana"),
-        ("Picking toy duck up", "toy duck"),
-        ("Lifting a candlestick up", None),
-        ("Lifting banana, red", "banana"),
-    ],
-)
-def test_clips_about_a_held_out_category_are_known_by_their_words(words, found, parts):
-    assert parts.objects.is_held_out(words, ("banana", "toy duck", "candle")) == found
 
 
 def test_an_unseen_mesh_is_found_among_the_trainings_also_turned_moved_and_renamed(
@@ -239,35 +184,6 @@ def test_an_unseen_mesh_is_found_among_the_trainings_also_turned_moved_and_renam
 
     with pytest.raises(V2PError, match=r"toy_2\.obj is the unseen object 'thing'"):
         parts.objects.demand_apart([tmp_path / "task"], {"thing": unseen})
-
-
-def test_a_scan_is_turned_about_the_vertical_until_its_sides_are_its_own(parts):
-    box = trimesh.creation.box((0.03, 0.11, 0.09))
-    box.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0, 0, 1]))
-    box.apply_translation([0.2, 0.0, 0.5])
-
-    square = parts.objects.turned_square(box)
-
-    assert sorted(square.extents) == pytest.approx([0.03, 0.09, 0.11])
-    assert square.extents[2] == pytest.approx(0.09)
-    assert square.bounds.mean(0) == pytest.approx([0, 0, 0], abs=1e-12)
-    assert square.volume == pytest.approx(0.03 * 0.11 * 0.09)
-
-
-def test_a_missing_scan_is_named_with_those_that_are_there(parts, tmp_path):
-    (tmp_path / "mug").mkdir()
-    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "mug" / "textured.obj")
-    cfg = parts.config.UnseenConfig(shapes=("mug",), categories=("banana",))
-
-    with pytest.raises(V2PError, match=r"no textured\.obj of banana; it has mug"):
-        parts.objects.unseen_meshes(tmp_path, cfg)
-
-
-def test_a_drawn_category_that_clips_may_be_about_is_refused(parts, tmp_path):
-    with pytest.raises(V2PError, match=r"names \['egg'\], which clips may be about"):
-        parts.objects.draw_unseen(
-            parts.config.UnseenConfig(drawn_categories=("egg",)), ("banana",), tmp_path
-        )
 
 
 def test_no_scan_lies_in_the_repository():
@@ -322,15 +238,6 @@ def test_tables_hold_every_arm(parts):
     assert "| videos | 5 | 37.5% (13.7%-69.4%) | 0.38 | 75% | 0% | 25% | 90% | 4 | 100 |" in text
     assert "| videos - toys | 10 | +0.0 points" in text
     assert "of other scenes and another robot" in text
-
-
-def test_a_study_of_another_kind_of_task_shows_none_of_the_papers_figures_on_lifting(parts):
-    shown = {
-        kind: "another robot" in parts.table.table([{**row("videos", 5, 0, "1110"), "kind": kind}])
-        for kind in ("lift_up", "place_onto")
-    }
-
-    assert shown == {"lift_up": True, "place_onto": False}
 
 
 # --- a cell, and the study ------------------------------------------------------------------------------------------
@@ -409,11 +316,6 @@ def test_a_study_that_was_killed_after_a_cell_goes_on_and_ends_with_every_cell_o
         study.make_cells(arguments(tmp_path, config=ROOT / "configs/studies/lifting_laptop.yaml"))
     with pytest.raises(V2PError, match=r"--counts \[7\] are not all among the counts"):
         study.make_cells(arguments(tmp_path, counts=[7]))
-
-
-def test_a_study_without_results_says_so(study, tmp_path):
-    with pytest.raises(V2PError, match="holds no results yet; run the study first"):
-        study.show(arguments(tmp_path))
 
 
 @pytest.fixture

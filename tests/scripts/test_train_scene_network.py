@@ -41,12 +41,6 @@ def test_a_part_shows_how_much_of_the_table_lies_across_its_own_middle(trainer):
     assert np.exp(known[2]) == pytest.approx(_table_between(40, 180, 180.0))
 
 
-def test_a_part_in_the_sky_shows_no_table(trainer):
-    level = np.array([0.1, 0.0, 0.0])
-
-    assert np.isnan(trainer.known_of(level, (slice(0, 40), slice(0, 60)), (H, W))).all()
-
-
 def test_another_camera_at_the_same_place_sees_the_table_where_it_says(trainer):
     """A black dot on a white table: found again in the turned picture, projected by the turned camera."""
     camera = camera_above((H, W), PITCH_RAD, FOV_RAD, HEIGHT_M)
@@ -91,11 +85,3 @@ def test_the_camera_s_part_of_the_weights_says_the_same_camera(trainer, tmp_path
         torch.testing.assert_close(part.camera_of(x), whole(x)[1], atol=0.01, rtol=0.01)
     sizes = [(tmp_path / f"{n}.safetensors").stat().st_size for n in ("whole", "camera")]
     assert sizes[1] < 0.8 * sizes[0]
-
-
-def test_uneven_light_changes_a_picture_smoothly(trainer):
-    light = trainer.light_over((120, 160), np.random.default_rng(0))
-
-    assert light.shape == (120, 160, 1)
-    assert light.min() > 0
-    assert np.abs(np.diff(light, axis=1)).max() < 0.05

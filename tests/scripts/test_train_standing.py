@@ -32,30 +32,6 @@ def test_the_cue_that_tells_gets_the_weight(trainer, groups):
     assert constant == pytest.approx(0, abs=1e-6)
 
 
-def test_what_is_left_when_the_right_one_is_taken_away_is_believed_less(trainer, groups):
-    weights = trainer.choosing(groups)
-    there = [trainer.found(g, weights) for g in groups]
-    away = [trainer.missed(g, weights) for g in groups]
-    doubt = trainer.doubting([*there, *away])
-
-    def trust(findings):
-        return np.median([doubt[0] + doubt[1:] @ f.cues for f in findings])
-
-    assert np.mean([f.right for f in there]) > 0.9
-    assert not any(f.right for f in away)
-    assert trust(there) > 0.5 > 0 > trust(away)
-
-
-def test_without_another_candidate_nothing_can_be_missed(trainer):
-    alone = (np.zeros((1, 3)), np.array([0.9]), np.eye(1))
-
-    assert trainer.missed(alone, np.zeros(3)) is None
-
-
-def test_better_cut_candidates_count_more(trainer):
-    np.testing.assert_allclose(trainer.worth(np.array([0.4, 0.7, 0.95])), [0, 0.5, 1])
-
-
 def test_the_weights_of_all_cues_are_written(trainer, groups, tmp_path, monkeypatch, capsys):
     for i, (cues, right, alike) in enumerate(groups):
         np.savez(
