@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from v2p_data.scene.frames.checks import check_change, check_still
 from v2p_data.scene.frames.footage import check_cuts, without_bars
 from v2p_data.scene.frames.one_pane import FindHands, as_a_person_cropped, with_one_pane
-from v2p_data.scene.frames.paint_over import without_graphics
 from v2p_data.scene.frames.repeats import without_repeats
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
 from v2p_data.scene.frames.stabilise import hint_in_aligned, stabilised
@@ -53,11 +52,11 @@ def prepare(
 ) -> PreparedClip:
     """Return the clip ready to be searched, with its working frames and what the network sees, where it is asked.
 
-    Of several pictures at once the one with the hand is taken. Black bars are cut off, repeated frames dropped, captions painted over, and frames aligned where the camera sways.
+    Of several pictures at once the one with the hand is taken. Black bars are cut off, repeated frames dropped, and frames aligned where the camera sways.
     `max_camera_shift_px` is of a picture 320 px wide.
 
     Raises:
-        ItemRejectedError: `bad_hint`, `nothing_moves`, `split_screen`, `cut`, `overlay` or `camera_moves`, with the number that
+        ItemRejectedError: `bad_hint`, `nothing_moves`, `split_screen`, `cut` or `camera_moves`, with the number that
             decided.
     """
     asked = as_a_person_cropped(clip)
@@ -68,10 +67,6 @@ def prepare(
     if one is not clip:
         clip, working = one, working_clip_of(one)
     check_cuts(clip, working)
-    painted = without_graphics(clip)
-    if painted is not clip:
-        clip, working = painted, working_clip_of(painted)
-        check_change(working)
     steady = stabilised(clip, working)
     if steady is not clip:
         clip, working = steady, working_clip_of(steady)
