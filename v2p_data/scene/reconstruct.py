@@ -73,7 +73,6 @@ def prepared_for(clip: Clip, cfg: SceneConfig) -> PreparedClip:
     cfg = with_preset(cfg)
     prepared = prepare(
         clip,
-        lambda clip, working: track_hands(clip, working, cfg.hands),
         with_network=cfg.ground.backend == "network",
         max_camera_shift_px=cfg.max_camera_shift_px,
     )

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from v2p_data.errors import ItemRejectedError
-from v2p_data.scene.frames.one_pane import cropped
+from v2p_data.scene.frames.crop import cropped
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.video.clip import Clip
 

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from v2p_data.scene.frames.checks import check_change, check_still
+from v2p_data.scene.frames.crop import with_named_part
 from v2p_data.scene.frames.footage import check_cuts, without_bars
-from v2p_data.scene.frames.one_pane import FindHands, as_a_person_cropped, with_one_pane
 from v2p_data.scene.frames.repeats import without_repeats
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
 from v2p_data.scene.frames.stabilise import hint_in_aligned, stabilised
@@ -47,25 +47,19 @@ class PreparedClip:
         return replace(self, clip=replace(clip, hints=own))
 
 
-def prepare(
-    clip: Clip, find_hands: FindHands, *, with_network: bool, max_camera_shift_px: float
-) -> PreparedClip:
+def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> PreparedClip:
     """Return the clip ready to be searched, with its working frames and what the network sees, where it is asked.
 
-    Of several pictures at once the one with the hand is taken. Black bars are cut off, repeated frames dropped, and frames aligned where the camera sways.
+    The part of the pictures that a person named is taken. Black bars are cut off, repeated frames dropped, and frames aligned
+    where the camera sways.
     `max_camera_shift_px` is of a picture 320 px wide.
 
     Raises:
-        ItemRejectedError: `bad_hint`, `nothing_moves`, `split_screen`, `cut` or `camera_moves`, with the number that
-            decided.
+        ItemRejectedError: `bad_hint`, `nothing_moves`, `cut` or `camera_moves`, with the number that decided.
     """
-    asked = as_a_person_cropped(clip)
-    clip = without_repeats(without_bars(clip if asked is None else asked))
+    clip = without_repeats(without_bars(with_named_part(clip)))
     working = working_clip_of(clip)
     check_change(working)
-    one = clip if asked is not None else with_one_pane(clip, working, find_hands)
-    if one is not clip:
-        clip, working = one, working_clip_of(one)
     check_cuts(clip, working)
     steady = stabilised(clip, working)
     if steady is not clip:
