@@ -19,7 +19,6 @@ from v2p_data.scene.frames.hand_track import contact_share
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
 from v2p_data.scene.frames.segmentation import hand_at
 from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, seen_on_table
-from v2p_data.scene.grounding.sighted import known_by_sight
 from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
 from v2p_data.scene.scale.nouns import is_clear
 
@@ -58,9 +57,7 @@ def _object_cues(
     if not s.hinted and (words := named_colours(s.phrase)):
         image = grounded.working.rgb[s.at]
         match = float(colour_match(balance(image), words)[s.first].mean())
-        # Where nothing else in the picture fits the words better, the light is to blame.
-        known = known_by_sight(grounded.working, s.phrase, {s.at: s.first}) or 0.0
-        value = 0.4 + 0.6 * max(match / _COLOURED, known)
+        value = 0.4 + 0.6 * (match / _COLOURED)
         yield _cue("grounding", f"colour of {which}", value, f"{box}, or correct its colour word")
     if s.moves:
         track = f"track of {which} from start to end"

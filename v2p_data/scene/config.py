@@ -11,7 +11,6 @@ from v2p_data.scene.backends.config import (
     OutlineConfig,
     PoseConfig,
     SegmentConfig,
-    ThingsConfig,
 )
 
 type Preset = Literal["builtin", "learned"]
@@ -49,7 +48,6 @@ class SceneConfig:
     segment: SegmentConfig = field(default_factory=SegmentConfig)
     hands: HandsConfig = field(default_factory=HandsConfig)
     outline: OutlineConfig = field(default_factory=OutlineConfig)
-    things: ThingsConfig = field(default_factory=ThingsConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from v2p_data.scene.backends import nanodet_setup
 from v2p_data.scene.backends.config import DEFAULT_MODELS, OutlineConfig
 from v2p_data.scene.backends.hands_setup import installed_worker
 from v2p_data.scene.backends.mobile_sam_setup import installed_weights, transformers_is_there
@@ -86,7 +85,6 @@ def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machi
     found = {
         "hands": "mediapipe" if installed_worker() else "none",
         "outline": "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none",
-        "things": "nanodet" if nanodet_setup.weights_file().is_file() else "none",
     }
     for stage, backend in found.items():
         if getattr(cfg, stage).backend == "auto":

@@ -40,7 +40,7 @@ from v2p_data.scene.grounding.mirror_image import (
     mirrored_clip,
     mirrored_meaning,
 )
-from v2p_data.scene.grounding.outliner_by_model import outliner_of, sightings_of
+from v2p_data.scene.grounding.outliner_by_model import outliner_of
 from v2p_data.scene.meshes import with_meshes
 from v2p_data.scene.preset import with_preset
 from v2p_data.scene.remarks import remarks_on
@@ -78,8 +78,7 @@ def prepared_for(clip: Clip, cfg: SceneConfig) -> PreparedClip:
     )
     hands = track_hands(prepared.clip, prepared.working, cfg.hands)
     outliner = outliner_of(prepared.clip, prepared.working, cfg.outline)
-    sightings = sightings_of(prepared.clip, prepared.working, cfg.things)
-    working = replace(prepared.working, hands=hands, outliner=outliner, sightings=sightings)
+    working = replace(prepared.working, hands=hands, outliner=outliner)
     return replace(prepared, working=working)
 
 
@@ -219,9 +218,7 @@ def _grounded_in_mirror_image(
     """Return the caption's objects as they are found in the clip's mirror image."""
     mirrored = mirrored_clip(prepared)
     outliner = outliner_of(mirrored.clip, mirrored.working, cfg.outline)
-    sightings = sightings_of(mirrored.clip, mirrored.working, cfg.things)
-    working = replace(mirrored.working, outliner=outliner, sightings=sightings)
-    mirrored = replace(mirrored, working=working)
+    mirrored = replace(mirrored, working=replace(mirrored.working, outliner=outliner))
     found = _grounded(mirrored, mirrored_meaning(meaning), cfg)
     return as_filmed(found, prepared.working)
 

@@ -57,7 +57,7 @@ def test_without_setup_auto_asks_nobody_and_a_model_by_name_says_what_to_do(
 
     working = prepared_for(clip, SceneConfig(ground=ground)).working
 
-    assert (working.hands, working.outliner, working.sightings) == (None, None, None)
+    assert (working.hands, working.outliner) == (None, None)
     with pytest.raises(V2PError, match=f"run '{setup}'"):
         prepared_for(clip, SceneConfig(ground=ground, **{model: SETTINGS[model]}))
     assert run(["setup"]) == 0

@@ -20,7 +20,6 @@ from v2p_data.scene.backends.config import (
     HandsConfig,
     OutlineConfig,
     SegmentConfig,
-    ThingsConfig,
 )
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import SIZES, WEIGHTS_GB, Machine, checkpoints_of, missing, with_preset
@@ -76,7 +75,6 @@ def test_without_the_preset_nothing_changes_and_the_machine_is_not_asked():
     without_models = SceneConfig(
         hands=HandsConfig(backend="none"),
         outline=OutlineConfig(backend="none"),
-        things=ThingsConfig(backend="none"),
     )
     assert with_preset(SceneConfig(), machine) == without_models
     assert checkpoints_of(SceneConfig()) == ()
@@ -101,7 +99,6 @@ def test_what_is_missing_is_named_and_downloaded_once(
     options = [
         "--scene.ground.model", cfg.ground.model, "--scene.depth.model", cfg.depth.model,
         "--scene.segment.model", "user/tiny", "--scene.hands.backend", "none", "--scene.outline.backend", "none",
-        "--scene.things.backend", "none",
     ]  # fmt: skip
     with running_hub() as hub:
         files = {p.name: p.read_bytes() for p in folder.iterdir()}

@@ -8,6 +8,5 @@ transformers when they are called, not before. Default checkpoints, licences and
 
 Reading order: config, checkpoint (how a model is loaded), detect, segment, depth, worker, pinned_packages (how what is set up beside
 ours is installed), hands_setup (the environment of the hands worker), hands_worker (that worker; it runs there and imports
-nothing of ours), outlines (prompts and masks), mobile_sam_setup (its weights), mobile_sam, tiny_vit (its encoder),
-nanodet (things known by sight), nanodet_setup.
+nothing of ours), outlines (prompts and masks), mobile_sam_setup (its weights), mobile_sam, tiny_vit (its encoder).
 """

@@ -12,7 +12,6 @@ type GroundBackend = Literal[
 type SegmentBackend = Literal["flow", "sam2", "worker"]
 type HandsBackend = Literal["auto", "none", "mediapipe", "worker"]
 type OutlineBackend = Literal["auto", "none", "mobile_sam"]
-type ThingsBackend = Literal["auto", "none", "nanodet"]
 type DepthBackend = Literal["none", "depth_anything", "depth_pro", "moge", "worker"]
 
 DEFAULT_MODELS: dict[str, str] = {
@@ -137,14 +136,6 @@ class OutlineConfig:
     """`mobile_sam` needs 'v2p setup outlines' once, or `weights`; `auto` takes it where it can be used."""
     weights: Path | None = None
     """File with MobileSAM's weights (`mobile_sam.pt` as published, or safetensors); without one, what setup fetched."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ThingsConfig:
-    """Who knows everyday things by sight: what it sees competes with what the network sees, and speaks for it or against it."""
-
-    backend: ThingsBackend = "auto"
-    """`nanodet` needs 'v2p scene detectors --setup' once; `auto` takes it where that was done."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,6 @@ from scipy.optimize import linear_sum_assignment
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.checkpoint import Checkpoint, batches, load_checkpoint
 from v2p_data.scene.backends.config import GroundConfig
-from v2p_data.scene.backends.nanodet import overlaps
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
 _MAX_TOKENS = 256
@@ -227,3 +226,12 @@ def _things(boxes: np.ndarray, strength: np.ndarray, max_overlap: float) -> list
 def _tuple4(values: np.ndarray) -> tuple[float, float, float, float]:
     a, b, c, d = (float(v) for v in values)
     return a, b, c, d
+
+
+def overlaps(
+    box: Float[np.ndarray, "4"], boxes: Float[np.ndarray, "n 4"]
+) -> Float[np.ndarray, "n"]:
+    """Return how far a box overlaps each of others (IoU)."""
+    size = np.clip(np.minimum(box[2:], boxes[:, 2:]) - np.maximum(box[:2], boxes[:, :2]), 0, None)
+    both, areas = size.prod(1), (boxes[:, 2:] - boxes[:, :2]).prod(1)
+    return both / np.maximum(1e-6, (box[2:] - box[:2]).prod() + areas - both)

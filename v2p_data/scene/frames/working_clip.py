@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from v2p_data.scene.backends.nanodet import Sightings
 from v2p_data.scene.frames.colour import histogram, lab_distance, lab_of, likelihood, skin_prior
 from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.outliner import Outliner
@@ -57,8 +56,6 @@ class WorkingClip:
     """Where a model that knows hands was asked."""
     outliner: Outliner | None = None
     """Where a model that outlines objects was asked for."""
-    sightings: Sightings | None = None
-    """Where a model that knows things by sight was asked for."""
 
     @cached_property
     def lit(self) -> Float32[np.ndarray, "h w 3"]:

@@ -34,7 +34,6 @@ from v2p_data.scene.grounding.moved_object import (
     sureness_of,
     tracked_mover,
 )
-from v2p_data.scene.grounding.sighted import not_known
 from v2p_data.scene.grounding.static_by_change import find_static_by_change
 from v2p_data.scene.grounding.static_objects import StaticSearch, find_static_object
 from v2p_data.scene.grounding.tracking import carried
@@ -126,7 +125,7 @@ def ground_objects(
         working=working,
         table=table,
         segmentation=segmentation,
-        warnings=(*warnings, *not_known(working, meaning.phrases)),
+        warnings=warnings,
     )
 
 
@@ -159,7 +158,7 @@ def ground_brought(
         working=working,
         table=table,
         segmentation=segmentation,
-        warnings=(*warnings, *not_known(working, meaning.phrases)),
+        warnings=warnings,
     )
 
 

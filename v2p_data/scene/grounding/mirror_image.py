@@ -31,7 +31,7 @@ def has_marks(clip: Clip) -> bool:
 def mirrored_clip(prepared: PreparedClip) -> PreparedClip:
     """Return the mirror image of a clip without marks, and what the network sees in it.
 
-    Models of outlines and things are not carried over: they would show their frames as they were filmed.
+    A model of outlines is not carried over: it would show its frames as they were filmed.
     """
     clip = replace(prepared.clip, frames=prepared.clip.frames[:, :, ::-1])
     working = _mirrored_working(prepared.working)
@@ -88,7 +88,6 @@ def _mirrored_working(working: WorkingClip) -> WorkingClip:
         always=_mirrored_pictures(working.always),
         hands=None if hands is None else _mirrored_hands(hands, working.shape[1]),
         outliner=None,
-        sightings=None,
     )
 
 

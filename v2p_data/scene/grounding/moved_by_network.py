@@ -37,7 +37,6 @@ from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.handled import handling_in
 from v2p_data.scene.grounding.model_outlines import outlines_around
 from v2p_data.scene.grounding.moved_by_change import Moved
-from v2p_data.scene.grounding.sighted import Sighted, sighted
 
 _LIKELY, _POSSIBLE = 0.5, 0.25
 _GAP_PX = 7
@@ -58,10 +57,6 @@ _WHOLE = 8.0
 """Exponent of the overlap that the model expects: 0.99 for most whole objects, 0.9 for their parts."""
 _NOT_OUTLINED = 0.4
 """What a blob counts beside the model's outlines."""
-_IN_BOXES, _LEAST_MOVED = 6, 0.2
-"""Of the likest boxes, so many become blobs where the network sees motion in this share of them."""
-_BY_SIGHT = 0.5
-"""Exponent of how like the named thing a blob is to a model that knows things by sight."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,29 +246,9 @@ def _ends(
         blob.weighed("cut by colour", _PIECE)
         for blob in _rated(working, segmentation, phrase, i, cut, pieces)
     ]
-    seen = sighted(working, i, phrase)
-    if seen is not None:
-        boxed = [
-            mask
-            for mask in seen.boxed(working.rgb[i], moved, _IN_BOXES, _LEAST_MOVED)
-            if all(iou(mask, blob.mask) < _SAME_THING for blob in blobs)
-        ]
-        blobs += _rated(working, segmentation, phrase, i, boxed, boxed)
     if working.outliner is not None:
         blobs = _with_outlines(working, segmentation, phrase, i, blobs)
-    if seen is not None:
-        blobs = [_by_sight(blob, seen) for blob in blobs]
     return sorted(blobs, key=lambda blob: -blob.rating)[:8]
-
-
-def _by_sight(blob: _Blob, seen: Sighted) -> _Blob:
-    """Return a blob that counts less where other things in the picture fit the phrase better.
-
-    Where none does, light or a pale shade are to blame for the colour.
-    """
-    like = seen.of(blob.mask)
-    lit = blob.weighed("colour", max(blob.parts["colour"], 0.4 + 0.6 * like))
-    return replace(lit, preference=blob.preference * like**_BY_SIGHT)
 
 
 def _with_outlines(

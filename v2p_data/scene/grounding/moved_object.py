@@ -18,7 +18,6 @@ from v2p_data.scene.grounding.hint_masks import HintMask
 from v2p_data.scene.grounding.moved_by_change import Moved, find_moved_by_change
 from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network, rated
 from v2p_data.scene.grounding.outlines import disjoint_ends, without_shadow
-from v2p_data.scene.grounding.sighted import known_by_sight
 from v2p_data.scene.grounding.tracking import track
 from v2p_data.video.clip import Clip
 from v2p_data.video.meaning import Meaning
@@ -125,7 +124,7 @@ def _agreed(
     whole = moved.outlined == (0, 1)
     if by_change is None or by_change.score < _CHANGE_TELLS:
         opinion = _NO_OPINION_OF_WHOLE if whole else _NO_OPINION
-        return _with_opinion(working, meaning.manipulated, moved, opinion)
+        return _with_opinion(moved, opinion)
     if by_change.first.any() and by_change.last.any():
         other = rated(working, segmentation, meaning.manipulated, meaning.kind, by_change)
         if other.score > _CLEARLY_BETTER * moved.score:
@@ -146,14 +145,11 @@ def _agreed(
     )
     if whole:
         opinion = max(opinion, _NO_OPINION)
-    return _with_opinion(working, meaning.manipulated, moved, opinion)
+    return _with_opinion(moved, opinion)
 
 
-def _with_opinion(working: WorkingClip, phrase: str, moved: Moved, opinion: float) -> Moved:
-    """Return what was found with a second opinion, or with what a model that knows things by sight says, where that is higher."""
-    ends = {i: mask for i, mask in ((0, moved.first), (-1, moved.last)) if mask.any()}
-    known = known_by_sight(working, phrase, ends)
-    opinion = max(opinion, known or 0.0)
+def _with_opinion(moved: Moved, opinion: float) -> Moved:
+    """Return what was found with a second opinion."""
     cues = {**moved.cues, "second opinion": opinion}
     return replace(moved, score=moved.score * opinion, cues=cues)
 
@@ -168,7 +164,7 @@ def brought_object(
     """
     moved = find_brought(working, segmentation, thing.phrase, mark)
     if mark is None:
-        moved = _with_opinion(working, thing.phrase, moved, _NO_OPINION)
+        moved = _with_opinion(moved, _NO_OPINION)
         shares = segmentation.at(len(working.rgb) - 1)
         last = moved.last if moved.outlined else without_shadow(moved.last, shares)
         moved = replace(moved, last=last)

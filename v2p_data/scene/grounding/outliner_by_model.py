@@ -1,10 +1,8 @@
-"""Models that outline objects or know things by sight are made ready for one clip; they run only where a step asks them."""
+"""A model that outlines objects is made ready for one clip; it runs only where a step asks it."""
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends import nanodet_setup
-from v2p_data.scene.backends.config import OutlineConfig, ThingsConfig
+from v2p_data.scene.backends.config import OutlineConfig
 from v2p_data.scene.backends.mobile_sam_setup import installed_weights
-from v2p_data.scene.backends.nanodet import Sightings, nanodet
 from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.video.clip import Clip
@@ -33,29 +31,3 @@ def outliner_of(clip: Clip, working: WorkingClip, cfg: OutlineConfig) -> Outline
     from v2p_data.scene.backends.mobile_sam import mobile_sam
 
     return Outliner(mobile_sam(weights), clip.frames, working.frame_idx, working.shape)
-
-
-def sightings_of(clip: Clip, working: WorkingClip, cfg: ThingsConfig) -> Sightings | None:
-    """Return the model that knows things by sight for the clip's frames; None where none is asked for.
-
-    Args:
-        clip: the frames that are shown to the model.
-        working: the same clip at working size, in whose pixels the model answers.
-        cfg: settings; `auto` was written out by the preset.
-
-    Raises:
-        V2PError: the model was not set up here, or its weights cannot be read.
-    """
-    if cfg.backend != "nanodet":
-        return None
-    weights = nanodet_setup.weights_file()
-    if not weights.is_file():
-        raise V2PError(
-            "scene.things.backend is 'nanodet', which was not set up here; run 'v2p scene detectors --setup', or leave the option out"
-        )
-    return Sightings(
-        network=nanodet(weights),
-        frames=clip.frames,
-        frame_idx=working.frame_idx,
-        px_scale=working.px_scale,
-    )

@@ -32,7 +32,6 @@ from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.table import Table
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.model_outlines import outlines_around
-from v2p_data.scene.grounding.sighted import Sighted, sighted
 from v2p_data.scene.grounding.static_by_change import Found, pieces_of
 from v2p_data.scene.scale.camera_height import SeenCamera, px_per_m
 from v2p_data.scene.scale.nouns import Noun, noun_for
@@ -82,12 +81,6 @@ _NOT_OUTLINED = -2.0
 """What other candidates' outlines add to their rating beside those."""
 _MOST_TAKEN = 0.3
 """Share of an outline that other objects may hold."""
-_IN_BOXES = 6
-"""So many of the likest boxes become candidates."""
-_BY_SIGHT = 0.8
-"""Weight on the logarithm of how like the named thing a candidate is to a model that knows things by sight."""
-_SURE_BY_SIGHT, _HALF_KNOWN = 1.0, 0.3
-"""Weight on the same logarithm in the odds that the chosen one is right, which are as without such a model where it is this like."""
 _LESS_HIDDEN = 0.1
 """Share of an object by which less must be hidden in the late still for its outline to be taken there."""
 
@@ -157,18 +150,9 @@ def find_static_object(search: StaticSearch) -> Found | None:
 
     It is the candidate from which most overlap with the named object can be expected: a whole rather than its likelier half.
     """
-    seen = sighted(search.working, -1 if search.late else 0, search.phrase)
-    found = candidates(search)
-    if seen is not None:
-        found = _with_boxes(search, found, seen)
-    found = _with_outlines(search, found)
+    found = _with_outlines(search, candidates(search))
     if not found:
         return None
-    if seen is not None:
-        found = [
-            replace(one, preference=one.preference + _BY_SIGHT * float(np.log(seen.of(one.mask))))
-            for one in found
-        ]
     learned = _learned()
     rating = np.array([one.rating for one in found])
     likely = softmax(rating)
@@ -181,8 +165,6 @@ def find_static_object(search: StaticSearch) -> Found | None:
         odds = _sum(learned["sure"], {**said, **best.cues})
     else:
         odds = _sum(learned["aside"], said)
-    if seen is not None:
-        odds += _SURE_BY_SIGHT * float(np.log(seen.of(best.mask) / _HALF_KNOWN))
     if noun_for(search.phrase).handled:
         alike = [c.mask for c in found if c.outlined == best.outlined]
         mask = max((m for m in alike if _is_with_handle(m, mask)), key=np.sum)
@@ -251,21 +233,6 @@ def candidates(search: StaticSearch) -> list[StaticCandidate]:
     masks = _masks(search.static, cues.off_table, cues.free, cues.colour)
     rated = (cues.candidate(mask, is_part=is_part) for mask, is_part in masks)
     return [one for one in rated if one is not None]
-
-
-def _with_boxes(
-    search: StaticSearch, found: list[StaticCandidate], seen: Sighted
-) -> list[StaticCandidate]:
-    """Return the candidates and those in the boxes that a model which knows things by sight finds likest."""
-    rated = (
-        search.cues.candidate(mask, is_part=False)
-        for mask in seen.boxed(
-            search.working.rgb[-1 if search.late else 0], search.static, _IN_BOXES
-        )
-        if (mask & search.cues.free).sum() >= (1 - _MOST_TAKEN) * mask.sum()
-        and all(iou(mask, other.mask) < _SAME for other in found)
-    )
-    return [*found, *(one for one in rated if one is not None)]
 
 
 def _with_outlines(search: StaticSearch, found: list[StaticCandidate]) -> list[StaticCandidate]:
