@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from v2p_data.scene.frames.checks import check_change, check_still
 from v2p_data.scene.frames.crop import with_named_part
 from v2p_data.scene.frames.footage import check_cuts, without_bars
-from v2p_data.scene.frames.repeats import without_repeats
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
 from v2p_data.scene.frames.stabilise import hint_in_aligned, stabilised
 from v2p_data.scene.frames.working_clip import WorkingClip, working_clip_of
@@ -50,14 +49,13 @@ class PreparedClip:
 def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> PreparedClip:
     """Return the clip ready to be searched, with its working frames and what the network sees, where it is asked.
 
-    The part of the pictures that a person named is taken. Black bars are cut off, repeated frames dropped, and frames aligned
-    where the camera sways.
+    The part of the pictures that a person named is taken. Black bars are cut off, and frames aligned where the camera sways.
     `max_camera_shift_px` is of a picture 320 px wide.
 
     Raises:
         ItemRejectedError: `bad_hint`, `nothing_moves`, `cut` or `camera_moves`, with the number that decided.
     """
-    clip = without_repeats(without_bars(with_named_part(clip)))
+    clip = without_bars(with_named_part(clip))
     working = working_clip_of(clip)
     check_change(working)
     check_cuts(clip, working)
