@@ -34,13 +34,8 @@ from v2p_data.scene.frames.segmentation import segment_clip
 from v2p_data.scene.frames.stabilise import stabilised
 from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.scene.grounding.ground_objects import ground_objects
-from v2p_data.scene.grounding.static_objects import (
-    StaticCandidate,
-    StaticSearch,
-    candidates,
-    odds_of,
-    overlaps_of,
-)
+from v2p_data.scene.grounding.static_cues import StaticCandidate, StaticSearch
+from v2p_data.scene.grounding.static_objects import candidates, odds_of, overlaps_of
 from v2p_data.seeds import rng_for
 from v2p_data.video.captions import find_videos, parse_caption
 from v2p_data.video.clip import Clip

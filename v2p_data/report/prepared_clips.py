@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Int
 
 from v2p_data.scene.frames.prepare import PreparedClip
-from v2p_data.scene.grounding.hint_masks import hint_masks_of
+from v2p_data.scene.grounding.methods.base import Seen
+from v2p_data.scene.grounding.methods.hint import Hints
 from v2p_data.scene.reconstruct import prepared_for
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.clip import Clip
@@ -97,7 +98,8 @@ def outlines_of(prepared: PreparedClip) -> dict[str, Polygons]:
     x0, y0, x1, _ = clip.in_file_px
     to_file = (x1 - x0) / clip.width_px
     outlines: dict[str, Polygons] = {}
-    for phrase, marked in hint_masks_of(clip, working, prepared.segmentation, {}).items():
+    seen = Seen(clip=clip, working=working, segmentation=prepared.segmentation)
+    for phrase, marked in Hints().marks(seen).items():
         polygons, _ = cv2.findContours(
             marked.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
         )

@@ -5,8 +5,7 @@ Comes in: a `video.clip.Clip` (frames, caption, object phrases, optional hints).
 `scene.xml` (all objects in MJCF) and the overlay video; or an `ItemRejectedError` with a reason and the number that decided.
 
 Nothing is downloaded. A small network of our own, trained on rendered clips only, says which pixels are hand, moved thing,
-other thing and table. Everything else is OpenCV, scipy and trimesh. `--scene.ground.backend=heuristic` does without the
-network. Each step can ask a learned model instead (`backends/`, `docs/backends.md`).
+other thing and table. Everything else is OpenCV, scipy and trimesh. Each step can ask a learned model instead (`backends/`, `docs/backends.md`).
 
 Rooms, each of which imports only those above it:
     backends        learned models and workers

@@ -138,7 +138,7 @@ def _seen_on_table(grounded: GroundedObjects) -> float:
     """Return how far the manipulated object is seen to rest on the table at first, or at the end where a hand brings it, 0 to 1."""
     gap_px = {} if grounded.working.outliner is None else {"gap_px": EXACT_GAP_PX}
     thing, seen = grounded.objects[0], grounded.segmentation
-    if thing.brought and seen is not None:
+    if thing.brought:
         seen = replace(seen, early=seen.late)
     return seen_on_table(grounded.table, thing.first, seen, **gap_px)
 
@@ -153,8 +153,8 @@ def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:
         return False
     if _seen_on_table(grounded) < 1:
         return True
-    hand = None if grounded.segmentation is None else hand_at(grounded.segmentation, thing.at)
-    return hand is not None and bool((hand & grow(thing.first, TOUCH_PX)).any())
+    hand = hand_at(grounded.segmentation, thing.at)
+    return bool((hand & grow(thing.first, TOUCH_PX)).any())
 
 
 def by_stage(cues: tuple[Cue, ...]) -> dict[str, tuple[float, str]]:

@@ -69,8 +69,7 @@ class GroundedObjects:
     working: WorkingClip
     """As given, now knowing the hand's colours."""
     table: Table
-    segmentation: Segmentation | None
-    """None where the network was not asked."""
+    segmentation: Segmentation
     warnings: tuple[str, ...]
 
 

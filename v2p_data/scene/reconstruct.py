@@ -27,20 +27,21 @@ from v2p_data.scene.fitting.noun_variants import with_noun_variants
 from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.fitting.start_place import with_start_place
 from v2p_data.scene.frames.prepare import PreparedClip, prepare
-from v2p_data.scene.grounding.by_model import DETECTORS, detected, segmented
+from v2p_data.scene.grounding.by_model import outliner_of, segmented, track_hands
 from v2p_data.scene.grounding.ground_objects import (
     ground_brought,
     ground_objects,
     without_asides,
 )
-from v2p_data.scene.grounding.hands_by_model import track_hands
+from v2p_data.scene.grounding.methods.base import Method
+from v2p_data.scene.grounding.methods.detector import Detector
+from v2p_data.scene.grounding.methods.hint import Hints
 from v2p_data.scene.grounding.mirror_image import (
     as_filmed,
     has_marks,
     mirrored_clip,
     mirrored_meaning,
 )
-from v2p_data.scene.grounding.outliner_by_model import outliner_of
 from v2p_data.scene.meshes import with_meshes
 from v2p_data.scene.preset import with_preset
 from v2p_data.scene.remarks import remarks_on
@@ -73,7 +74,6 @@ def prepared_for(clip: Clip, cfg: SceneConfig) -> PreparedClip:
     cfg = with_preset(cfg)
     prepared = prepare(
         clip,
-        with_network=cfg.ground.backend == "network",
         max_camera_shift_px=cfg.max_camera_shift_px,
     )
     hands = track_hands(prepared.clip, prepared.working, cfg.hands)
@@ -178,7 +178,7 @@ def _rebuilt(
         ItemRejectedError: `motion_contradicts_caption`.
     """
     clip, segmentation = prepared.clip, grounded.segmentation
-    guess = camera_guess(None if segmentation is None else segmentation.camera, cfg)
+    guess = camera_guess(segmentation.camera, cfg)
     tracks = with_noun_variants(grounded.working, grounded.objects, guess, meaning.kind)
     grounded = replace(grounded, objects=tracks)
     if cfg.depth.backend != "none":
@@ -226,10 +226,10 @@ def _grounded_in_mirror_image(
 def _grounded(prepared: PreparedClip, meaning: Meaning, cfg: SceneConfig) -> GroundedObjects:
     """Return the caption's objects with their mask tracks."""
     clip, working, segmentation = prepared.clip, prepared.working, prepared.segmentation
-    boxes = None
-    if cfg.ground.backend in DETECTORS:
-        boxes = detected(clip, working, meaning.phrases, cfg.ground)
-    grounded = ground_objects(clip, working, meaning, segmentation, cfg.min_found, boxes)
+    methods: tuple[Method, ...] = (Hints(),)
+    if cfg.ground.backend != "network":
+        methods = (Detector(cfg.ground), *methods)
+    grounded = ground_objects(clip, working, meaning, segmentation, cfg.min_found, methods)
     if cfg.segment.backend != "flow":
         tracks = segmented(clip, grounded.working, grounded.objects, cfg.segment)
         grounded = replace(grounded, objects=tracks)

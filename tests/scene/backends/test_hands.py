@@ -17,7 +17,7 @@ from v2p_data.scene.fitting.landmark_scale import height_from_landmarks, px_per_
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.hand_track import HandTrack, contact_share, people_face
 from v2p_data.scene.frames.working_clip import working_clip_of
-from v2p_data.scene.grounding.hands_by_model import track_hands
+from v2p_data.scene.grounding.by_model import track_hands
 
 HAND_M = np.random.default_rng(3).normal(0, 0.03, (21, 3))
 """Any 21 points of the size of a hand will do: [m], axes right, down, forward."""

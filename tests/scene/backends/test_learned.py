@@ -18,7 +18,9 @@ from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import CameraGuess, ObjectTrack
 from v2p_data.scene.fitting.by_model import camera_from_depth
 from v2p_data.scene.frames.working_clip import working_clip_of
-from v2p_data.scene.grounding.by_model import detected, segmented
+from v2p_data.scene.grounding.by_model import segmented
+from v2p_data.scene.grounding.methods.base import Seen
+from v2p_data.scene.grounding.methods.detector import Detector
 from v2p_data.scene.reconstruct import reconstruct
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.shapes.by_worker import mesh_by_worker
@@ -78,7 +80,9 @@ def test_a_depth_worker_s_table_sets_the_camera(clip, working, box):
     assert guess.fov_rad == pytest.approx(1.01, abs=1e-6)
 
 
-def test_a_detector_s_boxes_lie_in_the_picture_and_are_one_per_phrase(clip, working, checkpoint):
+def test_a_detector_marks_each_phrase_once_at_an_end_of_the_clip(
+    clip, working, segmentation_of, checkpoint
+):
     cfg = GroundConfig(
         backend="grounding_dino",
         model=checkpoint("grounding_dino"),
@@ -86,15 +90,16 @@ def test_a_detector_s_boxes_lie_in_the_picture_and_are_one_per_phrase(clip, work
         text_threshold=0.0,
     )
 
-    boxes = detected(clip, working, ("blue box", "red cup"), cfg)
+    seen = Seen(
+        clip=clip, working=working, segmentation=segmentation_of([[]] * len(working.rgb))[1]
+    )
 
-    h, w = clip.frames.shape[1:3]
-    assert set(boxes) <= {"blue box", "red cup"}
-    for found in boxes.values():
-        x0, y0, x1, y1 = found.box_xyxy
-        assert 0 <= x0 < x1 <= w
-        assert 0 <= y0 < y1 <= h
-        assert found.frame in (0, len(clip.frames) - 1)
+    marks = Detector(cfg).marks(seen, ("blue box", "red cup"))
+
+    assert set(marks) <= {"blue box", "red cup"}
+    for mark in marks.values():
+        assert mark.box.any()
+        assert mark.frame in (0, len(working.rgb) - 1)
 
 
 def test_a_video_model_s_masks_replace_the_track_and_keep_the_found_mask_where_it_sees_nothing(

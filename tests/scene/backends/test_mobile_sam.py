@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends import mobile_sam_setup
-from v2p_data.scene.backends.config import GroundConfig, OutlineConfig
+from v2p_data.scene.backends.config import OutlineConfig
 from v2p_data.scene.backends.mobile_sam import MobileSam
 from v2p_data.scene.backends.outlines import EncodedPicture, Outlines, Spots
 from v2p_data.scene.config import SceneConfig
@@ -191,7 +191,7 @@ def test_the_model_sees_each_frame_of_the_clip_once_and_at_full_size():
 def test_a_prepared_clip_has_the_model_where_it_is_asked_for(weights, draw):
     clip = draw(num_frames=12)
     outline = OutlineConfig(backend="mobile_sam", weights=weights)
-    cfg = SceneConfig(ground=GroundConfig(backend="heuristic"), outline=outline)
+    cfg = SceneConfig(outline=outline)
 
     working = prepared_for(clip, cfg).working
 

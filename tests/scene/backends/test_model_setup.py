@@ -7,7 +7,7 @@ import pytest
 from v2p_data.cli import run
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends import hands_setup, mobile_sam_setup
-from v2p_data.scene.backends.config import GroundConfig, HandsConfig, OutlineConfig
+from v2p_data.scene.backends.config import HandsConfig, OutlineConfig
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import with_preset
 from v2p_data.scene.reconstruct import prepared_for
@@ -52,14 +52,14 @@ def test_auto_takes_a_model_where_it_was_set_up_and_the_recipe_says_so(model: st
 def test_without_setup_auto_asks_nobody_and_a_model_by_name_says_what_to_do(
     model: str, draw, capsys: pytest.CaptureFixture[str]
 ):
-    clip, ground = draw(num_frames=12), GroundConfig(backend="heuristic")
+    clip = draw(num_frames=12)
     setup = f"v2p setup {COMMANDS[model]}"
 
-    working = prepared_for(clip, SceneConfig(ground=ground)).working
+    working = prepared_for(clip, SceneConfig()).working
 
     assert (working.hands, working.outliner) == (None, None)
     with pytest.raises(V2PError, match=f"run '{setup}'"):
-        prepared_for(clip, SceneConfig(ground=ground, **{model: SETTINGS[model]}))
+        prepared_for(clip, SceneConfig(**{model: SETTINGS[model]}))
     assert run(["setup"]) == 0
     assert f"{COMMANDS[model]:<10}" in capsys.readouterr().out
 

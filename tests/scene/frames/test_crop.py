@@ -9,7 +9,6 @@ from sample_clips import with_frames
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.frames.crop import with_named_part
 from v2p_data.scene.frames.prepare import PreparedClip
-from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.video.captions import checked_entry
 from v2p_data.video.clip import Clip
 
@@ -49,7 +48,7 @@ def test_a_crop_that_is_no_part_of_a_picture_is_refused(crop):
         checked_entry(entry(crop), "captions.json, entry 'a.mp4'")
 
 
-def test_marks_in_the_pixels_of_the_cropped_picture_are_refused(clips):
+def test_marks_in_the_pixels_of_the_cropped_picture_are_refused(clips, segmentation_of):
     clip = side_by_side(clips)
     w = clip.width_px // 2
     crop = {"frame": 0, "box": [float(w), 0.0, 2.0 * w, float(clip.height_px)]}
@@ -60,6 +59,7 @@ def test_marks_in_the_pixels_of_the_cropped_picture_are_refused(clips):
 
     assert error.value.reason == "bad_hint"
     one = with_named_part(replace(clip, hints={"crop": crop}))
-    ready = PreparedClip(clip=one, working=working_clip_of(one), segmentation=None)
+    working, segmentation = segmentation_of([[]] * 3)
+    ready = PreparedClip(clip=one, working=working, segmentation=segmentation)
     with pytest.raises(V2PError, match="pixels of the whole file"):
         ready.with_hints({"red box": {"frame": 0, "box": [40, 60, 120, 140]}})

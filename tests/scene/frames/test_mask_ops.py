@@ -7,6 +7,8 @@ import pytest
 from v2p_data.scene.frames.mask_ops import attainable_iou, bounding_box, from_box
 
 GREY, WHITE, RED = (120, 118, 115), (235, 235, 235), (190, 40, 40)
+UNSEEN = np.zeros((120, 160), np.float32)
+"""A network that sees no object."""
 
 
 def picture(*things):
@@ -25,7 +27,7 @@ def overlap(mask, box):
 
 
 def test_what_stands_out_in_a_box_is_cut_out():
-    mask = from_box(picture(((60, 40, 30, 25), RED)), (57.0, 38.0, 93.0, 68.0))
+    mask = from_box(picture(((60, 40, 30, 25), RED)), (57.0, 38.0, 93.0, 68.0), UNSEEN)
 
     assert bounding_box(mask) == (60, 40, 30, 25)
 
@@ -34,7 +36,7 @@ def test_a_white_thing_on_white_still_fills_its_box():
     box = (62.0, 44.0, 78.0, 62.0)
     print_on_it = ((66, 56, 6, 5), RED)
 
-    mask = from_box(picture(((30, 30, 90, 60), WHITE), print_on_it), box)
+    mask = from_box(picture(((30, 30, 90, 60), WHITE), print_on_it), box, UNSEEN)
 
     assert overlap(mask, box) > 0.5
 

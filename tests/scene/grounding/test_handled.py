@@ -10,7 +10,7 @@ from v2p_data.scene.frames.classes import MOVED
 from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.grounding.ground_objects import check_hand
 from v2p_data.scene.grounding.handled import handling_in
-from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network
+from v2p_data.scene.grounding.moved_by_network import Given, find_moved_by_network
 
 H, W, FRAMES = 90, 120, 12
 RED, SIZE = (190, 40, 40), 14
@@ -77,7 +77,7 @@ def test_an_outline_that_no_hand_reaches_weighs_less(segmentation_of):
 def test_what_a_person_marked_is_not_weighed(segmentation_of):
     working, seen = segmentation_of(two_alike())
     working = replace(working, hands=hand_along(working, LOWER_Y))
-    marked = Marked(first=large(square(15, UPPER_Y), working))
+    marked = Given(first=large(square(15, UPPER_Y), working))
 
     found, _ = find_moved_by_network(working, seen, "red box", "place_onto", marked=marked)
 

@@ -70,7 +70,7 @@ def test_hands_are_mirrored_with_the_picture(prepared):
     width = prepared.working.shape[1]
     hand = np.full((1, 21, 2), (30.0, 50.0))
     hands = HandTrack(at=np.array([0]), px=hand, metres=np.ones((1, 21, 3)), num_sampled=1)
-    known = replace(prepared, working=replace(prepared.working, hands=hands), segmentation=None)
+    known = replace(prepared, working=replace(prepared.working, hands=hands))
 
     seen = mirrored_clip(known).working.hands
 

@@ -13,7 +13,7 @@ from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.scene.frames.table import find_table
 from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, seen_on_table
-from v2p_data.scene.grounding.hint_masks import Box, hint_masks_of
+from v2p_data.scene.grounding.methods.base import Seen, mark_in_box
 from v2p_data.scene.grounding.model_outlines import (
     outline_at_spots,
     outline_in_box,
@@ -21,7 +21,8 @@ from v2p_data.scene.grounding.model_outlines import (
 )
 from v2p_data.scene.grounding.moved_by_network import find_moved_by_network
 from v2p_data.scene.grounding.spot_masks import mask_at_spots
-from v2p_data.scene.grounding.static_objects import StaticSearch, find_static_object
+from v2p_data.scene.grounding.static_cues import StaticSearch
+from v2p_data.scene.grounding.static_objects import find_static_object
 from v2p_data.scene.scale.nouns import noun_for
 
 RED, BLUE, SLEEVE = (190, 40, 40), (40, 60, 190), (90, 90, 100)
@@ -165,7 +166,7 @@ def test_a_static_object_is_cut_out_of_the_things_around_it(segmentation_of):
             phrase="box", moved=noun_for("box"), kind="push_next_to",
             ends=(large(ends[0], clip.shape), large(ends[1], clip.shape)), taken=np.zeros(clip.shape, bool),
         )  # fmt: skip
-        return find_static_object(search).mask
+        return find_static_object(search)[0]
 
     truth = large(box, working.shape)
     assert iou(found(knowing), truth) > 0.95 > iou(found(working), truth)
@@ -185,12 +186,12 @@ def test_a_box_gives_the_outline_of_what_is_in_it(segmentation_of):
 
 def test_a_detectors_box_becomes_the_models_outline(segmentation_of, draw):
     frames = [[(square(40, 40, 20, 10), RED, OTHER)]] * 12
-    knowing, _ = with_model(segmentation_of(frames)[0], frames)
-    clip = draw(num_frames=12)
+    working, segmentation = segmentation_of(frames)
+    knowing, _ = with_model(working, frames)
+    seen = Seen(clip=draw(num_frames=12), working=knowing, segmentation=segmentation)
     scale = knowing.shape[1] / W / knowing.px_scale
-    box = Box(frame=0, box_xyxy=(38 * scale, 38 * scale, 62 * scale, 52 * scale), score=0.9)
 
-    mark = hint_masks_of(clip, knowing, None, {"box": box})["box"]
+    mark = mark_in_box(seen, 0, (38 * scale, 38 * scale, 62 * scale, 52 * scale), 0.9)
 
     assert iou(mark.mask, large(square(40, 40, 20, 10), knowing.shape)) > 0.95
 

@@ -8,9 +8,9 @@ import pytest
 from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.colour import histogram
+from v2p_data.scene.grounding.candidates import Moved
 from v2p_data.scene.grounding.ground_objects import ground_objects
-from v2p_data.scene.grounding.moved_by_change import Moved
-from v2p_data.scene.grounding.moved_by_network import Marked, find_moved_by_network, rated
+from v2p_data.scene.grounding.moved_by_network import Given, find_moved_by_network
 from v2p_data.scene.grounding.moved_object import hidden_in_container
 from v2p_data.scene.grounding.outlines import (
     completed,
@@ -115,7 +115,7 @@ def test_a_mask_given_by_hand_is_taken_as_it_is(segmentation_of):
     given[60:100, 50:90] = True
 
     found, _ = find_moved_by_network(
-        working, segmentation, "box", "push_right", marked=Marked(first=given)
+        working, segmentation, "box", "push_right", marked=Given(first=given)
     )
 
     np.testing.assert_array_equal(found.first, given)
@@ -400,7 +400,7 @@ def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(se
 
     ends = [
         find_moved_by_network(
-            working, segmentation, "red box", "insert", marked=Marked(first=first, goal=goal)
+            working, segmentation, "red box", "insert", marked=Given(first=first, goal=goal)
         )[0].last
         for goal in goals
     ]
@@ -420,7 +420,7 @@ def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(segment
         segmentation,
         "thing",
         "push_right",
-        marked=Marked(colour_hist=histogram(working.rgb[6][there])),
+        marked=Given(colour_hist=histogram(working.rgb[6][there])),
     )
 
     assert iou(moved.first, square(15, 60)) > 0.8
@@ -467,16 +467,3 @@ def test_a_thing_is_cut_by_its_colour_from_the_arm_that_was_taken_along(segmenta
     assert iou(red.first, square(15, 20)) > 0.8
     assert any_.first[large(arm & ~square(13, 18, 18), working)].mean() > 0.5, "nothing says which"
     assert red.score > 0.3, "the whole is no rival of its piece"
-
-
-def test_outlines_from_elsewhere_are_rated_like_the_networks_own(segmentation_of):
-    working, segmentation = segmentation_of(pushed(RED, BLUE))
-    own, _ = find_moved_by_network(working, segmentation, "red box", "push_right")
-
-    same = rated(working, segmentation, "red box", "push_right", own)
-    other = replace(own, first=large(square(15, 60), working), last=large(square(48, 60), working))
-    blue = rated(working, segmentation, "red box", "push_right", other)
-
-    alike = {cue: value for cue, value in own.cues.items() if cue != "no rival"}
-    assert same.cues == pytest.approx({**alike, "no rival": 1.0}, abs=0.02)
-    assert blue.score < 0.7 * same.score

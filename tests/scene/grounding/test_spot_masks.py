@@ -47,14 +47,6 @@ def test_a_click_outlines_the_object_around_it(picture, box, shares, click):
     assert iou(mask_at_spots(picture, [click], shares), box) > 0.85
 
 
-def test_colours_alone_do_without_the_network(picture):
-    y, x = np.mgrid[:H, :W]
-
-    mask = mask_at_spots(picture, [(60.0, 180.0)], None)
-
-    assert iou(mask, np.hypot(x - 60, y - 180) < 18) > 0.7
-
-
 def test_a_line_over_both_halves_takes_both(picture, box, shares):
     mask = mask_at_spots(picture, [(145.0, 105.0), (160.0, 118.0), (176.0, 125.0)], shares)
 

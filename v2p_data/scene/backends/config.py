@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 type DType = Literal["float32", "float16", "bfloat16"]
-type GroundBackend = Literal[
-    "heuristic", "network", "grounding_dino", "mm_grounding_dino", "owlv2", "worker"
-]
+type GroundBackend = Literal["network", "grounding_dino", "mm_grounding_dino", "owlv2", "worker"]
 type SegmentBackend = Literal["flow", "sam2", "worker"]
 type HandsBackend = Literal["auto", "none", "mediapipe", "worker"]
 type OutlineBackend = Literal["auto", "none", "mobile_sam"]
@@ -31,7 +29,7 @@ class GroundConfig:
     """How the objects of a caption are found in a frame."""
 
     backend: GroundBackend = "network"
-    """`heuristic` and `network` need no downloaded weights; `worker` asks a process of yours."""
+    """`network` needs no downloaded weights; `worker` asks a process of yours."""
     model: str = ""
     """Hub id or folder of a checkpoint; empty takes the backend's default."""
     device: str = "auto"

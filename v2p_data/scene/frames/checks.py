@@ -31,15 +31,13 @@ def check_change(working: WorkingClip) -> None:
         )
 
 
-def check_still(
-    working: WorkingClip, segmentation: Segmentation | None, max_shift_px: float
-) -> None:
+def check_still(working: WorkingClip, segmentation: Segmentation, max_shift_px: float) -> None:
     """Turn away a clip whose camera still moves; what passes in front of it does not count.
 
     Raises:
         ItemRejectedError: `camera_moves`, with the shift [px] of a picture 320 px wide.
     """
-    shift = camera_shift_px(working, None if segmentation is None else passers_by(segmentation))
+    shift = camera_shift_px(working, passers_by(segmentation))
     if shift > max_shift_px:
         raise ItemRejectedError(
             "camera_moves",

@@ -34,6 +34,8 @@ _SYNONYMS = {
     "cyan": "blue", "navy": "blue", "silver": "grey", "steel": "grey", "metal": "grey", "magenta": "pink",
 }  # fmt: skip
 _PLAIN = ("brown", "black", "white", "grey")
+_DARKEST_SHADOW = 0.22
+"""Of the lightness without the shadow."""
 
 
 def colour_words(phrase: str) -> tuple[str, ...]:
@@ -130,28 +132,13 @@ def similarity(a: Float[np.ndarray, "l a b"], b: Float[np.ndarray, "l a b"]) -> 
 
 
 def shadow(
-    lab: Float32[np.ndarray, "h w 3"],
-    bare: Float32[np.ndarray, "h w 3"],
-    darkest: float = 0.22,
-    drift: float = 0.0,
+    lab: Float32[np.ndarray, "h w 3"], bare: Float32[np.ndarray, "h w 3"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return where `lab` is `bare` with less light: darker in proportion, of the same hue.
-
-    Nothing is as dark as the share `darkest`; the hue may be off by `drift` more for each step of lightness that is missing.
-    """
+    """Return where `lab` is `bare` with less light: darker in proportion, of the same hue."""
     lab, bare = cv2.GaussianBlur(lab, (0, 0), 1.0), cv2.GaussianBlur(bare, (0, 0), 1.0)
     ratio = lab[..., 0] / np.maximum(bare[..., 0], 1)
     tint = np.linalg.norm(lab[..., 1:] - bare[..., 1:] * ratio[..., None], axis=-1)
-    missing = bare[..., 0] - lab[..., 0]
-    return (ratio > darkest) & (ratio < 0.96) & (tint < 6 + drift * missing)
-
-
-def skin_prior(image: UInt8[np.ndarray, "*time h w 3"]) -> Bool[np.ndarray, "*time h w"]:
-    """Return the pixels whose chrominance any human skin could have; wooden tables do as well."""
-    flat = np.ascontiguousarray(image.reshape(-1, image.shape[-2], 3))
-    ycc = cv2.cvtColor(flat, cv2.COLOR_RGB2YCrCb)
-    y, cr, cb = ycc[..., 0], ycc[..., 1], ycc[..., 2]
-    return ((y > 25) & (cr > 131) & (cr < 182) & (cb > 72) & (cb < 133)).reshape(image.shape[:-1])
+    return (ratio > _DARKEST_SHADOW) & (ratio < 0.96) & (tint < 6)
 
 
 def _cells(image: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Where hands and their fingertips are over a clip, as a model that knows hands says: what a hand takes and puts down.
 
-`grounding/hands_by_model.py` asks the model.
+`grounding/by_model.py` asks the model.
 """
 
 from dataclasses import dataclass

@@ -42,12 +42,12 @@ def refine(
 def from_box(
     image: UInt8[np.ndarray, "h w 3"],
     box: tuple[float, float, float, float],
-    thing: Float[np.ndarray, "h w"] | None = None,
+    thing: Float[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of the object in the box (x0, y0, x1, y1 in pixels of this image).
 
     Several methods run and the best-looking one is kept: GrabCut from a centred ellipse, what differs from the colours
-    of the ring around the box, and where `thing` (how likely each pixel is some object) is given, GrabCut from that.
+    of the ring around the box, and GrabCut from `thing` (how likely each pixel is some object).
     None is kept that fills less than half of the box: people draw boxes tightly.
     """
     h, w = image.shape[:2]
@@ -56,7 +56,7 @@ def from_box(
     inside = np.zeros((h, w), bool)
     inside[y0:y1, x0:x1] = True
     candidates = [_ellipse_cut(image, inside, (x0, y0, x1, y1)), _unlike_ring(image, inside)]
-    if thing is not None and ((thing > 0.5) & inside).sum() > 0.2 * inside.sum():
+    if ((thing > 0.5) & inside).sum() > 0.2 * inside.sum():
         core = largest(tidy((thing > 0.5) & inside))
         candidates += [core, refine(image, core, never=~grow(inside, 2))]
     masks = [

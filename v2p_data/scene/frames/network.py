@@ -176,8 +176,7 @@ def trained[N: nn.Module](
     """
     if not weights.is_file():
         raise V2PError(
-            f"the weights {weights.name} are not beside network.py; reinstall the package, train them with {script}, or "
-            "use --scene.ground.backend=heuristic"
+            f"the weights {weights.name} are not beside network.py; reinstall the package, or train them with {script}"
         )
     try:
         net.load_state_dict({k: v.float() for k, v in load_file(weights).items()})

@@ -20,8 +20,7 @@ class PreparedClip:
     clip: Clip
     """Aligned, where the camera swayed."""
     working: WorkingClip
-    segmentation: Segmentation | None
-    """None where another backend than the network grounds."""
+    segmentation: Segmentation
 
     def with_hints(self, hints: Mapping[str, Hint]) -> "PreparedClip":
         """Return the same with these hints, given in the file's pixels and frames, in place of the clip's own.
@@ -46,8 +45,8 @@ class PreparedClip:
         return replace(self, clip=replace(clip, hints=own))
 
 
-def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> PreparedClip:
-    """Return the clip ready to be searched, with its working frames and what the network sees, where it is asked.
+def prepare(clip: Clip, *, max_camera_shift_px: float) -> PreparedClip:
+    """Return the clip ready to be searched, with its working frames and what the network sees.
 
     The part of the pictures that a person named is taken. Black bars are cut off, and frames aligned where the camera sways.
     `max_camera_shift_px` is of a picture 320 px wide.
@@ -62,6 +61,6 @@ def prepare(clip: Clip, *, with_network: bool, max_camera_shift_px: float) -> Pr
     steady = stabilised(clip, working)
     if steady is not clip:
         clip, working = steady, working_clip_of(steady)
-    segmentation = segment_clip(clip, working) if with_network else None
+    segmentation = segment_clip(clip, working)
     check_still(working, segmentation, max_camera_shift_px)
     return PreparedClip(clip=clip, working=working, segmentation=segmentation)

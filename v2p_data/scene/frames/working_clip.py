@@ -4,14 +4,13 @@ Everything that looks at pixels works at 320 px width: the hand-written measures
 five-second clip then takes seconds.
 """
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from v2p_data.scene.frames.colour import histogram, lab_distance, lab_of, likelihood, skin_prior
+from v2p_data.scene.frames.colour import histogram, lab_distance, lab_of
 from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.video.clip import Clip
@@ -44,74 +43,18 @@ class WorkingClip:
     """What stands still during the last quarter."""
     always: UInt8[np.ndarray, "h w 3"]
     """What stands still most of the time."""
-    moving: UInt8[np.ndarray, "n 3"] = field(repr=False)
-    """Sample of the colours that move: arm, sleeve and object."""
     hand_hist: Float[np.ndarray, "l a b"] = field(repr=False)
-    """Colour histogram of the hand; zeros when little moves."""
+    """Colour histogram of the hand; zeros until the network has seen it."""
     rest_hist: Float[np.ndarray, "l a b"] = field(repr=False)
     """Colour histogram of what does not move."""
-    skin_only: bool = True
-    """Whether only skin-like pixels can be hand: so until the object's look is known."""
     hands: HandTrack | None = None
     """Where a model that knows hands was asked."""
     outliner: Outliner | None = None
     """Where a model that outlines objects was asked for."""
 
-    @cached_property
-    def lit(self) -> Float32[np.ndarray, "h w 3"]:
-        """Lab of the brightest still colour at each pixel: the surface without a shadow."""
-        stills = np.stack([lab_of(image) for image in self._stills])
-        brightest = stills[..., 0].argmax(0)
-        return np.take_along_axis(stills, brightest[None, ..., None], 0)[0]
-
-    @property
-    def _stills(self) -> tuple[UInt8[np.ndarray, "h w 3"], ...]:
-        return self.early, self.late, self.always
-
     @property
     def shape(self) -> tuple[int, int]:
         return self.rgb.shape[1], self.rgb.shape[2]
-
-    def hand(self, image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-        """Return pixels that look like the moving hand and not like static objects here."""
-        moving, still = likelihood(self.hand_hist, image), likelihood(self.rest_hist, image)
-        hand = (moving > 2 * still + 1e-7) & self.arm(image)
-        return hand & skin_prior(image) if self.skin_only else hand
-
-    def arm(self, image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-        """Return what is not always there and reaches in from the picture's edge: arms, with what they hold.
-
-        What stands free may have a hand's colours and is none, unless nearly all of it does.
-        """
-        here = lab_of(image)
-        passing = np.any([lab_distance(here, lab_of(still)) > 9 for still in self._stills], axis=0)
-        moving, still = likelihood(self.hand_hist, image), likelihood(self.rest_hist, image)
-        count, parts = cv2.connectedComponents(passing.astype(np.uint8))
-        likely = (moving > 2 * still + 1e-7) & passing
-        area = np.bincount(parts.ravel(), minlength=count)
-        share = np.bincount(parts[likely], minlength=count) / area
-        skin_share = np.bincount(parts[likely & skin_prior(image)], minlength=count) / area
-        touches = np.zeros(count, bool)
-        touches[np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])] = True
-        # Where an arm rests most of the time, the bare table "passes": it has no colour of an arm.
-        return passing & ((touches & (share > 0.05)) | (skin_share > 0.6))[parts]
-
-    def knowing(self, colour_hist: Float[np.ndarray, "l a b"]) -> "WorkingClip":
-        """Return the working clip with a hand that is everything that passes, less the object.
-
-        How much of what passes is object follows from the object's own colours (their weighted median ratio).
-        """
-        if len(self.moving) < 300 or not colour_hist.any():
-            return self
-        passing = histogram(self.moving)
-        cells = colour_hist > 0.02 * colour_hist.max()
-        ratio, weight = passing[cells] / colour_hist[cells], colour_hist[cells]
-        order = np.argsort(ratio)
-        middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
-        hand = np.maximum(passing - 1.3 * float(ratio[order][middle]) * colour_hist, 0)
-        if hand.sum() < 0.05:
-            return self
-        return replace(self, hand_hist=hand / hand.sum(), skin_only=False)
 
 
 def working_clip_of(clip: Clip) -> WorkingClip:
@@ -125,8 +68,6 @@ def working_clip_of(clip: Clip) -> WorkingClip:
     lab = lab_of(rgb)
     first, last = end_quarters(len(rgb))
     always = still_of(rgb)
-    moving = _passing(rgb, lab, always)
-    skin = moving[skin_prior(moving[None])[0]] if len(moving) else moving
     return WorkingClip(
         rgb=rgb,
         lab=lab,
@@ -135,8 +76,7 @@ def working_clip_of(clip: Clip) -> WorkingClip:
         early=still_of(rgb[first]),
         late=still_of(rgb[last]),
         always=always,
-        moving=moving,
-        hand_hist=histogram(skin if len(skin) > 300 else skin[:0]),
+        hand_hist=histogram(np.zeros((0, 3), np.uint8)),
         rest_hist=histogram(always.reshape(-1, 3)),
     )
 
@@ -247,15 +187,3 @@ def _tile_shift(
         if shifts:
             worst = max(worst or 0.0, float(np.median(shifts)))
     return worst
-
-
-def _passing(
-    rgb: UInt8[np.ndarray, "time h w 3"],
-    lab: Float32[np.ndarray, "time h w 3"],
-    always: UInt8[np.ndarray, "h w 3"],
-) -> UInt8[np.ndarray, "n 3"]:
-    """Return a sample of the colours that are there for a while only, where something usually is not."""
-    usual = lab_of(always)
-    pick = np.unique(np.linspace(0, len(rgb) - 1, 24).astype(int))
-    away = [lab_distance(lab[i], usual) > 15 for i in pick]
-    return np.concatenate([rgb[i][there] for i, there in zip(pick, away, strict=True)])

@@ -5,16 +5,16 @@ Comes in: working frames, and what the scene network sees in them. Goes out: an 
 
 Reading order:
     ground_objects      the order of the steps
-    moved_object        the manipulated object, by all ways together
+    methods             who marks objects before the network is asked: a person's hints, a detector
+    spot_masks, model_outlines          a click becomes an outline; a model that knows edges draws outlines
+    moved_object        the manipulated object, followed from end to end
     moved_by_network    what moved, by the scene network
-    moved_by_change, change_blobs       what moved, by colours and vanishing edges
-    static_objects      what stood still, by the scene network
-    static_by_change    what stood still, by colours and places
-    held_tool, tool_pieces              a tool in a hand
-    hint_masks          what a person or a detector marked
+    static_objects, static_cues         what stood still, by the scene network
+    candidates          what both searches choose from
     outlines            an outline is corrected
     tracking, mask_follower             a mask is carried through the clip
-    by_model            learned models
-    hands_by_model      a model that knows hands
+    brought, mirror_image               a search backwards in time, and one in the mirror image
     handled             where a hand takes an object and puts it down
+    marked_table        a person's mark on the bare table
+    by_model            learned models of hands, outlines and masks
 """

@@ -23,8 +23,8 @@ from v2p_data.scene.frames.colour import (
 from v2p_data.scene.frames.mask_ops import grow, solidity, tidy
 from v2p_data.scene.frames.segmentation import Segmentation, hand_at, segment_clip
 from v2p_data.scene.frames.working_clip import WorkingClip
-from v2p_data.scene.grounding.hint_masks import HintMask
-from v2p_data.scene.grounding.moved_by_change import Moved
+from v2p_data.scene.grounding.candidates import Moved
+from v2p_data.scene.grounding.methods.base import Mark
 from v2p_data.scene.grounding.moved_by_network import find_brought_by_network
 from v2p_data.scene.grounding.tracking import carried
 from v2p_data.video.clip import Clip
@@ -59,7 +59,7 @@ def seen_backwards(clip: Clip, working: WorkingClip) -> Segmentation:
 
 
 def find_brought(
-    working: WorkingClip, segmentation: Segmentation, phrase: str, mark: HintMask | None
+    working: WorkingClip, segmentation: Segmentation, phrase: str, mark: Mark | None
 ) -> Moved:
     """Return the object where the hand leaves it, its first outline being empty.
 

@@ -1,6 +1,6 @@
-"""A learned model or a worker finds the objects: boxes for phrases, then masks for boxes.
+"""Learned models beside the detectors: hands, outlines, and masks carried through the clip.
 
-Each function is for one backend setting and leaves everything else as it is.
+Each function is for one setting and leaves everything else as it is.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,13 +10,74 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from v2p_data.scene.backends.config import GroundConfig, SegmentConfig
+from v2p_data.errors import V2PError
+from v2p_data.scene.backends.config import HandsConfig, OutlineConfig, SegmentConfig
+from v2p_data.scene.backends.hands_setup import installed_worker
+from v2p_data.scene.backends.mobile_sam_setup import installed_weights
+from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 from v2p_data.scene.data_types import ObjectTrack
+from v2p_data.scene.frames.hand_track import HandTrack
+from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.scene.frames.working_clip import WorkingClip
-from v2p_data.scene.grounding.hint_masks import Box
 from v2p_data.video.clip import Clip
 
-DETECTORS = ("grounding_dino", "mm_grounding_dino", "owlv2", "worker")
+MOST_FRAMES = 75
+"""Frames of a clip that the model sees: at 40 ms each it takes 3 s."""
+
+
+def track_hands(clip: Clip, working: WorkingClip, cfg: HandsConfig) -> HandTrack | None:
+    """Return the clip's hands; None without a model.
+
+    Raises:
+        V2PError: `mediapipe` is asked for but was not set up, or the worker fails.
+    """
+    command = cfg.worker
+    if cfg.backend in ("auto", "mediapipe"):
+        command = installed_worker()
+        if not command and cfg.backend == "mediapipe":
+            raise V2PError(
+                "scene.hands.backend is 'mediapipe', which was not set up here; run 'v2p setup hands', or leave the option out"
+            )
+    if cfg.backend == "none" or not command:
+        return None
+    n = len(working.rgb)
+    picks = np.unique(np.linspace(0, n - 1, min(n, MOST_FRAMES)).round().astype(int))
+    images = clip.frames[working.frame_idx[picks]]
+    answer = run_worker(
+        command, WorkerRequest(kind="hands", arrays={"images": images}), cfg.worker_timeout_s
+    ).arrays
+    order = np.argsort(answer["image_idx"], kind="stable")
+    return HandTrack(
+        at=picks[answer["image_idx"][order]],
+        px=answer["landmarks_px"][order].astype(float) * working.px_scale,
+        metres=answer["landmarks_m"][order].astype(float),
+        num_sampled=len(picks),
+    )
+
+
+def outliner_of(clip: Clip, working: WorkingClip, cfg: OutlineConfig) -> Outliner | None:
+    """Return the model for the clip's frames; None where none is asked for.
+
+    Args:
+        clip: the frames that are shown to the model.
+        working: the same clip at working size, in whose pixels the model is asked and answers.
+        cfg: settings; `auto` was written out by the preset.
+
+    Raises:
+        V2PError: the model was not set up here, or its weights cannot be read.
+    """
+    if cfg.backend != "mobile_sam":
+        return None
+    weights = cfg.weights or installed_weights()
+    if weights is None:
+        raise V2PError(
+            "scene.outline.backend is 'mobile_sam', which was not set up here; run 'v2p setup outlines', name its file "
+            "with --scene.outline.weights, or leave the option out"
+        )
+    # transformers takes seconds to import.
+    from v2p_data.scene.backends.mobile_sam import mobile_sam
+
+    return Outliner(mobile_sam(weights), clip.frames, working.frame_idx, working.shape)
 
 
 class _Frames(Sequence[UInt8[np.ndarray, "h w 3"]]):
@@ -33,23 +94,6 @@ class _Frames(Sequence[UInt8[np.ndarray, "h w 3"]]):
 
     def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         return (self[i] for i in range(len(self)))
-
-
-def detected(
-    clip: Clip, working: WorkingClip, phrases: Sequence[str], cfg: GroundConfig
-) -> dict[str, Box]:
-    """Return a box per phrase that the detector finds, in the first frame, or in the last where only that shows it."""
-    from v2p_data.scene.backends.detect import detect  # imports transformers
-
-    ends = [int(working.frame_idx[0]), int(working.frame_idx[-1])]
-    by_picture = detect([clip.frames[i] for i in ends], phrases, cfg)
-    out: dict[str, Box] = {}
-    for frame, by_phrase in zip(ends, by_picture, strict=True):
-        for phrase, found in zip(phrases, by_phrase, strict=True):
-            if found and phrase not in out:
-                best = found[0]
-                out[phrase] = Box(frame=frame, box_xyxy=best.box_xyxy, score=best.score)
-    return out
 
 
 def segmented(

@@ -4,7 +4,7 @@ A user's box, points or a detector's box say where an object is in one frame; wi
 there decides. Everything works at working size.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,22 +20,21 @@ from v2p_data.scene.frames.segmentation import Segmentation, hand_at, table_seen
 from v2p_data.scene.frames.table import Table, find_table
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.brought import seen_backwards
-from v2p_data.scene.grounding.held_tool import HeldTool, find_tool
-from v2p_data.scene.grounding.hint_masks import Box, HintMask, hint_masks_of
+from v2p_data.scene.grounding.candidates import Moved
 from v2p_data.scene.grounding.marked_table import with_marked_table
-from v2p_data.scene.grounding.moved_by_change import Moved
+from v2p_data.scene.grounding.methods.base import Mark, Method, Seen
+from v2p_data.scene.grounding.methods.hint import Hints
 from v2p_data.scene.grounding.moved_object import (
     brought_object,
     check_there_at_first,
     every_nth,
     find_moved_object,
     hidden_in_container,
-    rise,
     sureness_of,
     tracked_mover,
 )
-from v2p_data.scene.grounding.static_by_change import find_static_by_change
-from v2p_data.scene.grounding.static_objects import StaticSearch, find_static_object
+from v2p_data.scene.grounding.static_cues import StaticSearch
+from v2p_data.scene.grounding.static_objects import find_static_object
 from v2p_data.scene.grounding.tracking import carried
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.scene.schema import Role
@@ -48,10 +47,6 @@ _BELOW_PX, _GAP_PX, EXACT_GAP_PX = 5, 1, 3
 """Depth of the strip below an object in which the network must see table, and where it begins; below a model's exact outline later."""
 _SEEN_BELOW, _FOOT_ON_TABLE = 0.5, 0.3
 """Mean probability of table in that strip, and share of the foot within the table's part, from which the object rests on the table."""
-_SETS_OUT = 0.05
-"""Share of its way that a pushed object has gone when it moves."""
-_WELL_SEEN = 0.6
-"""Share of a tool's largest area, from which a frame shows the tool well."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +56,7 @@ class _Scene:
     clip: Clip
     working: WorkingClip
     table: Table
-    segmentation: Segmentation | None
+    segmentation: Segmentation
     meaning: Meaning
     moved: Moved
     mover: ObjectTrack
@@ -73,33 +68,33 @@ def ground_objects(
     clip: Clip,
     working: WorkingClip,
     meaning: Meaning,
-    segmentation: Segmentation | None,
+    segmentation: Segmentation,
     min_found: float,
-    boxes: Mapping[str, Box] | None = None,
+    methods: Sequence[Method] = (Hints(),),
 ) -> GroundedObjects:
     """Return the masks of all objects that the caption names.
 
-    `segmentation` is what the network sees, where it was asked; `boxes` are what a detector says, by phrase: a user's hint
-    for the phrase goes before it.
+    `segmentation` is what the network sees; `methods` mark objects before it is asked, the later ones before the earlier ones.
 
     Raises:
         ItemRejectedError: `no_hand`, `not_there_at_first`, `bad_hint`, `object_not_found` or `reference_not_found`, with the number that
             decided.
     """
-    if segmentation is not None:
-        check_hand(clip, working, segmentation)
-        segmentation = with_marked_table(clip, working, segmentation)
-        working = _knowing_hand(working, segmentation)
-    table = find_table(working.always, table_seen(segmentation) if segmentation else None)
-    marked = hint_masks_of(clip, working, segmentation, boxes or {})
+    check_hand(clip, working, segmentation)
+    segmentation = with_marked_table(clip, working, segmentation)
+    working = _knowing_hand(working, segmentation)
+    table = find_table(working.always, table_seen(segmentation))
+    marked = dict[str, Mark]()
+    for method in methods:
+        marked |= method.marks(
+            Seen(clip=clip, working=working, segmentation=segmentation), meaning.phrases
+        )
     tool = next((phrase for phrase, role in meaning.others if role == "tool"), "")
     own = marked.get(meaning.manipulated)
     if own is not None and own.at_end(working):
         check_there_at_first(clip, meaning.manipulated, segmentation)
-    moved, tool_moved = find_moved_object(
-        clip, working, table, segmentation, meaning, tool, marked
-    )
-    sure, why = sureness_of(moved, segmentation, own)
+    moved, tool_moved = find_moved_object(clip, working, segmentation, meaning, tool, marked)
+    sure, why = sureness_of(moved, own)
     if sure < min_found:
         check_there_at_first(clip, meaning.manipulated, segmentation)
         raise ItemRejectedError(
@@ -108,8 +103,6 @@ def ground_objects(
             f"({why}); mark it, and each other object of the caption, with a box in captions.json",
             round(sure, 3),
         )
-    if segmentation is None:
-        working = working.knowing(moved.colour_hist)
     thing = tracked_mover(
         _unseen_object(clip, meaning.manipulated, "manipulated"), working, segmentation, moved, own
     )
@@ -118,7 +111,7 @@ def ground_objects(
     others, warnings = _others(scene, marked, tool_moved)
     objects = [thing, *others]
     may_be_hidden = own is None or not own.at_end(working)
-    if segmentation is not None and KINDS[meaning.kind].hides and may_be_hidden and objects[1:]:
+    if KINDS[meaning.kind].hides and may_be_hidden and objects[1:]:
         objects[0] = hidden_in_container(segmentation, objects[0], objects[1])
     return GroundedObjects(
         objects=tuple(objects),
@@ -142,7 +135,7 @@ def ground_brought(
     """
     segmentation = with_marked_table(clip, working, seen_backwards(clip, working))
     working = _knowing_hand(working, segmentation)
-    marked = hint_masks_of(clip, working, segmentation, {})
+    marked = Hints().marks(Seen(clip=clip, working=working, segmentation=segmentation))
     thing = _unseen_object(clip, meaning.manipulated, "manipulated")
     own = marked.get(meaning.manipulated)
     thing, moved = brought_object(thing, working, segmentation, own)
@@ -163,7 +156,7 @@ def ground_brought(
 
 
 def _others(
-    scene: _Scene, marked: Mapping[str, HintMask], tool_moved: Moved | None
+    scene: _Scene, marked: Mapping[str, Mark], tool_moved: Moved | None
 ) -> tuple[list[ObjectTrack], tuple[str, ...]]:
     """Return the caption's other objects, and a warning for each that is left out.
 
@@ -174,7 +167,7 @@ def _others(
     taken = np.zeros(scene.working.shape, bool)
     for phrase, role in scene.meaning.others:
         thing, mark = _unseen_object(scene.clip, phrase, role), marked.get(phrase)
-        if role == "tool" and (scene.segmentation is not None or mark is not None):
+        if role == "tool":
             seen = _tool(scene, thing, mark, tool_moved)
         else:
             seen = _static_object(scene, thing, mark, taken)
@@ -212,71 +205,30 @@ def _is_said(phrase: str, clip: Clip) -> bool:
 
 
 def _tool(
-    scene: _Scene, thing: ObjectTrack, mark: HintMask | None, tool_moved: Moved | None
+    scene: _Scene, thing: ObjectTrack, mark: Mark | None, tool_moved: Moved | None
 ) -> ObjectTrack | None:
-    """Return a tool: in a hand that brings it, else the second moving object, or the marked one, followed.
-
-    None where it is not found and the caption can do without.
+    """Return a tool: the marked one, or the second moving object; None where it is not found and the caption can do without.
 
     Raises:
         ItemRejectedError: `reference_not_found`.
     """
-    found, sure = None, 0.0
-    if scene.segmentation is not None:
-        box = None if mark is None else (mark.frame, mark.box)
-        found = find_tool(scene.working, scene.segmentation, scene.mover.masks, thing.noun, box)
-    if found is not None:
-        sure = found.sure if mark is None else mark.sure
-    if found is not None and sure >= scene.min_found:
-        return replace(
-            thing,
-            masks=found.masks,
-            quality=found.quality,
-            moves=True,
-            at=_first_pushing(found, scene.mover),
-            sure=sure,
-            why=found.why,
-            hinted=mark is not None,
-            in_hand=True,
-        )
-    seen = None
-    if mark is not None:
-        seen = _marked_tool(scene, thing, mark)
-    elif tool_moved is not None:
-        seen = tracked_mover(thing, scene.working, scene.segmentation, tool_moved, mark)
-    if seen is None:
-        _check_needed(scene, thing.phrase, sure)
-    return seen
+    if mark is not None and mark.mask.any():
+        return _marked_tool(scene, thing, mark)
+    if mark is None and tool_moved is not None:
+        return tracked_mover(thing, scene.working, scene.segmentation, tool_moved, mark)
+    _check_needed(scene, thing.phrase, 0.0)
+    return None
 
 
-def _first_pushing(tool: HeldTool, pushed: ObjectTrack) -> int:
-    """Return the working frame that shows a tool first and well while what it pushes moves, or shortly before or after."""
-    spots = {i: np.argwhere(m).mean(0) for i, m in enumerate(pushed.masks) if m.any()}
-    start = np.argwhere(pushed.first).mean(0)
-    way = np.argwhere(pushed.last).mean(0) - start
-    gone = {i: float((spot - start) @ way) / max(1e-6, way @ way) for i, spot in spots.items()}
-    moves = [i for i, share in gone.items() if _SETS_OUT < share < 1 - _SETS_OUT]
-    if not moves:
-        return tool.at
-    area = tool.masks.sum((1, 2)) * (tool.quality > 0)
-    around = range(max(0, moves[0] - 1), min(len(area), moves[-1] + 2))
-    seen = [i for i in around if area[i]]
-    return next((i for i in seen if area[i] > _WELL_SEEN * area[seen].max()), tool.at)
-
-
-def _marked_tool(scene: _Scene, thing: ObjectTrack, mark: HintMask) -> ObjectTrack | None:
-    """Return a marked tool, followed from that frame on; None where the mark is empty."""
-    if not mark.mask.any():
-        return None
+def _marked_tool(scene: _Scene, thing: ObjectTrack, mark: Mark) -> ObjectTrack:
+    """Return a marked tool, followed from that frame on."""
     working, segmentation = scene.working, scene.segmentation
     tracked = carried(
         working,
         mark.mask,
         mark.frame,
         every=every_nth(working),
-        moving=None
-        if segmentation is None
-        else lambda i: segmentation.at(i)[MOVED] + 0.5 * segmentation.at(i)[HAND],
+        moving=lambda i: segmentation.at(i)[MOVED] + 0.5 * segmentation.at(i)[HAND],
     )
     return replace(
         thing,
@@ -291,37 +243,29 @@ def _marked_tool(scene: _Scene, thing: ObjectTrack, mark: HintMask) -> ObjectTra
 
 
 def _static_object(
-    scene: _Scene, thing: ObjectTrack, mark: HintMask | None, taken: Bool[np.ndarray, "h w"]
+    scene: _Scene, thing: ObjectTrack, mark: Mark | None, taken: Bool[np.ndarray, "h w"]
 ) -> ObjectTrack | None:
     """Return a thing that stands still; None where it is not found and the caption can do without.
 
     Raises:
         ItemRejectedError: `reference_not_found`.
     """
-    phrase, kind, segmentation = thing.phrase, scene.meaning.kind, scene.segmentation
+    phrase, kind = thing.phrase, scene.meaning.kind
     late = kind == "uncover" if mark is None else mark.frame > 0
     if mark is not None:
         mask, sure = mark.mask, mark.sure
     else:
-        if segmentation is not None:
-            search = StaticSearch(
-                working=scene.working,
-                table=scene.table,
-                segmentation=segmentation,
-                phrase=phrase,
-                moved=scene.mover.noun,
-                kind=kind,
-                ends=(scene.moved.first, scene.moved.last),
-                taken=taken,
-            )
-            found = find_static_object(search)
-            sure = found.score if found else 0.0
-        else:
-            found = find_static_by_change(
-                scene.working, scene.table, phrase, kind, scene.moved, taken
-            )
-            sure = rise(found.score, 1.0, 0.5) if found else 0.0
-        mask = found.mask if found else np.zeros_like(taken)
+        search = StaticSearch(
+            working=scene.working,
+            table=scene.table,
+            segmentation=scene.segmentation,
+            phrase=phrase,
+            moved=scene.mover.noun,
+            kind=kind,
+            ends=(scene.moved.first, scene.moved.last),
+            taken=taken,
+        )
+        mask, sure = find_static_object(search) or (np.zeros_like(taken), 0.0)
     if sure < scene.min_found or not mask.any():
         _check_needed(scene, phrase, sure)
         return None
@@ -391,9 +335,7 @@ def _knowing_hand(working: WorkingClip, segmentation: Segmentation) -> WorkingCl
     hand = np.concatenate(pixels)
     if len(hand) < 300:
         return working
-    return replace(
-        working, hand_hist=histogram(hand[:: max(1, len(hand) // 60000)]), skin_only=False
-    )
+    return replace(working, hand_hist=histogram(hand[:: max(1, len(hand) // 60000)]))
 
 
 def _less_what_passes(
@@ -402,17 +344,15 @@ def _less_what_passes(
     """Return a standing thing's mask over time, less what passes in front of it."""
     out = np.repeat(mask[None], len(scene.mover.masks), axis=0)
     for i, hidden in enumerate(scene.mover.masks):
-        if scene.segmentation is not None:
-            shares = scene.segmentation.at(i)
-            hidden = hidden | (shares[HAND] + shares[MOVED] > 0.5)
-        out[i] &= ~hidden
+        shares = scene.segmentation.at(i)
+        out[i] &= ~(hidden | (shares[HAND] + shares[MOVED] > 0.5))
     return out
 
 
 def seen_on_table(
     table: Table,
     mask: Bool[np.ndarray, "h w"],
-    segmentation: Segmentation | None = None,
+    segmentation: Segmentation,
     gap_px: int = _GAP_PX,
 ) -> float:
     """Return how far the mask's foot is on the table's part of the picture, or the network sees table beneath it: 1 where it rests.
@@ -428,8 +368,6 @@ def seen_on_table(
     foot[y + int(0.75 * h) : y + h, x : x + w] = True
     foot &= mask
     on_table = float((foot & grow(table.hull, 6)).sum() / max(1, foot.sum())) / _FOOT_ON_TABLE
-    if segmentation is None:
-        return min(1.0, on_table)
     below = grow(foot, gap_px + _BELOW_PX - _GAP_PX) & ~grow(mask, gap_px)
     below[: y + int(0.75 * h)] = False
     beneath = float(segmentation.early[TABLE][below].mean()) if below.any() else 0.0

@@ -35,8 +35,7 @@ def mirrored_clip(prepared: PreparedClip) -> PreparedClip:
     """
     clip = replace(prepared.clip, frames=prepared.clip.frames[:, :, ::-1])
     working = _mirrored_working(prepared.working)
-    segmentation = None if prepared.segmentation is None else segment_clip(clip, working)
-    return PreparedClip(clip=clip, working=working, segmentation=segmentation)
+    return PreparedClip(clip=clip, working=working, segmentation=segment_clip(clip, working))
 
 
 def mirrored_meaning(meaning: Meaning) -> Meaning:
@@ -52,18 +51,12 @@ def as_filmed(grounded: GroundedObjects, working: WorkingClip) -> GroundedObject
         working: of the clip as it was filmed.
     """
     there = grounded.working
-    segmentation = grounded.segmentation
     return replace(
         grounded,
         objects=tuple(replace(one, masks=_mirrored(one.masks)) for one in grounded.objects),
-        working=replace(
-            working,
-            hand_hist=there.hand_hist,
-            rest_hist=there.rest_hist,
-            skin_only=there.skin_only,
-        ),
+        working=replace(working, hand_hist=there.hand_hist, rest_hist=there.rest_hist),
         table=_mirrored_table(grounded.table),
-        segmentation=None if segmentation is None else _mirrored_segmentation(segmentation),
+        segmentation=_mirrored_segmentation(grounded.segmentation),
     )
 
 

@@ -34,9 +34,9 @@ from v2p_data.scene.frames.mask_ops import (
 )
 from v2p_data.scene.frames.segmentation import LEAST_SHARE, Segmentation, hand_at
 from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.candidates import Candidate, Moved, connected_parts
 from v2p_data.scene.grounding.handled import handling_in
 from v2p_data.scene.grounding.model_outlines import outlines_around
-from v2p_data.scene.grounding.moved_by_change import Moved
 
 _LIKELY, _POSSIBLE = 0.5, 0.25
 _GAP_PX = 7
@@ -60,24 +60,20 @@ _NOT_OUTLINED = 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Blob:
-    mask: Bool[np.ndarray, "h w"]
-    area: int
+class _Blob(Candidate):
+    """What may be the moved object at one end of the clip; its cues are 0 to 1 each."""
+
     hist: np.ndarray
-    parts: dict[str, float]
-    """What its rating is the product of, each 0 to 1."""
     preference: float = 1.0
     """What its outline adds to the rating, not to the confidence."""
-    outlined: bool = False
-    """Whether a model that knows edges of objects drew it."""
 
     @property
     def rating(self) -> float:
-        return self.preference * float(np.prod(list(self.parts.values())))
+        return self.preference * float(np.prod(list(self.cues.values())))
 
     def weighed(self, what: str, part: float) -> "_Blob":
         """Return the blob with one factor more in its rating."""
-        return replace(self, parts={**self.parts, what: part})
+        return replace(self, cues={**self.cues, what: part})
 
 
 @dataclass(frozen=True)
@@ -86,16 +82,16 @@ class _Pair:
 
     first: _Blob
     last: _Blob
-    parts: dict[str, float]
+    cues: dict[str, float]
     """What speaks for their being the same thing, each 0 to 1."""
 
     @property
     def rating(self) -> float:
-        return self.first.rating * self.last.rating * float(np.prod(list(self.parts.values())))
+        return self.first.rating * self.last.rating * float(np.prod(list(self.cues.values())))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Marked:
+class Given:
     """What a person marked, at working size."""
 
     first: Bool[np.ndarray, "h w"] | None = None
@@ -114,13 +110,13 @@ def find_moved_by_network(
     phrase: str,
     kind: Kind,
     tool: str = "",
-    marked: Marked | None = None,
+    marked: Given | None = None,
 ) -> tuple[Moved, Moved | None] | None:
     """Return the manipulated object and, where the caption names one that a hand holds, the tool.
 
     None where nothing that moved was seen.
     """
-    given = marked or Marked()
+    given = marked or Given()
     starts = _ends(working, segmentation, phrase, 0, given.first)
     stops = _ends(working, segmentation, phrase, len(working.rgb) - 1, given.last)
     if given.colour_hist is not None:
@@ -142,7 +138,7 @@ def find_moved_by_network(
         stops = [_at_goal(blob, near) for blob in stops]
     pairs = sorted(
         (
-            _Pair(a, b, _pair_parts(a, b, kind, working.shape))
+            _Pair(a, b, _pair_cues(a, b, kind, working.shape))
             for a in starts
             for b in stops
         ),
@@ -191,7 +187,7 @@ def find_brought_by_network(
     best = stops[0]
     rival = max((b.rating for b in stops if not (b.mask & best.mask).any()), default=0.0)
     cues = {
-        **{f"last {k}": v for k, v in best.parts.items()},
+        **{f"last {k}": v for k, v in best.cues.items()},
         "no rival": float(1 / (1 + (rival / max(best.rating, 1e-6)) ** 2)),
     }
     return Moved(
@@ -221,7 +217,7 @@ def _ends(
 ) -> list[_Blob]:
     if given is not None:
         hist = histogram(working.rgb[i][given])
-        return [_Blob(mask=given, area=int(given.sum()), hist=hist, parts={"given": 1.0})]
+        return [_Blob(mask=given, hist=hist, cues={"given": 1.0})]
     moved = segmentation.at(i)[MOVED]
     h, w = working.shape
     cores: list[Bool[np.ndarray, "h w"]] = []
@@ -230,12 +226,8 @@ def _ends(
     for level in (_LIKELY, _POSSIBLE):
         # Print on an object and its content break it up: gaps are closed, but not over the hand.
         whole = tidy(moved > level, _GAP_PX) & ~(hand & (moved < _POSSIBLE))
-        count, parts, stats, _ = cv2.connectedComponentsWithStats(whole.astype(np.uint8))
-        for k in range(1, count):
-            mask = parts == k
-            if stats[k, cv2.CC_STAT_AREA] < LEAST_SHARE * h * w or any(
-                (mask & other).any() for other in masks
-            ):
+        for mask in connected_parts(whole, LEAST_SHARE * h * w):
+            if any((mask & other).any() for other in masks):
                 continue
             cores.append(mask)
             masks.append(mask_of_mover(working, segmentation, i, largest(_grown_to(mask, moved))))
@@ -317,9 +309,8 @@ def _rated(
     return [
         _Blob(
             mask=mask,
-            area=int(mask.sum()),
             hist=histogram(image[mask]),
-            parts={
+            cues={
                 "moved": min(1.0, 0.4 + 0.75 * float(moved[mask].mean())),
                 "size": float(1 - np.exp(-core.mean() / 0.002)),
                 "colour": _named_by(match, mask) ** (1.0 if named_colours(phrase) else 0.3),
@@ -329,20 +320,6 @@ def _rated(
         )
         for mask, core in zip(masks, cores, strict=True)
     ]
-
-
-def rated(
-    working: WorkingClip, segmentation: Segmentation, phrase: str, kind: Kind, moved: Moved
-) -> Moved:
-    """Return outlines found in another way, with the cues that the network's own are judged by."""
-    stop = len(working.rgb) - 1
-    (a,), (b,) = (
-        _rated(working, segmentation, phrase, i, [mask], [mask])
-        for i, mask in ((0, moved.first), (stop, moved.last))
-    )
-    b = _hidden_end(b, KINDS[kind].end_weight)
-    pair = _Pair(a, b, _pair_parts(a, b, kind, working.shape))
-    return _moved([pair], pair)
 
 
 def _last_seen(
@@ -361,14 +338,14 @@ def _by_hand(
 ) -> list[_Blob]:
     """Return blobs weighed by what hands do there, the best one first; what a person marked is left alone."""
     weighed = [
-        blob if "given" in blob.parts else blob.weighed(what, weight(blob.mask)) for blob in blobs
+        blob if "given" in blob.cues else blob.weighed(what, weight(blob.mask)) for blob in blobs
     ]
     return sorted(weighed, key=lambda blob: -blob.rating)
 
 
 def _hidden_end(blob: _Blob, weight: float) -> _Blob:
     """Return a blob of the last frame with ratings that count by this exponent."""
-    return replace(blob, parts={name: part**weight for name, part in blob.parts.items()})
+    return replace(blob, cues={name: cue**weight for name, cue in blob.cues.items()})
 
 
 def _alike(blob: _Blob, colour_hist: Float[np.ndarray, "l a b"]) -> _Blob:
@@ -405,10 +382,10 @@ def _vanishing(
     return float(np.clip(0.6 + 0.6 * (here - after) / (here + after + 4), 0.2, 1))
 
 
-def _pair_parts(a: _Blob, b: _Blob, kind: Kind, shape: tuple[int, int]) -> dict[str, float]:
+def _pair_cues(a: _Blob, b: _Blob, kind: Kind, shape: tuple[int, int]) -> dict[str, float]:
     ratio = abs(float(np.log(a.area / b.area)))
     weight = KINDS[kind].end_weight
-    parts = {
+    cues = {
         "alike": (0.3 + 0.7 * similarity(a.hist, b.hist)) ** weight,
         "same size": float(np.exp(-0.5 * (max(0.0, ratio - 0.4) / 0.7) ** 2)) ** weight,
     }
@@ -416,20 +393,20 @@ def _pair_parts(a: _Blob, b: _Blob, kind: Kind, shape: tuple[int, int]) -> dict[
     (rise, across) = (spots[0] - spots[1]) / shape[1]
     if kind in ("push_left", "push_right"):
         along = -across if kind == "push_right" else across
-        parts["direction"] = float(np.clip(0.5 + along / 0.06, 0.1, 1))
+        cues["direction"] = float(np.clip(0.5 + along / 0.06, 0.1, 1))
     elif kind == "lift_up":
         # What is lifted may be put down again before the clip ends.
-        parts["direction"] = float(np.clip(0.8 + rise / 0.08, 0.6, 1))
-    return parts
+        cues["direction"] = float(np.clip(0.8 + rise / 0.08, 0.6, 1))
+    return cues
 
 
 def _moved(pairs: list[_Pair], chosen: _Pair) -> Moved:
     a, b = chosen.first, chosen.last
     rival = max((pair.rating for pair in pairs if _is_another(pair, chosen)), default=0.0)
     cues = {
-        **{f"first {k}": v for k, v in a.parts.items()},
-        **{f"last {k}": v for k, v in b.parts.items()},
-        **chosen.parts,
+        **{f"first {k}": v for k, v in a.cues.items()},
+        **{f"last {k}": v for k, v in b.cues.items()},
+        **chosen.cues,
         "no rival": float(1 / (1 + (rival / max(chosen.rating, 1e-6)) ** 2)),
     }
     score = float(np.prod(list(cues.values())))

@@ -11,7 +11,7 @@ from v2p_data.scene.frames.classes import MOVED, OTHER, TABLE
 from v2p_data.scene.frames.colour import histogram, likelihood
 from v2p_data.scene.frames.mask_ops import grow, largest, tidy
 from v2p_data.scene.frames.working_clip import WorkingClip
-from v2p_data.scene.grounding.moved_by_change import Moved
+from v2p_data.scene.grounding.candidates import Moved
 
 _AROUND_PX = 10
 """Width of the ring around both outlines whose colours stand for the background, in a picture 320 px wide."""

@@ -60,7 +60,7 @@ look so, of 112 on those objects 7 %."""
 def mask_at_spots(
     picture: UInt8[np.ndarray, "h w 3"],
     spots: Sequence[tuple[float, float]],
-    shares: Float[np.ndarray, "5 h w"] | None,
+    shares: Float[np.ndarray, "5 h w"],
     outlines: Sequence[ModelOutline] = (),
 ) -> Bool[np.ndarray, "h w"]:
     """Return the outline of the object at a clicked pixel, or along a stroke.
@@ -76,9 +76,8 @@ def mask_at_spots(
     """
     marked = points_along(spots, picture.shape[:2])
     drawn = _pixels_of(marked, picture.shape[:2])
-    hand = np.zeros(drawn.shape, bool) if shares is None else shares[HAND] > _LIKELY
-    hand &= ~grow(drawn, 1)
-    thing = np.zeros(drawn.shape, np.float32) if shares is None else shares[MOVED] + shares[OTHER]
+    hand = (shares[HAND] > _LIKELY) & ~grow(drawn, 1)
+    thing = shares[MOVED] + shares[OTHER]
     drawn_by_model = [(one.mask, _WHOLE * float(np.log(min(1.0, one.iou)))) for one in outlines]
     others = ((mask, 0.0) for mask in _candidates(picture, marked, drawn, thing, hand))
     usable, preference = list[Bool[np.ndarray, "h w"]](), list[float]()
@@ -94,7 +93,7 @@ def mask_at_spots(
     lab = lab_of(picture)
     likeness = [_likeness(mask, lab, thing, drawn) for mask in usable]
     best = int(np.argmax(np.add(likeness, preference)))
-    if shares is not None and likeness[best] < _LEAST_LIKENESS and thing[drawn].mean() < _BARE:
+    if likeness[best] < _LEAST_LIKENESS and thing[drawn].mean() < _BARE:
         raise V2PError(
             "nothing stands out there from the table or the background; mark the middle of the object, or draw a box around it"
         )

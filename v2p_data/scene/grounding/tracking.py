@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Float32
 from v2p_data.scene.frames.colour import histogram, lab_distance, lab_of, likelihood
 from v2p_data.scene.frames.mask_ops import grow, iou, largest, tidy
 from v2p_data.scene.frames.working_clip import WorkingClip
+from v2p_data.scene.grounding.candidates import Moved
 from v2p_data.scene.grounding.mask_follower import CONFIG, Moving, follow, likeness_of, smoothed
-from v2p_data.scene.grounding.moved_by_change import Moved
 
 
 @dataclass(frozen=True, kw_only=True)
