@@ -11,7 +11,6 @@ from v2p_data.sim.env import ranges
 from v2p_data.sim.env.actions import bounds_of, joints_near, steps_to, targets_of
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.robot.action_names import DELTA_NAMES, action_names, actions_named
-from v2p_data.sim.robot.arms import BUILT_IN
 from v2p_data.sim.robot.robot import HOME_QPOS
 from v2p_data.sim.wrappers.gym_env import V2PEnv
 
@@ -94,24 +93,26 @@ def test_targets_hold_no_more_than_the_controller_goes_for(worlds_of):
     assert target[:, 2] == pytest.approx(low[2])
 
 
-def test_joints_hold_the_tool_where_it_shall_be_by_the_shortest_way():
+def test_joints_hold_the_tool_where_it_shall_be_by_the_shortest_way(worlds_of):
+    robot = worlds_of().world.robot
     home = np.tile(HOME_QPOS, (3, 1))
-    here = BUILT_IN.tool_state(home, np.zeros((3, 7)))
+    here = robot.tool_state(home, np.zeros((3, 7)))
     pos = here.pos + np.array([[0, 0, 0], [0.05, 0, 0], [0, -0.05, 0.05]])
     quat = np.array([[0, 1, 0, 0]] * 3, float)
 
-    qpos = joints_near(home, pos, quat, BUILT_IN)
+    qpos = joints_near(home, pos, quat, robot)
 
-    there = BUILT_IN.tool_state(qpos, np.zeros((3, 7)))
+    there = robot.tool_state(qpos, np.zeros((3, 7)))
     np.testing.assert_allclose(there.pos, pos, atol=1e-12)
     np.testing.assert_allclose(np.abs((there.quat_wxyz * quat).sum(1)), 1, atol=1e-12)
     assert np.abs(qpos - home).max() < 0.3
 
 
-def test_a_pose_out_of_reach_leaves_joints_finite():
+def test_a_pose_out_of_reach_leaves_joints_finite(worlds_of):
+    robot = worlds_of().world.robot
     home = np.tile(HOME_QPOS, (1, 1))
 
-    qpos = joints_near(home, np.array([[5.0, 0, 0]]), quats_about_z(np.zeros(1)).T, BUILT_IN)
+    qpos = joints_near(home, np.array([[5.0, 0, 0]]), quats_about_z(np.zeros(1)).T, robot)
 
     assert np.isfinite(qpos).all()
 

@@ -20,13 +20,12 @@ from v2p_data.sim.env.actions import steps_to, targets_of
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.model.world import World, build_world
 from v2p_data.sim.render.masks import FIRST_OBJECT, ROBOT, MaskRenderer
-from v2p_data.sim.robot.arms import RobotConfig, robot_from_json, robot_to_json
+from v2p_data.sim.robot.arms import FRANKA_MJCF, RobotConfig, robot_from_json, robot_to_json
 from v2p_data.sim.robot.robot import (
     COARSE,
     FINE,
     HOME_QPOS,
     ServoConfig,
-    robot_body_xml,
     tool_state,
 )
 from v2p_data.stages import EngineConfig, SimulatorConfig, task_stage
@@ -81,10 +80,7 @@ def six(tmp_path: Path) -> RobotConfig:
 def franka(tmp_path: Path) -> RobotConfig:
     """The built-in arm, read from a file as if it were a stranger's."""
     path = tmp_path / "franka.xml"
-    body = robot_body_xml(FINE, ServoConfig())
-    path.write_text(
-        f'<mujoco><compiler angle="radian" autolimits="true"/><worldbody>{body}</worldbody></mujoco>'
-    )
+    path.write_text(FRANKA_MJCF)
     return RobotConfig(
         path=path,
         eef_site="tcp",

@@ -469,7 +469,7 @@ def ball_at(env: BatchEnv, pos: tuple[float, float, float], size_px: int) -> lis
     """Return label images of all worlds, a ball where it hides behind nothing."""
     env._sim.object_qpos[:, 0, :3] = pos
     snapshot = env.snapshot(np.arange(env.num_envs))
-    with MaskRenderer(env.world, size_px, backend="rays") as renderer:
+    with MaskRenderer(env.world, size_px) as renderer:
         return [renderer.draw(snapshot, k) for k in range(env.num_envs)]
 
 
@@ -511,7 +511,7 @@ def test_a_camera_that_is_not_moved_is_the_models_to_the_pixel_and_moving_it_mov
     assert (snapshot.camera_quat == view.quat).all()
     assert (snapshot.camera_fovy_deg == view.fovy).all()
     assert all((a != b).any() for a, b in zip(masks, others, strict=True))
-    with MaskRenderer(fixed.world, 96, backend="rays") as renderer:
+    with MaskRenderer(fixed.world, 96) as renderer:
         renderer.draw(moved.snapshot(np.arange(1)), 0)
         np.testing.assert_array_equal(renderer.draw(snapshot, 0), masks[0])
 

@@ -230,7 +230,7 @@ def test_masks_show_the_notch(angle_scene: Scene, monkeypatch: pytest.MonkeyPatc
             camera_fovy_deg=view.fovy,
             **{name: getattr(world.model, name)[None].copy() for name in fields},
         )
-        with MaskRenderer(world, 128, backend="rays") as renderer:
+        with MaskRenderer(world, 128) as renderer:
             return int((renderer.draw(still, 0) == FIRST_OBJECT).sum())
 
     with_notch = pixels()

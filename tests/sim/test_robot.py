@@ -2,27 +2,29 @@ import mujoco
 import numpy as np
 import pytest
 
+from v2p_data.sim.robot.arms import RobotConfig, read_arm
 from v2p_data.sim.robot.robot import (
     COARSE,
     FINE,
     HOME_QPOS,
+    JOINT_RANGES_RAD,
     NUM_ARM_JOINTS,
     PhysicsConfig,
     ServoConfig,
     arm_qpos_for,
     option_xml,
-    robot_body_xml,
-    robot_rest_xml,
     tool_state,
 )
 
 
 def robot_model(physics: PhysicsConfig) -> mujoco.MjModel:
-    servo = ServoConfig()
-    return mujoco.MjModel.from_xml_string(
+    arm = read_arm(RobotConfig(), physics, ServoConfig())
+    world = mujoco.MjSpec.from_string(
         f'<mujoco><compiler angle="radian" autolimits="true"/>{option_xml(physics)}'
-        f"<worldbody>{robot_body_xml(physics, servo)}</worldbody>{robot_rest_xml(servo)}</mujoco>"
+        f'<worldbody><site name="base"/>{arm.bodies_xml}</worldbody>{arm.servos_xml}</mujoco>'
     )
+    arm.put_into(world)
+    return world.compile()
 
 
 def settled(model: mujoco.MjModel, pos: np.ndarray, qpos: np.ndarray) -> mujoco.MjData:
@@ -37,6 +39,7 @@ def settled(model: mujoco.MjModel, pos: np.ndarray, qpos: np.ndarray) -> mujoco.
 
 def test_tool_pose_and_velocity_agree_with_mujoco():
     model = robot_model(COARSE)
+    assert model.jnt_range[:7].tolist() == [list(limits) for limits in JOINT_RANGES_RAD]
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
     qpos, qvel = rng.uniform(-1.5, 1.5, (5, 7)), rng.normal(size=(5, 7))

@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float
 
 from v2p_data.geometry.camera import CV_FROM_GL, Camera
 from v2p_data.sim.render.zbuffer import Views, ZBuffer
-from v2p_data.sim.robot.robot import FINE, NUM_ARM_JOINTS, ServoConfig, robot_body_xml
+from v2p_data.sim.robot.arms import RobotConfig, read_arm
+from v2p_data.sim.robot.robot import FINE, NUM_ARM_JOINTS, ServoConfig
 
 NEAR_M = 0.01
 
@@ -30,10 +31,7 @@ class Silhouette:
     """
 
     def __init__(self, camera: Camera) -> None:
-        self.model = mujoco.MjModel.from_xml_string(
-            '<mujoco><compiler angle="radian" autolimits="true"/><worldbody>'
-            f"{robot_body_xml(FINE, ServoConfig())}</worldbody></mujoco>"
-        )
+        self.model = read_arm(RobotConfig(), FINE, ServoConfig()).spec.compile()
         self.model.vis.map.znear = NEAR_M / self.model.stat.extent
         self.data = mujoco.MjData(self.model)
         height, width = camera.height_px, camera.width_px

@@ -21,13 +21,13 @@ from scipy.spatial.transform import Rotation
 from v2p_data.geometry.camera import Camera, mujoco_xyaxes
 from v2p_data.scene.scene import Scene
 from v2p_data.sim.model.world import CAMERA, ObjectModel, World, build_world
+from v2p_data.sim.robot.arms import RobotConfig, read_arm
 from v2p_data.sim.robot.robot import (
     FINE,
     FINGER_TRAVEL_M,
     NUM_ARM_JOINTS,
     PADS,
     ServoConfig,
-    robot_body_xml,
     xml_row,
 )
 from v2p_data.twin.parameters import TwinParameters
@@ -77,6 +77,7 @@ def build_twin(scene: Scene, parameters: TwinParameters, camera: Camera) -> Twin
         ItemRejectedError: an object does not suit the robot, or its mesh is no solid.
     """
     base = build_world(scene, FINE)
+    arm = read_arm(RobotConfig(), FINE, ServoConfig(finger_armature_kg=FINGER_ARMATURE_KG))
     assets, bodies = "", ""
     for obj in base.objects:
         asset, body = _object_xml(base, obj, parameters)
@@ -92,18 +93,17 @@ def build_twin(scene: Scene, parameters: TwinParameters, camera: Camera) -> Twin
         '<quality offsamples="0" shadowsize="1024"/>'
         '<headlight ambient="0.35 0.35 0.35" diffuse="0.15 0.15 0.15" specular="0 0 0"/></visual>'
         '<asset><texture type="skybox" builtin="gradient" rgb1="0.75 0.76 0.78" rgb2="0.45 0.44 0.43" '
-        f'width="128" height="128"/>{assets}</asset><worldbody>'
+        f'width="128" height="128"/>{assets}</asset><worldbody><site name="base" size="0.001" group="4"/>'
         f'<light pos="{xml_row(lamp)}" dir="{xml_row(np.array([0.5, 0, 0]) - lamp)}" '
         f'diffuse="{xml_row(np.full(3, 0.75 * p.lamp_scale))}" specular="0.2 0.2 0.2" castshadow="true"/>'
         f'<camera name="{CAMERA}" pos="{xml_row(camera.T_world_cam[:3, 3])}" '
         f'xyaxes="{xml_row(mujoco_xyaxes(camera.T_world_cam))}" fovy="{_fovy_deg(camera)}"/>'
         f'<geom name="table" type="plane" size="1.5 1.5 0.1" pos="0 0 {p.table_height_m}" contype="1" '
         f'conaffinity="3" condim="6" friction="{p.table_friction:.6g} 0.003 0.0005" '
-        f'solref="{p.contact_time_s:.6g} 1"/>'
-        f"{robot_body_xml(FINE, ServoConfig(finger_armature_kg=FINGER_ARMATURE_KG))}{bodies}</worldbody>"
-        f"{_drives_xml(p)}</mujoco>"
+        f'solref="{p.contact_time_s:.6g} 1"/>{arm.bodies_xml}{bodies}</worldbody>{_drives_xml(p)}</mujoco>'
     )
     spec = mujoco.MjSpec.from_string(xml)
+    arm.put_into(spec)
     _change_robot(spec, p)
     _paint_table(spec, p)
     model = spec.compile()
@@ -113,10 +113,7 @@ def build_twin(scene: Scene, parameters: TwinParameters, camera: Camera) -> Twin
 
 def nominal_arm() -> mujoco.MjModel:
     """Return the arm as its maker's data and the calibrated mount say, for controllers: no objects, no errors."""
-    spec = mujoco.MjSpec.from_string(
-        f'<mujoco><compiler angle="radian" autolimits="true"/><worldbody>{robot_body_xml(FINE, ServoConfig())}'
-        "</worldbody></mujoco>"
-    )
+    spec = read_arm(RobotConfig(), FINE, ServoConfig()).spec
     for k, armature in enumerate(ARMATURE_KG_M2):
         spec.joint(f"joint{k + 1}").armature = armature
     return spec.compile()

@@ -92,7 +92,7 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
             world = build_world(bundle.scene, FINE)
         _copy_task(bundle, partial / "tasks" / name)
         (partial / "mjcf").mkdir(exist_ok=True)
-        (partial / "mjcf" / f"{name}.xml").write_text(world.xml)
+        (partial / "mjcf" / f"{name}.xml").write_text(world.spec.to_xml())
         rows.append(f"| {len(rows)} | {bundle.description} | `{name}` | {bundle.policy_steps()} |")
     modules = engine_modules()
     for module in modules:

@@ -357,7 +357,7 @@ def _present(name: str) -> torch.device:
 
 def _without_orientation_servo(world: World) -> mujoco.MjModel:
     """Return the model with three rotational servos about the world's axes instead, and without delay lines."""
-    spec = mujoco.MjSpec.from_string(world.xml)
+    spec = world.spec.copy()
     servo = spec.actuator("servo_rotation")
     original = world.model.actuator("servo_rotation").id
     kp = float(world.model.actuator_gainprm[original, 0])

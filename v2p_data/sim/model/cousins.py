@@ -60,8 +60,6 @@ class Cousin:
 
 def opening_m_of(robot: RobotConfig) -> float:
     """Return the distance between the open pads."""
-    if robot.path is None:
-        return 2 * FINGER_TRAVEL_M
     return 2 * read_arm(robot, FINE, ServoConfig()).finger_travel_m
 
 

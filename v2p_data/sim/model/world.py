@@ -11,6 +11,7 @@ uniform density. The manipulated object comes first, as in the scene.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import mujoco
@@ -20,23 +21,13 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.geometry.camera import look_at, mujoco_xyaxes
 from v2p_data.kinds import KINDS
 from v2p_data.scene.scene import Scene, SceneObject, friction_attribute, hollow_floor_m
 from v2p_data.sim.model.solids import solids_of
 from v2p_data.sim.model.suitability import check_grasp, check_names, checked_size
-from v2p_data.sim.robot.arms import BUILT_IN, Robot, RobotConfig, read_arm, sensor_ends
-from v2p_data.sim.robot.robot import (
-    BASE_SITE_XML,
-    FINGER_TRAVEL_M,
-    PADS,
-    PhysicsConfig,
-    ServoConfig,
-    option_xml,
-    robot_body_xml,
-    robot_rest_xml,
-    servo_xml,
-    xml_row,
-)
+from v2p_data.sim.robot.arms import Robot, RobotConfig, read_arm
+from v2p_data.sim.robot.robot import PADS, PhysicsConfig, ServoConfig, option_xml, xml_row
 
 type Size = tuple[float, float, float]
 """Extents along x, y, z [m]."""
@@ -108,8 +99,8 @@ class ObjectModel:
 class World:
     """The compiled model with the addresses of its objects."""
 
-    xml: str
-    """Its text; of another arm than the built-in one it lacks the bodies."""
+    spec: Any
+    """What it was compiled from; change a copy."""
     model: mujoco.MjModel
     robot: Robot
     physics: PhysicsConfig
@@ -130,38 +121,30 @@ def build_world(
         ItemRejectedError: an object is too large, too small, too heavy or too wide for this robot, or its mesh
             is no solid.
     """
-    servo = servo or ServoConfig()
     check_names(scene, RESERVED_NAMES)
-    arm = read_arm(robot, physics, servo) if robot and robot.path else None
-    opening_m = 2 * (arm.finger_travel_m if arm else FINGER_TRAVEL_M)
-    drafts = [_draft(o, scene, opening_m) for o in scene.objects]
+    arm = read_arm(robot or RobotConfig(), physics, servo or ServoConfig())
+    drafts = [_draft(o, scene, 2 * arm.finger_travel_m) for o in scene.objects]
     sensors = "".join(
         f'<contact name="{pad}_{o.name}" {end} body2="{o.name}" num="1" reduce="netforce" data="found"/>'
         for o in scene.objects
-        for pad, end in zip(PADS, sensor_ends(arm, PADS), strict=True)
+        for pad, end in zip(PADS, arm.sensor_ends, strict=True)
     )
-    if arm is None:
-        bodies, driven = robot_body_xml(physics, servo), robot_rest_xml(servo)
-    else:
-        bodies, driven = BASE_SITE_XML, servo_xml(servo, *arm.driven, arm.finger_travel_m)
     xml = (
         f'<mujoco model={quoteattr(scene.title)}><compiler angle="radian" autolimits="true"/>{option_xml(physics)}'
         '<visual><global offwidth="640" offheight="640"/><quality offsamples="0" shadowsize="1024"/>'
         '<headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>'
         f"<asset>{''.join(d.form.asset_xml for d in drafts)}</asset>"
-        f'<worldbody><light pos="0.5 -0.5 2" dir="0 0.2 -1" castshadow="false"/>{_camera_xml()}'
+        '<worldbody><site name="base" size="0.001" group="4"/>'
+        f'<light pos="0.5 -0.5 2" dir="0 0.2 -1" castshadow="false"/>{_camera_xml()}'
         '<geom name="table" type="plane" size="1.5 1.5 0.1" contype="1" conaffinity="3" condim="4" '
         f'friction="{friction_attribute()}" solref="{physics.solref_s} 1" rgba="0.55 0.5 0.45 1"/>'
-        f"{bodies}{''.join(d.body_xml(physics) for d in drafts)}</worldbody>"
-        f"{driven}<sensor>{sensors}</sensor></mujoco>"
+        f"{arm.bodies_xml}{''.join(d.body_xml(physics) for d in drafts)}</worldbody>"
+        f"{arm.servos_xml}<sensor>{sensors}</sensor></mujoco>"
     )
     try:
-        if arm is None:
-            model = mujoco.MjModel.from_xml_string(xml)
-        else:
-            spec = mujoco.MjSpec.from_string(xml)
-            arm.put_into(spec)
-            model = spec.compile()
+        spec = mujoco.MjSpec.from_string(xml)
+        arm.put_into(spec)
+        model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise ItemRejectedError(
             "model_not_compiled",
@@ -169,8 +152,8 @@ def build_world(
             "and meshes those of real objects?",
         ) from error
     return World(
-        robot=arm.robot(model) if arm else BUILT_IN,
-        xml=xml,
+        robot=arm.robot(model),
+        spec=spec,
         model=model,
         physics=physics,
         objects=tuple(d.located(model) for d in drafts),
@@ -475,12 +458,8 @@ def _mass_properties(parts: list[Part], mass_kg: float) -> tuple[np.ndarray, np.
 
 def _camera_xml() -> str:
     """Return the camera: on the robot's side, so that +y is on the image's left."""
-    forward = np.subtract(CAMERA_TARGET, CAMERA_POS)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    up = np.cross(right, forward)
-    return f'<camera name="{CAMERA}" pos="{xml_row(CAMERA_POS)}" xyaxes="{xml_row((*right, *up))}" fovy="{CAMERA_FOVY_DEG}"/>'
+    axes = mujoco_xyaxes(look_at(np.array(CAMERA_POS), np.array(CAMERA_TARGET)))
+    return f'<camera name="{CAMERA}" pos="{xml_row(CAMERA_POS)}" xyaxes="{xml_row(axes)}" fovy="{CAMERA_FOVY_DEG}"/>'
 
 
 def _mesh_name(name: str, part_idx: int, scale_idx: int) -> str:

@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 
 from v2p_data.sim.env.batch_env import Snapshot
-from v2p_data.sim.model.world import ServoConfig, World, build_world
-from v2p_data.sim.robot.arms import read_arm, robot_from_json
+from v2p_data.sim.model.world import World, build_world
+from v2p_data.sim.robot.arms import robot_from_json
 from v2p_data.sim.robot.robot import FINE
 from v2p_data.task.task import TaskBundle
 
@@ -111,7 +111,7 @@ def furnish(
     """
     plain = build_world(bundle.scene, FINE, robot=robot_from_json(bundle.robot))
     count = int(rng.integers(*distractors.count, endpoint=True))
-    spec = _spec(bundle, plain)
+    spec = plain.spec.copy()
     things = [_add_thing(spec, k, distractors, rng) for k in range(count)]
     drawn_look = {} if look.is_off else _paint(spec, plain, look, rng)
     world = replace(plain, model=spec.compile())
@@ -122,14 +122,6 @@ def furnish(
     furnished = Furnished(world=world, drawn={}, sizes=sizes)
     _find_places(furnished, things, snapshots, index, rng)
     return replace(furnished, drawn={"distractors": things, "look": drawn_look})
-
-
-def _spec(bundle: TaskBundle, plain: World) -> Any:
-    spec = mujoco.MjSpec.from_string(plain.xml)
-    robot = robot_from_json(bundle.robot)
-    if robot and robot.path:
-        read_arm(robot, FINE, ServoConfig()).put_into(spec)
-    return spec
 
 
 def _add_thing(

@@ -1,15 +1,16 @@
-"""Any MJCF arm in the built-in one's place: its file, the names of its tool and fingers, and what follows from them.
+"""Arms as MJCF, the built-in one (`franka`) or any other: its text, the names of its tool and fingers, and what follows.
 
-The file gives bodies, joints and geoms. Its actuators, tendons, sensors, keyframes and contact excludes are left out, and
-constraints that hold the arm are refused: the arm is driven by the same Cartesian servos as the built-in one, on a site at its tool centre point. Gravity is compensated, and only its last three
-links and the gripper collide, with objects and the table, as of the built-in arm. In the model its names begin with `robot/`.
+The text gives bodies, joints and geoms. Its actuators, tendons, sensors, keyframes and contact excludes are left out, and
+constraints that hold the arm are refused: every arm is driven by the same Cartesian servos, on a site at its tool centre
+point. Gravity is compensated, and only the last three links and the gripper collide, with objects and the table. In the
+model the names of another arm than the built-in one begin with `robot/`.
 """
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco's classes come from a compiled module that declares none of them.
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,15 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.geometry.pose import matrix_from_quat
+from v2p_data.sim.robot.franka import FRANKA_BODIES
 from v2p_data.sim.robot.robot import (
-    FINGER_TRAVEL_M,
-    NUM_ARM_JOINTS,
+    HOME_QPOS,
+    PADS,
     PhysicsConfig,
     ServoConfig,
     ToolState,
     arm_qpos_for,
+    servo_xml,
     tool_state,
 )
 from v2p_data.task.robot_files import robot_files
@@ -99,14 +102,11 @@ class Robot:
         return self.arm.stop - self.arm.start
 
 
-BUILT_IN = Robot(
-    arm=slice(0, NUM_ARM_JOINTS),
-    arm_dofs=slice(0, NUM_ARM_JOINTS),
-    fingers=slice(NUM_ARM_JOINTS, NUM_ARM_JOINTS + 2),
-    finger_travel_m=FINGER_TRAVEL_M,
-    tool_state=tool_state,
-    qpos_for=arm_qpos_for,
+FRANKA_MJCF = f'<mujoco><compiler angle="radian"/><worldbody>{FRANKA_BODIES}</worldbody></mujoco>'
+FRANKA = RobotConfig(
+    eef_site="tcp", fingers=("finger_left", "finger_right"), pads=PADS, home_qpos=HOME_QPOS
 )
+"""The built-in arm's names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,55 +115,105 @@ class ArmFile:
 
     cfg: RobotConfig
     spec: Any
-    kinematics: "Kinematics"
+    servo: ServoConfig
+    physics: PhysicsConfig
+    chain: tuple[str, ...]
+    """Its bodies from base to tool."""
+    tcp: str
+    """Site at its tool centre point."""
+    tool_state: Callable[[np.ndarray, np.ndarray], ToolState]
+    qpos_for: Callable[[np.ndarray, np.ndarray], np.ndarray]
     joints: tuple[str, ...]
     finger_travel_m: float
     pad_kind: str
     """`geom` or `body`."""
 
     @property
-    def driven(self) -> tuple[str, tuple[str, str]]:
-        """The tool's site and the finger joints by their names in the model."""
-        left, right = self.cfg.fingers
-        return PREFIX + TCP_SITE, (PREFIX + left, PREFIX + right)
+    def prefix(self) -> str:
+        """Begins its names in the model."""
+        return PREFIX if self.cfg.path else ""
+
+    @property
+    def servos_xml(self) -> str:
+        """What drives it, for the root of a model."""
+        left, right = (self.prefix + name for name in self.cfg.fingers)
+        return servo_xml(self.servo, self.prefix + self.tcp, (left, right), self.finger_travel_m)
+
+    @property
+    def sensor_ends(self) -> tuple[str, ...]:
+        """For each pad the XML attribute of a contact sensor that refers to it."""
+        return tuple(f'{self.pad_kind}1="{self.prefix}{pad}"' for pad in self.cfg.pads)
+
+    @property
+    def bodies_xml(self) -> str:
+        """What stands in the `<worldbody>` of a world's text: the built-in arm. Others follow with `put_into`."""
+        return "" if self.cfg.path else FRANKA_BODIES
 
     def put_into(self, world: Any) -> None:
-        """Add the arm to the spec of a world; its names get the prefix."""
+        """Add the arm to the spec of a world, or make it ready there."""
+        if self.cfg.path is None:
+            names = {body.name for body in self.spec.bodies[1:]}
+            self.make_ready(world, [body for body in world.bodies if body.name in names])
+            return
         turn = Rotation.from_euler("z", self.cfg.base_yaw_rad).as_quat(scalar_first=True)
         frame = world.worldbody.add_frame(pos=list(self.cfg.base_pos_m), quat=turn.tolist())
         world.attach(self.spec, prefix=PREFIX, frame=frame)
 
+    def make_ready(self, spec: Any, bodies: Sequence[Any]) -> None:
+        """Give bodies and joints in a spec what the servos need, and let wrist and gripper alone collide."""
+        cfg, servo = self.cfg, self.servo
+        for name in (*self.joints, *cfg.fingers):
+            joint = spec.joint(name)
+            is_finger = name in cfg.fingers
+            # Without inertia and friction stiff servos shake.
+            joint.armature = max(joint.armature, servo.finger_armature_kg if is_finger else 0.1)
+            joint.damping = np.maximum(joint.damping, [2.0 if is_finger else 1.0, 0, 0])
+            joint.frictionloss = 0.0
+        if len(self.joints) > MIN_JOINTS:
+            elbow, home = spec.joint(self.joints[REDUNDANT_JOINT]), cfg.home_qpos[REDUNDANT_JOINT]
+            elbow.stiffness = [servo.elbow_stiffness_nm, 0, 0]
+            elbow.springref = np.degrees(home) if spec.compiler.degree else home
+        moving = [name for name in self.chain if spec.body(name).joints]
+        wrist = moving[-COLLIDING_LINKS]
+        near = {b.name for b in spec.body(wrist).find_all(mujoco.mjtObj.mjOBJ_BODY)} | {wrist}
+        for body in bodies:
+            if body.name != "world":
+                body.gravcomp = 1
+            for geom in body.geoms:
+                collides = body.name in near and (geom.contype or geom.conaffinity)
+                geom.contype, geom.conaffinity = (2 if collides else 0), 0
+                if collides and (geom.name if self.pad_kind == "geom" else body.name) in cfg.pads:
+                    geom.condim, geom.priority = 4, 1
+                    geom.friction = [1.0, 0.01, 0.001]
+                    geom.solref = [self.physics.solref_s, 1.0]
+                    geom.solimp = [0.95, 0.99, 0.001, 0.5, 2.0]
+
     def robot(self, model: mujoco.MjModel) -> Robot:
         """Return where the arm is in the compiled model."""
-        joints = [model.joint(PREFIX + j) for j in self.joints]
-        fingers = [model.joint(PREFIX + j) for j in self.cfg.fingers]
+        joints = [model.joint(self.prefix + j) for j in self.joints]
+        fingers = [model.joint(self.prefix + j) for j in self.cfg.fingers]
         where = self.cfg.path
         return Robot(
             arm=_span([int(j.qposadr[0]) for j in joints], f"the arm joints of {where}"),
             arm_dofs=_span([int(j.dofadr[0]) for j in joints], f"the arm joints of {where}"),
             fingers=_span([int(j.qposadr[0]) for j in fingers], f"the finger joints of {where}"),
             finger_travel_m=self.finger_travel_m,
-            tool_state=self.kinematics.tool_state,
-            qpos_for=self.kinematics.qpos_for,
+            tool_state=self.tool_state,
+            qpos_for=self.qpos_for,
         )
 
 
 def read_arm(cfg: RobotConfig, physics: PhysicsConfig, servo: ServoConfig) -> ArmFile:
-    """Return the arm in `cfg.path`, stripped of what drives it there.
+    """Return the arm in `cfg.path`, or the built-in one, stripped of what drives it there.
 
     Raises:
         V2PError: there is no such file, it is no MJCF, or it lacks what `cfg` names.
     """
-    path = cfg.path
-    if path is None or not path.is_file():
-        raise V2PError(f"there is no robot file {path}; --sim.robot.path names an MJCF file")
-    robot_files(path)  # nothing is compiled that is more than an arm
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
+    if cfg.path is None:
+        cfg, spec = FRANKA, mujoco.MjSpec.from_string(FRANKA_MJCF)
         model = spec.compile()
-    except (ValueError, RuntimeError, mujoco.FatalError) as error:
-        words = " ".join(str(error).split())
-        raise V2PError(f"robot file {path} is no MJCF that MuJoCo reads: {words}") from error
+    else:
+        spec, model = _loaded(cfg.path)
     body, place = _tool(cfg, model)
     chain = _chain_to(model, body)
     fingers = [_named(model, "joint", name, cfg, "fingers") for name in cfg.fingers]
@@ -176,22 +226,43 @@ def read_arm(cfg: RobotConfig, physics: PhysicsConfig, servo: ServoConfig) -> Ar
     for pad in cfg.pads:
         _named(model, kind, pad, cfg, "pads")
     _strip(spec, cfg)
-    spec.body(model.body(body).name).add_site(
-        name=TCP_SITE, pos=place[:3, 3].tolist(), quat=_quat(place[:3, :3]).tolist(), group=4
-    )
-    _prepare(spec, cfg, names, servo)
-    _prepare_geoms(spec, cfg, [model.body(b).name for b in chain], kind, physics)
-    base = np.eye(4)
-    base[:3, :3] = Rotation.from_euler("z", cfg.base_yaw_rad).as_matrix()
-    base[:3, 3] = cfg.base_pos_m
-    return ArmFile(
+    arm = ArmFile(
         cfg=cfg,
         spec=spec,
-        kinematics=Kinematics(model, chain, base, place, cfg),
+        servo=servo,
+        physics=physics,
+        chain=tuple(model.body(b).name for b in chain),
+        tcp=cfg.eef_site,
+        tool_state=tool_state,
+        qpos_for=arm_qpos_for,
         joints=names,
         finger_travel_m=travel,
         pad_kind=kind,
     )
+    arm.make_ready(spec, spec.bodies)
+    if cfg.path is None:
+        return arm
+    spec.body(model.body(body).name).add_site(
+        name=TCP_SITE, pos=place[:3, 3].tolist(), quat=_quat(place[:3, :3]).tolist(), group=4
+    )
+    base = np.eye(4)
+    base[:3, :3] = Rotation.from_euler("z", cfg.base_yaw_rad).as_matrix()
+    base[:3, 3] = cfg.base_pos_m
+    found = Kinematics(model, chain, base, place, cfg)
+    return replace(arm, tcp=TCP_SITE, tool_state=found.tool_state, qpos_for=found.qpos_for)
+
+
+def _loaded(path: Path) -> tuple[Any, mujoco.MjModel]:
+    """Return what a robot's file holds, as it is and compiled."""
+    if not path.is_file():
+        raise V2PError(f"there is no robot file {path}; --sim.robot.path names an MJCF file")
+    robot_files(path)  # nothing is compiled that is more than an arm
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        return spec, spec.compile()
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        words = " ".join(str(error).split())
+        raise V2PError(f"robot file {path} is no MJCF that MuJoCo reads: {words}") from error
 
 
 class Kinematics:
@@ -434,40 +505,6 @@ def _strip(spec: Any, cfg: RobotConfig) -> None:
             spec.delete(element)
 
 
-def _prepare(spec: Any, cfg: RobotConfig, joints: tuple[str, ...], servo: ServoConfig) -> None:
-    """Compensate gravity and give joints the inertia and friction without which stiff servos shake."""
-    for body in spec.bodies[1:]:
-        body.gravcomp = 1
-    for name in (*joints, *cfg.fingers):
-        joint = spec.joint(name)
-        is_finger = name in cfg.fingers
-        joint.armature = max(joint.armature, servo.finger_armature_kg if is_finger else 0.1)
-        joint.damping = np.maximum(joint.damping, [2.0 if is_finger else 1.0, 0, 0])
-        joint.frictionloss = 0.0
-    if len(joints) > MIN_JOINTS:
-        elbow, home = spec.joint(joints[REDUNDANT_JOINT]), cfg.home_qpos[REDUNDANT_JOINT]
-        elbow.stiffness = [servo.elbow_stiffness_nm, 0, 0]
-        elbow.springref = np.degrees(home) if spec.compiler.degree else home
-
-
-def _prepare_geoms(
-    spec: Any, cfg: RobotConfig, chain: list[str], pad_kind: str, physics: PhysicsConfig
-) -> None:
-    """Let wrist and gripper collide with objects and the table only, and give the pads their grip."""
-    moving = [name for name in chain if spec.body(name).joints]
-    wrist = moving[-COLLIDING_LINKS]
-    near = {b.name for b in spec.body(wrist).find_all(mujoco.mjtObj.mjOBJ_BODY)} | {wrist}
-    for body in spec.bodies:
-        for geom in body.geoms:
-            collides = body.name in near and (geom.contype or geom.conaffinity)
-            geom.contype, geom.conaffinity = (2 if collides else 0), 0
-            if collides and (geom.name if pad_kind == "geom" else body.name) in cfg.pads:
-                geom.condim, geom.priority = 4, 1
-                geom.friction = [1.0, 0.01, 0.001]
-                geom.solref = [physics.solref_s, 1.0]
-                geom.solimp = [0.95, 0.99, 0.001, 0.5, 2.0]
-
-
 def _turns(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return the rotations about one axis, `(n, 3, 3)` (Rodrigues)."""
     x, y, z = axis
@@ -478,10 +515,3 @@ def _turns(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 def _quat(R: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(R).as_quat(scalar_first=True)
-
-
-def sensor_ends(arm: ArmFile | None, pads: Iterable[str]) -> list[str]:
-    """Return for each pad the XML attribute of a contact sensor that refers to it."""
-    if arm is None:
-        return [f'geom1="{pad}"' for pad in pads]
-    return [f'{arm.pad_kind}1="{PREFIX}{pad}"' for pad in arm.cfg.pads]

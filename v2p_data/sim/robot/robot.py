@@ -1,12 +1,10 @@
-"""The robot: a Franka-Panda-like arm with a 2F-85-like gripper, as MJCF text and as closed-form kinematics.
+"""What drives an arm, and the built-in arm's closed-form kinematics; `franka` has its bodies.
 
-The arm follows Cartesian targets by itself: three position servos and one quaternion servo act on the tool
+An arm follows Cartesian targets by itself: three position servos and one quaternion servo act on the tool
 centre point `tcp`, so nothing inverts kinematics while it runs. Controls are
 `[x, y, z, qw, qx, qy, qz, finger]`: the wanted `tcp` pose in the world [m, wxyz] and the finger travel
 [m], 0 closed and `FINGER_TRAVEL_M` open. Joint 3 carries a weak spring towards 0: every reachable pose has
 a solution with joint 3 at 0, so the spring settles the arm's redundancy without moving the tool.
-
-Kinematics, joint limits, link masses and inertias are Franka Emika's published values.
 """
 
 from collections.abc import Iterable
@@ -27,8 +25,6 @@ FINGER_THICKNESS_M = 0.012
 FINGERTIP_BELOW_TCP_M = 0.015
 QUAT_DOWN = (0.0, 1.0, 0.0, 0.0)
 """`quat_wxyz` of the gripper pointing straight down with zero yaw."""
-BASE_SITE_XML = '<site name="base" size="0.001" group="4"/>'
-"""The world's origin, in which the servos' targets are given."""
 PADS = ("pad_left", "pad_right")
 NUM_CONTROLS = 8
 
@@ -84,32 +80,15 @@ class ServoConfig:
     """Past controls kept for delayed actuation; covers 20 ms at the fine time step."""
 
 
-# Per link: position and x-rotation [degrees] in its parent, mass [kg], centre of mass [m], inertia
-# [kg m2: xx yy zz xy xz yz], joint range [rad]; then visual capsules as (from, to, radius).
-_LINKS = (
-    ((0, 0, 0.333), 0, 4.970684, (0.003875, 0.002081, -0.04762),
-     (0.70337, 0.70661, 0.009117, -0.000139, 0.006772, 0.019169), (-2.8973, 2.8973),
-     (((0, 0, -0.19), (0, 0, 0), 0.06),)),
-    ((0, 0, 0), -90, 0.646926, (-0.003141, -0.02872, 0.003495),
-     (0.007962, 0.02811, 0.025995, -0.003925, 0.010254, 0.000704), (-1.7628, 1.7628),
-     (((0, 0, -0.05), (0, 0, 0.05), 0.06), ((0, -0.06, 0), (0, -0.19, 0), 0.06))),
-    ((0, -0.316, 0), 90, 3.228604, (0.027518, 0.039252, -0.066502),
-     (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805), (-2.8973, 2.8973),
-     (((0, 0, -0.12), (0, 0, 0), 0.055), ((0.0825, 0, 0), (0.0825, 0.06, 0), 0.05))),
-    ((0.0825, 0, 0), 90, 3.587895, (-0.05317, 0.104419, 0.027454),
-     (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641), (-3.0718, -0.0698),
-     (((0, 0, -0.05), (0, 0, 0.05), 0.055), ((-0.0825, 0.08, 0), (-0.0825, 0.14, 0), 0.05))),
-    ((-0.0825, 0.384, 0), -90, 1.225946, (-0.011953, 0.041065, -0.038437),
-     (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229), (-2.8973, 2.8973),
-     (((0, 0, -0.24), (0, 0, -0.17), 0.055), ((0, 0.05, -0.2), (0, 0.07, -0.02), 0.035))),
-    ((0, 0, 0), 90, 1.666555, (0.060149, -0.014117, -0.010517),
-     (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341), (-0.0175, 3.7525),
-     (((0, 0, -0.05), (0, 0, 0.03), 0.045), ((0.03, 0, 0), (0.088, 0, 0), 0.045))),
-    ((0.088, 0, 0), 90, 0.735522, (0.010517, -0.004252, 0.061597),
-     (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741), (-2.8973, 2.8973),
-     (((0, 0, -0.02), (0, 0, 0.08), 0.042),)),
-)  # fmt: skip
-JOINT_RANGES_RAD = tuple(link[5] for link in _LINKS)
+JOINT_RANGES_RAD = (
+    (-2.8973, 2.8973),
+    (-1.7628, 1.7628),
+    (-2.8973, 2.8973),
+    (-3.0718, -0.0698),
+    (-2.8973, 2.8973),
+    (-0.0175, 3.7525),
+    (-2.8973, 2.8973),
+)
 
 
 def option_xml(physics: PhysicsConfig) -> str:
@@ -122,58 +101,6 @@ def option_xml(physics: PhysicsConfig) -> str:
         f'<option timestep="{physics.timestep_s}" integrator="discrete" cone="elliptic" impratio="3" '
         'iterations="20" ls_iterations="50" tolerance="1e-5" jacobian="dense"/>'
     )
-
-
-def robot_body_xml(physics: PhysicsConfig, servo: ServoConfig) -> str:
-    """Return the arm's bodies, for `<worldbody>`. Only wrist and gripper collide, never with each other."""
-    opening, closing = "", ""
-    for i, (pos, angle, mass, com, inertia, limits, capsules) in enumerate(_LINKS):
-        stiffness = f' stiffness="{servo.elbow_stiffness_nm}"' if i == 2 else ""
-        collision = "2" if i >= 4 else "0"
-        opening += (
-            f'<body name="link{i + 1}" pos="{xml_row(pos)}" euler="{np.radians(angle)} 0 0" gravcomp="1">'
-            f'<inertial mass="{mass}" pos="{xml_row(com)}" fullinertia="{xml_row(inertia)}"/>'
-            f'<joint name="joint{i + 1}" axis="0 0 1" range="{xml_row(limits)}" armature="0.1" damping="1"{stiffness}/>'
-        )
-        for k, (start, end, radius) in enumerate(capsules):
-            opening += (
-                f'<geom name="link{i + 1}_{k}" type="capsule" fromto="{xml_row(start)} {xml_row(end)}" size="{radius}" '
-                f'contype="{collision}" conaffinity="0" rgba="0.93 0.93 0.95 1"/>'
-            )
-        closing += "</body>"
-    base = (
-        f"{BASE_SITE_XML}"
-        '<geom name="link0_0" type="cylinder" fromto="0 0 0 0 0 0.14" size="0.07" contype="0" conaffinity="0" '
-        'rgba="0.93 0.93 0.95 1"/>'
-    )
-    return base + opening + _gripper_xml(physics, servo) + closing
-
-
-def _gripper_xml(physics: PhysicsConfig, servo: ServoConfig) -> str:
-    fingers = ""
-    for pad, joint, side in (("pad_left", "finger_left", 1), ("pad_right", "finger_right", -1)):
-        fingers += (
-            f'<body name="{joint}" pos="0 0 0.12" gravcomp="1">'
-            f'<inertial mass="0.03" pos="0 {0.006 * side} 0.01" diaginertia="1e-5 1e-5 1e-5"/>'
-            f'<joint name="{joint}" type="slide" axis="0 {side} 0" range="0 {FINGER_TRAVEL_M}" '
-            f'armature="{servo.finger_armature_kg}" damping="2"/>'
-            f'<geom name="{pad}" type="box" pos="0 {0.006 * side} 0.0075" size="0.011 0.006 0.0325" '
-            f'contype="2" conaffinity="0" condim="4" friction="1 0.01 0.001" priority="1" '
-            f'solref="{physics.solref_s} 1" solimp="0.95 0.99 0.001" rgba="0.3 0.3 0.32 1"/></body>'
-        )
-    return (
-        '<body name="hand" pos="0 0 0.107" euler="0 0 -0.7853981633974483" gravcomp="1">'
-        '<inertial mass="0.8" pos="0 0 0.045" diaginertia="9e-4 9e-4 5e-4"/>'
-        '<geom name="palm" type="box" pos="0 0 0.045" size="0.035 0.05 0.045" contype="2" conaffinity="0" '
-        'rgba="0.15 0.15 0.17 1"/>'
-        f'<site name="tcp" pos="0 0 0.145" size="0.005" group="4"/>{fingers}</body>'
-    )
-
-
-def robot_rest_xml(servo: ServoConfig) -> str:
-    """Return contact exclusions, the finger coupling and the servos, for the root of the model."""
-    exclusion = '<contact><exclude body1="link7" body2="hand"/></contact>'
-    return exclusion + servo_xml(servo, "tcp", ("finger_left", "finger_right"), FINGER_TRAVEL_M)
 
 
 def servo_xml(servo: ServoConfig, site: str, fingers: tuple[str, str], travel_m: float) -> str:
@@ -269,9 +196,16 @@ def arm_qpos_for(
     return qpos
 
 
-# What the links' places in their parents mean for the tool: all of them lie along axes that `_chain` goes through.
-_SHOULDER_HEIGHT, _UPPER_ARM = _LINKS[0][0][2], -_LINKS[2][0][1]
-_ELBOW_OFFSET, _FOREARM, _WRIST_OFFSET = _LINKS[3][0][0], _LINKS[4][0][1], _LINKS[6][0][0]
+_SHOULDER_HEIGHT, _UPPER_ARM, _ELBOW_OFFSET, _FOREARM, _WRIST_OFFSET = (
+    0.333,
+    0.316,
+    0.0825,
+    0.384,
+    0.088,
+)
+"""Between the joints, as in `franka`."""
+_TURNS_BACK = (False, True, False, False, True, False, False)
+"""Each next frame is turned about x by 90 degrees, forth or back."""
 _LEVER_OF_JOINT = (0, 0, 0, 1, 2, 2)
 """Joints 1 to 3 meet in the shoulder and 5 and 6 in the wrist; joint 7 has none, it points at the tool."""
 
@@ -313,14 +247,14 @@ def _chain(qpos: Float[np.ndarray, "n 7"]) -> _Chain:
     for i in range(1, NUM_ARM_JOINTS):
         before, frame = frames[i - 1], frames[i]
         frame.real = before.real
-        if _LINKS[i][1] > 0:
-            frame.imag = axes[i - 1]
-            np.negative(before.imag, out=axes[i])
-            wz, xy = wz - xy, xy + wz
-        else:
+        if _TURNS_BACK[i]:
             np.negative(axes[i - 1], out=frame.imag)
             axes[i] = before.imag
             wz, xy = wz + xy, xy - wz
+        else:
+            frame.imag = axes[i - 1]
+            np.negative(before.imag, out=axes[i])
+            wz, xy = wz - xy, xy + wz
         frame *= turn[i]
         wz *= half[i]
         xy *= back[i]
