@@ -1,8 +1,9 @@
-"""The command line from end to end, killed in every stage and told to go on."""
+"""The command line from end to end, killed in every stage; the notebook and the page of the Python API as they stand."""
 
 import hashlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,7 +13,9 @@ from pathlib import Path
 
 import pytest
 
-SAMPLES = Path(__file__).parents[1] / "datasets" / "sample_videos"
+ROOT = Path(__file__).parents[1]
+SAMPLES = ROOT / "datasets" / "sample_videos"
+AROUND = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg", "PYTHONPATH": str(ROOT)}
 STAGES = ("scene", "task", "expert", "episodes", "dataset")
 SETTINGS = """
 task: {num_samples: 2}
@@ -46,7 +49,7 @@ def start(videos: Path, out: Path, *flags: str) -> subprocess.Popen[str]:
         text=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        env=AROUND,
     )
 
 
@@ -54,6 +57,29 @@ def finish(process: subprocess.Popen[str]) -> str:
     output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, output
     return output
+
+
+def ran(script: str, where: Path, **variables: str) -> str:
+    """Return what a script of a folder prints; it must end well."""
+    done = subprocess.run(
+        [sys.executable, script],
+        cwd=where,
+        env=AROUND | variables,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def calm(videos, tmp_path_factory) -> Path:
+    """Return a run that nobody disturbed."""
+    out = tmp_path_factory.mktemp("calm") / "run"
+    finish(start(videos, out))
+    return out
 
 
 def content(out: Path) -> dict[str, str]:
@@ -77,9 +103,9 @@ def content(out: Path) -> dict[str, str]:
 @pytest.mark.slow
 @pytest.mark.e2e
 @pytest.mark.timeout(900)
-def test_a_run_killed_in_every_stage_ends_in_the_dataset_of_an_undisturbed_one(videos, tmp_path):
-    finish(start(videos, tmp_path / "calm"))
-
+def test_a_run_killed_in_every_stage_ends_in_the_dataset_of_an_undisturbed_one(
+    videos, calm, tmp_path
+):
     out = tmp_path / "killed"
     for stage in STAGES:
         process = start(videos, out)
@@ -95,7 +121,55 @@ def test_a_run_killed_in_every_stage_ends_in_the_dataset_of_an_undisturbed_one(v
     finish(start(videos, out))
 
     assert len(content(out)) > 5
-    assert content(out) == content(tmp_path / "calm")
+    assert content(out) == content(calm)
     again = finish(start(videos, out))
     assert "made in" not in again
     assert not list(out.rglob("*.partial"))
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_notebook_runs_on_a_run_of_one_clip(calm: Path, tmp_path: Path):
+    notebook = json.loads((ROOT / "docs" / "quickstart.ipynb").read_text())
+    cells = [c for c in notebook["cells"] if c["cell_type"] == "code"]
+    (tmp_path / "cells.py").write_text("\n\n".join("".join(c["source"]) for c in cells))
+
+    said = ran("cells.py", tmp_path, V2P_RUN=str(calm))
+
+    assert "manipulated green_carton" in said
+    assert "3 episodes" in said
+    assert re.search(r"expert of .* \(\d+ of 16\)", said)
+
+
+@pytest.mark.slow
+def test_the_blocks_of_the_api_page_run_one_after_the_other(tmp_path: Path):
+    page = (ROOT / "docs" / "python_api.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.S | re.M)
+    (tmp_path / "datasets").symlink_to(ROOT / "datasets")
+    (tmp_path / "blocks.py").write_text("\n".join(blocks))
+
+    said = ran("blocks.py", tmp_path)
+
+    assert len(blocks) == 4
+    assert "lift_up" in said
+    assert "task lift_red_box made" in said
+    assert (tmp_path / "outputs" / "by_hand" / "task" / "task.py").is_file()
+
+
+def test_every_function_that_the_api_page_names_is_defined_in_its_file():
+    page = (ROOT / "docs" / "python_api.md").read_text()
+    rows = re.findall(
+        r"^\| [^|]+ \| ([^|]+) \| ([^|]+) \|$", page.split("## Where the rest is")[1], re.M
+    )
+    checked = 0
+    for called, defined in rows[2:]:
+        places = re.findall(r"`([\w/]+\.py)`", defined)
+        folder = ROOT / places[0].rsplit("/", 1)[0] if places else ROOT
+        sources = [(ROOT / p if "/" in p else folder / p).read_text() for p in places]
+        for name in re.findall(r"`(\w+)", called):
+            checked += 1
+            assert any(
+                re.search(rf"^\s*(def|class) {name}\b", s, re.M) for s in sources
+            ) or name in ("scene", "expert"), f"{name} is not in {places}"
+    assert checked > 20

@@ -5,8 +5,8 @@
           (cousin --> task --> ...) -----------------------------------+
 
 Each stage is a recipe and inputs (what it is) and a `make_*` function (how it comes about). A `make_*` loads
-its inputs, calls the craft, saves, and returns the counts that the record keeps. Heavy libraries are imported
-where they are used, so that listing stages costs little.
+its inputs, calls the craft, saves, and returns the counts that the record keeps. Importing this module loads torch,
+MuJoCo and trimesh, which takes seconds: commands that only look at a run do without it.
 """
 
 import json

@@ -558,10 +558,12 @@ def _tell_cousins(outcomes: Iterable[Outcome]) -> None:
         bad = [next((o for o in made if o.status in ("failed", "rejected")), None) for made in cousins.values()]  # fmt: skip
         why = Counter(o.reason or o.status for o in bad if o is not None)
         first = {o.reason: o.detail for o in reversed(bad) if o is not None}
-        told = "; ".join(f"{n} {reason}: {first.get(reason, '')}" for reason, n in why.most_common())  # fmt: skip
+        reasons = "; ".join(
+            f"{n} {reason}: {first.get(reason, '')}" for reason, n in why.most_common()
+        )
         came = sum(all(o.is_usable for o in made) for made in cousins.values())
         print(  # noqa: T201
-            f"{family}: {came} of {len(cousins)} cousins came through{f' ({told})' if told else ''}",
+            f"{family}: {came} of {len(cousins)} cousins came through{f' ({reasons})' if reasons else ''}",
             file=sys.stderr,
         )
 

@@ -1,7 +1,7 @@
 """What people post around a caption and what names no object: links, tags, decorations, remarks on the filming.
 
 A caption is cut into sentences and these into parts. What stands in round brackets, links, mentions, tags at the
-ends and remarks go; what is left is told. The remarks are known in English, German, French, Spanish and Chinese.
+ends and remarks go; the rest stays. The remarks are known in English, German, French, Spanish and Chinese.
 """
 
 # ruff: noqa: RUF001 - the wide marks of Chinese are meant
@@ -74,7 +74,7 @@ _REMARKS = re.compile(
 _ALL_REMARK = re.compile(_any_of(_WHOLE), re.IGNORECASE)
 
 
-def told(caption: str) -> list[str]:
+def sentences_of(caption: str) -> list[str]:
     """Return the sentences of a caption without what tells nothing of the scene; none where there is nothing else.
 
     A tag between words stands for its word ("Put #sponge into the bowl").

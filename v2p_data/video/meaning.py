@@ -1,10 +1,15 @@
 """What a caption asks for: the kind of task, which object is manipulated, and what the others are for.
 
-A caption is read in three steps, without what people post around it (`chatter`). It is cut into clauses at its verbs; each clause is cut at its prepositions
-("Pushing plate | from left to right | next to brown box"); and `TaskKind.phrases` says what a verb with a
-preposition means. The first preposition in the order of `_RANK` that the table knows decides, so a direction
-outranks a neighbour, and a neighbour outranks a tool. The last clause with a known kind wins: it tells how the
-clip ends. To teach a new phrase, add it to its kind in `v2p_data/kinds.py`.
+`parse_caption` works in four steps:
+
+1. `chatter` takes away links, tags and remarks.
+2. `_clauses` cuts the text at its verbs.
+3. `_read` cuts each clause at its prepositions ("Pushing plate | from left to right | next to brown box") and looks the
+   verb and a preposition up in `TaskKind.phrases`. Where several prepositions are known, `_RANK` chooses: a direction
+   before a neighbour, a neighbour before a tool.
+4. The last clause with a known kind wins: it tells how the clip ends.
+
+To teach a new phrase, add it to its kind in `v2p_data/kinds.py`.
 """
 
 import re
@@ -12,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.video.chatter import told
+from v2p_data.video.chatter import sentences_of
 
 Role = Literal["reference", "tool", "container", "cover"]
 
@@ -69,7 +74,7 @@ _PREPOSITIONS = {
 """Preposition or particle -> how it is written. The first that fits at a place is taken."""
 
 _RANK = {"left": 0, "right": 0, "up": 2, "over": 2, "with": 3}
-"""Which preposition is asked first; 1 where not named, in the order of the caption."""
+"""Preposition -> rank; the lowest rank is looked up first. Others have rank 1, in the order of the caption."""
 
 _PARTICLES = {"left", "right", "over", "upright", "up", "down", "off"}
 """These may stand without a phrase of their own ("lift the box up")."""
@@ -148,7 +153,7 @@ def parse_caption(caption: str, objects: tuple[str, ...] = ()) -> Meaning:
         objects: phrases for the objects, if they are known; those that the caption does not name become
             references, and the first stands in where the caption names nothing that moves.
     """
-    sentences = told(_marked(caption.replace("§", " ").lower(), objects))
+    sentences = sentences_of(_marked(caption.replace("§", " ").lower(), objects))
     sentences = [_marked(_normal(sentence), objects) for sentence in sentences]
     # where something is done in one of them, the others are talk
     text = ", ".join([s for s in sentences if _has_verb(s)] or sentences[:1])
@@ -284,7 +289,7 @@ def _phrase(words: str) -> str:
 
 
 def _after(kind: Kind, outcome: str, moved: str) -> Kind:
-    """Return the kind once the words that tell the outcome are heard as well."""
+    """Return the kind that the words on the outcome leave."""
     if re.search(r"\breveal", outcome) and moved:
         return "uncover"
     if re.search(r"\bfalls? over\b|\btips? over\b", outcome):
@@ -297,7 +302,7 @@ def _after(kind: Kind, outcome: str, moved: str) -> Kind:
 def _named(
     kind: Kind, moved: str, others: list[tuple[str, Role]], objects: tuple[str, ...]
 ) -> Meaning:
-    """Return the meaning in the words of `objects` wherever a phrase means one of them."""
+    """Return the meaning; a phrase that means one of `objects` gets that object's name."""
     said = " ".join([moved, *(phrase for phrase, _ in others)])
     used = {objects[int(index)] for index in _OBJECT.findall(said)}
 
