@@ -81,7 +81,7 @@ assert result.fields == {"metric": True}
 """Per page, for its only block."""
 ELSEWHERE = {
     "docs/datasets.md": "tests/episodes/test_envhub.py",
-    "docs/python_api.md": "tests/test_quickstart.py",
+    "docs/python_api.md": "tests/test_chain.py",
 }
 """Pages whose blocks are run, as they stand, by another test: with a Hub at hand, or one after the other."""
 

@@ -54,8 +54,12 @@ def test_a_child_ends_when_its_parent_is_killed(tmp_path, by_kernel):
         """)
     )
     parent = subprocess.Popen(
-        [sys.executable, "-c", f"import subprocess, sys; subprocess.run([sys.executable, {str(child)!r}])"]
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-c",
+            f"import subprocess, sys; subprocess.run([sys.executable, {str(child)!r}])",
+        ]
+    )
     (pid,) = told(tmp_path / "pid")
 
     assert not has_ended(pid)
@@ -82,8 +86,9 @@ def test_a_process_of_ours_whose_parent_is_gone_ends_before_it_imports(module):
 
     done = subprocess.run(
         [sys.executable, "-I", "-X", "importtime", "-c", of_another.stdout.decode()],
-        capture_output=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        check=False,
+    )
 
     assert done.returncode == -signal.SIGKILL
     assert b"v2p_data.processes" in done.stderr

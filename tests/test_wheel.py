@@ -59,9 +59,15 @@ def v2p(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The command of a fresh environment that sees our dependencies, but not the repository."""
     home = tmp_path_factory.mktemp("environment")
     call(
-        sys.executable, "-m", "virtualenv", "--quiet", "--no-download", "--no-periodic-update", home,
+        sys.executable,
+        "-m",
+        "virtualenv",
+        "--quiet",
+        "--no-download",
+        "--no-periodic-update",
+        home,
         cwd=home,
-    )  # fmt: skip
+    )
     python = home / "bin" / "python"
     options = ("--quiet", "--no-index", "--no-deps", "--disable-pip-version-check")
     call(python, "-m", "pip", "install", *options, wheel, cwd=home)
@@ -103,9 +109,17 @@ def test_a_video_becomes_a_scene_a_task_and_a_page_without_a_clone(v2p: Path, tm
     (tmp_path / "videos" / "captions.json").write_text(json.dumps({name: caption}))
 
     call(
-        v2p, "task", "videos", "--out", "run", "--task.num-samples", 1, "--workers", 1,
+        v2p,
+        "task",
+        "videos",
+        "--out",
+        "run",
+        "--task.num-samples",
+        1,
+        "--workers",
+        1,
         cwd=tmp_path,
-    )  # fmt: skip
+    )
 
     (task,) = tmp_path.glob("run/task/*/task.json")
     assert json.loads(task.read_text())["kind"] == "tip_over"

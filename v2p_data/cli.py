@@ -47,8 +47,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "setup": ("setup", "which learned models are set up here; with a name, set one up"),
     "demo": ("run", "the whole chain on three sample clips"),
 }
-"""Command -> module of `v2p_data.commands` that holds it, and what it does; a folder that is named as a command's second
-word is given as `./review`."""
+"""Command -> module of `v2p_data.commands` that holds it, and what it does; a folder of a second word's name is given
+as `./review`."""
 EXIT_CODES = {
     0: "made; videos that were rejected are listed, with reasons",
     1: "a check found something wrong (verify, status --check)",
@@ -127,7 +127,7 @@ def parse[T](kind: type[T], argv: list[str], command: str, default: T | None = N
 
 
 def command_of(provenances: Sequence[Mapping[str, Any]]) -> list[str] | None:
-    """Return the command line that the newest of these records was made by, with all its settings; None where it is not known."""
+    """Return the command line that made the newest of these records, with all its settings; None if it is not known."""
     newest = max(provenances, key=lambda made: str(made.get("time", "")), default={})
     argv = [str(word) for word in newest.get("argv", [])]
     return argv if argv[1:2] and argv[1] in COMMANDS else None
@@ -148,7 +148,8 @@ def _sentence(event: Any, kind: type, argv: list[str]) -> str:
     match event:
         case wrong.MissingArgs():
             unknown = "".join(f", and {word} is unknown" for word in event.unrecognized_tokens[:1])
-            return f"missing: {', '.join(a.arg.display_name() for a in event.missing_arguments)}{unknown}."
+            names = ", ".join(missing.arg.display_name() for missing in event.missing_arguments)
+            return f"missing: {names}{unknown}."
         case wrong.UnrecognizedArgs():
             word = event.tokens[0].partition("=")[0]
             close = difflib.get_close_matches(word, _options(kind), n=1)

@@ -698,7 +698,7 @@ def make_evaluation(
     tasks: Mapping[str, Path],
     seen: Sequence[str],
 ) -> dict[str, Any]:
-    """Judge many episodes of each task; write rates with their intervals, kinds of failure, films and contact sheets."""
+    """Judge many episodes of each task; write rates with intervals, kinds of failure, films and contact sheets."""
     from v2p_data.report.films import write_films
     from v2p_data.report.sheet import SheetConfig, write_contact_sheet
 

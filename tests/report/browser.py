@@ -10,8 +10,13 @@ from pathlib import Path
 from typing import Any
 
 CHROMIUM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
-)  # fmt: skip
+    (
+        found
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (found := shutil.which(name))
+    ),
+    None,
+)
 """None where this machine has none: tests that need it are skipped."""
 
 
@@ -35,13 +40,26 @@ class Browser:
 
         self._process = subprocess.Popen(
             [
-                *(str(CHROMIUM), "--headless=new", "--no-sandbox", "--disable-gpu", "--mute-audio"),
+                *(
+                    str(CHROMIUM),
+                    "--headless=new",
+                    "--no-sandbox",
+                    "--disable-gpu",
+                    "--mute-audio",
+                ),
                 *("--remote-debugging-pipe", f"--user-data-dir={self.home}", "--no-first-run"),
-                *("--disable-background-networking", "--disable-component-update", "--hide-scrollbars"),
+                *(
+                    "--disable-background-networking",
+                    "--disable-component-update",
+                    "--hide-scrollbars",
+                ),
                 *(f"--window-size={width},{height}", "about:blank"),
             ],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, close_fds=False, preexec_fn=wired,
-        )  # fmt: skip
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            close_fds=False,
+            preexec_fn=wired,
+        )
         os.close(to_browser)
         os.close(from_browser)
         self._buffer = b""
@@ -53,8 +71,12 @@ class Browser:
         self.call("Page.enable")
         self.call("Runtime.enable")
         self.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
-        )  # fmt: skip
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -66,16 +66,34 @@ class FakeRun:
         folder = self.folder("scene", item)
         trimesh.creation.cylinder(0.04, 0.1).export(folder / "mug.obj")
         mug = SceneObject(
-            name="mug", label="a mug", role="manipulated", shape="mesh", size_m=(0.08, 0.08, 0.1),
-            mass_kg=0.25, friction=0.7, hollow=True, mesh="mug.obj", rgba=(0.8, 0.3, 0.2, 1.0),
-            source={"size": "noun table: mug", "mass": "volume and density"}, frames=(0, 30),
-            poses_world=((0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)), confidences=(0.9, 0.81),
-        )  # fmt: skip
+            name="mug",
+            label="a mug",
+            role="manipulated",
+            shape="mesh",
+            size_m=(0.08, 0.08, 0.1),
+            mass_kg=0.25,
+            friction=0.7,
+            hollow=True,
+            mesh="mug.obj",
+            rgba=(0.8, 0.3, 0.2, 1.0),
+            source={"size": "noun table: mug", "mass": "volume and density"},
+            frames=(0, 30),
+            poses_world=(
+                (0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0),
+                (0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0),
+            ),
+            confidences=(0.9, 0.81),
+        )
         fields = {"title": item, "video": f"{item}.mp4", "description": caption, "kind": "lift_up"}
         Scene(
-            **(fields | more), objects=(mug,), fps=24.0, num_frames=48, confidence=0.77, warnings=("a weak shadow",),
+            **(fields | more),
+            objects=(mug,),
+            fps=24.0,
+            num_frames=48,
+            confidence=0.77,
+            warnings=("a weak shadow",),
             camera=Camera(width_px=64, height_px=48, K=np.eye(3), T_world_cam=np.eye(4)),
-        ).save(folder)  # fmt: skip
+        ).save(folder)
         (folder / "overlay.mp4").write_bytes(film())
         counts = {"kind": "lift_up", "objects": 1}
         return self.record(folder, counts=counts, recipe={"config": {"caption": caption}})
@@ -87,11 +105,26 @@ class FakeRun:
         audit = {
             "score": 0.85,
             "checks": [
-                {"name": "reset", "asks": text or "false at every reset?", "passed": True, "share": 0.0},
-                {"name": "becomes_true", "asks": "true after a plausible displacement?", "passed": True, "share": 0.071},
-                {"name": "flung", "asks": "false when it flies past?", "passed": False, "share": 0.25},
+                {
+                    "name": "reset",
+                    "asks": text or "false at every reset?",
+                    "passed": True,
+                    "share": 0.0,
+                },
+                {
+                    "name": "becomes_true",
+                    "asks": "true after a plausible displacement?",
+                    "passed": True,
+                    "share": 0.071,
+                },
+                {
+                    "name": "flung",
+                    "asks": "false when it flies past?",
+                    "passed": False,
+                    "share": 0.25,
+                },
             ],
-        }  # fmt: skip
+        }
         samples = [
             {"runnable": False, "error": text or "NameError: mug", "score": 0.0, "audit": {}},
             {"runnable": True, "error": "", "score": 0.85, "audit": audit},
@@ -168,9 +201,14 @@ class FakeRun:
         self.expert("lift_mug")
         self.episodes("lift_mug")
         self.rejected(
-            "scene", "shaky", "camera_moves", "the camera moves by 31 px; hold it still", 31.0,
-            recipe={"config": {"caption": "Pushing a box to the left"}}, seconds=1.5,
-        )  # fmt: skip
+            "scene",
+            "shaky",
+            "camera_moves",
+            "the camera moves by 31 px; hold it still",
+            31.0,
+            recipe={"config": {"caption": "Pushing a box to the left"}},
+            seconds=1.5,
+        )
         self.scene("tip_bottle", "Tipping a bottle over", kind="tip_over")
         self.task("tip_bottle")
         self.expert(
@@ -183,10 +221,24 @@ class FakeRun:
         self.policy()
         self.evaluation(
             [
-                {"task": "lift_mug", "seen": True, "successes": 15, "trials": 20, "low": 0.531, "high": 0.888},
-                {"task": "unseen_lift", "seen": False, "successes": 4, "trials": 20, "low": 0.081, "high": 0.416},
+                {
+                    "task": "lift_mug",
+                    "seen": True,
+                    "successes": 15,
+                    "trials": 20,
+                    "low": 0.531,
+                    "high": 0.888,
+                },
+                {
+                    "task": "unseen_lift",
+                    "seen": False,
+                    "successes": 4,
+                    "trials": 20,
+                    "low": 0.081,
+                    "high": 0.416,
+                },
             ]
-        )  # fmt: skip
+        )
         return self
 
 
@@ -207,9 +259,17 @@ def episode(name: str, item: str, num_frames=40) -> Episode:
         labels[t, 40:52, 26:38] = 2
     action = np.sin(np.linspace(0, 6, num_frames)[:, None] + np.arange(7)).astype(np.float32)
     return Episode(
-        id=name, item=item, task="Lifting a mug", seed=1, labels=labels, action=action, objects=("mug",),
-        state=np.zeros((num_frames, 11), np.float32), success=np.arange(num_frames) > 30, referee=True,
-    )  # fmt: skip
+        id=name,
+        item=item,
+        task="Lifting a mug",
+        seed=1,
+        labels=labels,
+        action=action,
+        objects=("mug",),
+        state=np.zeros((num_frames, 11), np.float32),
+        success=np.arange(num_frames) > 30,
+        referee=True,
+    )
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,7 @@ import trimesh
 
 from v2p_data.report.media import (
     MediaBudget,
+    Medium,
     draw_mesh,
     film_uri,
     frames_uri,
@@ -122,8 +123,8 @@ def test_the_top_of_a_box_is_lighter_than_its_sides():
 def test_the_budget_refuses_what_does_not_fit_and_names_it():
     budget = MediaBudget(max_bytes=10)
 
-    assert budget.admit("123456", "one") == "123456"
-    assert budget.admit("123456", "two") is None
-    assert budget.admit("1234", "three") == "1234"
-    assert budget.admit(None, "none") is None
+    assert budget.admit("123456", "one", "a box") == Medium(uri="123456", alt="a box")
+    assert budget.admit("123456", "two", "a box") is None
+    assert budget.admit("1234", "three", "a film", is_film=True) is not None
+    assert budget.admit(None, "none", "a box") is None
     assert budget.left_out == ["two"]

@@ -80,22 +80,48 @@ def test_the_summary_holds_the_numbers_that_matter(whole):
 
 def test_each_video_has_its_caption_objects_task_expert_and_episodes(whole):
     for words in (
-        "Lifting a mug", "8.0 \u00d7 8.0 \u00d7 10.0", "noun table: mug", "250 g", "volume and density", "a weak shadow",
-        "class LiftMug(Task):", "false at every reset?", "after 7.1 cm", "true in 25 % of moments",
-        "2 task codes were tried", "1, picked", "Written by the model gpt-4o, picked by the audit.", "NameError: mug", "60 of 64, 95 % interval 85 % to 98 %", "Success while training",
-        "lift_mug_0000", "lift_mug_0002", "3 episodes were kept from 5 rollouts", "background 0, robot 64, mug 128", "gripper",
-    ):  # fmt: skip
+        "Lifting a mug",
+        "8.0 \u00d7 8.0 \u00d7 10.0",
+        "noun table: mug",
+        "250 g",
+        "volume and density",
+        "a weak shadow",
+        "class LiftMug(Task):",
+        "false at every reset?",
+        "after 7.1 cm",
+        "true in 25 % of moments",
+        "2 task codes were tried",
+        "1, picked",
+        "Written by the model gpt-4o, picked by the audit.",
+        "NameError: mug",
+        "60 of 64, 95 % interval 85 % to 98 %",
+        "Success while training",
+        "lift_mug_0000",
+        "lift_mug_0002",
+        "3 episodes were kept from 5 rollouts",
+        "background 0, robot 64, mug 128",
+        "gripper",
+    ):
         assert words in whole.text
     alts = [a["alt"] for a in whole.of("img")] + [a["aria-label"] for a in whole.of("video")]
-    for start in ("Mesh of a mug", "Contact sheet", "The video 'lift_mug.mp4'", "Segmentation masks of episode lift_mug_0000"):  # fmt: skip
+    for start in (
+        "Mesh of a mug",
+        "Contact sheet",
+        "The video 'lift_mug.mp4'",
+        "Segmentation masks of episode lift_mug_0000",
+    ):
         assert any(str(alt).startswith(start) for alt in alts)
 
 
 def test_rejections_are_listed_with_reason_and_number(whole):
     for words in (
-        "camera moves", "the camera moves by 31 px; hold it still", "expert not learned", "not successful",
-        "0.25 to 0.5", "2 results of a stage and 2 episodes did not pass",
-    ):  # fmt: skip
+        "camera moves",
+        "the camera moves by 31 px; hold it still",
+        "expert not learned",
+        "not successful",
+        "0.25 to 0.5",
+        "2 results of a stage and 2 episodes did not pass",
+    ):
         assert words in whole.text
 
 
@@ -116,9 +142,14 @@ def test_time_machine_cost_and_commands_are_there(whole):
     total = 12 + 3 + 95 + 42 + 1.5 + 12 + 3 + 95 + 12 + 3 + 30 + 400 + 200
 
     for words in (
-        f"{int(total // 60)} min {round(total % 60):02d} s of work", "0 calls of language models, 0 tokens", "mujoco 4.0.0",
-        "v2p generate 'my videos'", "LeRobotDataset('anna/demo', root=", "v2p train", "v2p eval",
-    ):  # fmt: skip
+        f"{int(total // 60)} min {round(total % 60):02d} s of work",
+        "0 calls of language models, 0 tokens",
+        "mujoco 4.0.0",
+        "v2p generate 'my videos'",
+        "LeRobotDataset('anna/demo', root=",
+        "v2p train",
+        "v2p eval",
+    ):
         assert words in whole.text
 
 
@@ -350,8 +381,15 @@ def test_a_page_that_finds_no_room_ends_in_a_sentence_and_leaves_the_old_one(run
 
 @pytest.mark.parametrize(
     ("seconds", "words"),
-    [(0.42, "0.4 s"), (9.96, "10 s"), (59.6, "1 min 00 s"), (190.0, "3 min 10 s"), (3900.0, "1 h 05 min"), (None, "-")],
-)  # fmt: skip
+    [
+        (0.42, "0.4 s"),
+        (9.96, "10 s"),
+        (59.6, "1 min 00 s"),
+        (190.0, "3 min 10 s"),
+        (3900.0, "1 h 05 min"),
+        (None, "-"),
+    ],
+)
 def test_durations_are_words(seconds, words):
     assert duration(seconds).replace(NO_BREAK, " ") == words
 

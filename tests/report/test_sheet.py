@@ -32,8 +32,11 @@ def a_row(value: int, *, succeeded: bool, count=3) -> Row:
     frames = np.zeros((count, 80, 80, 3), np.uint8)
     frames[:] = (value + np.arange(count) * 10)[:, None, None, None]
     return Row(
-        label=f"world {value}", succeeded=succeeded, frames=frames, seconds=tuple(0.5 * k for k in range(count)),
-    )  # fmt: skip
+        label=f"world {value}",
+        succeeded=succeeded,
+        frames=frames,
+        seconds=tuple(0.5 * k for k in range(count)),
+    )
 
 
 def thumbnail(sheet: np.ndarray, row: int, column: int) -> np.ndarray:
@@ -109,14 +112,29 @@ class Judged:
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> World:
     box = SceneObject(
-        name="box", label="a box", role="manipulated", shape="box", size_m=(0.08, 0.08, 0.08), mass_kg=0.1,
-        friction=0.8, rgba=(0.9, 0.1, 0.1, 1.0), frames=(0,), poses_world=((0.0, 0.0, 0.04, 1.0, 0.0, 0.0, 0.0),),
-    )  # fmt: skip
+        name="box",
+        label="a box",
+        role="manipulated",
+        shape="box",
+        size_m=(0.08, 0.08, 0.08),
+        mass_kg=0.1,
+        friction=0.8,
+        rgba=(0.9, 0.1, 0.1, 1.0),
+        frames=(0,),
+        poses_world=((0.0, 0.0, 0.04, 1.0, 0.0, 0.0, 0.0),),
+    )
     scene = Scene(
-        title="sheet", video="a.mp4", description="lifting a box", kind="lift_up", objects=(box,), fps=20.0,
-        num_frames=2, confidence=1.0, folder=tmp_path_factory.mktemp("scene"),
+        title="sheet",
+        video="a.mp4",
+        description="lifting a box",
+        kind="lift_up",
+        objects=(box,),
+        fps=20.0,
+        num_frames=2,
+        confidence=1.0,
+        folder=tmp_path_factory.mktemp("scene"),
         camera=Camera(width_px=64, height_px=48, K=np.eye(3), T_world_cam=np.eye(4)),
-    )  # fmt: skip
+    )
     return build_world(scene, FINE)
 
 

@@ -277,13 +277,19 @@ def _odd_labels() -> dict[str, Any]:
         "one_without_label": [{"id": 7}, {"id": stem, "label": "lifting red box up"}],
         "none_with_label": [{"id": stem}, {"id": 8}],
         "without_id": [{"label": "lifting"}, {"id": stem, "label": "lifting red box up"}],
-        "odd_ids": [{"id": None, "label": "x"}, {"id": [1], "label": "x"}, {"id": 1.5, "label": "x"}],
+        "odd_ids": [
+            {"id": None, "label": "x"},
+            {"id": [1], "label": "x"},
+            {"id": 1.5, "label": "x"},
+        ],
         "too_few": [{"id": stem, "template": slots, "placeholders": ["red box"]}],
         "too_many": [{"id": stem, "template": slots, "placeholders": ["a", "b", "c"]}],
         "none": [{"id": stem, "template": slots}],
         "brackets": [{"id": stem, "template": slots, "placeholders": ["box [red]", "can"]}],
         "equal": [{"id": stem, "template": slots, "placeholders": ["cup", "cup"]}],
-        "three_equal": [{"id": stem, "label": "cup Cup CUP", "placeholders": ["cup", "Cup", "CUP"]}],
+        "three_equal": [
+            {"id": stem, "label": "cup Cup CUP", "placeholders": ["cup", "Cup", "CUP"]}
+        ],
         "empty_words": [{"id": stem, "label": "lifting red box", "placeholders": [""]}],
         "placeholders_of_text": [{"id": stem, "label": "lifting red box", "placeholders": "box"}],
         "label_of_numbers": [{"id": stem, "label": 3, "placeholders": ["box"]}],
@@ -293,7 +299,7 @@ def _odd_labels() -> dict[str, Any]:
         "unrelated": {"a": 1},
         "numbers": [1, 2, 3],
         "deep": b"[" * 100_000,
-    }  # fmt: skip
+    }
 
 
 def _odd_boxes() -> dict[str, Any]:

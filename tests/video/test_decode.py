@@ -491,7 +491,7 @@ def set_times(path, times_ms):
         ([t - 40 * (i % 2) for i, t in enumerate(STEPS)], 0),
     ],
     ids=["a minute on", "one far off", "from 0", "early from 0", "stands", "back", "twice each"],
-)  # fmt: skip
+)
 def test_pictures_follow_one_another_where_the_clock_does_not(film, times_ms, jump):
     path = set_times(film("clock.flv", squares(40, 96, 256), codec="flv", fps=25), times_ms)
 

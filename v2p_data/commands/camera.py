@@ -49,21 +49,23 @@ def camera_command(argv: list[str]) -> int:
     ]
     if len(clips) < FEWEST:
         raise V2PError(
-            f"{args.run} holds {len(clips)} scenes whose camera was guessed, and it takes at least {FEWEST} to know it better; "
-            "make them with 'v2p scene VIDEOS --out RUN', without settings for the camera"
+            f"{args.run} holds {len(clips)} scenes whose camera was guessed, and it takes at least {FEWEST} to know it"
+            " better; make them with 'v2p scene VIDEOS --out RUN', without settings for the camera"
         )
     camera = shared_camera(clips)
     print(table(clips, camera))  # noqa: T201
     for item in camera.strangers:
         print(  # noqa: T201
-            f"'{item}' seems to be filmed from elsewhere, or to be misunderstood: look at it, and name it with --without"
+            f"'{item}' seems to be filmed from elsewhere, or to be misunderstood: look at it, and name it with"
+            " --without"
         )
     records = [record.provenance for _, record in scenes.values()]
     again = command_of(records) or ["v2p", "scene", "VIDEOS", "--out", str(args.run)]
     print(f"Next: {shlex.join([*again, *flags(camera)])}")  # noqa: T201
     if args.without:
         print(  # noqa: T201
-            f"That gives this camera to all videos of the folder: take those of {', '.join(args.without)} out of it before"
+            "That gives this camera to all videos of the folder: take those of"
+            f" {', '.join(args.without)} out of it before"
         )
     return 0
 
@@ -104,8 +106,9 @@ def table(clips: Sequence[Filmed], camera: SharedCamera) -> str:
         )
     one = float(np.median([clip.width_sd for clip in clips]))
     lines += [
-        f"{len(clips)} clips from one stand: the camera is {camera.height_m:.2f} m above the table, looks {np.degrees(camera.pitch_rad):.0f} "
-        f"degrees down and sees {np.degrees(camera.fov_rad):.0f} degrees from left to right",
+        f"{len(clips)} clips from one stand: the camera is {camera.height_m:.2f} m above the table, looks "
+        f"{np.degrees(camera.pitch_rad):.0f} degrees down and sees {np.degrees(camera.fov_rad):.0f} degrees "
+        "from left to right",
         f"all lengths may be off by {camera.spread:.0%} together, instead of {one:.0%} clip by clip",
     ]
     return "\n".join(lines)

@@ -27,9 +27,15 @@ class Progress:
         self.path, self.show, self.written = runtime.root / PROGRESS_FILE, show, 0.0
         before = json_or_none(self.path)
         is_ours = isinstance(before, dict) and before.get("pid") == os.getpid()
-        self.data: dict[str, Any] = before if is_ours else {
-            "pid": os.getpid(), "began": time.time(), "stages": {},
-        }  # fmt: skip
+        self.data: dict[str, Any] = (
+            before
+            if is_ours
+            else {
+                "pid": os.getpid(),
+                "began": time.time(),
+                "stages": {},
+            }
+        )
         self.data["workers"] = runtime.workers
         planned = Counter(stage.name for stage in in_order(stages))
         self.data["stages"] |= {
@@ -83,6 +89,8 @@ def progress_of(root: Path) -> dict[str, Any]:
         counts["running"] = counts["running"] if at_work else []
     parts = [counts["seconds_left"] for counts in data["stages"].values()]
     return {
-        "run": str(root), "at_work": at_work, **data,
+        "run": str(root),
+        "at_work": at_work,
+        **data,
         "seconds_left": None if None in parts else sum(parts),
-    }  # fmt: skip
+    }

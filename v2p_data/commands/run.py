@@ -344,8 +344,8 @@ def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Pat
         and cfg.policy.encoder == "resnet18"
     ):
         print(  # noqa: T201
-            "ResNet18 trains for hours to days on a CPU; --policy.preset=small --policy.steps=4000 --policy.batch-size=256 "
-            "takes minutes",
+            "ResNet18 trains for hours to days on a CPU; --policy.preset=small --policy.steps=4000"
+            " --policy.batch-size=256 takes minutes",
             file=sys.stderr,
         )
     stage = policy_stage(dataset.resolve(), record, cfg, sources)
@@ -465,9 +465,15 @@ def _record_to_train(dataset: Path, root: Path) -> tuple[Record, bool]:
         return _dataset_record(dataset), True
     listed = {name: mark.sha256 for name, mark in list_files(dataset).items()}
     return Record(
-        stage="dataset", item=dataset.resolve().name, version=0, fingerprint=fingerprint(listed)[:8],
-        recipe={}, inputs={}, seconds=0.0, counts={"repo_id": about["repo_id"]},
-    ), False  # fmt: skip
+        stage="dataset",
+        item=dataset.resolve().name,
+        version=0,
+        fingerprint=fingerprint(listed)[:8],
+        recipe={},
+        inputs={},
+        seconds=0.0,
+        counts={"repo_id": about["repo_id"]},
+    ), False
 
 
 def _home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
@@ -534,6 +540,7 @@ def _up_to(
     stages = stages if name == "scene" else family
     counts = tally(list(outcomes.values()), name)
     rest = ", ".join(f"{n} {status}" for status, n in counts.items() if status != "usable")
+    made = "videos" if len(family) == len(stages) else "tasks of videos and cousins"
     if name == "scene" and not counts["usable"]:
         then = f"v2p scene review {shlex.quote(str(args.out))}   (to mark what was not found)"
     else:
@@ -541,7 +548,7 @@ def _up_to(
         then = _goes_on(then, args.videos, args, "--out", str(args.out)) + repo
     _say(
         f"Made {root / name}",
-        f"{counts['usable']} of {len(stages)} {'videos' if len(family) == len(stages) else 'tasks of videos and cousins'}{f' ({rest})' if rest else ''}; page: {page}",
+        f"{counts['usable']} of {len(stages)} {made}{f' ({rest})' if rest else ''}; page: {page}",
         then,
     )
     return exit_code(outcomes.values(), is_made=bool(counts["usable"]))
@@ -555,7 +562,10 @@ def _tell_cousins(outcomes: Iterable[Outcome]) -> None:
         if mark and number.isdecimal():
             of_family.setdefault(family, {}).setdefault(number, []).append(outcome)
     for family, cousins in of_family.items():
-        bad = [next((o for o in made if o.status in ("failed", "rejected")), None) for made in cousins.values()]  # fmt: skip
+        bad = [
+            next((o for o in made if o.status in ("failed", "rejected")), None)
+            for made in cousins.values()
+        ]
         why = Counter(o.reason or o.status for o in bad if o is not None)
         first = {o.reason: o.detail for o in reversed(bad) if o is not None}
         reasons = "; ".join(
@@ -593,7 +603,7 @@ def _goes_on(command: str, source: Path, args: Settings, *more: str) -> str:
 
 
 def _videos(folder: Path) -> list[VideoItem]:
-    """Return a folder's videos; say what was passed over, and which of them nobody describes: the caption names what is looked for."""
+    """Return a folder's videos; say what was passed over, and which videos have no caption."""
     footage = read_footage(folder)
     for note in footage.notes:
         print(note, file=sys.stderr)  # noqa: T201

@@ -19,8 +19,8 @@ from v2p_data.scene.preset import UNWANTED_FILES, checkpoints_of, missing, told,
 @dataclass(frozen=True, kw_only=True)
 class Setup:
     model: tyro.conf.Positional[Literal["hands", "outlines", "learned"] | None] = None
-    """Which to set up: MediaPipe finds hands, MobileSAM outlines objects, `learned` are the models of --scene.preset=learned.
-    What is there already is kept. Without a name all are listed."""
+    """Which to set up: MediaPipe finds hands, MobileSAM outlines objects, `learned` are the models of
+    --scene.preset=learned. What is there already is kept. Without a name all are listed."""
 
 
 def setup_command(argv: list[str]) -> int:
@@ -66,8 +66,8 @@ def fetch_learned(models: Sequence[str]) -> None:
             fetch_model(model, ignore=UNWANTED_FILES)
     except V2PError as error:
         raise V2PError(
-            f"{error}. Without a network, copy the Hub's cache folder (HF_HOME) from a machine that has them, or name folders"
-            " with --scene.ground.model, --scene.segment.model and --scene.depth.model"
+            f"{error}. Without a network, copy the Hub's cache folder (HF_HOME) from a machine that has them, or name"
+            " folders with --scene.ground.model, --scene.segment.model and --scene.depth.model"
         ) from error
 
 

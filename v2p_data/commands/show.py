@@ -15,7 +15,7 @@ from v2p_data.task.task import TASK_FILE, TaskBundle
 @dataclass(frozen=True, kw_only=True)
 class Show:
     path: tyro.conf.Positional[Path]
-    """Folder of a task, of a reward search or of one candidate in it; or of a run: then all of its tasks and searches."""
+    """Folder of a task, of a reward search or of one candidate in it; of a run: all of its tasks and searches."""
     candidate: int | None = None
     """Number of the candidate of a search to show; by default the chosen one."""
 

@@ -92,8 +92,15 @@ def _row(stage: str, folder: Path, *, check: bool) -> Row | None:
     except OSError as error:
         return stage, item, "damaged", f"{folder} cannot be read ({error.strerror})"
     if record.rejected:
-        return stage, record.item, "rejected", f"{record.rejected.get('reason')}: {record.rejected.get('detail')}"  # fmt: skip
-    counts = ", ".join(f"{k} {v}" for k, v in record.counts.items() if isinstance(v, int | float | str))  # fmt: skip
+        return (
+            stage,
+            record.item,
+            "rejected",
+            f"{record.rejected.get('reason')}: {record.rejected.get('detail')}",
+        )
+    counts = ", ".join(
+        f"{k} {v}" for k, v in record.counts.items() if isinstance(v, int | float | str)
+    )
     return stage, record.item, f"{record.seconds:.0f} s", counts
 
 

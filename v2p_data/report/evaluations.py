@@ -57,15 +57,25 @@ def _row(
 ) -> EvaluationRow:
     task, judged = str(row.get("task", "")), str(row.get("judged", POLICY))
     place = folder / VIDEOS_FOLDER / task
+    tries = f"{_who(judged)} tries {task}"
     films = [
-        Medium(uri=uri, alt=f"{_who(judged)} tries {task}: {path.stem}", is_film=True)
+        film
         for path in _films(place, folder)[: cfg.max_rollouts_per_task]
-        if (uri := budget.admit(film_uri(path, 320, cfg.max_film_frames), f"{task}: {path.name}"))
+        if (
+            film := budget.admit(
+                film_uri(path, 320, cfg.max_film_frames),
+                f"{task}: {path.name}",
+                f"{tries}: {path.stem}",
+                is_film=True,
+            )
+        )
     ]
     sheet = None
     if place.resolve().is_relative_to(folder.resolve()):
         sheet = budget.admit(
-            picture_uri(place / SHEET_FILE, cfg.sheet_width_px), f"contact sheet of {task}"
+            picture_uri(place / SHEET_FILE, cfg.sheet_width_px),
+            f"contact sheet of {task}",
+            f"{tries}: contact sheet, an episode per row, successes first",
         )
     failures = as_dict(row.get("failures"))
     return EvaluationRow(
@@ -77,12 +87,7 @@ def _row(
         failures=[(kind, int(count)) for kind, n in failures.items() if (count := number(n))],
         median_success_s=number(row.get("median_success_s")),
         films=films,
-        sheet=Medium(
-            uri=sheet,
-            alt=f"{_who(judged)} tries {task}: contact sheet, an episode per row, successes first",
-        )
-        if sheet
-        else None,
+        sheet=sheet,
     )
 
 

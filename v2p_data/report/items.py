@@ -45,39 +45,6 @@ STRIP_MOMENTS = 6
 """Masks side by side, for those who do not press play."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ObjectView:
-    obj: SceneObject
-    picture: Medium | None
-    confidence: float | None
-    """The lowest over the frames that have a pose."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EpisodeView:
-    """One demonstration: what the policy sees and what the expert did."""
-
-    name: str
-    film: Medium | None
-    strip: Medium | None
-    """Moments from the first frame to the last, side by side."""
-    charts: list[Markup]
-    num_frames: int
-    greys: str
-    referee: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class SampleView:
-    """One of the task codes that were written."""
-
-    is_picked: bool
-    runnable: bool
-    score: float | None
-    trouble: str
-    """Why it was not better: an error, a veto, the checks that failed."""
-
-
 @dataclass(kw_only=True)
 class ItemView:
     """One video, from its caption to its episodes."""
@@ -93,11 +60,12 @@ class ItemView:
     results: dict[str, Result | None] = field(default_factory=dict[str, Result | None])
     scene: Scene | None = None
     overlay: list[Medium] = field(default_factory=list[Medium])
-    objects: list[ObjectView] = field(default_factory=list[ObjectView])
+    objects: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     code: str = ""
     task: dict[str, Any] = field(default_factory=dict[str, Any])
     audit: AuditView | None = None
-    samples: list[SampleView] = field(default_factory=list[SampleView])
+    samples: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    """The task codes that were written."""
     pick: str = ""
     """Who wrote and who picked, and what picking was good for."""
     reward: RewardView | None = None
@@ -106,14 +74,21 @@ class ItemView:
     """Who made the expert, and what PPO changed, in a sentence or two."""
     charts: list[Markup] = field(default_factory=list[Markup])
     sheet: Medium | None = None
-    episodes: list[EpisodeView] = field(default_factory=list[EpisodeView])
+    episodes: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    """Demonstrations: what the policy sees and what the expert did."""
     notes: list[str] = field(default_factory=list[str])
     """What could not be read, one sentence each."""
 
 
 def item_view(
-    run: Run, item: str, anchor: str, is_held_out: bool, is_shown: bool, cfg: PageConfig, budget: MediaBudget
-) -> ItemView:  # fmt: skip
+    run: Run,
+    item: str,
+    anchor: str,
+    is_held_out: bool,
+    is_shown: bool,
+    cfg: PageConfig,
+    budget: MediaBudget,
+) -> ItemView:
     view = ItemView(
         anchor=anchor,
         item=item,
@@ -156,26 +131,24 @@ def _add_scene(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBud
         return
     film = film_uri(result.folder / "overlay.mp4", cfg.film_width_px, cfg.max_film_frames)
     about = f"The video '{scene.video}' with outlines of what was understood"
-    if uri := budget.admit(film, f"overlay of {view.item}"):
-        view.overlay.append(Medium(uri=uri, alt=about, is_film=True))
-    else:
-        for name, when in (("overlay_first.png", "first"), ("overlay_last.png", "last")):
-            picture = picture_uri(result.folder / name, cfg.film_width_px)
-            if uri := budget.admit(picture, f"{when} overlay of {view.item}"):
-                view.overlay.append(Medium(uri=uri, alt=f"{about}, {when} frame"))
-    for obj in scene.objects:
-        picture = budget.admit(
-            _mesh_picture(result.folder, obj, cfg.mesh_size_px), f"mesh of {obj.name}"
-        )
-        view.objects.append(
-            ObjectView(
-                obj=obj,
-                picture=Medium(uri=picture, alt=f"Mesh of {obj.label or obj.name}")
-                if picture
-                else None,
-                confidence=min(obj.confidences) if obj.confidences else None,
+    shown = [budget.admit(film, f"overlay of {view.item}", about, is_film=True)]
+    if shown == [None]:
+        shown = [
+            budget.admit(
+                picture_uri(result.folder / f"overlay_{when}.png", cfg.film_width_px),
+                f"{when} overlay of {view.item}",
+                f"{about}, {when} frame",
             )
-        )
+            for when in ("first", "last")
+        ]
+    view.overlay = [medium for medium in shown if medium]
+    for obj in scene.objects:
+        mesh = _mesh_picture(result.folder, obj, cfg.mesh_size_px)
+        about = f"Mesh of {obj.label or obj.name}"
+        # The lowest confidence over the frames that have a pose.
+        confidence = min(obj.confidences) if obj.confidences else None
+        picture = budget.admit(mesh, f"mesh of {obj.name}", about)
+        view.objects.append({"obj": obj, "picture": picture, "confidence": confidence})
 
 
 def _mesh_picture(folder: Path, obj: SceneObject, size_px: int) -> str | None:
@@ -187,7 +160,8 @@ def _mesh_picture(folder: Path, obj: SceneObject, size_px: int) -> str | None:
         return None
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
-        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)  # pyright: ignore[reportAttributeAccessIssue]
+        vertices = np.asarray(mesh.vertices, float)  # pyright: ignore[reportAttributeAccessIssue]
+        faces = np.asarray(mesh.faces, int)  # pyright: ignore[reportAttributeAccessIssue]
     except (ValueError, IndexError, KeyError, AttributeError, TypeError):
         return None
     if not len(faces) or not np.isfinite(vertices).all():
@@ -215,14 +189,11 @@ def _add_expert(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBu
     view.rate = rate_of(counts.get("success"))
     view.made_by = _made_by(as_dict(counts.get("learning")))
     view.charts = training_charts(read_curve(result.folder / "curve.csv"))
-    uri = budget.admit(
+    view.sheet = budget.admit(
         picture_uri(result.folder / "sheet.png", cfg.sheet_width_px),
         f"contact sheet of {view.item}",
+        "Contact sheet of the expert's episodes: a row each, eight moments from left to right",
     )
-    if uri:
-        view.sheet = Medium(
-            uri=uri, alt="Contact sheet of the expert's episodes: a row each, eight moments from left to right"
-        )  # fmt: skip
 
 
 def _add_episodes(view: ItemView, result: Result, cfg: PageConfig, budget: MediaBudget) -> None:
@@ -235,52 +206,43 @@ def _add_episodes(view: ItemView, result: Result, cfg: PageConfig, budget: Media
             view.notes.append(str(error))
 
 
-def _episode_view(episode: Episode, cfg: PageConfig, budget: MediaBudget) -> EpisodeView:
+def _episode_view(episode: Episode, cfg: PageConfig, budget: MediaBudget) -> dict[str, Any]:
     from v2p_data.sim.render.masks import label_names, labels_to_rgb
 
     names = label_names(episode.objects)
     greys = labels_to_rgb(np.arange(len(names), dtype=np.uint8)[None])[0, :, 0]
-    uri = budget.admit(
-        frames_uri(labels_to_rgb(episode.labels), float(FPS)), f"masks of episode {episode.id}"
-    )
+    film = frames_uri(labels_to_rgb(episode.labels), float(FPS))
     moments = np.linspace(0, episode.num_frames - 1, STRIP_MOMENTS).round().astype(int)
-    strip = budget.admit(
-        png_uri(labels_to_rgb(np.concatenate([*episode.labels[moments, ::2, ::2]], axis=1))),
-        f"moments of episode {episode.id}",
-    )
+    strip = png_uri(labels_to_rgb(np.concatenate([*episode.labels[moments, ::2, ::2]], axis=1)))
     seconds = np.arange(episode.num_frames) / FPS
     steps = episode.simulated.get(EXECUTED_KEY, episode.action)
     lines = [
         Line(name=name.split(".")[0].replace("_", " "), x=seconds, y=steps[:, k].astype(float))
         for k, name in enumerate(ACTION_NAMES)
-    ]  # fmt: skip
-    return EpisodeView(
-        name=episode.id,
-        film=Medium(uri=uri, alt=f"Segmentation masks of episode {episode.id}", is_film=True)
-        if uri
-        else None,
-        strip=Medium(uri=strip, alt=f"Masks of episode {episode.id} at {STRIP_MOMENTS} moments")
-        if strip
-        else None,
-        charts=[
-            line_chart(
-                group,
-                title=title,
-                x_label="time [s]",
-                y_range=(-1.0, 1.0),
-                width_px=320,
-                height_px=100,
-            )
-            for title, group in (
-                ("Action: position", lines[:3]),
-                ("Action: rotation", lines[3:6]),
-                ("Action: gripper", lines[6:]),
-            )
+    ]
+    size = {"y_range": (-1.0, 1.0), "width_px": 320, "height_px": 100}
+    parts = {"position": lines[:3], "rotation": lines[3:6], "gripper": lines[6:]}
+    return {
+        "name": episode.id,
+        "film": budget.admit(
+            film,
+            f"masks of episode {episode.id}",
+            f"Segmentation masks of episode {episode.id}",
+            is_film=True,
+        ),
+        "strip": budget.admit(
+            strip,
+            f"moments of episode {episode.id}",
+            f"Masks of episode {episode.id} at {STRIP_MOMENTS} moments",
+        ),
+        "charts": [
+            line_chart(group, title=f"Action: {part}", x_label="time [s]", **size)
+            for part, group in parts.items()
         ],
-        num_frames=episode.num_frames,
-        greys=", ".join(f"{names[k].replace('_', ' ')} {greys[k]}" for k in sorted(names)),
-        referee=episode.referee,
-    )
+        "num_frames": episode.num_frames,
+        "greys": ", ".join(f"{names[k].replace('_', ' ')} {greys[k]}" for k in sorted(names)),
+        "referee": episode.referee,
+    }
 
 
 def _note_older_inputs(view: ItemView) -> None:
@@ -300,17 +262,17 @@ def _note_older_inputs(view: ItemView) -> None:
 # --- pieces --------------------------------------------------------------------------------------------------
 
 
-def _sample_view(sample: Mapping[str, Any], is_picked: bool) -> SampleView:
+def _sample_view(sample: Mapping[str, Any], is_picked: bool) -> dict[str, Any]:
+    """Return one of the task codes, with why it was not better: an error, a veto, the checks that failed."""
     audit = as_dict(sample.get("audit"))
-    failed = [
-        str(c.get("asks")) for c in as_dicts(audit.get("checks")) if c.get("passed") is not True
-    ]
-    return SampleView(
-        is_picked=is_picked,
-        runnable=sample.get("runnable") is True,
-        score=number(sample.get("score")),
-        trouble=str(sample.get("error") or audit.get("vetoed") or " ".join(failed)),
-    )
+    checks = as_dicts(audit.get("checks"))
+    failed = [str(c.get("asks")) for c in checks if c.get("passed") is not True]
+    return {
+        "is_picked": is_picked,
+        "runnable": sample.get("runnable") is True,
+        "score": number(sample.get("score")),
+        "trouble": str(sample.get("error") or audit.get("vetoed") or " ".join(failed)),
+    }
 
 
 def _made_by(learning: Mapping[str, Any]) -> str:

@@ -55,15 +55,17 @@ class MediaBudget:
     left_out: list[str] = field(default_factory=list[str])
     """Names of the media that did not fit."""
 
-    def admit(self, uri: str | None, name: str) -> str | None:
-        """Return the URI if it fits, else None, and remember which."""
+    def admit(
+        self, uri: str | None, name: str, alt: str, *, is_film: bool = False
+    ) -> Medium | None:
+        """Return the medium if it fits, else None, and remember its name."""
         if uri is None:
             return None
         if self.used_bytes + len(uri) > self.max_bytes:
             self.left_out.append(name)
             return None
         self.used_bytes += len(uri)
-        return uri
+        return Medium(uri=uri, alt=alt, is_film=is_film)
 
 
 def picture_uri(path: Path, max_width_px: int) -> str | None:

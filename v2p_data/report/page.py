@@ -40,15 +40,6 @@ PAGE_FILE = "report.html"
 TEMPLATE_FILE = "page.html"
 
 
-@dataclass(frozen=True, kw_only=True)
-class StageTime:
-    stage: str
-    num_items: int
-    seconds: float
-    share: float
-    """Share of the longest stage's time, for the bar."""
-
-
 def write_page(root: Path, out: Path | None = None, cfg: PageConfig | None = None) -> Path:
     """Write a run's page and return its path, `root/report.html` unless told otherwise.
 
@@ -69,7 +60,8 @@ def write_page(root: Path, out: Path | None = None, cfg: PageConfig | None = Non
             temporary.unlink()
         why = write_refusal(error) or str(error) or "memory does not suffice"
         raise V2PError(
-            f"cannot write the page {path}: {why}, then run 'v2p report {shlex.quote(str(root))}'; what the run made is kept"
+            f"cannot write the page {path}: {why}, then run 'v2p report {shlex.quote(str(root))}';"
+            " what the run made is kept"
         ) from error
     return path
 
@@ -94,11 +86,11 @@ def render_page(root: Path, cfg: PageConfig) -> str:
     environment.filters.update(
         duration=duration, percent=percent, words=lambda s: str(s).replace("_", " ")
     )
-    provenance = _newest_provenance(run)
+    provenance, figures = _newest_provenance(run), _figures(run, items, evaluation)
     page = environment.get_template(TEMPLATE_FILE).render(
         title=root.resolve().name,
-        summary=_summary(run, items, evaluation),
-        figures=_key_figures(run, items, evaluation),
+        summary=_summary(figures),
+        figures=_key_figures(figures),
         items=items,
         item_stages=[s for s in ITEM_STAGES if s != "reward" or run.of_stage(s)],
         joint=[r for stage in JOINT_STAGES for r in run.of_stage(stage)],
@@ -130,66 +122,89 @@ def _grouped(count: int) -> str:
     return f"{count:,}".replace(",", "\u202f")
 
 
-def _summary(run: Run, items: Sequence[ItemView], evaluation: Sequence[EvaluationRow]) -> str:
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """The numbers that matter."""
+
+    videos: int
+    """Without those that are held out to judge the policy."""
+    made: dict[str, int]
+    """How many of them came through each stage."""
+    has_experts: bool
+    datasets: list[tuple[str, int, int]]
+    """Name, episodes, frames."""
+    policy: dict[bool, tuple[int, int]]
+    """Successes and trials of the policy, on tasks that it has seen and on those it has not."""
+
+
+def _figures(run: Run, items: Sequence[ItemView], evaluation: Sequence[EvaluationRow]) -> Figures:
+    own = [v.results for v in items if not v.is_held_out]
+    counts = [(r.item, r.counts) for r in run.made("dataset")]
+    rates = {
+        is_seen: [r.rate for r in evaluation if r.is_policy and r.is_seen == is_seen]
+        for is_seen in (True, False)
+    }
+    return Figures(
+        videos=len(own),
+        made={
+            stage: sum((r := results[stage]) is not None and r.status == "made" for results in own)
+            for stage in ("scene", "task", "expert")
+        },
+        has_experts=any(results["expert"] for results in own),
+        datasets=[
+            (
+                str(c.get("repo_id", item)),
+                *(int(number(c.get(k)) or 0) for k in ("episodes", "frames")),
+            )
+            for item, c in counts
+        ],
+        policy={
+            is_seen: (sum(r.successes for r in of_kind), sum(r.trials for r in of_kind))
+            for is_seen, of_kind in rates.items()
+            if of_kind
+        },
+    )
+
+
+def _summary(figures: Figures) -> str:
     """Return what happened in a few sentences."""
-    own = [v for v in items if not v.is_held_out]
-    accepted = sum(_is_made(v, "scene") for v in own)
-    tasks = sum(_is_made(v, "task") for v in own)
-    learned = sum(_is_made(v, "expert") for v in own)
+    accepted = figures.made["scene"]
     sentences = [
-        f"{_plural(len(own), 'video')} went in; {accepted} became "
-        f"{'a simulated scene' if accepted == 1 else 'simulated scenes'}, {tasks} of them with an audited task."
-        if own
+        f"{_plural(figures.videos, 'video')} went in; {accepted} became "
+        f"{'a simulated scene' if accepted == 1 else 'simulated scenes'}, "
+        f"{figures.made['task']} of them with an audited task."
+        if figures.videos
         else "This run holds no video yet."
     ]
-    if any(v.results["expert"] for v in own):
-        sentences.append(f"{_plural(learned, 'task was', 'tasks were')} learned by an expert.")
-    for result in run.made("dataset"):
-        episodes, frames = (int(number(result.counts.get(k)) or 0) for k in ("episodes", "frames"))
-        sentences.append(
-            f"The dataset {result.counts.get('repo_id', result.item)} holds "
-            f"{_plural(episodes, 'successful episode')}, {_plural(frames, 'frame')}."
-        )
-    for is_seen, words in ((True, "it was trained on"), (False, "it has never seen")):
-        rates = [r.rate for r in evaluation if r.is_policy and r.is_seen == is_seen]
-        if rates:
-            k, n = sum(r.successes for r in rates), sum(r.trials for r in rates)
-            sentences.append(
-                f"The policy succeeds in {k} of {n} episodes ({percent(k / n)}) on tasks {words}."
-            )
+    if figures.has_experts:
+        learned = _plural(figures.made["expert"], "task was", "tasks were")
+        sentences.append(f"{learned} learned by an expert.")
+    sentences += [
+        f"The dataset {name} holds {_plural(episodes, 'successful episode')}, {_plural(frames, 'frame')}."
+        for name, episodes, frames in figures.datasets
+    ]
+    sentences += [
+        f"The policy succeeds in {k} of {n} episodes ({percent(k / n)}) on tasks "
+        f"{'it was trained on' if is_seen else 'it has never seen'}."
+        for is_seen, (k, n) in figures.policy.items()
+    ]
     return " ".join(sentences)
 
 
-def _key_figures(
-    run: Run, items: Sequence[ItemView], evaluation: Sequence[EvaluationRow]
-) -> list[tuple[str, str]]:
+def _key_figures(figures: Figures) -> list[tuple[str, str]]:
     """Return label and value of the numbers that matter, dashes where a stage has not run."""
-    own = [v for v in items if not v.is_held_out]
-    datasets = run.made("dataset")
-
-    def total(name: str) -> str:
-        return _grouped(sum(int(number(r.counts.get(name)) or 0) for r in datasets))
-
-    def success(is_seen: bool) -> str:
-        rates = [r.rate for r in evaluation if r.is_policy and r.is_seen == is_seen]
-        if not rates:
-            return "-"
-        return percent(sum(r.successes for r in rates) / sum(r.trials for r in rates))
-
+    totals = [_grouped(sum(n)) for n in zip(*(d[1:] for d in figures.datasets), strict=True)]
+    episodes, frames = totals or ("-", "-")
+    success = {is_seen: percent(k / n) for is_seen, (k, n) in figures.policy.items()}
     return [
-        ("Videos in", str(len(own))),
-        ("Scenes accepted", str(sum(_is_made(v, "scene") for v in own))),
-        ("Tasks learned", str(sum(_is_made(v, "expert") for v in own))),
-        ("Episodes", total("episodes") if datasets else "-"),
-        ("Frames", total("frames") if datasets else "-"),
-        ("Policy, seen tasks", success(True)),
-        ("Policy, unseen tasks", success(False)),
+        ("Videos in", str(figures.videos)),
+        ("Scenes accepted", str(figures.made["scene"])),
+        ("Tasks learned", str(figures.made["expert"])),
+        ("Episodes", episodes),
+        ("Frames", frames),
+        ("Policy, seen tasks", success.get(True, "-")),
+        ("Policy, unseen tasks", success.get(False, "-")),
     ]
-
-
-def _is_made(view: ItemView, stage: str) -> bool:
-    result = view.results[stage]
-    return result is not None and result.status == "made"
 
 
 # --- the policy ----------------------------------------------------------------------------------------------
@@ -212,14 +227,15 @@ def _policy_charts(run: Run) -> list[Markup]:
 # --- time, machine, what next ----------------------------------------------------------------------------
 
 
-def _times(run: Run) -> list[StageTime]:
+def _times(run: Run) -> list[dict[str, Any]]:
+    """Return the time of each stage, with its share of the longest stage's for the bar."""
     by_stage = {
         stage: [r.seconds for r in run.of_stage(stage) if r.seconds is not None]
         for stage in STAGES
     }
     longest = max((sum(s, 0.0) for s in by_stage.values()), default=0.0) or 1.0
     return [
-        StageTime(stage=stage, num_items=len(s), seconds=sum(s), share=sum(s) / longest)
+        {"stage": stage, "num_items": len(s), "seconds": sum(s), "share": sum(s) / longest}
         for stage, s in by_stage.items()
         if s
     ]

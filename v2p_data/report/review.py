@@ -452,9 +452,13 @@ def _result(outcome: Outcome) -> Result:
     return Result(
         stage=outcome.stage,
         item=outcome.item,
-        status="made" if outcome.is_usable else "rejected" if outcome.status == "rejected" else "failed",
+        status="made"
+        if outcome.is_usable
+        else "rejected"
+        if outcome.status == "rejected"
+        else "failed",
         folder=outcome.folder,
         record=read_record(outcome.folder),
         reason=outcome.reason,
         detail=outcome.detail,
-    )  # fmt: skip
+    )

@@ -23,7 +23,9 @@ def training_charts(curve: Mapping[str, np.ndarray]) -> list[Markup]:
     charts = [
         line_chart(
             lines({"success_deterministic": "deterministic", "success_stochastic": "exploring"}),
-            title="Success while training", x_label="control steps", y_range=(0.0, 1.0),
+            title="Success while training",
+            x_label="control steps",
+            y_range=(0.0, 1.0),
         ),
         line_chart(
             lines({"return": "mean return"}), title="Return per episode", x_label="control steps"
@@ -31,5 +33,5 @@ def training_charts(curve: Mapping[str, np.ndarray]) -> list[Markup]:
         line_chart(
             lines(parts)[:NUM_STYLES], title="Reward parts, mean per step", x_label="control steps"
         ),
-    ]  # fmt: skip
+    ]
     return [chart for chart in charts if chart]

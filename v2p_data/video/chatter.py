@@ -35,7 +35,7 @@ _WORDS = [
     r"sans (?:le )?(?:son|musique|coupures?)|sin (?:sonido|audio|música|cortes)|[无没]有?(?:声音?|剪辑|配乐)",
     r"lol|haha+|lmao|omg|xd|ok(?:ay)?,? so|oc|unedited|uncut|raw footage|original (?:sound|video)|handyvideo|ungeschnitten|non monté|sin editar|原声|未剪辑",
     r"(?:part|pt|teil|partie|parte|episode|ep|take|vol|folge|épisode|episodio|capítulo)\.? ?#?\d+(?:/\d+)?(?! (?:of|von|de)\b)|第 ?[\d一二三四五六七八九十]+ ?[集期部]",
-]  # fmt: skip
+]
 """Remarks of a word or two, which go wherever they stand."""
 
 _ENDINGS = [

@@ -1,8 +1,8 @@
 """A video file becomes a clip: the only place that decodes video.
 
 Reads whatever libav reads from a local file of a known container, one frame at a time. What comes out is RGB,
-turned and mirrored the way a player shows it, scaled down, and evenly spaced in time. Bytes that are no usable video end in
-an `ItemRejectedError`, never in a crash or an endless loop.
+turned and mirrored the way a player shows it, scaled down, and evenly spaced in time. Bytes that are no usable video end
+in an `ItemRejectedError`, never in a crash or an endless loop.
 """
 
 import logging
@@ -49,7 +49,8 @@ _COMBED = 0.2
 """Of the pixels that change, the share that stands out from the rows above and below alike. At most 0.13 in 36 clips as
 they were filmed, at least 0.3 in the same clips with every second row from the next picture."""
 _AS_WOVEN = 0.6
-"""Share of the pixels that would stand out if a picture had the other rows of its neighbour: at most 0.21, at least 2.8 there."""
+"""Share of the pixels that would stand out if a picture had the other rows of its neighbour: at most 0.21 in clips as
+filmed, at least 2.8 in interlaced ones."""
 _LEAST_COMBED = 200
 """Pixels, below which a share says nothing."""
 _OTHER_SHAPE = 1.1
@@ -101,7 +102,8 @@ def read_clip(item: VideoItem, cfg: VideoConfig = VideoConfig()) -> Clip:
 
     Raises:
         ItemRejectedError: `empty_file`, `unreadable`, `truncated`, `no_video_stream`, `odd_angle`, `too_few_frames`,
-            `picture_turns`, `interlaced`, `too_small`, `too_large`, `too_long` or `too_slow`; `bad_hint` where a hint marks what the video does not have.
+            `picture_turns`, `interlaced`, `too_small`, `too_large`, `too_long` or `too_slow`; `bad_hint` where a hint
+            marks what the video does not have.
     """
     film = _decode(item.path, cfg)
     total = film.seen

@@ -1,7 +1,7 @@
 """Hints: what a person marked about an object, checked alone and against the picture that it was marked in."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -157,19 +157,24 @@ def hints_in_clip(
     sx, sy = clip_px[0] / shown_px[0], clip_px[1] / shown_px[1]
     moved: dict[str, Hint] = {}
     for name, hint in hints.items():
-        there = hint.copy()
-        there["frame"] = int(np.abs(source_frame - hint.get("frame", 0)).argmin())
-        if "box" in hint:
-            x0, y0, x1, y1 = hint["box"]
-            there["box"] = [x0 * sx, y0 * sy, x1 * sx, y1 * sy]
-        if "points" in hint:
-            there["points"] = [[x * sx, y * sy] for x, y in hint["points"]]
-        if "click" in hint:
-            there["click"] = [hint["click"][0] * sx, hint["click"][1] * sy]
-        if "stroke" in hint:
-            there["stroke"] = [[x * sx, y * sy] for x, y in hint["stroke"]]
-        moved[name] = there
+        moved[name] = with_spots(hint, lambda x, y: [x * sx, y * sy])
+        moved[name]["frame"] = int(np.abs(source_frame - hint.get("frame", 0)).argmin())
     return moved
+
+
+def with_spots(hint: Hint, moved: Callable[[float, float], list[float]]) -> Hint:
+    """Return the hint with all its spots moved, a box by its corners."""
+    there = hint.copy()
+    if "box" in hint:
+        x0, y0, x1, y1 = hint["box"]
+        there["box"] = [*moved(x0, y0), *moved(x1, y1)]
+    if "points" in hint:
+        there["points"] = [moved(x, y) for x, y in hint["points"]]
+    if "click" in hint:
+        there["click"] = moved(*hint["click"])
+    if "stroke" in hint:
+        there["stroke"] = [moved(x, y) for x, y in hint["stroke"]]
+    return there
 
 
 def hints_in_crop(
@@ -209,17 +214,12 @@ def _in_crop(hint: Hint, crop: Crop) -> Hint:
     def inside(x: float, y: float) -> list[float]:
         return [min(max(x - x0, 0.0), x1 - x0 - 1.0), min(max(y - y0, 0.0), y1 - y0 - 1.0)]
 
-    out = hint.copy()
+    there = with_spots(hint, inside)
     if "box" in hint:
-        a, b, c, d = hint["box"]
-        out["box"] = [*inside(a, b), *(v + 1.0 for v in inside(c - 1, d - 1))]
-    if "points" in hint:
-        out["points"] = [inside(x, y) for x, y in hint["points"]]
-    if "click" in hint:
-        out["click"] = inside(*hint["click"])
-    if "stroke" in hint:
-        out["stroke"] = [inside(x, y) for x, y in hint["stroke"]]
-    return out
+        # A box ends behind its last pixel.
+        _, _, x, y = hint["box"]
+        there["box"][2:] = [v + 1.0 for v in inside(x - 1, y - 1)]
+    return there
 
 
 def boxes_as_read(hints: Mapping[str, Hint], where: str) -> list[str]:

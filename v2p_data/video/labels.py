@@ -108,7 +108,7 @@ def _objects(placeholders: Any) -> list[str]:
 
 
 def _filled(text: str, objects: list[str]) -> str:
-    """Return the text with its `[something]` replaced by the objects, in order; what is left over loses its brackets."""
+    """Return the text with its `[something]` replaced by the objects, in order; others lose their brackets."""
     left = iter(objects)
     return _SLOT.sub(lambda slot: next(left, slot.group(1)), text)
 

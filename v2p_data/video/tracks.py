@@ -137,7 +137,7 @@ def shown_axes(frame: VideoFrame) -> Float[np.ndarray, "2 2"] | None:
     Source: ISO 14496-12, 8.3.2; libavutil/display.h.
     """
     try:
-        data = bytes(frame.side_data["DISPLAYMATRIX"])  # pyright: ignore[reportTypedDictNotRequiredAccess, reportGeneralTypeIssues]
+        data = bytes(frame.side_data["DISPLAYMATRIX"])  # pyright: ignore
     except KeyError:
         return None
     except (
