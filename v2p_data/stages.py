@@ -46,7 +46,6 @@ from v2p_data.pipeline.artifact import (
     Record,
     demand_whole,
     provenance,
-    read_record,
     write_json_atomically,
 )
 from v2p_data.pipeline.fingerprint import file_digest, fingerprint
@@ -518,30 +517,11 @@ def make_dataset(
         out,
         runtime,
         provenance={
-            "items": {item: _history(folder, runtime.root) for item, folder in inputs.items()},
+            "items": {item: history(folder, runtime.root) for item, folder in inputs.items()},
             **provenance(),
         },
         tasks={item: stage.folder(runtime.root) for item, stage in tasks.items()},
     )
-
-
-def _history(folder: Path, root: Path) -> dict[str, Any]:
-    """Return the recipes of a result and of everything it came from."""
-    record = read_record(folder)
-    if record is None:
-        return {}
-    needed = {
-        name: _history(path, root)
-        for name, source in record.inputs.items()
-        for path in root.glob(f"*/{source}")
-    }
-    return {
-        "stage": record.stage,
-        "folder": folder.name,
-        "recipe": record.recipe,
-        "counts": record.counts,
-        "inputs": needed,
-    }
 
 
 # --- dataset -> distillation -> policy -------------------------------------------------------------------------

@@ -226,6 +226,7 @@ REFUSED: dict[str, Spoil] = {
     "lengths are fractions": cells(TABLE, "length", lambda c: pa.array([6.5, float("nan")])),
     "lengths are texts": cells(TABLE, "length", lambda c: pa.array(["six", "six"])),
     "tasks are numbers": cells(TABLE, "tasks", lambda c: pa.array([1, 2])),
+    "the label 4000000000": value(ABOUT, "episodes", [{"id": "a", "item": "toy", "task": "lift the toy up", "seed": 0, "length": FRAMES, "labels": {"4000000000": "toy"}, "params": {}}]),
     "a length is missing": cells(TABLE, "length", lambda c: pa.array([6, None])),
 }  # fmt: skip
 """No command reads these."""
@@ -254,6 +255,5 @@ FOUND: dict[str, Spoil] = {
     "times are NaN": cell(TABLE, "videos/observation.images.mask/from_timestamp", float("nan")),
     "times of 10^30 s": cell(TABLE, "videos/observation.images.mask/from_timestamp", 1e30),
     "a task of number 10^9": cell(DATA, "task_index", 10**9),
-    "the label 4000000000": value(ABOUT, "episodes", [{"id": "a", "item": "toy", "task": "lift the toy up", "seed": 0, "length": FRAMES, "labels": {"4000000000": "toy"}, "params": {}}]),
 }  # fmt: skip
 """These can be read, and are not as they should be."""

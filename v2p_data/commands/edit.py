@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -11,19 +11,17 @@ from v2p_data.commands.display import telling
 from v2p_data.episodes.dataset.repo_id import check_repo_id
 
 if TYPE_CHECKING:
-    from v2p_data.episodes.dataset.edit import Edited
+    from v2p_data.episodes.dataset.edit import NewDataset
 
 
 @dataclass(frozen=True, kw_only=True)
 class Merge:
     datasets: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of LeRobot v3 datasets; their episodes stay in this order. One is copied, with exact statistics."""
+    """Folders of datasets that v2p made; their episodes stay in this order."""
     out: Path
     """Where the new dataset shall lie; must not exist."""
     repo_id: str
     """USER/NAME, under which it will be pushed."""
-    original: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """The dataset of v2p that LeRobot's tools made some of these from: what they left out is taken from it."""
     language: bool = False
     """Write LeRobot's language columns as well: subtasks, motions and questions with exact times."""
 
@@ -31,7 +29,7 @@ class Merge:
 @dataclass(frozen=True, kw_only=True)
 class Drop:
     dataset: tyro.conf.Positional[Path]
-    """Folder of a LeRobot v3 dataset, which stays as it is."""
+    """Folder of a dataset that v2p made, which stays as it is."""
     tasks: tuple[str, ...] = ()
     """Instructions, or names of the videos that tasks were made from."""
     episodes: tuple[int, ...] = ()
@@ -44,29 +42,23 @@ class Drop:
 
 def merge_command(argv: list[str]) -> int:
     from v2p_data.episodes.dataset.edit import merge
-    from v2p_data.episodes.dataset.edited import demand_sound
 
     args = parse(Merge, argv, "merge")
     check_repo_id(args.repo_id)
     with telling("merge") as progress:
-        for dataset in (*args.datasets, *([args.original] if args.original else [])):
-            demand_sound(dataset)
         made = merge(
-            args.datasets, args.repo_id, args.out,
-            original=args.original, language=args.language, on_progress=progress,
-        )  # fmt: skip
+            args.datasets, args.repo_id, args.out, language=args.language, on_progress=progress
+        )
     return _tell(made)
 
 
 def drop_command(argv: list[str]) -> int:
     from v2p_data.episodes.dataset.edit import drop
-    from v2p_data.episodes.dataset.edited import demand_sound
 
     args = parse(Drop, argv, "drop")
     if args.repo_id is not None:
         check_repo_id(args.repo_id)
     with telling("drop") as progress:
-        demand_sound(args.dataset)
         made = drop(
             args.dataset, args.tasks, args.out, args.repo_id,
             episodes=args.episodes, on_progress=progress,
@@ -74,11 +66,10 @@ def drop_command(argv: list[str]) -> int:
     return _tell(made)
 
 
-def _tell(made: "Edited") -> int:
+def _tell(made: "NewDataset") -> int:
     lines = [
         f"Made {made.root}: {made.num_episodes} episodes, {made.num_frames} frames of {len(made.tasks)} tasks, "
         "every frame equal to where it came from",
-        *made.notes,
         f"Next: v2p push {made.root} --repo-id {made.repo_id}",
     ]
     print("\n".join(lines))  # noqa: T201

@@ -25,7 +25,6 @@ from v2p_data.commands.display import (
 )
 from v2p_data.commands.progress import Progress
 from v2p_data.commands.setup import fetch_preset
-from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.episodes.hub.policy_card import note_results
 from v2p_data.errors import NotAllError, V2PError
@@ -331,8 +330,8 @@ def generate(
 
 def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Path:
     """Train a policy on a finished dataset and return its folder."""
-    record, is_as_made = _record_to_train(dataset, root)
-    sources = sources_of(dataset.resolve(), root) if is_as_made else []
+    record = _record_to_train(dataset, root)
+    sources = sources_of(dataset.resolve(), root)
     if not sources and cfg.distillation.rounds and cfg.policy.preset != "paper":
         print(  # noqa: T201
             f"the experts of {dataset} are not in {root}, so the policy clones its demonstrations only",
@@ -439,30 +438,19 @@ def _dataset_record(dataset: Path) -> Record:
     return record
 
 
-def _record_to_train(dataset: Path, root: Path) -> tuple[Record, bool]:
-    """Return the record of a dataset of this engine, and whether it is as it was made.
-
-    One that was merged, cut or edited since gets a record by its content.
+def _record_to_train(dataset: Path, root: Path) -> Record:
+    """Return the record of a dataset of this engine; one that was merged or cut gets a record by its content.
 
     Raises:
-        V2PError: it is none, or damaged.
+        V2PError: it is none, or not as it was made.
     """
     if not (dataset / "meta/info.json").exists():
-        return _dataset_record(dataset), True  # which says what is wrong
-    from v2p_data.episodes.dataset.edited import demand_sound, is_like_ours
+        return _dataset_record(dataset)  # which says what is wrong
+    from v2p_data.episodes.dataset.about import demand_ours
 
-    record = read_record(dataset)
-    changed = demand_sound(dataset, memory_of(dataset, root))
-    if record is not None and not changed.edited:
-        return _dataset_record(dataset), True
-    about = read_about(dataset)
-    if about is None and is_like_ours(dataset):
-        raise V2PError(
-            f"{dataset} has our columns, but what v2p knew of its episodes was left out by another tool; bring it back with "
-            f"'v2p merge {shlex.quote(str(dataset))} --from ORIGINAL --out NEW --repo-id USER/NAME' and train on NEW"
-        )
-    if about is None:
-        return _dataset_record(dataset), True
+    about = demand_ours(dataset, memory_of(dataset, root))
+    if read_record(dataset) is not None:
+        return _dataset_record(dataset)
     listed = {name: mark.sha256 for name, mark in list_files(dataset).items()}
     return Record(
         stage="dataset",
@@ -473,7 +461,7 @@ def _record_to_train(dataset: Path, root: Path) -> tuple[Record, bool]:
         inputs={},
         seconds=0.0,
         counts={"repo_id": about["repo_id"]},
-    ), False
+    )
 
 
 def _home_of(who: Contestant, tasks: Sequence[Path]) -> Path:

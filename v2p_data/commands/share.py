@@ -1,7 +1,7 @@
 """Commands for finished things: check them, tell where they come from, give them away."""
 
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class Verify:
     dataset: tyro.conf.Positional[Path]
-    """Folder of a LeRobot v3 dataset, ours or anybody's."""
+    """Folder of a dataset that v2p made."""
     json: Path | None = None
     """Write the findings as JSON to this file, too."""
 
@@ -55,11 +55,9 @@ class Explain:
     path: tyro.conf.Positional[Path]
     """Folder of a dataset, or of any result of a run."""
     other: tyro.conf.Positional[Path | None] = None
-    """A second one, to be told in which fields the two differ."""
+    """A second one: in which fields do the two differ?"""
     episode: int | None = None
-    """Tell of this episode only."""
-    json: Path | None = None
-    """Write it as JSON to this file, too."""
+    """This episode only."""
 
 
 def verify_command(argv: list[str]) -> int:
@@ -130,21 +128,17 @@ def _pushed(args: Push) -> tuple["Pushed", str]:
 
 
 def explain_command(argv: list[str]) -> int:
-    from v2p_data.episodes.dataset.explain import differences, explain, told_as_json
+    from v2p_data.episodes.dataset.explain import differences, explain, records_of
 
     args = parse(Explain, argv, "explain")
     for path in (args.path, args.other):
         if path is not None:
             demand_whole(path, below="meta/")
     if args.other is None:
-        lines = explain(args.path, args.episode)
-        data: object = told_as_json(args.path, args.episode)
+        lines = explain(records_of(args.path, args.episode))
     else:
         found = differences(args.path, args.other)
-        lines = [f"{d.field}: {d.first} -> {d.second}" for d in found]
-        lines.append(f"{len(found)} fields differ" if found else "they differ in nothing that makes a difference")  # fmt: skip
-        data = [asdict(d) for d in found]
-    if args.json is not None:
-        write_json_atomically(args.json, data)
+        lines = [f"{field}: {first} -> {second}" for field, first, second in found]
+        lines.append(f"{len(found)} fields differ")
     print("\n".join(lines))  # noqa: T201
     return 0

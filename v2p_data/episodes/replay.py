@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float32
 
 from v2p_data.episodes.config import EpisodesConfig
-from v2p_data.episodes.dataset.about import CARRIED_TASKS, read_about
+from v2p_data.episodes.dataset.about import CARRIED_TASKS, demand_about
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     EXECUTED_KEY,
@@ -127,11 +127,7 @@ def replay(
     """
     info = read_info(root)
     demand_bounded(root)
-    about = read_about(root)
-    if about is None:
-        raise V2PError(
-            f"{root} has no {METADATA_FILE}: only datasets that v2p made can be replayed"
-        )
+    about = demand_about(root)
     with damage_told(root):
         batches, skipped = _batches(root, about, num_episodes or int(info["total_episodes"]))
     total = sum(map(len, batches.values()))

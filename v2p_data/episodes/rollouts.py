@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from v2p_data.episodes.dataset.features import (
     CAMERA_POSE_KEY,
+    COLUMNS,
     CONTACT_KEY,
     EXECUTED_KEY,
     FPS,
@@ -130,7 +131,7 @@ class Rollouts:
             INTRINSICS_KEY: np.tile(K[[0, 1, 0, 1], [0, 1, 2, 2]], (length, 1)),
             CAMERA_POSE_KEY: np.tile(np.append(start.camera_pos[world], quat), (length, 1)),
         }
-        columns = {key: found[key].astype(column.dtype) for key, column in SIMULATED.items()}
+        columns = {key: found[key].astype(COLUMNS[key].dtype) for key in SIMULATED}
         return columns | ({EXECUTED_KEY: self.executed[:length, world]} if self.names else {})
 
     def reject(self, world: int) -> dict[str, Any]:

@@ -99,6 +99,25 @@ def read_record(folder: Path) -> Record | None:
         raise damaged(folder, f"{path} holds no record ({str(error)[:200]})") from error
 
 
+def history(folder: Path, root: Path) -> dict[str, Any]:
+    """Return the recipes of a result and of everything it came from."""
+    record = read_record(folder)
+    if record is None:
+        return {}
+    needed = {
+        name: history(path, root)
+        for name, source in record.inputs.items()
+        for path in root.glob(f"*/{source}")
+    }
+    return {
+        "stage": record.stage,
+        "folder": folder.name,
+        "recipe": record.recipe,
+        "counts": record.counts,
+        "inputs": needed,
+    }
+
+
 def demand_whole(folder: Path, root: Path | None = None, below: str = "") -> None:
     """Raise if a finished folder is not as it was made.
 

@@ -17,7 +17,6 @@ from v2p_data.episodes.dataset.features import ArmInterface, interface_in
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import check_checkpoint
 from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
-from v2p_data.pipeline.contents import memory_of
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.pipeline.settings import from_values
 from v2p_data.play import VisionActor
@@ -82,14 +81,8 @@ def recorded_under(source: Source) -> EpisodesConfig:
 
 
 def demand_whole_sources(dataset: Path, sources: Sequence[Source], root: Path) -> None:
-    """Raise if a dataset, or what is behind it, is not as it was made: see `demand_whole` and `demand_sound`."""
-    from v2p_data.episodes.dataset.edited import demand_sound
-
-    if sources:
-        demand_whole(dataset, root)
-    else:  # perhaps edited since
-        demand_sound(dataset, memory_of(dataset, root))
-    for folder in (f for s in sources for f in (s.task, s.expert, s.episodes)):
+    """Raise if a dataset, or what is behind it, is not as it was made: see `demand_whole`."""
+    for folder in (dataset, *(f for s in sources for f in (s.task, s.expert, s.episodes))):
         demand_whole(folder, root)
 
 

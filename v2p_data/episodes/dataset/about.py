@@ -1,31 +1,17 @@
 """`meta/v2p.json` of a dataset, read with suspicion: what this engine says of each episode and of how it was made."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
-from v2p_data.episodes.dataset.features import (
-    ACTION_KEY,
-    EPISODE_COLUMN,
-    METADATA_FILE,
-    METADATA_SCHEMA,
-    STATE_KEY,
-)
-from v2p_data.episodes.dataset.intake import MAX_JSON_BYTES
-from v2p_data.episodes.dataset.tables import (
-    EPISODES_GLOB,
-    READING_ERRORS,
-    Found,
-    episodes_of,
-    read_info,
-)
-from v2p_data.errors import V2PError
+from v2p_data.episodes.dataset.features import METADATA_FILE, METADATA_SCHEMA
+from v2p_data.episodes.dataset.intake import MAX_JSON_BYTES, demand_bounded
+from v2p_data.episodes.dataset.tables import Problem
+from v2p_data.errors import UnusableError, V2PError
 from v2p_data.json_files import json_or_none
-from v2p_data.sim.render.masks import PALETTE
+from v2p_data.pipeline.artifact import read_record
+from v2p_data.pipeline.contents import Damage, damages, demand_no
+from v2p_data.scene.files import is_plain_path
 
 CARRIED_TASKS = Path("v2p/tasks")
 """Of a dataset: the tasks that its episodes were made in, a folder each."""
@@ -39,18 +25,15 @@ _KINDS_OF_ENTRY: dict[str, type] = {
 
 
 def read_about(root: Path) -> dict[str, Any] | None:
-    """Return a dataset's `meta/v2p.json`, or what the table of episodes holds of it, None where there is neither.
+    """Return a dataset's `meta/v2p.json`, None where there is none.
 
     Raises:
         V2PError: it is damaged, or a newer version wrote it.
     """
     path = root / METADATA_FILE
     if not path.exists(follow_symlinks=False):
-        about = _from_table(root)
-        if about is None:
-            return None
-    else:
-        about = json_or_none(path, max_bytes=MAX_JSON_BYTES[METADATA_FILE])
+        return None
+    about = json_or_none(path, max_bytes=MAX_JSON_BYTES[METADATA_FILE])
     if not isinstance(about, dict):
         raise V2PError(f"{path} is damaged: it is no JSON object; {_remedy(root)}")
     schema = about.get("schema", METADATA_SCHEMA)
@@ -63,6 +46,8 @@ def read_about(root: Path) -> dict[str, Any] | None:
     if wrong is None:
         for k, entry in enumerate(about["episodes"]):
             wrong = _wrong(entry, _KINDS_OF_ENTRY) or _no_label(entry["labels"])
+            if wrong is None and not (is_plain_path(entry["item"]) and "/" not in entry["item"]):
+                wrong = "'item', the plain name of a folder,"
             if wrong is not None:
                 wrong = f"{wrong} of episode {k}"
                 break
@@ -73,50 +58,62 @@ def read_about(root: Path) -> dict[str, Any] | None:
     return about
 
 
-def as_in_table(about: dict[str, Any], episodes: pa.Table) -> dict[str, Any]:
-    """Return `about` with the instructions and lengths of the table of episodes, which LeRobot's tools change."""
-    told = zip(
-        about["episodes"],
-        episodes.column("tasks").to_pylist(),
-        episodes.column("length").to_pylist(),
-        strict=True,
-    )
-    return about | {
-        "episodes": [e | {"task": "; ".join(tasks), "length": n} for e, tasks, n in told]
-    }
+def demand_ours(root: Path, memory: Path | None = None) -> dict[str, Any]:
+    """Return `meta/v2p.json` of a dataset of ours that can be read in bounded memory.
 
+    Args:
+        root: folder of the dataset.
+        memory: file that remembers which files were compared, see `contents.damages`.
 
-def _from_table(root: Path) -> dict[str, Any] | None:
-    """Return what the table of episodes tells, None where it has no such column or not of every episode."""
-    files = sorted(root.glob(EPISODES_GLOB))
+    Raises:
+        V2PError: it is another tool's, cannot be read, or is not as it was made.
+    """
     try:
-        if not files or any(EPISODE_COLUMN not in pq.read_schema(path).names for path in files):
-            return None
-        episodes, names = episodes_of(root), read_info(root)["features"]
-        entries = [
-            json.loads(text) for text in episodes.column(EPISODE_COLUMN).to_pylist() if text
-        ]
-    except READING_ERRORS:
-        return None
-    if len(entries) != len(episodes) or not all(isinstance(e, dict) for e in entries):
-        return None
-    return as_in_table(
-        {
-            "schema": METADATA_SCHEMA,
-            "repo_id": f"local/{root.resolve().name}",
-            "palette": {str(label): grey for label, grey in enumerate(PALETTE)},
-            "state": names.get(STATE_KEY, {}).get("names"),
-            "action": names.get(ACTION_KEY, {}).get("names"),
-            "episodes": entries,
-            "provenance": {},
-        },
-        episodes,
-    )
+        demand_bounded(root)
+    except V2PError:
+        _demand_unchanged(root, memory)  # which says more where there is a record
+        raise
+    _demand_unchanged(root, memory)
+    return demand_about(root)
+
+
+def _demand_unchanged(root: Path, memory: Path | None) -> None:
+    try:
+        demand_no(changed_files(root, memory), root)
+    except UnusableError as error:
+        raise V2PError(
+            f"{error}; where another tool changed it on purpose, go on with that tool (lerobot-edit-dataset, lerobot-train)"
+        ) from error
+
+
+def demand_about(root: Path) -> dict[str, Any]:
+    """Return `meta/v2p.json` of a dataset.
+
+    Raises:
+        V2PError: there is none, it is damaged, or a newer version wrote it.
+    """
+    about = read_about(root)
+    if about is None:
+        raise V2PError(
+            f"{root / METADATA_FILE} is missing, so v2p did not make this dataset, or another tool changed it; "
+            "lerobot-edit-dataset merges and cuts any LeRobot dataset, lerobot-dataset-viz shows it"
+        )
+    return about
+
+
+def changed_files(root: Path, memory: Path | None = None) -> list[Damage]:
+    """Return the files of a dataset that are not as its record lists them; a dataset without a record has none.
+
+    Raises:
+        UnusableError: the record is damaged.
+    """
+    record = read_record(root)
+    return damages(root, (record.files if record else None) or {}, memory=memory)
 
 
 def about_problems(
     root: Path, about: Mapping[str, Any], tasks: Sequence[Sequence[str]], lengths: Sequence[int]
-) -> Iterator[Found]:
+) -> Iterator[Problem]:
     """Yield where `meta/v2p.json` contradicts the episode table or itself, and tasks that should be there.
 
     Args:
@@ -127,30 +124,30 @@ def about_problems(
     """
     entries = about["episodes"]
     if len(entries) != len(lengths):
-        yield Found(
+        yield Problem(
             check="about", where=METADATA_FILE,
             detail=f"tells of {len(entries)} episodes, the episode table of {len(lengths)}",
         )  # fmt: skip
     for k, (entry, words, length) in enumerate(zip(entries, tasks, lengths, strict=False)):
         if (entry["length"], [entry["task"]]) != (length, list(words)):
-            yield Found(
+            yield Problem(
                 check="about", where=f"episode {k}",
                 detail=f"{METADATA_FILE} says {entry['length']} frames of '{entry['task']}', the episode table {length} "
                 f"of '{'; '.join(words)}'",
             )  # fmt: skip
         unknown = [label for label in entry["labels"] if label not in about["palette"]]
         if unknown:
-            yield Found(
+            yield Problem(
                 check="about", where=f"episode {k}",
                 detail=f"{METADATA_FILE} gives no grey for label {', '.join(unknown)}",
             )  # fmt: skip
     if len({e["id"] for e in entries}) != len(entries):
-        yield Found(check="about", where=METADATA_FILE, detail="names an episode twice")
+        yield Problem(check="about", where=METADATA_FILE, detail="names an episode twice")
     if about["provenance"].get("items") or (root / CARRIED_TASKS).is_dir():
         for item in dict.fromkeys(e["item"] for e in entries):
             for part in TASK_PARTS:
                 if not (root / CARRIED_TASKS / item / part).is_file():
-                    yield Found(
+                    yield Problem(
                         check="missing_file", where=str(CARRIED_TASKS / item / part),
                         detail=f"is missing, and episodes were made in task '{item}'",
                     )  # fmt: skip

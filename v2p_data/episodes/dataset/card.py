@@ -6,17 +6,17 @@ from typing import Any
 
 from v2p_data.episodes.dataset.about import read_about
 from v2p_data.episodes.dataset.features import (
+    ACTION_KEY,
     ACTION_NAMES,
     CAMERA_OF_MASKS,
-    DONE_KEY,
-    EXECUTED,
-    EXECUTED_KEY,
+    COLUMNS,
+    HANDOVER,
     INTERVENTION_KEY,
     METADATA_FILE,
-    SIMULATED,
+    RGB_KEY,
+    STATE_KEY,
     WRIST_KEY,
 )
-from v2p_data.episodes.dataset.handovers import who_acted
 from v2p_data.episodes.dataset.sheet import SHEET_FILE, write_sheet
 from v2p_data.episodes.dataset.tables import damage_told, read_info
 from v2p_data.errors import V2PError
@@ -167,23 +167,17 @@ def _frame(info: dict[str, Any]) -> str:
         if key in CAMERA_OF_MASKS:
             meaning = "segmentation mask as grey video, lossless"
             meaning += ", of a camera that the hand carries" if key == WRIST_KEY else ""
-        elif key.startswith("observation.images"):
+        elif key == RGB_KEY:
             meaning = "picture of the same camera at the same moment"
-        elif key == "observation.state":
+        elif key == STATE_KEY:
             # Datasets of earlier versions have the first seven.
             names = tuple(feature["names"])
             units = (*STATE_UNITS, *("rad",) * len(names))
             meaning = _named(names, units[: len(names)])
-        elif key == "action":
+        elif key == ACTION_KEY:
             meaning = _action(feature["names"])
-        elif key == "next.success":
-            meaning = "the task's success has held for 0.25 s by the end of this action"
-        elif key == DONE_KEY:
-            meaning = "true in the last row of an episode"
-        elif key in SIMULATED or key == EXECUTED_KEY:
-            meaning = (SIMULATED | {EXECUTED_KEY: EXECUTED})[key].meaning
-        elif key == INTERVENTION_KEY:
-            meaning = "true where the expert acted, false where a student did"
+        elif key in COLUMNS:
+            meaning = COLUMNS[key].meaning
         else:
             continue
         lines.append(f"| `{key}` | {list(feature['shape'])} | {meaning} |")
@@ -204,13 +198,16 @@ def _action(names: list[str]) -> str:
 
 
 def _who_acted(episodes: list[dict[str, Any]]) -> str:
-    acted = who_acted(episodes)
+    handovers = [e for e in episodes if e.get("source") == HANDOVER]
+    frames = sum(int(e["length"]) for e in handovers)
+    by_student = sum(int(e["student_frames"]) for e in handovers)
+    alone = sum(int(e["length"]) for e in episodes) - frames
     return "\n".join(
         [
             "| episodes | number | frames in which the expert acted | frames in which a student acted |",
             "|---|---|---|---|",
-            f"| demonstrations | {acted.num_demonstrations} | {acted.demonstration_frames} | 0 |",
-            f"| handovers | {acted.num_handovers} | {acted.taken_over_frames} | {acted.student_frames} |",
+            f"| demonstrations | {len(episodes) - len(handovers)} | {alone} | 0 |",
+            f"| handovers | {len(handovers)} | {frames - by_student} | {by_student} |",
             "",
             "In a handover a student policy acts and the expert takes over. `action` is the expert's in every frame: "
             "where a student acted, it is what the expert would have done there, not what was done. LeRobot's own "

@@ -8,7 +8,7 @@ LeRobot's own encoder makes of the same pictures with the same settings, less th
 import hashlib
 import io
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,6 +115,40 @@ def join(parts: Iterable[Encoded], path: Path) -> None:
     with temporary.open("rb") as written:
         os.fsync(written.fileno())
     temporary.replace(path)
+
+
+def cut(path: Path, spans: Iterable[tuple[int, int]]) -> Iterator[Encoded]:
+    """Yield some spans of frames `[first, last)` of a file that `join` wrote, each as a stream of its own.
+
+    Raises:
+        ValueError: a span does not begin with a key frame, or its frames do not follow each other.
+    """
+    av = _av()
+    with av.open(str(path)) as video:
+        stream = video.streams.video[0]
+        tick = 1 / (FPS * stream.time_base)
+        packets = [p for p in video.demux(stream) if p.dts is not None]
+        times = [p.pts for p in packets]
+        for first, last in spans:
+            wanted = [round(k * tick) for k in range(first, last)]
+            if times[first:last] != wanted or not packets[first].is_keyframe:
+                raise ValueError(f"has no key frame for frame {first}, or none for each after it")
+            buffer = io.BytesIO()
+            with av.open(buffer, "w", format="mp4") as made:
+                into = made.add_stream_from_template(stream, opaque=True)
+                into.time_base = stream.time_base
+                for packet in packets[first:last]:
+                    packet.pts -= wanted[0]
+                    packet.dts -= wanted[0]
+                    packet.stream = into
+                    made.mux(packet)
+            yield Encoded(mp4=buffer.getvalue(), num_frames=last - first)
+
+
+def decoder_of(part: Encoded) -> bytes:
+    """Return what sets up the decoder of a stream."""
+    with _av().open(io.BytesIO(part.mp4)) as video:
+        return bytes(video.streams.video[0].codec_context.extradata or b"")
 
 
 def _av() -> Any:

@@ -6,8 +6,11 @@ and ours, take as inputs what begins with `observation.`; no other column may be
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
+
+from v2p_data.episodes.staging import Episode
 from v2p_data.sim.robot.action_names import DELTA_NAMES as ACTION_NAMES
 from v2p_data.sim.robot.action_names import Actions, actions_named, joint_names
 from v2p_data.sim.robot.interface import ArmInterface
@@ -29,7 +32,6 @@ INTRINSICS_KEY = "camera.intrinsics"
 CAMERA_POSE_KEY = "camera.pose"
 INTERVENTION_KEY = "intervention"
 """Whether the expert acted, as LeRobot's DAgger recordings name it; True throughout in demonstrations."""
-INTERVENTION_FEATURE: dict[str, Any] = {"dtype": "bool", "shape": (1,), "names": None}
 KEY_OF_CAMERA = {"mask": MASK_KEY, "mask_wrist": WRIST_KEY, "rgb": RGB_KEY}
 CAMERA_OF_MASKS = {MASK_KEY: "mask", WRIST_KEY: "mask_wrist"}
 DEMONSTRATION, HANDOVER = "demonstration", "handover"
@@ -62,12 +64,15 @@ SLOTS = 7
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """Numbers that a simulator knows; a robot's recordings lack them."""
+    """A column of numbers, one a frame."""
 
     dtype: str = "float32"
     names: tuple[str, ...] | None = None
     """Of the entries; None for a single number."""
     meaning: str
+    """For the card."""
+    where: Literal["everywhere", "handovers", "simulation", "targets"] = "everywhere"
+    """Which datasets have it: all, those with handovers, those of a simulator alone, those whose actions are targets."""
 
     @property
     def feature(self) -> dict[str, Any]:
@@ -76,36 +81,67 @@ class Column:
         return {"dtype": self.dtype, "shape": (len(self.names or " "),), "names": names}
 
 
-SIMULATED = {
+COLUMNS = {
+    SUCCESS_KEY: Column(
+        dtype="bool",
+        meaning="the task's success has held for 0.25 s by the end of this action",
+    ),
+    INTERVENTION_KEY: Column(
+        dtype="bool",
+        meaning="true where the expert acted, false where a student did",
+        where="handovers",
+    ),
+    DONE_KEY: Column(dtype="bool", meaning="true in the last row of an episode"),
     REWARD_KEY: Column(
         meaning="the task's own shaped reward of what this action led to, 1 is a full one, and 1 more while it succeeds",
+        where="simulation",
     ),
     OBJECT_POSE_KEY: Column(
         names=tuple(f"object_{k}.{axis}" for k in range(1, SLOTS + 1) for axis in _POSE),
         meaning="not for policies: per object the position of its centre [m] and its quaternion wxyz in the robot's base "
         "frame, before the action; object 1 has the label 2; 0 throughout where there is none",
+        where="simulation",
     ),
     CONTACT_KEY: Column(
         dtype="bool",
         names=tuple(f"object_{k}.{s}" for k in range(1, SLOTS + 1) for s in ("left", "right")),
         meaning="not for policies: whether the left and the right finger's pad touches the object, before the action",
+        where="simulation",
     ),
     INTRINSICS_KEY: Column(
         names=("fx", "fy", "cx", "cy"),
         meaning="focal lengths and principal point [px]; pixel centres are at integers plus one half",
+        where="simulation",
     ),
     CAMERA_POSE_KEY: Column(
         names=_POSE,
         meaning="the camera's position [m] and quaternion wxyz in the robot's base frame; OpenCV's axes: x right, y down, "
         "z forward",
+        where="simulation",
+    ),
+    EXECUTED_KEY: Column(
+        names=ACTION_NAMES,
+        meaning="not for policies: the step of the tool that was carried out, each in [-1, 1]; of these episodes `action` is a target",
+        where="targets",
     ),
 }
-"""Shapes do not depend on the task, so that all datasets of ours go together."""
-EXECUTED = Column(
-    names=ACTION_NAMES,
-    meaning="not for policies: the step of the tool that was carried out, each in [-1, 1]; of these episodes `action` is a target",
-)
-"""Only where `action` is not the step itself."""
+"""All columns but pictures, state and action, in their order. Shapes do not depend on the task, so that datasets go together.
+
+A new column has an entry here and its values in `Rollouts.simulated`, or, without a simulator, in `columns_of`."""
+SIMULATED = tuple(key for key, column in COLUMNS.items() if column.where == "simulation")
+"""Numbers that a simulator knows; a robot's recordings lack them."""
+
+
+def columns_of(episode: Episode) -> dict[str, np.ndarray]:
+    """Return what an episode's rows hold, by column; pictures and numbering aside."""
+    return {
+        STATE_KEY: episode.state,
+        ACTION_KEY: episode.action,
+        SUCCESS_KEY: episode.success,
+        INTERVENTION_KEY: episode.expert_acted,
+        DONE_KEY: np.arange(episode.num_frames) == episode.num_frames - 1,
+        **episode.simulated,
+    }
 
 
 def actions_in(info: Mapping[str, Any]) -> Actions | None:
@@ -146,6 +182,12 @@ def features(
         has_handovers: some episodes were acted by a student at first, so there is a column that says who acted.
         is_simulated: all episodes are a simulator's, so there is what only a simulator knows.
     """
+    has = {
+        "everywhere": True,
+        "handovers": has_handovers,
+        "simulation": is_simulated,
+        "targets": tuple(actions) != ACTION_NAMES,
+    }
     return {
         **{
             KEY_OF_CAMERA[camera]: {
@@ -161,9 +203,5 @@ def features(
             "names": list(states),
         },
         ACTION_KEY: {"dtype": "float32", "shape": (len(actions),), "names": list(actions)},
-        SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},
-        **({INTERVENTION_KEY: INTERVENTION_FEATURE} if has_handovers else {}),
-        DONE_KEY: {"dtype": "bool", "shape": (1,), "names": None},
-        **({k: column.feature for k, column in SIMULATED.items()} if is_simulated else {}),
-        **({EXECUTED_KEY: EXECUTED.feature} if tuple(actions) != ACTION_NAMES else {}),
+        **{key: column.feature for key, column in COLUMNS.items() if has[column.where]},
     }

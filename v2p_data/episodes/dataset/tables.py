@@ -30,7 +30,7 @@ FRAME_SLACK = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class Problem:
     """One thing that does not fit."""
 
     check: str
@@ -102,15 +102,15 @@ def damage_told(root: Path) -> Generator[None]:
         ) from error
 
 
-def layout_problems(root: Path, info: dict[str, Any]) -> list[Found]:
+def layout_problems(root: Path, info: dict[str, Any]) -> list[Problem]:
     """Return what is missing, damaged or contradicts itself in the files, pictures aside."""
     try:
         return _layout_problems(root, info)
     except READING_ERRORS as error:
-        return [Found(check="unreadable_file", where="meta and data", detail=f"cannot be read ({_words(error)})")]  # fmt: skip
+        return [Problem(check="unreadable_file", where="meta and data", detail=f"cannot be read ({_words(error)})")]  # fmt: skip
 
 
-def _layout_problems(root: Path, info: dict[str, Any]) -> list[Found]:
+def _layout_problems(root: Path, info: dict[str, Any]) -> list[Problem]:
     found = list(_missing(root, info))
     if found:
         return found
@@ -141,19 +141,19 @@ STOPPING = (
 """After these LeRobot is not asked: it would look for the rest on the Hub, or make room for what is not there."""
 
 
-def _missing(root: Path, info: dict[str, Any]) -> Iterator[Found]:
+def _missing(root: Path, info: dict[str, Any]) -> Iterator[Problem]:
     wanted = [STATS_FILE, TASKS_FILE, EPISODES_GLOB, DATA_GLOB]
     wanted += [f"videos/{key}/*/*.mp4" for key in camera_keys(info, "video")]
     for pattern in wanted:
         if not any(root.glob(pattern)):
-            yield Found(
+            yield Problem(
                 check="missing_file",
                 where=pattern,
                 detail="is missing; the dataset was not finalized or not copied whole",
             )
 
 
-def _unreadable(root: Path) -> Iterator[Found]:
+def _unreadable(root: Path) -> Iterator[Problem]:
     for path in [
         root / TASKS_FILE,
         *sorted(root.glob(EPISODES_GLOB)),
@@ -163,15 +163,15 @@ def _unreadable(root: Path) -> Iterator[Found]:
             pq.read_metadata(path)
         except (pa.ArrowException, OSError) as error:
             words = str(error).splitlines()[0][:150]
-            yield Found(
+            yield Problem(
                 check="unreadable_file", where=_name(root, path),
                 detail=f"is no whole parquet file ({words}); its writer was killed or the copy was cut",
             )  # fmt: skip
     if json_or_none(root / STATS_FILE) is None:
-        yield Found(check="unreadable_file", where=STATS_FILE, detail="is no JSON")
+        yield Problem(check="unreadable_file", where=STATS_FILE, detail="is no JSON")
 
 
-def _missing_parts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
+def _missing_parts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
     """Yield columns and files that the tables name and that are not there."""
     wanted = ["episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"]
     wanted += ["data/chunk_index", "data/file_index"]
@@ -179,7 +179,7 @@ def _missing_parts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iter
     wanted += [f"videos/{key}/{part}" for key in camera_keys(info, "video") for part in parts]
     absent = [name for name in wanted if name not in episodes.column_names]
     if absent:
-        yield Found(
+        yield Problem(
             check="missing_column", where="meta/episodes", detail=f"lacks {', '.join(absent)}"
         )
         return
@@ -196,7 +196,7 @@ def _missing_parts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iter
         files |= {video_path(info, key, int(c), int(f)) for c, f in pairs}
     for name in sorted(files):
         if not (root / name).is_file():
-            yield Found(
+            yield Problem(
                 check="missing_file", where=name, detail="is missing, and episodes name it"
             )
 
@@ -224,38 +224,38 @@ def row_spans(of_row: np.ndarray) -> dict[int, tuple[int, int]]:
     return {int(k): (int(a), int(n)) for k, a, n in zip(numbers, first, count, strict=True)}
 
 
-def _counts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
+def _counts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
     lengths = column(episodes, "length")
     said = int(info["total_episodes"]), int(info["total_frames"])
     true = len(lengths), int(lengths.sum())
     if said != true:
-        yield Found(
+        yield Problem(
             check="counts", where=INFO_FILE,
             detail=f"names {said} episodes and frames, the episode table {true}",
         )  # fmt: skip
     rows = sum(pq.read_metadata(path).num_rows for path in sorted(root.glob(DATA_GLOB)))
     if rows != true[1]:
-        yield Found(
+        yield Problem(
             check="counts", where="data", detail=f"holds {rows} rows, the episode table {true[1]}"
         )
     tasks = tasks_of(root)
     if int(info.get("total_tasks", len(tasks))) != len(tasks):
-        yield Found(
+        yield Problem(
             check="counts", where=INFO_FILE,
             detail=f"names {info['total_tasks']} tasks, {TASKS_FILE} holds {len(tasks)}",
         )  # fmt: skip
     numbers = column(pq.read_table(root / TASKS_FILE), "task_index")
     if not np.array_equal(numbers, np.arange(len(numbers))):
-        yield Found(
+        yield Problem(
             check="index", where=TASKS_FILE,
             detail="tasks are not in the order of their numbers, so LeRobot takes one for another",
         )  # fmt: skip
 
 
-def _episode_order(episodes: pa.Table) -> Iterator[Found]:
+def _episode_order(episodes: pa.Table) -> Iterator[Problem]:
     numbers = column(episodes, "episode_index")
     if not np.array_equal(numbers, np.arange(len(numbers))):
-        yield Found(
+        yield Problem(
             check="index", where="meta/episodes",
             detail="episode numbers have a gap or are out of order; LeRobot finds episodes by position "
             "and takes one for another",
@@ -264,13 +264,13 @@ def _episode_order(episodes: pa.Table) -> Iterator[Found]:
     starts = column(episodes, "dataset_from_index"), column(episodes, "dataset_to_index")
     wrong = np.flatnonzero((starts[1] != ends) | (starts[0] != ends - column(episodes, "length")))
     if len(wrong):
-        yield Found(
+        yield Problem(
             check="index", where=f"episode {wrong[0]}",
             detail=f"its rows are said to be {starts[0][wrong[0]]} to {starts[1][wrong[0]]}, which its place and length contradict",
         )  # fmt: skip
 
 
-def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
+def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
     """Yield what is wrong with which rows lie in which file."""
     where_is: dict[int, set[str]] = {}
     counted: dict[int, int] = {}
@@ -279,12 +279,12 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Foun
         name = _name(root, path)
         absent = [c for c in _columns(info) if c not in pq.read_schema(path).names]
         if absent:
-            yield Found(check="missing_column", where=name, detail=f"lacks {', '.join(absent)}")
+            yield Problem(check="missing_column", where=name, detail=f"lacks {', '.join(absent)}")
             return
         table = pq.read_table(path, columns=["episode_index", "task_index"])
         tasks = column(table, "task_index")
         if len(tasks) and not 0 <= tasks.min() <= tasks.max() < num_tasks:
-            yield Found(
+            yield Problem(
                 check="task", where=name, detail=f"names task {tasks.max()} of {num_tasks}"
             )
         for number, rows in zip(*np.unique(column(table, "episode_index"), return_counts=True), strict=True):  # fmt: skip
@@ -292,9 +292,11 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Foun
             counted[int(number)] = counted.get(int(number), 0) + int(rows)
     for k, length in enumerate(column(episodes, "length")):
         if counted.get(k, 0) == 0:
-            yield Found(check="missing_rows", where=f"episode {k}", detail="has no rows in data/")
+            yield Problem(
+                check="missing_rows", where=f"episode {k}", detail="has no rows in data/"
+            )
         elif counted[k] != length:
-            yield Found(
+            yield Problem(
                 check="length", where=f"episode {k}", detail=f"has {counted[k]} rows, not {length}"
             )
     named = [
@@ -303,7 +305,7 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Foun
     ]  # fmt: skip
     for k, name in enumerate(named):
         if where_is.get(k, {name}) != {name}:
-            yield Found(
+            yield Problem(
                 check="index", where=f"episode {k}",
                 detail=f"is said to lie in {name} and lies in {', '.join(sorted(where_is[k]))}",
             )  # fmt: skip
@@ -313,7 +315,7 @@ def _columns(info: dict[str, Any]) -> list[str]:
     return [k for k, f in info["features"].items() if f.get("dtype") != "video"]
 
 
-def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
+def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
     """Yield episodes whose part of the video is of another length, or overlaps another's."""
     fps = float(info["fps"])
     seconds = column(episodes, "length") / fps
@@ -322,7 +324,7 @@ def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
         end = column(episodes, f"videos/{key}/to_timestamp")
         wrong = np.flatnonzero(np.abs(end - start - seconds) > FRAME_SLACK / fps)
         for k in wrong:
-            yield Found(
+            yield Problem(
                 check="video_times", where=f"episode {k}",
                 detail=f"{key}: {end[k] - start[k]:.3f} s of video for {seconds[k]:.3f} s of rows",
             )  # fmt: skip
@@ -332,13 +334,13 @@ def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Found]:
         order = np.lexsort((start, files[:, 1], files[:, 0]))
         for a, b in itertools.pairwise(order):
             if (files[a] == files[b]).all() and start[b] < end[a] - FRAME_SLACK / fps:
-                yield Found(
+                yield Problem(
                     check="video_times", where=f"episode {b}",
                     detail=f"{key}: begins in the video before episode {a} ends there",
                 )  # fmt: skip
 
 
-def _video_sizes(root: Path, info: dict[str, Any]) -> Iterator[Found]:
+def _video_sizes(root: Path, info: dict[str, Any]) -> Iterator[Problem]:
     """Yield videos of other pictures than the dataset says; what no player opens is left to LeRobot."""
     from lerobot.datasets.video_utils import av  # LeRobot's module is this room's door to video
 
@@ -349,7 +351,7 @@ def _video_sizes(root: Path, info: dict[str, Any]) -> Iterator[Found]:
             with suppress(av.FFmpegError, LookupError, ValueError), av.open(str(path)) as video:
                 size = video.streams.video[0].height, video.streams.video[0].width
             if size not in (said[:2], said[1:]):
-                yield Found(
+                yield Problem(
                     check="video_size", where=_name(root, path),
                     detail=f"has pictures of {size[1]} x {size[0]} px, {INFO_FILE} says {said}",
                 )  # fmt: skip

@@ -1,35 +1,31 @@
-"""A dataset, reopened with LeRobot and looked at frame by frame.
+"""A dataset of ours, reopened with LeRobot and looked at frame by frame.
 
-The tables are read first, without LeRobot (`tables`); then every frame is read the way a training would read
-it. With the staged episodes at hand each mask, state and action is compared with what was recorded. Any LeRobot
-v3 dataset is welcome: what holds for all is checked, what holds for ours only is left out elsewhere, and
-the report says what was left out and why.
+The tables are read first, without LeRobot (`tables`); then every frame is read the way a training would read it.
+With the staged episodes at hand each mask, state and action is compared with what was recorded.
 """
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from v2p_data.episodes.dataset.about import CARRIED_TASKS, about_problems, as_in_table, read_about
-from v2p_data.episodes.dataset.edited import changed_files
-from v2p_data.episodes.dataset.features import INTERVENTION_KEY, METADATA_FILE
-from v2p_data.episodes.dataset.frame_checks import Checks, Said
+from v2p_data.episodes.dataset.about import about_problems, changed_files, demand_about
+from v2p_data.episodes.dataset.features import INTERVENTION_KEY
+from v2p_data.episodes.dataset.frame_checks import DatasetChecks
 from v2p_data.episodes.dataset.intake import demand_bounded
 from v2p_data.episodes.dataset.reading import Rows, same
 from v2p_data.episodes.dataset.tables import (
     STOPPING,
-    Found,
+    Problem,
     episodes_of,
     layout_problems,
     read_info,
 )
 from v2p_data.episodes.staging import Episode
-from v2p_data.errors import UnusableError, V2PError
+from v2p_data.errors import UnusableError
 from v2p_data.pipeline.artifact import RECORD_FILE
 
-Problem = Found
 SHOWN_PROBLEMS = 5
 RENUMBERED = ("index", "episode_index", "task_index")
 
@@ -39,17 +35,11 @@ class VerifyReport:
     """What was read and what is wrong with it."""
 
     root: Path
-    num_episodes: int
-    num_frames: int
-    is_ours: bool
-    """Written by this engine, so that its own rules apply."""
-    is_compared: bool
+    num_episodes: int = 0
+    num_frames: int = 0
+    is_compared: bool = False
     """Every frame was compared with what was recorded."""
     problems: tuple[Problem, ...]
-    notes: tuple[Problem, ...] = ()
-    """Oddities that no training suffers from."""
-    skipped: tuple[str, ...] = ()
-    """What was not checked, and why."""
 
     @property
     def is_good(self) -> bool:
@@ -61,7 +51,7 @@ class VerifyReport:
         if self.is_good:
             same = ", all equal to what was recorded" if self.is_compared else ""
             return f"{read}: no problem found{same}"
-        kinds = list(_kinds(self.problems))
+        kinds = self._kinds()
         shown = "; ".join(f"{where}: {p.detail}" for p, where in kinds[:SHOWN_PROBLEMS])
         more = len(kinds) - SHOWN_PROBLEMS
         return f"{read}: {len(self.problems)} problems: {shown}" + (
@@ -69,26 +59,23 @@ class VerifyReport:
         )
 
     def lines(self) -> list[str]:
-        """Return it for people, a line for each kind."""
-        return [
-            *(f"problem  {p.check:<16} {where}: {p.detail}" for p, where in _kinds(self.problems)),
-            *(f"note     {p.check:<16} {where}: {p.detail}" for p, where in _kinds(self.notes)),
-            *(f"skipped  {words}" for words in self.skipped),
-        ]
+        """Return it for people, a line for each kind of problem."""
+        return [f"problem  {p.check:<16} {where}: {p.detail}" for p, where in self._kinds()]
 
     def as_json(self) -> dict[str, Any]:
         """Return it for JSON."""
         return asdict(self) | {"root": str(self.root), "is_good": self.is_good}
 
-
-def _kinds(found: Sequence[Found]) -> Iterator[tuple[Found, str]]:
-    """Yield the first finding of each kind, and where it is; of a kind are those that differ in their numbers only."""
-    kinds: dict[tuple[str, ...], list[Found]] = {}
-    for one in found:
-        words = (re.sub(r"\d+", "#", words) for words in (one.where, one.detail))
-        kinds.setdefault((one.check, *words), []).append(one)
-    for first, *more in kinds.values():
-        yield first, f"{first.where} and {len(more)} more like it" if more else first.where
+    def _kinds(self) -> list[tuple[Problem, str]]:
+        """Return the first problem of each kind and where it is; those of a kind differ in their numbers only."""
+        kinds: dict[tuple[str, ...], list[Problem]] = {}
+        for one in self.problems:
+            words = (re.sub(r"\d+", "#", words) for words in (one.where, one.detail))
+            kinds.setdefault((one.check, *words), []).append(one)
+        return [
+            (first, f"{first.where} and {len(more)} more like it" if more else first.where)
+            for first, *more in kinds.values()
+        ]
 
 
 def verify(
@@ -97,125 +84,85 @@ def verify(
     *,
     on_progress: Callable[[float, str], None] = lambda share, words: None,
 ) -> VerifyReport:
-    """Read every frame of the LeRobot dataset at `root` and list what is wrong.
+    """Read every frame of the dataset of ours at `root` and list what is wrong.
 
     Args:
         root: folder of a finished dataset.
         staged: the episodes it was packed from, in order, to compare with.
-        on_progress: told the share that is done and a few words.
+        on_progress: is called with the share that is done and a few words.
 
     Raises:
-        V2PError: there is no LeRobot v3 dataset at `root`, or none that can be read in bounded memory.
+        V2PError: there is no dataset of ours at `root`, or none that can be read in bounded memory.
     """
     info = read_info(root)
     demand_bounded(root)
-    said = Said()
-    said.problems += [*_changed_files(root, said), *layout_problems(root, info)]
-    about = _about(root, said)
-    checks = Checks(info=info, about=about, said=said)
-    if any(p.check in STOPPING for p in said.problems):
-        return _report(root, checks, 0, 0, is_compared=False)
-    if about is not None:
-        table = episodes_of(root)
-        if said.notes and len(table) == len(about["episodes"]):  # edited
-            told, about = about, as_in_table(about, table)
-            pairs = zip(told["episodes"], about["episodes"], strict=True)
-            if renamed := sum(a["task"] != b["task"] for a, b in pairs):
-                said.note("edited", "meta/episodes", f"{renamed} of {len(table)} episodes have another instruction than when they were packed")  # fmt: skip
-        tasks, lengths = (table.column(name).to_pylist() for name in ("tasks", "length"))
-        said.problems += about_problems(root, about, tasks, lengths)
-    leftovers = sorted(p.name for p in [root / "images", *root.glob("tmp*")] if p.exists())
-    if leftovers:
-        said.note("leftovers", ", ".join(leftovers), "LeRobot's temporary files; a push of its own uploads tmp*")  # fmt: skip
-    repo_id = str((about or {}).get("repo_id", "local/dataset"))
+    about = demand_about(root)
+    problems = [*_changed(root), *layout_problems(root, info)]
+    if any(p.check in STOPPING for p in problems):
+        return VerifyReport(root=root, problems=tuple(problems))
+    table = episodes_of(root)
+    lengths = [int(n) for n in table.column("length").to_pylist()]
+    problems += about_problems(root, about, table.column("tasks").to_pylist(), lengths)
     on_progress(0.0, "starting LeRobot")
-    return _read(root, checks, repo_id, staged, on_progress)
-
-
-def _changed_files(root: Path, said: Said) -> Iterator[Found]:
-    """Yield what is not as the record of a dataset of ours lists it; others have no record."""
     try:
-        changed = changed_files(root)
-    except UnusableError as error:
-        yield Found(check="record", where=RECORD_FILE, detail=error.detail)
-        return
-    if changed.edited:
-        said.note("edited", ", ".join(changed.edited), "changed since packing, as LeRobot's tools change them")  # fmt: skip
-    for damage in changed.damaged:
-        where = damage.path.relative_to(root).as_posix()
-        yield Found(check="changed_file", where=where, detail=f"{damage.what}, says {RECORD_FILE}")
-
-
-def _about(root: Path, said: Said) -> dict[str, Any] | None:
-    """Return what our own metadata says; what is wrong with it is a finding."""
-    try:
-        about = read_about(root)
-    except V2PError as error:
-        said.add("unreadable_about", METADATA_FILE, str(error))
-        return None
-    if not (root / METADATA_FILE).is_file():
-        if (root / CARRIED_TASKS).is_dir():
-            said.add(
-                "missing_file", METADATA_FILE, "is missing, and the dataset carries tasks of ours"
-            )
-        elif about is not None:
-            said.note("edited", METADATA_FILE, "was left out by LeRobot's tools; meta/episodes holds what it said of each episode")  # fmt: skip
-    return about
-
-
-def _read(
-    root: Path,
-    checks: Checks,
-    repo_id: str,
-    staged: Sequence[Path] | None,
-    on_progress: Callable[[float, str], None],
-) -> VerifyReport:
-    try:
-        rows = Rows(root, repo_id)
+        rows = Rows(root, str(about["repo_id"]))
     except Exception as error:  # noqa: BLE001 - whatever LeRobot stumbles over is the finding
-        checks.said.add("does_not_open", str(root), f"{type(error).__name__}: {error}")
-        return _report(root, checks, 0, 0, is_compared=False)
-    lengths = [int(n) for n in episodes_of(root).column("length").to_pylist()]
+        words = f"{type(error).__name__}: {error}"
+        problems.append(Problem(check="does_not_open", where=str(root), detail=words))
+        return VerifyReport(root=root, problems=tuple(problems))
+    checks = DatasetChecks(info, about, problems)
     if staged is not None and len(staged) != len(lengths):
-        checks.said.add(
+        checks.add(
             "counts", "dataset", f"holds {len(lengths)} episodes, {len(staged)} were recorded"
         )
     start = 0
     for k, length in enumerate(lengths):
         recorded = Episode.load(staged[k]) if staged is not None and k < len(staged) else None
-        episode = checks.episode(k, start, length, recorded)
-        try:
-            for row in rows.episode(start, length):
-                episode.look_at(row)
-        except Exception as error:  # noqa: BLE001 - whatever LeRobot stumbles over is the finding
-            words = str(error).strip().splitlines()[:1] or [""]
-            checks.said.add("does_not_read", f"episode {k}", f"after frame {len(episode.tasks)}: {type(error).__name__}: {words[0][:200]}")  # fmt: skip
-        else:
-            episode.finish()
+        _check_episode(checks, rows, k, start, length, recorded)
         start += length
         on_progress((k + 1) / len(lengths), f"read {k + 1} episodes")
     checks.statistics(rows.dataset.meta.stats or {})
-    return _report(root, checks, len(lengths), start, is_compared=staged is not None)
-
-
-def _report(
-    root: Path, checks: Checks, num_episodes: int, num_frames: int, *, is_compared: bool
-) -> VerifyReport:
     return VerifyReport(
         root=root,
-        num_episodes=num_episodes,
-        num_frames=num_frames,
-        is_ours=checks.is_ours,
-        is_compared=is_compared,
-        problems=tuple(checks.said.problems),
-        notes=tuple(checks.said.notes),
-        skipped=tuple(checks.skipped()),
+        num_episodes=len(lengths),
+        num_frames=start,
+        is_compared=staged is not None,
+        problems=tuple(problems),
     )
 
 
-def frames_differ(
-    root: Path, sources: Sequence[tuple[Path, Sequence[int]]], keys: Sequence[str] | None = None
-) -> str:
+def _changed(root: Path) -> list[Problem]:
+    """Return what is not as the record of the dataset lists it."""
+    try:
+        changed = changed_files(root)
+    except UnusableError as error:
+        return [Problem(check="record", where=RECORD_FILE, detail=error.detail)]
+    return [
+        Problem(
+            check="changed_file",
+            where=damage.path.relative_to(root).as_posix(),
+            detail=f"{damage.what}, says {RECORD_FILE}",
+        )
+        for damage in changed
+    ]
+
+
+def _check_episode(
+    checks: DatasetChecks, rows: Rows, k: int, start: int, length: int, recorded: Episode | None
+) -> None:
+    episode = checks.episode(k, start, length, recorded)
+    try:
+        for row in rows.episode(start, length):
+            episode.look_at(row)
+    except Exception as error:  # noqa: BLE001 - whatever LeRobot stumbles over is the finding
+        words = (str(error).strip().splitlines() or [""])[0][:200]
+        where = f"after frame {len(episode.tasks)}"
+        checks.add("does_not_read", f"episode {k}", f"{where}: {type(error).__name__}: {words}")
+    else:
+        episode.finish()
+
+
+def difference_of_frames(root: Path, sources: Sequence[tuple[Path, Sequence[int]]]) -> str:
     """Return how the dataset at `root` differs from episodes of other datasets, frame by frame.
 
     Of a source without the column that says who acted the expert did throughout. One without words says nothing of them.
@@ -223,15 +170,13 @@ def frames_differ(
     Args:
         root: the dataset; its episodes are those of `sources`, in order.
         sources: folders of datasets, each with the numbers of its episodes.
-        keys: columns to compare; all but the numbering by default.
 
     Returns:
         A sentence, empty where all pixels and numbers are equal.
     """
     made = Rows(root)
-    absent = {INTERVENTION_KEY: True}
-    columns = [*(keys or (k for k in made.dataset.meta.features if k not in RENUMBERED)), "task"]
-    told = [key for key in columns if key.startswith("language_")]
+    columns = [*(k for k in made.dataset.meta.features if k not in RENUMBERED), "task"]
+    words = [key for key in columns if key.startswith("language_")]
     at = 0
     for folder, numbers in sources:
         source = Rows(folder)
@@ -242,11 +187,12 @@ def frames_differ(
                 return f"{root} ends before episode {number} of {folder}"
             pairs = zip(source.episode(start, length), made.episode(at, length), strict=True)
             for t, (old, new) in enumerate(pairs):
-                absent |= {key: new[key] for key in told}
-                wrong = [
-                    key for key in columns if not same(old.get(key, absent.get(key)), new[key])
-                ]
+                absent = {INTERVENTION_KEY: True} | {key: new[key] for key in words}
+                wrong = [k for k in columns if not same(old.get(k, absent.get(k)), new[k])]
                 if wrong:
-                    return f"row {at + t} differs from frame {t} of episode {number} of {folder} in {', '.join(wrong)}"  # fmt: skip
+                    return (
+                        f"row {at + t} differs from frame {t} of episode {number} of {folder} in "
+                        f"{', '.join(wrong)}"
+                    )
             at += length
     return "" if at == len(made) else f"{root} holds {len(made)} rows, {at} were to be in it"

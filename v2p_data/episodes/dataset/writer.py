@@ -5,6 +5,7 @@ dataset grows in `<root>.partial`, is checked, and is renamed into place at the 
 finished. The same episodes give the same bytes, after any number of kills, with any number of threads.
 """
 
+import hashlib
 import json
 import logging
 import os
@@ -18,16 +19,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from v2p_data.episodes.dataset.cut import write_stats
-from v2p_data.episodes.dataset.edited import number_digest
 from v2p_data.episodes.dataset.encoding import MASK_CRF, RGB_CRF, encoder_config
 from v2p_data.episodes.dataset.episode_stats import number_stats
 from v2p_data.episodes.dataset.features import (
-    ACTION_KEY,
     ACTION_NAMES,
     CONTACT_KEY,
     DEMONSTRATION,
-    DONE_KEY,
     EPISODE_COLUMN,
     EXECUTED_KEY,
     FPS,
@@ -38,10 +35,16 @@ from v2p_data.episodes.dataset.features import (
     METADATA_SCHEMA,
     ROBOT_TYPE,
     SIMULATED,
-    STATE_KEY,
-    SUCCESS_KEY,
+    columns_of,
     features,
     state_names,
+)
+from v2p_data.episodes.dataset.layout import (
+    CHUNK_FILES,
+    VIDEO_FILE_MB,
+    RowFiles,
+    file_in,
+    write_stats,
 )
 from v2p_data.episodes.dataset.repo_id import check_repo_id
 from v2p_data.episodes.dataset.shards import (
@@ -52,6 +55,7 @@ from v2p_data.episodes.dataset.shards import (
     stats_of,
     write_file,
 )
+from v2p_data.episodes.dataset.tables import VIDEO_PATH
 from v2p_data.episodes.staging import (
     Episode,
     Heading,
@@ -63,10 +67,6 @@ from v2p_data.sim.render.masks import MASK_CAMERAS, PALETTE, WRIST_CAMERA, label
 
 logger = logging.getLogger(__name__)
 
-VIDEO_FILE_MB = 200
-"""LeRobot's own limit, for us and for its tools when they add to the dataset; 400,000 frames of masks."""
-DATA_FILE_FRAMES = 400_000
-"""Rows per file, 40 MB; each episode is a row group of its own, as LeRobot writes it."""
 EPISODES_PER_WRITE = 100
 
 
@@ -201,12 +201,13 @@ def _write(
 ) -> list[dict[str, Any]]:
     """Write everything but our own metadata; return what is told of each episode there."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
     from lerobot.datasets.io_utils import write_info
 
     first = shards[0].episodes[0]
     headings = [heading for shard in shards for heading in shard.episodes]
     has_handovers = any(e.is_handover for e in headings)
-    is_simulated = all(SIMULATED.keys() <= set(e.known) for e in headings)
+    is_simulated = all(set(SIMULATED) <= set(e.known) for e in headings)
     meta: Any = LeRobotDatasetMetadata.create(
         repo_id,
         fps=FPS,
@@ -225,7 +226,8 @@ def _write(
     )
     lies_in = _write_videos(shards, finished, first.cameras, meta)
     described: list[dict[str, Any]] = []
-    data = _DataFiles(meta)
+    schema = get_hf_features_from_features(meta.features).arrow_schema
+    files = RowFiles(root, schema)
     try:
         for shard in shards:
             frame = 0
@@ -238,17 +240,18 @@ def _write(
                     number, start = lies_in[camera, shard.number]
                     key, begin = f"videos/{KEY_OF_CAMERA[camera]}", start + frame
                     where |= {
-                        f"{key}/chunk_index": number // meta.chunks_size,
-                        f"{key}/file_index": number % meta.chunks_size,
+                        f"{key}/chunk_index": number // CHUNK_FILES,
+                        f"{key}/file_index": number % CHUNK_FILES,
                         f"{key}/from_timestamp": begin / FPS,
                         f"{key}/to_timestamp": (begin + episode.num_frames) / FPS,
                     }
                 described.append(_describe(episode, meta.features))
                 where[EPISODE_COLUMN] = json.dumps(described[-1])
-                data.add(episode, {KEY_OF_CAMERA[c]: s for c, s in stats.items()}, where)
+                of_pictures = {KEY_OF_CAMERA[c]: s for c, s in stats.items()}
+                _save_episode(meta, files, episode, of_pictures, where)
                 frame += episode.num_frames
     finally:
-        data.close()
+        files.close()
         meta.finalize()
     write_info(meta.info, root)
     write_stats(root)
@@ -263,7 +266,8 @@ def _write_videos(
     for camera in cameras:
         planned = plan_files(shards, finished, camera, VIDEO_FILE_MB * 2**20)
         for number, group in enumerate(planned):
-            write_file(group, finished, camera, _video_path(meta, number, camera))
+            path = file_in(VIDEO_PATH, number, video_key=KEY_OF_CAMERA[camera])
+            write_file(group, finished, camera, Path(meta.root) / path)
             frame = 0
             for shard in group:
                 lies_in[camera, shard.number] = number, frame
@@ -274,77 +278,31 @@ def _write_videos(
     return lies_in
 
 
-class _DataFiles:
-    """Writes rows and what LeRobot notes of each episode.
-
-    Args:
-        meta: LeRobot's metadata, which grows.
-    """
-
-    def __init__(self, meta: Any) -> None:
-        from lerobot.datasets.feature_utils import get_hf_features_from_features
-
-        self.meta = meta
-        self.schema: pa.Schema = get_hf_features_from_features(meta.features).arrow_schema
-        self.numbers = {k: f for k, f in meta.features.items() if f["dtype"] != "video"}
-        self.file = 0
-        self.first_row = 0
-        self.writer: pq.ParquetWriter | None = None
-
-    def add(self, episode: Episode, picture_stats: dict[str, Any], where: dict[str, Any]) -> None:
-        """Append an episode."""
-        meta, count = self.meta, episode.num_frames
-        index, first = int(meta.total_episodes), int(meta.total_frames)
-        meta.save_episode_tasks([episode.task])
-        columns = {
-            STATE_KEY: episode.state,
-            ACTION_KEY: episode.action,
-            SUCCESS_KEY: episode.success,
-            INTERVENTION_KEY: episode.expert_acted,
-            DONE_KEY: np.arange(count) == count - 1,
-            **episode.simulated,
-            "timestamp": (np.arange(count) / FPS).astype(np.float32),
-            "frame_index": np.arange(count),
-            "episode_index": np.full(count, index),
-            "index": np.arange(first, first + count),
-            "task_index": np.full(count, meta.get_task_index(episode.task)),
-        }
-        if self.writer is None or first - self.first_row + count > DATA_FILE_FRAMES:
-            self._next_file(first)
-        assert self.writer is not None
-        table = pa.table({n: _column(columns[n], self.schema.field(n)) for n in self.schema.names})
-        self.writer.write_table(table.cast(self.schema))
-        chunk, file = divmod(self.file - 1, meta.chunks_size)
-        meta.save_episode(
-            index,
-            count,
-            [episode.task],
-            picture_stats | number_stats({n: columns[n] for n in self.numbers}, self.numbers),
-            {
-                "data/chunk_index": chunk,
-                "data/file_index": file,
-                "dataset_from_index": first,
-                "dataset_to_index": first + count,
-                **where,
-            },
-        )
-
-    def _next_file(self, first_row: int) -> None:
-        self.close()
-        chunk, file = divmod(self.file, self.meta.chunks_size)
-        path = self.meta.root / self.meta.data_path.format(chunk_index=chunk, file_index=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self.writer = pq.ParquetWriter(
-            path, schema=self.schema, compression="snappy", use_dictionary=True
-        )
-        self.file += 1
-        self.first_row = first_row
-
-    def close(self) -> None:
-        """Finish the file in hand."""
-        if self.writer is not None:
-            self.writer.close()
-            self.writer = None
+def _save_episode(
+    meta: Any,
+    files: RowFiles,
+    episode: Episode,
+    picture_stats: dict[str, Any],
+    where: dict[str, Any],
+) -> None:
+    """Append an episode's rows, and what LeRobot's metadata holds of it."""
+    index, count = int(meta.total_episodes), episode.num_frames
+    first = int(meta.total_frames)
+    meta.save_episode_tasks([episode.task])
+    columns = {
+        **columns_of(episode),
+        "timestamp": (np.arange(count) / FPS).astype(np.float32),
+        "frame_index": np.arange(count),
+        "episode_index": np.full(count, index),
+        "index": np.arange(first, first + count),
+        "task_index": np.full(count, meta.get_task_index(episode.task)),
+    }
+    schema = files.schema
+    table = pa.table({n: _column(columns[n], schema.field(n)) for n in schema.names})
+    lies_in = files.add(table)
+    numbers = {k: f for k, f in meta.features.items() if f["dtype"] != "video"}
+    stats = picture_stats | number_stats({n: columns[n] for n in numbers}, numbers)
+    meta.save_episode(index, count, [episode.task], stats, lies_in | where)
 
 
 def _column(values: np.ndarray, field: pa.Field) -> pa.Array:
@@ -352,14 +310,6 @@ def _column(values: np.ndarray, field: pa.Field) -> pa.Array:
         return pa.array(values, type=field.type)
     flat = pa.array(np.ascontiguousarray(values).reshape(-1), type=field.type.value_type)
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-
-
-def _video_path(meta: Any, number: int, camera: str) -> Path:
-    chunk, file = divmod(number, meta.chunks_size)
-    name = meta.video_path.format(
-        video_key=KEY_OF_CAMERA[camera], chunk_index=chunk, file_index=file
-    )
-    return Path(meta.root) / name
 
 
 def _describe(episode: Episode, columns: Collection[str]) -> dict[str, Any]:
@@ -380,10 +330,18 @@ def _describe(episode: Episode, columns: Collection[str]) -> dict[str, Any]:
         "labels": {str(k): name for k, name in label_names(episode.objects).items()},
         "success": bool(np.any(episode.success)),
         "referee": episode.referee,
-        "numbers": number_digest(numbers),
+        "numbers": _number_digest(numbers),
         "params": episode.params,
         **(source if INTERVENTION_KEY in columns else {}),
     }
+
+
+def _number_digest(columns: Sequence[np.ndarray]) -> str:
+    """Return the digest of an episode's columns of fractions, in the order of the features."""
+    digest = hashlib.sha256()
+    for values in columns:
+        digest.update(np.asarray(values, np.float64).tobytes())
+    return digest.hexdigest()
 
 
 def _check_tables(root: Path, shards: Sequence[Shard]) -> None:
