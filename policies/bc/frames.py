@@ -6,8 +6,6 @@ is made anew when either has changed, or where its arrays have not the checksums
 whole or absent, and one process at a time reads or writes it.
 """
 
-import contextlib
-import fcntl
 import hashlib
 import json
 import logging
@@ -22,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
+from filelock import FileLock
 from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 
@@ -245,7 +244,7 @@ def _as_array(column: Any) -> np.ndarray:
 def _cached_pictures(dataset: Path, meta: Any, net: BCNet, key: str, cache: Path) -> Prepared:
     num_frames = int(np.sum(meta.episodes["length"]))
     identity = _identity(dataset, meta, net, key)
-    with _locked(cache):
+    with _lock_of(cache):
         stored = _open_cache(cache, identity)
         if stored is not None:
             return stored
@@ -276,13 +275,10 @@ def _cached_pictures(dataset: Path, meta: Any, net: BCNet, key: str, cache: Path
     return stored
 
 
-@contextlib.contextmanager
-def _locked(cache: Path) -> Iterator[None]:
-    """Let no other process read or write the cache meanwhile."""
+def _lock_of(cache: Path) -> FileLock:
+    """Return the lock under which a cache is read and written."""
     cache.parent.mkdir(parents=True, exist_ok=True)
-    with cache.with_name(f"{cache.name}.lock").open("a") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        yield
+    return FileLock(cache.with_name(f"{cache.name}.lock"))
 
 
 def _identity(dataset: Path, meta: Any, net: BCNet, key: str) -> str:

@@ -1,20 +1,24 @@
 """What a run and its workers agree on, wherever these are: events, locks, and what a worker does with its output."""
 
 import faulthandler
-import fcntl
 import logging
 import os
-import time
+import uuid
+from collections.abc import Generator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TextIO
+from typing import Literal
+
+from filelock import FileLock, Timeout
 
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.runner import Outcome, Stage
 
 RUN_LOCK = ".lock"
-WORKER_LOCK = ".workers.lock"
-"""Shared by the workers: as long as one lives, no new run begins."""
+RUN_NAME_FILE = ".run"
+WORKERS_FOLDER = ".workers"
+"""Holds a lock for each worker: as long as one lives, no new run begins."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,51 +34,66 @@ class Event:
 
 def is_at_work(root: Path) -> bool:
     """Return whether a run holds the folder's lock."""
-    try:
-        with (root / RUN_LOCK).open() as stream:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
+    if not (root / RUN_LOCK).exists():
         return False
-    return False
+    try:
+        with FileLock(root / RUN_LOCK, blocking=False):
+            return False
+    except OSError as error:
+        return isinstance(error, Timeout)
 
 
 def run_name(root: Path) -> str:
     """Return what tells the run that is at work in a folder from earlier and later ones; empty: none began."""
-    return (root / RUN_LOCK).read_text() if (root / RUN_LOCK).exists() else ""
+    return (root / RUN_NAME_FILE).read_text() if (root / RUN_NAME_FILE).exists() else ""
 
 
-def lock(stream: TextIO, root: Path, wait_s: float) -> None:
-    """Hold an open file alone.
+def held(path: Path, root: Path, wait_s: float) -> AbstractContextManager[object]:
+    """Return a lock of a run folder, held until the context or this process ends.
 
     Raises:
         V2PError: another process holds it, and did so all the time.
     """
-    deadline = time.monotonic() + wait_s
-    while True:
-        try:
-            return fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if time.monotonic() >= deadline:
-                raise V2PError(
-                    f"another v2p run is at work in {root}; wait for it or choose another --out"
-                ) from error
-            time.sleep(0.1)
+    try:
+        return FileLock(path).acquire(timeout=wait_s, poll_interval=0.1)
+    except Timeout as error:
+        raise V2PError(
+            f"another v2p run is at work in {root}; wait for it or choose another --out"
+        ) from error
+
+
+@contextmanager
+def as_worker(root: Path) -> Generator[None]:
+    """Be one of the workers of a run folder, for whose end a new run waits."""
+    (root / WORKERS_FOLDER).mkdir(parents=True, exist_ok=True)
+    path = root / WORKERS_FOLDER / f"{uuid.uuid4().hex}.lock"
+    with held(path, root, wait_s=0.0):
+        yield
+        path.unlink(missing_ok=True)
+
+
+def wait_for_workers(root: Path, wait_s: float) -> None:
+    """Return when the workers of earlier runs have ended; remove what they left.
+
+    Raises:
+        V2PError: one of them is still at work.
+    """
+    for path in (root / WORKERS_FOLDER).glob("*.lock"):
+        with held(path, root, wait_s):
+            path.unlink(missing_ok=True)
 
 
 def no_progress(share: float, words: str) -> None:
     del share, words
 
 
-def write_to(log: Path) -> TextIO:
-    """Send all that this process says to the end of a log; return it, which stays open."""
+def write_to(log: Path) -> None:
+    """Send all that this process says to the end of a log."""
     log.parent.mkdir(parents=True, exist_ok=True)
-    stream = log.open("a")
-    os.dup2(stream.fileno(), 1)
-    os.dup2(stream.fileno(), 2)
+    with log.open("a") as stream:
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", force=True)
-    return stream
 
 
 def limit_threads(num_threads: int) -> None:

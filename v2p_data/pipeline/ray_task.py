@@ -1,21 +1,19 @@
 """What a task does on its node: one stage, in a process of its own. Knows nothing of Ray."""
 
 import contextlib
-import fcntl
 import os
 import pickle
 import signal
 import socket
 import sys
 from pathlib import Path
-from typing import TextIO
 
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.at_work import (
-    WORKER_LOCK,
+    as_worker,
+    held,
     limit_threads,
     limit_time,
-    lock,
     run_name,
     write_to,
 )
@@ -34,7 +32,7 @@ def log_of(stage: Stage, root: Path) -> Path:
 def work(how: bytes, what: bytes) -> Outcome:
     """Make a stage in this process of a node, which does nothing else; return what became of it.
 
-    Two processes never fill one folder: the item's log is held until the process ends, and a run that has been followed
+    Two processes never fill one folder: the item's lock is held until the process ends, and a run that has been followed
     by another one begins nothing more.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once, not when Python gets round to it
@@ -44,30 +42,31 @@ def work(how: bytes, what: bytes) -> Outcome:
     with contextlib.suppress(OSError):
         os.chdir(home)  # recipes may name videos relative to it
     stage: Stage = pickle.loads(what)
+    log = log_of(stage, runtime.root)
     try:
-        alive = _part_of(run, runtime.root)
-        lock(write_to(log_of(stage, runtime.root)), runtime.root, wait_s=ITEM_FREE_S)
+        _demand_at_work(run, runtime.root)
+        write_to(log)
+        with (
+            as_worker(runtime.root),
+            held(log.with_suffix(".lock"), runtime.root, wait_s=ITEM_FREE_S),
+        ):
+            _demand_at_work(run, runtime.root)  # perhaps another one waits for us since
+            limit_time(runtime.limit_s)
+            return stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
     except V2PError as error:
         return failed(stage, runtime.root, "error", str(error))
-    limit_time(runtime.limit_s)
-    with alive:
-        return stored_outcome(stage, runtime.root) or make_stage(stage, runtime)
 
 
-def _part_of(run: str, root: Path) -> TextIO:
-    """Return the workers' lock, held, of a run that is still at work.
+def _demand_at_work(run: str, root: Path) -> None:
+    """Raise unless a run is the last one in its folder; asked by a worker, for whose end a new run waits.
 
     Raises:
-        V2PError: this node does not see that run.
+        V2PError: it has been followed by another one, or this node does not see it.
     """
-    with contextlib.suppress(FileNotFoundError):
-        alive = (root / WORKER_LOCK).open("a")
-        fcntl.flock(alive, fcntl.LOCK_SH)
-        if run_name(root) == run:  # asked after the lock, for which a new run waits
-            return alive
-    raise V2PError(
-        f"{socket.gethostname()} does not see this run in {root}: all nodes need the run folder at the same path"
-    )
+    if run_name(root) != run:
+        raise V2PError(
+            f"{socket.gethostname()} does not see this run in {root}: all nodes need the run folder at the same path"
+        )
 
 
 def failed(stage: Stage, root: Path, reason: str, detail: str) -> Outcome:

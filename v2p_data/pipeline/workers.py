@@ -5,7 +5,6 @@ when their parent is gone, however it went, so that a killed run leaves nothing 
 """
 
 import contextlib
-import fcntl
 import heapq
 import multiprocessing
 import os
@@ -18,17 +17,19 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Protocol, TextIO, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.at_work import (
     RUN_LOCK,
-    WORKER_LOCK,
+    RUN_NAME_FILE,
     Event,
+    as_worker,
+    held,
     limit_threads,
     limit_time,
-    lock,
     no_progress,
+    wait_for_workers,
     write_to,
 )
 from v2p_data.pipeline.leases import Shared
@@ -57,18 +58,14 @@ def only_run_in(root: Path) -> Generator[None]:
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
-        stream: TextIO = (root / RUN_LOCK).open("a")
+        lock = held(root / RUN_LOCK, root, wait_s=0.2)  # `is_at_work` holds it for a moment
     except OSError as error:
         raise V2PError(
             f"cannot write to {root}: {error.strerror}; choose another folder with --out"
         ) from error
-    with stream:
-        lock(stream, root, wait_s=0.2)  # `is_at_work` holds it for a moment
-        stream.truncate(0)
-        stream.write(uuid.uuid4().hex)
-        stream.flush()
-        with (root / WORKER_LOCK).open("a") as workers:
-            lock(workers, root, wait_s=WORKERS_END_S)
+    with lock:
+        (root / RUN_NAME_FILE).write_text(uuid.uuid4().hex)
+        wait_for_workers(root, WORKERS_END_S)
         yield
 
 
@@ -293,8 +290,12 @@ def _work(connection: Connection, runtime: Runtime, log: Path, parent_pid: int) 
     end_with_parent(parent_pid)
     write_to(log)
     limit_threads(runtime.num_threads)
-    alive = (runtime.root / WORKER_LOCK).open("a")
-    fcntl.flock(alive, fcntl.LOCK_SH)
+    with as_worker(runtime.root):
+        _make_stages(connection, runtime)
+
+
+def _make_stages(connection: Connection, runtime: Runtime) -> None:
+    """Make the stages that come through the connection, until it is closed."""
     while True:
         try:
             stage: Stage = connection.recv()

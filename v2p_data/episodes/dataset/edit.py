@@ -160,7 +160,7 @@ def _demand_alike(a: _Source, b: _Source) -> None:
     one, two = (s.info["features"] for s in (a, b))
     missing = (sorted({*x} - {*y, INTERVENTION_KEY}) for x, y in ((one, two), (two, one)))
     demand_equal("the list of columns, less what both have,", *missing)
-    for key in one.keys() & two.keys():
+    for key in [key for key in one if key in two]:
         for part in ("names", "dtype", "shape"):
             demand_equal(f"{part} of {key}", one[key].get(part), two[key].get(part))
     for name in AGREEING:
