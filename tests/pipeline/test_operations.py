@@ -55,6 +55,20 @@ def test_gc_lists_what_no_dataset_came_from_and_deletes_it_when_told(run, capsys
     assert not any((run / ".fetching").iterdir())
 
 
+def test_gc_follows_no_link_and_deletes_nothing_that_stages_did_not_make(run, tmp_path_factory):
+    outside = tmp_path_factory.mktemp("outside")
+    (outside / "text").write_text("mine")
+    (run / "scene" / "linked-00000000.partial").symlink_to(outside)
+    (run / "scene" / "notes.partial").mkdir()
+    (run / "task").symlink_to(outside.parent)
+
+    assert gc_command([str(run), "--delete"]) == 0
+
+    assert (outside / "text").read_text() == "mine"
+    assert (run / "scene" / "linked-00000000.partial").is_symlink()
+    assert (run / "scene" / "notes.partial").is_dir()
+
+
 def test_gc_keeps_what_the_last_command_asked_for(run, capsys):
     old = dataset("old").inputs["clip"]
     write_json_atomically(run / "run.json", [{"stage": "scene", "folder": old.folder_name}])

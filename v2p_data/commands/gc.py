@@ -1,7 +1,7 @@
 """What can be deleted of a run folder, and what it would cost to make again."""
 
+import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,10 @@ from v2p_data.report.reading import PARTIAL_SUFFIX
 
 FINAL = ("dataset", "policy", "evaluation")
 """Stages whose results are wanted for themselves."""
+
+
+OWN_NAME = re.compile(r".+-[0-9a-f]{8}(\.partial)?")
+"""Of folders that stages make."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +51,8 @@ def gc_command(argv: list[str]) -> int:
         raise V2PError(
             f"{run} is a store that other drivers may be using; give the folder of a run"
         )
+    if (run / FETCHING_FOLDER).is_symlink():
+        raise V2PError(f"{run / FETCHING_FOLDER} is a link, which no run makes; remove it")
     with only_run_in(run):
         found = wastes(run)
         if not found:
@@ -73,14 +79,14 @@ def gc_command(argv: list[str]) -> int:
 def wastes(run: Path) -> list[Waste]:
     """Return unfinished work, and results that no dataset, policy, evaluation or rejection came from.
 
-    What the last command asked for is no waste either, and without a final result nothing finished is.
+    What the last command asked for is needed too, and without a final result everything finished is. Links, and folders
+    that are not named like a result, are nobody's waste.
     """
-    records = dict(_records(run))
+    folders = [folder for stage in STAGE_ORDER for folder in _own_folders(run / stage)]
+    records = {f.name: record for f in folders if (record := _record_of(f)) is not None}
     asked = json_or_none(run / RUN_FILE)
     needed = {str(entry.get("folder")) for entry in (asked if isinstance(asked, list) else [])}
-    needed |= {
-        name for name, record in records.items() if record.stage in FINAL or record.rejected
-    }
+    needed |= {name for name, r in records.items() if r.stage in FINAL or r.rejected}
     todo = list(needed)
     while todo:
         if (record := records.get(todo.pop())) is not None:
@@ -90,27 +96,30 @@ def wastes(run: Path) -> list[Waste]:
             todo += new
     is_final = any(record.stage in FINAL for record in records.values())
     found = [
-        Waste(folder=f, why="half fetched", seconds=0.0) for f in run.glob(f"{FETCHING_FOLDER}/*")
+        Waste(folder=f, why="half fetched", seconds=0.0)
+        for f in (run / FETCHING_FOLDER).glob("*")
+        if f.is_dir() and not f.is_symlink()
     ]
-    for stage in STAGE_ORDER:
-        for folder in sorted((run / stage).glob("*")):
-            record = records.get(folder.name)
-            if folder.suffix == PARTIAL_SUFFIX:
-                found.append(Waste(folder=folder, why="unfinished", seconds=0.0))
-            elif is_final and record is not None and folder.name not in needed:
-                found.append(
-                    Waste(folder=folder, why="nothing came of it", seconds=record.seconds)
-                )
+    for folder in folders:
+        if folder.suffix == PARTIAL_SUFFIX:
+            found.append(Waste(folder=folder, why="unfinished", seconds=0.0))
+        elif is_final and folder.name in records and folder.name not in needed:
+            seconds = records[folder.name].seconds
+            found.append(Waste(folder=folder, why="nothing came of it", seconds=seconds))
     return found
 
 
-def _records(run: Path) -> Iterator[tuple[str, Record]]:
-    """Yield the name and record of each result that can be read; what is damaged is for `v2p status`."""
-    for stage in STAGE_ORDER:
-        for folder in (run / stage).glob("*"):
-            try:
-                record = read_record(folder)
-            except UnusableError:
-                continue
-            if record is not None and folder.suffix != PARTIAL_SUFFIX:
-                yield folder.name, record
+def _own_folders(place: Path) -> list[Path]:
+    """Return the results and the unfinished work in a stage's folder, none of which is reached by a link."""
+    if place.is_symlink():
+        return []
+    found = sorted(place.glob("*"))
+    return [f for f in found if OWN_NAME.fullmatch(f.name) and f.is_dir() and not f.is_symlink()]
+
+
+def _record_of(folder: Path) -> Record | None:
+    """Return the record of a finished result; what is damaged is for `v2p status`."""
+    try:
+        return None if folder.suffix == PARTIAL_SUFFIX else read_record(folder)
+    except UnusableError:
+        return None

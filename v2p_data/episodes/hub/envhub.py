@@ -1,14 +1,12 @@
 """Reconstructed tasks as a repository that LeRobot loads by its name (EnvHub).
 
 The repository holds `env.py` with `make_env(n_envs, use_async_envs)`, the tasks with their scenes and code, a
-model in MJCF of each, and as much of this engine's source as running them takes, so that nothing of ours
-must be installed. LeRobot fetches `env.py` alone; it fetches the rest, at the same commit.
+model in MJCF of each, and this engine's source, so that nothing of ours must be installed. LeRobot fetches `env.py` alone; it fetches the rest, at the same commit.
 """
 
-import ast
 import importlib.metadata
+import re
 import shutil
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,15 +28,11 @@ from v2p_data.sim.robot.robot import FINE
 from v2p_data.task.sandbox.trial import demand_trial
 from v2p_data.task.task import TASK_FILE, TaskBundle, told_of
 
-PACKAGE = "v2p_data"
 SOURCE = Path(__file__).parents[2]
-ENTRY = f"{PACKAGE}.sim.wrappers.lerobot_env"
-"""What `env.py` imports; everything that it needs comes along."""
+DISTRIBUTION = "lerobot_policy_v2p"
 PLACES = (Path(), CARRIED_TASKS, Path("task"))
 """Where a folder of tasks, a dataset and a run keep theirs."""
 MAX_FILE_BYTES = 200_000_000
-EXACT = ("mujoco", "lerobot")
-"""Other versions of these make other physics, or load otherwise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,16 +88,11 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
         (partial / "mjcf").mkdir(exist_ok=True)
         (partial / "mjcf" / f"{name}.xml").write_text(world.spec.to_xml())
         rows.append(f"| {len(rows)} | {bundle.description} | `{name}` | {bundle.policy_steps()} |")
-    modules = engine_modules()
-    for module in modules:
-        path = _path_of(module)
-        into = partial / path.relative_to(SOURCE.parent)
-        into.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, into)
+    shutil.copytree(SOURCE, partial / SOURCE.name, ignore=_not_source)
     (partial / "env.py").write_text(
         ENV_PY.replace("REPO_ID", repo_id).replace("SETTINGS", repr(settings))
     )
-    (partial / "requirements.txt").write_text("\n".join(requirements(modules)) + "\n")
+    (partial / "requirements.txt").write_text("\n".join(requirements()) + "\n")
     (partial / "README.md").write_text(_card(repo_id, rows, states, names))
     partial.rename(out)
     return EnvHub(folder=out, repo_id=repo_id, tasks=tuple(folders))
@@ -116,62 +105,20 @@ def _copy_task(bundle: TaskBundle, into: Path) -> None:
         shutil.copyfile(own_file(bundle.folder, name, MAX_FILE_BYTES), into / name)
 
 
-def engine_modules() -> list[str]:
-    """Return the modules of this engine that running a task takes."""
-    found: set[str] = set()
-    wanted = [ENTRY]
-    while wanted:
-        module = wanted.pop()
-        if module in found:
-            continue
-        found.add(module)
-        parts = module.split(".")
-        wanted += [".".join(parts[:n]) for n in range(1, len(parts))]
-        wanted += [name for name in _imported(_path_of(module)) if name.split(".")[0] == PACKAGE]
-    return sorted(found)
+def _not_source(folder: str, names: list[str]) -> list[str]:
+    """Return what of a folder of this engine is neither a folder nor Python: networks and pages, which no task takes."""
+    return [
+        n
+        for n in names
+        if not n.endswith(".py") and (n == "__pycache__" or not Path(folder, n).is_dir())
+    ]
 
 
-def requirements(modules: list[str]) -> list[str]:
-    """Return the distributions that these modules import, with the versions they run with here."""
-    tops = {name.split(".")[0] for m in modules for name in _imported(_path_of(m))}
-    homes = importlib.metadata.packages_distributions()
-    names = {
-        top if top in homes[top] else homes[top][0]
-        for top in tops - {PACKAGE} - sys.stdlib_module_names
-        if top in homes
-    }
-    lines = []
-    for name in sorted(names, key=str.lower):
-        version = importlib.metadata.version(name).split("+")[0]
-        lines.append(f"{name}{'==' if name in EXACT else '>='}{version}")
-    return lines
-
-
-def _imported(path: Path) -> set[str]:
-    """Return the modules that a file imports, inside functions too."""
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            names.add(node.module)
-            within = {f"{node.module}.{alias.name}" for alias in node.names}
-            names |= {n for n in within if n.startswith(PACKAGE) and _is_module(n)}
-        elif isinstance(node, ast.Constant) and str(node.value).endswith("_child.py"):
-            # A script of its own, started beside the module that names it.
-            child = path.with_name(str(node.value))
-            names.add(".".join(child.relative_to(SOURCE.parent).with_suffix("").parts))
-    return names
-
-
-def _is_module(name: str) -> bool:
-    path = SOURCE.parent / name.replace(".", "/")
-    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
-
-
-def _path_of(module: str) -> Path:
-    path = SOURCE.parent / module.replace(".", "/")
-    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+def requirements() -> list[str]:
+    """Return what this engine needs without its extras, MuJoCo in the version that runs here: others make other physics."""
+    lines = [line for line in importlib.metadata.requires(DISTRIBUTION) or [] if ";" not in line]
+    others = [line for line in lines if not re.match(r"mujoco\b", line)]
+    return sorted([*others, f"mujoco=={importlib.metadata.version('mujoco')}"])
 
 
 def _tasks_in(source: Path) -> dict[str, Path]:
