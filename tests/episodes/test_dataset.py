@@ -318,7 +318,7 @@ def test_half_a_dataset_is_written_anew(staged: list[Path], tmp_path: Path):
 def test_episodes_of_another_size_do_not_go_in(staged: list[Path], tmp_path: Path, make_episode):
     odd = make_episode(7, size_px=32).save(tmp_path)
 
-    with pytest.raises(V2PError, match="collect all episodes at one size"):
+    with pytest.raises(V2PError, match="collect all episodes with one --episodes"):
         pack([*staged[:1], odd], "user/toys", tmp_path / "toys")
     assert not (tmp_path / "toys").exists()
 

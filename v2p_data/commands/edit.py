@@ -11,7 +11,7 @@ from v2p_data.commands.display import telling
 from v2p_data.episodes.dataset.repo_id import check_repo_id
 
 if TYPE_CHECKING:
-    from v2p_data.episodes.dataset.edit import NewDataset
+    from v2p_data.episodes.dataset.layout import NewDataset
 
 
 @dataclass(frozen=True, kw_only=True)

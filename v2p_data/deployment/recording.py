@@ -14,7 +14,8 @@ import numpy as np
 from v2p_data.deployment.robot import Reading
 from v2p_data.deployment.sight import Seen
 from v2p_data.episodes.dataset import encoding
-from v2p_data.episodes.dataset.writer import Packed, pack
+from v2p_data.episodes.dataset.layout import NewDataset
+from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import RGB_CAMERA, Episode, refusals_told
 from v2p_data.errors import V2PError
 from v2p_data.sim.render.masks import MASK_CAMERA
@@ -56,7 +57,7 @@ class Recorder:
 
     def save(
         self, out: Path, repo_id: str, objects: tuple[str, ...], about: Mapping[str, Any]
-    ) -> Packed | None:
+    ) -> NewDataset | None:
         """Write the dataset at `out`; None where nothing worth keeping was seen.
 
         Args:

@@ -16,6 +16,7 @@ from v2p_data.episodes.dataset.card import write_card
 from v2p_data.episodes.dataset.copying import Part, write_parts
 from v2p_data.episodes.dataset.features import DEMONSTRATION, INTERVENTION_KEY, METADATA_FILE
 from v2p_data.episodes.dataset.language import write_language
+from v2p_data.episodes.dataset.layout import NewDataset
 from v2p_data.episodes.dataset.repo_id import check_repo_id
 from v2p_data.episodes.dataset.tables import layout_problems, read_info
 from v2p_data.episodes.dataset.verify import difference_of_frames
@@ -26,17 +27,6 @@ from v2p_data.scene.files import copy_folder
 AGREEING = ("schema", "palette", "state", "action")
 """Entries of `meta/v2p.json` that must be the same in datasets that go together."""
 Progress = Callable[[float, str], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class NewDataset:
-    """A dataset that was made of others."""
-
-    root: Path
-    repo_id: str
-    num_episodes: int
-    num_frames: int
-    tasks: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)

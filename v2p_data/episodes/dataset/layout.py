@@ -1,6 +1,7 @@
 """The files of a dataset that is being written: rows, the table of episodes, statistics."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,17 @@ VIDEO_FILE_MB = 200
 """LeRobot's own limit, for us and for its tools when they add to the dataset; 400,000 frames of masks."""
 DATA_FILE_FRAMES = 400_000
 """Rows per file, 40 MB; each episode is a row group of its own, as LeRobot writes it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewDataset:
+    """A finished dataset."""
+
+    root: Path
+    repo_id: str
+    num_episodes: int
+    num_frames: int
+    tasks: tuple[str, ...]
 
 
 class RowFiles:

@@ -10,8 +10,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +41,7 @@ from v2p_data.episodes.dataset.features import (
 from v2p_data.episodes.dataset.layout import (
     CHUNK_FILES,
     VIDEO_FILE_MB,
+    NewDataset,
     RowFiles,
     file_in,
     write_stats,
@@ -62,22 +62,19 @@ from v2p_data.episodes.staging import (
     refusals_told,
 )
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.pipeline.artifact import commit_folder, write_json_atomically
 from v2p_data.sim.render.masks import MASK_CAMERAS, PALETTE, WRIST_CAMERA, label_names
 
 logger = logging.getLogger(__name__)
 
 EPISODES_PER_WRITE = 100
-
-
-@dataclass(frozen=True, kw_only=True)
-class Packed:
-    """A finished dataset."""
-
-    root: Path
-    repo_id: str
-    num_episodes: int
-    num_frames: int
+ALIKE = {
+    "size_px": ("masks of", "--episodes.size-px"),
+    "cameras": ("pictures of", "--episodes.render and --episodes.wrist"),
+    "actions": ("actions of", "--episodes.actions and one arm"),
+    "num_states": ("states of this many numbers:", "--episodes.joint-state and one arm"),
+}
+"""Fields of `Heading` that are the same in all episodes of a dataset -> what they say, and the options that decide it."""
 
 
 def pack(
@@ -88,7 +85,7 @@ def pack(
     provenance: Mapping[str, Any] | None = None,
     num_threads: int = 0,
     on_progress: Callable[[float, str], None] = lambda share, words: None,
-) -> Packed:
+) -> NewDataset:
     """Write staged episodes, in this order, as a LeRobot v3 dataset at `root`.
 
     A packing that was stopped goes on where it was when it is called again. Where handovers are among the episodes,
@@ -130,12 +127,17 @@ def pack(
         )
         _check_tables(growing, shards)
         _flush(growing)
-        growing.rename(root)
-        _flush_folder(root.parent)
+        commit_folder(growing, root)
         shutil.rmtree(partial)
     num_frames = sum(h.num_frames for h in headings)
     logger.info("packed %d episodes, %d frames, at %s", len(headings), num_frames, root)
-    return Packed(root=root, repo_id=repo_id, num_episodes=len(headings), num_frames=num_frames)
+    return NewDataset(
+        root=root,
+        repo_id=repo_id,
+        num_episodes=len(headings),
+        num_frames=num_frames,
+        tasks=tuple(dict.fromkeys(h.task for h in headings)),
+    )
 
 
 def _about(
@@ -169,26 +171,13 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
             f"masks must be square, {first.path} has {first.size_px[0]} x {first.size_px[1]}"
         )
     for heading in headings:
-        if heading.size_px != first.size_px:
-            raise V2PError(
-                f"{heading.path} has masks of {heading.size_px} px, the first episode of {first.size_px} px; "
-                "collect all episodes at one size"
-            )
-        if heading.cameras != first.cameras:
-            raise V2PError(
-                f"{heading.path} has pictures of {', '.join(heading.cameras)}, the first episode of "
-                f"{', '.join(first.cameras)}; collect all episodes with one --episodes.render and --episodes.wrist"
-            )
-        if heading.actions != first.actions:
-            raise V2PError(
-                f"{heading.path} has actions of {', '.join(heading.actions or ACTION_NAMES)}, the first episode of "
-                f"{', '.join(first.actions or ACTION_NAMES)}; collect all episodes with one --episodes.actions and one arm"
-            )
-        if heading.num_states != first.num_states:
-            raise V2PError(
-                f"{heading.path} has states of {heading.num_states} numbers, the first episode of "
-                f"{first.num_states}; collect all episodes with one --episodes.joint-state and one arm"
-            )
+        for name, (what, options) in ALIKE.items():
+            mine, theirs = getattr(heading, name), getattr(first, name)
+            if mine != theirs:
+                raise V2PError(
+                    f"{heading.path} has {what} {mine or ACTION_NAMES}, the first episode {theirs or ACTION_NAMES}; collect "
+                    f"all episodes with one {options}"
+                )
         if heading.num_frames < 2:
             raise V2PError(
                 f"{heading.path} has {heading.num_frames} frames; an episode has two at least"
@@ -358,18 +347,6 @@ def _check_tables(root: Path, shards: Sequence[Shard]) -> None:
 
 def _flush(root: Path) -> None:
     """Have everything on disk before it is renamed: after a power cut, too, it is whole or absent."""
-    for path in _files(root):
+    for path in (p for p in root.rglob("*") if p.is_file()):
         with path.open("rb") as stream:
             os.fsync(stream.fileno())
-
-
-def _flush_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _files(root: Path) -> Iterator[Path]:
-    return (path for path in root.rglob("*") if path.is_file())

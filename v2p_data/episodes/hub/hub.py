@@ -92,14 +92,11 @@ class Pushed:
 @dataclass(frozen=True, kw_only=True)
 class _Upload:
     folder: Path
-    repo_id: str
-    repo_type: RepoType
-    private: bool
+    repo_type: RepoType = "model"
     marker: str
     """A repository that holds files but not this one is about something else."""
     replaces: tuple[str, ...] = ()
     tags: tuple[str, ...] = ()
-    waits_s: tuple[float, ...]
 
 
 def push_dataset(
@@ -134,18 +131,14 @@ def push_dataset(
     if (root / METADATA_FILE).is_file():
         _remove_places(root)
         write_card(root, repo_id)
-    return _push(
-        _Upload(
-            folder=root,
-            repo_id=repo_id,
-            repo_type="dataset",
-            private=private,
-            marker="meta/info.json",
-            replaces=DATASET_PARTS,
-            tags=tuple(t for t in (version, tag) if t),
-            waits_s=tuple(waits_s),
-        )
+    upload = _Upload(
+        folder=root,
+        repo_type="dataset",
+        marker="meta/info.json",
+        replaces=DATASET_PARTS,
+        tags=tuple(t for t in (version, tag) if t),
     )
+    return _push(upload, repo_id, private=private, waits_s=waits_s)
 
 
 def push_policy(
@@ -172,17 +165,8 @@ def push_policy(
     if not (folder / CARD_FILE).is_file():
         write_policy_card(folder)
     name_policy(folder, repo_id)
-    return _push(
-        _Upload(
-            folder=folder,
-            repo_id=repo_id,
-            repo_type="model",
-            private=private,
-            marker="config.json",
-            tags=(tag,) if tag else (),
-            waits_s=tuple(waits_s),
-        )
-    )
+    upload = _Upload(folder=folder, marker="config.json", tags=(tag,) if tag else ())
+    return _push(upload, repo_id, private=private, waits_s=waits_s)
 
 
 def fetch_policy(repo_id: str, *, waits_s: Sequence[float] = WAITS_S) -> Path:
@@ -217,18 +201,14 @@ def fetch_model(
 
     def fetch() -> Path:
         try:
-            return once()
+            found = snapshot_download(
+                repo_id, endpoint=endpoint, token=token or False, ignore_patterns=list(ignore)
+            )
         except (
             LocalEntryNotFoundError
         ) as error:  # nothing is stored here, for the reason that it hides
             raise error.__cause__ or error from None
-
-    def once() -> Path:
-        return Path(
-            snapshot_download(
-                repo_id, endpoint=endpoint, token=token or False, ignore_patterns=list(ignore)
-            )
-        )
+        return Path(found)
 
     return _explained(lambda: _patiently(fetch, waits_s), f"fetch '{repo_id}'", endpoint, token)
 
@@ -249,27 +229,19 @@ def push_envhub(
     check_repo_id(repo_id)
     if not (folder / ENV_FILE).is_file():
         raise V2PError(f"{folder} holds no {ENV_FILE}: it is no EnvHub repository")
-    return _push(
-        _Upload(
-            folder=folder,
-            repo_id=repo_id,
-            repo_type="model",
-            private=private,
-            marker=ENV_FILE,
-            replaces=ENV_PARTS,
-            tags=(tag,) if tag else (),
-            waits_s=tuple(waits_s),
-        )
+    upload = _Upload(
+        folder=folder, marker=ENV_FILE, replaces=ENV_PARTS, tags=(tag,) if tag else ()
     )
+    return _push(upload, repo_id, private=private, waits_s=waits_s)
 
 
-def _push(upload: _Upload) -> Pushed:
+def _push(upload: _Upload, repo_id: str, *, private: bool, waits_s: Sequence[float]) -> Pushed:
     token = _token()
     _check_no_secret(upload.folder, token)
     endpoint = _endpoint()
 
     api = HfApi(endpoint=endpoint, token=token)
-    repo_id, repo_type = upload.repo_id, upload.repo_type
+    repo_type = upload.repo_type
     url = f"{endpoint}/{'datasets/' if repo_type == 'dataset' else ''}{repo_id}"
 
     def send_files() -> Any:
@@ -283,10 +255,10 @@ def _push(upload: _Upload) -> Pushed:
         )
 
     def send() -> Pushed:
-        api.create_repo(repo_id, repo_type=repo_type, private=upload.private, exist_ok=True)
+        api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True)
         info = api.repo_info(repo_id, repo_type=repo_type)
         visibility = "private" if info.private else "gated" if info.gated else "public"
-        if upload.private and not info.private:
+        if private and not info.private:
             raise V2PError(
                 f"'{repo_id}' exists and is {visibility}, so what is pushed there can be seen; nothing was sent. Make it "
                 f"private at {url}/settings, or choose another --repo-id"
@@ -319,9 +291,7 @@ def _push(upload: _Upload) -> Pushed:
             api.create_tag(repo_id, tag=tag, repo_type=repo_type, exist_ok=True)
         return Pushed(repo_id=repo_id, url=url, commit=commit.oid, visibility=visibility)
 
-    return _explained(
-        lambda: _patiently(send, upload.waits_s), f"push '{repo_id}'", endpoint, token
-    )
+    return _explained(lambda: _patiently(send, waits_s), f"push '{repo_id}'", endpoint, token)
 
 
 @contextmanager
