@@ -338,57 +338,6 @@ def test_a_missing_recorded_episode_is_noticed(packed: Path, staged: list[Path])
     assert "counts" in checks_that_fail(packed, staged[:2])
 
 
-def test_a_lost_video_is_named(packed: Path, tmp_path: Path):
-    root = copied(packed, tmp_path)
-    shutil.rmtree(root / "videos")
-
-    (problem,) = verify(root).problems
-
-    assert (problem.check, problem.where) == (
-        "missing_file",
-        "videos/observation.images.mask/*/*.mp4",
-    )
-
-
-def test_wrong_numbers_are_noticed(packed: Path, tmp_path: Path):
-    root = copied(packed, tmp_path)
-
-    def spoil(rows: dict) -> None:
-        rows["action"][3] = [1.5] * 7
-        rows["observation.state"][13][0] = float("nan")
-        rows["timestamp"][30] += 0.02
-        rows["next.success"][23] = False
-
-    edit_table(root, "data/*/*.parquet", spoil)
-
-    found = checks_that_fail(root)
-
-    assert {"action_bounds", "finite", "success", "statistics"} <= found
-    assert found & {"timestamps", "does_not_read"}
-
-
-def test_a_repeated_episode_is_noticed(packed: Path, tmp_path: Path):
-    root = copied(packed, tmp_path)
-
-    def repeat(rows: dict) -> None:
-        for key in ("action", "observation.state", "next.reward", "privileged.object_pose"):
-            rows[key][12:24] = rows[key][:12]
-
-    edit_table(root, "data/*/*.parquet", repeat)
-
-    assert "duplicate" in checks_that_fail(root)
-
-
-def test_a_dead_camera_and_foreign_greys_are_noticed(tmp_path: Path, make_episode):
-    still, moving = make_episode(0), make_episode(1)
-    still.labels[:] = still.labels[:1]
-    folder = tmp_path / "staged"
-    root = tmp_path / "toys"
-    pack([still.save(folder), moving.save(folder)], "user/toys", root)
-
-    assert checks_that_fail(root) == {"dead_camera"}
-
-
 def test_the_card_tells_tasks_palette_and_ranges(packed: Path, tmp_path: Path):
     root = copied(packed, tmp_path)
 

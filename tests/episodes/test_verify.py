@@ -22,6 +22,7 @@ FRONT = "observation.images.mask"
 DATA = "data/chunk-000/file-000.parquet"
 TABLE = "meta/episodes/chunk-000/file-000.parquet"
 VIDEO = f"videos/{FRONT}/chunk-000/file-000.mp4"
+FLOATS = ("action", "observation.state", "next.reward", "privileged.object_pose")
 Change = Callable[[Path], None]
 
 
@@ -104,6 +105,9 @@ def test_lossy_masks_are_one_line_for_all_episodes(packed: Path, tmp_path: Path)
         ("statistics", "meta/stats.json", entry("meta/stats.json", lambda s: s["action"].update(mean=[0.0] * 7))),
         ("statistics", "meta/stats.json", entry("meta/stats.json", lambda s: s.pop("observation.state"))),
         ("statistics", "meta/stats.json", entry("meta/stats.json", lambda s: s[FRONT].update(mean=[[[0.9]]] * 3, max=[[[1.0]]] * 3))),
+        ("action_bounds", "episode 0", rows(DATA, put("action", 3, [1.5] * 7))),
+        ("success", "episode 1", rows(DATA, put("next.success", 23, False))),
+        ("duplicate", "episode 1", rows(DATA, lambda c: [c[k].__setitem__(slice(12, 24), c[k][:12]) for k in FLOATS])),
         ("index", "episode 1", rows(DATA, put("frame_index", 15, 7))),
         ("index", "episode 2", rows(TABLE, put("dataset_from_index", 2, 20))),
         ("index", "meta/episodes", rows(TABLE, put("episode_index", 2, 5))),
@@ -134,6 +138,15 @@ def test_each_fault_is_found_by_its_name(
     found = {(problem.check, problem.where) for problem in verify(root).problems}
 
     assert (check, where) in found
+
+
+def test_a_camera_whose_picture_never_changes_is_dead(make_episode, tmp_path: Path):
+    still, moving = make_episode(0), make_episode(1)
+    still.labels[:] = still.labels[:1]
+    staged = [episode.save(tmp_path / "staged") for episode in (still, moving)]
+    pack(staged, "user/toys", tmp_path / "toys")
+
+    assert [p.check for p in verify(tmp_path / "toys").problems] == ["dead_camera"]
 
 
 def test_a_damaged_video_of_ours_shows_greys_that_are_no_label(packed: Path, tmp_path: Path):

@@ -19,7 +19,7 @@ from v2p_data.pipeline.artifact import (
     write_record,
 )
 from v2p_data.pipeline.contents import MEMORY_FOLDER
-from v2p_data.pipeline.runner import Outcome, Runtime, Stage, make_stage, stored_outcome
+from v2p_data.pipeline.runner import Runtime, Stage, make_stage, stored_outcome
 from v2p_data.pipeline.workers import run_stages
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -42,15 +42,21 @@ def root(tmp_path: Path, stages: tuple[Stage, Stage]) -> Path:
     return tmp_path
 
 
-def reads_as(stage: Stage, root: Path) -> Outcome | None:
-    """Return what a run takes a result for; the sentence about damage names the file and what to do."""
+def status_of(stage: Stage, root: Path) -> str:
     outcome = stored_outcome(stage, root)
-    if outcome is not None and outcome.status == "failed":
-        assert outcome.reason == "damaged"
-        assert str(stage.folder(root)) in outcome.detail
-        assert outcome.detail.endswith(ANEW)
-        assert "\n" not in outcome.detail
-    return outcome
+    assert outcome is not None
+    return outcome.status
+
+
+def damage_of(stage: Stage, root: Path) -> str:
+    """Return the sentence with which a damaged result fails; it names the file and what to do."""
+    outcome = stored_outcome(stage, root)
+    assert outcome is not None
+    assert (outcome.status, outcome.reason) == ("failed", "damaged")
+    assert str(stage.folder(root)) in outcome.detail
+    assert outcome.detail.endswith(ANEW)
+    assert "\n" not in outcome.detail
+    return outcome.detail
 
 
 @pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)
@@ -59,13 +65,11 @@ def test_a_harmed_file_fails_its_result_and_stays_where_it_is(root, stages, harm
     harm(one.folder(root) / "text")
     before = sorted(one.folder(root).iterdir())
 
-    outcome = reads_as(one, root)
+    detail = damage_of(one, root)
     made = make_stage(two, Runtime(root=root))
 
-    assert outcome is not None
-    assert outcome.status == "failed"
-    assert str(one.folder(root) / "text") in outcome.detail
-    assert (made.status, made.reason, made.detail) == ("failed", "damaged", outcome.detail)
+    assert str(one.folder(root) / "text") in detail
+    assert (made.status, made.reason, made.detail) == ("failed", "damaged", detail)
     assert sorted(one.folder(root).iterdir()) == before
 
 
@@ -74,11 +78,9 @@ def test_a_harmed_record_fails_its_result_and_nothing_is_lost(root, stages, harm
     record = stages[0].folder(root) / "record.json"
     harm(record)
 
-    outcome = reads_as(stages[0], root)
+    detail = damage_of(stages[0], root)
 
-    assert outcome is not None
-    assert outcome.status == "failed"
-    assert str(record) in outcome.detail
+    assert str(record) in detail
     assert (record.parent / "text").read_text() == "a" * 200
 
 
@@ -89,9 +91,7 @@ def test_every_entry_of_a_record_is_guarded(root, stages):
     for name, harm in harms_of_entries(record):
         record.write_text(whole)
         harm(record)
-        outcome = stored_outcome(stages[0], root)
-        assert outcome is not None, name
-        assert outcome.status == "failed", name
+        assert status_of(stages[0], root) == "failed", name
         count += 1
     assert count > 100
 
@@ -101,10 +101,7 @@ def test_records_of_the_version_before_are_read_and_their_files_are_not_asked_fo
     as_before(folder)
     flip(0.5)(folder / "text")
 
-    outcome = stored_outcome(stages[0], root)
-
-    assert outcome is not None
-    assert outcome.status == "kept"
+    assert status_of(stages[0], root) == "kept"
     record = read_record(folder)
     assert record is not None
     assert (record.schema, record.files) == (1, None)
@@ -141,10 +138,9 @@ def test_the_record_of_another_result_is_not_taken_for_this_ones(root, stages):
     make_stage(other, Runtime(root=root))
     shutil.copy(other.folder(root) / "record.json", stages[0].folder(root) / "record.json")
 
-    outcome = reads_as(stages[0], root)
+    detail = damage_of(stages[0], root)
 
-    assert outcome is not None
-    assert "is of another result" in outcome.detail
+    assert "is of another result" in detail
 
 
 def test_an_empty_folder_is_filled_and_a_half_deleted_one_is_not_overwritten(tmp_path, stages):
@@ -154,10 +150,9 @@ def test_an_empty_folder_is_filled_and_a_half_deleted_one_is_not_overwritten(tmp
     assert make_stage(stages[0], Runtime(root=tmp_path)).status == "made"
 
     (folder / "record.json").unlink()
-    outcome = reads_as(stages[0], tmp_path)
+    detail = damage_of(stages[0], tmp_path)
 
-    assert outcome is not None
-    assert "record.json is missing" in outcome.detail
+    assert "record.json is missing" in detail
     assert (folder / "text").is_file()
 
 
@@ -167,10 +162,7 @@ def test_files_that_were_added_later_are_no_damage(root, stages):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("mine")
 
-    outcome = stored_outcome(stages[0], root)
-
-    assert outcome is not None
-    assert outcome.status == "kept"
+    assert status_of(stages[0], root) == "kept"
 
 
 def make_with_card(config, inputs, out, runtime):
@@ -185,10 +177,7 @@ def test_a_card_and_logs_may_change(tmp_path):
     (stage.folder(tmp_path) / "README.md").write_text("pushed under another name")
     (stage.folder(tmp_path) / "events.out.tfevents.1").unlink()
 
-    outcome = stored_outcome(stage, tmp_path)
-
-    assert outcome is not None
-    assert outcome.status == "kept"
+    assert status_of(stage, tmp_path) == "kept"
     record = read_record(stage.folder(tmp_path))
     assert record is not None
     assert set(record.files or {}) == {"weights"}
@@ -218,10 +207,9 @@ def test_bits_that_flip_behind_an_old_time_are_noticed(root, stages):
     flip(0.5)(path)
     os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
 
-    outcome = reads_as(stages[0], root)
+    detail = damage_of(stages[0], root)
 
-    assert outcome is not None
-    assert "has another content" in outcome.detail
+    assert "has another content" in detail
 
 
 @pytest.mark.parametrize("harm", (HARMS | JSON_HARMS).values(), ids=HARMS | JSON_HARMS)
@@ -229,10 +217,7 @@ def test_a_damaged_memory_is_no_damage(root, stages, harm: Callable[[Path], None
     (memory,) = (root / MEMORY_FOLDER).glob("*/*.json")
     harm(memory)
 
-    outcome = stored_outcome(stages[0], root)
-
-    assert outcome is not None
-    assert outcome.status == "kept"
+    assert status_of(stages[0], root) == "kept"
 
 
 def test_a_memory_of_another_content_hides_no_damage(root, stages):
@@ -244,10 +229,9 @@ def test_a_memory_of_another_content_hides_no_damage(root, stages):
     mark = replace(record.files["text"], sha256="0" * 16)
     write_record(folder, replace(record, files={"text": mark}))
 
-    outcome = reads_as(stages[0], root)
+    detail = damage_of(stages[0], root)
 
-    assert outcome is not None
-    assert "has another content" in outcome.detail
+    assert "has another content" in detail
 
 
 def test_one_damaged_item_fails_and_the_others_go_on(tmp_path):
@@ -274,9 +258,7 @@ def test_a_damaged_result_that_was_deleted_is_made_anew(root, stages):
 
     assert stored_outcome(stages[0], root) is None
     assert make_stage(stages[0], Runtime(root=root)).status == "made"
-    outcome = stored_outcome(stages[0], root)
-    assert outcome is not None
-    assert outcome.status == "kept"
+    assert status_of(stages[0], root) == "kept"
 
 
 def test_the_traceback_of_an_earlier_try_does_not_stay(tmp_path):
