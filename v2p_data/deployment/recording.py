@@ -16,7 +16,7 @@ from v2p_data.deployment.sight import Seen
 from v2p_data.episodes.dataset import encoding
 from v2p_data.episodes.dataset.layout import NewDataset
 from v2p_data.episodes.dataset.writer import pack
-from v2p_data.episodes.staging import RGB_CAMERA, Episode, refusals_told
+from v2p_data.episodes.staging import RGB_CAMERA, Episode, refusals_named
 from v2p_data.errors import V2PError
 from v2p_data.sim.render.masks import MASK_CAMERA
 
@@ -74,7 +74,7 @@ class Recorder:
             return None
         has_rgb = len(self._pictures) == len(self)
         staged = out.with_name(out.name + ".partial") / STAGED
-        with refusals_told("recording", out.parent):
+        with refusals_named("recording", out.parent):
             episode = Episode(
                 id="run_00000",
                 item="run",

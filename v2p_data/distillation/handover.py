@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int, UInt8
 
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.config import EpisodesConfig
-from v2p_data.episodes.rollouts import Lesson, Rollouts, Telling, record_rollouts
+from v2p_data.episodes.rollouts import Lesson, NotedActor, Rollouts, record_rollouts
 from v2p_data.play import Actor, View
 from v2p_data.seeds import rng_for
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
@@ -100,13 +100,15 @@ def hand_over(
     horizon = round(cfg.time_scale * env.horizon)
     size_px, wrist = episodes.size_px, episodes.wrist
     pictures = np.empty((horizon, cfg.worlds, size_px * (1 + wrist), size_px), np.uint8)
-    telling = Telling(lesson.expert, episodes.interface, env)
-    actor = Handover(student, telling, takeover, pictures)
+    noted = NotedActor(lesson.expert, episodes.interface, env)
+    actor = Handover(student, noted, takeover, pictures)
     view = View(env, size_px, num_threads, wrist=wrist)
     recorded = record_rollouts(
         view, actor, episodes.cut, seed=seed, horizon=horizon, referee=lesson.referee
     )
-    columns: dict[str, Any] = vars(recorded) | {"action": np.stack(actor.answers)} | telling.told()
+    columns: dict[str, Any] = (
+        vars(recorded) | {"action": np.stack(actor.answers)} | noted.columns()
+    )
     return Handovers(
         **columns,
         labels=pictures[: len(actor.answers)],

@@ -20,7 +20,7 @@ from v2p_data.distillation.handover import Handovers, hand_over
 from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
 from v2p_data.episodes.rollouts import Lesson
-from v2p_data.episodes.staging import Episode, refusals_told, staged_episodes
+from v2p_data.episodes.staging import Episode, refusals_named, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import write_json_atomically
@@ -120,13 +120,13 @@ def distill(
         student: knows the demonstrations already; learns further in place.
         train: trains it.
         out: `rounds/`, `student/` and `training/` are written here.
-        on_progress: told the share that is done and a few words.
+        on_progress: called with the share that is done and a few words.
 
     Raises:
         V2PError: the pictures are not masks, the disk is full, or `out` cannot be written to.
     """
     demand_masks(course.episodes)
-    with refusals_told("distillation", out):
+    with refusals_named("distillation", out):
         return _distill(course, student, train, out, on_progress)
 
 
@@ -283,7 +283,7 @@ def _stage(
             seed=handovers.seed,
             labels=labels,
             state=handovers.state[:length, world].copy(),
-            action=handovers.told[:length, world].copy(),
+            action=handovers.recorded_action[:length, world].copy(),
             success=rows >= handovers.held_at[world],
             simulated=handovers.simulated(world, episodes.size_px),
             intervention=rows >= handovers.taken_over_at[world],

@@ -25,7 +25,7 @@ from v2p_data.episodes.rollouts import CutConfig, Lesson, Rollouts, roll_out
 from v2p_data.episodes.staging import (
     EPISODES_FOLDER,
     Episode,
-    refusals_told,
+    refusals_named,
     save_arrays,
     staged_episodes,
 )
@@ -86,13 +86,13 @@ def collect(
         out: `episodes/<id>.npz`, `failed/<batch>.npz`, `rejected.jsonl` and `batches/` are written here.
         seed: decides everything that is drawn.
         num_threads: for physics, masks and writing; changes no result.
-        on_progress: told the share that is done and a few words.
+        on_progress: called with the share that is done and a few words.
 
     Raises:
         ItemRejectedError: after `cfg.max_batches` there are fewer than `cfg.min_episodes`.
         V2PError: the disk is full, or `out` cannot be written to; what was staged is kept.
     """
-    with refusals_told("collecting episodes", out):
+    with refusals_named("collecting episodes", out):
         return _collect(lesson, cfg, out, seed, num_threads, on_progress)
 
 

@@ -66,7 +66,7 @@ class EpisodesConfig:
 
     @property
     def interface(self) -> ArmInterface:
-        """What is seen of the arm and told it."""
+        """What is seen of the arm and what it is commanded."""
         return ArmInterface(actions=self.actions, joint_state=self.joint_state)
 
     @property

@@ -59,7 +59,7 @@ class Artist:
             seed=rollouts.seed,
             labels=labels,
             state=rollouts.state[:length, world].copy(),
-            action=rollouts.told[:length, world].copy(),
+            action=rollouts.recorded_action[:length, world].copy(),
             success=np.arange(length) >= rollouts.held_at[world],
             simulated=rollouts.simulated(world, cfg.size_px),
             referee=bool(rollouts.referee[world]),

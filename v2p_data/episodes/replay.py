@@ -29,7 +29,7 @@ from v2p_data.episodes.dataset.features import (
     SUCCESS_KEY,
 )
 from v2p_data.episodes.dataset.intake import demand_bounded
-from v2p_data.episodes.dataset.tables import DATA_GLOB, column, damage_told, read_info, row_spans
+from v2p_data.episodes.dataset.tables import DATA_GLOB, column, damage_named, read_info, row_spans
 from v2p_data.episodes.rollouts import Lesson, Rollouts, roll_out
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.settings import from_values
@@ -128,7 +128,7 @@ def replay(
     info = read_info(root)
     demand_bounded(root)
     about = demand_about(root)
-    with damage_told(root):
+    with damage_named(root):
         batches, skipped = _batches(root, about, num_episodes or int(info["total_episodes"]))
     total = sum(map(len, batches.values()))
     if not total:

@@ -98,7 +98,7 @@ class Rollouts:
     """What `action` leads to, where a dataset's `action` is a target."""
 
     @property
-    def told(self) -> Float32[np.ndarray, "time env act"]:
+    def recorded_action(self) -> Float32[np.ndarray, "time env act"]:
         """A dataset's `action`."""
         return self.action if self.targets is None else self.targets.astype(np.float32)
 
@@ -193,7 +193,7 @@ class EpisodeEnds:
         return self._held & ~self.broke
 
 
-class Telling:
+class NotedActor:
     """An actor whose steps are noted as targets, and whose state is noted with the angles of the joints.
 
     Args:
@@ -222,13 +222,13 @@ class Telling:
             self._targets.append(targets_of(view.worlds, step, self._interface.actions))
         return action
 
-    def told(self) -> dict[str, Any]:
+    def columns(self) -> dict[str, Any]:
         """Return fields of `Rollouts`: `state` where joints are in it, `names` and `targets` where actions are targets."""
-        told: dict[str, Any] = {"state": np.stack(self._states)} if self._states else {}
+        found: dict[str, Any] = {"state": np.stack(self._states)} if self._states else {}
         if self._targets:
-            told["names"] = action_names(self._interface.actions, self._num_joints)
-            told["targets"] = np.stack(self._targets)
-        return told
+            found["names"] = action_names(self._interface.actions, self._num_joints)
+            found["targets"] = np.stack(self._targets)
+        return found
 
 
 def roll_out(
@@ -250,9 +250,9 @@ def roll_out(
         num_threads=num_threads,
         task=lesson.task,
     )
-    telling = Telling(lesson.expert, interface, env)
-    recorded = record_rollouts(View(env), telling, cut, seed=seed, referee=lesson.referee)
-    return replace(recorded, **telling.told())
+    noted = NotedActor(lesson.expert, interface, env)
+    recorded = record_rollouts(View(env), noted, cut, seed=seed, referee=lesson.referee)
+    return replace(recorded, **noted.columns())
 
 
 def record_rollouts(

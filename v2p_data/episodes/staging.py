@@ -238,7 +238,7 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 @contextmanager
-def refusals_told(doing: str, where: Path) -> Iterator[None]:
+def refusals_named(doing: str, where: Path) -> Iterator[None]:
     """Turn a full disk, a limit or a read-only folder into one sentence.
 
     Args:

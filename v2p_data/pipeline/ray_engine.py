@@ -29,14 +29,14 @@ TRIES = 3
 CONNECT_S = 5.0
 """The head of a cluster answers sooner."""
 FEWEST_IN_FLIGHT = 64
-"""Tasks that a small cluster is told of at a time: what waits there makes it grow, where it can."""
+"""Tasks that a small cluster is given at a time: what waits there makes it grow, where it can."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Task:
     stage: Stage
     tries: int
-    said: int
+    log_bytes: int
     """Bytes in its log before it began."""
 
 
@@ -98,8 +98,8 @@ class RayEngine:
             num_gpus=int(on_gpu),
         ).remote(self.paths, how, self.ray.cloudpickle.dumps(stage))
         log = log_of(stage, runtime.root)
-        said = log.stat().st_size if log.exists() else 0
-        self.tasks[reference] = _Task(stage=stage, tries=tries, said=said)
+        log_bytes = log.stat().st_size if log.exists() else 0
+        self.tasks[reference] = _Task(stage=stage, tries=tries, log_bytes=log_bytes)
 
     def events(self) -> Iterator[Event]:
         errors = self.ray.exceptions
@@ -115,7 +115,7 @@ class RayEngine:
             except errors.RayError as error:
                 how, log, reason = type(error).__name__, log_of(stage, root), "crashed"
                 why = f"its process ended {TRIES} times, last of {how}; its output is in {log}"
-                if log.exists() and OUT_OF_TIME in log.read_bytes()[task.said :]:
+                if log.exists() and OUT_OF_TIME in log.read_bytes()[task.log_bytes :]:
                     reason = "too_long"
                     why = f"it took longer than --limit-s={self.runtime.limit_s:g} s and was ended; its output is in {log}"
                 elif task.tries < TRIES:

@@ -18,7 +18,7 @@ from v2p_data.episodes.dataset.features import (
     WRIST_KEY,
 )
 from v2p_data.episodes.dataset.sheet import SHEET_FILE, write_sheet
-from v2p_data.episodes.dataset.tables import damage_told, read_info
+from v2p_data.episodes.dataset.tables import damage_named, read_info
 from v2p_data.errors import V2PError
 from v2p_data.sim.robot.action_names import TOOL_NAMES, actions_named
 
@@ -71,7 +71,7 @@ def write_card(root: Path, repo_id: str) -> Path:
         )
     has_sheet = _drawn(root, info, about)
     path = root / CARD_FILE
-    with damage_told(root):
+    with damage_named(root):
         card = dataset_card(about, info, repo_id, has_sheet=has_sheet)
     write_text(path, card)
     return path

@@ -86,8 +86,8 @@ def write_parts(parts: Sequence[Part], entries: Sequence[dict[str, Any]], out: P
     columns = _write_rows(parts, whole, tasks, episodes, out)
     for key in camera_keys(whole.info):
         columns |= _write_videos(parts, key, tables, out)
-    told = {EPISODE_COLUMN: [json.dumps(entry) for entry in entries]}
-    write_episodes(out, replaced(episodes, columns | told))
+    entries_column = {EPISODE_COLUMN: [json.dumps(entry) for entry in entries]}
+    write_episodes(out, replaced(episodes, columns | entries_column))
     info = whole.info | {
         "total_episodes": len(episodes),
         "total_frames": int(column(episodes, "length").sum()),
@@ -137,10 +137,10 @@ def _write_rows(
         if INTERVENTION_KEY not in rows.column_names and whole.has_actors:
             rows = rows.append_column(INTERVENTION_KEY, pa.array(np.ones(count, bool)))
         rows = replaced(rows, {name: values.tolist() for name, values in new.items()})
-        told: dict[str, Any] = {"episode_index": k, **files.add(rows.select(files.schema.names))}
+        place: dict[str, Any] = {"episode_index": k, **files.add(rows.select(files.schema.names))}
         for name, stats in number_stats(new, features).items():
-            told |= {f"stats/{name}/{stat}": value.tolist() for stat, value in stats.items()}
-        for name, value in told.items():
+            place |= {f"stats/{name}/{stat}": value.tolist() for stat, value in stats.items()}
+        for name, value in place.items():
             columns.setdefault(name, []).append(value)
     files.close()
     return columns
@@ -180,9 +180,9 @@ def _write_videos(
             write_group()
             number, frames, size, group = number + 1, 0, 0, []
         chunk, file = divmod(number, CHUNK_FILES)
-        told = {"chunk_index": chunk, "file_index": file, "from_timestamp": frames / encoding.FPS}
+        place = {"chunk_index": chunk, "file_index": file, "from_timestamp": frames / encoding.FPS}
         frames, size = frames + stream.num_frames, size + len(stream.mp4)
-        for name, value in (told | {"to_timestamp": frames / encoding.FPS}).items():
+        for name, value in (place | {"to_timestamp": frames / encoding.FPS}).items():
             columns.setdefault(f"videos/{key}/{name}", []).append(value)
         group.append(stream)
     write_group()

@@ -188,12 +188,12 @@ def _merged_about(sources: Sequence[_Source], repo_id: str, partial: Path) -> di
         for entry in source.entries:
             item = names.get(entry["item"], entry["item"])
             key = keys.get(entry.get("history", entry["item"]), item)
-            told = {k: v for k, v in entry.items() if k != "history"} | {"item": item}
+            renamed = {k: v for k, v in entry.items() if k != "history"} | {"item": item}
             if has_actors:
-                told.setdefault("source", DEMONSTRATION)
-                told.setdefault("student_frames", 0)
-            told.setdefault("from", source.about["repo_id"])
-            episodes.append(told | ({"history": key} if key != item else {}))
+                renamed.setdefault("source", DEMONSTRATION)
+                renamed.setdefault("student_frames", 0)
+            renamed.setdefault("from", source.about["repo_id"])
+            episodes.append(renamed | ({"history": key} if key != item else {}))
         edits += source.provenance.get("edits", [])
         facts.append({k: v for k, v in source.provenance.items() if k not in ("items", "edits")})
     merged = [

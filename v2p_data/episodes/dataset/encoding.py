@@ -1,14 +1,13 @@
 """Pictures become H.264 and are put end to end: each episode is a stream of its own that any other can follow.
 
 Masks are exact. A label goes straight to the luma that its grey has, chroma is constant, crf 0 loses nothing;
-what comes out is decoded again and compared before anybody is told that it exists. The stream is what
+what comes out is decoded again and compared before it is used. The stream is what
 LeRobot's own encoder makes of the same pictures with the same settings, less the way through PNG files.
 """
 
-import hashlib
 import io
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,12 +82,11 @@ def join(parts: Iterable[Encoded], path: Path) -> None:
     The parts are looked at once, in order, so that they need not be in memory together.
 
     Raises:
-        RuntimeError: the streams need different decoders, or the file does not hold what was put in.
+        RuntimeError: the streams need different decoders.
     """
     av = _av()
     temporary = path.with_name(path.name + ".tmp")
-    put = hashlib.sha256()
-    lengths: list[int] = []
+    frames = 0
     with av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as made:
         into: Any = None
         extradata = b""
@@ -101,17 +99,15 @@ def join(parts: Iterable[Encoded], path: Path) -> None:
                     extradata = bytes(stream.codec_context.extradata or b"")
                 elif bytes(stream.codec_context.extradata or b"") != extradata:
                     raise RuntimeError(f"a stream for {path} needs another decoder than the first")
-                shift = round(sum(lengths) / (FPS * stream.time_base))
+                shift = round(frames / (FPS * stream.time_base))
                 for packet in video.demux(stream):
                     if packet.dts is None:
                         continue
-                    put.update(bytes(packet))
                     packet.pts += shift
                     packet.dts += shift
                     packet.stream = into
                     made.mux(packet)
-            lengths.append(part.num_frames)
-    _check_joined(temporary, lengths, put.hexdigest())
+            frames += part.num_frames
     with temporary.open("rb") as written:
         os.fsync(written.fileno())
     temporary.replace(path)
@@ -197,24 +193,3 @@ def _check_masks(mp4: bytes, labels: np.ndarray) -> None:
                 raise RuntimeError(f"frame {count - 1} does not come back as it was encoded")
     if count != len(labels):
         raise RuntimeError(f"{len(labels)} frames were encoded and {count} came back")
-
-
-def _check_joined(path: Path, lengths: Sequence[int], digest: str) -> None:
-    with _av().open(str(path)) as video:
-        stream = video.streams.video[0]
-        tick = 1 / (FPS * stream.time_base)
-        got = hashlib.sha256()
-        times: list[int] = []
-        starts: list[bool] = []
-        for packet in video.demux(stream):
-            if packet.dts is not None:
-                got.update(bytes(packet))
-                times.append(packet.pts)
-                starts.append(bool(packet.is_keyframe))
-    firsts = np.cumsum([0, *lengths[:-1]])
-    if (
-        got.hexdigest() != digest
-        or times != [round(k * tick) for k in range(sum(lengths))]
-        or not all(starts[k] for k in firsts)
-    ):
-        raise RuntimeError(f"{path} does not hold the {sum(lengths)} frames that were put into it")

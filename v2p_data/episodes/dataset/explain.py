@@ -9,7 +9,7 @@ from typing import Any
 
 from v2p_data.episodes.dataset.about import demand_about
 from v2p_data.episodes.dataset.intake import demand_bounded
-from v2p_data.episodes.dataset.tables import INFO_FILE, damage_told, read_info
+from v2p_data.episodes.dataset.tables import INFO_FILE, damage_named, read_info
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import RECORD_FILE, history, read_record
 
@@ -32,7 +32,7 @@ def records_of(path: Path, episode: int | None = None) -> dict[str, Any]:
         )
     if episode is not None:
         raise V2PError(f"{path} is no dataset, so it has no episode {episode}")
-    with damage_told(path):
+    with damage_named(path):
         return history(path, path.resolve().parent.parent)
 
 

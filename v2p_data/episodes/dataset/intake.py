@@ -166,10 +166,10 @@ def _demand_plain(root: Path) -> None:
 
 
 def _check_stats(root: Path) -> None:
-    said = json_or_none(root / STATS_FILE)
-    if said is None:
+    found = json_or_none(root / STATS_FILE)
+    if found is None:
         return
-    for key, stats in said.items() if isinstance(said, dict) else [("the file", said)]:
+    for key, stats in found.items() if isinstance(found, dict) else [("the file", found)]:
         if not isinstance(stats, dict):
             raise V2PError(
                 f"{root / STATS_FILE}: {str(key)[:100]!r} is no object of statistics; {ADVICE}"
@@ -191,11 +191,11 @@ def _decoded(path: Path) -> Iterator[int]:
         file = pq.ParquetFile(path)
     except (pa.ArrowException, OSError):
         return
-    said = file.metadata
+    metadata = file.metadata
     repeated: set[str] = set()
-    for group in range(said.num_row_groups):
-        for k in range(said.num_columns):
-            part = said.row_group(group).column(k)
+    for group in range(metadata.num_row_groups):
+        for k in range(metadata.num_columns):
+            part = metadata.row_group(group).column(k)
             yield part.num_values * _WIDTHS.get(part.physical_type, _TEXT)
             if part.physical_type not in _WIDTHS:
                 if not part.path_in_schema.endswith(".bytes"):  # pictures are read one by one

@@ -88,13 +88,13 @@ def subtasks(
 
 def motions(state: Float[np.ndarray, "time 11"]) -> dict[int, str]:
     """Return how tool and fingers move, by the first row of each motion."""
-    said: dict[int, str] = {}
+    words_at: dict[int, str] = {}
     words = [_motion(step) for step in np.diff(state, axis=0)]
     for row, word in enumerate(words):
-        is_new = not said or said[max(said)] != word
+        is_new = not words_at or words_at[max(words_at)] != word
         if is_new and (row == 0 or words[row : row + SHORTEST_ROWS] == [word] * SHORTEST_ROWS):
-            said[row] = word
-    return said
+            words_at[row] = word
+    return words_at
 
 
 def direction(way: Float[np.ndarray, "3"]) -> str:
@@ -163,13 +163,13 @@ def _rows(
     name = str(entry["labels"].get("2", "object")).replace("_", " ")
     parts = subtasks(name, places, numbers(CONTACT_KEY)[:, :2] > 0, numbers(SUCCESS_KEY) > 0)
     plan = "\n".join(f"{k}. {part}" for k, part in enumerate(parts.values(), start=1))
-    said = [(0, "user", "task_aug", words) for words in paraphrases(entry["task"])]
-    said += [(0, "assistant", "plan", plan)]
-    said += [(row, "assistant", "subtask", words) for row, words in parts.items()]
-    said += [(row, "assistant", "motion", words) for row, words in motions(state).items()]
+    rows = [(0, "user", "task_aug", words) for words in paraphrases(entry["task"])]
+    rows += [(0, "assistant", "plan", plan)]
+    rows += [(row, "assistant", "subtask", words) for row, words in parts.items()]
+    rows += [(row, "assistant", "motion", words) for row, words in motions(state).items()]
     persistent = [
         {"role": role, "content": content, "style": style, "timestamp": times[row]}
-        for row, role, style, content in said
+        for row, role, style, content in rows
     ]
     fx, fy, cx, cy = numbers(INTRINSICS_KEY)[0]
     lens = Camera(

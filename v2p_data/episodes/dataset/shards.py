@@ -101,11 +101,11 @@ def make_shards(
                 on_progress(done / total, f"packed {done}/{total} episodes")
             for camera in shard.episodes[0].cameras:
                 encoding.join([p.videos[camera] for p in parts], shard.file(folder, camera))
-            said = [
+            stats = [
                 {c: {k: v.tolist() for k, v in s.items()} for c, s in p.stats.items()}
                 for p in parts
             ]
-            note = {"fingerprint": shard.fingerprint, "stats": said}
+            note = {"fingerprint": shard.fingerprint, "stats": stats}
             write_json_atomically(shard.note(folder), note)
 
 

@@ -88,7 +88,7 @@ READING_ERRORS = (pa.ArrowException, OSError, LookupError, TypeError, ValueError
 
 
 @contextmanager
-def damage_told(root: Path) -> Generator[None]:
+def damage_named(root: Path) -> Generator[None]:
     """Turn what a damaged dataset does to its readers into one sentence.
 
     Raises:
@@ -226,12 +226,12 @@ def row_spans(of_row: np.ndarray) -> dict[int, tuple[int, int]]:
 
 def _counts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
     lengths = column(episodes, "length")
-    said = int(info["total_episodes"]), int(info["total_frames"])
+    noted = int(info["total_episodes"]), int(info["total_frames"])
     true = len(lengths), int(lengths.sum())
-    if said != true:
+    if noted != true:
         yield Problem(
             check="counts", where=INFO_FILE,
-            detail=f"names {said} episodes and frames, the episode table {true}",
+            detail=f"names {noted} episodes and frames, the episode table {true}",
         )  # fmt: skip
     rows = sum(pq.read_metadata(path).num_rows for path in sorted(root.glob(DATA_GLOB)))
     if rows != true[1]:
@@ -266,7 +266,7 @@ def _episode_order(episodes: pa.Table) -> Iterator[Problem]:
     if len(wrong):
         yield Problem(
             check="index", where=f"episode {wrong[0]}",
-            detail=f"its rows are said to be {starts[0][wrong[0]]} to {starts[1][wrong[0]]}, which its place and length contradict",
+            detail=f"its rows are noted as {starts[0][wrong[0]]} to {starts[1][wrong[0]]}, which its place and length contradict",
         )  # fmt: skip
 
 
@@ -307,7 +307,7 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Prob
         if where_is.get(k, {name}) != {name}:
             yield Problem(
                 check="index", where=f"episode {k}",
-                detail=f"is said to lie in {name} and lies in {', '.join(sorted(where_is[k]))}",
+                detail=f"is noted in {name} and lies in {', '.join(sorted(where_is[k]))}",
             )  # fmt: skip
 
 
@@ -345,15 +345,15 @@ def _video_sizes(root: Path, info: dict[str, Any]) -> Iterator[Problem]:
     from lerobot.datasets.video_utils import av  # LeRobot's module is this room's door to video
 
     for key in camera_keys(info, "video"):
-        said = tuple(info["features"][key]["shape"])
+        shape = tuple(info["features"][key]["shape"])
         for path in sorted(root.glob(f"videos/{key}/*/*.mp4")):
-            size = said[:2]
+            size = shape[:2]
             with suppress(av.FFmpegError, LookupError, ValueError), av.open(str(path)) as video:
                 size = video.streams.video[0].height, video.streams.video[0].width
-            if size not in (said[:2], said[1:]):
+            if size not in (shape[:2], shape[1:]):
                 yield Problem(
                     check="video_size", where=_name(root, path),
-                    detail=f"has pictures of {size[1]} x {size[0]} px, {INFO_FILE} says {said}",
+                    detail=f"has pictures of {size[1]} x {size[0]} px, {INFO_FILE} names {shape}",
                 )  # fmt: skip
 
 

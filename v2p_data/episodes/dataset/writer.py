@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from v2p_data.episodes.dataset.encoding import MASK_CRF, RGB_CRF, encoder_config
 from v2p_data.episodes.dataset.episode_stats import number_stats
@@ -55,11 +54,11 @@ from v2p_data.episodes.dataset.shards import (
     stats_of,
     write_file,
 )
-from v2p_data.episodes.dataset.tables import VIDEO_PATH
+from v2p_data.episodes.dataset.tables import VIDEO_PATH, layout_problems, read_info
 from v2p_data.episodes.staging import (
     Episode,
     Heading,
-    refusals_told,
+    refusals_named,
 )
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import commit_folder, write_json_atomically
@@ -98,7 +97,7 @@ def pack(
         root: where it shall lie; must not exist.
         provenance: how the episodes came about, JSON; kept in `meta/v2p.json`.
         num_threads: 0 for all cores; changes no byte.
-        on_progress: told the share that is done and a few words.
+        on_progress: called with the share that is done and a few words.
 
     Raises:
         V2PError: there is something at `root`, nothing to pack, the episodes do not go together, or nothing can be
@@ -111,7 +110,7 @@ def pack(
         )
     headings = _headings(staged)
     partial = root.with_name(root.name + ".partial")
-    with refusals_told("packing", root.parent):
+    with refusals_named("packing", root.parent):
         partial.mkdir(parents=True, exist_ok=True)
         on_progress(0.0, "starting LeRobot")
         shards = plan_shards(headings)
@@ -125,7 +124,8 @@ def pack(
         write_json_atomically(
             growing / METADATA_FILE, _about(repo_id, headings, described, provenance or {})
         )
-        _check_tables(growing, shards)
+        if problems := layout_problems(growing, read_info(growing)):
+            raise RuntimeError(f"{problems[0].where} {problems[0].detail}")
         _flush(growing)
         commit_folder(growing, root)
         shutil.rmtree(partial)
@@ -188,7 +188,7 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
 def _write(
     shards: Sequence[Shard], finished: Path, repo_id: str, root: Path
 ) -> list[dict[str, Any]]:
-    """Write everything but our own metadata; return what is told of each episode there."""
+    """Write everything but our own metadata; return what it holds of each episode."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.feature_utils import get_hf_features_from_features
     from lerobot.datasets.io_utils import write_info
@@ -331,18 +331,6 @@ def _number_digest(columns: Sequence[np.ndarray]) -> str:
     for values in columns:
         digest.update(np.asarray(values, np.float64).tobytes())
     return digest.hexdigest()
-
-
-def _check_tables(root: Path, shards: Sequence[Shard]) -> None:
-    """Raise unless the files on disk hold as many rows and episodes as were put in."""
-
-    def rows(pattern: str) -> int:
-        return sum(pq.ParquetFile(p).metadata.num_rows for p in root.glob(pattern))
-
-    wanted = (sum(len(s.episodes) for s in shards), sum(s.num_frames for s in shards))
-    counted = (rows("meta/episodes/*/*.parquet"), rows("data/*/*.parquet"))
-    if counted != wanted:
-        raise RuntimeError(f"the tables hold {counted} episodes and frames, not {wanted}")
 
 
 def _flush(root: Path) -> None:

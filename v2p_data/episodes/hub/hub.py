@@ -305,7 +305,7 @@ def _without_xet() -> Generator[None]:
 
 
 def _endpoint() -> str:
-    """Return the Hub's address; the library's default is what the environment said when it was imported."""
+    """Return the Hub's address; the library's default is what the environment held when it was imported."""
     return os.environ.get("HF_ENDPOINT", "").rstrip("/") or DEFAULT_ENDPOINT
 
 
@@ -362,7 +362,7 @@ def _explained[T](transfer: Callable[[], T], doing: str, endpoint: str, token: s
         return transfer()
     except HfHubHTTPError as error:
         status = error.response.status_code if error.response is not None else 0
-        said = _first_line(error.server_message or str(error), token)
+        words = _first_line(error.server_message or str(error), token)
         reasons = {
             401: "the token in HF_TOKEN is not valid there; make a new one with write access",
             403: f"the token in HF_TOKEN may not {doing}; check the user name before the slash and what the token "
@@ -375,7 +375,7 @@ def _explained[T](transfer: Callable[[], T], doing: str, endpoint: str, token: s
             429: f"it asks to slow down; wait some minutes and {again}",
         }
         reason = reasons.get(status, f"the fault is on its side; {again}")
-        raise V2PError(f"{endpoint} answered {status} ({said}): {reason}") from None
+        raise V2PError(f"{endpoint} answered {status} ({words}): {reason}") from None
     except OfflineModeIsEnabled:
         raise V2PError(
             f"cannot {doing}: HF_HUB_OFFLINE is set; unset it and run the command again"

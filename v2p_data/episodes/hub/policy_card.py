@@ -1,4 +1,4 @@
-"""The card of a policy: written with its folder, told each evaluation, and pushed as it is."""
+"""The card of a policy: written with its folder, given each evaluation, and pushed as it is."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
