@@ -18,8 +18,6 @@ from v2p_data.report.reading import PARTIAL_SUFFIX
 
 FINAL = ("dataset", "policy", "evaluation")
 """Stages whose results are wanted for themselves."""
-
-
 OWN_NAME = re.compile(r".+-[0-9a-f]{8}(\.partial)?")
 """Of folders that stages make."""
 
