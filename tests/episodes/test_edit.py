@@ -313,15 +313,19 @@ def test_a_write_that_the_system_refuses_leaves_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
-def encoded_anew(root: Path, copy: Path) -> Path:
-    """Return a copy of the dataset whose video LeRobot encoded anew: every second frame is a key frame."""
+def encoded_anew(root: Path, copy: Path, key_every: int) -> Path:
+    """Return a copy of the dataset whose video LeRobot encoded anew."""
     from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.dataset_tools import reencode_dataset
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     shutil.copytree(root, copy)
     encoder = RGBEncoderConfig(
-        vcodec="h264", crf=30, g=2, pix_fmt="yuv420p", extra_options={"bf": 0}
+        vcodec="h264",
+        crf=30,
+        g=key_every,
+        pix_fmt="yuv420p",
+        extra_options={"bf": 0, "sc_threshold": 0},
     )
     reencode_dataset(LeRobotDataset("user/x", root=copy), rgb_encoder=encoder)
     return copy
@@ -331,7 +335,7 @@ def test_files_of_unlike_encoders_stay_apart_and_no_pixel_is_altered(
     packed: Path, more: Path, tmp_path: Path
 ):
     """Packets of both in one file would be decoded by the settings of the first."""
-    lossy = encoded_anew(packed, tmp_path / "lossy")
+    lossy = encoded_anew(packed, tmp_path / "lossy", key_every=2)
 
     out = merge([more, lossy], "user/both", tmp_path / "both").root  # compares every pixel
 
@@ -340,7 +344,7 @@ def test_files_of_unlike_encoders_stay_apart_and_no_pixel_is_altered(
 
 def test_a_video_whose_episodes_cannot_be_told_apart_is_named(more: Path, tmp_path: Path):
     """The second episode begins at frame 11, which is no key frame after another tool encoded the file anew."""
-    root = encoded_anew(more, tmp_path / "lossy")
+    root = encoded_anew(more, tmp_path / "lossy", key_every=250)
 
     with pytest.raises(V2PError, match=r"file-000\.mp4 has no key frame .*lerobot-edit-dataset"):
         drop(root, [PUSH], tmp_path / "out")

@@ -7,7 +7,6 @@ finished. The same episodes give the same bytes, after any number of kills, with
 
 import hashlib
 import json
-import logging
 import os
 import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -64,7 +63,6 @@ from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import commit_folder, write_json_atomically
 from v2p_data.sim.render.masks import MASK_CAMERAS, PALETTE, WRIST_CAMERA, label_names
 
-logger = logging.getLogger(__name__)
 
 EPISODES_PER_WRITE = 100
 ALIKE = {
@@ -117,8 +115,7 @@ def pack(
         make_shards(shards, partial / "shards", num_threads=num_threads,
                     on_progress=lambda share, words: on_progress(0.9 * share, words))  # fmt: skip
         growing = partial / "dataset"
-        if growing.exists():
-            shutil.rmtree(growing)
+        shutil.rmtree(growing, ignore_errors=True)
         on_progress(0.9, "writing the tables")
         described = _write(shards, partial / "shards", repo_id, growing)
         write_json_atomically(
@@ -129,13 +126,11 @@ def pack(
         _flush(growing)
         commit_folder(growing, root)
         shutil.rmtree(partial)
-    num_frames = sum(h.num_frames for h in headings)
-    logger.info("packed %d episodes, %d frames, at %s", len(headings), num_frames, root)
     return NewDataset(
         root=root,
         repo_id=repo_id,
         num_episodes=len(headings),
-        num_frames=num_frames,
+        num_frames=sum(h.num_frames for h in headings),
         tasks=tuple(dict.fromkeys(h.task for h in headings)),
     )
 
