@@ -63,7 +63,6 @@ from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import commit_folder, write_json_atomically
 from v2p_data.sim.render.masks import MASK_CAMERAS, PALETTE, WRIST_CAMERA, label_names
 
-
 EPISODES_PER_WRITE = 100
 ALIKE = {
     "size_px": ("masks of", "--episodes.size-px"),
