@@ -1,4 +1,4 @@
-"""Settings of the expert stage, without the libraries that train."""
+"""Settings of the expert stage."""
 
 from dataclasses import dataclass, field
 from typing import Literal

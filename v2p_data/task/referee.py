@@ -200,7 +200,10 @@ Verdict = Bool[np.ndarray, "env"]
 
 
 def referee_success(kind: Kind, scene: Scene, trajectory: Trajectory) -> Bool[np.ndarray, "env"]:
-    """Return per world whether the robot did what its kind of task says; what comes about by itself never counts.
+    """Return per world whether the robot did what its kind of task says.
+
+    What moves while the robot is away from it does not count. How something was carried is not looked at: a push may be a
+    carry. Docs: `docs/experts.md`.
 
     Raises:
         V2PError: the kind needs an object that the scene lacks.

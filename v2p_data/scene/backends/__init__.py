@@ -1,4 +1,6 @@
-"""Learned models for the stages of reconstruction, one option each, all of them off by default.
+"""Learned models for the stages of reconstruction, one option each.
+
+Detector, tracker, depth, mesh and pose are off by default. Hands and outlines are used where they are set up.
 
 Comes in: RGB pictures (uint8, `h w 3`) and phrases, boxes or masks in pixels of these pictures. Goes out: boxes
 (`detect`), mask tracks (`segment`), metric depth and the table plane under it (`depth`), or what a model in an
