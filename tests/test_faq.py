@@ -72,7 +72,7 @@ def test_every_dotted_option_that_a_page_names_exists():
     from v2p_data.commands import deploy, run
 
     known: set[str] = set()
-    for kind in (run.Generate, run.Train, run.Evaluate, run.Distill, deploy.Deploy):
+    for kind in (run.Generate, run.Train, run.Evaluate, deploy.Deploy):
         for action in tyro.extras.get_parser(kind)._actions:
             known |= {option for option in action.option_strings if "." in option}
     groups = {option.split(".")[0] for option in known}
