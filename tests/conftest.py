@@ -22,7 +22,6 @@ UNCHECKED = (
     "v2p_data.scene.fitting.shape_fit",
     "v2p_data.scene.fitting.silhouette",
     "v2p_data.task.sandbox.reader",
-    "v2p_data.reward.code",
 )
 """Called ten thousand times and more a clip or a reward: checking their arguments takes as long as their work. The first
 sends a function to nodes that may not have the checker."""

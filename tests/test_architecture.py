@@ -111,7 +111,7 @@ INSIDE: dict[str, dict[str, set[str]]] = {
         "audit": {"templates", "sandbox", "task"},
         "llm": {"audit", "templates", "sandbox", "likeness", "task"},
     },
-    "reward": {"code": set(), "trajectories": set(), "feedback": {"trajectories"}},
+    "reward": {"trajectories": set(), "feedback": {"trajectories"}},
     "episodes": {
         "staging": set(),
         "dataset": {"staging"},

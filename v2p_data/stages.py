@@ -289,15 +289,7 @@ def make_task(
 
 
 def reward_stage(task: Stage, cfg: EngineConfig) -> Stage:
-    """Return the stage that searches a task's reward; its result is the task with the reward that was found.
-
-    Raises:
-        V2PError: the method plays programs and leaves no reward.
-    """
-    if cfg.reward.method == "code_as_policy":
-        raise V2PError(
-            "--reward.method=code_as_policy has no reward to learn from; scripts/compare_reward_methods.py plays it"
-        )
+    """Return the stage that searches a task's reward; its result is the task with the reward that was found."""
     vlm = cfg.task.vlm if cfg.task.writer == "vlm" else None
     return Stage(
         name="reward",
@@ -306,7 +298,7 @@ def reward_stage(task: Stage, cfg: EngineConfig) -> Stage:
         inputs={"task": task},
         sources=task_data(asks_model=vlm is not None)
         | ({} if vlm is None else {"model": fingerprint(vlm.recipe())}),
-        version=2,
+        version=3,
         make=partial(make_reward, vlm=vlm),
         resumes=True,
     )
@@ -321,8 +313,7 @@ def make_reward(
     vlm: VlmConfig | None,
 ) -> dict[str, Any]:
     """Search, and write the task with the reward that was found; a model, if there is one, writes the rewards."""
-    from v2p_data.reward.methods import told
-    from v2p_data.reward.search import How, search_reward
+    from v2p_data.reward.search import RewardSearch
 
     bundle = TaskBundle.load(inputs["task"])
     seed = seed_for(cfg.seed, "reward", bundle.title)
@@ -331,20 +322,15 @@ def make_reward(
         from v2p_data.task.llm.client import VlmClient
         from v2p_data.task.llm.writer import ModelWriter
 
-        client = VlmClient(told(vlm, cfg.config), out / "calls", seed)
+        client = VlmClient(vlm, out / "calls", seed)
         writer = ModelWriter(client=client, pools=(runtime.root / SOLVED_POOL_FOLDER,))
-    found = search_reward(
-        bundle,
-        cfg.config,
-        out / REWARD_SEARCH_FOLDER,
-        seed=seed,
-        how=How(num_threads=runtime.num_threads),
-        writer=writer,
-        on_progress=runtime.progress,
+    search = RewardSearch(
+        bundle, cfg.config, out / REWARD_SEARCH_FOLDER, seed=seed, runtime=runtime, writer=writer
     )
+    best = search.run()
     shutil.rmtree(out / SCENE_FOLDER, ignore_errors=True)  # of a run that was killed just here
-    replace(bundle, code=found.code, class_name=found.class_name).save(out)
-    return found.as_dict()
+    replace(bundle, code=best.code).save(out)
+    return search.summary()
 
 
 # --- task -> expert ------------------------------------------------------------------------------------------
@@ -356,8 +342,7 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
     A killed training starts anew: it lasts a minute or two, and only then is its result the same as an
     undisturbed one's. It learns with the bonus for success that its reward was searched with; a usual one is not named.
     """
-    is_searched = task.name == "reward"
-    bonus = cfg.reward.paid_bonus_ratio if is_searched else cfg.reward.bonus_ratio
+    bonus = cfg.reward.bonus_ratio
     named = {} if bonus == RewardConfig().bonus_ratio else {"bonus ratio": f"{bonus:g}"}
     return Stage(
         name="expert",

@@ -8,6 +8,7 @@ import tyro
 
 from v2p_data.cli import parse
 from v2p_data.commands import reward
+from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import demand_whole
 from v2p_data.task.task import TASK_FILE, TaskBundle
 
@@ -15,16 +16,18 @@ from v2p_data.task.task import TASK_FILE, TaskBundle
 @dataclass(frozen=True, kw_only=True)
 class Show:
     path: tyro.conf.Positional[Path]
-    """Folder of a task, of a reward search or of one candidate in it; of a run: all of its tasks and searches."""
-    candidate: int | None = None
-    """Number of the candidate of a search to show; by default the chosen one."""
+    """Folder of a task or of a reward search; of a run: all of its tasks and searches."""
 
 
 def show_command(argv: list[str]) -> int:
     args = parse(Show, argv, "show")
     parts = [shown(folder) for folder in tasks_in(args.path)]
-    if not parts or reward.searches_in(args.path):
-        parts.append(reward.shown(args.path, args.candidate))
+    parts += [reward.shown(search) for search in reward.searches_in(args.path)]
+    if not parts:
+        raise V2PError(
+            f"{args.path} holds neither a task nor a reward search; make them with 'v2p task VIDEOS' and "
+            "'v2p reward search TASK'"
+        )
     print("\n\n\n".join(parts))  # noqa: T201
     return 0
 

@@ -52,7 +52,7 @@ class Worlds:
     num_threads: int = 1
     """For the physics; changes no result."""
     bonus_ratio: float = SimConfig.bonus_ratio
-    """What a step of success earns, see `SimConfig`; 0 by RoboGen's method."""
+    """What a step of success earns, see `SimConfig`."""
 
     def make(self, num_envs: int, purpose: str, *, fine: bool = False) -> BatchEnv:
         """Return worlds on the CPU for a purpose, whose name is part of their seed."""

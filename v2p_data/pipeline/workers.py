@@ -83,15 +83,19 @@ class Engine(Protocol):
 
 
 def run_stages(
-    stages: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None]
+    stages: Sequence[Stage],
+    runtime: Runtime,
+    on_event: Callable[[Event], None],
+    engine: Engine | None = None,
 ) -> dict[Key, Outcome]:
     """Make every stage and what it needs; return the outcome per (stage name, folder name).
 
     With a store, what others made is taken and what they are making is waited for, while all else goes on.
+    `engine` is used and left open; without one the runtime's is started where there is something to make.
     """
     ordered = list(in_order(stages))
     with Shared(runtime) as shared:
-        outcomes = _run_stages(ordered, runtime, on_event, shared)
+        outcomes = _run_stages(ordered, runtime, on_event, shared, engine)
         shared.fetch_all(ordered, outcomes)
     return outcomes
 
@@ -135,14 +139,18 @@ class _Schedule:
 
 
 def _run_stages(
-    ordered: Sequence[Stage], runtime: Runtime, on_event: Callable[[Event], None], shared: Shared
+    ordered: Sequence[Stage],
+    runtime: Runtime,
+    on_event: Callable[[Event], None],
+    shared: Shared,
+    lent: Engine | None,
 ) -> dict[Key, Outcome]:
     plan = _Schedule(runtime.root, on_event)
     for place, stage in enumerate(ordered):
         plan.add(place, stage, shared.stored(stage))
     if not plan.ready:
         return plan.outcomes
-    engine = _engine(runtime, num_pending=len(plan.num_missing))
+    engine = lent or _engine(runtime, num_pending=len(plan.num_missing))
     try:
         while plan.ready or engine.is_busy:
             others: list[tuple[int, Stage]] = []  # at work on another driver
@@ -168,7 +176,8 @@ def _run_stages(
                     shared.ended(event.stage)
                     plan.ended(event.stage, event.outcome)
     finally:
-        engine.close()
+        if lent is None:
+            engine.close()
     return plan.outcomes
 
 
@@ -184,7 +193,7 @@ def _engine(runtime: Runtime, num_pending: int) -> Engine:
         from v2p_data.pipeline.ray_engine import RayEngine
 
         return RayEngine(runtime)
-    return _Pool(runtime, size=min(max(1, runtime.workers), num_pending))
+    return Pool(runtime, size=min(max(1, runtime.workers), num_pending))
 
 
 def _key(stage: Stage) -> Key:
@@ -199,7 +208,9 @@ class _Worker:
     started: float = 0.0
 
 
-class _Pool:
+class Pool:
+    """Worker processes of this machine, at most `size` at the same time; each loads the libraries once."""
+
     def __init__(self, runtime: Runtime, size: int) -> None:
         # Spawned, not forked: a fork would share the caller's OpenGL and thread state.
         self.context = multiprocessing.get_context("spawn")
@@ -222,8 +233,9 @@ class _Pool:
         if worker is None:
             ours, theirs = self.context.Pipe()
             log = self.runtime.root / "logs" / f"worker-{len(self.workers)}.log"
+            # No daemon, for a stage may run stages of its own; it ends with its parent all the same.
             process = self.context.Process(
-                target=_work, args=(theirs, self.runtime, log, os.getpid()), daemon=True
+                target=_work, args=(theirs, self.runtime, log, os.getpid())
             )
             process.start()
             theirs.close()

@@ -36,9 +36,9 @@ from v2p_data.report.reading import (
     read_curve,
 )
 from v2p_data.report.rewards import RewardView, reward_view
-from v2p_data.report.searches import SEARCH_FOLDER
 from v2p_data.report.training import training_charts
 from v2p_data.scene.scene import Scene, SceneObject
+from v2p_data.task.task import REWARD_SEARCH_FOLDER
 
 MAX_MODEL_CHARS = 100
 STRIP_MOMENTS = 6
@@ -105,7 +105,7 @@ def item_view(
         _add_task(view, task)
     reward, expert, episodes = (view.results[k] for k in ("reward", "expert", "episodes"))
     if reward is not None and is_shown:
-        view.reward = reward_view(reward.folder / SEARCH_FOLDER)
+        view.reward = reward_view(reward.folder / REWARD_SEARCH_FOLDER)
     if expert is not None and is_shown:
         _add_expert(view, expert, cfg, budget)
     if episodes is not None and is_shown:

@@ -1,10 +1,12 @@
-"""A reward search as part of the page: each round's candidates, and of the best one training, audit, origin and code.
+"""A reward search as part of the page, finished or not: each round's candidates, and how the best one trained and came about.
 
-Text and numbers only. A search of five rounds of eight adds about 50 kB to a page whose media may take 22 MB.
+Text and numbers only. Trainings were written by processes that ran generated code, so their files are read as a
+stranger's: small, inside the search's folder, and never trusted to be whole.
 """
 
 import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -13,70 +15,46 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from v2p_data.report.audits import AuditView, audit_view
-from v2p_data.report.chart import NUM_STYLES, Line, line_chart
-from v2p_data.report.reading import as_dict, as_dicts, number, read_curve
-from v2p_data.report.searches import (
-    MAX_TEXT_CHARS,
-    Candidate,
-    Search,
-    Trial,
-    read_feedback,
-    read_search,
-    training_curve,
-)
+from v2p_data.errors import V2PError
+from v2p_data.json_files import MAX_BYTES, json_or_none
+from v2p_data.report.chart import Line, line_chart
+from v2p_data.report.reading import as_dict, as_dicts, as_list, number, read_curve
 from v2p_data.report.training import training_charts
 from v2p_data.report.words import NO_BREAK, percent
+from v2p_data.scene.files import own_file
 
-UNTRAINED = {"prescreened": "turned away untrained", "refused": "refused untrained"}
-FAULTS = {
-    "crashed": "crashed",
-    "hang": "hung",
-    "out_of_time": "ran out of time",
-    "out_of_memory": "ran out of memory",
-    "not_finite": "was not finite",
-    "unbounded": "knew no bounds",
-    "error": "failed with an error",
-} | UNTRAINED
-AUTHORS = {
-    "given": "the task's own",
-    "template": "a template",
-    "reflection": "rules",
-    "model": "a language model",
-}
-"""Who wrote a reward, by `Candidate.origin`."""
+SEARCH_FILE = "search.json"
+AUTHORS = {"given": "the task's own", "template": "a template", "model": "a language model"}
+"""Who wrote a reward, by its `origin`."""
+MAX_CANDIDATES = 200
+MAX_CODE_CHARS, MAX_SENTENCE_CHARS, MAX_NAME_CHARS = 20_000, 500, 100
 MAX_PARTS = 30
-MAX_NAME_CHARS = 100
-DIFF_CONTEXT = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class CandidateView:
-    """One line of a round."""
+class RewardRow:
+    """One reward that was tried."""
 
     number: int
+    iteration: int
+    """Its round, from 0."""
     parent: int | None
     author: str
     mark: str
     """Colour of its state, one of the page's."""
     state: str
     rates: tuple[float, ...]
-    """Success of each evaluation."""
-    success: float | None
+    """Success after each rung."""
     why: list[str]
     """What went wrong, or the reasons for which it was written."""
     seconds: float | None
-    is_leader: bool
+    folder: str
+    """Name of its last rung's folder."""
+    code: str = field(repr=False)
 
-
-@dataclass(frozen=True, kw_only=True)
-class RoundView:
-    """Candidates that were trained against each other."""
-
-    number: int
-    """From 1."""
-    candidates: list[CandidateView]
-    chart: Markup
+    @property
+    def success(self) -> float | None:
+        return self.rates[-1] if self.rates else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,41 +73,33 @@ class PartView:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StepView:
-    """How one reward was made from another."""
-
-    number: int
-    parent: int
-    author: str
-    reasons: tuple[str, ...]
-    difference: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class RewardView:
     """A search, and the candidate that leads it."""
 
-    method: str
-    without: str
-    num_candidates: int
-    rounds: list[RoundView]
-    leader: int | None
-    author: str
-    """Who wrote the leader's reward."""
+    title: str
+    rows: dict[int, RewardRow]
+    """By number, in the order in which they were written."""
+    leader: RewardRow | None
     is_chosen: bool
     """The search is finished; otherwise its leader is only the best so far."""
-    success: float | None
-    per_seed: tuple[float, ...]
     stopped_by: str
-    cost_share: float | None
-    charts: list[Markup] = field(default_factory=list[Markup])
-    facts: list[str] = field(default_factory=list[str])
+    steps: float | None
+    """Control steps of training that it took."""
+    by_round: Markup
+    """The paper's figure 4: success of the best reward of each round, and of the best so far."""
+    charts: list[Markup]
+    """Of the leader's training."""
+    facts: list[str]
     """What the leader's policy did, one sentence each."""
-    parts: list[PartView] = field(default_factory=list[PartView])
-    audit: AuditView
-    lineage: list[StepView] = field(default_factory=list[StepView])
-    """The leader's origin first, then its parent's, back to the first round."""
-    code: str = ""
+    parts: list[PartView]
+    lineage: list[tuple[RewardRow, RewardRow, str]]
+    """The leader, its parent and the difference of their codes; then the parent's, back to the first round."""
+
+    @property
+    def rounds(self) -> list[list[RewardRow]]:
+        """Return the candidates that were trained against each other."""
+        iterations = sorted({row.iteration for row in self.rows.values()})
+        return [[row for row in self.rows.values() if row.iteration == i] for i in iterations]
 
 
 def reward_view(folder: Path) -> RewardView | None:
@@ -138,188 +108,152 @@ def reward_view(folder: Path) -> RewardView | None:
     Args:
         folder: of the search, finished or not.
     """
-    search = read_search(folder)
-    if search is None:
+    if not folder.is_dir():
         return None
-    leader, choice = search.leader, search.choice
-    view = RewardView(
-        method=search.method,
-        without=", ".join(search.without),
-        num_candidates=len(search.candidates),
-        rounds=_rounds(search, leader),
-        leader=None if leader is None else leader.number,
-        author="" if leader is None else _author(leader),
-        is_chosen=leader is not None and choice is not None,
-        success=choice.success if choice else search.success(leader) if leader else None,
-        per_seed=choice.per_seed if choice else (),
-        stopped_by=choice.stopped_by if choice else "",
-        cost_share=choice.cost_share if choice else None,
-        audit=audit_view(search.audit),
-        code=leader.code if leader else "",
+    table = as_dict(json_or_none(folder / SEARCH_FILE))
+    found, rungs = as_dict(table.get("found")), len(as_list(table.get("rungs")))
+    entries = as_dicts(table.get("candidates"))[:MAX_CANDIDATES]
+    last = max((e["iteration"] for e in entries if isinstance(e.get("iteration"), int)), default=0)
+    made = [_row(entry, rungs, last if not found else last + 1) for entry in entries]
+    rows = {row.number: row for row in made if row is not None}
+    able = [row for row in rows.values() if row.success]
+    best = max(able, key=lambda row: (row.success or 0.0, -row.number), default=None)
+    chosen = found.get("chosen")
+    leader = rows.get(chosen, best) if isinstance(chosen, int) else best
+    place = f"candidate/{leader.folder}" if leader and leader.folder else ""
+    record = _own_file(folder, f"{place}/record.json")
+    feedback = as_dict(as_dict(as_dict(record and json_or_none(record)).get("counts")).get("feedback"))  # fmt: skip
+    curve = _own_file(folder, f"{place}/train/curve.csv")
+    parts = [*as_dicts(feedback.get("components"))[:MAX_PARTS], as_dict(feedback.get("reward"))]
+    return RewardView(
+        title=str(table.get("title") or "")[:MAX_NAME_CHARS],
+        rows=rows,
+        leader=leader,
+        is_chosen=bool(found) and leader is not None,
+        stopped_by=str(found.get("stopped_by") or ""),
+        steps=number(found.get("steps")),
+        by_round=_success_by_round(list(rows.values())),
+        charts=training_charts(read_curve(curve)) if curve else [],
+        facts=_facts(feedback),
+        parts=[_part(row) for row in parts if row],
+        lineage=_lineage(rows, leader),
     )
-    if leader is not None:
-        _add_training(view, search, leader)
-        line = search.lineage(leader)
-        for child, parent in pairwise(line):
-            view.lineage.append(_step(child, parent))
-    return view
 
 
-# --- rounds --------------------------------------------------------------------------------------------------
-
-
-def _rounds(search: Search, leader: Candidate | None) -> list[RoundView]:
-    iterations = sorted({c.iteration for c in search.candidates.values()})
-    views: list[RoundView] = []
-    for iteration in iterations:
-        members = [c for c in search.candidates.values() if c.iteration == iteration]
-        # A single evaluation makes no line; its number is in the table.
-        longest = sorted(members, key=lambda c: (-len(c.first.successes), c.number))
-        drawn = {c.number for c in longest[:NUM_STYLES]}
-        lines = [
-            _line(search, c.first, f"candidate {c.number}")
-            for c in members
-            if c.number in drawn and len(c.first.successes) > 1
-        ]
-        chart = line_chart(
-            lines,
-            title=f"Success of round {iteration + 1}'s candidates in evaluations",
-            x_label="control steps",
-            y_range=(0.0, 1.0),
-        )
-        candidates = [_candidate(search, c, c is leader) for c in members]
-        views.append(RoundView(number=iteration + 1, candidates=candidates, chart=chart))
-    return views
-
-
-def _candidate(search: Search, candidate: Candidate, is_leader: bool) -> CandidateView:
-    trial = candidate.first
-    mark, state = _state(search, candidate)
-    return CandidateView(
-        number=candidate.number,
-        parent=candidate.parent,
-        author=_author(candidate),
+def _row(entry: dict[str, Any], rungs: int, at_work: int) -> RewardRow | None:
+    """Return a candidate's line; rounds before `at_work` have ended."""
+    index, iteration, parent = entry.get("number"), entry.get("iteration"), entry.get("parent")
+    if not isinstance(index, int) or not isinstance(iteration, int):
+        return None
+    results = as_dicts(entry.get("results"))
+    rates = [number(r.get("success")) for r in results]
+    done, why = len(results), str(entry.get("why") or "")[:MAX_SENTENCE_CHARS]
+    if why:
+        mark, state = "rejected", "failed"
+    elif done == rungs:
+        mark, state = "made", "trained to the end"
+    elif entry.get("is_finished") is True:
+        mark, state = "made", f"reached the target at rung {done} of {rungs}"
+    elif iteration < at_work:
+        mark, state = "none", f"stopped at rung {done} of {rungs}"
+    else:
+        mark, state = "unfinished", f"under way, {done} of {rungs} rungs" if done else "waits"
+    seconds = [s for r in results if (s := number(r.get("seconds"))) is not None]
+    origin = str(entry.get("origin") or "unknown")[:MAX_SENTENCE_CHARS]
+    reasons = [str(r)[:MAX_SENTENCE_CHARS] for r in as_list(entry.get("reasons"))[:20]]
+    return RewardRow(
+        number=index,
+        iteration=iteration,
+        parent=parent if isinstance(parent, int) else None,
+        author=AUTHORS.get(origin, origin),
         mark=mark,
         state=state,
-        rates=trial.successes,
-        success=search.success(candidate),
-        why=[trial.why] if trial.why else list(candidate.reasons),
-        seconds=trial.seconds,
-        is_leader=is_leader,
+        rates=tuple(min(1.0, max(0.0, rate)) for rate in rates if rate is not None),
+        why=[why] if why else reasons,
+        seconds=sum(seconds) if seconds else None,
+        folder=Path(str(results[-1].get("folder") or "")).name if results else "",
+        code=str(entry.get("code") or "")[:MAX_CODE_CHARS],
     )
 
 
-def _author(candidate: Candidate) -> str:
-    return AUTHORS.get(candidate.origin, candidate.origin)
-
-
-def _state(search: Search, candidate: Candidate) -> tuple[str, str]:
-    """Return the page's mark and the words for how far a candidate came."""
-    trial, rungs = candidate.first, search.rungs
-    done = len(trial.successes)
-    if trial.fault:
-        return "rejected", FAULTS.get(trial.fault, trial.fault.replace("_", " "))
-    if trial.is_ended:
-        return "made", f"reached the target after {done} of {rungs[-1]} evaluations"
-    if done >= rungs[-1]:
-        return "made", "trained to the end"
-    if candidate.iteration in search.ended_rounds:
-        rung = sum(mark < done for mark in rungs) + 1
-        return "none", f"stopped at rung {rung} of {len(rungs)}"
-    return "unfinished", f"under way, {done} of {rungs[-1]} evaluations" if done else "waits"
-
-
-def _line(search: Search, trial: Trial, name: str) -> Line:
-    steps = search.steps_per_evaluation * np.arange(1, len(trial.successes) + 1)
-    return Line(name=name, x=steps, y=np.array(trial.successes, float))
-
-
-# --- the leader ----------------------------------------------------------------------------------------------
-
-
-def _add_training(view: RewardView, search: Search, leader: Candidate) -> None:
-    seeds = [
-        _line(search, trial, f"seed {k}")
-        for k, trial in enumerate(leader.trials)
-        if len(trial.successes) > 1
+def _success_by_round(rows: Sequence[RewardRow]) -> Markup:
+    """Return the curve over the rounds, nothing for a single one."""
+    rounds = sorted({row.iteration for row in rows})
+    best = [max((r.success or 0.0 for r in rows if r.iteration == i), default=0.0) for i in rounds]
+    if len(rounds) < 2:
+        return Markup("")
+    x = np.array(rounds, float) + 1
+    lines = [
+        Line(name="best so far", x=x, y=np.maximum.accumulate(best)),
+        Line(name="best of the round", x=x, y=np.array(best)),
     ]
-    by_seed = line_chart(
-        seeds[:NUM_STYLES],
-        title=f"Success of candidate {leader.number} in evaluations"
-        + (", on each seed" if len(seeds) > 1 else ""),
-        x_label="control steps",
-        y_range=(0.0, 1.0),
-    )
-    curve = training_curve(leader.first)
-    others = training_charts(read_curve(curve)) if curve is not None else []
-    view.charts.extend(chart for chart in (by_seed, *others) if chart)
-    feedback = read_feedback(leader.first)
-    view.facts.extend(_facts(feedback))
-    rows = as_dicts(feedback.get("components"))[:MAX_PARTS]
-    view.parts.extend(_part(row) for row in (*rows, as_dict(feedback.get("reward"))) if row)
+    return line_chart(lines, title="Success after each round", x_label="round", y_range=(0.0, 1.0))
+
+
+def _lineage(
+    rows: dict[int, RewardRow], leader: RewardRow | None
+) -> list[tuple[RewardRow, RewardRow, str]]:
+    """Return how the leader came about, the newest step first."""
+    line = [leader] if leader else []
+    # A parent is always older; a file that says otherwise must not lead in circles.
+    while line and (parent := line[-1].parent) is not None and parent < line[-1].number:
+        if parent not in rows:
+            break
+        line.append(rows[parent])
+    return [
+        (child, parent, difference(parent.code, child.code)) for child, parent in pairwise(line)
+    ]
+
+
+def difference(old: str, new: str) -> str:
+    """Return the lines in which two texts differ as a unified diff without its head, empty where they are the same."""
+    lines = difflib.unified_diff(old.splitlines(), new.splitlines(), n=1, lineterm="")
+    return "\n".join(list(lines)[2:])[:MAX_CODE_CHARS]
 
 
 def _facts(feedback: dict[str, Any]) -> list[str]:
     """Return the analysis of a policy's episodes in sentences; what is missing is left out."""
-    episodes, successes = number(feedback.get("num_episodes")), number(feedback.get("num_successes"))  # fmt: skip
+    known = {k: n for k, v in feedback.items() if (n := number(v)) is not None}
     facts: list[str] = []
-    if episodes and successes is not None:
+    if known.get("num_episodes") and "num_successes" in known:
+        words = f"Of {known['num_episodes']:.0f} episodes of its last policy {known['num_successes']:.0f} succeeded"
+        if "ever_success" in known:
+            words += f"; {percent(known['ever_success'])} had success at some step"
+        if "time_to_success_s" in known:
+            words += f"; it took {known['time_to_success_s']:.1f}{NO_BREAK}s (median)"
+        facts.append(f"{words}.")
+    if "reward_ranks" in known:
         facts.append(
-            f"Of {episodes:.0f} episodes of its last policy {successes:.0f} succeeded"
-            + _if(
-                feedback.get("ever_success"), lambda x: f"; {percent(x)} had success at some step"
-            )
-            + _if(
-                feedback.get("time_to_success_s"),
-                lambda x: f"; it took {x:.1f}{NO_BREAK}s (median)",
-            )
-            + _if(feedback.get("episode_s"), lambda x: f", in episodes of {x:.1f}{NO_BREAK}s")
-            + "."
+            "A successful episode earned more generated reward than a failed one with probability "
+            f"{known['reward_ranks']:.2f}; chance is 0.50."
         )
-    words = "A successful episode earned more generated reward than a failed one with probability"
-    facts.append(_if(feedback.get("reward_ranks"), lambda x: f"{words} {x:.2f}; chance is 0.50."))
     for obj in as_dicts(feedback.get("objects"))[:MAX_PARTS]:
         shares = [
-            f"{name} in {percent(known)}"
+            f"{name} in {percent(share)}"
             for name in ("reached", "touched", "grasped", "raised")
-            if (known := number(obj.get(name))) is not None
+            if (share := number(obj.get(name))) is not None
         ]
         name = str(obj.get("name"))[:MAX_NAME_CHARS].replace("_", " ")
-        moved = _if(obj.get("moved_m"), lambda x: f"; moved by {100 * x:.1f}{NO_BREAK}cm (median)")
-        facts.append(f"{name}: {', '.join(shares)} of episodes{moved}.")
-    return [fact for fact in facts if fact]
+        facts.append(f"{name}: {', '.join(shares)} of episodes.")
+    return facts
 
 
 def _part(row: dict[str, Any]) -> PartView:
-    def mean(name: str) -> float | None:
-        return number(as_dict(row.get(name)).get("mean"))
-
+    overall, successful, failed = (
+        number(as_dict(row.get(k)).get("mean")) for k in ("overall", "successful", "failed")
+    )
     return PartView(
         name=str(row.get("name") or "")[:MAX_NAME_CHARS],
         share=number(row.get("share")),
-        means=(mean("overall"), mean("successful"), mean("failed")),
+        means=(overall, successful, failed),
         correlations=(number(row.get("step_correlation")), number(row.get("episode_correlation"))),
         saturated=(number(row.get("saturated_high")), number(row.get("saturated_low"))),
         is_dead=row.get("is_dead") is True,
     )
 
 
-def _step(child: Candidate, parent: Candidate) -> StepView:
-    return StepView(
-        number=child.number,
-        parent=parent.number,
-        author=_author(child),
-        reasons=child.reasons,
-        difference=difference(parent.code.splitlines(), child.code.splitlines()),
-    )
-
-
-def difference(old: Sequence[str], new: Sequence[str]) -> str:
-    """Return the lines in which two texts differ as a unified diff without its head, empty where they are the same."""
-    lines = list(difflib.unified_diff(old, new, n=DIFF_CONTEXT, lineterm=""))[2:]
-    return "\n".join(lines)[:MAX_TEXT_CHARS]
-
-
-def _if(value: Any, words: Callable[[float], str]) -> str:
-    known = number(value)
-    return "" if known is None else words(known)
+def _own_file(folder: Path, name: str) -> Path | None:
+    """Return a file below the search's folder; None where there is none, it is large, or a link leads out."""
+    with suppress(V2PError, OSError):
+        return own_file(folder, name, MAX_BYTES)
+    return None

@@ -1,9 +1,7 @@
 """One task code becomes the best reward found.
 
-In: a `TaskBundle` and a trainer that is passed in. What a trained policy did comes back as `Trajectories`
-(`record.record_trajectories` plays them, one `.npz` each); `feedback.feedback_of` boils them down to a table;
-`reflect.reflect` reads the table and writes the next rewards as code, each with its reasons; to that end
-`reward_code.Reward` takes a reward apart, changes parts and writes it again. `prescreen.prescreen` turns away rewards that
-rank stored failures above stored successes before anything is trained with them. Out: task code that differs from its
-parent in the reward only.
+In: a `TaskBundle` and, where there is one, a model that writes. `search.search_reward` goes through rounds of rewards.
+Each reward is a stage of the pipeline (`candidate`): PPO learns with it and its policy is judged. `feedback` says per
+component what successful and failed episodes earned. From this text the model writes the next round. Out: the
+`Candidate` that did best; its code differs from the task's in the reward only.
 """

@@ -1,254 +1,197 @@
-"""One candidate reward as it lies on disk: its code, where it came from, and what its trainings came to.
+"""One reward as a stage of the pipeline: PPO learns with it from nothing up to a rung, and its policy is judged.
 
-    candidates/007/code.py, candidate.json          written once
-    candidates/007/seed-0/evaluations.json          one entry per mark (a mark is `rungs[0] * steps` control steps)
-    candidates/007/seed-0/done.json | fault.json    the mark up to which it is complete, or why it failed
-    candidates/007/seed-0/feedback.json, trajectories.npz, train/
-
-What a training wrote was written by a process that ran generated code: it is read as data.
+A rung is a stage whose input is the rung before, from whose checkpoint it goes on. The record's counts hold success,
+rank and what each component did; `train/` holds checkpoint, curve and policies. All candidates get the same worlds and
+weights: they differ by their rewards alone.
 """
 
-import math
-from dataclasses import dataclass, field
+import csv
+import functools
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from v2p_data.errors import V2PError
-from v2p_data.json_files import json_or_none
-from v2p_data.pipeline.artifact import write_json_atomically
+from policies.ppo.config import PPOConfig
+from policies.ppo.curve import CURVE_FILE
+from policies.ppo.policy import Expert
+from policies.ppo.train import LAST_FOLDER, train_expert
+from v2p_data.experts.learning import Worlds
+from v2p_data.pipeline.artifact import provenance
+from v2p_data.pipeline.runner import Runtime, Stage
+from v2p_data.play import StateActor
+from v2p_data.reward.config import RewardConfig
+from v2p_data.reward.feedback import Feedback, feedback_of
+from v2p_data.reward.trajectories import Trajectories, record_trajectories
+from v2p_data.scene.scene import SceneObject
+from v2p_data.sim.env.task_check import check_reward
+from v2p_data.sim.robot.robot import COARSE
+from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
+from v2p_data.task.sandbox.confine import Rights, confine
+from v2p_data.task.task import TaskBundle
 
-CODE_FILE = "code.py"
-CANDIDATE_FILE = "candidate.json"
-EVALUATIONS_FILE = "evaluations.json"
-DONE_FILE = "done.json"
-FAULT_FILE = "fault.json"
-FEEDBACK_FILE = "feedback.json"
-TRAJECTORIES_FILE = "trajectories.npz"
 TRAIN_FOLDER = "train"
-LAST_POLICY = "last"
-MAX_WORDS = 500
+LEAST_WAY_M = 0.01
+"""The video's displacement says nothing below this."""
 RANKING_WEIGHT = 0.1
-"""So much success is made up for by a reward that pays successes more than failures instead of less: three evaluations of
-64 episodes tell no smaller difference of success apart (1.96 standard errors of a difference, 0.10)."""
-
-Kind = Literal[
-    "crashed",
-    "hang",
-    "out_of_time",
-    "out_of_memory",
-    "not_finite",
-    "unbounded",
-    "error",
-    "prescreened",
-    "refused",
-]
-"""Why a candidate has no result. The last two never train."""
-KINDS: tuple[Kind, ...] = get_args(Kind)
+"""So much success is made up for by a reward that pays successes more than failures instead of less: 192 episodes tell no
+smaller difference of success apart (1.96 standard errors of a difference, 0.10)."""
+RIGHTS = {"memory_bytes": 4 * 2**30, "file_bytes": 2 * 2**30, "open_files": 256, "processes": 64}
+"""What a process may use that runs a generated reward; the memory is on top of what the libraries take."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fault:
-    """Why a candidate has no result."""
-
-    kind: Kind
-    reason: str
-
-    def as_dict(self) -> dict[str, str]:
-        """Return it for JSON."""
-        return {"kind": self.kind, "reason": self.reason}
-
-    @staticmethod
-    def read(path: Path) -> "Fault | None":
-        """Return what a file says, None where there is no such file."""
-        if not path.is_file():
-            return None
-        data = json_or_none(path)
-        said = data.get("kind") if isinstance(data, dict) else None
-        kind: Kind
-        for kind in KINDS:
-            if kind == said:
-                return Fault(kind=kind, reason=str(data.get("reason", ""))[:MAX_WORDS])
-        return Fault(kind="crashed", reason="its process left no readable reason")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluation:
-    """How the policy did at one mark, in worlds that no training sees; all candidates get the same ones."""
-
-    success: float
-    """Share of episodes whose success was held at their end."""
-    ever: float
-    """Share of episodes with success at any step."""
-    closeness: float
-    """How much of the video's displacement of the manipulated object happened, 0 to 1; 0 where it is not known."""
-    touched: float
-    """Share of steps at which the gripper touched that object."""
-    control_steps: int
-    """What the evaluation took, over all worlds."""
-    ranking: float | None = None
-    """Probability that a success earned more generated reward than a failure; None where there are none of either."""
-
-    @property
-    def rank(self) -> float:
-        """Success first, then whose reward tells success from failure; where nobody succeeds, who is on the way to it."""
-        on_the_way = 0.5 * self.ever + 0.4 * self.closeness + 0.1 * self.touched
-        ranking = float(self.success > 0) if self.ranking is None else self.ranking
-        return self.success + 0.1 * on_the_way + RANKING_WEIGHT * ranking
-
-    @staticmethod
-    def of(data: Any) -> "Evaluation":
-        """Read one entry.
-
-        Raises:
-            ValueError, TypeError, KeyError: it is none.
-        """
-        shares = {k: float(data[k]) for k in ("success", "ever", "closeness", "touched")}
-        if not all(math.isfinite(v) and 0 <= v <= 1 for v in shares.values()):
-            raise ValueError("a share is not between 0 and 1")
-        ranking = data.get("ranking")
-        if ranking is not None and not 0 <= float(ranking) <= 1:
-            raise ValueError("a probability is not between 0 and 1")
-        return Evaluation(
-            **shares,
-            control_steps=max(0, int(data["control_steps"])),
-            ranking=None if ranking is None else float(ranking),
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Training:
-    """One training of a candidate on one seed, as far as it came."""
-
-    folder: Path
-    evaluations: tuple[Evaluation, ...] = ()
-    done: int = 0
-    """Marks that are complete."""
-    reached: bool = False
-    """It stopped at the last of them because it succeeds often enough."""
-    seconds: float = 0.0
-    fault: Fault | None = None
-
-    def is_done(self, mark: int) -> bool:
-        """Tell whether nothing is left to do up to a mark."""
-        return self.fault is not None or self.reached or self.done >= mark
-
-    def success(self, count: int, mark: int | None = None) -> float:
-        """Return the mean success of the last `count` evaluations up to a mark, 0 without any."""
-        return _mean([e.success for e in self._last(count, mark)])
-
-    def rank(self, count: int, mark: int | None = None) -> float:
-        """Return the mean rank of the last `count` evaluations up to a mark, -1 without any."""
-        last = self._last(count, mark)
-        return _mean([e.rank for e in last]) if last else -1.0
-
-    def _last(self, count: int, mark: int | None) -> tuple[Evaluation, ...]:
-        return self.evaluations[:mark][-count:]
-
-    @staticmethod
-    def load(folder: Path) -> "Training":
-        """Read how far a training came; an empty one where there is nothing."""
-        fault = Fault.read(folder / FAULT_FILE)
-        try:
-            entries = json_or_none(folder / EVALUATIONS_FILE) or []
-            done = json_or_none(folder / DONE_FILE) or {}
-            evaluations = tuple(Evaluation.of(e) for e in entries)
-            mark, reached = int(done.get("mark", 0)), bool(done.get("reached", False))
-            seconds = float(done.get("seconds", 0.0))
-            mark = min(mark, len(evaluations))
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            return Training(
-                folder=folder,
-                fault=fault
-                or Fault(kind="crashed", reason=f"its results are unreadable: {error}"),
-            )
-        return Training(
-            folder=folder,
-            evaluations=evaluations,
-            done=mark,
-            reached=reached,
-            seconds=seconds,
-            fault=fault,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Candidate:
-    """One reward of the search."""
+    """One reward of a search, and how far it came."""
 
-    folder: Path
     number: int
     iteration: int
+    """Its round, from 0."""
     code: str = field(repr=False)
     """Whole task code."""
+    origin: str
+    """Who wrote its reward: `given` with the task, a `template` or a `model`."""
     parent: int | None = None
-    """The candidate it was written from."""
-    origin: str = "template"
-    """Who wrote its reward: `given` with the task, or else a `template`, rules of `reflection` or a `model`."""
+    """The candidate from which it was written."""
     reasons: tuple[str, ...] = ()
+    why: str = ""
+    """Why it has no further result."""
+    results: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    """The counts of its rungs' records, with the folder of each and its seconds."""
+    stage: Stage | None = None
+    """Its last rung."""
 
-    def save(self) -> None:
-        """Write code and origin."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / CODE_FILE).write_text(self.code)
-        write_json_atomically(
-            self.folder / CANDIDATE_FILE,
-            {
-                "number": self.number,
-                "iteration": self.iteration,
-                "parent": self.parent,
-                "origin": self.origin,
-                "reasons": list(self.reasons),
-            },
-        )
+    @property
+    def success(self) -> float:
+        """Share of episodes whose success was held at their end, after the last rung; 0 without any."""
+        return self.results[-1]["success"] if self.results else 0.0
 
-    @staticmethod
-    def load(folder: Path) -> "Candidate":
-        """Read what `save` wrote.
-
-        Raises:
-            V2PError: there is no candidate.
-        """
-        data = json_or_none(folder / CANDIDATE_FILE)
-        if not isinstance(data, dict):
-            raise V2PError(f"{folder} holds no candidate of a reward search")
-        return Candidate(
-            folder=folder,
-            number=data["number"],
-            iteration=data["iteration"],
-            code=(folder / CODE_FILE).read_text(),
-            parent=data["parent"],
-            origin=data["origin"],
-            reasons=tuple(data["reasons"]),
-        )
-
-    def training(self, seed: int = 0) -> Training:
-        """Return how far its training on one of its seeds came."""
-        return Training.load(self.training_folder(seed))
-
-    def training_folder(self, seed: int = 0) -> Path:
-        """Return where a training lies."""
-        return self.folder / f"seed-{seed}"
-
-    def fail(self, fault: Fault, seed: int = 0) -> None:
-        """Write down that it has no result."""
-        folder = self.training_folder(seed)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json_atomically(folder / FAULT_FILE, fault.as_dict())
-
-    def policy_folder(self, seed: int = 0) -> Path:
-        """Return the policy at the end of a training."""
-        return self.training_folder(seed) / TRAIN_FOLDER / LAST_POLICY
+    def is_finished(self, cfg: RewardConfig) -> bool:
+        """Tell whether it trained to the end, or reached the target."""
+        return len(self.results) == len(cfg.rungs) or self.success >= cfg.target_success
 
 
-def load_candidates(search: Path) -> list[Candidate]:
-    """Return all candidates of a search, in the order in which they were written."""
-    return [
-        Candidate.load(path.parent)
-        for path in sorted((search / "candidates").glob(f"*/{CANDIDATE_FILE}"))
-    ]
+def candidate_stage(
+    candidate: Candidate, bundle: TaskBundle, cfg: RewardConfig, rung: int, seed: int
+) -> Stage:
+    """Return a candidate's stage up to a rung; the rung before is its input."""
+    return Stage(
+        name="candidate",
+        item=f"{candidate.number:03d}-rung-{rung}",
+        config={"code": candidate.code, "rung": rung, "reward": cfg, "seed": seed},
+        inputs={"before": candidate.stage} if candidate.stage else {},
+        make=partial(make_candidate, bundle=bundle),
+        resumes=True,
+    )
 
 
-def _mean(values: list[float]) -> float:
-    return float(np.mean(values)) if values else 0.0
+def make_candidate(
+    cfg: dict[str, Any],
+    inputs: Mapping[str, Path],
+    out: Path,
+    runtime: Runtime,
+    *,
+    bundle: TaskBundle,
+) -> dict[str, Any]:
+    """Train from the rung before, play one episode in each of the judging worlds, return what came of it."""
+    _confine(runtime.root)
+    reward: RewardConfig = cfg["reward"]
+    # Tried by the search, which made it; a confined process can start no trial of its own.
+    bundle = replace(bundle, code=cfg["code"], folder=Path())
+    check_reward(bundle)
+    worlds = Worlds(
+        bundle=bundle,
+        seed=cfg["seed"],
+        num_threads=runtime.num_threads,
+        bonus_ratio=reward.bonus_ratio,
+    )
+    train = out / TRAIN_FOLDER
+    if "before" in inputs and not train.is_dir():
+        copied = shutil.copytree(inputs["before"] / TRAIN_FOLDER, out / "copy", dirs_exist_ok=True)
+        copied.rename(train)
+    steps = round(reward.steps * reward.rungs[cfg["rung"]])
+    train_expert(
+        TorchRLEnv(worlds.make(reward.num_envs, "worlds")),
+        ppo_config(reward.num_envs, steps, num_threads=runtime.num_threads),
+        train,
+        seed=worlds.seed_of("ppo"),
+        on_progress=lambda done, total, _: runtime.progress(done / total, "training"),
+        draws=False,
+    )
+    judge = worlds.make(reward.eval_worlds, "judging")
+    played = record_trajectories(judge, StateActor(Expert.load(train / LAST_FOLDER).act))
+    curves = component_curves(train / CURVE_FILE)
+    feedback = feedback_of(played, COARSE.control_dt_s, curves=curves)
+    return {
+        "steps": steps,
+        "success": feedback.success_rate,
+        "rank": rank_of(feedback, played, bundle.scene.manipulated),
+        "feedback": asdict(feedback),
+        "feedback_text": feedback.text(),
+    }
+
+
+def ppo_config(num_envs: int, total_steps: int, *, num_threads: int = 1) -> PPOConfig:
+    """Return the recipe of all candidates: only steps end it, never what training itself believes."""
+    return PPOConfig(
+        total_steps=total_steps,
+        max_seconds=float("inf"),
+        target_success=2.0,
+        decline=2.0,
+        plateau_steps=total_steps,
+        num_deterministic=max(1, num_envs // 8),
+        window_episodes=max(64, num_envs // 4),
+        min_window_episodes=max(1, num_envs // 8),
+        minibatch=min(1024, num_envs * 4),
+        num_threads=num_threads,
+    )
+
+
+def rank_of(feedback: Feedback, played: Trajectories, obj: SceneObject) -> float:
+    """Return what candidates are ordered by: success first, then whose reward tells success from failure.
+
+    Where nobody succeeds it is who is on the way to success: at any step, as far as in the video, or in touch.
+    """
+    moved = played.states[f"{obj.name}_pos"][-1] - played.states[f"{obj.name}_start_pos"][-1]
+    touched = float((played.states[f"{obj.name}_touched"] > 0.5).mean())
+    on_the_way = (
+        0.5 * feedback.ever_success + 0.4 * float(closeness(moved, obj).mean()) + 0.1 * touched
+    )
+    success, ranking = feedback.success_rate, feedback.reward_ranks
+    if ranking is None:  # none succeeded, or none failed
+        ranking = float(success > 0)
+    return success + 0.1 * on_the_way + RANKING_WEIGHT * ranking
+
+
+def closeness(moved_m: Float[np.ndarray, "env 3"], obj: SceneObject) -> Float[np.ndarray, "env"]:
+    """Return how much of the video's displacement happened: 0 for none, 1 for all of it."""
+    way = np.asarray(obj.first_to_last.translation_m if obj.poses_world else np.zeros(3), float)
+    length = float(np.linalg.norm(way))
+    if length < LEAST_WAY_M:
+        return np.zeros(len(moved_m))
+    return np.clip(1 - np.linalg.norm(moved_m - way, axis=1) / length, 0.0, 1.0)
+
+
+def component_curves(curve: Path) -> dict[str, Sequence[float]]:
+    """Return per component, and for `success`, its mean in the course of training."""
+    with curve.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    names = {"success_deterministic": "success"} | {
+        k: k.removeprefix("reward_") for k in rows[0] if k.startswith("reward_")
+    }
+    return {name: [float(row[k] or "nan") for row in rows] for k, name in names.items()}
+
+
+@functools.cache
+def _confine(root: Path) -> None:
+    """Give up the network, programs, memory and all folders but the search's, for the rest of this process's life."""
+    provenance()  # asks git, for the record
+    confine(
+        Rights(seconds=None, folder=root, **RIGHTS), parent_pid=os.getppid(), give_up_root=False
+    )

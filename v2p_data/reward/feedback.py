@@ -1,20 +1,18 @@
 """From trajectories to what can be said about a reward: a table per component, successes and failures apart.
 
-The numbers go to `reflect` and, as text, to a language model: the paper's figure 9 is an answer to such a text. Splitting
-them by the episode's outcome is the paper's addition to Eureka; correlation, saturation and shares are ours.
+The numbers go onto the page and, as text, to a language model: the paper's figure 9 is an answer to such a text.
+Splitting them by the episode's outcome is the paper's addition to Eureka; correlation, saturation and shares are ours.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from v2p_data.errors import V2PError
-from v2p_data.reward.trajectories import HELD_STEPS
-from v2p_data.reward.trajectories import Trajectories as Trajectories
+from v2p_data.reward.trajectories import Trajectories
+from v2p_data.sim.env.task_code import HELD_STEPS
 
 DEAD_SPREAD = 1e-6
 """A component whose values differ by less than this, or by less than this part of their size, says nothing."""
@@ -105,31 +103,6 @@ class Feedback:
     def success_rate(self) -> float:
         """Share of episodes that succeeded."""
         return self.num_successes / self.num_episodes if self.num_episodes else 0.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON; see `from_dict`."""
-        return {**asdict(self), "success_rate": self.success_rate}
-
-    @staticmethod
-    def from_dict(data: dict[str, Any]) -> "Feedback":
-        """Read what `as_dict` gave.
-
-        Raises:
-            V2PError: it is no feedback.
-        """
-        try:
-            known = {k: v for k, v in data.items() if k != "success_rate"}
-            return Feedback(
-                **{
-                    **known,
-                    "reward": _component_from(known["reward"]),
-                    "components": tuple(_component_from(c) for c in known["components"]),
-                    "success_curve": tuple(known.get("success_curve", ())),
-                    "objects": tuple(ObjectFeedback(**o) for o in known.get("objects", ())),
-                }
-            )
-        except (TypeError, KeyError, AttributeError) as error:
-            raise V2PError(f"this is no feedback on a reward ({error})") from error
 
     def text(self) -> str:
         """Return what is told to a language model."""
@@ -402,11 +375,3 @@ def _thinned(values: Sequence[float]) -> tuple[float, ...]:
         return tuple(finite)
     places = np.linspace(0, len(finite) - 1, CURVE_POINTS).round().astype(int)
     return tuple(finite[i] for i in places)
-
-
-def _component_from(data: dict[str, Any]) -> ComponentFeedback:
-    spreads = {
-        k: None if data[k] is None else Spread(**data[k])
-        for k in ("overall", "successful", "failed")
-    }
-    return ComponentFeedback(**{**data, **spreads, "curve": tuple(data.get("curve", ()))})

@@ -1,494 +1,257 @@
 """Rounds of rewards, trained against each other: the worse half stops early, the best of all rounds is never lost.
 
-Everything is a function of the files in the search's folder: what is there is not done again, what is half done
-goes on from its checkpoint. A search that is killed and started again ends with the same answer.
+The search's folder is a run folder of its own: a candidate's rung is one result in it. A search that is killed and started
+again keeps what is complete and goes on from checkpoints. Rewards are written again from the model's stored answers.
 
-    recipe.json                 what is searched; another recipe is refused
-    bundle/                     the task whose reward is searched
-    taught/                     what candidates start from, where they do not start from nothing
-    candidates/000/ ...         see `candidate`
-    rounds/0.json ...           which candidates make up a round; written once they all are
-    search.json                 the table so far, and in the end the choice
+    candidate/000-rung-0-1a2b3c4d/ ...   see `candidate`
+    search.json                          the table so far, and in the end the choice
 """
 
-import fcntl
 import logging
-import shutil
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from v2p_data.errors import V2PError
-from v2p_data.json_files import json_or_none, read_object
-from v2p_data.pipeline.artifact import write_json_atomically
-from v2p_data.pipeline.fingerprint import canonical
-from v2p_data.reward.candidate import (
-    DONE_FILE,
-    TRAIN_FOLDER,
-    TRAJECTORIES_FILE,
-    Candidate,
-    Fault,
-    Training,
-)
-from v2p_data.reward.config import Limits, RewardConfig
-from v2p_data.reward.drafts import RoundWriter
-from v2p_data.reward.jobs import Job, Jobs
-from v2p_data.reward.methods import (
-    Prepared,
-    RewardWriter,
-    prepare,
-    save_bundle,
-)
-from v2p_data.reward.screening import screened
-from v2p_data.reward.trajectories import Trajectories
-from v2p_data.seeds import rng_for, seed_for
-from v2p_data.task.sandbox.sandbox import class_name
+from v2p_data.pipeline.artifact import read_record, write_json_atomically
+from v2p_data.pipeline.runner import Runtime
+from v2p_data.pipeline.workers import Pool, only_run_in, run_stages
+from v2p_data.reward.candidate import Candidate, candidate_stage
+from v2p_data.reward.config import RewardConfig
+from v2p_data.seeds import seed_for
+from v2p_data.task.llm.client import UnusableAnswersError
+from v2p_data.task.llm.writer import ModelWriter
+from v2p_data.task.sandbox.splice import SpliceError, reward_part, with_reward
+from v2p_data.task.sandbox.trial import demand_trial
 from v2p_data.task.task import TaskBundle
+from v2p_data.task.templates.variants import VARIANTS
+from v2p_data.task.templates.write import write_task
 
 logger = logging.getLogger(__name__)
 
 SEARCH_FILE = "search.json"
-RECIPE_FILE = "recipe.json"
-BUNDLE_FOLDER = "bundle"
-TAUGHT_FOLDER = "taught"
-
-Progress = Callable[[float, str], None]
+CANDIDATE_LIMIT_S = 3600.0
+"""A candidate that takes longer from one rung to the next has failed, and the search goes on."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class How:
-    """How a search is run; never part of what it finds."""
-
-    workers: int = 1
-    """Candidates that train at the same time."""
-    num_threads: int = 1
-    """For the physics and torch of one candidate."""
-    limits: Limits = field(default_factory=Limits)
-    jobs: Jobs | None = None
-    """Processes to use, instead of new ones."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Found:
-    """What a search came to."""
-
-    chosen: int
-    """Number of the candidate."""
-    code: str = field(repr=False)
-    """Its task code."""
-    class_name: str
-    origin: str
-    """Who wrote its reward, see `Candidate.origin`."""
-    success: float
-    """Mean over the confirmed seeds of the mean over the last evaluations."""
-    per_seed: tuple[float, ...]
-    policy: Path
-    """The chosen candidate's policy at the end of its first training."""
-    stopped_by: str
-    """`target` or `rounds`."""
-    trained_steps: int
-    evaluated_steps: int
-    taught_steps: int
-    full_steps: int
-    """What training every candidate to the end, with all its evaluations, would have taken."""
-    faults: dict[str, int]
-    """Candidates without a result, by kind."""
-
-    @property
-    def cost_share(self) -> float:
-        """Steps of the search over those of training every candidate of the rounds that took place to the end."""
-        return (self.trained_steps + self.evaluated_steps) / max(self.full_steps, 1)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
-        known = asdict(self)
-        return {k: v for k, v in known.items() if k not in {"code", "class_name", "policy"}} | {
-            "cost_share": self.cost_share
-        }
-
-
-def search_reward(
-    bundle: TaskBundle,
-    cfg: RewardConfig,
-    out: Path,
-    *,
-    seed: int,
-    how: How | None = None,
-    writer: RewardWriter | None = None,
-    on_progress: Progress = lambda share, words: None,
-) -> Found:
-    """Return the best reward that the budget finds; go on with a search that was stopped.
+class RewardSearch:
+    """Searches the reward of one task.
 
     Args:
         bundle: the task, audited.
         cfg: what is searched.
         out: folder of the search.
         seed: of everything that is drawn.
-        how: processes, threads and limits.
-        writer: a model, which writes all rewards; without it templates write the first ones and rules the later ones,
-            as they do where it gives too few that can be used.
-        on_progress: told the share that is done and a few words.
-
-    Raises:
-        V2PError: the folder holds another search or is being searched, or no candidate can be trained at all.
+        runtime: as many candidates train at the same time as it has threads.
+        writer: a model; it writes the first rewards beside the task's own, and all later ones. Without it, and where it
+            gives too few at first, templates write, and there is one round.
     """
-    if cfg.method == "code_as_policy":
-        raise V2PError(
-            "code_as_policy searches no reward, it plays programs: see scripts/compare_reward_methods.py"
-        )
-    if cfg.iterations < 1:
-        raise V2PError("a reward search needs at least one round: --reward.iterations 5")
-    how = how or How()
-    out.mkdir(parents=True, exist_ok=True)
-    with _alone_in(out):
-        _check_recipe(bundle, cfg, seed, out)
-        search = _Search(bundle, cfg, out, seed, how, writer, on_progress)
-        try:
-            return search.run()
-        finally:
-            if how.jobs is None:
-                search.jobs.close()
 
-
-class _Search:
     def __init__(
         self,
         bundle: TaskBundle,
         cfg: RewardConfig,
         out: Path,
+        *,
         seed: int,
-        how: How,
-        writer: RewardWriter | None,
-        on_progress: Progress,
+        runtime: Runtime,
+        writer: ModelWriter | None = None,
     ) -> None:
-        self.cfg, self.out, self.seed, self.how = cfg, out, seed, how
-        self.writer, self.on_progress = writer, on_progress
-        self.jobs = how.jobs or Jobs(workers=how.workers, limits=how.limits)
-        made = TaskBundle.load(out / BUNDLE_FOLDER) if (out / BUNDLE_FOLDER).is_dir() else None
-        self.prepared: Prepared = prepare(
-            bundle, cfg, rng_for(seed, "first rewards"), writer, made
+        self.bundle, self.cfg, self.out, self.seed = bundle, cfg, out, seed
+        self.on_progress, self.writer = runtime.progress, writer
+        self.runtime = replace(
+            runtime, root=out, workers=runtime.num_threads, num_threads=1,
+            engine="local", store="", limit_s=CANDIDATE_LIMIT_S,
+        )  # fmt: skip
+        self.num_rounds = max(1, cfg.iterations) if writer else 1
+        self.candidates: list[Candidate] = []
+        self.stopped_by = ""
+        """`target` or `rounds`; empty while it goes on."""
+
+    def run(self) -> Candidate:
+        """Return the best reward that the budget finds; go on with a search that was stopped.
+
+        Raises:
+            V2PError: the folder is being searched, or no candidate can be trained at all.
+        """
+        demand_trial(self.bundle)
+        pool = Pool(self.runtime, size=min(self.runtime.workers, self.cfg.candidates))
+        with only_run_in(self.out), closing(pool):
+            for iteration in range(self.num_rounds):
+                made = self._first() if iteration == 0 else self._children(iteration)
+                self.candidates += made
+                self._halve(iteration, made, pool)
+                if self.best().success >= self.cfg.target_success:
+                    self.stopped_by = "target"
+                    break
+            self.stopped_by = self.stopped_by or "rounds"
+            self._write_table()
+        return self.best()
+
+    def best(self) -> Candidate:
+        """Return the best candidate of all rounds: one that trained to the end before one that was stopped."""
+        trained = [c for c in self.candidates if c.results]
+        if not trained:
+            reasons = "; ".join(f"{c.number}: {c.why}" for c in self.candidates[:3])
+            raise V2PError(f"no candidate in {self.out} could be trained; {reasons}")
+        return min(
+            trained, key=lambda c: (not c.is_finished(self.cfg), -c.results[-1]["rank"], c.number)
         )
-        self.base = self.prepared.bundle
-        self.rounds: list[list[Candidate]] = []
-        self.warm_start: Path | None = None
-        if made is None:
-            save_bundle(self.base, out / BUNDLE_FOLDER)
 
-    def run(self) -> Found:
-        self._teach()
-        stopped_by = "rounds"
-        for iteration in range(self.cfg.num_iterations):
-            self.rounds.append(self._round(iteration))
-            self._halve(iteration)
-            self._write_table(None)
-            if self._best().success >= self.cfg.target_success:
-                stopped_by = "target"
-                break
-        best = self._best().candidate
-        marks = self.cfg.marks[-1]
-        confirmations = [self._job(best, k, marks) for k in range(1, self.cfg.confirm_seeds)]
-        self.jobs.run(confirmations, on_wait=lambda _: self._tell("confirming the choice"))
-        trainings = [best.training(k) for k in range(self.cfg.confirm_seeds)]
-        # A seed on which the choice fails counts as what it is: no success.
-        per_seed = tuple(0.0 if t.fault else t.success(self.cfg.evaluations) for t in trainings)
-        found = self._found(best, per_seed, stopped_by)
-        self._write_table(found)
-        self.on_progress(1.0, f"success {found.success:.0%}")
-        return found
+    def summary(self) -> dict[str, Any]:
+        """Return what a finished search came to, for the record."""
+        best = self.best()
+        return {
+            "chosen": best.number,
+            "origin": best.origin,
+            "success": best.success,
+            "stopped_by": self.stopped_by,
+            "rewards": len(self.candidates),
+            "rounds": 1 + max(c.iteration for c in self.candidates),
+            "failed": sum(not c.results for c in self.candidates),
+            "steps": sum(c.results[-1]["steps"] for c in self.candidates if c.results),
+        }
 
-    # -- rounds
+    # -- writing
 
-    def _round(self, iteration: int) -> list[Candidate]:
-        """Return a round's candidates: those that were written before, or new ones."""
-        path = self.out / "rounds" / f"{iteration}.json"
-        folder = self.out / "candidates"
-        numbers = json_or_none(path)
-        if isinstance(numbers, list):
-            return [Candidate.load(folder / f"{n:03d}") for n in numbers]
-        self._tell(f"round {iteration + 1}: writing rewards")
-        writing = RoundWriter(
-            prepared=self.prepared,
-            cfg=self.cfg,
-            seed=self.seed,
-            writer=self.writer,
-            tried=tuple(c.code for r in self.rounds for c in r),
-        )
-        elites = [standing.candidate for standing in self._elites()]
-        drafts = writing.first() if iteration == 0 else writing.children(iteration, elites)
-        start = sum(len(r) for r in self.rounds)
-        made: list[Candidate] = []
-        faults = screened(drafts, self.base.scene, self._stored_trajectories(), self.seed)
-        for k, (draft, fault) in enumerate(zip(drafts, faults, strict=True)):
-            place = folder / f"{start + k:03d}"
-            shutil.rmtree(place, ignore_errors=True)  # of a round that a kill cut short
-            candidate = Candidate(
-                folder=place,
-                number=start + k,
-                iteration=iteration,
-                code=draft.code,
-                parent=draft.parent,
-                origin=draft.origin,
-                reasons=draft.reasons,
-            )
-            candidate.save()
-            if fault is not None:
-                candidate.fail(fault)
-            made.append(candidate)
-        path.parent.mkdir(exist_ok=True)
-        write_json_atomically(path, [c.number for c in made])
+    def _first(self) -> list[Candidate]:
+        """Return the task's own reward, the model's, and templates over the same success in place of missing ones."""
+        given = Candidate(number=0, iteration=0, code=self.bundle.code, origin="given")
+        made = [given]
+        said = self._ask(made, 0, lambda w, n: w.first_rewards(self.bundle, n))
+        for variant in VARIANTS:
+            code = write_task(self.bundle.scene, variant)
+            self._add(made, 0, code, "template", reasons=(*said, variant.idea))
         return made
 
-    def _stored_trajectories(self) -> list[Trajectories]:
-        """Return what the elites' policies did, successes and failures."""
-        stored: list[Trajectories] = []
-        for standing in self._elites():
-            path = standing.training.folder / TRAJECTORIES_FILE
-            with suppress(V2PError):
-                stored.append(Trajectories.load(path))
-        return stored
+    def _children(self, iteration: int) -> list[Candidate]:
+        """Return what the model makes of the best reward so far, from what training showed."""
+        best, made = self.best(), list[Candidate]()
+        words = best.results[-1]["feedback_text"]
+        self._ask(
+            made,
+            iteration,
+            lambda w, n: w.better_rewards(self.bundle, best.code, words, n, iteration),
+            parent=best.number,
+        )
+        return made
+
+    def _ask(
+        self,
+        made: list[Candidate],
+        iteration: int,
+        ask: Callable[[ModelWriter, int], list[str]],
+        parent: int | None = None,
+    ) -> tuple[str, ...]:
+        """Add what the model writes, if there is one; return in words how much of it is missing."""
+        count = self.cfg.candidates - len(made)
+        if self.writer is None or not count:
+            return ()
+        before, fault = len(made), "the others do not run, or were tried before"
+        try:
+            codes = ask(self.writer, count)
+        except UnusableAnswersError as error:
+            codes, fault = [], str(error)
+        for code in codes:
+            self._add(made, iteration, code, "model", parent)
+        if len(made) == before + count:
+            return ()
+        words = (
+            f"the model gave {len(made) - before} of {count} rewards that could be used ({fault})"
+        )
+        logger.warning("%s: %s", self.bundle.title, words)
+        return (f"not by the model: {words}",)
+
+    def _add(
+        self,
+        made: list[Candidate],
+        iteration: int,
+        code: str,
+        origin: str,
+        parent: int | None = None,
+        reasons: tuple[str, ...] = (),
+    ) -> None:
+        """Add a candidate with a code's reward, unless the round is full or that reward is known."""
+        known = {reward_part(c.code) for c in (*self.candidates, *made)}
+        if len(made) == self.cfg.candidates or reward_part(code) in known:
+            return
+        try:
+            code = with_reward(self.bundle.code, code)
+        except SpliceError:
+            logger.info("a reward by a %s cannot be put into the task", origin)
+            return
+        number = len(self.candidates) + len(made)
+        made.append(
+            Candidate(
+                number=number, iteration=iteration, code=code,
+                origin=origin, parent=parent, reasons=reasons,
+            )
+        )  # fmt: skip
 
     # -- halving
 
-    def _halve(self, iteration: int) -> None:
+    def _halve(self, iteration: int, alive: list[Candidate], pool: Pool) -> None:
         """Train a round's candidates; after each rung the better part of them goes on."""
-        marks = self.cfg.marks
-        alive = [c for c in self.rounds[-1] if c.training().fault is None]
-        rivals = self._standings(self.rounds[:-1])
-        for k, mark in enumerate(marks):
-            words = f"round {iteration + 1}: {len(alive)} candidates to {mark}/{marks[-1]}"
-            share = (iteration + k / len(marks)) / self.cfg.num_iterations
-            self.jobs.run(
-                [self._job(c, 0, mark) for c in alive],
-                on_wait=lambda _, s=share, w=words: self._tell(w, s),
-            )
-            standing = {c.number: c.training() for c in alive}
-            alive = [c for c in alive if standing[c.number].fault is None]
-            if mark == marks[-1]:
-                return
-            count = self.cfg.evaluations
-            alive.sort(key=lambda c: (-standing[c.number].rank(count, mark), c.number))
-            enough = [c for c in alive if standing[c.number].reached]
+        rivals = [c for c in self.candidates if c.iteration < iteration]
+        for rung in range(len(self.cfg.rungs)):
+            self._train(alive, iteration, rung, pool)
+            alive = [c for c in alive if len(c.results) > rung]
+            if any(c.success >= self.cfg.target_success for c in alive):
+                return  # nothing is left to be found: the others need not go on
+            alive.sort(key=lambda c: (-c.results[rung]["rank"], c.number))
             alive = alive[: max(1, int(len(alive) * self.cfg.keep))]
-            if marks[k + 1] == marks[-1] and rivals and not enough:
-                line = max(r.training.rank(count, mark) for r in rivals) - self.cfg.gate
-                alive = [c for c in alive if standing[c.number].rank(count, mark) >= line]
-            if enough:  # nothing is left to be found: the others need not go on
-                return
+            at_rung = [c.results[rung]["rank"] for c in rivals if len(c.results) > rung]
+            if rung == len(self.cfg.rungs) - 2 and at_rung:
+                line = max(at_rung) - self.cfg.gate
+                alive = [c for c in alive if c.results[rung]["rank"] >= line]
 
-    def _job(self, candidate: Candidate, seed: int, mark: int) -> Job:
-        cfg = self.cfg
-        return Job(
-            folder=candidate.training_folder(seed),
-            mark=mark,
-            request={
-                "job": "train",
-                "bundle": str((self.out / BUNDLE_FOLDER).resolve()),
-                "code": str((candidate.folder / "code.py").resolve()),
-                # The same worlds and weights for all candidates: their difference is the reward's.
-                "seed": seed_for(self.seed, "training", seed),
-                "eval_seed": seed_for(self.seed, "evaluation", seed),
-                "steps_per_mark": self._steps_per_mark,
-                "bonus_ratio": cfg.paid_bonus_ratio,
-                "num_envs": cfg.num_envs,
-                "num_threads": self.how.num_threads,
-                "eval_worlds": cfg.eval_worlds,
-                "evaluations": cfg.evaluations,
-                "target_success": cfg.target_success,
-                "sees_video": self.prepared.seen is self.base.scene,
-                "warm_start": str(self.warm_start.resolve()) if self.warm_start else None,
+    def _train(self, alive: list[Candidate], iteration: int, rung: int, pool: Pool) -> None:
+        """Bring candidates up to a rung, each in a process of its own."""
+        self._write_table()
+        seed = seed_for(self.seed, "training")
+        for each in alive:
+            each.stage = candidate_stage(each, self.bundle, self.cfg, rung, seed)
+        share = (iteration + rung / len(self.cfg.rungs)) / self.num_rounds
+        words = f"round {iteration + 1}: {len(alive)} rewards to {self.cfg.rungs[rung]:.0%} of their steps"
+        outcomes = run_stages(
+            [c.stage for c in alive if c.stage],
+            self.runtime,
+            lambda event: self.on_progress(share, words),
+            pool,
+        )
+        for each in alive:
+            assert each.stage is not None
+            outcome = outcomes[(each.stage.name, each.stage.folder_name)]
+            record = read_record(outcome.folder) if outcome.is_usable else None
+            if record is None:
+                each.why = f"{outcome.reason}: {outcome.detail}"
+            else:
+                place = {"folder": outcome.folder.name, "seconds": outcome.seconds}
+                each.results.append(record.counts | place)
+        self._write_table()
+
+    def _write_table(self) -> None:
+        """Write what is known for a reader: every candidate with its code, and the choice once there is one."""
+        rows = [
+            {
+                **{k: v for k, v in vars(c).items() if k not in {"results", "stage"}},
+                "results": [
+                    {k: r[k] for k in ("steps", "success", "rank", "seconds", "folder")}
+                    for r in c.results
+                ],
+                "is_finished": c.is_finished(self.cfg),
+            }
+            for c in self.candidates
+        ]
+        found = self.summary() if self.stopped_by else None
+        write_json_atomically(
+            self.out / SEARCH_FILE,
+            {
+                "title": self.bundle.title,
+                "rungs": self.cfg.rungs,
+                "candidates": rows,
+                "found": found,
             },
         )
-
-    @property
-    def _steps_per_mark(self) -> int:
-        return max(1, round(self.cfg.steps * self.cfg.rungs[0]))
-
-    def _teach(self) -> None:
-        """Have the policy made that candidates start from."""
-        if self.cfg.start == "nothing":
-            return
-        folder = self.out / TAUGHT_FOLDER
-        self._tell("imitating a program")
-        code = self.out / BUNDLE_FOLDER / "task.py"
-        request = {
-            "job": "teach",
-            "bundle": str((self.out / BUNDLE_FOLDER).resolve()),
-            "code": str(code.resolve()),
-            "seed": seed_for(self.seed, "teach"),
-            "rounds": self.cfg.taught_rounds,
-            "num_envs": self.cfg.num_envs,
-            "num_threads": self.how.num_threads,
-            "eval_worlds": self.cfg.eval_worlds,
-        }
-        self.jobs.run([Job(folder=folder, request=request)])
-        fault = Fault.read(folder / "fault.json")
-        if fault is not None:
-            raise V2PError(f"no policy to start from could be taught: {fault.reason}")
-        done = json_or_none(folder / DONE_FILE) or {}
-        if done.get("teacher"):
-            self.warm_start = folder / TRAIN_FOLDER
-
-    # -- who is where
-
-    def _standings(self, rounds: Sequence[Sequence[Candidate]]) -> list["Standing"]:
-        return standings([c for r in rounds for c in r], self.cfg)
-
-    def _elites(self) -> list["Standing"]:
-        return self._standings(self.rounds)[: self.cfg.elites]
-
-    def _best(self) -> "Standing":
-        ordered = self._standings(self.rounds)
-        if not ordered:
-            reasons = [
-                f"{c.number}: {t.fault.kind}, {t.fault.reason}"
-                for c in self.rounds[-1]
-                if (t := c.training()).fault is not None
-            ]
-            raise V2PError(
-                f"none of {len(self.rounds[-1])} candidates in {self.out} could be trained; "
-                + "; ".join(reasons[:3])
-            )
-        return ordered[0]
-
-    def _found(self, best: Candidate, per_seed: tuple[float, ...], stopped_by: str) -> Found:
-        trained = evaluated = 0
-        faults: dict[str, int] = {}
-        candidates = [c for r in self.rounds for c in r]
-        per_evaluation = self.cfg.eval_worlds * self.base.horizon_steps
-        for candidate in candidates:
-            for k in range(self.cfg.confirm_seeds):
-                training = candidate.training(k)
-                trained += len(training.evaluations) * self._steps_per_mark
-                evaluated += sum(e.control_steps for e in training.evaluations)
-            fault = candidate.training().fault
-            if fault is not None:
-                faults[fault.kind] = faults.get(fault.kind, 0) + 1
-        marks = self.cfg.marks[-1]
-        worth = [c for c in candidates if not _is_screened(c.training())]
-        taught = json_or_none(self.out / TAUGHT_FOLDER / DONE_FILE) or {}
-        return Found(
-            chosen=best.number,
-            code=best.code,
-            class_name=class_name(best.code),
-            origin=best.origin,
-            success=float(np.mean(per_seed)),
-            per_seed=per_seed,
-            policy=best.policy_folder(),
-            stopped_by=stopped_by,
-            trained_steps=trained,
-            evaluated_steps=evaluated,
-            taught_steps=int(taught.get("control_steps", 0)),
-            full_steps=len(worth) * marks * (self._steps_per_mark + per_evaluation),
-            faults=faults,
-        )
-
-    def _write_table(self, found: Found | None) -> None:
-        rows = [candidate_row(c, self.cfg) for r in self.rounds for c in r]
-        table = {
-            "method": self.cfg.method,
-            "without": list(self.cfg.without),
-            "title": self.base.title,
-            "marks": list(self.cfg.marks),
-            "steps_per_mark": self._steps_per_mark,
-            "candidates": rows,
-            "found": None if found is None else found.as_dict(),
-        }
-        write_json_atomically(self.out / SEARCH_FILE, table)
-
-    def _tell(self, words: str, share: float | None = None) -> None:
-        self._share = max(share or 0.0, getattr(self, "_share", 0.0))
-        self.on_progress(self._share, words)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Standing:
-    """A candidate and how far its first training came."""
-
-    candidate: Candidate
-    training: Training
-    cfg: RewardConfig
-
-    @property
-    def is_finished(self) -> bool:
-        return self.training.reached or self.training.done >= self.cfg.marks[-1]
-
-    @property
-    def rank(self) -> float:
-        return self.training.rank(self.cfg.evaluations)
-
-    @property
-    def success(self) -> float:
-        return self.training.success(self.cfg.evaluations)
-
-
-def standings(candidates: Sequence[Candidate], cfg: RewardConfig) -> list[Standing]:
-    """Return the candidates that trained, the best one first: those trained to the end before those that were stopped."""
-    found = [Standing(candidate=c, training=c.training(), cfg=cfg) for c in candidates]
-    trained = [s for s in found if s.training.fault is None and s.training.evaluations]
-    return sorted(trained, key=lambda s: (not s.is_finished, -s.rank, s.candidate.number))
-
-
-def candidate_row(candidate: Candidate, cfg: RewardConfig) -> dict[str, Any]:
-    """Return a candidate's line of `search.json`."""
-    training = candidate.training()
-    standing = Standing(candidate=candidate, training=training, cfg=cfg)
-    if training.fault is not None:
-        state = training.fault.kind
-    elif standing.is_finished:
-        state = "reached" if training.reached else "finished"
-    else:
-        state = "stopped"
-    return {
-        "number": candidate.number,
-        "round": candidate.iteration,
-        "parent": candidate.parent,
-        "origin": candidate.origin,
-        "reasons": list(candidate.reasons),
-        "state": state,
-        "why": "" if training.fault is None else training.fault.reason,
-        "marks": len(training.evaluations),
-        "success": standing.success,
-        "rank": standing.rank,
-        "successes": [e.success for e in training.evaluations],
-        "seconds": round(training.seconds, 1),
-    }
-
-
-def _is_screened(training: Training) -> bool:
-    return training.fault is not None and training.fault.kind in ("refused", "prescreened")
-
-
-@contextmanager
-def _alone_in(out: Path) -> Generator[None]:
-    with (out / ".lock").open("a") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise V2PError(f"another search is at work in {out}; wait for it") from error
-        yield
-
-
-def _check_recipe(bundle: TaskBundle, cfg: RewardConfig, seed: int, out: Path) -> None:
-    recipe = {
-        "config": canonical(cfg),
-        "seed": seed,
-        "title": bundle.title,
-        "code": bundle.code,
-        "horizon_steps": bundle.horizon_steps,
-    }
-    path = out / RECIPE_FILE
-    if not path.is_file():
-        write_json_atomically(path, recipe)
-        return
-    saved = read_object(path, f"clear {out} away, or choose another folder")
-    if saved == recipe:
-        return
-    changed = [k for k in recipe if saved.get(k) != recipe[k]]
-    if changed == ["config"]:
-        was, now = saved["config"], recipe["config"]
-        changed = [f"{k} was {was.get(k)}, is {now[k]}" for k in now if was.get(k) != now[k]]
-    raise V2PError(f"{out} holds another search ({', '.join(changed)}); choose another folder")

@@ -1,25 +1,21 @@
-"""What a policy did in a batch of episodes, and how it lies on disk: one `.npz` without pickles.
+"""What a policy did in a batch of episodes, one per world: played and written down in memory.
 
 The first axis is the control step, the second the world; what comes after an episode's end is NaN. States are
-kept for a few moments only, enough to ask another reward what it would have paid.
+kept for a few moments only.
 """
 
-import json
-import zipfile
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from v2p_data.errors import V2PError
+from v2p_data.play import Actor, View, play
+from v2p_data.sim.env.batch_env import BatchEnv
+from v2p_data.sim.env.task_code import HELD_STEPS
+from v2p_data.task.task import OBJECT_STATES
 
-HELD_STEPS = 5
-"""An episode succeeded if success is true for its last so many steps, as in `sim.batch_env`."""
-MAX_BYTES = 2_000_000_000
-"""Largest file, unpacked. It may come from a process that ran strange code."""
-MAX_NAMES = 4_000
-_TABLE = "table"
+NUM_MOMENTS = 25
+"""Moments of each episode whose states are kept, evenly spread over the horizon."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,29 +31,9 @@ class Trajectories:
     length: Int[np.ndarray, "env"]
     """Steps that each episode took."""
     moments: Int[np.ndarray, "moment"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Steps, ascending, for which `states` and `actions` are kept: those that `reward[moments]` was paid for."""
+    """Steps, ascending, for which `states` are kept: those that `reward[moments]` was paid for."""
     states: dict[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
-    """`task.task.ROBOT_STATES` and `OBJECT_STATES`, each `(moment, env, ...)` float32."""
-    actions: Float32[np.ndarray, "kept num act"] = field(
-        default_factory=lambda: np.zeros((0, 0, 7), np.float32)
-    )
-    """`(moment, env, 7)`; of no length where nothing is kept."""
-
-    def __post_init__(self) -> None:
-        steps, envs = self.success.shape
-        for name, part in {**self.components, "the reward": self.reward}.items():
-            if part.shape != (steps, envs):
-                raise V2PError(f"'{name}' has shape {part.shape}, but success has {(steps, envs)}")
-        if self.length.shape != (envs,) or ((self.length < 0) | (self.length > steps)).any():
-            raise V2PError(f"need one length of 0 to {steps} steps for each of {envs} episodes")
-        if ((self.moments < 0) | (self.moments >= steps)).any():
-            raise V2PError(f"moments must be steps from 0 to {steps - 1}")
-        if len(self.moments):
-            for name, state in {**self.states, "actions": self.actions}.items():
-                if state.shape[:2] != (len(self.moments), envs):
-                    raise V2PError(
-                        f"'{name}' has shape {state.shape}; it must begin with {(len(self.moments), envs)}"
-                    )
+    """`eef_pos` and each object's `task.task.OBJECT_STATES`, each `(moment, env, ...)` float32."""
 
     @property
     def num_episodes(self) -> int:
@@ -76,63 +52,51 @@ class Trajectories:
         is_last = (steps >= self.length - HELD_STEPS) & self.played
         return (self.success | ~is_last).all(0) & (self.length >= HELD_STEPS)
 
-    def save(self, path: Path) -> None:
-        """Write it as `.npz`."""
-        named = {f"component {k}": v for k, v in self.components.items()}
-        named |= {f"state {k}": v for k, v in self.states.items()}
-        named |= {
-            "reward": self.reward,
-            "success": self.success,
-            "length": self.length,
-            "moments": self.moments,
-            "actions": self.actions,
-        }
-        # Names come from task code: they go into a table, not into the archive's own directory.
-        table = {f"array_{i}": name for i, name in enumerate(named)}
-        arrays = {f"array_{i}": array for i, array in enumerate(named.values())}
-        arrays[_TABLE] = np.array(json.dumps(table))
-        with path.open("wb") as file:
-            np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
 
-    @staticmethod
-    def load(path: Path) -> "Trajectories":
-        """Read what `save` wrote, as data from a stranger.
+def record_trajectories(
+    env: BatchEnv, actor: Actor, *, num_moments: int = NUM_MOMENTS
+) -> Trajectories:
+    """Play one episode in every world and return what was paid, and the states of some moments.
 
-        Raises:
-            V2PError: it holds no trajectories.
-        """
-        try:
-            named = _named_arrays(path)
-            groups = {
-                group: {
-                    k.removeprefix(group): v.astype(np.float32, copy=False)
-                    for k, v in named.items()
-                    if k.startswith(group)
-                }
-                for group in ("component ", "state ")
-            }
-            return Trajectories(
-                components=groups["component "],
-                states=groups["state "],
-                reward=named["reward"].astype(np.float32, copy=False),
-                success=named["success"].astype(bool, copy=False),
-                length=named["length"].astype(np.int64, copy=False),
-                moments=named["moments"].astype(np.int64, copy=False),
-                actions=named["actions"].astype(np.float32, copy=False),
-            )
-        except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise V2PError(
-                f"{path} holds no trajectories ({type(error).__name__}: {error})"
-            ) from error
+    A world whose simulation breaks down ends its episode at the step before.
 
+    Args:
+        env: the worlds; they are reset first and left as they are at the end.
+        actor: who acts.
+        num_moments: how many moments' states are kept; all if the horizon is shorter.
+    """
+    n, horizon = env.num_envs, env.horizon
+    moments = np.unique(np.linspace(0, horizon - 1, min(num_moments, horizon)).round().astype(int))
+    keys = ["eef_pos", *(f"{o}_{k}" for o in env.object_names for k in OBJECT_STATES)]
+    components = {
+        k: np.full((horizon, n), np.nan, np.float32) for k in dict.fromkeys(env.component_names)
+    }
+    reward = np.full((horizon, n), np.nan, np.float32)
+    success = np.zeros((horizon, n), bool)
+    length = np.full(n, horizon)
+    states: dict[str, list[np.ndarray]] = {key: [] for key in keys}
+    env.reset(np.arange(n))
 
-def _named_arrays(path: Path) -> dict[str, np.ndarray]:
-    with zipfile.ZipFile(path) as archive:
-        size = sum(info.file_size for info in archive.infolist())
-    if size > MAX_BYTES:
-        raise ValueError(f"it would unpack to {size / 1e9:.1f} GB")
-    with np.load(path, allow_pickle=False) as file:
-        table = json.loads(str(file[_TABLE]))
-        if not isinstance(table, dict) or len(table) > MAX_NAMES:
-            raise TypeError("its table of names is broken")
-        return {str(name): np.asarray(file[key]) for key, name in table.items()}
+    def note(view: View) -> None:
+        step, result = view.t - 1, view.result
+        np.minimum(length, step, out=length, where=result.terminated)
+        goes_on = length > step
+        for name, row in components.items():
+            row[step] = np.where(goes_on, result.components[name], np.nan)
+        reward[step] = np.where(goes_on, result.task_reward, np.nan)
+        success[step] = result.success & goes_on
+        if step in moments:
+            now = env.states()
+            for key in keys:
+                # A copy, finite also where a world broke down: those rows are beyond the episode's end.
+                states[key].append(np.nan_to_num(now[key].numpy().astype(np.float32)))
+
+    play(View(env), actor, [note])
+    return Trajectories(
+        components=components,
+        reward=reward,
+        success=success,
+        length=length,
+        moments=moments,
+        states={k: np.stack(v) for k, v in states.items()},
+    )

@@ -261,30 +261,6 @@ class ModelWriter:
     pools: tuple[Path, ...] = ()
     """Of solved tasks, whose rewards are shown as good ones."""
 
-    def task_code(self, bundle: TaskBundle) -> str:
-        """Return one code for a task, its first thought: neither picked nor audited.
-
-        Raises:
-            BudgetError: the budget is used up.
-            UnusableAnswersError: no answer runs.
-            V2PError: the server cannot be asked.
-        """
-        scene = bundle.scene
-        made = write_samples(
-            self.client,
-            scene,
-            1,
-            self._examples(bundle),
-            lambda codes: smoke_run_all(codes, scene),
-            lambda written: [""] * len(written),
-        )
-        ((code, result),) = made.final
-        if not result.runnable:
-            raise UnusableAnswersError(
-                f"no code for '{bundle.title}' could be used; the last one's fault: {result.error}. {STRONGER}"
-            )
-        return code
-
     def first_rewards(self, bundle: TaskBundle, count: int) -> list[str]:
         """Return the task's code with up to `count` other rewards, before anything was trained.
 
@@ -298,7 +274,7 @@ class ModelWriter:
         )
 
     def better_rewards(
-        self, bundle: TaskBundle, code: str, feedback_text: str, count: int
+        self, bundle: TaskBundle, code: str, feedback_text: str, count: int, iteration: int
     ) -> list[str]:
         """Return `code` with up to `count` better rewards; everything else is the same, so success cannot move.
 
@@ -309,6 +285,7 @@ class ModelWriter:
             code: the task code that was trained with.
             feedback_text: what the training showed, component by component.
             count: how many.
+            iteration: the round, from 0; a later one asks anew where the best reward is still the same.
 
         Raises:
             BudgetError: the budget is used up.
@@ -316,7 +293,9 @@ class ModelWriter:
             V2PError: the code's success depends on its reward, or the server cannot be asked.
         """
         question = better_reward_question(code, feedback_text)
-        return self._rewards(bundle, code, question, count, "better reward")
+        return self._rewards(
+            bundle, code, question, count, f"better reward of round {iteration + 1}"
+        )
 
     def _examples(self, bundle: TaskBundle) -> list[Example]:
         cfg = self.client.cfg

@@ -1,1 +1,0 @@
-"""Reward code is read and rewritten: its components, terms, slopes and conditions."""
