@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_parts import RED, W, large, square
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.classes import MOVED
@@ -12,15 +13,8 @@ from v2p_data.scene.grounding.ground_objects import check_hand
 from v2p_data.scene.grounding.handled import handling_in
 from v2p_data.scene.grounding.moved_by_network import Given, find_moved_by_network
 
-H, W, FRAMES = 90, 120, 12
-RED, SIZE = (190, 40, 40), 14
+FRAMES, SIZE = 12, 14
 UPPER_Y, LOWER_Y = 20, 60
-
-
-def square(x: int, y: int) -> np.ndarray:
-    mask = np.zeros((H, W), bool)
-    mask[y : y + SIZE, x : x + SIZE] = True
-    return mask
 
 
 def two_alike():
@@ -44,11 +38,6 @@ def hand_along(working, y: int, num_sampled: int = FRAMES) -> HandTrack:
     )
 
 
-def large(mask: np.ndarray, working) -> np.ndarray:
-    h, w = working.shape
-    return mask[(np.arange(h) * H) // h][:, (np.arange(w) * W) // w]
-
-
 @pytest.mark.parametrize("y", [UPPER_Y, LOWER_Y])
 def test_of_two_alike_the_one_that_a_hand_takes_and_puts_down_is_moved(segmentation_of, y: int):
     working, seen = segmentation_of(two_alike())
@@ -56,8 +45,8 @@ def test_of_two_alike_the_one_that_a_hand_takes_and_puts_down_is_moved(segmentat
 
     found, _ = find_moved_by_network(working, seen, "red box", "place_onto")
 
-    assert (found.first & large(square(15, y), working)).sum() > 0.8 * found.first.sum()
-    assert (found.last & large(square(48, y), working)).sum() > 0.8 * found.last.sum()
+    assert (found.first & large(square(15, y), working.shape)).sum() > 0.8 * found.first.sum()
+    assert (found.last & large(square(48, y), working.shape)).sum() > 0.8 * found.last.sum()
     assert found.cues["first taken by a hand"] == 1.0
     assert found.cues["last put down by a hand"] == 1.0
     assert found.cues["no rival"] > 0.9
@@ -70,14 +59,14 @@ def test_an_outline_that_no_hand_reaches_weighs_less(segmentation_of):
 
     assert handling is not None
     for weight, x in ((handling.taken_from, 15), (handling.put_at, 48)):
-        assert weight(large(square(x, UPPER_Y), working)) == pytest.approx(0.3)
-        assert weight(large(square(x, LOWER_Y), working)) == 1.0
+        assert weight(large(square(x, UPPER_Y), working.shape)) == pytest.approx(0.3)
+        assert weight(large(square(x, LOWER_Y), working.shape)) == 1.0
 
 
 def test_what_a_person_marked_is_not_weighed(segmentation_of):
     working, seen = segmentation_of(two_alike())
     working = replace(working, hands=hand_along(working, LOWER_Y))
-    marked = Given(first=large(square(15, UPPER_Y), working))
+    marked = Given(first=large(square(15, UPPER_Y), working.shape))
 
     found, _ = find_moved_by_network(working, seen, "red box", "place_onto", marked=marked)
 

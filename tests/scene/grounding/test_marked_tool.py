@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
+from drawn_parts import GREEN, RED, large, square
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.frames.classes import HAND, MOVED
@@ -11,18 +11,10 @@ from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.grounding.ground_objects import ground_objects
 from v2p_data.video.captions import parse_caption
 
-RED, GREEN = (190, 40, 40), (40, 150, 60)
-
-
-def area(x: int, y: int, w: int, h: int) -> np.ndarray:
-    out = np.zeros((90, 120), bool)
-    out[y : y + h, x : x + w] = True
-    return out
-
 
 def test_a_marked_tool_is_followed_and_an_unmarked_one_is_asked_for(segmentation_of, draw):
-    sticks = [area(74 - 3 * i, 44, 30, 6) for i in range(12)]
-    blocks = [area(60 - 3 * i, 40, 14, 14) for i in range(12)]
+    sticks = [square(74 - 3 * i, 44, 30, 6) for i in range(12)]
+    blocks = [square(60 - 3 * i, 40, 14, 14) for i in range(12)]
     pairs = zip(blocks, sticks, strict=True)
     working, segmentation = segmentation_of(
         [[(block, RED, MOVED), (stick, GREEN, HAND)] for block, stick in pairs]
@@ -35,9 +27,7 @@ def test_a_marked_tool_is_followed_and_an_unmarked_one_is_asked_for(segmentation
 
     assert (block.role, block.in_hand) == ("manipulated", False)
     assert (stick.role, stick.in_hand, stick.moves) == ("tool", True, True)
-    h, w = working.shape
-    shown = sticks[8][(np.arange(h) * 90) // h][:, (np.arange(w) * 120) // w]
-    assert iou(stick.masks[8], shown) > 0.6
+    assert iou(stick.masks[8], large(sticks[8], working.shape)) > 0.6
     with pytest.raises(ItemRejectedError, match="the 'stick' was not found") as error:
         ground_objects(clip, working, meaning, segmentation, 0.5)
     assert error.value.reason == "reference_not_found"

@@ -109,22 +109,3 @@ def test_what_somebody_clicked_is_searched_once(prepared, searches):
 )
 def test_only_what_tells_a_place_is_a_mark(prepared, hint, is_mark):
     assert has_marks(replace(prepared.clip, hints={"blue box": hint})) == is_mark
-
-
-@pytest.mark.long
-def test_a_sure_scene_is_searched_once(prepared, monkeypatch):
-    searched = []
-    original = steps._grounded
-    monkeypatch.setattr(steps, "_grounded", lambda *a: searched.append(a) or original(*a))
-    monkeypatch.setattr(steps, "confidence_of", lambda _cues: 0.9)
-
-    assert rebuilt(prepared).confidence == 0.9
-    assert len(searched) == 1
-
-
-@pytest.mark.long
-def test_the_surer_scene_of_both_is_kept(prepared, monkeypatch):
-    values = iter([0.4, 0.4, 0.6, 0.6])
-    monkeypatch.setattr(steps, "confidence_of", lambda _cues: next(values))
-
-    assert rebuilt(prepared).confidence == 0.6

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from drawn_parts import BLUE, RED, W, large, square
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.outlines import EncodedPicture, Outlines
@@ -25,8 +26,7 @@ from v2p_data.scene.grounding.static_cues import StaticSearch
 from v2p_data.scene.grounding.static_objects import find_static_object
 from v2p_data.scene.scale.nouns import noun_for
 
-RED, BLUE, SLEEVE = (190, 40, 40), (40, 60, 190), (90, 90, 100)
-H, W = 90, 120
+SLEEVE = (90, 90, 100)
 
 
 class TruthModel:
@@ -64,17 +64,6 @@ class TruthModel:
             return best if (best & box).any() else None
         on = [tuple(int(v) for v in spot) for spot in prompt.on]
         return next((m for m in objects if all(m[v, u] for u, v in on)), None)
-
-
-def square(x, y, wide=14, tall=14):
-    mask = np.zeros((H, W), bool)
-    mask[y : y + tall, x : x + wide] = True
-    return mask
-
-
-def large(mask, shape):
-    h, w = shape
-    return mask[(np.arange(h) * H) // h][:, (np.arange(w) * W) // w]
 
 
 def with_model(working, parts_by_frame):

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_parts import BLUE, RED, SKIN, H, W, large, square
 
 from v2p_data.scene.data_types import ObjectTrack
 from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.colour import histogram
+from v2p_data.scene.frames.mask_ops import iou as mask_iou
 from v2p_data.scene.grounding.candidates import Moved
 from v2p_data.scene.grounding.ground_objects import ground_objects
 from v2p_data.scene.grounding.moved_by_network import Given, find_moved_by_network
@@ -23,15 +25,6 @@ from v2p_data.scene.grounding.tracking import carried, track
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.video.captions import parse_caption
 
-H, W = 90, 120
-TABLE_RGB, RED, BLUE, SKIN = (150, 140, 120), (190, 40, 40), (40, 60, 190), (224, 172, 140)
-
-
-def square(x, y, size=14):
-    mask = np.zeros((H, W), bool)
-    mask[y : y + size, x : x + size] = True
-    return mask
-
 
 def pushed(colour_a, colour_b):
     """Two squares move from left to right, `a` above `b`."""
@@ -45,18 +38,8 @@ def pushed(colour_a, colour_b):
 
 
 def iou(mask, truth):
-    rows, columns = (
-        (np.arange(mask.shape[0]) * H) // mask.shape[0],
-        (np.arange(mask.shape[1]) * W) // mask.shape[1],
-    )
-    truth = truth[rows][:, columns]
-    return (mask & truth).sum() / (mask | truth).sum()
-
-
-def large(mask, working):
-    """Return a mask of the drawn frames at working size."""
-    h, w = working.shape
-    return mask[(np.arange(h) * H) // h][:, (np.arange(w) * W) // w]
+    """Return how far a mask at working size overlaps one of the drawn frames."""
+    return mask_iou(mask, large(truth, mask.shape))
 
 
 @pytest.mark.parametrize(("phrase", "y"), [("red box", 20), ("blue box", 60)])
@@ -183,7 +166,7 @@ def test_an_outline_at_the_end_that_shows_something_else_is_not_believed(segment
     frames = [[(square(10 + 6 * i, 40), RED, MOVED)] for i in range(12)]
     frames[-1] = [(square(76, 40), BLUE, MOVED)]
     working, segmentation = segmentation_of(frames)
-    first, last = large(square(10, 40), working), large(square(76, 40), working)
+    first, last = large(square(10, 40), working.shape), large(square(76, 40), working.shape)
     moved = Moved(
         first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
@@ -207,7 +190,7 @@ def test_a_look_alike_that_lay_there_all_along_is_not_the_thing_at_the_end(
         parts += [(square(6, 36, 40), SKIN, HAND)] if 4 <= i < 8 else []
         frames.append([*parts, (there, RED, OTHER)] if i >= lies_there_from else parts)
     working, _ = segmentation_of(frames)
-    first, last = large(gone, working), large(there, working)
+    first, last = large(gone, working.shape), large(there, working.shape)
     moved = Moved(
         first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
@@ -222,7 +205,7 @@ def test_where_the_network_surely_sees_bare_table_nothing_is_followed(segmentati
     """It knows the thing at first; what looks like it later is table to the network, while a fist hides the thing."""
     frames = [[(square(10 + 6 * i, 40), RED, MOVED if i < 6 else TABLE)] for i in range(12)]
     working, segmentation = segmentation_of(frames)
-    first, last = large(square(10, 40), working), large(square(76, 40), working)
+    first, last = large(square(10, 40), working.shape), large(square(76, 40), working.shape)
     moved = Moved(
         first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
@@ -245,7 +228,7 @@ def test_what_lies_there_still_keeps_its_whole_outline(segmentation_of):
         upper[47:], lower[:47] = False, False
         frames.append([(upper, RED, MOVED), (lower, (165, 150, 110), MOVED)])
     working, _ = segmentation_of(frames)
-    first, last = large(square(10, 40), working), large(square(46, 40), working)
+    first, last = large(square(10, 40), working.shape), large(square(46, 40), working.shape)
     half = first.copy()
     half[: round(47 / H * len(half))] = False
     moved = Moved(
@@ -264,8 +247,8 @@ def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours(segmen
     frames[-1] = [(arm, SKIN, MOVED), (square(76, 40), RED, MOVED)]
     working, segmentation = segmentation_of(frames)
     hand = replace(working, hand_hist=histogram(np.tile(np.array(SKIN, np.uint8), (400, 1))))
-    first, thing = large(square(10, 40), working), large(square(76, 40), working)
-    last = thing | large(arm, working)
+    first, thing = large(square(10, 40), working.shape), large(square(76, 40), working.shape)
+    last = thing | large(arm, working.shape)
     moved = Moved(
         first=first, last=last, score=1.0, colour_hist=histogram(working.rgb[0][first]), cues={}
     )
@@ -278,7 +261,7 @@ def test_the_hand_that_holds_a_thing_at_the_end_is_cut_off_by_its_colours(segmen
 
 def test_where_a_thing_will_stand_is_not_part_of_its_first_outline(segmentation_of):
     working, _ = segmentation_of([[(square(30 + 2 * i, 40), RED, MOVED)] for i in range(10)])
-    first, last = large(square(30, 40), working), large(square(48, 40), working)
+    first, last = large(square(30, 40), working.shape), large(square(48, 40), working.shape)
     moved = Moved(first=first | last, last=last, score=1.0, colour_hist=np.zeros((12, 24, 24)))
 
     freed = disjoint_ends(working, moved)
@@ -293,7 +276,7 @@ def test_what_is_covered_by_both_outlines_stays_with_both_where_it_shows_the_thi
     segmentation_of,
 ):
     working, _ = segmentation_of([[(square(30 + i, 40), RED, MOVED)] for i in range(8)])
-    first, last = large(square(30, 40), working), large(square(37, 40), working)
+    first, last = large(square(30, 40), working.shape), large(square(37, 40), working.shape)
 
     same = disjoint_ends(
         working, Moved(first=first, last=last, score=1.0, colour_hist=np.zeros((12, 24, 24)))
@@ -396,7 +379,10 @@ def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(se
     frames = pushed(RED, RED)
     working, segmentation = segmentation_of(frames)
     start, near, far = square(15, 20), square(44, 14, 26), square(44, 54, 26)
-    first, goals = large(start, working), [large(goal, working) for goal in (near, far)]
+    first, goals = (
+        large(start, working.shape),
+        [large(goal, working.shape) for goal in (near, far)],
+    )
 
     ends = [
         find_moved_by_network(
@@ -413,7 +399,7 @@ def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(segment
     """Of two that move alike the blue one is meant: a mark in the middle says so, and is no outline of either end."""
     frames = pushed(RED, BLUE)
     working, segmentation = segmentation_of(frames)
-    there = large(square(15 + 3 * 6, 60), working)
+    there = large(square(15 + 3 * 6, 60), working.shape)
 
     moved, _ = find_moved_by_network(
         working,
@@ -465,5 +451,7 @@ def test_a_thing_is_cut_by_its_colour_from_the_arm_that_was_taken_along(segmenta
     any_, _ = find_moved_by_network(working, segmentation, "box", "push_right")
 
     assert iou(red.first, square(15, 20)) > 0.8
-    assert any_.first[large(arm & ~square(13, 18, 18), working)].mean() > 0.5, "nothing says which"
+    assert any_.first[large(arm & ~square(13, 18, 18), working.shape)].mean() > 0.5, (
+        "nothing says which"
+    )
     assert red.score > 0.3, "the whole is no rival of its piece"

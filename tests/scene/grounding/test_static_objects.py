@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_parts import BLUE, GREEN, RED, SKIN, large, square
 
 from v2p_data.scene.frames.classes import BACKGROUND, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.mask_ops import iou
@@ -21,22 +22,9 @@ from v2p_data.scene.grounding.static_objects import candidates, find_static_obje
 from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.scene.scale.nouns import noun_for
 
-RED, BLUE, GREEN, SKIN = (190, 40, 40), (40, 60, 190), (40, 150, 60), (224, 172, 140)
 CAMERA = SeenCamera(
     pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.9, table_width_sd=0.2
 )
-
-
-def square(x, y, size=14):
-    mask = np.zeros((90, 120), bool)
-    mask[y : y + size, x : x + size] = True
-    return mask
-
-
-def large(mask, working):
-    """Return a mask at working size."""
-    h, w = working.shape
-    return mask[(np.arange(h) * 90) // h][:, (np.arange(w) * 120) // w]
 
 
 def pushed_to(x, others):
@@ -49,7 +37,7 @@ def pushed_to(x, others):
 
 def searched(segmentation_of, frames, phrase, kind, ends, moved="thing"):
     working, segmentation = segmentation_of(frames)
-    first, last = (large(mask, working) for mask in ends)
+    first, last = (large(mask, working.shape) for mask in ends)
     return StaticSearch(
         working=working,
         table=find_table(working.always, segmentation.early[TABLE] > 0.5),
@@ -76,7 +64,7 @@ def test_of_two_things_the_one_that_was_pushed_to_is_meant(segmentation_of):
         segmentation_of, frames, "box", "push_next_to", (square(5, 40), square(52, 40))
     )
 
-    assert iou(found, large(near, working)) > 0.8
+    assert iou(found, large(near, working.shape)) > 0.8
 
 
 def test_a_basket_that_fills_a_third_of_the_picture_is_still_a_thing(segmentation_of):
@@ -87,7 +75,7 @@ def test_a_basket_that_fills_a_third_of_the_picture_is_still_a_thing(segmentatio
         segmentation_of, frames, "laundry basket", "throw_into", (square(5, 40), square(60, 40))
     )
 
-    assert iou(found, large(basket, working)) > 0.8
+    assert iou(found, large(basket, working.shape)) > 0.8
 
 
 def test_a_table_that_seems_to_be_a_thing_is_too_large_to_be_a_cup(segmentation_of):
@@ -108,8 +96,8 @@ def test_a_named_colour_outweighs_a_little_distance(segmentation_of):
     blue, _, working = meant(segmentation_of, frames, "blue box", "push_next_to", ends)
     green, _, _ = meant(segmentation_of, frames, "green box", "push_next_to", ends)
 
-    assert iou(blue, large(near, working)) > 0.8
-    assert iou(green, large(far, working)) > 0.8
+    assert iou(blue, large(near, working.shape)) > 0.8
+    assert iou(green, large(far, working.shape)) > 0.8
 
 
 def test_a_whole_that_was_cut_out_twice_is_meant_rather_than_something_likelier_by_itself(
@@ -122,7 +110,7 @@ def test_a_whole_that_was_cut_out_twice_is_meant_rather_than_something_likelier_
     shapes = [(square(72, 28, 20), 0.70), (square(73, 29, 19), 0.69), (square(5, 5), 0.75)]
     found = [
         StaticCandidate(
-            mask=large(mask, search.working),
+            mask=large(mask, search.working.shape),
             cues={**dict.fromkeys(usual.cues, 0.0), "seen": seen},
         )
         for mask, seen in shapes
@@ -156,7 +144,7 @@ def test_what_an_arm_hides_at_first_is_found_where_it_is_seen_later(segmentation
         segmentation_of, frames, "blue bin", "throw_into", (square(5, 40), square(72, 34, 10))
     )
 
-    assert iou(found, large(bin_, working)) > 0.8
+    assert iou(found, large(bin_, working.shape)) > 0.8
 
 
 def test_where_nothing_stands_nothing_is_believed(segmentation_of):
@@ -175,7 +163,7 @@ def test_print_on_the_table_is_no_part_of_what_stands_beside_it(segmentation_of)
         segmentation_of, frames, "blue box", "push_next_to", (square(5, 40), square(52, 40))
     )
 
-    assert iou(found, large(thing, working)) > 0.85
+    assert iou(found, large(thing, working.shape)) > 0.85
 
 
 def test_what_is_uncovered_is_looked_for_where_the_cover_stood(segmentation_of):
@@ -188,7 +176,7 @@ def test_what_is_uncovered_is_looked_for_where_the_cover_stood(segmentation_of):
         segmentation_of, frames, "box", "uncover", (square(18, 36, 20), square(62, 36, 20))
     )
 
-    assert iou(found, large(under, working)) > 0.6
+    assert iou(found, large(under, working.shape)) > 0.6
 
 
 def test_pixels_count_in_the_frames_that_show_them(segmentation_of):
@@ -198,7 +186,7 @@ def test_pixels_count_in_the_frames_that_show_them(segmentation_of):
         parts.append((bin_, SKIN, HAND))
     working, segmentation = segmentation_of(frames)
 
-    assert static_share(segmentation, "insert")[large(bin_, working)].min() > 0.7
+    assert static_share(segmentation, "insert")[large(bin_, working.shape)].min() > 0.7
 
 
 def test_where_all_seems_too_small_things_are_compared_with_what_moves(segmentation_of):
@@ -233,7 +221,7 @@ def test_what_stands_is_apart_from_table_and_wall(segmentation_of):
     parts = [(square(0, 0, 30), (90, 90, 90), BACKGROUND), (thing, RED, OTHER)]
     working, segmentation = segmentation_of([parts for _ in range(12)])
 
-    assert iou(static_share(segmentation, "push_left") > 0.5, large(thing, working)) > 0.8
+    assert iou(static_share(segmentation, "push_left") > 0.5, large(thing, working.shape)) > 0.8
 
 
 def test_what_has_table_beneath_it_stands_on_the_table_whatever_its_colours_say(segmentation_of):
@@ -243,8 +231,8 @@ def test_what_has_table_beneath_it_stands_on_the_table_whatever_its_colours_say(
     working, segmentation = segmentation_of([parts for _ in range(12)])
     nowhere = replace(find_table(working.always), hull=np.zeros(working.shape, bool))
 
-    assert seen_on_table(nowhere, large(on, working), segmentation) == 1
-    assert seen_on_table(nowhere, large(off, working), segmentation) < 1
+    assert seen_on_table(nowhere, large(on, working.shape), segmentation) == 1
+    assert seen_on_table(nowhere, large(off, working.shape), segmentation) < 1
 
 
 @pytest.mark.parametrize(("phrase", "far"), [("ball", False), ("plate", False), ("box", True)])
