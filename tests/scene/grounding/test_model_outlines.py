@@ -218,7 +218,10 @@ def test_beneath_an_exact_outline_the_table_is_looked_for_a_little_lower(segment
     seen = large(square(20, 40, 80, 23), working.shape)
     exact = seen.copy()
     exact[np.flatnonzero(seen.any(1))[-4:]] = False
-    table = replace(find_table(working.always), hull=np.zeros(working.shape, bool))
+    table = replace(
+        find_table(working.always, segmentation.early[TABLE] > 0.5),
+        hull=np.zeros(working.shape, bool),
+    )
 
     assert seen_on_table(table, exact, segmentation) < 1
     assert seen_on_table(table, exact, segmentation, gap_px=EXACT_GAP_PX) == 1

@@ -229,7 +229,10 @@ def test_what_has_table_beneath_it_stands_on_the_table_whatever_its_colours_say(
     wall = square(0, 0, 40)
     parts = [(wall, (90, 90, 90), BACKGROUND), (on, RED, OTHER), (off, RED, OTHER)]
     working, segmentation = segmentation_of([parts for _ in range(12)])
-    nowhere = replace(find_table(working.always), hull=np.zeros(working.shape, bool))
+    nowhere = replace(
+        find_table(working.always, segmentation.early[TABLE] > 0.5),
+        hull=np.zeros(working.shape, bool),
+    )
 
     assert seen_on_table(nowhere, large(on, working.shape), segmentation) == 1
     assert seen_on_table(nowhere, large(off, working.shape), segmentation) < 1

@@ -33,69 +33,22 @@ class Table:
         return (_distance(lab, self.lab) > max(7.0, self.noise)) & self.hull
 
 
-def find_table(
-    image: UInt8[np.ndarray, "h w 3"], given: Bool[np.ndarray, "h w"] | None = None
-) -> Table:
-    """Return the table in a still: where `given` says it is, or the largest low, central, even-coloured region.
+def find_table(image: UInt8[np.ndarray, "h w 3"], bare: Bool[np.ndarray, "h w"]) -> Table:
+    """Return the table in a still by its bare part; by all of the picture where hardly any is bare.
 
-    k-means in Lab proposes regions; a quadratic in x and y then follows the light across the winner.
+    A quadratic in x and y follows the light across it.
     """
-    if given is not None and given.mean() > _LEAST_SEEN:
-        return _coat(image, given, spreads=False)
-    return _coat(image, _even_region(image), spreads=True)
-
-
-def _even_region(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     h, w = image.shape[:2]
-    y, x = np.mgrid[:h, :w].astype(np.float32)
-    lab = np.asarray(cv2.GaussianBlur(lab_of(image), (0, 0), 1.5), np.float32)
-    edges = sum(
-        np.linalg.norm(cv2.Sobel(lab, cv2.CV_32F, dx, 1 - dx, ksize=3), axis=-1) for dx in (0, 1)
-    )
-    prior = (0.15 + np.clip((y / h - 0.2) / 0.5, 0, 1)) * np.exp(-(((x / w - 0.5) / 0.45) ** 2))
-    samples = (lab * np.array([0.6, 1, 1], np.float32)).reshape(-1, 3)
-    cv2.setRNGSeed(
-        1
-    )  # OpenCV's k-means draws its own start; the same picture must give the same table
-    _, labels, _ = cv2.kmeans(samples, 7, np.empty(0), (3, 20, 1), 2, cv2.KMEANS_PP_CENTERS)
-    labels = labels.reshape(h, w)
-    best, seen = -1.0, np.zeros((h, w), bool)
-    for i in range(7):
-        count, parts = cv2.connectedComponents(((labels == i) & (edges < 60)).astype(np.uint8))
-        for j in range(1, count):
-            value = float((prior * (edges < 40))[parts == j].sum())
-            if value > best:
-                best, seen = value, parts == j
-    return seen
-
-
-def _coat(
-    image: UInt8[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"], *, spreads: bool
-) -> Table:
-    """Return the table whose bare part is `seen`, with the colour that it has; `spreads` lets the part grow."""
-    h, w = image.shape[:2]
+    seen = bare if bare.mean() > _LEAST_SEEN else np.ones_like(bare)
     y, x = np.mgrid[:h, :w].astype(np.float32)
     lab = np.asarray(cv2.GaussianBlur(lab_of(image), (0, 0), 1.5), np.float32)
     basis = np.stack(
         [np.ones_like(x), x / w, y / h, (x / w) ** 2, (y / h) ** 2, x * y / w / h], -1
     )
-    model, noise = lab, 7.0
-    for _ in range(8):
-        coefficients = np.linalg.lstsq(basis[seen][::5], lab[seen][::5], rcond=None)[0]
-        model = (basis @ coefficients).astype(np.float32)
-        residual = np.linalg.norm((lab - model) * np.array([0.7, 1.2, 1.2]), axis=-1)
-        noise = 3 * float(np.clip(1.5 * np.median(residual[seen]), 2.5, 6))
-        if not spreads:
-            break
-        even = cv2.morphologyEx(
-            (residual < noise).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))
-        )
-        count, parts = cv2.connectedComponents(even)
-        overlap = np.bincount(parts[seen], minlength=count)
-        overlap[0] = 0
-        if overlap.max() < 50:
-            break
-        seen = parts == overlap.argmax()
+    coefficients = np.linalg.lstsq(basis[seen][::5], lab[seen][::5], rcond=None)[0]
+    model = (basis @ coefficients).astype(np.float32)
+    residual = np.linalg.norm((lab - model) * np.array([0.7, 1.2, 1.2]), axis=-1)
+    noise = 3 * float(np.clip(1.5 * np.median(residual[seen]), 2.5, 6))
     return Table(seen=seen, hull=_hull_of(seen), lab=model, noise=noise)
 
 
