@@ -45,6 +45,7 @@ from v2p_data.experts.labeller import choose_program, labeller_of
 from v2p_data.pipeline.artifact import (
     Record,
     demand_whole,
+    history,
     provenance,
     write_json_atomically,
 )
