@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
@@ -96,13 +97,15 @@ def blocks() -> list[tuple[str, str]]:
 
 
 def needs_opengl() -> None:
-    from toy_task import bundle
+    from toy_task import PushTask, bundle
 
+    from v2p_data.sim.env.batch_env import BatchEnv
     from v2p_data.sim.render.masks import MaskRenderer
 
+    worlds = BatchEnv(bundle(), num_envs=1, seed=3, num_threads=1, task=PushTask)
     with MaskRenderer(bundle(), 64) as renderer:
         try:
-            renderer._gl("this page")
+            renderer.draw_rgb(worlds.snapshot(np.arange(1)), 0)
         except V2PError as error:
             pytest.skip(str(error))
 
