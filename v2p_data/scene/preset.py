@@ -55,9 +55,6 @@ WEIGHTS_GB = {
     "facebook/sam2.1-hiera-base-plus": 0.32,
     "facebook/sam2.1-hiera-large": 0.90,
     "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf": 0.10,
-    "openmmlab-community/mm_grounding_dino_tiny_o365v1_goldg_v3det": 0.69,
-    "google/owlv2-base-patch16-ensemble": 0.62,
-    "apple/DepthPro-hf": 3.8,
 }
 """Size of the weights [GB], from their number of parameters in float32."""
 NEEDED_FILES = ("config.json", "model.safetensors")

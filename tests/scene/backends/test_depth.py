@@ -1,34 +1,29 @@
-import sys
-from types import ModuleType
-
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
-from v2p_data.scene.backends.checkpoint import load_checkpoint
 from v2p_data.scene.backends.config import DepthConfig
 from v2p_data.scene.backends.depth import predict_depth, table_from_depth
 from v2p_data.scene.fitting.silhouette import camera_above
 
 
-def config(backend: str, checkpoint, **more) -> DepthConfig:
+def config(checkpoint, **more) -> DepthConfig:
     return DepthConfig(
-        backend=backend, model=checkpoint(backend), device=checkpoint.device, **more
+        backend="depth_anything",
+        model=checkpoint("depth_anything"),
+        device=checkpoint.device,
+        **more,
     )
 
 
-@pytest.mark.parametrize("backend", ["depth_anything", "depth_pro"])
-def test_a_saved_checkpoint_gives_positive_depth_of_the_pictures_size(
-    backend, checkpoint, picture
-):
+def test_a_saved_checkpoint_gives_positive_depth_of_the_pictures_size(checkpoint, picture):
     images = np.stack([picture, picture[:, ::-1], 255 - picture])
 
-    together = predict_depth(images, config(backend, checkpoint, batch_size=3))
-    alone = predict_depth(images, config(backend, checkpoint, batch_size=1))
+    together = predict_depth(images, config(checkpoint, batch_size=3))
+    alone = predict_depth(images, config(checkpoint, batch_size=1))
 
     assert together.depth_m.shape == (3, 48, 64)
     assert (together.depth_m > 0).all()
@@ -37,27 +32,12 @@ def test_a_saved_checkpoint_gives_positive_depth_of_the_pictures_size(
 
 
 def test_depth_anythings_depth_stays_below_the_checkpoints_farthest(checkpoint, picture):
-    assert predict_depth([picture], config("depth_anything", checkpoint)).depth_m.max() <= 20
-
-
-def test_depth_pros_field_of_view_comes_in_radians(checkpoint, picture, monkeypatch):
-    loaded = load_checkpoint("depth_pro", checkpoint("depth_pro"), "cpu", "float32")
-    run = loaded.model.forward
-    # The untrained head says about zero degrees, which no camera has.
-    monkeypatch.setattr(loaded.model, "forward", lambda **given: widened(run(**given)))
-
-    def widened(out):
-        out["field_of_view"] = torch.full_like(out["field_of_view"], 60.0)
-        return out
-
-    depth = predict_depth([picture], config("depth_pro", checkpoint))
-
-    assert depth.fov_rad == pytest.approx([np.pi / 3])
+    assert predict_depth([picture], config(checkpoint)).depth_m.max() <= 20
 
 
 def test_half_precision_gives_nearly_the_same_depth(checkpoint, picture):
     full, half = (
-        predict_depth([picture], config("depth_anything", checkpoint, dtype=dtype)).depth_m
+        predict_depth([picture], config(checkpoint, dtype=dtype)).depth_m
         for dtype in ("float32", "bfloat16")
     )
 
@@ -84,44 +64,7 @@ def make_relative(checkpoint, tmp_path) -> str:
 
 def test_pictures_of_different_sizes_are_a_clear_error(checkpoint, picture):
     with pytest.raises(V2PError, match="one size"):
-        predict_depth([picture, picture[1:]], config("depth_anything", checkpoint))
-
-
-def test_without_moge_the_way_to_get_it_is_named(picture):
-    with pytest.raises(V2PError, match="microsoft/MoGe"):
-        predict_depth([picture], DepthConfig(backend="moge", device="cpu"))
-
-
-def test_moges_own_package_is_called_as_its_readme_says(picture, monkeypatch):
-    class MoGeModel(torch.nn.Module):
-        @classmethod
-        def from_pretrained(cls, name):
-            assert name == "Ruicheng/moge-2-vitl-normal"
-            return cls()
-
-        def infer(self, image, use_fp16):
-            assert image.shape == (3, 48, 64)
-            assert 0 <= float(image.min()) <= float(image.max()) <= 1
-            assert not use_fp16
-            depth = torch.full((48, 64), 0.7)
-            depth[0, 0] = torch.inf
-            half_width = np.tan(
-                0.5
-            )  # of the picture at distance one, for a field of view of one radian
-            K = torch.tensor([[0.5 / half_width, 0, 0.5], [0, 0.7, 0.5], [0, 0, 1]])
-            return {"depth": depth, "mask": depth < 10, "intrinsics": K}
-
-    package = ModuleType("moge.model.v2")
-    package.MoGeModel = MoGeModel
-    for name, module in {"moge": ModuleType("moge"), "moge.model": ModuleType("moge.model"),
-                         "moge.model.v2": package}.items():  # fmt: skip
-        monkeypatch.setitem(sys.modules, name, module)
-
-    depth = predict_depth([picture], DepthConfig(backend="moge", device="cpu"))
-
-    assert depth.fov_rad == pytest.approx([1.0], abs=1e-6)
-    assert np.isnan(depth.depth_m[0, 0, 0])
-    assert np.nanmax(depth.depth_m) == pytest.approx(0.7)
+        predict_depth([picture, picture[1:]], config(checkpoint))
 
 
 def seen(

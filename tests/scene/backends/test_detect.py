@@ -9,22 +9,19 @@ from v2p_data.scene.backends.checkpoint import load_checkpoint
 from v2p_data.scene.backends.config import GroundConfig
 from v2p_data.scene.backends.detect import assign, detect
 
-DETECTORS = ("grounding_dino", "mm_grounding_dino", "owlv2")
 RED, BROWN = (6.0, 20.0, 22.0, 36.0), (40.0, 22.0, 58.0, 38.0)
 
 
-def config(backend: str, checkpoint, **more) -> GroundConfig:
-    settings = {"box_threshold": 0.0, "text_threshold": 0.0, "max_overlap": 0.9, **more}
+def config(checkpoint, model: str = "", **more) -> GroundConfig:
+    settings = {"box_threshold": 0.0, "text_threshold": 0.0, "max_overlap": 0.9}
+    settings |= {"device": checkpoint.device, **more}
     return GroundConfig(
-        backend=backend, model=checkpoint(backend), device=checkpoint.device, **settings
+        backend="grounding_dino", model=model or checkpoint("grounding_dino"), **settings
     )
 
 
-@pytest.mark.parametrize("backend", DETECTORS)
-def test_a_saved_checkpoint_finds_boxes_inside_the_picture_best_first(
-    backend, checkpoint, picture
-):
-    found = detect([picture], ["red box", "brown box"], config(backend, checkpoint))
+def test_a_saved_checkpoint_finds_boxes_inside_the_picture_best_first(checkpoint, picture):
+    found = detect([picture], ["red box", "brown box"], config(checkpoint))
 
     assert len(found) == 1
     assert [{d.phrase for d in ds} for ds in found[0]] == [{"red box"}, {"brown box"}]
@@ -36,29 +33,23 @@ def test_a_saved_checkpoint_finds_boxes_inside_the_picture_best_first(
         assert all(0 < d.score <= 1 for d in detections)
 
 
-@pytest.mark.parametrize("backend", DETECTORS)
-def test_the_batch_size_and_pictures_beside_change_nothing(backend, checkpoint, picture):
+def test_the_batch_size_and_pictures_beside_change_nothing(checkpoint, picture):
     other = np.full((40, 56, 3), 90, np.uint8)
     images = [picture, picture[:, ::-1].copy(), other]
 
-    together = detect(images, ["red box", "cup"], config(backend, checkpoint, batch_size=3))
-    alone = [
-        detect([i], ["red box", "cup"], config(backend, checkpoint, batch_size=1))[0]
-        for i in images
-    ]
+    together = detect(images, ["red box", "cup"], config(checkpoint, batch_size=3))
+    alone = [detect([i], ["red box", "cup"], config(checkpoint, batch_size=1))[0] for i in images]
 
     for a, b in zip(together, alone, strict=True):
         for x, y in zip(a, b, strict=True):
             np.testing.assert_allclose([d.box_xyxy for d in x], [d.box_xyxy for d in y], atol=1e-3)
 
 
-@pytest.mark.parametrize("backend", DETECTORS)
 def test_boxes_and_scores_are_those_that_transformers_itself_makes_of_the_output(
-    backend, checkpoint, picture
+    checkpoint, picture
 ):
-    loaded = load_checkpoint(backend, checkpoint(backend), "cpu", "float32")
-    text = ["a photo of a cup"] if backend == "owlv2" else "cup."
-    inputs = loaded.processor(images=[picture], text=[text], return_tensors="pt")
+    loaded = load_checkpoint("grounding_dino", checkpoint("grounding_dino"), "cpu", "float32")
+    inputs = loaded.processor(images=[picture], text=["cup."], return_tensors="pt")
     with torch.no_grad():
         out = loaded.model(**inputs)
     theirs = loaded.processor.post_process_grounded_object_detection(
@@ -66,15 +57,13 @@ def test_boxes_and_scores_are_those_that_transformers_itself_makes_of_the_output
     )[0]
     boxes = theirs["boxes"].numpy()
 
-    found = detect([picture], ["cup"], config(backend, checkpoint, max_overlap=1.0))[0][0]
+    found = detect([picture], ["cup"], config(checkpoint, max_overlap=1.0))[0][0]
 
     assert found
     for detection in found:
         clipped = np.clip(boxes, 0, [64, 48, 64, 48])
         off = np.abs(clipped - detection.box_xyxy).max(1)
         assert off.min() < 1e-3
-        if backend == "owlv2":
-            assert abs(float(theirs["scores"][off.argmin()]) - detection.score) < 1e-5
 
 
 def test_the_words_of_a_phrase_read_the_scores_of_their_own_tokens(checkpoint, picture, answering):
@@ -83,12 +72,12 @@ def test_the_words_of_a_phrase_read_the_scores_of_their_own_tokens(checkpoint, p
     logits[0, 0, [1, 2, 5, 6]] = torch.tensor([0.9, 0.7, 0.1, 0.7]).logit()
     logits[0, 1, [1, 2, 5, 6]] = torch.tensor([0.2, 0.6, 0.8, 0.6]).logit()
     boxes = torch.tensor([[[0.25, 0.5, 0.25, 0.5], [0.75, 0.5, 0.25, 0.5]]])
-    answering("grounding_dino", logits, boxes)
+    answering(logits, boxes)
 
     red, brown = detect(
         [picture],
         ["red box", "the brown box"],
-        config("grounding_dino", checkpoint, box_threshold=0.3, text_threshold=0.25),
+        config(checkpoint, box_threshold=0.3, text_threshold=0.25),
     )[0]
 
     assert red[0].box_xyxy == pytest.approx((8, 12, 24, 36))
@@ -101,8 +90,8 @@ def test_the_words_of_a_phrase_read_the_scores_of_their_own_tokens(checkpoint, p
 def answering(checkpoint, monkeypatch):
     """Let a loaded model answer given logits and boxes: the model's weights are the outside world here."""
 
-    def answer(backend: str, logits: torch.Tensor, boxes: torch.Tensor) -> None:
-        loaded = load_checkpoint(backend, checkpoint(backend), "cpu", "float32")
+    def answer(logits: torch.Tensor, boxes: torch.Tensor) -> None:
+        loaded = load_checkpoint("grounding_dino", checkpoint("grounding_dino"), "cpu", "float32")
 
         def forward(**_):
             return type("Out", (), {"logits": logits, "pred_boxes": boxes})()
@@ -149,58 +138,45 @@ def test_what_is_found_nowhere_has_no_box():
     assert assign(np.zeros((0, 4)), np.zeros((0, 2)), ["cup", "box"], 0.7) == [[], []]
 
 
-def test_half_precision_finds_the_same_boxes_roughly(checkpoint, picture):
-    full, half = (
-        detect([picture], ["cup"], config("owlv2", checkpoint, dtype=dtype))[0][0][0].box_xyxy
-        for dtype in ("float32", "bfloat16")
-    )
-
-    np.testing.assert_allclose(half, full, atol=2)
-
-
 @pytest.mark.parametrize("phrases", [[], [""], ["cup", " . "]])
 def test_no_phrase_is_a_clear_error(checkpoint, picture, phrases):
     with pytest.raises(V2PError, match="needs a word"):
-        detect([picture], phrases, config("owlv2", checkpoint))
+        detect([picture], phrases, config(checkpoint))
 
 
 def test_more_text_than_the_model_reads_is_a_clear_error(checkpoint, picture):
     with pytest.raises(V2PError, match="tokens"):
-        detect([picture], ["red box"] * 90, config("grounding_dino", checkpoint))
+        detect([picture], ["red box"] * 90, config(checkpoint))
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(checkpoint, picture):
-    cfg = GroundConfig(backend="owlv2", model=checkpoint("grounding_dino"), device="cpu")
+    cfg = config(checkpoint, model=checkpoint("sam2"))
 
-    with pytest.raises(V2PError, match="'grounding-dino' model, but backend 'owlv2'"):
+    with pytest.raises(V2PError, match="'sam2_video' model, but backend 'grounding_dino'"):
         detect([picture], ["cup"], cfg)
 
 
-def test_a_checkpoint_that_is_not_there_is_a_clear_error(tmp_path, picture):
-    cfg = GroundConfig(backend="owlv2", model=str(tmp_path), device="cpu")
-
+def test_a_checkpoint_that_is_not_there_is_a_clear_error(checkpoint, tmp_path, picture):
     with pytest.raises(V2PError, match="cannot be loaded"):
-        detect([picture], ["cup"], cfg)
+        detect([picture], ["cup"], config(checkpoint, model=str(tmp_path)))
 
 
 def test_a_checkpoint_without_some_weights_is_refused(checkpoint, picture, tmp_path):
-    from transformers import Owlv2ForObjectDetection, Owlv2Processor
+    from transformers import GroundingDinoForObjectDetection, GroundingDinoProcessor
 
-    model = Owlv2ForObjectDetection.from_pretrained(checkpoint("owlv2"))
-    weights = {k: v for k, v in model.state_dict().items() if not k.startswith("box_head")}
+    whole = checkpoint("grounding_dino")
+    model = GroundingDinoForObjectDetection.from_pretrained(whole)
+    weights = {k: v for k, v in model.state_dict().items() if "enc_output." not in k}
     model.save_pretrained(tmp_path, state_dict=weights)
-    Owlv2Processor.from_pretrained(checkpoint("owlv2")).save_pretrained(tmp_path)
-    cfg = GroundConfig(backend="owlv2", model=str(tmp_path), device="cpu")
+    GroundingDinoProcessor.from_pretrained(whole).save_pretrained(tmp_path)
 
     with pytest.raises(V2PError, match=r"lacks \d+ weights"):
-        detect([picture], ["cup"], cfg)
+        detect([picture], ["cup"], config(checkpoint, model=str(tmp_path)))
 
 
 def test_a_gpu_that_is_not_there_is_a_clear_error(checkpoint, picture):
-    cfg = GroundConfig(backend="owlv2", model=checkpoint("owlv2"), device="cuda:63")
-
     with pytest.raises(V2PError, match="device=cpu"):
-        detect([picture], ["cup"], cfg)
+        detect([picture], ["cup"], config(checkpoint, device="cuda:63"))
 
 
 def test_without_transformers_the_way_to_install_it_is_named(checkpoint, picture, monkeypatch):
@@ -208,4 +184,4 @@ def test_without_transformers_the_way_to_install_it_is_named(checkpoint, picture
     load_checkpoint.cache_clear()
 
     with pytest.raises(V2PError, match="learned"):
-        detect([picture], ["cup"], config("owlv2", checkpoint))
+        detect([picture], ["cup"], config(checkpoint))

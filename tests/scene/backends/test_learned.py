@@ -118,7 +118,10 @@ def test_a_video_model_s_masks_replace_the_track_and_keep_the_found_mask_where_i
 def test_a_whole_scene_is_made_with_learned_models_or_turned_away_with_a_reason(clip, checkpoint):
     cfg = SceneConfig(
         ground=GroundConfig(
-            backend="owlv2", model=checkpoint("owlv2"), box_threshold=0.0, text_threshold=0.0
+            backend="grounding_dino",
+            model=checkpoint("grounding_dino"),
+            box_threshold=0.0,
+            text_threshold=0.0,
         ),
         segment=SegmentConfig(backend="sam2", model=checkpoint("sam2")),
         depth=DepthConfig(backend="depth_anything", model=checkpoint("depth_anything")),

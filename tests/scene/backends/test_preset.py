@@ -58,7 +58,9 @@ def test_a_larger_gpu_gets_larger_models_and_every_size_is_known():
 
 def test_a_stage_that_was_set_keeps_its_backend():
     cfg = SceneConfig(
-        preset="learned", ground=GroundConfig(backend="owlv2"), depth=DepthConfig(backend="moge")
+        preset="learned",
+        ground=GroundConfig(backend="worker", worker="mine"),
+        depth=DepthConfig(backend="worker", worker="my_worker"),
     )
 
     resolved = on(24.0, cfg)

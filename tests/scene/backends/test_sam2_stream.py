@@ -13,7 +13,9 @@ from v2p_data.scene.backends.segment import Prompt, segment_video
 @pytest.fixture
 def cfg(checkpoint):
     # Random weights draw no outline: the threshold is what decides, and half of the pixels pass this one.
-    return SegmentConfig(backend="sam2", model=checkpoint("sam2"), device=checkpoint.device)
+    return SegmentConfig(
+        backend="sam2", model=checkpoint("sam2"), device=checkpoint.device, num_points=1
+    )
 
 
 @pytest.fixture
@@ -24,16 +26,16 @@ def clip(picture):
 def test_a_stream_gives_the_masks_that_the_whole_clip_gives(cfg, clip):
     tracker = Sam2Tracker(cfg)
     assert isinstance(tracker, StreamTracker)
-    whole = segment_video(clip, [Prompt(points_px=((14.0, 28.0),))], cfg)
+    click, clicked = (14.5, 28.5), np.zeros(clip.shape[1:3], bool)
+    clicked[28, 14] = True
+    whole = segment_video(clip, [Prompt(frame_idx=0, mask=clicked)], cfg)
     nothing = np.zeros(clip.shape[1:3], bool)
     if not whole.masks[0, 0].any() or whole.scores[0, 0] <= 0.5:
         with pytest.raises(V2PError, match="sees no object"):
-            tracker.start(clip[0], (14.0, 28.0), nothing)
+            tracker.start(clip[0], click, nothing)
         found = [tracker.track(picture, nothing) for picture in clip[1:]]
     else:
-        np.testing.assert_array_equal(
-            tracker.start(clip[0], (14.0, 28.0), nothing), whole.masks[0, 0]
-        )
+        np.testing.assert_array_equal(tracker.start(clip[0], click, nothing), whole.masks[0, 0])
         found = [tracker.track(picture, nothing) for picture in clip[1:]]
 
     for t, tracked in enumerate(found, start=1):

@@ -9,7 +9,14 @@ from v2p_data.scene.backends.segment import Prompt, points_inside, segment_video
 
 LENGTH = 9
 """More frames than the tiny tracker remembers (4)."""
-POINTS = (((14.0, 28.0), (10.0, 24.0)), ((48.0, 30.0), (52.0, 34.0)))
+BOXES = ((20, 6), (22, 40))
+"""First row and column of two objects of 16 pixels a side."""
+
+
+def outlined(corner: tuple[int, int], frame_idx: int = 0) -> Prompt:
+    mask = np.zeros((64, 64), bool)
+    mask[corner[0] : corner[0] + 16, corner[1] : corner[1] + 16] = True
+    return Prompt(frame_idx=frame_idx, mask=mask)
 
 
 @pytest.fixture
@@ -35,14 +42,15 @@ def tracked_by_transformers(checkpoint, clip, start: int) -> np.ndarray:
     """Return logits [object time h w] of the library's own tracker, which holds the whole clip."""
     loaded = load_checkpoint("sam2", checkpoint("sam2"), "cpu", "float32")
     logits = np.full((2, LENGTH, *clip.shape[1:3]), np.nan)
+    points = [points_inside(outlined(box).mask, 5).tolist() for box in BOXES]
     for reverse in (False, True):
         session = loaded.processor.init_video_session(video=list(clip))
         loaded.processor.add_inputs_to_inference_session(
             session,
             start,
             [0, 1],
-            input_points=[[[list(p) for p in points] for points in POINTS]],
-            input_labels=[[[1, 1], [1, 1]]],
+            input_points=[points],
+            input_labels=[[[1] * 5] * 2],
         )
         with torch.inference_mode():
             for out in loaded.model.propagate_in_video_iterator(
@@ -59,7 +67,7 @@ def tracked_by_transformers(checkpoint, clip, start: int) -> np.ndarray:
 def test_frame_by_frame_and_forgetting_gives_what_the_library_gives_with_the_whole_clip(
     checkpoint, clip, start
 ):
-    prompts = [Prompt(frame_idx=start, points_px=points) for points in POINTS]
+    prompts = [outlined(box, start) for box in BOXES]
 
     found = segment_video(clip, prompts, config(checkpoint))
 
@@ -70,7 +78,7 @@ def test_frame_by_frame_and_forgetting_gives_what_the_library_gives_with_the_who
 
 
 def test_a_pixel_belongs_to_one_object_and_scores_are_shares(checkpoint, clip):
-    prompts = [Prompt(points_px=points) for points in POINTS]
+    prompts = [outlined(box) for box in BOXES]
 
     found = segment_video(clip, prompts, config(checkpoint))
 
@@ -79,22 +87,11 @@ def test_a_pixel_belongs_to_one_object_and_scores_are_shares(checkpoint, clip):
     assert ((found.scores >= 0) & (found.scores <= 1)).all()
 
 
-def test_boxes_masks_and_points_at_different_frames_prompt_one_clip(checkpoint, clip):
-    mask = np.zeros((64, 64), bool)
-    mask[22:38, 40:58] = True
-    prompts = [
-        Prompt(frame_idx=3, box_xyxy=(12.0, 20.0, 28.0, 36.0)),
-        Prompt(frame_idx=0, mask=mask),
-        Prompt(frame_idx=LENGTH - 1, points_px=((30.0, 28.0),)),
-    ]
+def test_masks_in_different_frames_prompt_one_clip(checkpoint, clip):
+    prompts = [outlined(BOXES[0], 3), outlined(BOXES[1], LENGTH - 1)]
 
     found = segment_video(clip, prompts, config(checkpoint, offload=True))
 
-    by_box, by_mask, by_point = found.points_px
-    assert by_box.shape == by_mask.shape == (5, 2)
-    assert ((by_box >= (12, 20)) & (by_box <= (28, 36))).all()
-    assert all(mask[int(v), int(u)] for u, v in by_mask)
-    np.testing.assert_array_equal(by_point, [(30, 28)])
     assert (found.scores > 0).all()
 
 
@@ -108,7 +105,7 @@ def test_frames_are_read_one_at_a_time_and_the_tracker_forgets(checkpoint, clip,
         lambda **given: sessions.append(make(**given)) or sessions[-1],
     )
 
-    segment_video(list(clip), [Prompt(points_px=POINTS[0])], config(checkpoint))
+    segment_video(list(clip), [outlined(BOXES[0])], config(checkpoint))
 
     (session,) = sessions
     assert not session.processed_frames
@@ -141,17 +138,11 @@ def test_points_in_a_ring_avoid_its_hole_and_a_tiny_mask_repeats_its_own():
 @pytest.mark.parametrize(
     ("prompt", "said"),
     [
-        (Prompt(frame_idx=LENGTH, points_px=((1.0, 1.0),)), "frames 0..8"),
-        (Prompt(points_px=((70.0, 1.0),)), "outside"),
-        (Prompt(box_xyxy=(9.0, 9.0, 9.0, 20.0)), "empty"),
-        (Prompt(mask=np.zeros((64, 64), bool)), "a pixel set"),
+        (outlined(BOXES[0], LENGTH), "frames 0..8"),
+        (Prompt(frame_idx=0, mask=np.ones((32, 64), bool)), "64 x 64"),
+        (Prompt(frame_idx=0, mask=np.zeros((64, 64), bool)), "a pixel set"),
     ],
 )
 def test_a_prompt_that_points_nowhere_is_a_clear_error(checkpoint, clip, prompt, said):
     with pytest.raises(V2PError, match=said):
         segment_video(clip, [prompt], config(checkpoint))
-
-
-def test_a_prompt_is_one_thing():
-    with pytest.raises(ValueError, match="exactly one"):
-        Prompt(box_xyxy=(0.0, 0.0, 1.0, 1.0), points_px=((0.0, 0.0),))

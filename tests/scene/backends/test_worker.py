@@ -425,7 +425,9 @@ def test_a_worker_can_ground_and_segment(worker, picture):
         answer("segment", masks=masks, scores=np.ones(masks.shape[:2]))
         """
     )
-    prompt = Prompt(frame_idx=1, points_px=((8.0, 22.0), (20.0, 30.0)))
+    mask = np.zeros(picture.shape[:2], bool)
+    mask[22:30, 8:20] = True
+    prompt = Prompt(frame_idx=1, mask=mask)
     followed = segment_video(
         np.stack([picture] * 3), [prompt], SegmentConfig(backend="worker", worker=segment)
     )

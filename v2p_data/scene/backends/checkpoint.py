@@ -18,16 +18,12 @@ from v2p_data.scene.backends.config import DEFAULT_MODELS, DType
 
 MODEL_CLASSES = {
     "grounding_dino": "GroundingDinoForObjectDetection",
-    "mm_grounding_dino": "MMGroundingDinoForObjectDetection",
-    "owlv2": "Owlv2ForObjectDetection",
     "sam2": "Sam2VideoModel",
     "depth_anything": "DepthAnythingForDepthEstimation",
-    "depth_pro": "DepthProForDepthEstimation",
 }
 _PROCESSORS = {
     "sam2": "Sam2VideoProcessor",
     "depth_anything": "AutoImageProcessor",
-    "depth_pro": "AutoImageProcessor",
 }
 
 

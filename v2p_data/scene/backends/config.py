@@ -6,20 +6,18 @@ from pathlib import Path
 from typing import Literal
 
 type DType = Literal["float32", "float16", "bfloat16"]
-type GroundBackend = Literal["network", "grounding_dino", "mm_grounding_dino", "owlv2", "worker"]
+type GroundBackend = Literal["network", "grounding_dino", "worker"]
 type SegmentBackend = Literal["flow", "sam2", "worker"]
 type HandsBackend = Literal["auto", "none", "mediapipe", "worker"]
 type OutlineBackend = Literal["auto", "none", "mobile_sam"]
-type DepthBackend = Literal["none", "depth_anything", "depth_pro", "moge", "worker"]
+type DepthBackend = Literal["none", "depth_anything", "worker"]
 
+DETECTORS = ("grounding_dino", "worker")
+"""Backends that return boxes for phrases."""
 DEFAULT_MODELS: dict[str, str] = {
     "grounding_dino": "IDEA-Research/grounding-dino-tiny",
-    "mm_grounding_dino": "openmmlab-community/mm_grounding_dino_tiny_o365v1_goldg_v3det",
-    "owlv2": "google/owlv2-base-patch16-ensemble",
     "sam2": "facebook/sam2.1-hiera-small",
     "depth_anything": "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf",
-    "depth_pro": "apple/DepthPro-hf",
-    "moge": "Ruicheng/moge-2-vitl-normal",
 }
 """The checkpoint that an empty `model` stands for; `docs/backends.md` has the licence of each."""
 
@@ -34,12 +32,10 @@ class GroundConfig:
     """Hub id or folder of a checkpoint; empty takes the backend's default."""
     device: str = "auto"
     """`auto`, `cpu`, `cuda` or `cuda:1`; `auto` takes the GPU where there is one."""
-    dtype: DType = "float32"
-    """Weights and activations; half precision is for GPUs."""
     batch_size: int = 4
     """Pictures per pass; fewer need less memory."""
     box_threshold: float = 0.3
-    """Boxes the model is less sure of are dropped; OWLv2's scores run lower, so there 0.1 is usual."""
+    """Boxes the model is less sure of are dropped."""
     text_threshold: float = 0.25
     """Words of a prompt the model ties less firmly to a box do not count as named by it."""
     max_overlap: float = 0.7
@@ -92,7 +88,7 @@ class DepthConfig:
     """How far every pixel is, which fixes the camera's height, pitch and roll over the table."""
 
     backend: DepthBackend = "none"
-    """`none` relies on usual sizes; `depth_pro` and `moge` give the field of view too."""
+    """`none` relies on usual sizes; `worker` asks a process of yours."""
     model: str = ""
     """Hub id or folder of a checkpoint with metric depth; empty takes the backend's default."""
     device: str = "auto"
@@ -102,7 +98,7 @@ class DepthConfig:
     batch_size: int = 1
     """Pictures per pass; fewer need less memory."""
     worker: str = ""
-    """Command line of a worker (`docs/workers.md`); with `backend=worker`, or `moge` in its own environment."""
+    """Command line of a worker (`docs/workers.md`); with `backend=worker` only."""
     worker_timeout_s: float = 600.0
     """After this the worker's whole process group is killed."""
 

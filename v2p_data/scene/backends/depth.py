@@ -1,7 +1,6 @@
 """Pictures become metric depth, and depth becomes the table plane: the camera's height, pitch and roll.
 
-Depth Anything (metric variants) and Depth Pro come with transformers; MoGe has no class there, so its own package is
-used where it is installed, or a worker.
+A metric Depth Anything comes with transformers; any other model answers as a worker.
 """
 
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.checkpoint import batches, device_for, load_checkpoint
+from v2p_data.scene.backends.checkpoint import batches, load_checkpoint
 from v2p_data.scene.backends.config import DEFAULT_MODELS, DepthConfig
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
@@ -27,7 +26,7 @@ class Depth:
     depth_m: Float[np.ndarray, "n h w"]
     """Along the optical axis, not along the ray; NaN where the model gives none."""
     fov_rad: Float[np.ndarray, "n"] | None
-    """Horizontal field of view per picture, where the model gives it."""
+    """Horizontal field of view per picture, where a worker gives it."""
     metric: bool
     """Whether the unit is the metre; if not, depth is right up to one factor."""
 
@@ -56,42 +55,32 @@ def predict_depth(
     Raises:
         V2PError: the model cannot be loaded, gives relative depth only, or its worker fails.
 
-    Source: Yang et al. 2024 (Depth Anything V2), arXiv:2406.09414; Bochkovskii et al. 2024 (Depth Pro), arXiv:2410.02073;
-        Wang et al. 2025 (MoGe-2), arXiv:2507.02546.
+    Source: Yang et al. 2024 (Depth Anything V2), arXiv:2406.09414.
     """
     if not len(images) or len({image.shape for image in images}) > 1:
         raise V2PError(f"depth needs at least one picture and all of one size, got {len(images)}")
-    if cfg.backend == "worker" or (cfg.backend == "moge" and cfg.worker):
+    if cfg.backend == "worker":
         return _by_worker(images, cfg)
-    if cfg.backend == "moge":
-        return _by_moge(images, cfg)
-    if cfg.backend not in ("depth_anything", "depth_pro"):
+    if cfg.backend != "depth_anything":
         raise V2PError(
-            f"depth backend '{cfg.backend}' predicts nothing; known: depth_anything, depth_pro, moge, worker"
+            f"depth backend '{cfg.backend}' predicts nothing; known: depth_anything, worker"
         )
     checkpoint = load_checkpoint(cfg.backend, cfg.model, cfg.device, cfg.dtype)
-    config = checkpoint.model.config
-    if cfg.backend == "depth_anything" and config.depth_estimation_type != "metric":
+    if checkpoint.model.config.depth_estimation_type != "metric":
         raise V2PError(
             f"checkpoint '{checkpoint.name}' gives relative depth, which fixes no size; take a metric one, such as "
             f"'{DEFAULT_MODELS['depth_anything']}'"
         )
     depths: list[np.ndarray] = []
-    fovs: list[float] = []
     for batch in batches(images, cfg.batch_size):
         inputs = checkpoint.processor(images=batch, return_tensors="pt").to(checkpoint.device)
         with torch.inference_mode():
             out = checkpoint.model(pixel_values=inputs["pixel_values"].to(checkpoint.dtype))
         out.predicted_depth = out.predicted_depth.float()
-        if out.get("field_of_view") is not None:
-            out.field_of_view = out.field_of_view.float()
         sizes = [image.shape[:2] for image in batch]
         done = checkpoint.processor.post_process_depth_estimation(out, target_sizes=sizes)
-        for one in done:
-            depths.append(one["predicted_depth"].cpu().numpy())
-            if one.get("field_of_view") is not None:
-                fovs.append(float(np.deg2rad(one["field_of_view"].item())))
-    return _checked(np.stack(depths), np.array(fovs) if fovs else None, metric=True)
+        depths += [one["predicted_depth"].cpu().numpy() for one in done]
+    return _checked(np.stack(depths), None, metric=True)
 
 
 def table_from_depth(
@@ -191,36 +180,6 @@ def _by_worker(images: Sequence[np.ndarray] | np.ndarray, cfg: DepthConfig) -> D
         None if fov is None else fov.astype(np.float64),
         metric=bool(answer.fields["metric"]),
     )
-
-
-def _by_moge(images: Sequence[np.ndarray] | np.ndarray, cfg: DepthConfig) -> Depth:
-    """Run MoGe-2 by its own package, `moge.model.v2`, with intrinsics relative to the picture's size."""
-    try:
-        from moge.model.v2 import MoGeModel  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise V2PError(
-            "depth backend 'moge' needs the moge package, which is not installed; install it from its repository, "
-            "microsoft/MoGe, or give a worker (docs/workers.md)"
-        ) from None
-    device = device_for(cfg.device)
-    name = cfg.model or DEFAULT_MODELS["moge"]
-    try:
-        model = MoGeModel.from_pretrained(name)
-    except (OSError, ValueError) as error:
-        raise V2PError(
-            f"checkpoint '{name}' of backend 'moge' cannot be loaded ({error})"
-        ) from error
-    model = model.to(device).eval()
-    depths, fovs = [], []
-    for image in images:
-        tensor = torch.tensor(image / 255, dtype=torch.float32, device=device).permute(2, 0, 1)
-        with torch.inference_mode():
-            out = model.infer(tensor, use_fp16=cfg.dtype == "float16")
-        depth = out["depth"].float().cpu().numpy().astype(np.float64)
-        seen = out["mask"].cpu().numpy().astype(bool)
-        depths.append(np.where(seen & np.isfinite(depth), depth, np.nan))
-        fovs.append(2 * np.arctan(0.5 / float(out["intrinsics"][0, 0])))
-    return _checked(np.stack(depths), np.array(fovs), metric=True)
 
 
 def _checked(depth: np.ndarray, fov: np.ndarray | None, *, metric: bool) -> Depth:

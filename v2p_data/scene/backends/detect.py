@@ -1,8 +1,7 @@
-"""Phrases become boxes, by Grounding DINO, MM-Grounding-DINO or OWLv2.
+"""Phrases become boxes, by Grounding DINO or a worker.
 
-Every model is brought to one table, how well each box shows each phrase; what follows is the same for all. Two phrases
-never share one thing: "red box" and "brown box" are told apart by the assignment of things to phrases that is best
-for all of them together.
+Both give one table: how well each box shows each phrase. Two phrases never share one thing: "red box" and "brown box"
+are told apart by the assignment of things to phrases that is best for all of them together.
 """
 
 import re
@@ -15,8 +14,8 @@ from jaxtyping import Float, UInt8
 from scipy.optimize import linear_sum_assignment
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.checkpoint import Checkpoint, batches, load_checkpoint
-from v2p_data.scene.backends.config import GroundConfig
+from v2p_data.scene.backends.checkpoint import batches, load_checkpoint
+from v2p_data.scene.backends.config import DETECTORS, GroundConfig
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
 _MAX_TOKENS = 256
@@ -33,7 +32,7 @@ class Detection:
     box_xyxy: tuple[float, float, float, float]
     """Left, top, right, bottom [px] in the picture given, clipped to it."""
     score: float
-    """The model's own, 0 to 1: the mean over the phrase's words, or of the phrase as a whole (OWLv2)."""
+    """The model's own, 0 to 1: the mean over the phrase's words."""
 
 
 def detect(
@@ -48,11 +47,11 @@ def detect(
     Raises:
         V2PError: no phrase, an empty one, too much text, or the model cannot be loaded.
 
-    Source: Liu et al. 2023 (Grounding DINO), arXiv:2303.05499; Minderer et al. 2023 (OWLv2), arXiv:2306.09683.
+    Source: Liu et al. 2023 (Grounding DINO), arXiv:2303.05499.
     """
-    if cfg.backend not in ("grounding_dino", "mm_grounding_dino", "owlv2", "worker"):
+    if cfg.backend not in DETECTORS:
         raise V2PError(
-            f"ground backend '{cfg.backend}' is no detector; known: grounding_dino, mm_grounding_dino, owlv2, worker"
+            f"ground backend '{cfg.backend}' is no detector; known: {', '.join(DETECTORS)}"
         )
     if not phrases or not all(re.search(r"\w", phrase) for phrase in phrases):
         raise V2PError(f"every phrase to look for needs a word, got {list(phrases)}")
@@ -108,15 +107,7 @@ def _tables(
     """Return per picture the boxes [px] and how well each shows each phrase; 0 where it does not."""
     if cfg.backend == "worker":
         return _by_worker(images, phrases, cfg)
-    checkpoint = load_checkpoint(cfg.backend, cfg.model, cfg.device, cfg.dtype)
-    table = _owlv2 if cfg.backend == "owlv2" else _grounding_dino
-    return table(checkpoint, images, phrases, cfg)
-
-
-def _grounding_dino(
-    checkpoint: Checkpoint, images: list[np.ndarray], phrases: Sequence[str], cfg: GroundConfig
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return boxes [px] and scores per picture; a score of 0 where a phrase does not name the box."""
+    checkpoint = load_checkpoint(cfg.backend, cfg.model, cfg.device, "float32")
     prompt, word_spans = _prompt(phrases)
     tokenizer = checkpoint.processor.tokenizer
     offsets = tokenizer(prompt, return_offsets_mapping=True)["offset_mapping"]
@@ -145,23 +136,6 @@ def _grounding_dino(
             )
         answer.append((box, np.stack(columns, axis=1)))
     return answer
-
-
-def _owlv2(
-    checkpoint: Checkpoint, images: list[np.ndarray], phrases: Sequence[str], cfg: GroundConfig
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return boxes [px] and scores per picture; a score of 0 below the threshold."""
-    queries = [f"a photo of a {_clean(phrase)}" for phrase in phrases]
-    inputs = checkpoint.processor(
-        images=images, text=[queries] * len(images), return_tensors="pt", truncation=True
-    ).to(checkpoint.device)
-    inputs["pixel_values"] = inputs["pixel_values"].to(checkpoint.dtype)
-    with torch.inference_mode():
-        out = checkpoint.model(**inputs)
-    scores = torch.sigmoid(out.logits.float()).cpu().numpy()
-    side = max(images[0].shape[:2])  # the picture is padded to a square at its right and bottom
-    boxes = _corners(out.pred_boxes, side, side)
-    return list(zip(boxes, np.where(scores > cfg.box_threshold, scores, 0.0), strict=True))
 
 
 def _by_worker(

@@ -1,11 +1,11 @@
-"""Boxes, points or masks at one frame become masks at every frame, by SAM 2.
+"""Masks in one frame become masks in every frame, by SAM 2.
 
-As in the paper an object is prompted by a few positive points inside its mask; for a box that mask is what SAM 2 sees in
-the box. The clip is followed from the prompted frame to its end and to its start, one frame at a time; what the tracker
-no longer looks back at is forgotten, so that memory does not grow with the clip.
+As in the paper an object is prompted by a few positive points inside its mask. The clip is followed from
+the prompted frame to its end and to its start, one frame at a time. What the tracker no longer looks back at is forgotten,
+so that memory does not grow with the clip.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,19 +22,10 @@ from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
 @dataclass(frozen=True, kw_only=True)
 class Prompt:
-    """Where one object is at one frame: exactly one of box, points and mask."""
+    """What one object looks like in one frame."""
 
-    frame_idx: int = 0
-    box_xyxy: tuple[float, float, float, float] | None = None
-    """Left, top, right, bottom [px]."""
-    points_px: tuple[tuple[float, float], ...] | None = None
-    """Points on the object, u right and v down."""
-    mask: Bool[np.ndarray, "h w"] | None = None
-
-    def __post_init__(self) -> None:
-        given = [self.box_xyxy is not None, bool(self.points_px), self.mask is not None]
-        if sum(given) != 1:
-            raise ValueError("a prompt is exactly one of box_xyxy, points_px and mask")
+    frame_idx: int
+    mask: Bool[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +35,6 @@ class SegmentedVideo:
     masks: Bool[np.ndarray, "object time h w"]
     scores: Float[np.ndarray, "object time"]
     """How sure the model is that the object is seen at all, 0 to 1."""
-    points_px: tuple[Float[np.ndarray, "_k 2"], ...]
-    """The positive points that each object was prompted with, u right and v down; none where a worker got its box."""
 
 
 def segment_video(
@@ -76,20 +65,19 @@ def segment_video(
     checkpoint = load_checkpoint("sam2", cfg.model, cfg.device, cfg.dtype)
     masks = np.zeros((len(prompts), len(frames), h, w), bool)
     scores = np.zeros((len(prompts), len(frames)))
-    points: list[np.ndarray] = [np.zeros((0, 2))] * len(prompts)
     for start in sorted({prompt.frame_idx for prompt in prompts}):
         which = [i for i, prompt in enumerate(prompts) if prompt.frame_idx == start]
-        for i in which:
-            points[i] = _points(checkpoint, np.asarray(frames[start]), prompts[i], cfg)
-        prompted = [points[i] for i in which]
+        points = [points_inside(prompts[i].mask, cfg.num_points) for i in which]
         for step in (1, -1):
-            order = range(start, len(frames) if step > 0 else -1, step)
-            for t, logits, sure in _follow(checkpoint, frames, order, prompted, cfg):
+            # Backwards the tracker is shown the clip in reverse, as a clip of its own.
+            stream = Stream(checkpoint, points, cfg)
+            for t in range(start, len(frames) if step > 0 else -1, step):
+                logits, sure = stream.next(np.asarray(frames[t]))
                 masks[which, t] = _apart(logits, cfg.mask_threshold)
                 scores[which, t] = sure
             if start == 0:
                 break
-    return SegmentedVideo(masks=masks, scores=scores, points_px=tuple(points))
+    return SegmentedVideo(masks=masks, scores=scores)
 
 
 def points_inside(mask: Bool[np.ndarray, "h w"], count: int) -> Float[np.ndarray, "count 2"]:
@@ -121,7 +109,7 @@ def _by_worker(
         kind="segment",
         arrays={
             "images": np.stack([np.asarray(frames[t]) for t in range(len(frames))]),
-            "boxes_xyxy": np.array([_box_of(prompt) for prompt in prompts]),
+            "boxes_xyxy": np.array([_box_of(prompt.mask) for prompt in prompts]),
             "frame_idx": np.array([prompt.frame_idx for prompt in prompts]),
         },
     )
@@ -129,66 +117,13 @@ def _by_worker(
     return SegmentedVideo(
         masks=found["masks"],
         scores=found["scores"].astype(np.float64),
-        points_px=tuple(np.zeros((0, 2)) for _ in prompts),
     )
 
 
-def _box_of(prompt: Prompt) -> tuple[float, float, float, float]:
-    """Return the box around whatever the prompt is [px]."""
-    if prompt.box_xyxy is not None:
-        return prompt.box_xyxy
-    if prompt.mask is not None:
-        y, x = np.nonzero(prompt.mask)
-        return float(x.min()), float(y.min()), float(x.max() + 1), float(y.max() + 1)
-    xy = np.array(prompt.points_px)
-    return (
-        float(xy[:, 0].min()),
-        float(xy[:, 1].min()),
-        float(xy[:, 0].max()),
-        float(xy[:, 1].max()),
-    )
-
-
-def _points(
-    checkpoint: Checkpoint, image: np.ndarray, prompt: Prompt, cfg: SegmentConfig
-) -> Float[np.ndarray, "k 2"]:
-    """Return the positive points that stand for a prompt."""
-    if prompt.points_px is not None:
-        return np.array(prompt.points_px, np.float64)
-    if prompt.mask is not None:
-        return points_inside(prompt.mask, cfg.num_points)
-    assert prompt.box_xyxy is not None
-    h, w = image.shape[:2]
-    session = _session(checkpoint, cfg)
-    inputs = _prepared(checkpoint, image)
-    checkpoint.processor.add_inputs_to_inference_session(
-        session, 0, [0], input_boxes=[[list(prompt.box_xyxy)]], original_size=(h, w)
-    )
-    with torch.inference_mode():
-        out = checkpoint.model(session, frame=inputs, run_mem_encoder=False)
-    inside = np.zeros((h, w), bool)
-    left, top, right, bottom = (round(v) for v in prompt.box_xyxy)
-    inside[max(0, top) : max(bottom, top + 1), max(0, left) : max(right, left + 1)] = True
-    seen = (_logits(checkpoint, out.pred_masks, (h, w))[0] > cfg.mask_threshold) & inside
-    # Where the model sees next to nothing in the box, the middle of the box is the best guess.
-    return points_inside(seen if seen.sum() >= 0.02 * inside.sum() else inside, cfg.num_points)
-
-
-def _follow(
-    checkpoint: Checkpoint,
-    frames: Sequence[np.ndarray] | np.ndarray,
-    order: Sequence[int],
-    points: Sequence[Float[np.ndarray, "k 2"]],
-    cfg: SegmentConfig,
-) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Yield frame, logits at full size and scores per object, from the prompted frame on in the order given.
-
-    Backwards the tracker is shown the clip in reverse, as a clip of its own.
-    """
-    stream = Stream(checkpoint, points, cfg)
-    for t in order:
-        logits, sure = stream.next(np.asarray(frames[t]))
-        yield t, logits, sure
+def _box_of(mask: Bool[np.ndarray, "h w"]) -> tuple[float, float, float, float]:
+    """Return the box around a mask [px]."""
+    y, x = np.nonzero(mask)
+    return float(x.min()), float(y.min()), float(x.max() + 1), float(y.max() + 1)
 
 
 class Stream:
@@ -284,15 +219,7 @@ def _check(prompt: Prompt, i: int, num_frames: int, size: tuple[int, int]) -> No
         raise V2PError(
             f"prompt {i} is at frame {prompt.frame_idx}, but the clip has frames 0..{num_frames - 1}"
         )
-    if prompt.mask is not None and (prompt.mask.shape != (h, w) or not prompt.mask.any()):
+    if prompt.mask.shape != (h, w) or not prompt.mask.any():
         raise V2PError(
             f"the mask of prompt {i} must be {h} x {w} with a pixel set, got {prompt.mask.shape}"
         )
-    corners = prompt.points_px or ()
-    if prompt.box_xyxy is not None:
-        left, top, right, bottom = prompt.box_xyxy
-        if not (left < right and top < bottom):
-            raise V2PError(f"the box of prompt {i} is empty: {prompt.box_xyxy}")
-        corners = (((left + right) / 2, (top + bottom) / 2),)
-    if not all(0 <= x <= w and 0 <= y <= h for x, y in corners):
-        raise V2PError(f"prompt {i} lies outside its {w} x {h} picture")
