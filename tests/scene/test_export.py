@@ -309,7 +309,7 @@ def test_an_object_that_was_made_by_hand_has_a_motion_but_no_masks(scene):
         poses_world=((0.0, 0.0, 0.025, 1.0, 0.0, 0.0, 0.0), (0.1, 0.0, 0.025, 1.0, 0.0, 0.0, 0.0)),
     )
 
-    assert cube.first_to_last.translation_m == (0.1, 0.0, 0.0)
+    assert cube.motion.translation_m == (0.1, 0.0, 0.0)
     with pytest.raises(V2PError, match="not made from a video"):
         replace(scene, objects=(cube,)).masks("cube")
 

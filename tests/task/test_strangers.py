@@ -16,8 +16,7 @@ import pytest
 from v2p_data.cli import run
 from v2p_data.errors import V2PError
 from v2p_data.scene.files import copy_folder, is_plain_path, own_file
-from v2p_data.scene.scene import SCHEMA, Scene, SceneObject
-from v2p_data.scene.schema import ObjectEntry, SceneFile
+from v2p_data.scene.scene import SCHEMA, Scene, SceneFile
 from v2p_data.sim.env.batch_env import BatchEnv
 from v2p_data.sim.robot.arms import RobotConfig
 from v2p_data.sim.wrappers.gym_env import V2PEnv
@@ -210,7 +209,6 @@ def test_the_files_have_the_fields_of_what_they_become():
     def names(kind: type) -> set[str]:
         return {f.name for f in fields(kind)}
 
-    assert set(ObjectEntry.model_fields) == names(SceneObject) | {"first_to_last"}
     assert set(SceneFile.model_fields) == (
         names(Scene) - {"folder", "T_world_cams", "crop_px"}
     ) | {"version"}

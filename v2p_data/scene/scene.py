@@ -7,17 +7,44 @@ side, so the same words (left, right, in front of) mean the same in the video an
 
 import json
 import zipfile
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Le, Len
 from jaxtyping import Bool, Float
+from pydantic import AfterValidator, Field, StringConstraints
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.kinds import Kind, kind_named
-from v2p_data.scene.schema import Observed, Role, Shape, Symmetry, read_scene_file
+from v2p_data.scene.files import own_file, read_own
+from v2p_data.scene.schema import (
+    MAX_FILE_BYTES,
+    STRICT,
+    Count,
+    Entry,
+    FileModel,
+    Length,
+    MeshPath,
+    Name,
+    Observed,
+    Place,
+    Pose,
+    Role,
+    Row4,
+    Shape,
+    Share,
+    Slug,
+    Symmetry,
+    Vector,
+    Words,
+    of_unit_length,
+    parsed,
+    path_of_kind,
+)
 
 SCENE_FILE = "scene.json"
 SCHEMA = 2
@@ -25,6 +52,14 @@ GRAVITY_M_S2 = (0.0, 0.0, -9.81)
 FLOOR_MIN_M = 0.006
 """Through thinner floors hard-pressed objects were pushed into the table."""
 FLOOR_MAX_M = 0.02
+MAX_SCENE_BYTES = 32_000_000
+"""An hour of two objects at 10 Hz."""
+MAX_OBJECTS = 20
+MAX_PARTS = 128
+"""Most parts of one object."""
+MAX_SCENE_PARTS = 512
+"""Most parts of all objects together; MuJoCo gets each in seven sizes."""
+MAX_FRAMES = 50_000
 MAX_MASKS_BYTES = 1_000_000_000
 """Largest unpacked mask track: an hour at 10 Hz, one bit per pixel."""
 
@@ -33,18 +68,20 @@ MAX_MASKS_BYTES = 1_000_000_000
 class Plane:
     """All points p of the world frame with normal · p = offset."""
 
-    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    __pydantic_config__ = STRICT
+    normal: Annotated[tuple[float, float, float], AfterValidator(of_unit_length)] = (0.0, 0.0, 1.0)
     """Unit vector."""
-    offset_m: float = 0.0
+    offset_m: Place = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageConfidence:
     """How sure one stage of the reconstruction is."""
 
-    value: float
+    __pydantic_config__ = STRICT
+    value: Share
     """0 to 1."""
-    reason: str
+    reason: Words
     """What made it low, in words; empty for a sure one."""
 
 
@@ -52,8 +89,9 @@ class StageConfidence:
 class Motion:
     """A move from one pose to another, in the world frame."""
 
-    translation_m: tuple[float, float, float]
-    rotation_vector_rad: tuple[float, float, float]
+    __pydantic_config__ = STRICT
+    translation_m: Vector
+    rotation_vector_rad: Vector
     """Axis times angle; of a symmetric object the smallest that looks the same."""
 
 
@@ -61,44 +99,53 @@ class Motion:
 class SceneObject:
     """One object: what it is, how large, and where it was in the video."""
 
-    name: str
+    __pydantic_config__ = STRICT
+    name: Name
     """Identifier, unique in the scene, that task code uses: states have `<name>_pos` and so on."""
-    label: str
+    label: Words
     """The words of the caption."""
     role: Role
     shape: Shape
     """A primitive when it fits within tolerance, else `mesh` (its `parts` collide)."""
-    size_m: tuple[float, float, float]
+    size_m: tuple[Length, Length, Length]
     """Full extents along the object's own x, y, z. Cylinders: (diameter, diameter, height), axis z."""
-    mass_kg: float
-    friction: float
+    mass_kg: Annotated[float, Gt(0), Le(1e4)]
+    friction: Annotated[float, Ge(0), Le(100)]
     """Sliding friction on a wooden table."""
     hollow: bool = False
     """Open at the top: a bowl, a cup, a box without a lid."""
-    mesh: str = ""
+    mesh: MeshPath = ""
     """OBJ file, relative to the scene folder, watertight, centred on its bounding box, in metres."""
-    mesh_ply: str = ""
+    mesh_ply: MeshPath = ""
     """The same mesh as PLY."""
-    parts: tuple[str, ...] = ()
+    parts: Annotated[tuple[MeshPath, ...], Len(0, MAX_PARTS)] = ()
     """OBJ files of convex solids in the mesh's frame that together are the object: what collides."""
-    urdf: str = ""
-    mjcf: str = ""
-    mask_track: str = ""
+    urdf: Annotated[str, path_of_kind(".urdf")] = ""
+    mjcf: Annotated[str, path_of_kind(".xml")] = ""
+    mask_track: Annotated[str, path_of_kind(".npz")] = ""
     """File with the object's masks; `Scene.masks` reads it."""
     symmetry: Symmetry = "none"
     """Turns that leave it alike: `box` half turns about its axes, `round` any about its own z, `sphere` all."""
-    rgba: tuple[float, float, float, float] = (0.8, 0.4, 0.2, 1.0)
+    rgba: tuple[Share, Share, Share, Share] = (0.8, 0.4, 0.2, 1.0)
     """Mean colour in the video."""
-    source: dict[str, str] = field(default_factory=dict[str, str])
+    source: Annotated[dict[Words, Words], Len(0, 32)] = field(default_factory=dict[str, str])
     """Where size, mass and friction come from, in words."""
-    frames: tuple[int, ...] = ()
+    frames: Annotated[tuple[Count, ...], Len(0, MAX_FRAMES)] = ()
     """Video frames with a pose, first and last at least."""
-    poses_world: tuple[tuple[float, ...], ...] = ()
+    poses_world: Annotated[tuple[Pose, ...], Len(0, MAX_FRAMES)] = ()
     """Per frame `[x, y, z, qw, qx, qy, qz]` of the object's centre [m]."""
-    confidences: tuple[float, ...] = ()
+    confidences: Annotated[tuple[Share, ...], Len(0, MAX_FRAMES)] = ()
     """Per frame, 0 to 1."""
-    observed: tuple[Observed, ...] = ()
+    observed: Annotated[tuple[Observed, ...], Len(0, MAX_FRAMES)] = ()
     """Per frame: `no_depth` where one view does not show how far away it is, as in mid-air; empty: all `full`."""
+    first_to_last: Motion | None = field(default=None, compare=False, repr=False)
+    """For readers of the file, as `motion`."""
+
+    @property
+    def files(self) -> list[str]:
+        """The files that it names."""
+        named = (self.mesh, self.mesh_ply, self.urdf, self.mjcf, self.mask_track, *self.parts)
+        return [file for file in named if file]
 
     @property
     def first_pose(self) -> Float[np.ndarray, "7"]:
@@ -125,7 +172,7 @@ class SceneObject:
         return np.asarray(self.poses_world[-1], float)
 
     @property
-    def first_to_last(self) -> Motion:
+    def motion(self) -> Motion:
         """What the video did to the object."""
         first, last = (
             Rotation.from_quat(p[3:], scalar_first=True) for p in (self.first_pose, self.last_pose)
@@ -281,8 +328,9 @@ class Scene:
         if self.crop_px is not None:
             data["camera"]["crop_px"] = [round(v, 2) for v in self.crop_px]
         for written, thing in zip(data["objects"], self.objects, strict=True):
-            if thing.poses_world:  # for readers of the file; here it follows from the poses
-                written["first_to_last"] = asdict(thing.first_to_last)
+            del written["first_to_last"]
+            if thing.poses_world:
+                written["first_to_last"] = asdict(thing.motion)
         data["schema"] = SCHEMA
         (folder / SCENE_FILE).write_text(json.dumps(data, indent=1))
 
@@ -297,38 +345,99 @@ class Scene:
             raise V2PError(
                 f"{folder} holds no {SCENE_FILE}: it is no scene; make one with 'v2p scene'"
             )
-        read = read_scene_file(folder, SCENE_FILE)
-        same = {f.name: getattr(read, f.name) for f in fields(Scene) if f.name in _AS_WRITTEN}
+        read = _read(folder)
+        same = {name: getattr(read, name) for name in SceneFile.model_fields}
+        del same["version"]
+        camera = read.camera
         return Scene(
-            **same,
-            kind=kind_named(read.kind, str(folder / SCENE_FILE)),
-            objects=tuple(
-                SceneObject(**{f.name: getattr(thing, f.name) for f in fields(SceneObject)})
-                for thing in read.objects
-            ),
-            confidences={
-                stage: StageConfidence(value=sure.value, reason=sure.reason)
-                for stage, sure in read.confidences.items()
+            **same
+            | {
+                "kind": kind_named(read.kind, str(folder / SCENE_FILE)),
+                "camera": Camera(
+                    width_px=camera.width_px,
+                    height_px=camera.height_px,
+                    K=np.array(camera.K, float),
+                    T_world_cam=np.array(camera.T_world_cam, float),
+                ),
             },
-            table=Plane(normal=read.table.normal, offset_m=read.table.offset_m),
-            camera=Camera(
-                width_px=read.camera.width_px,
-                height_px=read.camera.height_px,
-                K=np.array(read.camera.K, float),
-                T_world_cam=np.array(read.camera.T_world_cam, float),
-            ),
-            T_world_cams=np.array(read.camera.T_world_cams, float)
-            if read.camera.T_world_cams
-            else None,
-            crop_px=read.camera.crop_px,
+            T_world_cams=np.array(camera.T_world_cams, float) if camera.T_world_cams else None,
+            crop_px=camera.crop_px,
             folder=folder,
         )
 
 
-_AS_WRITTEN = {f.name for f in fields(Scene)} - {
-    *("kind", "objects", "confidences", "table", "camera", "T_world_cams", "crop_px", "folder")
-}
-"""Fields that stand in the file as they are."""
+class CameraEntry(FileModel):
+    width_px: Annotated[int, Gt(0), Le(16_384)]
+    height_px: Annotated[int, Gt(0), Le(16_384)]
+    K: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]]
+    T_world_cam: tuple[Row4, Row4, Row4, Row4]
+    T_world_cams: Annotated[tuple[tuple[Row4, Row4, Row4, Row4], ...], Len(0, MAX_FRAMES)] = ()
+    crop_px: tuple[Entry, Entry, Entry, Entry] | None = None
+
+
+class SceneFile(FileModel):
+    """The fields of `Scene`, which says what they mean, with the limits of what a file may say."""
+
+    title: Slug
+    video: Words
+    description: Words
+    kind: Name
+    objects: Annotated[tuple[SceneObject, ...], Len(0, MAX_OBJECTS)]
+    camera: CameraEntry
+    fps: Annotated[float, Gt(0), Le(10_000)]
+    num_frames: Count
+    confidence: Share
+    confidences: Annotated[dict[Words, StageConfidence], Len(0, 32)] = Field(
+        default_factory=dict[str, StageConfidence]
+    )
+    scale_spread: Annotated[float, Ge(0), Le(100)] = 0.0
+    table: Plane
+    gravity_m_s2: Vector = GRAVITY_M_S2
+    warnings: Annotated[tuple[Words, ...], Len(0, 200)] = ()
+    family: Annotated[Words, StringConstraints(max_length=200)] = ""
+    version: Literal[2] = Field(alias="schema")
+
+
+def _read(folder: Path) -> SceneFile:
+    """Return what a scene file says, as far as it may.
+
+    Raises:
+        V2PError: it cannot be read, was written by another version, or says what it may not.
+    """
+    path = folder / SCENE_FILE
+    data = read_own(folder, SCENE_FILE, MAX_SCENE_BYTES)
+    found = parsed(data, SceneFile, path, "remake it with 'v2p scene'", version_field="schema")
+    if len(found.camera.T_world_cams) not in (0, found.num_frames):
+        raise V2PError(
+            f"{path}: camera.T_world_cams has {len(found.camera.T_world_cams)} poses, but the clip has {found.num_frames} frames"
+        )
+    if len({o.name for o in found.objects}) < len(found.objects):
+        names = ", ".join(o.name for o in found.objects)
+        raise V2PError(f"{path}: two objects have one name ({names}); each needs its own")
+    if (count := sum(len(o.parts) for o in found.objects)) > MAX_SCENE_PARTS:
+        raise V2PError(
+            f"{path}: its objects have {count} parts; at most {MAX_SCENE_PARTS} can be simulated"
+        )
+    for thing in found.objects:
+        _check_trajectory(thing, path)
+        for file in thing.files:
+            if (folder / file).exists():
+                own_file(folder, file, MAX_FILE_BYTES)
+    return found
+
+
+def _check_trajectory(thing: SceneObject, path: Path) -> None:
+    """Demand that all lists with one entry a frame are equally long."""
+    counts = {
+        "frames": len(thing.frames),
+        "poses_world": len(thing.poses_world),
+        "confidences": len(thing.confidences),
+        "observed": len(thing.observed),
+    }
+    given = {name: n for name, n in counts.items() if n}
+    if len(set(given.values())) > 1:
+        lengths = ", ".join(f"{n} {name}" for name, n in given.items())
+        raise V2PError(f"{path}: object '{thing.name}' has {lengths}; there must be one per frame")
 
 
 def _rounded3(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:

@@ -1,4 +1,4 @@
-"""What a `scene.json` may hold: the one place that says which fields, numbers and texts are taken from a file.
+"""The numbers, texts and paths that a JSON file may hold, and how such a file is read: `scene.json` and those like it.
 
 The limits are wide: they keep out what no video can give and what would make this engine hang. Whether a scene suits the
 robot is asked later, with sentences of its own (`sim.suitability`).
@@ -8,34 +8,25 @@ import difflib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, Gt, Le, Len
+from annotated_types import Ge, Gt, Le
 from pydantic import (
     AfterValidator,
     BaseModel,
     ConfigDict,
-    Field,
     StringConstraints,
     ValidationError,
 )
 
 from v2p_data.errors import V2PError
 from v2p_data.letters import is_shown
-from v2p_data.scene.files import is_plain_path, own_file, read_own
+from v2p_data.scene.files import is_plain_path
 
 Role = Literal["manipulated", "reference", "tool", "container", "cover"]
 Shape = Literal["box", "cylinder", "sphere", "mesh"]
 Symmetry = Literal["none", "box", "round", "sphere"]
 Observed = Literal["full", "no_depth"]
-MAX_SCENE_BYTES = 32_000_000
-"""An hour of two objects at 10 Hz."""
 MAX_FILE_BYTES = 200_000_000
 """Largest mesh or mask track."""
-MAX_OBJECTS = 20
-MAX_PARTS = 128
-"""Most parts of one object."""
-MAX_SCENE_PARTS = 512
-"""Most parts of all objects together; MuJoCo gets each in seven sizes."""
-MAX_FRAMES = 50_000
 MESH_KINDS = (".obj", ".stl", ".ply")
 ERRORS_SHOWN = 3
 
@@ -58,7 +49,7 @@ def _file_name(text: str) -> str:
     return text
 
 
-def _path_of_kind(*kinds: str) -> AfterValidator:
+def path_of_kind(*kinds: str) -> AfterValidator:
     def check(text: str) -> str:
         if text and not is_plain_path(text):
             raise ValueError(
@@ -71,14 +62,14 @@ def _path_of_kind(*kinds: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _of_unit_length(values: tuple[float, ...]) -> tuple[float, ...]:
+def of_unit_length(values: tuple[float, ...]) -> tuple[float, ...]:
     if not 0.81 < sum(v * v for v in values) < 1.21:
         raise ValueError("is not of length 1")
     return values
 
 
 def _turned(pose: tuple[float, ...]) -> tuple[float, ...]:
-    _of_unit_length(pose[3:])
+    of_unit_length(pose[3:])
     return pose
 
 
@@ -98,124 +89,19 @@ Length = Annotated[float, Gt(0), Le(1e5)]
 Vector = tuple[Place, Place, Place]
 Row4 = tuple[Entry, Entry, Entry, Entry]
 Pose = Annotated[tuple[Place, Place, Place, Place, Place, Place, Place], AfterValidator(_turned)]
-MeshPath = Annotated[str, _path_of_kind(*MESH_KINDS)]
+MeshPath = Annotated[str, path_of_kind(*MESH_KINDS)]
+
+
+STRICT = ConfigDict(
+    extra="forbid", strict=True, allow_inf_nan=False, frozen=True, hide_input_in_errors=True
+)
+"""Unknown fields, other types and numbers that are not finite are errors."""
 
 
 class FileModel(BaseModel):
-    """Part of a JSON file: unknown fields, other types and numbers that are not finite are errors."""
+    """Part of a JSON file."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, allow_inf_nan=False, frozen=True, hide_input_in_errors=True
-    )
-
-
-class MotionEntry(FileModel):
-    translation_m: Vector
-    rotation_vector_rad: Vector
-
-
-class ObjectEntry(FileModel):
-    """The fields of `SceneObject`, which says what they mean."""
-
-    name: Name
-    label: Words
-    role: Role
-    shape: Shape
-    size_m: tuple[Length, Length, Length]
-    mass_kg: Annotated[float, Gt(0), Le(1e4)]
-    friction: Annotated[float, Ge(0), Le(100)]
-    hollow: bool = False
-    mesh: MeshPath = ""
-    mesh_ply: MeshPath = ""
-    parts: Annotated[tuple[MeshPath, ...], Len(0, MAX_PARTS)] = ()
-    urdf: Annotated[str, _path_of_kind(".urdf")] = ""
-    mjcf: Annotated[str, _path_of_kind(".xml")] = ""
-    mask_track: Annotated[str, _path_of_kind(".npz")] = ""
-    symmetry: Symmetry = "none"
-    rgba: tuple[Share, Share, Share, Share] = (0.8, 0.4, 0.2, 1.0)
-    source: Annotated[dict[Words, Words], Len(0, 32)] = Field(default_factory=dict[str, str])
-    frames: Annotated[tuple[Count, ...], Len(0, MAX_FRAMES)] = ()
-    poses_world: Annotated[tuple[Pose, ...], Len(0, MAX_FRAMES)] = ()
-    confidences: Annotated[tuple[Share, ...], Len(0, MAX_FRAMES)] = ()
-    observed: Annotated[tuple[Observed, ...], Len(0, MAX_FRAMES)] = ()
-    first_to_last: MotionEntry | None = None
-    """For readers of the file; it follows from the poses."""
-
-    @property
-    def files(self) -> list[str]:
-        """The files that it names."""
-        named = (self.mesh, self.mesh_ply, self.urdf, self.mjcf, self.mask_track, *self.parts)
-        return [file for file in named if file]
-
-
-class CameraEntry(FileModel):
-    width_px: Annotated[int, Gt(0), Le(16_384)]
-    height_px: Annotated[int, Gt(0), Le(16_384)]
-    K: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]]
-    T_world_cam: tuple[Row4, Row4, Row4, Row4]
-    T_world_cams: Annotated[tuple[tuple[Row4, Row4, Row4, Row4], ...], Len(0, MAX_FRAMES)] = ()
-    crop_px: tuple[Entry, Entry, Entry, Entry] | None = None
-
-
-class PlaneEntry(FileModel):
-    normal: Annotated[tuple[float, float, float], AfterValidator(_of_unit_length)]
-    offset_m: Place
-
-
-class ConfidenceEntry(FileModel):
-    value: Share
-    reason: Words
-
-
-class SceneFile(FileModel):
-    """The fields of `Scene`, which says what they mean."""
-
-    title: Slug
-    video: Words
-    description: Words
-    kind: Name
-    objects: Annotated[tuple[ObjectEntry, ...], Len(0, MAX_OBJECTS)]
-    camera: CameraEntry
-    fps: Annotated[float, Gt(0), Le(10_000)]
-    num_frames: Count
-    confidence: Share
-    confidences: Annotated[dict[Words, ConfidenceEntry], Len(0, 32)] = Field(
-        default_factory=dict[str, ConfidenceEntry]
-    )
-    scale_spread: Annotated[float, Ge(0), Le(100)] = 0.0
-    table: PlaneEntry
-    gravity_m_s2: tuple[Place, Place, Place] = (0.0, 0.0, -9.81)
-    warnings: Annotated[tuple[Words, ...], Len(0, 200)] = ()
-    family: Annotated[str, StringConstraints(max_length=200), AfterValidator(_printable)] = ""
-    version: Literal[2] = Field(alias="schema")
-
-
-def read_scene_file(folder: Path, name: str) -> SceneFile:
-    """Return what a scene file says.
-
-    Raises:
-        V2PError: it cannot be read, was written by another version, or says what it may not.
-    """
-    data = read_own(folder, name, MAX_SCENE_BYTES)
-    path = folder / name
-    found = parsed(data, SceneFile, path, "remake it with 'v2p scene'", version_field="schema")
-    if len(found.camera.T_world_cams) not in (0, found.num_frames):
-        raise V2PError(
-            f"{path}: camera.T_world_cams has {len(found.camera.T_world_cams)} poses, but the clip has {found.num_frames} frames"
-        )
-    if len({o.name for o in found.objects}) < len(found.objects):
-        names = ", ".join(o.name for o in found.objects)
-        raise V2PError(f"{path}: two objects have one name ({names}); each needs its own")
-    if (count := sum(len(o.parts) for o in found.objects)) > MAX_SCENE_PARTS:
-        raise V2PError(
-            f"{path}: its objects have {count} parts; at most {MAX_SCENE_PARTS} can be simulated"
-        )
-    for thing in found.objects:
-        _check_trajectory(thing, path)
-        for file in thing.files:
-            if (folder / file).exists():
-                own_file(folder, file, MAX_FILE_BYTES)
-    return found
+    model_config = STRICT
 
 
 def parsed[T: FileModel](
@@ -249,7 +135,7 @@ def _told(fault: Any, kind: type[FileModel]) -> str:
     parts = [str(part) for part in fault["loc"]]
     where = ".".join(p for p in parts if not p.startswith("("))  # names of alternatives
     where = ascii(where[:200])[1:-1]
-    if fault["type"] == "extra_forbidden":
+    if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         close = difflib.get_close_matches(str(last), _fields(kind), n=1)
         return f"unknown field '{where}'" + (f" (did you mean '{close[0]}'?)" if close else "")
     words = str(fault["msg"]).removeprefix("Value error, ")
@@ -258,20 +144,7 @@ def _told(fault: Any, kind: type[FileModel]) -> str:
 
 
 def _fields(kind: type[FileModel]) -> set[str]:
-    """Return the names of all fields of a model and of the models of this file."""
-    models = (kind, *FileModel.__subclasses__())
-    return {field.alias or name for m in models for name, field in m.model_fields.items()}
-
-
-def _check_trajectory(thing: ObjectEntry, path: Path) -> None:
-    """Demand that all lists with one entry a frame are equally long."""
-    counts = {
-        "frames": len(thing.frames),
-        "poses_world": len(thing.poses_world),
-        "confidences": len(thing.confidences),
-        "observed": len(thing.observed),
-    }
-    given = {name: n for name, n in counts.items() if n}
-    if len(set(given.values())) > 1:
-        told = ", ".join(f"{n} {name}" for name, n in given.items())
-        raise V2PError(f"{path}: object '{thing.name}' has {told}; there must be one per frame")
+    """Return the names of all fields of a model and of what it consists of, as a file spells them."""
+    schema = kind.model_json_schema()
+    parts = (schema, *schema.get("$defs", {}).values())
+    return {name for part in parts for name in part.get("properties", {})}

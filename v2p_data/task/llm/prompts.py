@@ -207,8 +207,8 @@ def scene_words(scene: Scene, *, tracking: bool, shapes: bool) -> str:
                     f"| `{o.name}` | {frame} | {_numbers(pose[:3])} | {_numbers(pose[3:])} |"
                 )
             move, turn = (
-                o.first_to_last.translation_m,
-                np.degrees(o.first_to_last.rotation_vector_rad),
+                o.motion.translation_m,
+                np.degrees(o.motion.rotation_vector_rad),
             )
             distance = float(np.linalg.norm(move))
             lines.append(
