@@ -13,11 +13,9 @@ from v2p_data.errors import ItemRejectedError
 from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.data_types import Cue, GroundedObjects, ObjectTrack, PlacedObject, Placement
 from v2p_data.scene.fitting.placement import vote_of
-from v2p_data.scene.fitting.trajectory import TOUCH_PX
 from v2p_data.scene.frames.colour import balance, colour_match, named_colours
 from v2p_data.scene.frames.hand_track import contact_share
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
-from v2p_data.scene.frames.segmentation import hand_at
 from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, seen_on_table
 from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
 from v2p_data.scene.scale.nouns import is_clear
@@ -32,8 +30,6 @@ _IN_THE_AIR = 0.6
 """Confidence in an object that does not rest on the table at first; it falls from 1 where half of what that needs is seen."""
 _GOOD, _LEAST_CUE = 0.95, 0.01
 """A cue above the first needs no help; the second keeps a ratio finite."""
-_GROWN = 0.2
-"""Logarithm of the size at the beginning over the size at the end. Twelve drawn objects that rest at first all stay below it."""
 
 
 def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tuple[Cue, ...]:
@@ -141,20 +137,6 @@ def _seen_on_table(grounded: GroundedObjects) -> float:
     if thing.brought:
         seen = replace(seen, early=seen.late)
     return seen_on_table(grounded.table, thing.first, seen, **gap_px)
-
-
-def held_at_first(grounded: GroundedObjects, placement: Placement) -> bool:
-    """Return whether a hand seems to hold the manipulated object in the air when the clip begins.
-
-    Then it seems larger than where it ends, and has a hand beside it or no table under it.
-    """
-    thing = grounded.objects[0]
-    if placement.objects[0].log_growth < _GROWN:
-        return False
-    if _seen_on_table(grounded) < 1:
-        return True
-    hand = hand_at(grounded.segmentation, thing.at)
-    return bool((hand & grow(thing.first, TOUCH_PX)).any())
 
 
 def by_stage(cues: tuple[Cue, ...]) -> dict[str, tuple[float, str]]:

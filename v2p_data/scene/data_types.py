@@ -139,9 +139,6 @@ class PlacedObject:
     """Whether a hand hides it from the camera: then its poses go with the hand."""
     unseen: bool = False
     """Whether nothing shows where it ends: then it is put in the middle of its container."""
-    log_growth: float = 0.0
-    """Logarithm of how much larger it seems where it starts than where it ends, if it lies on the table at both: what is held
-    in the air is nearer to the camera, and seems larger."""
     lifted_off: bool = False
     """Whether it lies on something at first: then its last outline, on the table, shows its shape."""
     T_world_seen: Float[np.ndarray, "4 4"] | None = None

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, UInt8
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.scene.confidence import held_at_first
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import (
     Estimate,
@@ -32,8 +31,6 @@ from v2p_data.video.clip import Clip
 
 _OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 """Half a turn about x: upside down."""
-_HELD_SURE = 0.3
-"""Confidence, 0 to 1, of a first pose on the table where a hand seems to hold the object in the air."""
 _LEAST_QUALITY = 0.4
 """Quality, 0 to 1, of a mask that is kept in an object's mask track."""
 
@@ -76,9 +73,6 @@ def estimates_of(
         name = slug_for(s.phrase, taken)
         taken.add(name)
         solid = _from_outline(s, placed, made)
-        if not out and held_at_first(grounded, placement):
-            first, *rest = solid.confidences
-            solid = replace(solid, confidences=(min(first, _HELD_SURE), *rest))
         if s.known_m:  # the user's word on the size outranks the outline's
             size = three(placement.height_m * np.array(placed.first.size))
             solid = _stretched(solid, size)

@@ -3,7 +3,6 @@
 import numpy as np
 
 from v2p_data.kinds import Kind
-from v2p_data.scene.confidence import held_at_first
 from v2p_data.scene.data_types import GroundedObjects, Placement
 from v2p_data.scene.frames.hand_track import people_face
 
@@ -41,11 +40,6 @@ def remarks_on(
         out.append(
             f"a hand brings '{grounded.objects[0].phrase}': nothing shows it on the table at first; its first pose is a place that was chosen, "
             f"{100 * np.linalg.norm(way_m):.0f} cm from where it ends"
-        )
-    if held_at_first(grounded, placement):
-        out.append(
-            f"'{grounded.objects[0].phrase}' seems {np.expm1(thing.log_growth):.0%} larger at first than at the end, as if a hand held it in the "
-            "air: its first pose is where it would stand on the table"
         )
     if people_face(grounded.working.hands):
         out.append(

@@ -8,7 +8,7 @@ import difflib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Gt, Le, Len
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -88,7 +88,7 @@ Length = Annotated[float, Gt(0), Le(1e5)]
 """Metres; so many because sizes in millimetres are told of later."""
 Vector = tuple[Place, Place, Place]
 Row4 = tuple[Entry, Entry, Entry, Entry]
-Pose = Annotated[tuple[Place, Place, Place, Place, Place, Place, Place], AfterValidator(_turned)]
+Pose = Annotated[tuple[Place, ...], Len(7, 7), AfterValidator(_turned)]
 MeshPath = Annotated[str, path_of_kind(*MESH_KINDS)]
 
 

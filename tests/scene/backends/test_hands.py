@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 
 from v2p_data.errors import V2PError
-from v2p_data.geometry.camera import Camera, intrinsics
 from v2p_data.scene.backends import hands_setup
 from v2p_data.scene.backends.config import HandsConfig
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
-from v2p_data.scene.data_types import RestingObject
-from v2p_data.scene.fitting.landmark_scale import height_from_landmarks, px_per_m
-from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.frames.hand_track import HandTrack, contact_share, people_face
 from v2p_data.scene.frames.working_clip import working_clip_of
 from v2p_data.scene.grounding.by_model import track_hands
@@ -149,37 +145,6 @@ def test_a_hand_that_goes_along_touches_and_one_that_stays_away_does_not():
     assert contact_share(track(10, away), masks, moving) == 0.0
     assert contact_share(track(10, away, sampled=30), masks, moving) is None
     assert contact_share(None, masks, moving) is None
-
-
-@pytest.mark.parametrize("height_m", [0.4, 0.7])
-def test_landmarks_at_a_resting_object_give_the_camera_s_height(height_m: float):
-    shape, pitch = (240, 320), 0.6
-    camera = camera_above(shape, pitch, 0.9)
-    foot = np.array([1.4, 0.1, 0.0])  # camera heights
-    grip = foot + np.array([0, 0, 0.05 / height_m])
-    landmarks = grip + (HAND_M / height_m) @ camera.T_world_cam[:3, :3].T
-    px = np.repeat(camera.project(landmarks)[None], 6, 0)
-    u, v = camera.project(grip[None])[0].astype(int)
-    masks = np.zeros((6, *shape), bool)
-    masks[:, v - 12 : v + 12, u - 12 : u + 12] = True
-    resting = RestingObject(masks=masks, rests=[(masks[0], foot)], camera=camera, pitch_rad=pitch)
-
-    told = height_from_landmarks(track(6, px), resting, 0.5)
-
-    assert told is not None
-    assert told[0] == pytest.approx(height_m, rel=0.05)
-    assert told[1] == pytest.approx(0.22, abs=0.01)
-    assert height_from_landmarks(track(2, px[:2]), resting, 0.5) is None
-
-
-def test_the_scale_of_landmarks_is_that_of_the_picture():
-    camera = Camera(
-        width_px=640, height_px=480, K=intrinsics(640, 480, 0.8), T_world_cam=np.eye(4)
-    )
-
-    shown = px_per_m(camera.project(HAND_M + np.array([0.05, 0, 0.8])), HAND_M)
-
-    assert shown == pytest.approx(camera.K[0, 0] / 0.8, rel=0.05)
 
 
 def pointing(way: tuple[float, float], at: tuple[float, float]) -> np.ndarray:

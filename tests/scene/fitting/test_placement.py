@@ -5,19 +5,14 @@ import numpy as np
 import pytest
 
 from v2p_data.geometry.mesh import outline_points
-from v2p_data.scene.confidence import held_at_first
 from v2p_data.scene.config import SceneConfig
-from v2p_data.scene.data_types import CameraGuess, GroundedObjects, ObjectTrack
+from v2p_data.scene.data_types import CameraGuess, ObjectTrack
 from v2p_data.scene.fitting.camera_guess import with_measured_camera
 from v2p_data.scene.fitting.noun_variants import with_noun_variants
 from v2p_data.scene.fitting.object_view import hidden_around, round_body
 from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.fitting.silhouette import camera_above
-from v2p_data.scene.frames.classes import CLASSES, HAND
-from v2p_data.scene.frames.segmentation import Segmentation
-from v2p_data.scene.frames.table import find_table
 from v2p_data.scene.frames.working_clip import working_clip_of
-from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.video.clip import Clip
 
@@ -73,44 +68,6 @@ def test_what_comes_later_hides_nothing_now_but_an_arm_does():
 
     assert hidden[arm].mean() > 0.2
     assert not hidden[block(160, 100)].any()
-
-
-@pytest.mark.parametrize(
-    ("above", "by_a_hand", "held"),
-    [(0.3, True, True), (0.3, False, False), (0.0, True, False)],
-)
-def test_a_cup_that_a_hand_holds_in_the_air_at_first_is_told_from_one_that_stands(
-    above: float, by_a_hand: bool, held: bool
-):
-    way = [cup_at(1.15, 0.25 - 0.5 * k / 23, above * (1 - k / 23)) for k in range(24)]
-    frames = np.full((24, H, W, 3), 150, np.uint8)
-    for frame, outline in zip(frames, way, strict=True):
-        frame[outline] = 200, 30, 30
-    working = working_clip_of(filmed(frames))
-    thing = ObjectTrack(
-        phrase="cup", role="manipulated", noun=noun_for("cup"), masks=np.stack(way), quality=np.ones(24), moves=True,
-        at=0, known_m=None, sure=0.9, why="",
-    )  # fmt: skip
-    guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV)
-    shares = np.zeros((24, len(CLASSES), H, W), np.float32)
-    if by_a_hand:
-        x = int(np.nonzero(way[0])[1].min())
-        shares[:, HAND, :100, x - 20 : x] = 1
-    segmentation = Segmentation(
-        idx=np.arange(24), shares=shares, early=shares[0], late=shares[-1],
-        camera=SeenCamera(
-            pitch_rad=PITCH, pitch_sd_rad=0.1, focal_widths=1.0, table_width_m=0.8, table_width_sd=0.2
-        ),
-    )  # fmt: skip
-    table = find_table(working.always, np.ones((H, W), bool))
-    grounded = GroundedObjects(
-        objects=(thing,), working=working, table=table, segmentation=segmentation, warnings=()
-    )
-
-    placement = place(working, (thing,), "place_onto", guess, 10)
-
-    assert (placement.objects[0].log_growth > 0.2) == (above > 0)
-    assert held_at_first(grounded, placement) == held
 
 
 def outline_of(noun, size, x: float, y: float, above: float = 0.0) -> np.ndarray:

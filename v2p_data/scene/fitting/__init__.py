@@ -10,7 +10,7 @@ Reading order:
     silhouette, shape_fit, cuboid_network   one shape under one outline; how a box is turned
     end_poses, trajectory           poses at both ends, and between
     tool_pose, place_tool           a tool in a hand
-    hand_scale, landmark_scale      the hand as a ruler, by its look and by its landmarks
+    hand_scale      the hand as a ruler
     refine_pose     the last pose once more, with the mesh
     ring_mask       the hole of a ring
     metric          camera heights become metres

@@ -17,8 +17,6 @@ from v2p_data.scene.scale.nouns import Noun
 
 UNSEEN_IOU = 0.35
 """IoU: an outline at the end that the object covers no better shows something else."""
-_HAS_ITS_SHAPE = 0.8
-"""IoU: an outline that the object covers no better tells no size."""
 _LYING_TELLS = 0.1
 """IoU by which lying on the table at first must fit a lid better than lying on what it covered."""
 _HELD_TELLS = 0.1
@@ -39,8 +37,6 @@ class EndPoses:
     """What standing as at first would have cost at the end."""
     unseen: bool = False
     """Whether the goal hides where it ends."""
-    log_growth: float = 0.0
-    """Logarithm of how much larger it seems at first than at the end."""
     lifted_off: bool = False
     """Whether it lies on the other object at first."""
 
@@ -149,16 +145,6 @@ def fit_lifted_off(see: ObjectView, lying: EndPoses, other_fit: Fit, camera: Cam
     if first.cost + last.cost > lying.first.cost + lying.last.cost + _LYING_TELLS:
         return lying
     return replace(lying, first=first, last=last, lifted_off=True)
-
-
-def log_growth(see: ObjectView, fits: EndPoses, camera: Camera) -> float:
-    """Return the logarithm of how much larger an object is at first than its last outline says by itself, as far as that has its shape."""
-    rest = rest_of(fits.last.T_world_obj[:3, :3])
-    silhouette = Silhouette(*round_body(see.last_mask, see.last_hidden, see.s.noun), camera)
-    alone = fit_shape(silhouette, see.s.noun, rest, thorough=False)
-    if alone.iou < _HAS_ITS_SHAPE:
-        return 0.0
-    return float(np.log(np.array(fits.first.size) / np.array(alone.size)).mean())
 
 
 def goal_of(

@@ -112,6 +112,5 @@ def placed_along(see: ObjectView, fits: EndPoses, trajectory: Trajectory) -> Pla
         observed=tuple(trajectory.observed),
         rival=fits.rival,
         unseen=fits.unseen,
-        log_growth=fits.log_growth,
         lifted_off=fits.lifted_off,
     )

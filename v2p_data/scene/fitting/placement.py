@@ -25,9 +25,7 @@ from v2p_data.scene.fitting.end_poses import (
     fit_lifted_off,
     goal_of,
     is_lid,
-    log_growth,
 )
-from v2p_data.scene.fitting.landmark_scale import height_from_landmarks
 from v2p_data.scene.fitting.object_view import ObjectView, object_view
 from v2p_data.scene.fitting.pitch import best_pitch
 from v2p_data.scene.fitting.place_tool import SeenIn, place_tool, placed_along
@@ -75,8 +73,8 @@ def place(
     height_m, spread = camera_height_m(votes, known)
     if len(resting) == len(objects):
         resting_object = _resting_object(views[0], fits[0], plan, camera, pitch_rad)
-        if told := _told_by_hand(working, segmentation, resting_object, height_m):
-            height_m, spread = camera_height_m(votes, [*known, *told])
+        if by_hand := _height_by_hand(working, segmentation, resting_object, height_m):
+            height_m, spread = camera_height_m(votes, [*known, by_hand])
     seen_in = SeenIn(working=working, segmentation=segmentation)
     placed: list[PlacedObject] = []
     for k, see in enumerate(views):
@@ -97,23 +95,20 @@ def place(
     )
 
 
-def _told_by_hand(
+def _height_by_hand(
     working: WorkingClip,
     segmentation: Segmentation | None,
     resting: RestingObject,
     height_m: float,
-) -> list[tuple[float, float]]:
-    """Return what a hand that touches the object at rest says of the camera's height, with spreads: by its look and by its landmarks."""
-    told = []
-    if segmentation is not None:
-        from v2p_data.scene.fitting.hand_scale import (
-            height_from_hand,  # torch takes a second to import
-        )
+) -> tuple[float, float] | None:
+    """Return the camera's height [m] by the hand that touches the object at rest, and its spread; None where no hand says it."""
+    if segmentation is None:
+        return None
+    from v2p_data.scene.fitting.hand_scale import (
+        height_from_hand,  # torch takes a second to import
+    )
 
-        told.append(height_from_hand(working, segmentation, resting, height_m))
-    if working.hands is not None:
-        told.append(height_from_landmarks(working.hands, resting, height_m))
-    return [vote for vote in told if vote is not None]
+    return height_from_hand(working, segmentation, resting, height_m)
 
 
 def _manipulated(
@@ -130,8 +125,6 @@ def _manipulated(
     out = fit_both_ends(see, plan, camera, support, within)
     if plan.starts_on_other and 1 in fits and is_lid(see.s.noun):
         out = fit_lifted_off(see, out, fits[1].first, camera)
-    if plan.end == "on_table" and not out.unseen and not see.s.brought:
-        out = replace(out, log_growth=log_growth(see, out, camera))
     return out
 
 

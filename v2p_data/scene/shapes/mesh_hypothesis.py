@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 
-Kind = Literal["primitive", "revolution", "inflated", "spoon"]
+Kind = Literal["primitive", "revolution", "inflated"]
 Size = tuple[float, float, float]
 
 

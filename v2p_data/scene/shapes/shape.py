@@ -21,10 +21,7 @@ from v2p_data.scene.shapes.inflation import inflation
 from v2p_data.scene.shapes.mesh_hypothesis import Kind, MeshHypothesis, Size, iou_of
 from v2p_data.scene.shapes.revolved import revolution
 from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
-from v2p_data.scene.shapes.spoon import is_spoon, spoons
 
-_OTHER_END = 0.03
-"""By so much, in units of IoU, a spoon must cover its outline better with its bowl at the end at which hands hold spoons."""
 _OTHER_SIDES = 1.8
 """An inflated silhouette's sides are at most by this factor others than the fitted primitive's."""
 
@@ -93,7 +90,7 @@ def best_shape(
     """
     cfg = cfg or ShapeConfig()
     crops = [SilhouetteCrop(view, camera) for view in views]
-    primitive = _spoon(views, crops, size_m) if is_spoon(noun) else _primitive(size_m, noun)
+    primitive = _primitive(size_m, noun)
     plain = iou_of(primitive, views, crops)
     hidden = crops[0].hidden_share(crops[0].drawn(primitive.mesh, views[0].T_world_obj))
     best, best_iou, best_gain = primitive, plain, 0.0
@@ -144,15 +141,6 @@ def _primitive(size_m: Size, noun: Noun) -> MeshHypothesis:
     )
 
 
-def _spoon(
-    views: Sequence[SilhouetteView], crops: list[SilhouetteCrop], size_m: Size
-) -> MeshHypothesis:
-    """Return the spoon with its bowl at the end that covers the outlines better."""
-    held, other = spoons(size_m, views[0].T_world_obj)
-    gain = iou_of(other, views, crops) - iou_of(held, views, crops)
-    return other if gain > _OTHER_END else held
-
-
 def _others(
     view: SilhouetteView, crop: SilhouetteCrop, size_m: Size, noun: Noun, cfg: ShapeConfig
 ) -> list[tuple[MeshHypothesis, float]]:
@@ -171,7 +159,7 @@ def _others(
             )
         found.append((revolution(view, body, size_m, noun), margin))
     if not noun.hollow and noun.symmetry != "sphere" and not crop.at_border:
-        irregular = noun.form == "box" and noun.symmetry == "none" and not is_spoon(noun)
+        irregular = noun.form == "box" and noun.symmetry == "none"
         margin = cfg.irregular_margin if irregular else cfg.regular_margin
         found.append((inflation(view, crop, size_m), margin))
     return [(candidate, margin) for candidate, margin in found if candidate is not None]
@@ -184,8 +172,6 @@ def _as_large(shape: MeshHypothesis, size_m: Size) -> bool:
 
 
 def _word(noun: Noun) -> str:
-    if is_spoon(noun):
-        return "spoon"
     if noun.bore:
         return "ring"
     hollow = "hollow " if noun.hollow else ""
