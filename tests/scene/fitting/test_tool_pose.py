@@ -1,18 +1,15 @@
 """A block is pushed over a table with a stick; the hand hides the stick's upper third."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 
 from v2p_data.geometry.mesh import outline_points
 from v2p_data.geometry.pose import transform
-from v2p_data.scene.data_types import Fit
+from v2p_data.scene.data_types import Fit, ObjectTrack, PlacedObject
 from v2p_data.scene.fitting.shape_fit import three
 from v2p_data.scene.fitting.silhouette import Silhouette, camera_above
-from v2p_data.scene.fitting.tool_pose import Pushed, PushMotion, fit_tool_pose, push_motion
-from v2p_data.scene.fitting.trajectory import Trajectory
+from v2p_data.scene.fitting.tool_pose import PushMotion, fit_tool, push_motion
 from v2p_data.scene.frames.classes import CLASSES, HAND
 from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.scale.camera_height import SeenCamera
@@ -26,14 +23,21 @@ SIDE = 0.1
 FROM, TO = np.array([1.2, 0.25]), np.array([1.3, -0.15])
 
 
-def block() -> tuple[Trajectory, Fit]:
-    """Return the block's poses: it moves in frames 5 to 15."""
-    poses = [
-        transform(np.eye(3), np.array([*(FROM + share * (TO - FROM)), SIDE / 2]))
-        for share in np.clip((np.arange(FRAMES) - 5) / 10, 0, 1)
-    ]
+def block(*, still: bool = False) -> PlacedObject:
+    """Return the block with its poses: it moves in frames 5 to 15."""
+    poses = np.stack(
+        [
+            transform(np.eye(3), np.array([*(FROM + share * (TO - FROM)), SIDE / 2]))
+            for share in np.clip((np.arange(FRAMES) - 5) / 10, 0, 0 if still else 1)
+        ]
+    )
     fit = Fit(size=(SIDE, SIDE, SIDE), T_world_obj=poses[0], iou=0.9, visible=1.0, cost=0.1)
-    return Trajectory(list(range(FRAMES)), poses, [1.0] * FRAMES, ["full"] * FRAMES), fit
+    nothing = np.zeros((H, W), bool)
+    return PlacedObject(
+        first=fit, last=fit, last_i=FRAMES - 1, last_mask=nothing, hidden=nothing, last_hidden=nothing,
+        frames=tuple(range(FRAMES)), T_world_objs=poses, confidences=(1.0,) * FRAMES, observed=("full",) * FRAMES,
+        rival=None,
+    )  # fmt: skip
 
 
 def arm_from(spot: np.ndarray) -> Segmentation:
@@ -51,16 +55,17 @@ def arm_from(spot: np.ndarray) -> Segmentation:
     )
 
 
-def pushed(segmentation: Segmentation | None = None) -> PushMotion:
-    trajectory, fit = block()
-    return push_motion(
-        Pushed(trajectory=trajectory, fit=fit, form="box"),
-        FRAMES,
-        np.zeros(2),
-        CAMERA,
-        HEIGHT_M,
-        segmentation,
-    )
+def pushed(
+    segmentation: Segmentation | None = None, tool_xy: np.ndarray = FROM, *, still: bool = False
+) -> PushMotion:
+    masks = np.zeros((FRAMES, H, W), bool)
+    u, v = CAMERA.project(np.array([[*tool_xy, 0.0]]))[0].round().astype(int)
+    masks[:, v - 1 : v + 2, u - 1 : u + 2] = True
+    tool = ObjectTrack(
+        phrase="stick", role="tool", noun=STICK, masks=masks, quality=np.ones(FRAMES), moves=True, at=0, known_m=None,
+        sure=1.0, why="",
+    )  # fmt: skip
+    return push_motion(block(still=still), "box", tool, CAMERA, HEIGHT_M, segmentation)
 
 
 def stick(
@@ -68,21 +73,20 @@ def stick(
 ) -> tuple[np.ndarray, tuple[float, float, float]]:
     """Return the stick's pose when the block is where it was at first, and its size."""
     size = np.array(STICK.size_m) / HEIGHT_M * (longer, 1, 1)
-    tip = np.array([*(push.spots[0] + push.behind), push.tip_height])
     level = np.array([np.cos(yaw), np.sin(yaw), 0])
     along = np.cos(tilt) * level + np.array([0, 0, np.sin(tilt)])
     side = np.cross([0, 0, 1], level)
     R = np.stack([along, side, np.cross(along, side)], 1)
-    return transform(R, tip + along * size[0] / 2), three(size)
+    return transform(R, push.tip + along * size[0] / 2), three(size)
 
 
-def seen(T: np.ndarray, size: tuple[float, float, float], shift: np.ndarray) -> Silhouette:
+def seen(T: np.ndarray, size: tuple[float, float, float], gone: np.ndarray) -> Silhouette:
     """Return the outline of the stick as far as a hand leaves it free."""
-    points = outline_points("box", size) @ T[:3, :3].T + T[:3, 3] + [*shift, 0]
+    points = outline_points("box", size) @ T[:3, :3].T + T[:3, 3] + gone
     mask = np.zeros((H * 8, W * 8), np.uint8)
     cv2.fillConvexPoly(mask, cv2.convexHull((CAMERA.project(points) * 8).astype(np.int32)), 1)
     whole = cv2.resize(mask, (W, H), interpolation=cv2.INTER_AREA) > 0
-    grip = CAMERA.project((T[:3, 3] + 0.35 * size[0] * T[:3, 0] + [*shift, 0])[None])[0]
+    grip = CAMERA.project((T[:3, 3] + 0.35 * size[0] * T[:3, 0] + gone)[None])[0]
     hand = np.zeros((H, W), np.uint8)
     cv2.circle(hand, grip.round().astype(int).tolist(), 11, 1, -1)
     return Silhouette(whole & (hand == 0), hand > 0, CAMERA)
@@ -92,27 +96,18 @@ def test_a_push_begins_and_ends_with_the_motion_and_comes_from_behind():
     push = pushed(arm_from(np.array([0.9, 0.5, 0.1])))
 
     assert push.frames == (5, 15)
-    np.testing.assert_allclose(push.way, (TO - FROM) / np.linalg.norm(TO - FROM), atol=1e-6)
-    assert push.behind @ push.way == pytest.approx(-SIDE / 2 * np.abs(push.way).sum())
+    way = (TO - FROM) / np.linalg.norm(TO - FROM)
+    assert push.back_rad == pytest.approx(np.arctan2(*(-way[::-1])))
+    assert (push.tip[:2] - FROM) @ way == pytest.approx(-SIDE / 2 * np.abs(way).sum())
     assert push.arm_rad is not None
     assert np.sin(push.arm_rad) > 0.5  # from the left
 
 
 def test_what_goes_nowhere_is_pushed_from_where_the_tool_is():
-    trajectory, fit = block()
-    still = replace(trajectory, poses=[trajectory.poses[0]] * FRAMES)
-
-    push = push_motion(
-        Pushed(trajectory=still, fit=fit, form="box"),
-        FRAMES,
-        FROM - [0.4, 0],
-        CAMERA,
-        HEIGHT_M,
-        None,
-    )
+    push = pushed(tool_xy=FROM - [0.4, 0], still=True)
 
     assert push.frames == (0, FRAMES - 1)
-    np.testing.assert_allclose(push.way, [1, 0], atol=1e-6)
+    assert abs(push.back_rad) == pytest.approx(np.pi, abs=0.02)
     assert push.arm_rad is None
 
 
@@ -122,28 +117,13 @@ def test_a_stick_is_found_tip_down_behind_the_block_with_the_length_that_is_seen
 ):
     push = pushed()
     T, size = stick(push, yaw, tilt, longer)
-    views = [(i, seen(T, size, push.spots[i] - push.spots[0])) for i in (5, 10, 15)]
+    views = [(push.gone[i], seen(T, size, push.gone[i])) for i in (5, 10, 15)]
 
-    held = fit_tool_pose(
-        views, push, STICK, three(np.array(STICK.size_m) / HEIGHT_M), STICK.spread
-    )
+    usual = three(np.array(STICK.size_m) / HEIGHT_M)
 
-    assert float(held.fit.T_world_obj[:3, 0] @ T[:3, 0]) > np.cos(np.radians(15))
-    assert held.fit.size[0] == pytest.approx(size[0], rel=0.15)
-    np.testing.assert_allclose(held.fit.T_world_obj[:3, 3], T[:3, 3], atol=0.07)
-    np.testing.assert_allclose(held.T_world_seen, held.fit.T_world_obj, atol=1e-9)
-    assert held.fit.iou > 0.6
+    held = fit_tool(views, push, STICK, usual, STICK.spread, HEIGHT_M)
 
-
-def test_what_is_seen_only_before_it_pushes_is_put_behind_the_block_with_the_same_turn():
-    """It is seen 8 cm away from there."""
-    push = pushed()
-    T, size = stick(push, 2.4, 0.5, 1.0)
-    away = np.array([-0.05, 0.15])
-
-    held = fit_tool_pose([(2, seen(T, size, away))], push, STICK, size, STICK.spread)
-
-    tip = held.fit.T_world_obj[:3, 3] - held.fit.T_world_obj[:3, 0] * held.fit.size[0] / 2
-    np.testing.assert_allclose(tip[:2], FROM + push.behind, atol=1e-6)
-    np.testing.assert_allclose(held.T_world_seen[:3, 3], T[:3, 3] + [*away, 0], atol=0.1)
-    assert float(held.fit.T_world_obj[:3, 0] @ T[:3, 0]) > np.cos(np.radians(30))
+    assert float(held.T_world_obj[:3, 0] @ T[:3, 0]) > np.cos(np.radians(15))
+    assert held.size[0] == pytest.approx(size[0], rel=0.15)
+    np.testing.assert_allclose(held.T_world_obj[:3, 3], T[:3, 3], atol=0.07)
+    assert held.iou > 0.6

@@ -9,7 +9,7 @@ Reading order:
     object_view, noun_variants      what is seen of an object at both ends, and which form its noun has
     silhouette, shape_fit, cuboid_network   one shape under one outline; how a box is turned
     end_poses, trajectory           poses at both ends, and between
-    tool_pose, place_tool           a tool in a hand
+    tool_pose                       a tool in a hand
     hand_scale      the hand as a ruler
     refine_pose     the last pose once more, with the mesh
     ring_mask       the hole of a ring

@@ -8,11 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform
-from v2p_data.scene.data_types import Fit, ObjectTrack
+from v2p_data.scene.data_types import Fit, ObjectTrack, PlacedObject
 from v2p_data.scene.fitting.object_view import MOUTH_DOWN, ObjectView, round_body
 from v2p_data.scene.fitting.plans import FitPlan
 from v2p_data.scene.fitting.shape_fit import Within, fit_lifted, fit_pose, fit_shape, three, yaw_of
 from v2p_data.scene.fitting.silhouette import Silhouette
+from v2p_data.scene.fitting.trajectory import Trajectory
 from v2p_data.scene.scale.nouns import Noun
 
 UNSEEN_IOU = 0.35
@@ -66,6 +67,25 @@ def fit_both_ends(
         rival=float(np.partition(costs, 1)[1] - min(costs)) if len(costs) > 1 else None,
         as_before=as_before,
         unseen=unseen and within is not None,
+    )
+
+
+def placed_along(see: ObjectView, fits: EndPoses, trajectory: Trajectory) -> PlacedObject:
+    """Return an object with its poses."""
+    return PlacedObject(
+        first=fits.first,
+        last=fits.last,
+        last_i=see.last_i,
+        last_mask=see.last_mask,
+        hidden=see.hidden,
+        last_hidden=see.last_hidden,
+        frames=tuple(trajectory.frames),
+        T_world_objs=np.stack(trajectory.poses),
+        confidences=tuple(trajectory.sure),
+        observed=tuple(trajectory.observed),
+        rival=fits.rival,
+        unseen=fits.unseen,
+        lifted_off=fits.lifted_off,
     )
 
 

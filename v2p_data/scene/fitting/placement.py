@@ -25,12 +25,13 @@ from v2p_data.scene.fitting.end_poses import (
     fit_lifted_off,
     goal_of,
     is_lid,
+    placed_along,
 )
 from v2p_data.scene.fitting.object_view import ObjectView, object_view
 from v2p_data.scene.fitting.pitch import best_pitch
-from v2p_data.scene.fitting.place_tool import SeenIn, place_tool, placed_along
 from v2p_data.scene.fitting.plans import TOOL, FitPlan, plan_of
 from v2p_data.scene.fitting.silhouette import camera_above
+from v2p_data.scene.fitting.tool_pose import place_tool
 from v2p_data.scene.fitting.trajectory import (
     Trajectory,
     carried_by_hand,
@@ -75,13 +76,13 @@ def place(
         resting_object = _resting_object(views[0], fits[0], plan, camera, pitch_rad)
         if by_hand := _height_by_hand(working, segmentation, resting_object, height_m):
             height_m, spread = camera_height_m(votes, [*known, by_hand])
-    seen_in = SeenIn(working=working, segmentation=segmentation)
     placed: list[PlacedObject] = []
     for k, see in enumerate(views):
         if k == 0 and carried:
             placed.append(_hidden_in_hand(see, fits[k], carried, camera))
         elif see.s.in_hand:
-            placed.append(place_tool(see, thing, placed[0], camera, height_m, seen_in, max_poses))
+            tool = place_tool(see, thing, placed[0], camera, height_m, working, segmentation)
+            placed.append(tool)
         else:
             trajectory = _trajectory(see, fits[k], plan, camera, max_poses)
             placed.append(placed_along(see, fits[k], trajectory))

@@ -6,6 +6,7 @@ alone is ambiguous (faces swap, flat things thicken), so the noun's proportions 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -56,11 +57,19 @@ def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
     return [(upright, 0.0), (lying, cost), (on_side, cost)]
 
 
+class Outline(Protocol):
+    """What a shape is compared with: one `Silhouette`, or several."""
+
+    def iou(self, points_world: Float[np.ndarray, "n 3"], hidden_weight: float = 0.0) -> float: ...
+    def visible(self, points_world: Float[np.ndarray, "n 3"]) -> float: ...
+    def appearance_cost(self, form: str, size: np.ndarray, T_world_obj: np.ndarray) -> float: ...
+
+
 @dataclass(frozen=True, kw_only=True)
-class _Fitting:
+class Fitting:
     """A shape under an outline, with the numbers that are searched for."""
 
-    silhouette: Silhouette
+    silhouette: Outline
     noun: Noun
     posed: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     """Size and pose `T_world_obj` for these numbers."""
@@ -119,7 +128,7 @@ def fit_shape(
         off = (v[3:] - v[3:].mean()) / spread
         return _PRIOR_WEIGHT * float((off**2).sum())
 
-    fitting = _Fitting(
+    fitting = Fitting(
         silhouette=silhouette, noun=noun, posed=posed, outline=lambda size: unit * size, held=held
     )
     starts = [
@@ -167,7 +176,7 @@ def fit_pose(
             cost += max(0.0, outside) / max(within.radius, 0.5 * reach)
         return cost
 
-    fitting = _Fitting(
+    fitting = Fitting(
         silhouette=silhouette, noun=noun, posed=posed, outline=lambda _: points, held=held
     )
     turns = _yaw_starts(noun, rest, thorough=True)
@@ -204,7 +213,7 @@ def fit_lifted(
         place = np.array([T_first[0, 3], start[1] + v[0] * reach, height])
         return extents, transform(turned, place)
 
-    fitting = _Fitting(
+    fitting = Fitting(
         silhouette=silhouette,
         noun=noun,
         posed=posed,
