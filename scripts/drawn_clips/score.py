@@ -24,7 +24,6 @@ from drawn_clips.score_types import (
     TrueThing,
 )
 from drawn_clips.shape_overlap import fitting_turns, iou, opening, shape_ious
-from v2p_data.geometry.mesh import mesh_for
 from v2p_data.geometry.pose import angle_between, apply, inverse
 from v2p_data.kinds import KINDS
 from v2p_data.scene.data_types import Reconstruction
@@ -43,9 +42,7 @@ def found_of(reconstruction: Reconstruction) -> FoundClip:
         noun = thing.noun
         mesh = thing.mesh
         # What arches is no vessel: a spoon has room under its handle.
-        hollow = noun.hollow and (mesh is None or opening(mesh) is not None)
-        if mesh is None:
-            mesh = mesh_for(noun.form, thing.size_m, hollow=hollow, taper=noun.taper)
+        hollow = noun.hollow and opening(mesh) is not None
         things.append(
             FoundThing(
                 phrase=thing.label,

@@ -13,7 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
-from v2p_data.geometry.mesh import lathe, lathe_parts
+from v2p_data.geometry.mesh import lathe, lathe_parts, mesh_for, parts_for
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Estimate, Reconstruction
 from v2p_data.scene.export import write_scene
@@ -30,6 +30,12 @@ BOWL = np.array([(0.03, -0.03), (0.06, -0.02), (0.075, 0.0), (0.08, 0.03)])
 def estimate(name: str, *, at: float, last: np.ndarray | None = None, **given) -> Estimate:
     noun = noun_for(name)
     size = given.pop("size_m", noun.size_m)
+    given = {
+        "shape": "mesh",
+        "mesh": mesh_for(noun.form, size, hollow=noun.hollow),
+        "parts": parts_for(noun.form, size, hollow=noun.hollow),
+        **given,
+    }
     first = transform(np.eye(3), np.array([0.0, at, size[2] / 2]))
     poses = np.stack([first, first, first if last is None else last])
     mask = np.zeros((24, 32), bool)
@@ -91,7 +97,7 @@ def reconstruction() -> Reconstruction:
                 parts=lathe_parts(BOWL, 0.004),
                 symmetry="round",
             ),
-            estimate("box", at=0.6, symmetry="box"),
+            estimate("box", at=0.6, symmetry="box", shape="box"),
             estimate("tray", at=-0.4),
         ),
         camera=camera_above((48, 64), 0.61, 1.01, 0.5),

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from v2p_data.geometry.mesh import outline_points, revolution
+from v2p_data.geometry.mesh import mesh_for, outline_points, parts_for, revolution
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.data_types import Estimate, Reconstruction
 from v2p_data.scene.fitting.silhouette import camera_above
@@ -51,6 +51,9 @@ def pushed(draw):
         masks={i: masks[i] > 0 for i in frames},
         source={},
         mass_kg=0.1,
+        shape="box",
+        mesh=mesh_for("box", BOX_M),
+        parts=parts_for("box", BOX_M),
     )
     return Reconstruction(
         clip=draw(num_frames=NUM_FRAMES),

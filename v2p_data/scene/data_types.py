@@ -17,7 +17,7 @@ from v2p_data.scene.frames.table import Table
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.scale.camera_height import table_width_m
 from v2p_data.scene.scale.nouns import Noun
-from v2p_data.scene.schema import Observed, Role, Symmetry
+from v2p_data.scene.schema import Observed, Role, Shape, Symmetry
 from v2p_data.video.clip import Clip
 
 
@@ -206,10 +206,12 @@ class Estimate:
     source: dict[str, str]
     """Where size, mass and friction come from, in words."""
     mass_kg: float
-    mesh: trimesh.Trimesh | None = field(default=None, repr=False)
-    """Best mesh, own frame, centred on its bounding box [m]; None means the noun's primitive of this size."""
-    parts: tuple[trimesh.Trimesh, ...] = field(default=(), repr=False)
-    """Convex solids that collide for `mesh`, in the same frame; empty where only the hull is known."""
+    shape: Shape
+    """A primitive where that says all, else `mesh`."""
+    mesh: trimesh.Trimesh = field(repr=False)
+    """In its own frame, centred on its bounding box [m]."""
+    parts: tuple[trimesh.Trimesh, ...] = field(repr=False)
+    """Convex solids that collide for `mesh`, in the same frame."""
     symmetry: Symmetry = "none"
     observed: tuple[Observed, ...] = ()
     """Per pose whether one view shows its depth; empty means that all are fully observed."""

@@ -9,6 +9,7 @@ import trimesh
 from jaxtyping import Bool, Float, UInt8
 
 from v2p_data.geometry.camera import Camera
+from v2p_data.geometry.mesh import mesh_for, parts_for
 from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import (
@@ -25,12 +26,14 @@ from v2p_data.scene.fitting.shape_fit import three
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.meshes import MeshedObject
 from v2p_data.scene.scale.nouns import Noun
-from v2p_data.scene.schema import Observed
+from v2p_data.scene.schema import Observed, Shape
 from v2p_data.scene.shapes.by_worker import mesh_by_worker
 from v2p_data.video.clip import Clip
 
 _OVER = np.diag([1.0, -1.0, -1.0, 1.0])
 """Half a turn about x: upside down."""
+_STRAIGHT = 0.06
+"""Tapers by less than this share are simulated as cylinders."""
 _LEAST_QUALITY = 0.4
 """Quality, 0 to 1, of a mask that is kept in an object's mask track."""
 
@@ -43,7 +46,7 @@ class _Solid:
     mesh: trimesh.Trimesh
     parts: tuple[trimesh.Trimesh, ...]
     is_primitive: bool
-    """Whether the noun's primitive of this size says all: then no mesh is written."""
+    """Whether the mesh is the noun's primitive of this size."""
     T_world_objs: Float[np.ndarray, "pose 4 4"]
     frames: tuple[int, ...]
     """Working frames with a pose."""
@@ -75,7 +78,7 @@ def estimates_of(
         solid = _from_outline(s, placed, made)
         if s.known_m:  # the user's word on the size outranks the outline's
             size = three(placement.height_m * np.array(placed.first.size))
-            solid = _stretched(solid, size)
+            solid = _stretched(solid, s.noun, size)
         if s.noun.hollow and s.role in ("manipulated", "cover") and KINDS[kind].has_cover:
             solid = _mouth_down(solid)
         if cfg.mesh.worker:
@@ -118,8 +121,14 @@ def _from_outline(s: ObjectTrack, placed: PlacedObject, made: MeshedObject) -> _
     )
 
 
-def _stretched(solid: _Solid, size_m: tuple[float, float, float]) -> _Solid:
+def _stretched(solid: _Solid, noun: Noun, size_m: tuple[float, float, float]) -> _Solid:
     """Return the mesh and its parts brought to these extents."""
+    if solid.is_primitive:
+        mesh, *parts = (
+            mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
+            *parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
+        )
+        return replace(solid, size_m=size_m, mesh=mesh, parts=tuple(parts))
     T = np.diag([*(np.array(size_m) / solid.mesh.extents), 1.0])
     mesh, *parts = (one.copy().apply_transform(T) for one in (solid.mesh, *solid.parts))
     return replace(solid, size_m=size_m, mesh=mesh, parts=tuple(parts))
@@ -193,11 +202,19 @@ def _estimate(
         masks=masks,
         source={**_sources(s), "shape": solid.source},
         mass_kg=_mass(s.noun, solid.size_m),
-        mesh=None if solid.is_primitive else solid.mesh,
-        parts=() if solid.is_primitive else solid.parts,
+        shape=_shape_of(solid, s.noun),
+        mesh=solid.mesh,
+        parts=solid.parts or (solid.mesh.convex_hull,),
         symmetry=s.noun.symmetry,
         observed=solid.observed,
     )
+
+
+def _shape_of(solid: _Solid, noun: Noun) -> Shape:
+    """Return the primitive that says all of an object, or `mesh`."""
+    if not solid.is_primitive or noun.hollow:
+        return "mesh"
+    return "mesh" if noun.form == "cylinder" and abs(noun.taper - 1) >= _STRAIGHT else noun.form
 
 
 def _mask_track(

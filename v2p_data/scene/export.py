@@ -16,7 +16,7 @@ import trimesh
 from jaxtyping import Float
 
 from v2p_data.geometry.camera import mujoco_xyaxes, poses_over_table
-from v2p_data.geometry.mesh import mass_properties, mesh_for, parts_for, write_obj, write_ply
+from v2p_data.geometry.mesh import mass_properties, mesh_for, write_obj, write_ply
 from v2p_data.geometry.pose import pose_from_transform
 from v2p_data.scene.data_types import Estimate, Reconstruction
 from v2p_data.scene.files import own_file
@@ -28,7 +28,7 @@ from v2p_data.scene.scene import (
     friction_attribute,
     write_masks,
 )
-from v2p_data.scene.schema import MAX_FILE_BYTES, Shape
+from v2p_data.scene.schema import MAX_FILE_BYTES
 
 MJCF_FILE = "scene.xml"
 
@@ -198,19 +198,11 @@ def _urdf_mesh(link: ET.Element, use: str, file: str) -> ET.Element:
 
 def _write_object(thing: Estimate, folder: Path) -> _Body:
     noun, name = thing.noun, thing.name
-    if thing.mesh is None:
-        mesh = mesh_for(noun.form, thing.size_m, hollow=noun.hollow, taper=noun.taper)
-        parts = parts_for(noun.form, thing.size_m, hollow=noun.hollow, taper=noun.taper)
-        simple = not noun.hollow and (noun.form != "cylinder" or abs(noun.taper - 1) < 0.06)
-    else:
-        mesh, simple = thing.mesh, False
-        parts = thing.parts or (mesh.convex_hull,)
-    shape: Shape = noun.form if simple else "mesh"
     written = SceneObject(
         name=name,
         label=thing.label,
         role=thing.role,
-        shape=shape,
+        shape=thing.shape,
         size_m=thing.size_m,
         mass_kg=thing.mass_kg,
         friction=noun.friction,
@@ -231,7 +223,7 @@ def _write_object(thing: Estimate, folder: Path) -> _Body:
         observed=thing.observed or ("full",) * len(thing.frames),
     )
     write_masks(folder / written.mask_track, thing.masks)
-    return _write_models(written, mesh, parts, folder)
+    return _write_models(written, thing.mesh, thing.parts, folder)
 
 
 def _write_models(

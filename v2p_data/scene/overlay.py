@@ -13,11 +13,9 @@ import cv2
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation, Slerp
 
 from v2p_data.geometry.camera import Camera
-from v2p_data.geometry.mesh import outline_points
 from v2p_data.scene.data_types import Estimate, Reconstruction
 
 LONG_SIDE_PX = 640
@@ -144,30 +142,8 @@ def _draw_shape(
     colour: Colour,
 ) -> Box | None:
     """Draw shape and axes; return where in the picture the shape is, None if it is out of sight."""
-    points = (
-        outline_points(thing.noun.form, thing.size_m, thing.noun.taper)
-        if thing.mesh is None
-        else np.asarray(thing.mesh.vertices)
-    )
-    world = points @ T[:3, :3].T + T[:3, 3]
-    pixels = camera.project(world)
-    if thing.mesh is not None:
-        _draw_mesh(image, thing.mesh, pixels, colour)
-    elif thing.noun.form == "box":
-        depth = np.linalg.norm(world - camera.T_world_cam[:3, 3], axis=1)
-        behind = int(depth.argmax())
-        for i in range(8):
-            for j in (i ^ 1, i ^ 2, i ^ 4):
-                if i < j:
-                    hidden = behind in (i, j)
-                    _polyline(image, pixels[[i, j]], colour, 1 if hidden else 2, dashed=hidden)
-    elif thing.noun.form == "cylinder":
-        for ring in (pixels[:20], pixels[20:]):
-            _polyline(image, np.concatenate([ring, ring[:1]]), colour, 2)
-        for i in _sides(pixels):
-            _polyline(image, pixels[[i, i + 20]], colour, 2)
-    else:
-        _draw_hull(image, pixels, colour)
+    pixels = camera.project(np.asarray(thing.mesh.vertices) @ T[:3, :3].T + T[:3, 3])
+    _draw_mesh(image, thing.mesh, pixels, colour)
     reach = max(0.02, 0.6 * max(thing.size_m))
     ends = camera.project(T[:3, 3] + np.vstack([np.zeros(3), reach * T[:3, :3].T]))
     for axis, shade in enumerate(_AXES):
@@ -193,26 +169,9 @@ def _draw_mesh(
     most = np.argsort(-angles[angles > _SHARP_RAD], kind="stable")[:_MAX_EDGES]
     for edge in sharp[most]:
         _polyline(image, pixels[edge], colour, 1)
-    _draw_hull(image, pixels, colour)
-
-
-def _draw_hull(
-    image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"], colour: Colour
-) -> None:
     if np.isfinite(pixels).all():
         hull = cv2.convexHull(pixels.astype(np.float32))[:, 0]
         _polyline(image, np.concatenate([hull, hull[:1]]), colour, 2)
-
-
-def _sides(pixels: Float[np.ndarray, "40 2"]) -> list[int]:
-    """Return which of the 20 lines from the upper to the lower ring are seen as the sides of a round thing."""
-    if not np.isfinite(pixels).all():
-        return []
-    try:
-        hull = ConvexHull(pixels).simplices
-    except QhullError:  # seen as a line
-        return []
-    return sorted({int(min(edge)) for edge in hull if abs(int(edge[0]) - int(edge[1])) == 20})
 
 
 def _draw_label(
@@ -307,20 +266,9 @@ def _resized(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def _polyline(
-    image: np.ndarray,
-    pixels: Float[np.ndarray, "n 2"],
-    colour: Colour,
-    width: int,
-    *,
-    dashed: bool = False,
+    image: np.ndarray, pixels: Float[np.ndarray, "n 2"], colour: Colour, width: int
 ) -> None:
     """Draw the parts of a line that can be seen; pixel centres are at one half, OpenCV's at whole numbers."""
-    if dashed and np.isfinite(pixels).all():
-        count = int(np.clip(np.linalg.norm(pixels[1] - pixels[0]) / 5, 1, 200)) | 1
-        stops = np.linspace(pixels[0], pixels[1], count + 1)
-        for k in range(0, count, 2):
-            _polyline(image, stops[k : k + 2], colour, width)
-        return
     keep = np.asarray(np.isfinite(pixels).all(1) & (np.abs(pixels) < _FAR_PX).all(1))
     for run in np.split(np.arange(len(pixels)), np.flatnonzero(np.diff(keep.astype(int))) + 1):
         if keep[run[0]] and len(run) > 1:
