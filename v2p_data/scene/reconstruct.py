@@ -23,7 +23,6 @@ from v2p_data.scene.estimates import estimates_of
 from v2p_data.scene.fitting.by_model import camera_from_depth
 from v2p_data.scene.fitting.camera_guess import camera_guess
 from v2p_data.scene.fitting.metric import clip_camera
-from v2p_data.scene.fitting.noun_variants import with_noun_variants
 from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.fitting.start_place import with_start_place
 from v2p_data.scene.frames.prepare import PreparedClip, prepare
@@ -179,8 +178,7 @@ def _rebuilt(
     """
     clip, segmentation = prepared.clip, grounded.segmentation
     guess = camera_guess(segmentation.camera, cfg)
-    tracks = with_noun_variants(grounded.working, grounded.objects, guess, meaning.kind)
-    grounded = replace(grounded, objects=tracks)
+    tracks = grounded.objects
     if cfg.depth.backend != "none":
         guess = camera_from_depth(clip, grounded.working, tracks, guess, cfg.depth, rng)
     placement = place(grounded.working, tracks, meaning.kind, guess, cfg.max_poses, segmentation)

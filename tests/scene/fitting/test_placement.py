@@ -8,7 +8,6 @@ from v2p_data.geometry.mesh import outline_points
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import CameraGuess, ObjectTrack
 from v2p_data.scene.fitting.camera_guess import with_measured_camera
-from v2p_data.scene.fitting.noun_variants import with_noun_variants
 from v2p_data.scene.fitting.object_view import hidden_around, round_body
 from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.fitting.silhouette import camera_above
@@ -108,45 +107,6 @@ def test_a_pan_is_fitted_without_its_handle():
     assert unknown[handle & ~body].mean() > 0.9
     assert (bowl == body | handle).all()
     assert not nothing.any()
-
-
-@pytest.mark.parametrize(("across_m", "word"), [(0.09, "lid"), (0.21, "pot lid")])
-def test_lids_of_jars_and_of_pots_are_told_by_their_size(across_m: float, word: str):
-    height_m = 0.5
-    flat, domed = noun_for("lid"), noun_for("pot lid")
-    seen = flat if word == "lid" else domed
-    size = tuple(float(v) for v in across_m / height_m * np.array(seen.size_m) / seen.size_m[0])
-    mask = outline_of(seen, size, 1.1, 0.0)
-    frames = np.full((12, H, W, 3), 150, np.uint8)
-    guess = CameraGuess(
-        pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=height_m, height_sd=0.12
-    )
-
-    lid = resting("lid", "manipulated", np.stack([mask] * 12))
-
-    (told,) = with_noun_variants(working_clip_of(filmed(frames)), (lid,), guess, "lift_up")
-
-    assert told.noun.size_m == noun_for(word).size_m
-
-
-@pytest.mark.parametrize(("vessel", "word"), [("jar", "lid"), ("pot", "pot lid")])
-def test_a_lid_is_about_as_wide_as_what_it_covers(vessel: str, word: str):
-    """Halfway between a jar's and a pot's, its own size does not tell."""
-    size = (0.27, 0.27, 0.06)
-    masks = [
-        outline_of(noun_for("lid"), size, 1.1, 0.0),
-        outline_of(noun_for(vessel), size, 1.1, 0.5),
-    ]
-    frames = np.full((12, H, W, 3), 150, np.uint8)
-    objects = tuple(
-        resting(name, role, np.stack([mask] * 12))
-        for name, role, mask in zip(("lid", vessel), ("cover", "reference"), masks, strict=True)
-    )
-    guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV, height_m=0.5)
-
-    told, _ = with_noun_variants(working_clip_of(filmed(frames)), objects, guess, "cover")
-
-    assert told.noun.size_m == noun_for(word).size_m
 
 
 def test_a_lid_that_is_taken_off_lay_on_what_it_covered():

@@ -249,25 +249,3 @@ def test_names_are_unique_python_identifiers():
     assert slug_for("3M tape", set()) == "object_3m_tape"
     assert slug_for("class", set()) == "object_class"
     assert slug_for("…", set()) == "object"
-
-
-def test_tins_are_tall_or_low_and_waste_bins_round_or_square():
-    tin, waste = noun_for("red tin"), noun_for("trash can")
-
-    assert tin.variant is not None
-    assert waste.variant is not None
-    assert (tin.variant.word, tin.variant.size_m) == ("tin", noun_for("tuna can").size_m)
-    assert tin.size_m[2] > tin.size_m[0]
-    assert tin.variant.size_m[2] < tin.variant.size_m[0]
-    assert (waste.form, waste.variant.form, waste.variant.symmetry) == ("cylinder", "box", "box")
-    assert noun_for("mug").variant is None
-
-
-def test_a_second_form_must_be_in_the_table():
-    later = (
-        table_with(form="box or pole") + table_with(noun="pole", synonyms="stick").splitlines()[1]
-    )
-
-    assert read_nouns(later + "\n", "mine.tsv")[0]["brolly"].variant is not None
-    with pytest.raises(V2PError, match="second form 'pole' is neither box nor another row"):
-        read_nouns(table_with(form="box or pole"), "mine.tsv")

@@ -6,7 +6,7 @@ Reading order:
     placement       the order of the steps
     plans           one plan per kind of task: where the object starts, how it moves, where it ends
     camera_guess, pitch             the camera
-    object_view, noun_variants      what is seen of an object at both ends, and which form its noun has
+    object_view                     what is seen of an object at both ends
     silhouette, shape_fit, cuboid_network   one shape under one outline; how a box is turned
     end_poses, trajectory           poses at both ends, and between
     tool_pose                       a tool in a hand

@@ -27,11 +27,6 @@ class FitPlan:
     mouth_last: Literal["as_first", "down", "down_or_up"] = "as_first"
     """How a hollow object rests at the end."""
 
-    @property
-    def covers(self) -> bool:
-        """Whether the object is about as wide as the other one, which it covers at first or at the end."""
-        return self.goal == "on_top" or self.starts_on_other
-
 
 TOOL = FitPlan(slides=True)
 """For what a hand moves beside the manipulated object."""

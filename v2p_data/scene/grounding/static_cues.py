@@ -130,14 +130,10 @@ def usual_area_px(noun: Noun, camera: SeenCamera, shape: tuple[int, int], row_px
 
 
 def larger_than_usual(noun: Noun, camera: SeenCamera, mask: Bool[np.ndarray, "h w"]) -> float:
-    """Return the logarithm of how much larger a mask's object seems than its kind usually is, of its forms the likelier."""
+    """Return the logarithm of how much larger a mask's object seems than its kind usually is."""
     y, tall = bounding_box(mask)[1::2]
     area, row_px = float(mask.sum()), y + _FOOT * tall
-    forms = [one for one in (noun, noun.variant) if one is not None]
-    offs = [
-        float(np.log(area / usual_area_px(one, camera, mask.shape, row_px))) / 2 for one in forms
-    ]
-    return min(offs, key=abs)
+    return float(np.log(area / usual_area_px(noun, camera, mask.shape, row_px))) / 2
 
 
 @dataclass(frozen=True, kw_only=True)

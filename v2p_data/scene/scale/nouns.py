@@ -6,8 +6,7 @@ standard deviation of log size within the noun. A word that is not in the table 
 """
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -66,8 +65,6 @@ class Noun:
     """Diameter of the hole through a roll or ring, as a share of its own; 0 where there is none."""
     taper: float = 1.0
     """Base diameter over top diameter, for solids of revolution."""
-    variant: "Noun | None" = None
-    """What things of that name may be as well: waste bins are round or square, tins tall or low."""
     spread: float = 0.2
     matter: Matter = "rigid"
     known: bool = True
@@ -100,24 +97,16 @@ def read_nouns(text: str, where: str) -> tuple[dict[str, Noun], dict[str, Noun]]
         raise V2PError(f"{where}:1 must name these columns, tab-separated: {', '.join(COLUMNS)}.")
     nouns: dict[str, Noun] = {}
     index: dict[str, Noun] = {}
-    # What names another row as its second form comes after it.
-    rows = list(enumerate(lines, start=2))
-    rows.sort(key=lambda row: _second_form(row[1]) not in ("", "box"))
-    for number, line in rows:
+    for number, line in enumerate(lines, start=2):
         cells = line.split("\t")
         try:
-            noun, synonyms = _noun(cells, nouns)
+            noun, synonyms = _noun(cells)
             for word in (noun.word, *synonyms):
                 _add(index, word, noun)
         except ValueError as error:
             raise V2PError(f"{where}:{number}, the row of '{cells[0]}': {error}.") from error
         nouns[noun.word] = noun
     return nouns, index
-
-
-def _second_form(line: str) -> str:
-    """Return what follows `or` in a row's form, or nothing."""
-    return "".join(line.split("\t")[1:2]).partition(" or ")[2]
 
 
 def noun_for(phrase: str) -> Noun:
@@ -151,7 +140,7 @@ def _add(index: dict[str, Noun], word: str, noun: Noun) -> None:
         raise ValueError(f"'{word}' is taken already by '{index[word].word}'")
 
 
-def _noun(cells: list[str], others: Mapping[str, Noun]) -> tuple[Noun, list[str]]:
+def _noun(cells: list[str]) -> tuple[Noun, list[str]]:
     if len(cells) != len(COLUMNS):
         raise ValueError(f"it has {len(cells)} cells, not {len(COLUMNS)}")
     row = dict(zip(COLUMNS, cells, strict=True))
@@ -166,11 +155,9 @@ def _noun(cells: list[str], others: Mapping[str, Noun]) -> tuple[Noun, list[str]
         raise ValueError(f"hollow is '{row['hollow']}', not 0 or 1 or the share of a bore between")
     bore = 0.0 if row["hollow"] == "1" else float(row["hollow"])
     value = {column: _positive(row, column) for column in (*COLUMNS[2:8], "taper")}
-    form, _, second = row["form"].partition(" or ")
+    form = row["form"]
     if form not in get_args(Form):
         raise ValueError(f"form '{form}' is none of {', '.join(get_args(Form))}")
-    if second not in ("", "box", *others):
-        raise ValueError(f"its second form '{second}' is neither box nor another row's noun")
     length, width, height = (round(value[side] / 100, 6) for side in COLUMNS[2:5])
     size_m = (length, width, height)
     noun = Noun(
@@ -200,11 +187,6 @@ def _noun(cells: list[str], others: Mapping[str, Noun]) -> tuple[Noun, list[str]
     fits = {"box": ("box",), "cylinder": ("round",), "sphere": ("round", "sphere")}[noun.form]
     if noun.symmetry not in ("none", *fits):
         raise ValueError(f"a {noun.form} cannot have the symmetry '{noun.symmetry}'")
-    if second == "box":
-        symmetry = "box" if noun.symmetry == "round" else noun.symmetry
-        noun = replace(noun, variant=replace(noun, form="box", taper=1.0, symmetry=symmetry))
-    elif second:
-        noun = replace(noun, variant=replace(others[second], word=noun.word))
     return noun, synonyms
 
 
