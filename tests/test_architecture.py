@@ -79,7 +79,7 @@ INSIDE: dict[str, dict[str, set[str]]] = {
         # The artefact, which other rooms of the house read.
         "files": set(),
         "schema": {"files"},
-        "scene": {"schema"},
+        "scene": {"schema", "files"},
         # Learned models know pictures and numbers, nothing of ours.
         "backends": {"files"},
         "config": {"backends"},

@@ -2,6 +2,7 @@
 
 import contextlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "episodes"))
 
 from hub_server import TOKEN, Repo, running_hub
 
-from v2p_data.cli import run
+from v2p_data.commands.setup import fetch_learned, fetch_preset
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.scene.backends.checkpoint import load_checkpoint
 from v2p_data.scene.backends.config import (
@@ -97,11 +98,7 @@ def test_what_is_missing_is_named_and_downloaded_once(
     checkpoint, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     folder = Path(checkpoint("sam2"))
-    cfg = tiny(checkpoint)
-    options = [
-        "--scene.ground.model", cfg.ground.model, "--scene.depth.model", cfg.depth.model,
-        "--scene.segment.model", "user/tiny", "--scene.hands.backend", "none", "--scene.outline.backend", "none",
-    ]  # fmt: skip
+    cfg = replace(tiny(checkpoint), segment=SegmentConfig(model="user/tiny"))
     with running_hub() as hub:
         files = {p.name: p.read_bytes() for p in folder.iterdir()}
         hub.repos["models/user/tiny"] = Repo(files=files | {"model.bin": b"the same again"})
@@ -111,13 +108,12 @@ def test_what_is_missing_is_named_and_downloaded_once(
         monkeypatch.setattr("huggingface_hub.constants.HF_HUB_DISABLE_XET", True)
         monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
 
-        assert run(["scene", "models", *options]) == 0
-        assert "not here yet: user/tiny" in capsys.readouterr().out
-        assert run(["scene", "models", *options, "--fetch"]) == 0
-        assert "all are here" in capsys.readouterr().out
+        assert missing(checkpoints_of(with_preset(cfg))) == ("user/tiny",)
+        fetch_preset(cfg)
+        assert "downloading learned models: user/tiny" in capsys.readouterr().err
         assert missing(["user/tiny"]) == ()
         asked = len(hub.requests)
-        assert run(["scene", "models", *options, "--fetch"]) == 0
+        fetch_preset(cfg)
         assert len(hub.requests) == asked
 
     assert not list((tmp_path / "cache").rglob("model.bin"))
@@ -126,8 +122,6 @@ def test_what_is_missing_is_named_and_downloaded_once(
 def test_a_model_that_cannot_be_had_is_one_sentence_with_what_to_do(
     checkpoint, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
-    from v2p_data.commands.setup import fetch_learned
-
     with running_hub() as hub:
         monkeypatch.setenv("HF_ENDPOINT", hub.url)
         monkeypatch.setenv("HF_TOKEN", TOKEN)

@@ -11,7 +11,10 @@ from v2p_data.scene.fitting.camera_guess import with_measured_camera
 from v2p_data.scene.fitting.object_view import hidden_around, round_body
 from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.fitting.silhouette import camera_above
+from v2p_data.scene.frames.classes import CLASSES
+from v2p_data.scene.frames.segmentation import Segmentation
 from v2p_data.scene.frames.working_clip import working_clip_of
+from v2p_data.scene.scale.camera_height import SeenCamera
 from v2p_data.scene.scale.nouns import noun_for
 from v2p_data.video.clip import Clip
 
@@ -127,7 +130,16 @@ def test_a_lid_that_is_taken_off_lay_on_what_it_covered():
     )
     guess = CameraGuess(pitch_rad=PITCH, pitch_sd_rad=0.02, fov_rad=FOV)
 
-    placed, other = place(working_clip_of(filmed(frames)), objects, "uncover", guess, 10).objects
+    shares = np.zeros((len(frames), len(CLASSES), H, W), np.float32)
+    seen = Segmentation(
+        idx=np.arange(len(frames)), shares=shares, early=shares[0], late=shares[-1],
+        camera=SeenCamera(
+            pitch_rad=PITCH, pitch_sd_rad=0.1, focal_widths=1.0, table_width_m=0.8, table_width_sd=0.2
+        ),
+    )  # fmt: skip
+
+    working = working_clip_of(filmed(frames))
+    placed, other = place(working, objects, "uncover", guess, 10, seen).objects
 
     start, stop = placed.T_world_objs[0][:3, 3], placed.T_world_objs[-1][:3, 3]
     assert placed.lifted_off

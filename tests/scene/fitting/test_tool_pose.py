@@ -40,11 +40,12 @@ def block(*, still: bool = False) -> PlacedObject:
     )  # fmt: skip
 
 
-def arm_from(spot: np.ndarray) -> Segmentation:
-    """Return what the network sees of an arm that comes in from the picture's edge to a spot of the table."""
-    tip = CAMERA.project(spot[None])[0].round().astype(int)
+def arm_from(spot: np.ndarray | None) -> Segmentation:
+    """Return what the network sees of an arm that comes in from the picture's edge to a spot of the table, or of none."""
     hand = np.zeros((H, W), np.uint8)
-    cv2.line(hand, (0, int(tip[1])), tuple(int(v) for v in tip), 1, 25)
+    if spot is not None:
+        tip = CAMERA.project(spot[None])[0].round().astype(int)
+        cv2.line(hand, (0, int(tip[1])), tuple(int(v) for v in tip), 1, 25)
     shares = np.zeros((FRAMES, len(CLASSES), H, W), np.float32)
     shares[:, HAND] = hand
     camera = SeenCamera(
@@ -56,7 +57,7 @@ def arm_from(spot: np.ndarray) -> Segmentation:
 
 
 def pushed(
-    segmentation: Segmentation | None = None, tool_xy: np.ndarray = FROM, *, still: bool = False
+    arm_at: np.ndarray | None = None, tool_xy: np.ndarray = FROM, *, still: bool = False
 ) -> PushMotion:
     masks = np.zeros((FRAMES, H, W), bool)
     u, v = CAMERA.project(np.array([[*tool_xy, 0.0]]))[0].round().astype(int)
@@ -65,7 +66,7 @@ def pushed(
         phrase="stick", role="tool", noun=STICK, masks=masks, quality=np.ones(FRAMES), moves=True, at=0, known_m=None,
         sure=1.0, why="",
     )  # fmt: skip
-    return push_motion(block(still=still), "box", tool, CAMERA, HEIGHT_M, segmentation)
+    return push_motion(block(still=still), "box", tool, CAMERA, HEIGHT_M, arm_from(arm_at))
 
 
 def stick(
@@ -93,7 +94,7 @@ def seen(T: np.ndarray, size: tuple[float, float, float], gone: np.ndarray) -> S
 
 
 def test_a_push_begins_and_ends_with_the_motion_and_comes_from_behind():
-    push = pushed(arm_from(np.array([0.9, 0.5, 0.1])))
+    push = pushed(np.array([0.9, 0.5, 0.1]))
 
     assert push.frames == (5, 15)
     way = (TO - FROM) / np.linalg.norm(TO - FROM)

@@ -49,11 +49,11 @@ def place(
     kind: Kind,
     guess: CameraGuess,
     max_poses: int,
-    segmentation: Segmentation | None = None,
+    segmentation: Segmentation,
 ) -> Placement:
     """Return camera, shapes and poses such that all outlines fit their masks, the manipulated object's at both ends.
 
-    `segmentation` is what the network sees, where it was asked: then the hand helps to tell the scale.
+    `segmentation` is what the network sees: the hand helps to tell the scale.
     """
     thing, plan = objects[0], plan_of(kind)
     views = [object_view(working, objects, s, plan) for s in objects]
@@ -61,7 +61,7 @@ def place(
     pitch_rad, firsts = best_pitch([views[k] for k in resting], guess)
     camera = camera_above(working.shape, pitch_rad, guess.fov_rad)
     carried = []
-    if plan.end == "in_air" and segmentation is not None:
+    if plan.end == "in_air":
         carried = carried_by_hand(thing, segmentation)
     fits = {k: EndPoses(first=fit, last=fit) for k, fit in zip(resting, firsts, strict=True)}
     if thing.moves and 0 in fits and not carried:
@@ -74,7 +74,9 @@ def place(
     height_m, spread = camera_height_m(votes, known)
     if len(resting) == len(objects):
         resting_object = _resting_object(views[0], fits[0], plan, camera, pitch_rad)
-        if by_hand := _height_by_hand(working, segmentation, resting_object, height_m):
+        from v2p_data.scene.fitting.hand_scale import height_from_hand  # imports torch
+
+        if by_hand := height_from_hand(working, segmentation, resting_object, height_m):
             height_m, spread = camera_height_m(votes, [*known, by_hand])
     placed: list[PlacedObject] = []
     for k, see in enumerate(views):
@@ -94,22 +96,6 @@ def place(
         scale_spread=spread,
         upright_cost=fits[0].as_before,
     )
-
-
-def _height_by_hand(
-    working: WorkingClip,
-    segmentation: Segmentation | None,
-    resting: RestingObject,
-    height_m: float,
-) -> tuple[float, float] | None:
-    """Return the camera's height [m] by the hand that touches the object at rest, and its spread; None where no hand says it."""
-    if segmentation is None:
-        return None
-    from v2p_data.scene.fitting.hand_scale import (
-        height_from_hand,  # torch takes a second to import
-    )
-
-    return height_from_hand(working, segmentation, resting, height_m)
 
 
 def _manipulated(

@@ -76,7 +76,7 @@ def place_tool(
     camera: Camera,
     height_m: float,
     working: WorkingClip,
-    segmentation: Segmentation | None,
+    segmentation: Segmentation,
 ) -> PlacedObject:
     """Return the poses of a tool in a hand while the pushed object moves."""
     s = see.s
@@ -115,7 +115,7 @@ def push_motion(
     tool: ObjectTrack,
     camera: Camera,
     height_m: float,
-    segmentation: Segmentation | None,
+    segmentation: Segmentation,
 ) -> PushMotion:
     """Return how a thing is pushed.
 
@@ -125,7 +125,7 @@ def push_motion(
         tool: what pushes it: where it is seen, from there a thing is pushed that hardly moves.
         camera: one camera height above the table.
         height_m: metres per camera height.
-        segmentation: what the network sees, where it was asked.
+        segmentation: what the network sees.
     """
     times = np.arange(len(tool.masks))
     spots = np.stack(
@@ -144,15 +144,12 @@ def push_motion(
     points = outline_points(form, pushed.first.size) @ pushed.first.T_world_obj[:3, :3].T
     behind = float((points[:, :2] @ way).min()) * way
     tall = float(np.ptp(points[:, 2]))
-    arm = None
-    if segmentation is not None:
-        arm = _arm_heading(segmentation, spots + behind, (begins, ends), camera, height_m)
     return PushMotion(
         frames=(begins, ends),
         gone=np.column_stack([spots - spots[0], np.zeros(len(spots))]),
         tip=np.array([*(spots[0] + behind), min(_HIGHEST_TIP_M / height_m, _TIP_AT * tall)]),
         back_rad=float(np.arctan2(-way[1], -way[0])),
-        arm_rad=arm,
+        arm_rad=_arm_heading(segmentation, spots + behind, (begins, ends), camera, height_m),
     )
 
 
