@@ -171,7 +171,7 @@ def rank_of(feedback: Feedback, played: Trajectories, obj: SceneObject) -> float
 
 def closeness(moved_m: Float[np.ndarray, "env 3"], obj: SceneObject) -> Float[np.ndarray, "env"]:
     """Return how much of the video's displacement happened: 0 for none, 1 for all of it."""
-    way = np.asarray(obj.first_to_last.translation_m if obj.poses_world else np.zeros(3), float)
+    way = np.asarray(obj.motion.translation_m if obj.poses_world else np.zeros(3), float)
     length = float(np.linalg.norm(way))
     if length < LEAST_WAY_M:
         return np.zeros(len(moved_m))
