@@ -63,8 +63,8 @@ class Driver:
         self.address, self.timeout_s = address, timeout_s
         self._lock = threading.Lock()
         self._next_id = 0
-        self._rest = b""
         self._socket: socket.socket | None = _connected(address, timeout_s)
+        self._lines = self._socket.makefile("rb")
 
     def hello(self) -> Hello:
         """Return what the driver says of its arm."""
@@ -123,6 +123,7 @@ class Driver:
     def close(self) -> None:
         """End the connection; the driver then holds the arm."""
         if self._socket is not None:
+            self._lines.close()
             self._socket.close()
             self._socket = None
 
@@ -139,7 +140,7 @@ class Driver:
             request = {"v": VERSION, "id": self._next_id, "do": do, **fields}
             try:
                 self._socket.sendall(json.dumps(request).encode() + b"\n")
-                line = self._line(self._socket)
+                line = self._lines.readline(LONGEST_LINE)
             except TimeoutError as error:
                 self.close()
                 raise V2PError(
@@ -149,23 +150,12 @@ class Driver:
             except OSError as error:
                 self.close()
                 raise self._gone(error.strerror or str(error)) from error
-        return self._answer(line, request)
-
-    def _line(self, connection: socket.socket) -> bytes:
-        parts = [self._rest]
-        length = len(self._rest)
-        while b"\n" not in parts[-1]:
-            part = connection.recv(65536)
-            if not part:
+            if not line.endswith(b"\n"):
                 self.close()
+                if len(line) == LONGEST_LINE:
+                    raise self._wrong(f"a line is longer than {LONGEST_LINE} bytes")
                 raise self._gone("it closed the connection")
-            parts.append(part)
-            length += len(part)
-            if length > LONGEST_LINE:
-                self.close()
-                raise self._wrong(f"a line is longer than {LONGEST_LINE} bytes")
-        line, _, self._rest = b"".join(parts).partition(b"\n")
-        return line
+        return self._answer(line, request)
 
     def _answer(self, line: bytes, request: dict[str, Any]) -> dict[str, Any]:
         try:
