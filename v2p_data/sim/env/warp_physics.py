@@ -230,7 +230,9 @@ class WarpPhysics(Physics):
     # -- inside
 
     def _allocate(self, num_envs: int) -> None:
-        per_world = dict.fromkeys((*PER_WORLD_FIELDS, "actuator_forcerange"), num_envs)
+        per_world: dict[str, int] = dict.fromkeys(
+            (*PER_WORLD_FIELDS, "actuator_forcerange"), num_envs
+        )
         self._m = mjw.put_model(self._model, batch_sizes=per_world)
         self._m.opt.warn_overflow = 0
         self._d = mjw.make_data(
