@@ -24,8 +24,8 @@ from v2p_data.experts.learning import (
     learn,
     success_of,
 )
-from v2p_data.experts.record import Comparison, Judged, Learned
-from v2p_data.experts.teacher import Played
+from v2p_data.experts.record import Comparison, Learned, PolicyScore
+from v2p_data.experts.teacher import EpisodeOutcomes
 from v2p_data.play import StateActor
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.task.benchmark import load_benchmark
@@ -83,12 +83,12 @@ def improved_in(folder: Path) -> ExpertResult:
     )
 
 
-def who_acts_so(obs: np.ndarray, wanted: np.ndarray) -> Callable[[StateActor], Played]:
+def who_acts_so(obs: np.ndarray, wanted: np.ndarray) -> Callable[[StateActor], EpisodeOutcomes]:
     """Return what plays 16 episodes, which succeed with the policy that answers `obs` with `wanted` only."""
 
-    def play(actor: StateActor) -> Played:
+    def play(actor: StateActor) -> EpisodeOutcomes:
         succeeds = np.full(16, np.array_equal(actor.function(obs), wanted))
-        return Played(at_end=succeeds, steps=np.where(succeeds, 10, 101), horizon=100)
+        return EpisodeOutcomes(at_end=succeeds, steps=np.where(succeeds, 10, 101), horizon=100)
 
     return play
 
@@ -216,7 +216,7 @@ def test_ppo_counts_as_better_only_where_an_interval_says_so(
     def difference(value: float, low: float, high: float) -> Difference:
         return Difference(value=value, low=low, high=high, pairs=256)
 
-    judged = Judged(success=wilson(250, 256), median_s=1.0, score=0.9)
+    judged = PolicyScore(success=wilson(250, 256), median_s=1.0, score=0.9)
 
     compared = Comparison(
         taught=judged,

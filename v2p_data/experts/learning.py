@@ -25,8 +25,8 @@ from policies.ppo.policy import Expert
 from policies.ppo.train import LAST_FOLDER, ExpertResult, train_expert
 from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
-from v2p_data.experts.record import Comparison, Judged, Learned
-from v2p_data.experts.teacher import Played, Teacher, Trial, try_out
+from v2p_data.experts.record import Comparison, Learned, PolicyScore
+from v2p_data.experts.teacher import EpisodeOutcomes, ProgramScore, Teacher, try_out
 from v2p_data.play import StateActor
 from v2p_data.seeds import seed_for
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
@@ -77,7 +77,7 @@ class Taught:
     """The best program's name."""
     program_success: float
     """Share of the trial worlds in which it held success at the end."""
-    trials: tuple[Trial, ...]
+    trials: tuple[ProgramScore, ...]
     folder: Path | None
     """The policy; None where no program succeeds often enough."""
     steps: int
@@ -237,8 +237,8 @@ def keep_better(
     both = of_taught.once & of_ppo.once
     states, dt_s = np.concatenate(seen), FINE.control_dt_s
     comparison = Comparison(
-        taught=Judged.of(of_taught, dt_s),
-        ppo=Judged.of(of_ppo, dt_s),
+        taught=PolicyScore.of(of_taught, dt_s),
+        ppo=PolicyScore.of(of_ppo, dt_s),
         success_gain=success_difference(of_ppo.once, of_taught.once),
         time_saved_s=median_difference(dt_s * of_taught.steps[both], dt_s * of_ppo.steps[both]),
         moved=float(np.abs(after.act(states) - before.act(states)).mean()),
@@ -247,15 +247,15 @@ def keep_better(
     return comparison, updates if comparison.is_better else 0
 
 
-def _exams(worlds: Worlds, cfg: ExpertConfig) -> Callable[[StateActor], Played]:
+def _exams(worlds: Worlds, cfg: ExpertConfig) -> Callable[[StateActor], EpisodeOutcomes]:
     """Return what plays the same episodes, at the fine time step, with every policy that it is given."""
     env = worlds.make(cfg.compare_worlds, "which is better", fine=True)
     return partial(try_out, env, seed=worlds.seed_of("episodes that compare"))
 
 
 def better_of_ppo(
-    play: Callable[[StateActor], Played], out: Path, improved: ExpertResult
-) -> tuple[Expert, int, Played]:
+    play: Callable[[StateActor], EpisodeOutcomes], out: Path, improved: ExpertResult
+) -> tuple[Expert, int, EpisodeOutcomes]:
     """Return the better one of PPO's two policies, its gradient steps and its episodes.
 
     The best in training had the highest of many noisy rates; the last one is as often the better one.

@@ -7,11 +7,11 @@ import numpy as np
 
 from policies.evaluation.paired import Difference
 from policies.evaluation.rate import Rate, wilson
-from v2p_data.experts.teacher import Played, Trial
+from v2p_data.experts.teacher import EpisodeOutcomes, ProgramScore
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judged:
+class PolicyScore:
     """How one policy did on the episodes that decide which policy is kept."""
 
     success: Rate
@@ -22,10 +22,10 @@ class Judged:
     """Mean of `policies.evaluation.paired.score`."""
 
     @staticmethod
-    def of(played: Played, dt_s: float) -> "Judged":
+    def of(played: EpisodeOutcomes, dt_s: float) -> "PolicyScore":
         """Return it from episodes with control steps of `dt_s` seconds."""
         once, steps = played.once, played.steps
-        return Judged(
+        return PolicyScore(
             success=wilson(int(once.sum()), len(once)),
             median_s=dt_s * float(np.median(steps[once])) if once.any() else None,
             score=played.score,
@@ -36,8 +36,8 @@ class Judged:
 class Comparison:
     """The taught policy and PPO's on the same episodes."""
 
-    taught: Judged
-    ppo: Judged
+    taught: PolicyScore
+    ppo: PolicyScore
     success_gain: Difference
     """PPO's success minus the taught policy's."""
     time_saved_s: Difference | None
@@ -63,7 +63,7 @@ class Learned:
     """Gradient steps of PPO that the expert's actor took; 0 for one that imitation alone made."""
     teacher: str
     """The program's name, or nothing."""
-    trials: tuple[Trial, ...]
+    trials: tuple[ProgramScore, ...]
     comparison: Comparison | None
     """Comparison of the taught policy with PPO's; None where nobody taught or PPO changed nothing."""
     stopped_by: str

@@ -46,7 +46,7 @@ GOOD_ENOUGH = 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class ProgramScore:
     """How one program did."""
 
     name: str
@@ -65,7 +65,7 @@ class Teacher:
         self.env = env
         self.programs = programs_for(env)
         self.name = next(iter(self.programs))
-        self.trials: tuple[Trial, ...] = ()
+        self.trials: tuple[ProgramScore, ...] = ()
 
     def act(self) -> Float[np.ndarray, "env 7"]:
         """Return the chosen program's actions for the worlds as they are."""
@@ -82,7 +82,7 @@ class Teacher:
             opening_m=2 * env.world.robot.finger_travel_m,
         )
 
-    def choose(self, env: BatchEnv) -> Trial:
+    def choose(self, env: BatchEnv) -> ProgramScore:
         """Play one episode of each program in every world of another environment and keep the best one.
 
         What the task's words name is tried first and kept if it succeeds well: the task's own success sees only
@@ -91,13 +91,13 @@ class Teacher:
         meant = KINDS[self.env.bundle.kind].programs
         names = sorted(self.programs, key=lambda name: not name.startswith(meant))
         player = Teacher(env)
-        trials: list[Trial] = []
+        trials: list[ProgramScore] = []
         for name in names:
             is_meant = name.startswith(meant)
             if not is_meant and any(t.success >= GOOD_ENOUGH for t in trials):
                 break
             player.name = name
-            trials.append(Trial(name=name, success=player.play()))
+            trials.append(ProgramScore(name=name, success=player.play()))
             logger.info("program '%s': %.0f %%", name, 100 * trials[-1].success)
         self.trials = tuple(trials)
         best = max(trials, key=lambda t: t.success + 0.2 * t.name.startswith(meant))
@@ -110,7 +110,7 @@ class Teacher:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Played:
+class EpisodeOutcomes:
     """One episode in every world, judged by the task's own success."""
 
     at_end: Bool[np.ndarray, "env"]
@@ -131,7 +131,7 @@ class Played:
         return float(np.mean([score(*pair) for pair in zip(self.once * 1.0, waited, strict=True)]))
 
 
-def try_out(env: BatchEnv, actor: Actor, seed: int | None = None) -> Played:
+def try_out(env: BatchEnv, actor: Actor, seed: int | None = None) -> EpisodeOutcomes:
     """Play one episode in every world; who is given the same seed plays the same episodes."""
     if seed is not None:
         env.seed(seed)
@@ -143,7 +143,7 @@ def try_out(env: BatchEnv, actor: Actor, seed: int | None = None) -> Played:
 
     view = View(env)
     play(view, actor, [note])
-    return Played(at_end=view.result.held, steps=steps, horizon=env.horizon)
+    return EpisodeOutcomes(at_end=view.result.held, steps=steps, horizon=env.horizon)
 
 
 def programs_for(env: BatchEnv) -> dict[str, Program]:

@@ -23,6 +23,7 @@ from v2p_data.task.sandbox.probes import (
     first_pose,
     rest_height,
     rest_heights,
+    turned,
 )
 from v2p_data.task.templates.variants import POSITION_ERROR_M, SIZE_ERROR_M, SIZE_ERROR_SHARE
 
@@ -171,17 +172,7 @@ def _at_pose(scene: Scene, tracked: list[Poses], moments: list[Poses], hand: str
     for obj in scene.objects:
         pose = np.stack([m[obj.name] for m in moments])
         start = np.tile(tracked[0][obj.name], (n, 1))
-        probe.objects[obj.name] = ObjectProbe(
-            pos=pose[:, :3],
-            quat=pose[:, 3:],
-            size=np.asarray(obj.size_m),
-            start_pos=start[:, :3],
-            start_quat=start[:, 3:],
-            vel_linear=np.zeros((n, 3)),
-            vel_angular=np.zeros((n, 3)),
-            grasped=np.zeros(n),
-            touched=np.zeros(n),
-        )
+        probe.objects[obj.name] = ObjectProbe.still(pose, start, obj)
     _put_hand(probe, scene, hand)
     return probe
 
@@ -195,8 +186,7 @@ def _put_hand(probe: Probe, scene: Scene, hand: str) -> None:
     if hand == "held":
         probe.eef_pos = grip
         probe.gripper_width = np.full(n, min(min(obj.size_m), GRIPPER_OPENING_M))
-        o.grasped = np.ones(n)
-        o.touched = np.ones(n)
+        o.grasped = o.touched = np.ones(n)
     elif hand == "by tool":
         tool = next(t for t in scene.others if t.role == "tool")
         t = probe.objects[tool.name]
@@ -205,22 +195,15 @@ def _put_hand(probe: Probe, scene: Scene, hand: str) -> None:
         behind = (max(obj.size_m[:2]) + max(tool.size_m[:2])) / 2
         t.pos = t.start_pos.copy()
         t.pos[:, :2] = o.pos[:, :2] - way * behind
-        t.grasped = np.ones(n)
-        t.touched = np.ones(n)
+        t.grasped = t.touched = np.ones(n)
         probe.eef_pos = t.pos.copy()
         probe.gripper_width = np.full(n, min(min(tool.size_m), GRIPPER_OPENING_M))
-        o.grasped = np.zeros(n)
-        o.touched = np.zeros(n)
     elif hand == "touching":
         probe.eef_pos = grip
         probe.gripper_width = np.zeros(n)
-        o.grasped = np.zeros(n)
         o.touched = np.ones(n)
     else:
         probe.eef_pos = o.pos + np.array([0.0, 0.0, half + 0.12])
-        probe.gripper_width = np.full(n, GRIPPER_OPENING_M)
-        o.grasped = np.zeros(n)
-        o.touched = np.zeros(n)
 
 
 def _resets(scene: Scene, rng: np.random.Generator) -> Probe:
@@ -230,8 +213,7 @@ def _resets(scene: Scene, rng: np.random.Generator) -> Probe:
         o.pos = o.pos + shift
         o.start_pos = o.pos.copy()
         yaw = rng.uniform(-np.pi, np.pi, RESET_ROWS)
-        turn = Rotation.from_rotvec(np.column_stack([0 * yaw, 0 * yaw, yaw]))
-        o.quat = (turn * Rotation.from_quat(o.quat, scalar_first=True)).as_quat(scalar_first=True)
+        o.quat = turned(yaw, o.quat)
         o.start_quat = o.quat.copy()
     low, high = np.array(WORKSPACE_M)
     probe.eef_pos = np.column_stack(
@@ -290,12 +272,10 @@ def _disturbed(
         sigma = np.minimum(SIZE_SIGMA_M / size, SIZE_SIGMA_SHARE)
         larger = sizes[obj.name] = size * np.exp(rng.normal(size=(n, 3)) * sigma * scale)
         shift = rng.normal(size=(n, 3)) * POSITION_SIGMA_M * scale
-        yaw = np.zeros((n, 3))
-        yaw[:, 2] = rng.normal(size=n) * YAW_SIGMA_RAD * scale[:, 0]
+        yaw = rng.normal(size=n) * YAW_SIGMA_RAD * scale[:, 0]
         at = np.stack([m[obj.name] for m in many])
         above = at[:, 2] - rest_heights(obj, at[:, 3:], np.tile(size, (n, 1)))
-        turned = Rotation.from_rotvec(yaw) * Rotation.from_quat(at[:, 3:], scalar_first=True)
-        at[:, 3:] = turned.as_quat(scalar_first=True)
+        at[:, 3:] = turned(yaw, at[:, 3:])
         at[:, :2] += shift[:, :2]
         lifted = np.where(above > LIFTED_M, above + shift[:, 2], above)
         at[:, 2] = rest_heights(obj, at[:, 3:], larger) + np.maximum(lifted, 0.0)

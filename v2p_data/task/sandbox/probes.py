@@ -38,6 +38,24 @@ class ObjectProbe:
     grasped: Float[np.ndarray, "env"]
     touched: Float[np.ndarray, "env"]
 
+    @staticmethod
+    def still(
+        pose: Float[np.ndarray, "env 7"], start: Float[np.ndarray, "env 7"], obj: SceneObject
+    ) -> "ObjectProbe":
+        """Return an object that rests at `pose` and was at `start` when the episode began."""
+        n = len(pose)
+        return ObjectProbe(
+            pos=pose[:, :3],
+            quat=pose[:, 3:],
+            size=np.asarray(obj.size_m),
+            start_pos=start[:, :3],
+            start_quat=start[:, 3:],
+            vel_linear=np.zeros((n, 3)),
+            vel_angular=np.zeros((n, 3)),
+            grasped=np.zeros(n),
+            touched=np.zeros(n),
+        )
+
 
 @dataclass(kw_only=True)
 class Probe:
@@ -113,17 +131,9 @@ def at_rest(scene: Scene, count: int = 1, centre: tuple[float, float] = (0.5, 0.
     origin = first_pose(scene.manipulated)[:2]
     for obj in scene.objects:
         pose = first_pose(obj)
-        pos = np.array([*(pose[:2] - origin + centre), rest_height(obj, pose[3:])])
-        probe.objects[obj.name] = ObjectProbe(
-            pos=np.tile(pos, (n, 1)),
-            quat=np.tile(pose[3:], (n, 1)),
-            size=np.asarray(obj.size_m),
-            start_pos=np.tile(pos, (n, 1)),
-            start_quat=np.tile(pose[3:], (n, 1)),
-            vel_linear=np.zeros((n, 3)),
-            vel_angular=np.zeros((n, 3)),
-            grasped=np.zeros(n),
-            touched=np.zeros(n),
+        pose[:3] = *(pose[:2] - origin + centre), rest_height(obj, pose[3:])
+        probe.objects[obj.name] = ObjectProbe.still(
+            np.tile(pose, (n, 1)), np.tile(pose, (n, 1)), obj
         )
     _spread(probe, scene)
     return probe
@@ -134,6 +144,14 @@ def first_pose(obj: SceneObject) -> Float[np.ndarray, "7"]:
     if not obj.poses_world:
         return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     return obj.laid_pose.copy()
+
+
+def turned(
+    yaw_rad: Float[np.ndarray, "n"], quat_wxyz: Float[np.ndarray, "n 4"]
+) -> Float[np.ndarray, "n 4"]:
+    """Return orientations turned about the vertical."""
+    turn = Rotation.from_rotvec(np.column_stack([0 * yaw_rad, 0 * yaw_rad, yaw_rad]))
+    return (turn * Rotation.from_quat(quat_wxyz, scalar_first=True)).as_quat(scalar_first=True)
 
 
 def random_states(scene: Scene, count: int, rng: np.random.Generator) -> States:
@@ -149,12 +167,7 @@ def random_states(scene: Scene, count: int, rng: np.random.Generator) -> States:
         o.size = o.size * rng.uniform(0.85, 1.15, (count, 3))
         shift = np.column_stack([rng.uniform(-0.1, 0.1, (count, 2)), np.zeros(count)])
         o.start_pos = o.start_pos + shift
-        yaw = Rotation.from_rotvec(
-            np.column_stack([np.zeros((count, 2)), rng.uniform(-np.pi, np.pi, count)])
-        )
-        o.start_quat = (yaw * Rotation.from_quat(o.start_quat, scalar_first=True)).as_quat(
-            scalar_first=True
-        )
+        o.start_quat = turned(rng.uniform(-np.pi, np.pi, count), o.start_quat)
         tilt = Rotation.from_rotvec(rng.normal(0, 0.3, (count, 3)))
         o.quat = (tilt * Rotation.from_quat(o.start_quat, scalar_first=True)).as_quat(
             scalar_first=True
