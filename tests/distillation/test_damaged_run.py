@@ -216,49 +216,49 @@ def test_no_dataset_is_made_of_what_is_damaged(
     assert not list(root.glob("dataset/others-*"))
 
 
+def training(root: Path) -> tuple[object, ...]:
+    return ("train", dataset_of(root), *QUICK, "--distillation.rounds", "1")
+
+
+def judging(root: Path) -> tuple[object, ...]:
+    return ("eval", policy_of(root), *FEW, "--seed", "3")
+
+
+def judging_an_expert(root: Path) -> tuple[object, ...]:
+    return ("eval", next(root.glob("expert/*")), *FEW)
+
+
+def pushing(root: Path) -> tuple[object, ...]:
+    return ("push", policy_of(root), "--repo-id", REPO_ID)
+
+
+def sharing_tasks(root: Path) -> tuple[object, ...]:
+    return ("push", root, "--repo-id", REPO_ID, "--envhub")
+
+
 @pytest.mark.parametrize("harm", [flip(0.5), HARMS["cut to 50%"], delete])
-@pytest.mark.parametrize("kind", ["expert weights", "staged episode", "task code"])
-def test_training_does_not_ask_a_damaged_expert(capsys, whole: Path, tmp_path: Path, kind, harm):
+@pytest.mark.parametrize(
+    ("command", "kind"),
+    [
+        (training, "expert weights"),
+        (training, "staged episode"),
+        (training, "task code"),
+        (judging, "policy weights"),
+        (judging, "policy settings"),
+        (judging, "processors"),
+        (judging, "task code"),
+        (judging_an_expert, "expert weights"),
+        (judging_an_expert, "expert"),
+        (pushing, "policy weights"),
+        (sharing_tasks, "task code"),
+    ],
+)
+def test_no_command_reads_what_is_damaged(
+    capsys, whole: Path, tmp_path: Path, command, kind, harm
+):
     path = harmed_copy(whole, tmp_path / "run", NAMES[kind].files(whole)[0], harm)
 
-    words = said(capsys, "train", dataset_of(tmp_path / "run"), *QUICK, "--distillation.rounds", "1")  # fmt: skip
-
-    assert str(path.parent) in words
-    assert path.name in words
-
-
-@pytest.mark.parametrize("harm", [flip(0.5), HARMS["cut to 50%"], delete])
-@pytest.mark.parametrize("kind", ["policy weights", "policy settings", "processors", "task code"])
-def test_a_damaged_policy_or_task_is_not_judged(capsys, whole: Path, tmp_path: Path, kind, harm):
-    path = harmed_copy(whole, tmp_path / "run", NAMES[kind].files(whole)[0], harm)
-
-    words = said(capsys, "eval", policy_of(tmp_path / "run"), *FEW, "--seed", "3")
-
-    assert path.name in words
-
-
-@pytest.mark.parametrize("harm", [flip(0.5), HARMS["cut to 50%"], delete])
-@pytest.mark.parametrize("kind", ["expert weights", "expert"])
-def test_a_damaged_expert_is_not_judged(capsys, whole: Path, tmp_path: Path, kind, harm):
-    path = harmed_copy(whole, tmp_path / "run", NAMES[kind].files(whole)[0], harm)
-
-    words = said(capsys, "eval", path.parent, *FEW)
-
-    assert path.name in words
-
-
-def test_a_damaged_policy_is_not_pushed(capsys, root: Path):
-    path = policy_of(root) / "model.safetensors"
-    flip(0.5)(path)
-
-    assert str(path) in said(capsys, "push", path.parent, "--repo-id", REPO_ID)
-
-
-def test_a_damaged_task_is_not_shared_as_an_environment(capsys, root: Path):
-    path = NAMES["task code"].files(root)[0]
-    flip(0.5)(path)
-
-    assert str(path) in said(capsys, "push", root, "--repo-id", REPO_ID, "--envhub")
+    assert path.name in said(capsys, *command(tmp_path / "run"))
 
 
 @pytest.mark.parametrize("command", ["train", "eval", "explain", "distill"])

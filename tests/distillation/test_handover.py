@@ -102,26 +102,6 @@ def test_the_expert_that_takes_over_at_once_needs_no_student(agreeing_referee):
     assert found.successes.any()
 
 
-@pytest.mark.parametrize("seed", [3, 4])
-def test_the_number_of_threads_changes_nothing(agreeing_referee, seed: int):
-    one, two = run(seed=seed), run(seed=seed, num_threads=2)
-
-    for name in ("labels", "state", "action", "taken_over_at", "num_frames", "referee"):
-        assert np.array_equal(getattr(one, name), getattr(two, name)), name
-    assert one.params == two.params
-
-
-def test_what_the_referee_denies_is_no_success(monkeypatch: pytest.MonkeyPatch):
-    odd = np.arange(5) % 2 == 1
-    monkeypatch.setattr(rollouts, "referee_verdict", lambda bundle, history: odd)
-
-    found = run()
-
-    assert found.task_successes.any()
-    assert (found.successes == (found.task_successes & odd)).all()
-    assert not found.task_successes.all()  # some cubes lie too far away
-
-
 def test_an_expert_sees_no_more_of_the_time_than_it_learned(agreeing_referee):
     shares: list[float] = []
 

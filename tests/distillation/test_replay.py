@@ -8,21 +8,16 @@ import pyarrow.parquet as pq
 import pytest
 import toy_run
 
-from v2p_data.episodes import rollouts
 from v2p_data.episodes.dataset.features import ACTION_KEY, METADATA_FILE
 from v2p_data.episodes.replay import replay
 from v2p_data.errors import V2PError
-from v2p_data.sim.env import verdict
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (verdict, rollouts):
-            patch.setattr(module, "referee_verdict", toy_run.agree)
-        yield toy_run.make_run(tmp_path_factory.mktemp("run"))
+@pytest.fixture
+def dataset(agreeing_referee, finished):
+    return toy_run.dataset_of(finished)
 
 
 @pytest.fixture

@@ -109,14 +109,6 @@ def test_a_missing_statistic_is_named(
     assert f"of '{key}'" in message
 
 
-def test_a_missing_video_is_named(capsys, dataset: Path):
-    (video,) = dataset.glob("videos/**/*.mp4")
-    video.unlink()
-    made_like_this(dataset)
-
-    assert f"{video.name} is missing" in said(capsys, "train", dataset, *QUICK)
-
-
 def test_settings_that_contradict_are_refused_before_any_work(capsys, dataset: Path):
     message = said(capsys, "train", dataset, "--policy.n-action-steps", "2")
 

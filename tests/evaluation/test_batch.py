@@ -15,7 +15,6 @@ from v2p_data.experts.actors import ProgramActor
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import StateActor, View, VisionActor
 from v2p_data.sim.env.batch_env import BatchEnv
-from v2p_data.sim.env.observation import PROGRESS_COLUMN
 from v2p_data.sim.env.task_code import HELD_STEPS
 from v2p_data.task.audit.resets import has_own_reset
 from v2p_data.task.benchmark import load_benchmark
@@ -178,20 +177,6 @@ def test_a_simulation_that_breaks_ends_its_episode_as_a_failure(bundle):
 
     assert result.broke.tolist() == [False, True, False, False, False]
     assert result.failures == ("", "simulation_broke", "", "", "")
-
-
-def test_an_expert_is_never_told_that_more_than_its_time_has_passed(bundle):
-    seen = []
-
-    def act(obs):
-        seen.append(obs[:, PROGRESS_COLUMN].max())
-        return np.zeros((len(obs), 7), np.float32)
-
-    judged(bundle, StateActor(act, obs_dim=90))
-
-    assert len(seen) == 24
-    np.testing.assert_allclose(seen[:13], np.arange(13) / 12, rtol=1e-6)
-    assert seen[13:] == [1.0] * 11
 
 
 def test_another_tasks_expert_is_turned_away(bundle):

@@ -14,7 +14,6 @@ from policies.ppo.config import ActorConfig, ImitationConfig, PPOConfig
 from policies.ppo.policy import ActorCritic, Expert, weights_of
 from policies.ppo.train import ExpertResult
 from v2p_data.errors import ItemRejectedError
-from v2p_data.experts import learning
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.learning import (
     TAUGHT_FOLDER,
@@ -178,26 +177,6 @@ def test_of_the_best_in_training_and_the_last_policy_the_one_that_does_better_on
 
     assert np.array_equal(kept[0].act(obs), wanted)
     assert kept[1] == updates
-
-
-@pytest.mark.parametrize(("better", "updates"), [("", 7), ("last", 9)])
-def test_without_a_teacher_the_expert_is_the_better_one_of_ppos_two_policies(
-    better: str, updates: int, bundle: TaskBundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    worlds = Worlds(bundle=bundle, seed=3)
-    dim = worlds.make(1, "shape").obs_dim
-    for seed, name in enumerate(("", "last")):
-        save_random_expert(tmp_path / name, dim, seed=seed)
-    obs = np.ones((16, dim), np.float32)
-    wanted = Expert.load(tmp_path / better).act(obs)
-    play = who_acts_so(obs, wanted)
-    monkeypatch.setattr(learning, "try_out", lambda env, actor, seed: play(actor))
-    monkeypatch.setattr(learning, "improve_by_ppo", lambda *_, **__: improved_in(tmp_path))
-
-    learned = learn(worlds, replace(TINY, teacher="none"), tmp_path)
-
-    assert np.array_equal(Expert.load(tmp_path).act(obs), wanted)
-    assert learned.actor_updates == updates
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from policies.bc.encoders import (
     shifted,
     shrink,
 )
-from policies.bc.heads import BinnedHead, RegressionHead
+from policies.bc.heads import BinnedHead
 
 GREYS = (0, 64, 128, 192, 255)
 
@@ -221,9 +221,3 @@ def test_a_distribution_about_one_level_decodes_to_its_mean():
     p = torch.tensor([1e-9, 0.25, 0.5, 0.25, 1e-9])
 
     assert float(BinnedHead(5).decode(p.log()[None])) == pytest.approx(0.0, abs=1e-5)
-
-
-def test_regression_learns_by_the_huber_loss():
-    loss = RegressionHead().loss(torch.tensor([[0.5], [3.0]]), torch.zeros(2))
-
-    assert loss.tolist() == pytest.approx([0.125, 2.5])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from point_mass import PointMass
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
@@ -122,17 +121,6 @@ def test_the_same_seed_makes_the_same_weights_and_another_seed_others(tmp_path: 
     assert not are_equal(weights_in(tmp_path / "a"), weights_in(tmp_path / "c"))
 
 
-def test_two_iterations_resumed_to_four_equal_four(tmp_path: Path):
-    train_expert(PointMass(64, seed=1), steps(4), tmp_path / "whole")
-
-    train_expert(PointMass(64, seed=1), steps(2), tmp_path / "parts")
-    train_expert(PointMass(64, seed=99), steps(4), tmp_path / "parts")
-
-    assert are_equal(weights_in(tmp_path / "whole"), weights_in(tmp_path / "parts"))
-    for whole, part in zip(rows_of(tmp_path / "whole"), rows_of(tmp_path / "parts"), strict=True):
-        assert {**whole, "seconds": ""} == {**part, "seconds": ""}
-
-
 def test_an_environment_without_state_resumes_with_new_episodes(tmp_path: Path):
     train_expert(PointMass(64, seed=1, keeps_state=False), steps(2), tmp_path)
     before = weights_in(tmp_path)
@@ -160,7 +148,8 @@ def test_a_kill_after_the_last_checkpoint_changes_nothing(tmp_path: Path):
     train_expert(PointMass(64, seed=1), steps(5), tmp_path / "killed")
 
     assert are_equal(weights_in(tmp_path / "whole"), weights_in(tmp_path / "killed"))
-    assert [row["iteration"] for row in rows_of(tmp_path / "killed")] == ["1", "2", "3", "4", "5"]
+    for whole, part in zip(rows_of(tmp_path / "whole"), rows_of(tmp_path / "killed"), strict=True):
+        assert {**whole, "seconds": ""} == {**part, "seconds": ""}
 
 
 def test_a_finished_training_is_left_as_it_is(tmp_path: Path):
@@ -222,24 +211,6 @@ def test_the_curve_holds_every_reward_component_by_name(tmp_path: Path):
     near = [float(row["reward_near"]) for row in rows_of(tmp_path)]
     # Two points drawn evenly in a square of side 2 are 1.04 apart on average.
     assert -1.5 < near[0] < -0.7
-
-
-def test_tensorboard_shows_the_csv_of_a_training_that_was_killed_and_went_on(tmp_path: Path):
-    def kill(done: int, total: int, success: float) -> None:
-        if done == 3 * BATCH:
-            raise KilledError
-
-    train_expert(PointMass(64, seed=1), steps(2), tmp_path)
-    with pytest.raises(KilledError):
-        train_expert(PointMass(64, seed=1), steps(5), tmp_path, on_progress=kill)
-    train_expert(PointMass(64, seed=1), steps(5), tmp_path)
-
-    shown = EventAccumulator(str(tmp_path)).Reload().Scalars("reward/near")
-    assert [(e.step, e.value) for e in shown] == [
-        (int(row["steps"]), pytest.approx(float(row["reward_near"]), rel=1e-5))
-        for row in rows_of(tmp_path)
-    ]
-    assert len(shown) == 5
 
 
 def test_evaluation_counts_whole_episodes_of_a_policy_that_knows_the_way():

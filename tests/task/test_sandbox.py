@@ -8,7 +8,7 @@ import torch
 from v2p_data.task.sandbox.reader.check import check_code
 from v2p_data.task.sandbox.reader.refusal import TaskCodeError
 from v2p_data.task.sandbox.sandbox import load_task
-from v2p_data.task.sandbox.smoke import _results
+from v2p_data.task.sandbox.smoke import _answers, _result
 from v2p_data.task.sandbox.smoke_child import FakePlacer
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -102,7 +102,7 @@ def test_task_code_sees_two_things_of_the_environment(scene_of):
 def test_an_answer_of_another_kind_is_that_samples_own_failure():
     answer = b'[{"runnable": true, "probe_success": [1]}, {"runnable": false, "error": "a\\u001b[2Jb\\ud800"}, 7]'
 
-    strange, shown, number = _results(answer, 3, 0)
+    strange, shown, number = (_result(data, 0, 0) for data in _answers(answer, b"", 3))
 
     assert not strange.runnable
     assert not number.runnable

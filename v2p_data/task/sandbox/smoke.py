@@ -1,22 +1,15 @@
 """Runs unknown task code once, in a child process that cannot hurt anyone, and says whether it works.
 
-The child forks for every sample, so that a crash, a hang or a memory bomb in one sample is that sample's own result.
-It stays for the next question, because torch takes seconds to import. See `sandbox` for what a fork may not do.
+The child forks for every sample, so that a crash, a hang or a memory bomb in one sample is that sample's own result, and
+torch is imported once for all of them. See `sandbox` for what a fork may not do.
 """
 
-import contextlib
 import hashlib
 import json
 import math
-import os
-import shutil
 import subprocess
 import tempfile
-import threading
-import time
 from dataclasses import dataclass, field
-from multiprocessing.connection import wait
-from multiprocessing.util import Finalize
 from typing import Any
 
 import numpy as np
@@ -32,13 +25,11 @@ from v2p_data.task.sandbox.reader.check import check_code
 from v2p_data.task.sandbox.reader.refusal import TaskCodeError
 from v2p_data.task.sandbox.source_text import shown
 
-CHILD = "smoke_child.py"
+CHILD = "v2p_data.task.sandbox.smoke_child"
 BATCH = 16
 PARTS = 3
 """Batch sizes, drawn at random, at which every program is asked again."""
 MAX_ANSWER_CHARS = 20_000_000
-ENDS_S = 5.0
-"""A child that has closed its output has ended by then."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,130 +181,62 @@ def _ask_child(
     seconds_each: float,
     timeout_s: float,
 ) -> list[SmokeResult]:
-    num_probes, num_starts = (len(x["eef_pos"]) if x else 0 for x in (probes, starts))
     request = trial_request(sources, scene, probes, seconds_each, starts)
-    deadline = time.monotonic() + timeout_s
-    child = _child()
-    try:
-        answer = child.ask(request, deadline)
-        if not answer:  # it has ended since the last question
-            child.end()
-            child = _child()
-            answer = child.ask(request, deadline)
-    except TimeoutError:
-        child.end()
-        return [
-            SmokeResult(runnable=False, error=f"the trial run took more than {timeout_s:g} s")
-        ] * len(sources)
-    if not answer.endswith(b"\n"):
-        child.end()
-    return _read(answer, child.complaint, len(sources), num_probes, num_starts)
-
-
-class _Child:
-    """A process that answers one request after the other, until nobody asks or its parent's thread ends."""
-
-    def __init__(self) -> None:
-        self._owner = os.getpid()
-        folder = tempfile.mkdtemp(prefix="v2p-task-")
-        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the child lives
-        self._process = subprocess.Popen(
-            own_python(f"v2p_data.task.sandbox.{CHILD.removesuffix('.py')}"),
+    with (
+        tempfile.TemporaryDirectory(prefix="v2p-task-") as folder,
+        tempfile.TemporaryFile() as answers,
+        tempfile.TemporaryFile() as complaints,
+    ):
+        environment = {
+            "OMP_NUM_THREADS": "1",
+            "HOME": folder,
+            "TMPDIR": folder,
+            "PATH": "/usr/bin:/bin",
+        }
+        with subprocess.Popen(
+            own_python(CHILD),
             stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._stderr,
+            stdout=answers,
+            stderr=complaints,
             cwd=folder,
-            env={
-                "OMP_NUM_THREADS": "1",
-                "HOME": folder,
-                "TMPDIR": folder,
-                "PATH": "/usr/bin:/bin",
-            },
+            env=environment,
             start_new_session=True,
-        )
-        # Also at the end of a worker process, which runs no `atexit`; never in a fork of this one.
-        self._end = Finalize(self, _end, args=(self._process, folder), exitpriority=0)
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether it can be asked: it lives, and is not that of a process from which this one was forked."""
-        return self._owner == os.getpid() and self._process.poll() is None
-
-    @property
-    def complaint(self) -> bytes:
-        """What it has written on its standard error."""
-        self._stderr.seek(0)
-        return self._stderr.read()
-
-    def ask(self, request: dict[str, Any], deadline: float) -> bytes:
-        """Return the answer, or what there is of it if the child ended.
-
-        Raises:
-            TimeoutError: the time is up.
-        """
-        questions, answers = self._process.stdin, self._process.stdout
-        assert questions is not None
-        assert answers is not None
-        answer = bytearray()
-        with contextlib.suppress(BrokenPipeError):
-            questions.write(json.dumps(request).encode() + b"\n")
-            questions.flush()
-        while not answer.endswith(b"\n") and len(answer) <= MAX_ANSWER_CHARS:
-            if not wait([answers.fileno()], max(0.0, deadline - time.monotonic())):
-                raise TimeoutError
-            chunk = os.read(answers.fileno(), 1 << 20)
-            if not chunk:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.wait(ENDS_S)
-                break
-            answer += chunk
-        return bytes(answer)
-
-    def end(self) -> None:
-        """Kill it unless it has ended by itself."""
-        self._end()
+        ) as process:
+            try:
+                process.communicate(json.dumps(request).encode(), timeout_s)
+            except subprocess.TimeoutExpired:
+                late = SmokeResult(
+                    runnable=False, error=f"the trial run took more than {timeout_s:g} s"
+                )
+                return [late] * len(sources)
+            finally:
+                end_group(process)
+        answers.seek(0)
+        complaints.seek(0)
+        given = _answers(answers.read(MAX_ANSWER_CHARS + 1), complaints.read(), len(sources))
+    num_probes, num_starts = (len(x["eef_pos"]) if x else 0 for x in (probes, starts))
+    return [_result(data, num_probes, num_starts) for data in given]
 
 
-def _end(process: subprocess.Popen[bytes], folder: str) -> None:
-    end_group(process)
-    for stream in (process.stdin, process.stdout):
-        with contextlib.suppress(BrokenPipeError, AttributeError):
-            stream.close()  # pyright: ignore[reportOptionalMemberAccess]
-    shutil.rmtree(folder, ignore_errors=True)
+def _answers(answer: bytes, complaint: bytes, count: int) -> list[Any]:
+    """Return the child's answers, one a sample.
 
-
-_children = threading.local()
-"""One a thread: the kernel ends a child with the thread that started it."""
-
-
-def _child() -> _Child:
-    """Return this thread's child, a new one where there is none."""
-    child: _Child | None = getattr(_children, "child", None)
-    if child is None or not child.is_ours:
-        child = _children.child = _Child()
-    return child
-
-
-def _read(
-    answer: bytes, complaint: bytes, count: int, num_probes: int, num_starts: int
-) -> list[SmokeResult]:
+    Raises:
+        V2PError: there are not so many.
+    """
     try:
-        return _results(answer, count, num_probes, num_starts)
-    except (ValueError, TypeError) as error:
+        if len(answer) > MAX_ANSWER_CHARS:
+            raise ValueError("the answer is too long")  # noqa: TRY301
+        data = json.loads(answer)
+        if not isinstance(data, list) or len(data) != count:
+            raise ValueError(f"{count} answers wanted")  # noqa: TRY301
+    except ValueError as error:
         tail = complaint.decode(errors="replace").strip().splitlines()[-1:]
         raise V2PError(
             f"the trial run of task code gave no answer ({error}{'; ' + tail[0] if tail else ''}); "
             "is there memory left for a Python process with torch?"
         ) from error
-
-
-def _results(answer: bytes, count: int, num_probes: int, num_starts: int = 0) -> list[SmokeResult]:
-    if len(answer) > MAX_ANSWER_CHARS:
-        raise ValueError("the answer is too long")
-    data = json.loads(answer)
-    if not isinstance(data, list) or len(data) != count:
-        raise ValueError(f"{count} answers wanted")
-    return [_result(d, num_probes, num_starts) for d in data]
+    return data
 
 
 def _result(data: Any, num_probes: int, num_starts: int) -> SmokeResult:

@@ -1,4 +1,4 @@
-"""The child process of `smoke`: reads task codes as lines of JSON, tries each in a fork with nothing left to abuse.
+"""The child process of `smoke`: reads task codes as JSON, tries each in a fork with nothing left to abuse.
 
 A fork may open no file and no socket, start no process, write no file, and use a bounded amount of time and
 memory (`confine`).
@@ -28,8 +28,6 @@ MEMORY_BYTES = 2 * 1024**3
 LARGE_REWARD = 1000.0
 """Ten full rewards: beside them the bonus for success hardly counts."""
 MAX_ANSWER_BYTES = 4_000_000
-IDLE_S = 60.0
-"""A child that nobody asks for so long ends; its memory is wanted elsewhere."""
 SLOW_S = 1.0
 SCALED = ("_pos", "_size", "_width")
 """How the names of states in metres end."""
@@ -83,15 +81,14 @@ class FakePlacer:
 
 
 def main() -> None:
-    """Answer requests from stdin on stdout, a line each, until none comes for `IDLE_S`."""
+    """Answer the request that is on stdin, on stdout."""
     leave_the_network()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
-    while select.select([sys.stdin], [], [], IDLE_S)[0] and (line := sys.stdin.readline()):
-        request: dict[str, Any] = json.loads(line)
-        warm_up(request)
-        answers = [in_a_fork(source, request) for source in request["sources"]]
-        print(json.dumps(answers), flush=True)  # noqa: T201 - this is the answer
+    request: dict[str, Any] = json.load(sys.stdin)
+    warm_up(request)
+    answers = [in_a_fork(source, request) for source in request["sources"]]
+    print(json.dumps(answers), flush=True)  # noqa: T201 - this is the answer
 
 
 def warm_up(request: dict[str, Any]) -> None:
