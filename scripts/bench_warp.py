@@ -24,11 +24,13 @@ import numpy as np
 import torch
 import tyro
 
+from policies.evaluation.rate import wilson
 from policies.ppo.config import PPOConfig
-from policies.ppo.evaluate import evaluate
 from policies.ppo.policy import Expert
 from policies.ppo.train import train_expert
 from v2p_data.errors import V2PError
+from v2p_data.experts.teacher import try_out
+from v2p_data.play import StateActor
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.benchmark import load_benchmark
@@ -99,15 +101,11 @@ def learn(settings: Settings) -> None:
         f"lift with {n} worlds: {result.steps} steps in {result.seconds:.1f} s, stopped by {result.stopped_by}, "
         f"success in training {result.success:.0%}, worlds that broke down {env.broken_count}"
     )
-    judge = TorchRLEnv(
-        BatchEnv(
-            bundle,
-            SimConfig(fine=True),
-            num_envs=min(64, settings.eval_episodes),
-            seed=settings.seed + 1,
-        )
+    judge = BatchEnv(
+        bundle, SimConfig(fine=True), num_envs=settings.eval_episodes, seed=settings.seed + 1
     )
-    rate = evaluate(judge, expert.act, num_episodes=settings.eval_episodes)
+    held = try_out(judge, StateActor(expert.act)).at_end
+    rate = wilson(int(held.sum()), len(held))
     print(f"fresh episodes on the CPU backend at the fine step: {rate}")
     print(f"warp_learned: {rate.value:.3f}")
 

@@ -109,8 +109,6 @@ class PPOConfig:
     """A kill loses at most about this much work."""
     num_threads: int = 1
     """Threads of torch. Two cost a factor three when another process shares the cores."""
-    eval_episodes: int = 128
-    """Fresh episodes of the best expert, for a caller of `evaluate`; training plays none."""
     actor: ActorConfig = field(default_factory=ActorConfig)
 
     def __post_init__(self) -> None:

@@ -41,7 +41,6 @@ from policies.ppo.curve import (
     cut_after,
     plot_curve,
 )
-from policies.ppo.evaluate import outcome
 from policies.ppo.policy import ActorCritic, Expert, load_weights, weights_of
 from policies.threads import torch_threads
 
@@ -470,15 +469,8 @@ class _Learner:
         self.optimiser.load_state_dict(saved["optimiser"])
         self.generator.set_state(saved["generator"])
         cut_after(self.out / CURVE_FILE, self.progress.steps)
-        if saved["env"]:
-            self.env.load_state_dict(saved["env"])
-            self.collector._carrier.update(TensorDict(saved["carrier"], self.env.batch_size))
-        else:
-            for name in ("discounted", "episode_return", "age", "waited"):
-                getattr(self.progress, name).zero_()
-            log.info(
-                "the environment keeps no state: its worlds start new episodes at this resumption"
-            )
+        self.env.load_state_dict(saved["env"])
+        self.collector._carrier.update(TensorDict(saved["carrier"], self.env.batch_size))
         log.info("going on from step %d of %d", self.progress.steps, self.cfg.total_steps)
 
 
@@ -539,6 +531,12 @@ def advantage_estimator(critic: TensorDictModule, cfg: PPOConfig) -> GAE:
     )
 
 
+def outcome(after: TensorDictBase) -> torch.Tensor:
+    """Return whether each world counts as a success if its episode ends here: `held`, else `success`."""
+    held = after.get("held", None)
+    return after.get("success") if held is None else held
+
+
 def _start_from(model: ActorCritic, expert: Expert, cfg: PPOConfig) -> None:
     """Take over actor and normalisation; the value starts at zero, for it belongs to another reward."""
     load_weights(model, weights_of(expert.model))
@@ -560,7 +558,6 @@ def _recipe(cfg: PPOConfig, seed: int) -> dict[str, Any]:
         "plateau_gain",
         "checkpoint_seconds",
         "num_threads",
-        "eval_episodes",
     }
     recipe = {k: v for k, v in asdict(cfg).items() if k not in free}
     recipe["seed"] = seed

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from point_mass import PointMass
+from point_mass import PointMass, success_rate
 
 from policies.ppo.config import ActorConfig, ImitationConfig, PPOConfig
-from policies.ppo.evaluate import evaluate
 from policies.ppo.imitate import imitate
 from policies.ppo.policy import Expert, weights_of
 from policies.ppo.train import train_expert
@@ -76,7 +75,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], part: str = "")
 
 
 def success(folder: Path) -> float:
-    return evaluate(PointMass(NUM_ENVS, seed=9), Expert.load(folder).act, num_episodes=200).value
+    return success_rate(Expert.load(folder).act, seed=9)
 
 
 @pytest.fixture(scope="module")

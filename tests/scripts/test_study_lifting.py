@@ -358,7 +358,6 @@ def test_a_cell_learns_from_a_toy_and_is_judged_on_an_unseen_object_that_nothing
                 imitation=ImitationConfig(rounds=8, least_rounds=8, teacher_rounds=6),
                 ppo=PPOConfig(
                     total_steps=512, window_episodes=4, min_window_episodes=2, num_deterministic=4,
-                    eval_episodes=4,
                 ),
             ),
             episodes=EpisodesConfig(num_episodes=2, batch_worlds=8, max_batches=4),
