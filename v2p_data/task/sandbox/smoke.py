@@ -53,7 +53,6 @@ class SmokeResult:
     start_rows: tuple[int, ...] = ()
     """Which of the offered layouts each of these came from."""
     start_success: tuple[bool, ...] = ()
-    seconds: float = 0.0
 
     @staticmethod
     def from_json(data: Any, num_probes: int, num_starts: int = 0) -> "SmokeResult":
@@ -101,7 +100,6 @@ class SmokeResult:
             start_poses=starts,
             start_rows=tuple(start_rows),
             start_success=tuple(start_success),
-            seconds=float(data.get("seconds", 0.0)),
         )
 
 
