@@ -4,10 +4,11 @@ import os
 import shutil
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.pipeline.runner import Stage
+from v2p_data.pipeline.workers import run_stages
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,3 +55,10 @@ def make_text(config, inputs, out, runtime):
 def chain(first: Recipe, second: Recipe, item: str = "clip") -> Stage:
     one = Stage(name="one", item=item, config=first, make=make_text)
     return Stage(name="two", item=item, config=second, inputs={"one": one}, make=make_text)
+
+
+def make_by_stages(config, inputs, out, runtime):
+    stages = [chain(Recipe(), Recipe()), chain(Recipe(trouble="crash"), Recipe(), item="bad")]
+    inner = replace(runtime, root=out / "inner", engine="local")
+    outcomes = run_stages(stages, inner, lambda event: None)
+    return {f"{o.stage} {o.item}": o.reason or o.status for o in outcomes.values()}

@@ -14,7 +14,7 @@ from v2p_data.pipeline.runner import Runtime, Stage
 from v2p_data.pipeline.workers import only_run_in, run_stages
 
 sys.path.insert(0, str(Path(__file__).parent))
-from sample_stages import Recipe, chain, make_noted, make_text
+from sample_stages import Recipe, chain, make_by_stages, make_noted, make_text
 
 
 def statuses(stages, root: Path, workers: int = 1) -> list[str]:
@@ -55,6 +55,21 @@ def test_one_bad_item_blocks_only_what_needs_it(tmp_path, trouble):
     assert by_item["good", "two"].status == "made"
     assert by_item["bad", "one"].status == ("rejected" if trouble == "reject" else "failed")
     assert by_item["bad", "two"].status == "blocked"
+
+
+def test_a_stage_may_run_stages_of_its_own(tmp_path):
+    stage = Stage(name="outer", item="clip", config=None, make=make_by_stages)
+
+    assert statuses([stage], tmp_path) == ["made"]
+
+    record = read_record(stage.folder(tmp_path))
+    assert record is not None
+    assert record.counts == {
+        "one clip": "made",
+        "two clip": "made",
+        "one bad": "crashed",
+        "two bad": "crashed",
+    }
 
 
 def test_a_worker_that_is_killed_between_two_stages_costs_nothing(tmp_path):
