@@ -182,7 +182,7 @@ def _options(kind: type, prefix: str = "--") -> Iterator[str]:
         inner = get_args(hints[field.name])[0] if notes else hints[field.name]
         is_nameless = any(getattr(note, "name", None) == "" for note in notes)
         name = prefix if is_nameless else f"{prefix}{field.name.replace('_', '-')}"
-        if is_dataclass(inner):
+        if isinstance(inner, type) and is_dataclass(inner):
             yield from _options(inner, name if is_nameless else f"{name}.")
         else:
             yield name

@@ -152,10 +152,7 @@ def _figures(run: Run, items: Sequence[ItemView], evaluation: Sequence[Evaluatio
         },
         has_experts=any(results["expert"] for results in own),
         datasets=[
-            (
-                str(c.get("repo_id", item)),
-                *(int(number(c.get(k)) or 0) for k in ("episodes", "frames")),
-            )
+            (str(c.get("repo_id", item)), _count(c, "episodes"), _count(c, "frames"))
             for item, c in counts
         ],
         policy={
@@ -164,6 +161,10 @@ def _figures(run: Run, items: Sequence[ItemView], evaluation: Sequence[Evaluatio
             if of_kind
         },
     )
+
+
+def _count(counts: dict[str, Any], name: str) -> int:
+    return int(number(counts.get(name)) or 0)
 
 
 def _summary(figures: Figures) -> str:

@@ -217,8 +217,8 @@ def _in_crop(hint: Hint, crop: Crop) -> Hint:
     there = with_spots(hint, inside)
     if "box" in hint:
         # A box ends behind its last pixel.
-        _, _, x, y = hint["box"]
-        there["box"][2:] = [v + 1.0 for v in inside(x - 1, y - 1)]
+        a, b, c, d = hint["box"]
+        there["box"] = [*inside(a, b), *(v + 1.0 for v in inside(c - 1, d - 1))]
     return there
 
 
