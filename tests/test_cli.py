@@ -18,7 +18,8 @@ import pytest
 from v2p_data import cli
 from v2p_data.cli import parse, run
 from v2p_data.commands import display
-from v2p_data.commands.run import FromVideos, changed_flags
+from v2p_data.commands.run import FromVideos
+from v2p_data.commands.settings import changed_flags
 from v2p_data.errors import V2PError
 from v2p_data.stages import EngineConfig
 from v2p_data.task.cache import cache_folder

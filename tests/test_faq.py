@@ -67,14 +67,12 @@ def test_every_kind_of_failure_and_every_ending_of_a_run_is_on_the_page():
 
 @pytest.mark.slow
 def test_every_dotted_option_that_a_page_names_exists():
-    import tyro
-
+    from v2p_data.cli import options_of
     from v2p_data.commands import deploy, run
 
     known: set[str] = set()
     for kind in (run.Generate, run.Train, run.Evaluate, deploy.Deploy):
-        for action in tyro.extras.get_parser(kind)._actions:
-            known |= {option for option in action.option_strings if "." in option}
+        known |= {option for option in options_of(kind) if "." in option}
     groups = {option.split(".")[0] for option in known}
     unknown: dict[str, set[str]] = {}
     for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):

@@ -152,7 +152,7 @@ def _sentence(event: Any, kind: type, argv: list[str]) -> str:
             return f"missing: {names}{unknown}."
         case wrong.UnrecognizedArgs():
             word = event.tokens[0].partition("=")[0]
-            close = difflib.get_close_matches(word, _options(kind), n=1)
+            close = difflib.get_close_matches(word, options_of(kind), n=1)
             return f"{word} is unknown.{f' Did you mean {close[0]}?' if close else ''}"
         case wrong.InvalidChoice():
             return f"{event.argument.display_name()} is {' or '.join(sorted(event.choices))}, not '{event.value}'."
@@ -174,7 +174,7 @@ def _field(option: str) -> str:
     return option.removeprefix("--").rpartition(".")[2].replace("-", "_")
 
 
-def _options(kind: type, prefix: str = "--") -> Iterator[str]:
+def options_of(kind: type, prefix: str = "--") -> Iterator[str]:
     """Yield the options of a command's dataclass."""
     hints = get_type_hints(kind, include_extras=True)
     for field in fields(kind):
@@ -183,7 +183,7 @@ def _options(kind: type, prefix: str = "--") -> Iterator[str]:
         is_nameless = any(getattr(note, "name", None) == "" for note in notes)
         name = prefix if is_nameless else f"{prefix}{field.name.replace('_', '-')}"
         if isinstance(inner, type) and is_dataclass(inner):
-            yield from _options(inner, name if is_nameless else f"{name}.")
+            yield from options_of(inner, name if is_nameless else f"{name}.")
         else:
             yield name
 

@@ -58,7 +58,7 @@ def deploy_command(argv: list[str]) -> int:
     args = parse(Deploy, others, "deploy")
     if args.record is not None:
         check_free(args.record)
-    from v2p_data.commands.run import check_device
+    from v2p_data.commands.settings import check_device
 
     check_device(args.device)
     if args.repo_id.count("/") != 1:

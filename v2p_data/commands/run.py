@@ -1,15 +1,13 @@
 """Commands that make things: the whole chain, or up to one stage."""
 
-import argparse
-import math
 import os
 import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import tyro
 
@@ -23,7 +21,9 @@ from v2p_data.commands.display import (
     tally,
     telling,
 )
+from v2p_data.commands.judged import contestant_at, home_of, rate_lines, seen_tasks
 from v2p_data.commands.progress import Progress
+from v2p_data.commands.settings import How, Running, Settings, goes_on, run_folder_for, with_config
 from v2p_data.commands.setup import fetch_preset
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.episodes.hub.policy_card import note_results
@@ -32,7 +32,6 @@ from v2p_data.evaluation.judging import PROGRAMS, Contestant, contestant, task_f
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
 from v2p_data.pipeline.contents import list_files, memory_of
 from v2p_data.pipeline.fingerprint import fingerprint
-from v2p_data.pipeline.ray_engine import demand_ray
 from v2p_data.pipeline.run_file import RUN_FILE, outcomes_json
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage, in_order, stored_outcome
 from v2p_data.pipeline.settings import load_settings
@@ -43,7 +42,6 @@ from v2p_data.stages import (
     COUSIN_MARK,
     EVALUATION_FILE,
     POLICY_FOLDER,
-    ROOT_OF_TASKS,
     EngineConfig,
     chain,
     dataset_stage,
@@ -56,69 +54,8 @@ from v2p_data.stages import (
     task_stage,
     with_cousins,
 )
-from v2p_data.task.task import TASK_FILE, TaskBundle
+from v2p_data.task.task import TaskBundle
 from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, read_footage
-
-
-@dataclass(frozen=True, kw_only=True)
-class How:
-    """How to run; never part of what is made."""
-
-    workers: int = 0
-    """Jobs at the same time; 0: as many as there are cores, here or on the cluster."""
-    threads: int = 1
-    """Threads per job."""
-    device: str = "cpu"
-    """Where the policy trains: cpu, cuda, mps."""
-    store: str = ""
-    """Folder or URL (s3://BUCKET/PREFIX) that drivers and machines share results in; each keeps an --out of its own."""
-    lease_s: float = 60.0
-    """With --store: a driver without a sign of life for so long is taken for dead by the others."""
-    limit_s: float = 0.0
-    """A job that takes longer is ended, and its item has failed; 0: no limit. A policy may take days."""
-    engine: Literal["local", "ray"] = "local"
-    """Where jobs run: processes of this machine, or tasks of a Ray cluster whose nodes share --out."""
-    address: str = "auto"
-    """Of the Ray cluster's head, HOST:PORT; auto: the one that this machine belongs to."""
-
-    def runtime(self, root: Path) -> Runtime:
-        if self.workers < 0 or self.threads < 1:
-            raise V2PError(
-                f"--workers is at least 0 and --threads at least 1, got {self.workers} and {self.threads}"
-            )
-        if not 0 < self.lease_s < math.inf:
-            raise V2PError(f"--lease-s is a number of seconds above 0, got {self.lease_s}")
-        if not 0 <= self.limit_s < math.inf:
-            raise V2PError(f"--limit-s is a number of seconds, 0 for no limit, got {self.limit_s}")
-        if self.engine == "ray":
-            demand_ray()
-        else:
-            check_device(self.device)
-        return Runtime(
-            root=root,
-            workers=self.workers or (0 if self.engine == "ray" else os.cpu_count() or 1),
-            num_threads=self.threads,
-            device=self.device,
-            engine=self.engine,
-            address=self.address,
-            store=self.store,
-            lease_s=self.lease_s,
-            limit_s=self.limit_s,
-        )
-
-
-Engine = Annotated[EngineConfig, tyro.conf.arg(name="")]
-Running = Annotated[How, tyro.conf.arg(name="")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What all commands that make things are told."""
-
-    config: Path | None = None
-    """YAML file with settings; flags go over it."""
-    engine: Engine = field(default_factory=EngineConfig)
-    how: Running = field(default_factory=How)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,8 +117,8 @@ def episodes_command(argv: list[str]) -> int:
 
 
 def generate_command(argv: list[str]) -> int:
-    args = _with_config(Generate, argv, "generate")
-    root = _run_folder(args.out)
+    args = with_config(Generate, argv, "generate")
+    root = run_folder_for(args.out)
     check_repo_id(args.repo_id)
     with only_run_in(root):
         dataset, code = generate(
@@ -194,14 +131,14 @@ def generate_command(argv: list[str]) -> int:
     _say(
         f"Made {dataset}",
         f"{counts['episodes']} episodes, {counts['frames']} frames; page: {page}",
-        _goes_on("train", dataset, args),
+        goes_on("train", dataset, args),
     )
     return code
 
 
 def train_command(argv: list[str]) -> int:
-    args = _with_config(Train, argv, "train")
-    root = _run_folder(args.out or args.dataset.resolve().parent.parent)
+    args = with_config(Train, argv, "train")
+    root = run_folder_for(args.out or args.dataset.resolve().parent.parent)
     with only_run_in(root):
         policy = train(args.dataset, root, args.engine, args.how.runtime(root))
         page = _page(root)
@@ -209,14 +146,14 @@ def train_command(argv: list[str]) -> int:
     _say(
         f"Made {policy}",
         f"loss {counts['final_loss']:.3f} after {counts['steps']} steps; page: {page}",
-        _goes_on("eval", policy, args),
+        goes_on("eval", policy, args),
     )
     return 0
 
 
 def distill_command(argv: list[str]) -> int:
-    args = _with_config(Train, argv, "distill")
-    root = _run_folder(args.out or args.dataset.resolve().parent.parent)
+    args = with_config(Train, argv, "distill")
+    root = run_folder_for(args.out or args.dataset.resolve().parent.parent)
     if not args.engine.distillation.rounds:
         raise V2PError("--distillation.rounds=0 leaves nothing to do; it is 1 or more")
     record = _dataset_record(args.dataset)
@@ -240,15 +177,15 @@ def distill_command(argv: list[str]) -> int:
         f"Made {packed.folder(root)}",
         f"{counts['episodes']} handover episodes, {counts['frames']} frames; the expert recovered {recovered} of each"
         f" round's; page: {page}",
-        _goes_on("train", args.dataset, args),
+        goes_on("train", args.dataset, args),
     )
     return 0
 
 
 def eval_command(argv: list[str]) -> int:
-    args = _with_config(Evaluate, argv, "eval")
-    who = _contestant(args.policy)
-    root = _run_folder(args.out or _home_of(who, args.tasks))
+    args = with_config(Evaluate, argv, "eval")
+    who = contestant_at(args.policy)
+    root = run_folder_for(args.out or home_of(who, args.tasks))
     unseen = {name: path for folder in args.tasks for name, path in task_folders(folder).items()}
     with only_run_in(root):
         outcome, rows = evaluate(who, unseen, root, args.engine, args.how.runtime(root))
@@ -274,7 +211,7 @@ def demo_command(argv: list[str]) -> int:
         raise V2PError(
             f"the sample clips are not at {samples}; run the demo from a clone of the repository"
         )
-    root = _run_folder(args.out)
+    root = run_folder_for(args.out)
     cfg = load_settings(settings, EngineConfig)
     runtime = args.how.runtime(root)
     print(  # noqa: T201
@@ -358,7 +295,7 @@ def evaluate(
     who: Contestant, unseen: dict[str, Path], root: Path, cfg: EngineConfig, runtime: Runtime
 ) -> tuple[Outcome, list[dict[str, Any]]]:
     """Judge a policy, an expert or the programs in the tasks that it learned from and in unseen ones."""
-    seen = _seen_tasks(who)
+    seen = seen_tasks(who)
     tasks = {**seen, **unseen}
     for task in tasks.values():
         demand_whole_part(task.resolve(), root)
@@ -375,43 +312,6 @@ def evaluate(
     if who.kind == "policy" and not who.repo_id and os.access(who.folder, os.W_OK):
         note_results(who.folder, rows)
     return outcome, rows
-
-
-def _contestant(policy: Path) -> Contestant:
-    """Return who lies at a path, or the policy that is on the Hub by this name.
-
-    Raises:
-        V2PError: there is neither.
-    """
-    repo_id = policy.as_posix()
-    if policy.exists() or not is_repo_id(repo_id):
-        demand_whole_part(policy.resolve())
-        return contestant(policy)
-    from v2p_data.episodes.hub.hub import fetch_policy
-
-    try:
-        return replace(contestant(fetch_policy(repo_id)), repo_id=repo_id)
-    except V2PError as error:
-        raise V2PError(f"there is no folder {policy}, and {error}") from error
-
-
-def _seen_tasks(who: Contestant) -> dict[str, Path]:
-    """Return the tasks of a policy's dataset, or the one that an expert learned, as far as its run has them."""
-    if who.kind == "programs" or who.repo_id:
-        return {}
-    root = _home_of(who, ())
-    record = read_record(who.folder.parent if who.kind == "policy" else who.folder)
-    if record is not None and (who.kind, record.stage) == ("policy", "policy"):
-        named = (record.recipe.get("sources") or {}).get("dataset")
-        for dataset in sorted((root / "dataset").glob(str(named))):
-            # The run's own tasks first: those in the dataset do not say where the file of another arm lies.
-            own = {source.item: source.task for source in sources_of(dataset, root)}
-            return own or task_folders(dataset / ROOT_OF_TASKS)
-    if record is not None and (who.kind, record.stage) == ("expert", "expert"):
-        for stage, folder in record.inputs.items():
-            if (root / stage / folder / TASK_FILE).is_file():
-                return {record.item: root / stage / folder}
-    return {}
 
 
 def _all_threads(runtime: Runtime) -> Runtime:
@@ -464,45 +364,6 @@ def _record_to_train(dataset: Path, root: Path) -> Record:
     )
 
 
-def _home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
-    """Return the run folder that a policy or an expert lies in; of the programs, the one that the tasks lie in.
-
-    What is judged by its name on the Hub gets a run folder of its own.
-
-    Raises:
-        V2PError: the programs' tasks are not named.
-    """
-    if who.kind == "programs":
-        if not tasks:
-            raise V2PError(f"the scripted programs need tasks: v2p eval {PROGRAMS} --tasks FOLDER")
-        task = next(iter(task_folders(tasks[0]).values()))
-        return task.resolve().parent.parent
-    if who.repo_id:
-        return Path("outputs") / who.repo_id.split("/")[-1]
-    return who.folder.parent.parent.parent if who.kind == "policy" else who.folder.parent.parent
-
-
-def rate_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return one line per task: seen or unseen, the rate and its interval."""
-    width = max(len(str(r["task"])) for r in rows)
-    return [
-        f"  {r['task']!s:<{width}}  {'seen  ' if r['seen'] else 'unseen'}  {r['successes']}/{r['trials']}"
-        f" = {r['rate']:.0%}, 95 % interval {r['low']:.0%} to {r['high']:.0%}{_more(r)}"
-        for r in rows
-    ]
-
-
-def _more(row: dict[str, Any]) -> str:
-    """Return how often success was still there at the end, and what went wrong most often."""
-    words = ""
-    if row.get("at_end"):
-        words += f"; at the end {row['at_end']['rate']:.0%}"
-    if row.get("own_reset"):
-        words += f"; from the task's own starts {row['own_reset']['rate']:.0%}"
-    failures = [f"{kind.replace('_', ' ')} {n}" for kind, n in row.get("failures", {}).items()]
-    return words + (f"; failures: {', '.join(failures)}" if failures else "")
-
-
 def _unseen_tasks(
     videos: Path, root: Path, cfg: EngineConfig, runtime: Runtime
 ) -> tuple[dict[str, Path], int]:
@@ -515,8 +376,8 @@ def _unseen_tasks(
 def _up_to(
     name: str, argv: list[str], stage_of: Callable[[VideoItem, EngineConfig], Stage], then: str
 ) -> int:
-    args = _with_config(FromVideos, argv, name)
-    root = _run_folder(args.out)
+    args = with_config(FromVideos, argv, name)
+    root = run_folder_for(args.out)
     fetch_preset(args.engine.scene)
     with only_run_in(root):
         stages = [stage_of(video, args.engine) for video in _videos(args.videos)]
@@ -533,7 +394,7 @@ def _up_to(
         then = f"v2p scene review {shlex.quote(str(args.out))}   (to mark what was not found)"
     else:
         repo = " --repo-id USER/NAME" if then == "generate" else ""
-        then = _goes_on(then, args.videos, args, "--out", str(args.out)) + repo
+        then = goes_on(then, args.videos, args, "--out", str(args.out)) + repo
     _say(
         f"Made {root / name}",
         f"{counts['usable']} of {len(stages)} {made}{f' ({rest})' if rest else ''}; page: {page}",
@@ -564,30 +425,6 @@ def _tell_cousins(outcomes: Iterable[Outcome]) -> None:
             f"{family}: {came} of {len(cousins)} cousins came through{f' ({reasons})' if reasons else ''}",
             file=sys.stderr,
         )
-
-
-def changed_flags(settings: Any, usual: Any, prefix: str = "--") -> list[str]:
-    """Return the flags that make these settings of the usual ones: without them the next command would do all anew."""
-    flags: list[str] = []
-    for each in fields(settings):
-        value, was = getattr(settings, each.name), getattr(usual, each.name)
-        name = prefix + each.name.replace("_", "-")
-        if is_dataclass(value):
-            flags += changed_flags(value, was, f"{name}.")
-        elif isinstance(value, bool) and value != was:
-            flags.append(name if value else f"{name[: len(prefix)]}no-{name[len(prefix) :]}")
-        elif isinstance(value, tuple) and value != was:
-            flags += [name, *map(str, value)]
-        elif value != was:
-            flags.append(f"{name}={value}")
-    return flags
-
-
-def _goes_on(command: str, source: Path, args: Settings, *more: str) -> str:
-    """Return a command line on `source` with the settings of this one."""
-    file = ["--config", str(args.config)] if args.config else []
-    flags = changed_flags(args.engine, _usual(args.config)) + changed_flags(args.how, How())
-    return shlex.join(["v2p", *command.split(), str(source), *more, *file, *flags])
 
 
 def _videos(folder: Path) -> list[VideoItem]:
@@ -644,53 +481,6 @@ def _record(folder: Path) -> Record:
     if record is None:
         raise V2PError(f"{folder} is not complete")
     return record
-
-
-def _with_config[T: Settings](kind: type[T], argv: list[str], name: str) -> T:
-    """Parse with the values of the file that --config names, if one is named, as the defaults of the flags."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--config", type=Path, nargs="?")
-    path = parser.parse_known_args(argv)[0].config
-    if path is None:
-        return parse(kind, argv, name)
-    missing = {
-        field.name: tyro.MISSING
-        for field in fields(kind)
-        if field.default is field.default_factory  # both MISSING: required
-    }
-    return parse(kind, argv, name, default=kind(engine=_usual(path), **missing))
-
-
-def _usual(config: Path | None) -> EngineConfig:
-    """Return the settings where no flag is given."""
-    return load_settings(config, EngineConfig) if config else EngineConfig()
-
-
-def check_device(name: str) -> None:
-    """Refuse a device that this machine lacks.
-
-    Raises:
-        V2PError: names those there are.
-    """
-    if name == "cpu":
-        return
-    import torch
-
-    found = ["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
-    found += ["cuda"] if torch.cuda.is_available() else []
-    found += ["mps"] if torch.backends.mps.is_available() else []
-    if name not in found:
-        raise V2PError(f"--device {name} is not on this machine; it has {', '.join(found)}")
-
-
-def _run_folder(out: Path) -> Path:
-    if (out / "meta" / "info.json").is_file():
-        raise V2PError(
-            f"{out} is a LeRobot dataset, and v2p never writes into one; choose another --out"
-        )
-    if out.exists() and not out.is_dir():
-        raise V2PError(f"{out} is a file; --out must be a folder")
-    return out
 
 
 def _say(made: str, number: str, then: str) -> None:
