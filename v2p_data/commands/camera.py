@@ -11,9 +11,9 @@ import numpy as np
 import tyro
 
 from v2p_data.cli import command_of, parse
-from v2p_data.errors import UnusableError, V2PError, did_you_mean
-from v2p_data.pipeline.artifact import Record, read_record
-from v2p_data.report.reading import PARTIAL_SUFFIX
+from v2p_data.errors import V2PError, did_you_mean
+from v2p_data.pipeline.artifact import Record
+from v2p_data.report.reading import records_in
 from v2p_data.scene.scale.shared_camera import (
     FEWEST,
     Filmed,
@@ -79,9 +79,11 @@ def guessed_scenes(run: Path) -> dict[str, tuple[Scene, Record]]:
     if not (run / "scene").is_dir():
         raise V2PError(f"{run} holds no scenes; make some with 'v2p scene VIDEOS --out RUN'")
     newest: dict[str, tuple[str, Path, Record]] = {}
-    for folder in sorted((run / "scene").iterdir()):
-        record = _record_in(folder)
-        if record is None or record.rejected or _given(record):
+    for folder, record in records_in(run, "scene"):
+        if isinstance(record, str):
+            print(f"left out: {record}", file=sys.stderr)  # noqa: T201
+            continue
+        if record.rejected or _given(record):
             continue
         when = str(record.provenance.get("time", ""))
         if record.item not in newest or when >= newest[record.item][0]:
@@ -121,17 +123,6 @@ def flags(camera: SharedCamera) -> list[str]:
         f"--scene.{name.replace('_', '-')}={value:.3f}"
         for name, value in zip(_SETTINGS, values, strict=True)
     ]
-
-
-def _record_in(folder: Path) -> Record | None:
-    """Return the record of a complete scene; None for what is half made or cannot be read."""
-    if folder.suffix == PARTIAL_SUFFIX:
-        return None
-    try:
-        return read_record(folder)
-    except UnusableError as error:
-        print(f"left out: {error}", file=sys.stderr)  # noqa: T201
-        return None
 
 
 def _given(record: Record) -> bool:

@@ -5,7 +5,7 @@ Nothing here trusts a file to be whole: a run may be young, killed or edited. Wh
 
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -96,17 +96,9 @@ def read_run(root: Path) -> Run:
         (str(o["stage"]), str(o["item"])): Path(str(o.get("folder", ""))).name for o in outcomes
     }
     for stage in STAGES:
-        for folder in sorted(_folders(root / stage)):
-            if folder.name.endswith(PARTIAL_SUFFIX):
-                continue
-            try:
-                record = read_record(folder)
-            except UnusableError as error:
-                unreadable.append(error.detail)
-                continue
-            if record is None:
-                if any(folder.iterdir()):
-                    unreadable.append(f"{folder / RECORD_FILE} is missing")
+        for folder, record in records_in(root, stage):
+            if isinstance(record, str):
+                unreadable.append(record)
                 continue
             unreadable += [
                 f"{d.path} {d.what}" for d in damages(folder, record.files or {}, sizes_only=True)
@@ -123,6 +115,17 @@ def read_run(root: Path) -> Run:
     for result in (*_unfinished(root, outcomes), *_from_partials(root)):
         results.setdefault((result.stage, result.item), result)
     return Run(root=root, results=results, unreadable=unreadable)
+
+
+def records_in(root: Path, stage: str) -> Iterator[tuple[Path, Record | str]]:
+    """Yield each finished folder of a stage with its record, or with a sentence on why it cannot be read."""
+    for folder in sorted(_folders(root / stage)):
+        if folder.suffix == PARTIAL_SUFFIX or not any(folder.iterdir()):
+            continue
+        try:
+            yield folder, read_record(folder) or f"{folder / RECORD_FILE} is missing"
+        except UnusableError as error:
+            yield folder, error.detail
 
 
 @dataclass(frozen=True, kw_only=True)
