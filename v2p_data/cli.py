@@ -186,6 +186,8 @@ def options_of(kind: type, prefix: str = "--") -> Iterator[str]:
             yield from options_of(inner, name if is_nameless else f"{name}.")
         else:
             yield name
+        if inner is bool:
+            yield f"{prefix}no-{field.name.replace('_', '-')}"
 
 
 def _command(name: str) -> Callable[[list[str]], int]:
