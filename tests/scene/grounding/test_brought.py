@@ -27,7 +27,10 @@ def rectangle(top, left, height=18, width=24):
 
 
 def frames_of(segmentation_of, *, first=None, look=BLUE):
-    """Return 13 frames in which a hand lowers a block from above; `first` is where one like it lies in the first four."""
+    """Return 13 frames in which a hand lowers a block from above.
+
+    `first` is where one like it lies in the first four.
+    """
     frames = []
     for i in range(13):
         top = min(50, -20 + 10 * i)

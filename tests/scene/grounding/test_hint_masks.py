@@ -23,18 +23,32 @@ WHOLE[Y : Y + TALL, X : X + WIDE] = True
 def seen_in(picture: np.ndarray, thing: np.ndarray) -> Seen:
     """Return a still clip of the picture, and the word of a network that sees the thing on a table."""
     clip = Clip(
-        item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=np.stack([picture] * 10), fps=12.0,
-        total_frames=10, source_fps=12.0, source_frame=np.arange(10), times_s=np.arange(10) / 12,
-        source_size_px=(W, H), warnings=(),
-    )  # fmt: skip
+        item="drawn",
+        path=Path("drawn.mp4"),
+        caption="",
+        objects=(),
+        hints={},
+        frames=np.stack([picture] * 10),
+        fps=12.0,
+        total_frames=10,
+        source_fps=12.0,
+        source_frame=np.arange(10),
+        times_s=np.arange(10) / 12,
+        source_size_px=(W, H),
+        warnings=(),
+    )
     label = np.where(thing, OTHER, TABLE)
     shares = (0.02 + 0.9 * (label == np.arange(len(CLASSES))[:, None, None])).astype(np.float32)
     camera = SeenCamera(
         pitch_rad=0.6, pitch_sd_rad=0.1, focal_widths=0.9, table_width_m=0.6, table_width_sd=0.2
     )
     segmentation = Segmentation(
-        idx=np.array([0, 9]), shares=np.stack([shares] * 2), early=shares, late=shares, camera=camera
-    )  # fmt: skip
+        idx=np.array([0, 9]),
+        shares=np.stack([shares] * 2),
+        early=shares,
+        late=shares,
+        camera=camera,
+    )
     return Seen(clip=clip, working=working_clip_of(clip), segmentation=segmentation)
 
 

@@ -24,9 +24,19 @@ def clip():
     frames[:5, 100:130, 140:180] = RED
     frames[5:, 100:130, 40:80] = RED
     return Clip(
-        item="drawn", path=Path("drawn.mp4"), caption="", objects=("box",), hints={}, frames=frames.astype(np.uint8), fps=12.0,
-        total_frames=10, source_fps=12.0, source_frame=np.arange(10), times_s=np.arange(10) / 12, source_size_px=(W, H),
-    )  # fmt: skip
+        item="drawn",
+        path=Path("drawn.mp4"),
+        caption="",
+        objects=("box",),
+        hints={},
+        frames=frames.astype(np.uint8),
+        fps=12.0,
+        total_frames=10,
+        source_fps=12.0,
+        source_frame=np.arange(10),
+        times_s=np.arange(10) / 12,
+        source_size_px=(W, H),
+    )
 
 
 def seen_as(name):
@@ -34,10 +44,14 @@ def seen_as(name):
     shares[:, name] = 1
     camera = SeenCamera(
         pitch_rad=0.6, pitch_sd_rad=0.2, focal_widths=1.0, table_width_m=0.7, table_width_sd=0.3
-    )  # fmt: skip
+    )
     return Segmentation(
-        idx=np.arange(10), shares=shares, early=shares[0].copy(), late=shares[-1].copy(), camera=camera
-    )  # fmt: skip
+        idx=np.arange(10),
+        shares=shares,
+        early=shares[0].copy(),
+        late=shares[-1].copy(),
+        camera=camera,
+    )
 
 
 def marked(clip, **hint):
@@ -50,7 +64,9 @@ def test_without_the_mark_nothing_changes(clip):
     assert with_marked_table(clip, working_clip_of(clip), seen) is seen
 
 
-@pytest.mark.parametrize("mark", [{"click": [20.0, 20.0]}, {"stroke": [[20.0, 20.0], [200.0, 30.0]]}])  # fmt: skip
+@pytest.mark.parametrize(
+    "mark", [{"click": [20.0, 20.0]}, {"stroke": [[20.0, 20.0], [200.0, 30.0]]}]
+)
 def test_the_table_is_table_where_it_is_bare_and_not_where_something_stands(clip, mark):
     seen = with_marked_table(marked(clip, **mark), working_clip_of(clip), seen_as(OTHER))
 

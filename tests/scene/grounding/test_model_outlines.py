@@ -1,4 +1,8 @@
-"""Outlines of a model that knows edges of objects. A model that answers from the drawn truth stands for it: the weights are not part of the repository."""
+"""Outlines of a model that knows edges of objects.
+
+A model that answers from the drawn truth stands for it: the weights are not part of the
+repository.
+"""
 
 from dataclasses import replace
 
@@ -151,10 +155,15 @@ def test_a_static_object_is_cut_out_of_the_things_around_it(segmentation_of):
     def found(clip):
         ends = (square(5, 40), square(49, 40))
         search = StaticSearch(
-            working=clip, table=find_table(clip.always, segmentation.early[TABLE] > 0.5), segmentation=segmentation,
-            phrase="box", moved=noun_for("box"), kind="push_next_to",
-            ends=(large(ends[0], clip.shape), large(ends[1], clip.shape)), taken=np.zeros(clip.shape, bool),
-        )  # fmt: skip
+            working=clip,
+            table=find_table(clip.always, segmentation.early[TABLE] > 0.5),
+            segmentation=segmentation,
+            phrase="box",
+            moved=noun_for("box"),
+            kind="push_next_to",
+            ends=(large(ends[0], clip.shape), large(ends[1], clip.shape)),
+            taken=np.zeros(clip.shape, bool),
+        )
         return find_static_object(search)[0]
 
     truth = large(box, working.shape)

@@ -124,13 +124,20 @@ def test_what_goes_into_a_bin_and_is_gone_was_swallowed(segmentation_of, seen_at
     masks[9:] = masks[9:] if seen_at_the_end else lost  # where the tracker went astray
     common = {"moves": True, "at": 0, "known_m": None, "sure": 0.9, "why": ""}
     thing = ObjectTrack(
-        phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks,
-        quality=np.ones(12), **common,
-    )  # fmt: skip
+        phrase="red cube",
+        role="manipulated",
+        noun=noun_for("cube"),
+        masks=masks,
+        quality=np.ones(12),
+        **common,
+    )
     bin_ = replace(
-        thing, role="container", noun=noun_for("bin"), moves=False,
+        thing,
+        role="container",
+        noun=noun_for("bin"),
+        moves=False,
         masks=np.repeat((segmentation.early[OTHER] > 0.5)[None], 12, 0),
-    )  # fmt: skip
+    )
 
     found = hidden_in_container(segmentation, thing, bin_)
 
@@ -150,13 +157,24 @@ def test_what_a_leg_uncovers_elsewhere_does_not_hide_that_the_marked_bin_swallow
     plug = (square(3, 3), BLUE, MOVED)
     _, segmentation = segmentation_of([*frames[:10], [*frames[10], plug], [*frames[11], plug]])
     thing = ObjectTrack(
-        phrase="red cube", role="manipulated", noun=noun_for("cube"),
-        masks=segmentation.shares[:, MOVED] > 0.5, quality=np.ones(12), moves=True, at=0, known_m=None, sure=0.9, why="",
-    )  # fmt: skip
+        phrase="red cube",
+        role="manipulated",
+        noun=noun_for("cube"),
+        masks=segmentation.shares[:, MOVED] > 0.5,
+        quality=np.ones(12),
+        moves=True,
+        at=0,
+        known_m=None,
+        sure=0.9,
+        why="",
+    )
     bin_ = replace(
-        thing, role="container", noun=noun_for("bin"), moves=False,
+        thing,
+        role="container",
+        noun=noun_for("bin"),
+        moves=False,
         masks=np.repeat((segmentation.early[OTHER] > 0.5)[None], 12, 0),
-    )  # fmt: skip
+    )
 
     assert not hidden_in_container(segmentation, thing, bin_).hidden_in_container
     assert hidden_in_container(segmentation, thing, replace(bin_, hinted=True)).hidden_in_container

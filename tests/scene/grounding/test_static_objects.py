@@ -1,4 +1,4 @@
-"""Which of the things that stand there is meant: the network's word is drawn by hand here, the weights are the learned ones."""
+"""Which thing that stands there is meant: what the network sees is drawn here, the weights are the learned ones."""
 
 import json
 from dataclasses import replace
@@ -30,9 +30,12 @@ CAMERA = SeenCamera(
 def pushed_to(x, others):
     """A red square goes along y = 40 from x = 5 to x; others stand there."""
     return [
-        [*((mask, rgb, OTHER) for mask, rgb in others), (square(round(5 + (x - 5) * i / 11), 40), RED, MOVED)]
+        [
+            *((mask, rgb, OTHER) for mask, rgb in others),
+            (square(round(5 + (x - 5) * i / 11), 40), RED, MOVED),
+        ]
         for i in range(12)
-    ]  # fmt: skip
+    ]
 
 
 def searched(segmentation_of, frames, phrase, kind, ends, moved="thing"):
@@ -105,7 +108,9 @@ def test_a_whole_that_was_cut_out_twice_is_meant_rather_than_something_likelier_
 ):
     """What two candidates nearly agree on is likelier than the one candidate that agrees with none."""
     ends = square(5, 40), square(50, 40)
-    search = searched(segmentation_of, pushed_to(50, [(square(72, 28, 20), BLUE)]), "box", "push_next_to", ends)  # fmt: skip
+    search = searched(
+        segmentation_of, pushed_to(50, [(square(72, 28, 20), BLUE)]), "box", "push_next_to", ends
+    )
     usual = candidates(search)[0]
     shapes = [(square(72, 28, 20), 0.70), (square(73, 29, 19), 0.69), (square(5, 5), 0.75)]
     found = [

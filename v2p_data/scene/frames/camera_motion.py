@@ -50,7 +50,8 @@ _WELL_EXPLAINED = 0.8
 _KEY_EXPLAINED = 0.6
 """A frame that is explained so well may be a keyframe."""
 _CLEARLY_BETTER = 1.3
-"""So many times more pixels must be explained by a camera that moves than by one that stands, in the mean over the frames that move."""
+"""So many times more pixels must be explained by a camera that moves than by one that stands, in
+the mean over the frames that move."""
 _LEAST_LINKED = 0.6
 """Share of the frames that must be linked to the first one itself."""
 _MOST_LOST = 0.15

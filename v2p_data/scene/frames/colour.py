@@ -24,15 +24,36 @@ _HUES_DEG = {
 }
 """Hue angle in Lab and half width at which the membership is one half."""
 _SATURATION = {
-    "red": 0.85, "orange": 0.55, "yellow": 0.42, "green": 0.16, "blue": 0.2, "purple": 0.2, "pink": 0.25,
-}  # fmt: skip
+    "red": 0.85,
+    "orange": 0.55,
+    "yellow": 0.42,
+    "green": 0.16,
+    "blue": 0.2,
+    "purple": 0.2,
+    "pink": 0.25,
+}
 """Chroma over lightness from which on a pixel counts as coloured. It does not change with the light; wood and light
 skin lie below 0.5, hence the higher bars for warm colours. Dark skin is told from red by its hue (50 degrees)."""
 _SYNONYMS = {
-    "gray": "grey", "violet": "purple", "lilac": "purple", "golden": "yellow", "beige": "brown", "tan": "brown",
-    "cardboard": "brown", "wooden": "brown", "crimson": "red", "scarlet": "red", "turquoise": "green", "teal": "green",
-    "cyan": "blue", "navy": "blue", "silver": "grey", "steel": "grey", "metal": "grey", "magenta": "pink",
-}  # fmt: skip
+    "gray": "grey",
+    "violet": "purple",
+    "lilac": "purple",
+    "golden": "yellow",
+    "beige": "brown",
+    "tan": "brown",
+    "cardboard": "brown",
+    "wooden": "brown",
+    "crimson": "red",
+    "scarlet": "red",
+    "turquoise": "green",
+    "teal": "green",
+    "cyan": "blue",
+    "navy": "blue",
+    "silver": "grey",
+    "steel": "grey",
+    "metal": "grey",
+    "magenta": "pink",
+}
 _PLAIN = ("brown", "black", "white", "grey")
 _DARKEST_SHADOW = 0.22
 """Of the lightness without the shadow."""

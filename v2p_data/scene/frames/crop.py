@@ -55,7 +55,8 @@ def with_named_part(clip: Clip) -> Clip:
     if min(box[2] - box[0], box[3] - box[1]) < MIN_CROP_PX // 2:
         raise ItemRejectedError(
             "bad_hint",
-            f"{clip.path.name}, hint 'crop': of the picture only {box[2] - box[0]} x {box[3] - box[1]} px are left, at the "
+            f"{clip.path.name}, hint 'crop': of the picture only {box[2] - box[0]} x "
+            f"{box[3] - box[1]} px are left, at the "
             f"size at which it is read; {MIN_CROP_PX // 2} or more are needed",
         )
     return cropped(rest, box, f"the part {_in_words(rest, box)} was taken, as its hint says")

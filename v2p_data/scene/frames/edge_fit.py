@@ -24,9 +24,11 @@ _ROUNDS = 8
 _FINE_PX = 8.0
 """What is coarser than about twice this is light, not texture."""
 _EVEN_EDGE = 3.0
-"""Grey levels per pixel: steeper edges count no more, or the pattern of one moving thing outweighs a whole table of wood."""
+"""Grey levels per pixel: steeper edges count no more, or the pattern of one moving thing outweighs
+a whole table of wood."""
 _USUAL = np.array([0.06, 0.03, 0.06, 0.03, 0.3, 0.3, 0.05, 0.05])
-"""How far a hand moves a picture, half a width being 1: scale, aspect, turn, shear, shift right and down, perspective (standard deviations)."""
+"""How far a hand moves a picture, half a width being 1: scale, aspect, turn, shear, shift right
+and down, perspective (standard deviations)."""
 _ALIKE = 9.0
 """So many neighbouring pixels tell one thing only."""
 _NOISE = (3.0, 14.0)
@@ -49,7 +51,7 @@ Homography = Float[np.ndarray, "3 3"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EdgePixels:
-    """The pixels of a frame that are fitted at one size, and how each changes with the eight numbers of a homography."""
+    """The pixels that are fitted at one size, and how each changes with the numbers of a homography."""
 
     spots: Float[np.ndarray, "n 2"]
     values: Float32[np.ndarray, "n"]
@@ -87,9 +89,15 @@ class EdgePixels:
         over = _OVER_PX * np.stack([gx[y, x], gy[y, x]], 1) / steep[:, None]
         rise = _values(fine, spots + over) - _values(fine, spots - over)
         return EdgePixels(
-            spots=spots, values=fine[y, x], jacobian=jacobian.astype(np.float64), steep=steep,
-            over=over, rise=rise, trust=np.ones(len(steep)), unit=unit,
-        )  # fmt: skip
+            spots=spots,
+            values=fine[y, x],
+            jacobian=jacobian.astype(np.float64),
+            steep=steep,
+            over=over,
+            rise=rise,
+            trust=np.ones(len(steep)),
+            unit=unit,
+        )
 
 
 def fine_of(image: Grey, level: int) -> Float32[np.ndarray, "b a"]:

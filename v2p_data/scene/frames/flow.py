@@ -5,7 +5,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 _LEAST_PX = 32
-"""OpenCV's DIS flow ends the process by a segmentation fault on some wide pictures that are lower than this (OpenCV 4.13)."""
+"""OpenCV's DIS flow ends the process by a segmentation fault on some wide pictures that are lower
+than this (OpenCV 4.13)."""
 
 
 def flow_to(

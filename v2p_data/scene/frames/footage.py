@@ -29,7 +29,8 @@ _SHIFT = 0.14
 _WINDOW = 3
 """Frames on each side of a cut that must show one scene: a hand that comes fast into the picture is no cut."""
 _OTHER, _SAME = 0.33, 0.55
-"""Correlation of edges: below the first, two pictures show different scenes; above the second, the same one. In 35 uncut clips neighbours
+"""Correlation of edges: below the first, two pictures show different scenes; above the second, the
+same one. In 35 uncut clips neighbours
 agree to 0.57 or more, but where a hand covers a nearly empty picture (0.26)."""
 
 
@@ -44,7 +45,8 @@ def without_bars(clip: Clip) -> Clip:
         return clip
     x0, y0, x1, y1 = box
     note = (
-        f"the picture has black bars: {x0} px left, {w - x1} right, {y0} above, {h - y1} below (of {w} x {h}) were cut off; masks, "
+        f"the picture has black bars: {x0} px left, {w - x1} right, {y0} above, {h - y1} below "
+        f"(of {w} x {h}) were cut off; masks, "
         "overlays and camera belong to the rest"
     )
     return cropped(clip, box, note)
@@ -106,8 +108,10 @@ def check_cuts(clip: Clip, working: WorkingClip) -> None:
     where = ", ".join(f"{times[at]:.1f} s" for at, _ in cuts[:4])
     raise ItemRejectedError(
         "cut",
-        f"the clip is cut at {where}: the edges before and after agree to {least:.2f}, one shot has {_OTHER:.2f} or more; its longest "
-        f"uncut part is from {start:.2f} to {stop:.2f} s: ffmpeg -ss {start:.2f} -to {stop:.2f} -i {clip.path.name} uncut.mp4",
+        f"the clip is cut at {where}: the edges before and after agree to {least:.2f}, one shot "
+        f"has {_OTHER:.2f} or more; its longest "
+        f"uncut part is from {start:.2f} to {stop:.2f} s: ffmpeg -ss {start:.2f} -to {stop:.2f} "
+        f"-i {clip.path.name} uncut.mp4",
         round(least, 3),
     )
 
@@ -143,7 +147,7 @@ def _one_each(found: list[tuple[int, float]]) -> list[tuple[int, float]]:
 
 
 def _edge_spectra(rgb: UInt8[np.ndarray, "time h w 3"]) -> list[_Edges]:
-    """Return each frame's edges at a small size, free of exposure: strength over the usual strength nearby, mean 0, norm 1."""
+    """Return each frame's edges at a small size, over the usual strength nearby: mean 0, norm 1."""
     h, w = rgb.shape[1:3]
     size = (_EDGE_PX, max(8, round(h * _EDGE_PX / w)))
     out = []

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 _WRIST, _MIDDLE_KNUCKLE = 0, 9
 _TIPS = [4, 8, 12, 16, 20]
 _REACH = 0.3
-"""In palm lengths: a fingertip so near to an object's mask touches it. Of 16 right objects of real clips 14 are nearer in 78 % of
+"""In palm lengths: a fingertip so near to an object's mask touches it. Of 16 right objects of real
+clips 14 are nearer in 78 % of
 the frames in which they move, and wrong ones in 0 to 16 %."""
 _KNOWN_SHARE = 0.5
 """Share of the sampled frames in which a hand must be found, so that its absence elsewhere means something."""
@@ -83,7 +84,7 @@ def contact_share(
 
 
 def people_face(hands: HandTrack | None) -> bool:
-    """Return whether hands reach in from opposite sides, one up and one down in the picture, in many frames at once: two people's.
+    """Return whether two people's hands are seen: one reaches up in the picture, the other down.
 
     One person's two hands point the same way, up or down. False where hands are not known.
     """

@@ -120,7 +120,7 @@ def attainable_iou(mask: Bool[np.ndarray, "h w"]) -> float:
 def from_points(
     image: UInt8[np.ndarray, "h w 3"], points: list[tuple[float, float]], alike_lab: float = 9.0
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the region around the points (x, y in pixels of this image) that has their colours, up to a distance in Lab."""
+    """Return the region around points (x, y) [px] that has their colours, up to a distance in Lab."""
     lab = lab_of(cv2.GaussianBlur(image, (0, 0), 1.0))
     h, w = lab.shape[:2]
     seed = np.zeros((h, w), np.uint8)
@@ -235,7 +235,10 @@ def from_core(
     likely: Bool[np.ndarray, "h w"],
     possible: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Return what GrabCut makes of three nested regions: all of the first is object, nothing outside of the last; None where it finds nothing."""
+    """Return what GrabCut makes of three nested regions: all of the first is object, nothing outside of the last.
+
+    None where it finds nothing.
+    """
     labels = np.full(core.shape, cv2.GC_BGD, np.uint8)
     labels[possible] = cv2.GC_PR_BGD
     labels[likely] = cv2.GC_PR_FGD

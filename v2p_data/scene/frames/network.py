@@ -1,7 +1,9 @@
-"""A small network of our own looks at one frame beside what stood there before and after: hand, moved thing, other things, table.
+"""A small network of our own tells hand, moved thing, other things and table in one frame.
 
-Three pictures go in (the frame, the still of the clip's beginning, the still of its end), class probabilities and a guess
-of the camera come out. It was trained on rendered clips only (`scripts/train_scene_network.py`): hands and the change they
+Three pictures go in (the frame, the still of the clip's beginning, the still of its end), class
+probabilities and a guess
+of the camera come out. It was trained on rendered clips only (`scripts/train_scene_network.py`):
+hands and the change they
 cause look much the same there. Weights lie beside this file.
 """
 
@@ -23,7 +25,8 @@ from v2p_data.scene.scale.camera_height import SeenCamera
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 CAMERA_WEIGHTS = Path(__file__).with_name("camera.safetensors")
-"""Of the network that is asked for the camera: it learned that longer than how real things look, and sees those less well."""
+"""Of the network that is asked for the camera: it learned that longer than how real things look,
+and sees those less well."""
 _STEP = 16
 _WIDTHS = (24, 48, 80, 128)
 _CAMERA_EVERY = 3
@@ -48,7 +51,10 @@ def net_size(height_px: int, width_px: int) -> tuple[int, int]:
 
 
 class Encoder(nn.Module):
-    """Four levels of a picture, each half as large as the one before; the coarsest compares all places with each other."""
+    """Four levels of a picture, each half as large as the one before.
+
+    The coarsest compares all places with each other.
+    """
 
     def __init__(self, n_in: int, widths: tuple[int, int, int, int]) -> None:
         super().__init__()
@@ -240,9 +246,13 @@ def resized(
 
 def _pair(n_in: int, n_out: int) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(n_in, n_out, 3, padding=1, bias=False), nn.BatchNorm2d(n_out), nn.ReLU(),
-        nn.Conv2d(n_out, n_out, 3, padding=1, bias=False), nn.BatchNorm2d(n_out), nn.ReLU(),
-    )  # fmt: skip
+        nn.Conv2d(n_in, n_out, 3, padding=1, bias=False),
+        nn.BatchNorm2d(n_out),
+        nn.ReLU(),
+        nn.Conv2d(n_out, n_out, 3, padding=1, bias=False),
+        nn.BatchNorm2d(n_out),
+        nn.ReLU(),
+    )
 
 
 def _twice(x: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""One clicked pixel, or a line drawn over an object, becomes the object's outline in that picture: colours, no weights."""
+"""A clicked pixel, or a line drawn over an object, becomes the object's outline by colours alone."""
 
 from dataclasses import dataclass
 
@@ -38,7 +38,8 @@ def clicked_mask(
     """Return the outline of the thing at a pixel (u right, v down).
 
     Raises:
-        V2PError: the pixel lies outside the picture, on the robot, on the table, or on something too small or too large.
+        V2PError: the pixel lies outside the picture, on the robot, on the table, or on something
+            too small or too large.
     """
     h, w = picture.shape[:2]
     u, v = click_px

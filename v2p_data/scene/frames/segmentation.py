@@ -171,7 +171,7 @@ def _windows(moved: Float32[np.ndarray, "n h w"]) -> _Windows | None:
 
 
 def share_at_first(segmentation: Segmentation) -> float | None:
-    """Return how much of the picture the moving object covers at the beginning, where it only comes into the picture later.
+    """Return the share of the picture that the moving object covers at first, where it comes in later.
 
     None where it is there from the beginning, or not seen at the end.
     """

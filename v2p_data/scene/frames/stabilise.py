@@ -1,6 +1,7 @@
 """Clips filmed from the hand: every frame is brought to where the first one was taken from.
 
-The table fills most of a picture, and a camera that sways, pans or walks by a few centimetres changes how it looks by one
+The table fills most of a picture, and a camera that sways, pans or walks by a few centimetres
+changes how it looks by one
 homography per frame (`camera_motion.py`). What stands high above the table keeps a little of the sway: that is
 why a camera that travels far is turned away.
 """
@@ -29,9 +30,12 @@ _FILL_FRAMES = 15
 
 
 def stabilised(clip: Clip, working: WorkingClip) -> Clip:
-    """Return the clip with its frames aligned with the first one; as it is where the camera stood still or no way is found.
+    """Return the clip with its frames aligned with the first one.
 
-    What the aligned frames no longer show at their edges is filled from the nearest frame that shows it; hints go along.
+    As it is where the camera stood still or no way is found.
+
+    What the aligned frames no longer show at their edges is filled from the nearest frame that
+    shows it; hints go along.
 
     Raises:
         ItemRejectedError: `camera_moves`: it clearly moved, and farther than can be undone.
@@ -58,7 +62,8 @@ def stabilised(clip: Clip, working: WorkingClip) -> Clip:
     to_small = np.diag([small_w / w, small_h / h, 1.0])
     to_filmed = np.linalg.inv(to_small) @ motion.to_frames @ to_small
     note = (
-        f"the camera swayed by up to {travel * WIDTH_PX:.0f} px of {WIDTH_PX}: all frames were aligned with the first, and "
+        f"the camera swayed by up to {travel * WIDTH_PX:.0f} px of {WIDTH_PX}: all frames were "
+        "aligned with the first, and "
         "masks and overlays belong to the aligned ones"
     )
     return replace(

@@ -1,6 +1,7 @@
 """An object that a hand brings: it is not on the table when the clip begins, and rests where the hand leaves it.
 
-Such a clip is seen backwards in time: there the object lies on the table first and is then carried off, as the network knows it. What it
+Such a clip is seen backwards in time: there the object lies on the table first and is then carried
+off, as the network knows it. What it
 sees is turned back before anything follows from it.
 """
 
@@ -30,10 +31,12 @@ from v2p_data.scene.grounding.tracking import carried
 from v2p_data.video.clip import Clip
 
 _PASSED_LAB, _TOUCH_PX = 12, 5
-"""Distance in Lab between the first frame and the last still, from which a pixel shows something else; and distance in a picture 320 px
+"""Distance in Lab between the first frame and the last still, from which a pixel shows something
+else; and distance in a picture 320 px
 wide, within which a hand holds something."""
 _AS_LARGE, _AS_COLOURED, _SOLID = 0.3, 0.65, 0.6
-"""Share of the object's outline, similarity of colours, and share of its convex hull that it fills, from which what is seen elsewhere is
+"""Share of the object's outline, similarity of colours, and share of its convex hull that it
+fills, from which what is seen elsewhere is
 the object itself. Edges of a person who sways fill less."""
 
 
@@ -64,7 +67,8 @@ def find_brought(
     """Return the object where the hand leaves it, its first outline being empty.
 
     Raises:
-        ItemRejectedError: `object_not_found`, where nothing came to rest, or what did lay elsewhere in the picture before.
+        ItemRejectedError: `object_not_found`, where nothing came to rest, or what did lay
+            elsewhere in the picture before.
     """
     moved = find_brought_by_network(working, segmentation, phrase, mark and mark.mask)
     if (
@@ -79,7 +83,7 @@ def find_brought(
 def _lay_elsewhere(
     working: WorkingClip, segmentation: Segmentation, last: Bool[np.ndarray, "h w"]
 ) -> bool:
-    """Return whether something that looks like the object is seen at another place in the first frame, and no hand holds it."""
+    """Return whether the first frame shows something like the object at another place, in no hand."""
     hand, here, bare = hand_at(segmentation, 0), working.lab[0], lab_of(working.late)
     gone = (lab_distance(here, bare) > _PASSED_LAB) & ~hand
     gone &= ~(shadow(here, bare) | shadow(bare, here))

@@ -36,7 +36,8 @@ def track_hands(clip: Clip, working: WorkingClip, cfg: HandsConfig) -> HandTrack
         command = installed_worker()
         if not command and cfg.backend == "mediapipe":
             raise V2PError(
-                "scene.hands.backend is 'mediapipe', which was not set up here; run 'v2p setup hands', or leave the option out"
+                "scene.hands.backend is 'mediapipe', which was not set up here; run 'v2p setup "
+                "hands', or leave the option out"
             )
     if cfg.backend == "none" or not command:
         return None

@@ -44,9 +44,11 @@ from v2p_data.video.meaning import Meaning
 _LEAST_HAND = 0.002
 """Least share of the picture that a hand covers in the frame that shows most of it."""
 _BELOW_PX, _GAP_PX, EXACT_GAP_PX = 5, 1, 3
-"""Depth of the strip below an object in which the network must see table, and where it begins; below a model's exact outline later."""
+"""Depth of the strip below an object in which the network must see table, and where it begins;
+below a model's exact outline later."""
 _SEEN_BELOW, _FOOT_ON_TABLE = 0.5, 0.3
-"""Mean probability of table in that strip, and share of the foot within the table's part, from which the object rests on the table."""
+"""Mean probability of table in that strip, and share of the foot within the table's part, from
+which the object rests on the table."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +76,12 @@ def ground_objects(
 ) -> GroundedObjects:
     """Return the masks of all objects that the caption names.
 
-    `segmentation` is what the network sees; `methods` mark objects before it is asked, the later ones before the earlier ones.
+    `segmentation` is what the network sees; `methods` mark objects before it is asked, the later
+    ones before the earlier ones.
 
     Raises:
-        ItemRejectedError: `no_hand`, `not_there_at_first`, `bad_hint`, `object_not_found` or `reference_not_found`, with the number that
+        ItemRejectedError: `no_hand`, `not_there_at_first`, `bad_hint`, `object_not_found` or
+            `reference_not_found`, with the number that
             decided.
     """
     check_hand(clip, working, segmentation)
@@ -183,9 +187,10 @@ def _others(
 def without_asides(
     grounded: GroundedObjects, meaning: Meaning, clip: Clip
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Return the numbers of the objects without those of which the caption does not speak, and a warning for each of these.
+    """Return the numbers of the objects that the caption names, and a warning for each other one.
 
-    What is only listed beside the caption of a lift, push or tip is no part of the task: such a scene makes sense without it.
+    What is only listed beside the caption of a lift, push or tip is no part of the task: such a
+    scene makes sense without it.
     """
     left_out = [
         k
@@ -195,7 +200,8 @@ def without_asides(
         and not (s.hinted or _is_said(s.phrase, clip))
     ]
     return [k for k in range(len(grounded.objects)) if k not in left_out], tuple(
-        f"the '{grounded.objects[k].phrase}', of which the caption does not speak, was not found surely enough and is left out"
+        f"the '{grounded.objects[k].phrase}', of which the caption does not speak, was not found "
+        "surely enough and is left out"
         for k in left_out
     )
 
@@ -207,7 +213,9 @@ def _is_said(phrase: str, clip: Clip) -> bool:
 def _tool(
     scene: _Scene, thing: ObjectTrack, mark: Mark | None, tool_moved: Moved | None
 ) -> ObjectTrack | None:
-    """Return a tool: the marked one, or the second moving object; None where it is not found and the caption can do without.
+    """Return a tool: the marked one, or the second moving object.
+
+    None where it is not found and the caption can do without.
 
     Raises:
         ItemRejectedError: `reference_not_found`.
@@ -289,7 +297,8 @@ def _check_needed(scene: _Scene, phrase: str, sure: float) -> None:
     if _is_said(phrase, clip) and KINDS[scene.meaning.kind].other != "ignored":
         raise ItemRejectedError(
             "reference_not_found",
-            f"the '{phrase}' was not found in {clip.item} (sure to {sure:.3f}, below {scene.min_found:g}); mark it with a box in captions.json",
+            f"the '{phrase}' was not found in {clip.item} (sure to {sure:.3f}, below "
+            f"{scene.min_found:g}); mark it with a box in captions.json",
             round(sure, 3),
         )
 
@@ -355,13 +364,14 @@ def seen_on_table(
     segmentation: Segmentation,
     gap_px: int = _GAP_PX,
 ) -> float:
-    """Return how far the mask's foot is on the table's part of the picture, or the network sees table beneath it: 1 where it rests.
+    """Return how far an object is seen to rest on the table, 0 to 1: by its foot, or by the table beneath it.
 
     Args:
         table: the table's part of the picture.
         mask: the object at the beginning.
         segmentation: what the network sees.
-        gap_px: between the mask and the strip beneath it; what the network sees as object goes on a little beside an exact outline.
+        gap_px: between the mask and the strip beneath it; what the network sees as object goes on
+            a little beside an exact outline.
     """
     x, y, w, h = bounding_box(mask)
     foot = np.zeros_like(mask)

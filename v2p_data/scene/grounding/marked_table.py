@@ -56,7 +56,7 @@ def _is_alike(
 
 
 def _bare_table(clip: Clip, working: WorkingClip, hint: Hint, i: int) -> Bool[np.ndarray, "h w"]:
-    """Return the part of working frame `i` that joins the marked pixels and has their colours, less what is marked as an object there."""
+    """Return what joins the marked pixels in working frame `i` and has their colours, without marked objects."""
     scale = working.px_scale
     marked = points_along([(x * scale, y * scale) for x, y in marked_spots(hint)], working.shape)
     if "box" in hint:

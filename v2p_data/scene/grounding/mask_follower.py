@@ -27,7 +27,8 @@ class TrackConfig:
     rests: float = 0.4
     """Share of the first outline that must look as before while the object has not left."""
     shrunk: float = 1.25
-    """Factor by which the resting part must exceed the carried mask to replace it: smaller gains are corrections of the outline."""
+    """Factor by which the resting part must exceed the carried mask to replace it: smaller gains
+    are corrections of the outline."""
     surely_bare: float = 0.8
     """Probability of bare table, mean over a mask, above which the mask shows no object that the network knows."""
     moves: float = 0.5
@@ -71,7 +72,8 @@ def follow(
 ) -> list[Bool[np.ndarray, "h w"]]:
     """Return the mask in these frames, the first of them the `anchor`.
 
-    With `may_rest`, what of the start looks as it did belongs to the mask while most of it does: the object lies there still.
+    With `may_rest`, what of the start looks as it did belongs to the mask while most of it does:
+    the object lies there still.
     """
     follower = _Follower(working, start, colour_hist, anchor, moving, may_rest=may_rest)
     return [start, *(follower.step(i) for i in steps[1:])]
@@ -127,7 +129,7 @@ class _Follower:
     def _carried(
         self, now: UInt8[np.ndarray, "h w"], window: tuple[slice, slice]
     ) -> Float32[np.ndarray, "i j"]:
-        """Return the last mask as optical flow carries it on, blurred: how likely each pixel is the object by its place."""
+        """Return how likely each pixel is the object by its place: the last mask carried by optical flow, blurred."""
         back = flow_to(now[window], self._grey[window])
         ch, cw = back.shape[:2]
         carried = cv2.remap(
@@ -219,7 +221,7 @@ def likeness_of(
     colour_hist: np.ndarray,
     area: float,
 ) -> float:
-    """Return how much a mask looks like the object, 0 to 1: by its colours, and by its area beside the expected one [px]."""
+    """Return how much a mask looks like the object, 0 to 1, by its colours and by its area [px]."""
     size = int(mask.sum())
     if size < CONFIG.least_px:
         return 0.0

@@ -1,7 +1,9 @@
 """The objects of a clip, searched in its mirror image.
 
-A network sees a mirrored clip a little differently, and so does everything that is built on it, though the scene is the same.
-Where the first search is not sure, a second one in the mirror image often is (test-time augmentation). Only pixels are mirrored:
+A network sees a mirrored clip a little differently, and so does everything that is built on it,
+though the scene is the same.
+Where the first search is not sure, a second one in the mirror image often is (test-time
+augmentation). Only pixels are mirrored:
 what was found is turned back before anything is measured.
 """
 

@@ -43,7 +43,7 @@ def outlines_around(
     region: Bool[np.ndarray, "h w"],
     hand: Bool[np.ndarray, "h w"] | None = None,
 ) -> list[ModelOutline]:
-    """Return what the model outlines at points of a region in working frame `i`, and in the region's box, the surest first.
+    """Return what the model outlines in a region of working frame `i`, the surest first.
 
     Empty where no such model was asked for. What is on the `hand` is left out.
     """
@@ -78,7 +78,10 @@ def outlines_around(
 def outline_in_box(
     working: WorkingClip, i: int, box_xyxy: tuple[float, float, float, float]
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Return the outline in a box that a person drew [working px]; None where no model was asked for, or it sees none there."""
+    """Return the outline in a box that a person drew [working px].
+
+    None where no model was asked for, or it sees none there.
+    """
     if working.outliner is None:
         return None
     seen = working.outliner.at(i, [Spots(box_xyxy=box_xyxy)])
@@ -94,7 +97,10 @@ def outline_in_box(
 def outline_at_spots(
     working: WorkingClip, i: int, spots: Sequence[tuple[float, float]]
 ) -> list[ModelOutline]:
-    """Return what the model outlines at a clicked pixel or along a stroke [working px], the surest first; empty without a model."""
+    """Return what the model outlines at a clicked pixel or along a stroke [working px], the surest first.
+
+    Empty without a model.
+    """
     if working.outliner is None:
         return []
     seen = working.outliner.at(i, [Spots(on=tuple(spots))])

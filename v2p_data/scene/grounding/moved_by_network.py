@@ -1,6 +1,7 @@
 """Which pixels are the moved object at the start and at the end, from what the scene network sees: the default way.
 
-The network's class `moved` is cut into blobs at both ends. Pairs of blobs are rated by how well they fit the caption and each other; the
+The network's class `moved` is cut into blobs at both ends. Pairs of blobs are rated by how well
+they fit the caption and each other; the
 product of the cues, 0 to 1, is the score, and the weakest cue is its reason.
 """
 
@@ -137,13 +138,9 @@ def find_moved_by_network(
         near = grow(given.goal, _GAP_PX)
         stops = [_at_goal(blob, near) for blob in stops]
     pairs = sorted(
-        (
-            _Pair(a, b, _pair_cues(a, b, kind, working.shape))
-            for a in starts
-            for b in stops
-        ),
+        (_Pair(a, b, _pair_cues(a, b, kind, working.shape)) for a in starts for b in stops),
         key=lambda pair: -pair.rating,
-    )  # fmt: skip
+    )
     if not pairs:
         return None
     if not tool:
@@ -157,9 +154,11 @@ def find_moved_by_network(
     in_hand = [_share_in_hand(working, segmentation, pair.first.hist) for pair in (best, second)]
     words = [colour_words(text) for text in (phrase, tool)]
     by_colour = [
-        _named(working.rgb[0], best.first.mask, words[0]) * _named(working.rgb[0], second.first.mask, words[1]),
-        _named(working.rgb[0], second.first.mask, words[0]) * _named(working.rgb[0], best.first.mask, words[1]),
-    ]  # fmt: skip
+        _named(working.rgb[0], best.first.mask, words[0])
+        * _named(working.rgb[0], second.first.mask, words[1]),
+        _named(working.rgb[0], second.first.mask, words[0])
+        * _named(working.rgb[0], best.first.mask, words[1]),
+    ]
     if by_colour[1] * (0.3 + in_hand[0]) > by_colour[0] * (0.3 + in_hand[1]):
         best, second = second, best
     return _moved(pairs, best), _moved(pairs, second)
@@ -248,7 +247,8 @@ def _with_outlines(
 ) -> list[_Blob]:
     """Return the blobs with the outlines that a model draws at the best of them.
 
-    A blob may hold an arm or the screen behind the object; the model draws each by itself. It is surer of whole objects than of parts.
+    A blob may hold an arm or the screen behind the object; the model draws each by itself. It is
+    surer of whole objects than of parts.
     """
     moved, hand = segmentation.at(i)[MOVED], hand_at(segmentation, i)
     best = sorted(blobs, key=lambda blob: -blob.rating)[:_ASKED]
@@ -298,7 +298,7 @@ def _rated(
     masks: Sequence[Bool[np.ndarray, "h w"]],
     cores: Sequence[Bool[np.ndarray, "h w"]],
 ) -> list[_Blob]:
-    """Return what speaks for each mask being what the phrase names, at working frame `i`, the first or one near the end.
+    """Return the masks with their cues, at working frame `i`: the first one or one near the end.
 
     `cores` are what the network saw of each before its outline was refined: noise is small there.
     """

@@ -22,7 +22,8 @@ from v2p_data.video.meaning import Meaning
 _ONE_END = 0.75
 """Factor on the score of what is seen at rest at the end alone."""
 _SURE_OF_WHOLE = 0.35
-"""Exponent of the rating where a model drew both outlines, 0.5 otherwise: then what else lowers the rating says less about them."""
+"""Exponent of the rating where a model drew both outlines, 0.5 otherwise: then what else lowers
+the rating says less about them."""
 _LITTLE = 0.2
 """Share of an object's first outline; when no more than this is seen, the object is hidden."""
 _TOUCH_PX = 6
@@ -144,14 +145,14 @@ def tracked_mover(
 
 
 def every_nth(working: WorkingClip) -> int:
-    """Return every how-manieth frame is tracked."""
+    """Return the step between the frames that are tracked."""
     return 1 if len(working.rgb) < 80 else 2
 
 
 def hidden_in_container(
     segmentation: Segmentation, thing: ObjectTrack, other: ObjectTrack
 ) -> ObjectTrack:
-    """Return the thing as last seen, where it goes into the other and nothing that moved is seen at the end: bins are deep.
+    """Return the thing as last seen, where it goes into the other and is out of sight at the end.
 
     Where the user marked the other, only what is seen there counts: hands and legs uncover things elsewhere.
     """
@@ -183,7 +184,8 @@ def check_there_at_first(clip: Clip, phrase: str, segmentation: Segmentation) ->
     if seen is not None:
         raise ItemRejectedError(
             "not_there_at_first",
-            f"the moving object of {clip.item} is not in the picture when it begins (it covers {seen:.2%} of it, at least {LEAST_SHARE:.2%} "
+            f"the moving object of {clip.item} is not in the picture when it begins (it covers "
+            f"{seen:.2%} of it, at least {LEAST_SHARE:.2%} "
             f"needed): let the clip begin where '{phrase}' lies on the table",
             round(seen, 5),
         )

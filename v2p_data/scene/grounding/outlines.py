@@ -1,4 +1,4 @@
-"""Outlines are corrected by what the scene network sees: table is cut off, missing parts are added, the two ends are made disjoint."""
+"""Outlines are corrected by the scene network: table is cut off, missing parts are added, both ends are parted."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -36,9 +36,10 @@ _LEAST_CHANGE = 0.05
 
 
 def disjoint_ends(working: WorkingClip, moved: Moved, keep: Sequence[int] = ()) -> Moved:
-    """Return both outlines, each without the other's place: the picture changes at both, but each shows the object at one only.
+    """Return both outlines, each without the other's place: the picture changes at both places.
 
-    A pixel in both outlines is background in a picture where it has the colours of the ring around both outlines. The rest of the
+    A pixel in both outlines is background in a picture where it has the colours of the ring around
+    both outlines. The rest of the
     outline is compared; where hardly anything is left of it, the other picture.
 
     Args:
@@ -70,7 +71,7 @@ def disjoint_ends(working: WorkingClip, moved: Moved, keep: Sequence[int] = ()) 
 def without_shadow(
     mask: Bool[np.ndarray, "h w"], shares: Float32[np.ndarray, "5 h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return a moved thing's outline without what to the network surely is bare table, shadows above all, and completed.
+    """Return a moved thing's outline completed, without what the network surely sees as table: shadows.
 
     Args:
         mask: the outline.
@@ -82,7 +83,9 @@ def without_shadow(
 def without_table(
     mask: Bool[np.ndarray, "h w"], shares: Float32[np.ndarray, "5 h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the outline without what to the network surely is bare table; `shares` is what it sees in the same picture.
+    """Return the outline without what to the network surely is bare table.
+
+    `shares` is what it sees in the same picture.
 
     It may leave several parts: the root of a handle is easily taken for table.
     """

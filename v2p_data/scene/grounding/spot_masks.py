@@ -1,7 +1,9 @@
 """A click on an object, or a stroke over it, becomes the object's outline in that picture.
 
-Candidates come from colours that the surroundings lack (`frames/one_click.py`), from what the network sees as an object, from the
-colours at the marked pixels, and from GrabCut with several sizes and proportions. The one counts that most looks like an object
+Candidates come from colours that the surroundings lack (`frames/one_click.py`), from what the
+network sees as an object, from the
+colours at the marked pixels, and from GrabCut with several sizes and proportions. The one counts
+that most looks like an object
 which somebody clicked near its middle.
 """
 
@@ -48,12 +50,14 @@ _LEAST_ON = 0.5
 _RING_PX = (1, 4)
 _MOST_CONTRAST = 40.0
 _WEIGHTS = np.array([-0.174, -0.028, 0.190, 0.141, 0.451, -1.014, -0.190])
-"""Of what `_likeness` looks at: least squares on the overlap with boxes drawn by hand around 56 objects of 32 real clips."""
+"""Of what `_likeness` looks at: least squares on the overlap with boxes drawn by hand around 56
+objects of 32 real clips."""
 
 _WHOLE = 1.0
 """Weight on the logarithm of the overlap that a model expects of its outline."""
 _LEAST_LIKENESS, _BARE = 0.40, 0.4
-"""What looks less like an object, where the network sees an object with a lower probability, is none. Of 112 clicks on bare table 94 %
+"""What looks less like an object, where the network sees an object with a lower probability, is
+none. Of 112 clicks on bare table 94 %
 look so, of 112 on those objects 7 %."""
 
 
@@ -95,7 +99,8 @@ def mask_at_spots(
     best = int(np.argmax(np.add(likeness, preference)))
     if likeness[best] < _LEAST_LIKENESS and thing[drawn].mean() < _BARE:
         raise V2PError(
-            "nothing stands out there from the table or the background; mark the middle of the object, or draw a box around it"
+            "nothing stands out there from the table or the background; mark the middle of the "
+            "object, or draw a box around it"
         )
     return usable[best]
 
@@ -163,7 +168,7 @@ def _likeness(
     thing: Float[np.ndarray, "h w"],
     drawn: Bool[np.ndarray, "h w"],
 ) -> float:
-    """Return how much a mask looks like an object that somebody marked near its middle: the expected overlap, up to a constant."""
+    """Return how much a mask looks like an object that was marked near its middle: an expected overlap."""
     ring = grow(mask, _RING_PX[1]) & ~grow(mask, _RING_PX[0])
     x, y, w, h = bounding_box(mask)
     u, v, wide, high = bounding_box(drawn)

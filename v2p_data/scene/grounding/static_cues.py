@@ -1,6 +1,7 @@
 """What speaks for a thing that stands still being the one that a phrase means.
 
-What each cue counts was learned from drawn clips (`scripts/train_standing.py`); the weights are `standing.json` beside this file.
+What each cue counts was learned from drawn clips (`scripts/train_standing.py`); the weights are
+`standing.json` beside this file.
 """
 
 import json
@@ -34,9 +35,11 @@ MOST_SHARE = 0.2
 _TOO_LARGE = 0.3
 """Logarithm of size over usual size, above which a candidate beyond `MOST_SHARE` is the table and no object."""
 _KINDS_VARY = 0.3
-"""Logarithm of size over usual size up to which the moved object says nothing against the camera: its kind varies that much."""
+"""Logarithm of size over usual size up to which the moved object says nothing against the camera:
+its kind varies that much."""
 _FOOT = 0.8
-"""Row of a candidate's foot, as a share of its height from the top: there its width is compared with the table's scale."""
+"""Row of a candidate's foot, as a share of its height from the top: there its width is compared
+with the table's scale."""
 _LEAST_FREE = 2.0
 """Frames without anything passing in front of a pixel, from which the network's word on it counts in full."""
 _MOST_GAP = 3.0
@@ -91,7 +94,7 @@ class StaticSearch:
 
     @cached_property
     def log_scale(self) -> float:
-        """By how much all seems larger than it is, as far as the moving object seems too large for its kind by more than kinds vary."""
+        """By how much all seems too large, as the moved object tells beyond what its kind varies (a logarithm)."""
         mask = self.ends[0]
         if not (self.moved.known and mask.any()):
             return 0.0
@@ -113,7 +116,8 @@ def static_share(segmentation: Segmentation, kind: Kind) -> Float32[np.ndarray, 
 def usual_area_px(noun: Noun, camera: SeenCamera, shape: tuple[int, int], row_px: float) -> float:
     """Return how many pixels a thing of the noun's usual size covers, its foot in that row of a picture of this shape.
 
-    Its top seen from above and its side, the mean over all yaws (of a convex outline the mean width is its girth over pi).
+    Its top seen from above and its side, the mean over all yaws (of a convex outline the mean
+    width is its girth over pi).
     """
     per_m = px_per_m(camera, shape, row_px)
     below = (row_px - shape[0] / 2) / shape[1]
@@ -195,7 +199,11 @@ def _own_cues(
     colour: Float32[np.ndarray, "h w"] | None,
     usual: float,
 ) -> dict[str, float]:
-    """Return what a candidate looks like; `colour` is how well each pixel has the colour that the phrase names, `usual` the table's mean."""
+    """Return what a candidate looks like.
+
+    `colour` is how well each pixel has the colour that the phrase names, `usual` the table's
+    mean.
+    """
     static, seen = search.static, search.table.seen
     h, w = mask.shape
     x, y, bw, bh = bounding_box(mask)

@@ -1,6 +1,7 @@
 """Which static object the caption means, from what the scene network sees.
 
-The network says of every pixel in every frame whether it shows an object that never moved. That is cut into candidates. Cues, such as
+The network says of every pixel in every frame whether it shows an object that never moved. That is
+cut into candidates. Cues, such as
 size, colour and place, say which candidate is meant (`static_cues.py`).
 """
 
@@ -40,7 +41,8 @@ _SAME = 0.9
 _ALIKE = 0.5
 """IoU from which two candidates are the same object, cut out differently."""
 _SOFTER = 0.7
-"""Factor on the learned ratings for the expected overlap: the odds they were learned for are too sure. Measured on 88 drawn clips."""
+"""Factor on the learned ratings for the expected overlap: the odds they were learned for are too
+sure. Measured on 88 drawn clips."""
 _LEAST_CHANCE = 0.01
 """Least and, from 1 downwards, greatest probability of a candidate."""
 _MOST_WITH_HANDLE = 1.5
@@ -56,7 +58,8 @@ _ASKED = 5
 _ASKED_APART = 0.7
 """IoU below which two candidates are asked for both."""
 _WHOLE = 30.0
-"""Weight on the logarithm of the overlap that such a model expects: 0.99 for most whole objects, 0.9 for their parts."""
+"""Weight on the logarithm of the overlap that such a model expects: 0.99 for most whole objects,
+0.9 for their parts."""
 _NOT_OUTLINED = -2.0
 """What other candidates' outlines add to their rating beside those."""
 _MOST_TAKEN = 0.3
@@ -68,7 +71,8 @@ _LESS_HIDDEN = 0.1
 def find_static_object(search: StaticSearch) -> tuple[Bool[np.ndarray, "h w"], float] | None:
     """Return the thing that the phrase means, and how likely it is the right one; None where nothing stands.
 
-    It is the candidate from which most overlap with the named object can be expected: a whole rather than its likelier half.
+    It is the candidate from which most overlap with the named object can be expected: a whole
+    rather than its likelier half.
     """
     found = _with_outlines(search, candidates(search))
     if not found:
@@ -101,7 +105,10 @@ def overlaps_of(found: list[StaticCandidate]) -> Float[np.ndarray, "n n"]:
 
 
 def odds_of(likely: Float[np.ndarray, "n"], alike: Float[np.ndarray, "n"]) -> float:
-    """Return the log odds of the likeliest candidate and those like it among all; `alike` is how far each overlaps it."""
+    """Return the log odds of the likeliest candidate and those like it among all.
+
+    `alike` is how far each overlaps it.
+    """
     share = float(np.clip(likely[alike > _ALIKE].sum(), _LEAST_CHANCE, 1 - _LEAST_CHANCE))
     return float(np.log(share / (1 - share)))
 

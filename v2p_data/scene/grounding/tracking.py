@@ -1,6 +1,7 @@
 """The object's mask in the frames between the first and the last.
 
-The mask is carried forwards from the start and backwards from the end (`mask_follower`); in each frame the better one counts.
+The mask is carried forwards from the start and backwards from the end (`mask_follower`); in each
+frame the better one counts.
 A pixel outside the first mask that still looks as in the first frame is not the object. A lost track has a low quality.
 """
 
@@ -216,7 +217,10 @@ def _alike_share(
     mask: Bool[np.ndarray, "h w"],
     but_for: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Return how much of a mask looks in a frame as in a smoothed still; `but_for` are pixels that do not count as alike."""
+    """Return how much of a mask looks in a frame as in a smoothed still.
+
+    `but_for` are pixels that do not count as alike.
+    """
     alike = lab_distance(smoothed(lab), still) < CONFIG.same_lab
     if but_for is not None:
         alike &= ~but_for

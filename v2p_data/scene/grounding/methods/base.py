@@ -27,7 +27,8 @@ from v2p_data.video.clip import Clip
 _ELSEWHERE_LAB = 12.0
 """Where a thing is, and where it is not, a picture differs by so much and more."""
 _SMALL_PX, _FILLED = 1500, 0.85
-"""At working size, 320 px wide: of smaller things the network, which sees them enlarged, knows more than their colours tell. People draw
+"""At working size, 320 px wide: of smaller things the network, which sees them enlarged, knows
+more than their colours tell. People draw
 boxes tightly: of a larger outline that spans less of its box a part is missing."""
 _BESIDE_PX = 3
 """At working size, 320 px wide: so far beside a box an edge may lie. People are off by a pixel or two."""
@@ -65,7 +66,7 @@ class Mark:
         return self.frame > 0.5 * (len(working.rgb) - 1)
 
     def on_its_way(self, working: WorkingClip) -> bool:
-        """Return whether what is marked is elsewhere at the nearer end of the clip: then the mark shows how it looks, not where it ends."""
+        """Return whether the object is elsewhere at the nearer end of the clip: then the mark only shows its look."""
         end = -1 if self.at_end(working) else 0
         off = lab_distance(working.lab[self.frame], working.lab[end])[self.mask]
         return bool(off.size and np.median(off) > _ELSEWHERE_LAB)
