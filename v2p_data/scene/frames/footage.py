@@ -30,8 +30,8 @@ _WINDOW = 3
 """Frames on each side of a cut that must show one scene: a hand that comes fast into the picture is no cut."""
 _OTHER, _SAME = 0.33, 0.55
 """Correlation of edges: below the first, two pictures show different scenes; above the second, the
-same one. In 35 uncut clips neighbours
-agree to 0.57 or more, but where a hand covers a nearly empty picture (0.26)."""
+same one. In 35 uncut clips neighbours agree to 0.57 or more, but where a hand covers a nearly empty
+picture (0.26)."""
 
 
 def without_bars(clip: Clip) -> Clip:

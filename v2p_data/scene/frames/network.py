@@ -1,10 +1,9 @@
 """A small network of our own tells hand, moved thing, other things and table in one frame.
 
-Three pictures go in (the frame, the still of the clip's beginning, the still of its end), class
-probabilities and a guess
-of the camera come out. It was trained on rendered clips only (`scripts/train_scene_network.py`):
-hands and the change they
-cause look much the same there. Weights lie beside this file.
+Three pictures go in: the frame, the still of the clip's beginning, and the still of its end. Class
+probabilities and a guess of the camera come out. It was trained on rendered clips only
+(`scripts/train_scene_network.py`); hands and the change they cause look much the same there. Weights
+lie beside this file.
 """
 
 from dataclasses import dataclass

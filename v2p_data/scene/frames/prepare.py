@@ -49,8 +49,7 @@ def prepare(clip: Clip, *, max_camera_shift_px: float) -> PreparedClip:
     """Return the clip ready to be searched, with its working frames and what the network sees.
 
     The part of the pictures that a person named is taken. Black bars are cut off, and frames
-    aligned where the camera sways.
-    `max_camera_shift_px` is of a picture 320 px wide.
+    aligned where the camera sways. `max_camera_shift_px` is of a picture 320 px wide.
 
     Raises:
         ItemRejectedError: `bad_hint`, `nothing_moves`, `cut` or `camera_moves`, with the number that decided.

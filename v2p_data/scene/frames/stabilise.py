@@ -1,9 +1,8 @@
 """Clips filmed from the hand: every frame is brought to where the first one was taken from.
 
 The table fills most of a picture, and a camera that sways, pans or walks by a few centimetres
-changes how it looks by one
-homography per frame (`camera_motion.py`). What stands high above the table keeps a little of the sway: that is
-why a camera that travels far is turned away.
+changes how it looks by one homography per frame (`camera_motion.py`). What stands high above the
+table keeps a little of the sway: that is why a camera that travels far is turned away.
 """
 
 from dataclasses import replace

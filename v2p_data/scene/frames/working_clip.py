@@ -111,10 +111,10 @@ def camera_shift_px(
 ) -> float:
     """Return how far the picture moved as a whole, at working size: the largest over nine frames.
 
-    Two measures look at it and the smaller one counts, since a camera that moves shows in both: corners fail where
-    most of them lie on what is moved, tiles where the picture is plain. `passers_by` is where
-    things moved in front of the
-    camera, as far as that is known: both measures look at the rest of the picture as well, which may be too little.
+    Two measures look at it and the smaller one counts, since a camera that moves shows in both:
+    corners fail where most of them lie on what is moved, tiles where the picture is plain.
+    `passers_by` is where things moved in front of the camera, as far as that is known: both
+    measures look at the rest of the picture as well, which may be too little.
     """
     grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in working.rgb]
     pick = np.unique(np.linspace(0, len(grey) - 1, 9).astype(int))

@@ -1,8 +1,7 @@
 """The caption's phrases become mask tracks: which pixels are which object, in every frame.
 
 Comes in: working frames, and what the scene network sees in them. Goes out: an `ObjectTrack` per
-object, all of them in a
-`GroundedObjects`.
+object, all of them in a `GroundedObjects`.
 
 Reading order:
     ground_objects      the order of the steps

@@ -1,8 +1,7 @@
 """An object that a hand brings: it is not on the table when the clip begins, and rests where the hand leaves it.
 
 Such a clip is seen backwards in time: there the object lies on the table first and is then carried
-off, as the network knows it. What it
-sees is turned back before anything follows from it.
+off, as the network knows it. What it sees is turned back before anything follows from it.
 """
 
 from dataclasses import replace
@@ -32,12 +31,10 @@ from v2p_data.video.clip import Clip
 
 _PASSED_LAB, _TOUCH_PX = 12, 5
 """Distance in Lab between the first frame and the last still, from which a pixel shows something
-else; and distance in a picture 320 px
-wide, within which a hand holds something."""
+else; and distance in a picture 320 px wide, within which a hand holds something."""
 _AS_LARGE, _AS_COLOURED, _SOLID = 0.3, 0.65, 0.6
-"""Share of the object's outline, similarity of colours, and share of its convex hull that it
-fills, from which what is seen elsewhere is
-the object itself. Edges of a person who sways fill less."""
+"""Share of the object's outline, similarity of colours, and share of its convex hull that it fills,
+from which what is seen elsewhere is the object itself. Edges of a person who sways fill less."""
 
 
 def seen_backwards(clip: Clip, working: WorkingClip) -> Segmentation:

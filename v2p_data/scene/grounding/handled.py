@@ -1,9 +1,8 @@
 """Which outlines a hand can have taken an object from, or put it down at: by its fingertips in the order of time.
 
-A hand handles objects only between taking one up and letting one go. An outline that the
-fingertips never reach, or reach only
-after most of the handling, is not where the object was taken from. The same holds backwards in
-time for its last outline.
+A hand handles objects only between taking one up and letting one go. An outline that the fingertips
+never reach, or reach only after most of the handling, is not where the object was taken from. The
+same holds backwards in time for its last outline.
 """
 
 from dataclasses import dataclass
@@ -18,9 +17,8 @@ from v2p_data.scene.frames.segmentation import Segmentation
 _LIKELY = 0.5
 _LATE, _TOO_LATE = 0.25, 0.5
 """Share of the handling before the first touch, or after the last one: up to the first it says
-nothing, from the second on the
-outline is not the object's. On 32 real clips right outlines have 0.17 at most, and the four wrong
-ones of other places 0.6 or more."""
+nothing, from the second on the outline is not the object's. On 32 real clips right outlines have
+0.17 at most, and the four wrong ones of other places 0.6 or more."""
 _LEAST = 0.3
 """Weight of an outline that is not where the hand takes or puts down."""
 _REACH = 0.6

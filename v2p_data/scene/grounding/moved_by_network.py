@@ -1,8 +1,8 @@
 """Which pixels are the moved object at the start and at the end, from what the scene network sees: the default way.
 
 The network's class `moved` is cut into blobs at both ends. Pairs of blobs are rated by how well
-they fit the caption and each other; the
-product of the cues, 0 to 1, is the score, and the weakest cue is its reason.
+they fit the caption and each other; the product of the cues, 0 to 1, is the score, and the weakest
+cue is its reason.
 """
 
 from collections.abc import Callable, Sequence

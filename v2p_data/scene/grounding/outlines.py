@@ -39,8 +39,8 @@ def disjoint_ends(working: WorkingClip, moved: Moved, keep: Sequence[int] = ()) 
     """Return both outlines, each without the other's place: the picture changes at both places.
 
     A pixel in both outlines is background in a picture where it has the colours of the ring around
-    both outlines. The rest of the
-    outline is compared; where hardly anything is left of it, the other picture.
+    both outlines. The rest of the outline is compared; where hardly anything is left of it, the
+    other picture.
 
     Args:
         working: frames.

@@ -1,8 +1,8 @@
 """Which static object the caption means, from what the scene network sees.
 
 The network says of every pixel in every frame whether it shows an object that never moved. That is
-cut into candidates. Cues, such as
-size, colour and place, say which candidate is meant (`static_cues.py`).
+cut into candidates. Cues, such as size, colour and place, say which candidate is meant
+(`static_cues.py`).
 """
 
 from collections.abc import Iterator

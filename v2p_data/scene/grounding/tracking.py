@@ -1,8 +1,8 @@
 """The object's mask in the frames between the first and the last.
 
 The mask is carried forwards from the start and backwards from the end (`mask_follower`); in each
-frame the better one counts.
-A pixel outside the first mask that still looks as in the first frame is not the object. A lost track has a low quality.
+frame the better one counts. A pixel outside the first mask that still looks as in the first frame
+is not the object. A lost track has a low quality.
 """
 
 from dataclasses import dataclass

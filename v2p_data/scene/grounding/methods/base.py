@@ -27,9 +27,9 @@ from v2p_data.video.clip import Clip
 _ELSEWHERE_LAB = 12.0
 """Where a thing is, and where it is not, a picture differs by so much and more."""
 _SMALL_PX, _FILLED = 1500, 0.85
-"""At working size, 320 px wide: of smaller things the network, which sees them enlarged, knows
-more than their colours tell. People draw
-boxes tightly: of a larger outline that spans less of its box a part is missing."""
+"""At working size, 320 px wide: of smaller things the network, which sees them enlarged, knows more
+than their colours tell. People draw boxes tightly: of a larger outline that spans less of its box a
+part is missing."""
 _BESIDE_PX = 3
 """At working size, 320 px wide: so far beside a box an edge may lie. People are off by a pixel or two."""
 _RAN_AWAY = 0.2
