@@ -15,7 +15,6 @@ from toy_task import act
 from v2p_data.distillation import rounds
 from v2p_data.distillation.rounds import Course, distill, handover_episodes, take_in
 from v2p_data.episodes import rollouts
-from v2p_data.episodes.mask_noise import MaskNoiseConfig
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
@@ -192,22 +191,6 @@ def test_pictures_of_colours_are_refused_in_one_sentence(tmp_path: Path):
 
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
-
-
-def test_faults_of_masks_are_those_that_the_demonstrations_have(agreeing_referee, calm: Path, tmp_path: Path):  # fmt: skip
-    noise = MaskNoiseConfig(drop_per_s=3.0)
-
-    told = run(
-        tmp_path, episodes=replace(EPISODES, mask_noise=noise), cfg=replace(DISTILLATION, rounds=1)
-    )
-
-    for path in told.paths:
-        faulty, clean = Episode.load(path), Episode.load(calm / path.relative_to(tmp_path))
-        lost = faulty.labels != clean.labels
-        assert faulty.params["mask_faults"]
-        assert lost.any()
-        assert (faulty.labels[lost] == 0).all()
-        assert np.array_equal(faulty.action, clean.action)
 
 
 def test_what_a_student_takes_in_is_what_was_staged(calm: Path):

@@ -10,7 +10,6 @@ from toy_task import act, bundle, collect_toys, lesson
 
 from v2p_data.episodes.collect import CutConfig, EpisodesConfig, roll_out
 from v2p_data.episodes.dataset.encoding import decode_rgb
-from v2p_data.episodes.mask_noise import Fault, MaskNoiseConfig, apply_faults
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.play import StateActor
@@ -93,17 +92,6 @@ def test_the_same_episode_gets_the_same_distractors(rollouts):
     )
 
     assert one == again != other
-
-
-def test_faults_are_what_the_parameters_say(plain: list[Episode], tmp_path: Path):
-    noise = MaskNoiseConfig(erode_per_s=1.0, dilate_per_s=1.0, drop_per_s=1.0, swap_per_s=1.0)
-
-    noisy = episodes(tmp_path, replace(PLAIN, mask_noise=noise))
-
-    for clean, faulty in zip(plain, noisy, strict=True):
-        faults = [Fault(**row) for row in faulty.params["mask_faults"]]
-        assert faults
-        assert (apply_faults(clean.labels, faults) == faulty.labels).all()
 
 
 @pytest.mark.slow  # video means LeRobot's import

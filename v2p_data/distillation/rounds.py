@@ -18,14 +18,13 @@ from jaxtyping import Float32, UInt8
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.distillation.handover import Handovers, hand_over
 from v2p_data.episodes.config import EpisodesConfig
-from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
 from v2p_data.episodes.rollouts import Lesson
 from v2p_data.episodes.staging import Episode, refusals_named, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.play import Policy, VisionActor
-from v2p_data.seeds import rng_for, seed_for
+from v2p_data.seeds import seed_for
 from v2p_data.task.task import TaskBundle
 
 logger = logging.getLogger(__name__)
@@ -268,20 +267,13 @@ def _stage(
         length = int(handovers.num_frames[world])
         rows = np.arange(length)
         episode_id = f"{bundle.title}_handover{number}_{first + world:05d}"
-        labels = handovers.labels[:length, world].copy()
-        params = handovers.params[world]
-        if not episodes.mask_noise.is_off:
-            rng = rng_for(handovers.seed, "mask-noise", episode_id)
-            faults = draw_faults(labels, episodes.mask_noise, rng)
-            labels = apply_faults(labels, faults)
-            params = params | {"mask_faults": as_json(faults)}
         Episode(
             id=episode_id,
             item=bundle.title,
             family=bundle.scene.family,
             task=bundle.description,
             seed=handovers.seed,
-            labels=labels,
+            labels=handovers.labels[:length, world].copy(),
             state=handovers.state[:length, world].copy(),
             action=handovers.recorded_action[:length, world].copy(),
             success=rows >= handovers.held_at[world],
@@ -289,7 +281,7 @@ def _stage(
             intervention=rows >= handovers.taken_over_at[world],
             referee=True,
             objects=tuple(o.name for o in bundle.scene.objects),
-            params=params,
+            params=handovers.params[world],
             cameras=episodes.cameras,
             actions=handovers.names,
         ).save(folder / "episodes")

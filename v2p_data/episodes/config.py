@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from v2p_data.episodes.mask_noise import MaskNoiseConfig
 from v2p_data.episodes.rollouts import CutConfig
 from v2p_data.episodes.staging import RGB_CAMERA
 from v2p_data.pipeline.fingerprint import UNSAID_BY_DEFAULT
@@ -45,8 +44,6 @@ class EpisodesConfig:
     """Things that stand about in the pictures; none by default."""
     look: LookConfig = field(default_factory=LookConfig)
     """Light and colours of RGB pictures; always the same by default."""
-    mask_noise: MaskNoiseConfig = field(default_factory=MaskNoiseConfig)
-    """Faults as a real segmenter makes them; none by default."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.min_episodes <= self.num_episodes:
@@ -59,10 +56,8 @@ class EpisodesConfig:
             raise ValueError(f"size_px must be even and at least 16, got {self.size_px}")
         if not self.look.is_off and self.render == "masks":
             raise ValueError("look changes RGB pictures only; set render to rgb or both")
-        if self.wrist and (self.render == "rgb" or not self.mask_noise.is_off):
-            raise ValueError(
-                "the wrist's camera gives exact masks only; set render to masks or both and leave mask_noise off"
-            )
+        if self.wrist and self.render == "rgb":
+            raise ValueError("the wrist's camera gives masks only; set render to masks or both")
 
     @property
     def interface(self) -> ArmInterface:

@@ -1,4 +1,4 @@
-"""The pictures of an episode, drawn from the saved states of its course: masks, colours, faults, distractors.
+"""The pictures of an episode, drawn from the saved states of its course: masks, colours, distractors.
 
 Everything drawn at random has a stream of its own per episode, so switching one thing on changes no other.
 """
@@ -9,7 +9,6 @@ import numpy as np
 
 from v2p_data.episodes.config import EpisodesConfig
 from v2p_data.episodes.dataset import encoding
-from v2p_data.episodes.mask_noise import apply_faults, as_json, draw_faults
 from v2p_data.episodes.rollouts import Rollouts
 from v2p_data.episodes.staging import Episode
 from v2p_data.seeds import rng_for
@@ -46,11 +45,6 @@ class Artist:
         bundle, cfg = self.bundle, self.cfg
         length = int(rollouts.num_frames[world])
         labels, rgb_mp4, drawn = self._pictures(rollouts, world, length, episode_id)
-        if not cfg.mask_noise.is_off:
-            rng = rng_for(rollouts.seed, "mask-noise", episode_id)
-            faults = draw_faults(labels, cfg.mask_noise, rng)
-            labels = apply_faults(labels, faults)
-            drawn["mask_faults"] = as_json(faults)
         return Episode(
             id=episode_id,
             item=bundle.title,
