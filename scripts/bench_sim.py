@@ -378,7 +378,7 @@ class BarePhysics:
     """
 
     def __init__(self, env: BatchEnv, threads: int) -> None:
-        self.substeps = env.physics.substeps
+        self.substeps = env.world.physics.substeps
         self.batch = Batch(env.world.model, env.num_envs, threads)
         state = env.state_dict()
         self.fields = {
