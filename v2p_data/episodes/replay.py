@@ -138,10 +138,6 @@ def replay(
     done: list[tuple[Replayed, np.ndarray]] = []
     for (item, seed), episodes in batches.items():
         on_progress(len(done) / total, f"{len(done)}/{total} episodes")
-        if Path(item).name != item:
-            raise V2PError(
-                f"{METADATA_FILE} names the task '{item}', which is no folder in {CARRIED_TASKS}"
-            )
         bundle, cfg = TaskBundle.load(root / CARRIED_TASKS / item), _recipe(about, item)
         rollouts = _played(bundle, cfg, seed, episodes, num_threads)
         done += [_compared(rollouts, e, item, e.world % cfg.batch_worlds) for e in episodes]

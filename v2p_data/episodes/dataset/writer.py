@@ -65,10 +65,10 @@ from v2p_data.sim.render.masks import MASK_CAMERAS, PALETTE, WRIST_CAMERA, label
 
 EPISODES_PER_WRITE = 100
 ALIKE = {
-    "size_px": ("masks of", "--episodes.size-px"),
-    "cameras": ("pictures of", "--episodes.render and --episodes.wrist"),
-    "actions": ("actions of", "--episodes.actions and one arm"),
-    "num_states": ("states of this many numbers:", "--episodes.joint-state and one arm"),
+    "size_px": ("masks of {} px", "--episodes.size-px"),
+    "cameras": ("pictures of {}", "--episodes.render and --episodes.wrist"),
+    "actions": ("actions of {}", "--episodes.actions and one arm"),
+    "num_states": ("states of {} numbers", "--episodes.joint-state and one arm"),
 }
 """Fields of `Heading` that are the same in all episodes of a dataset -> what they say, and the options that decide it."""
 
@@ -166,11 +166,11 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
         )
     for heading in headings:
         for name, (what, options) in ALIKE.items():
-            mine, theirs = getattr(heading, name), getattr(first, name)
+            mine, theirs = (getattr(h, name) or ACTION_NAMES for h in (heading, first))
             if mine != theirs:
                 raise V2PError(
-                    f"{heading.path} has {what} {mine or ACTION_NAMES}, the first episode {theirs or ACTION_NAMES}; collect "
-                    f"all episodes with one {options}"
+                    f"{heading.path} has {what.format(mine)}, the first episode {what.format(theirs)}; collect all episodes "
+                    f"with one {options}"
                 )
         if heading.num_frames < 2:
             raise V2PError(
