@@ -78,16 +78,6 @@ def test_thickness_and_mesh_grow_with_the_pixels_size(factor: float):
     np.testing.assert_allclose(large.bounds[:, :2], factor * mesh.bounds[:, :2], rtol=1e-6)
 
 
-def test_inflating_turns_and_mirrors_with_the_outline():
-    outline = boot()
-    half = inflated(outline, PX_M, 0.006)
-
-    for change in (np.transpose, np.fliplr, np.flipud):
-        np.testing.assert_allclose(
-            inflated(np.ascontiguousarray(change(outline)), PX_M, 0.006), change(half), atol=4e-4
-        )
-
-
 def test_columns_run_along_x_and_rows_along_y():
     outline = boot()
     y, x = np.nonzero(outline)
@@ -102,14 +92,6 @@ def test_columns_run_along_x_and_rows_along_y():
     assert toe[:, 1].min() > 0.037
     section = mesh.vertices[mesh.vertices[:, 1] < 0.03]
     assert section[:, 0].max() < 0.033
-
-
-def test_a_mesh_moves_with_its_outline():
-    mesh, _ = made(disc())
-
-    moved, _ = made(disc(at=(52, 33)))
-
-    np.testing.assert_allclose(moved.bounds - mesh.bounds, [[0.012, 0.003, 0]] * 2, atol=1e-6)
 
 
 def test_the_rim_lies_on_the_outline_to_half_a_pixel():
@@ -146,15 +128,6 @@ def test_a_pillow_is_closed_turned_outwards_and_the_same_from_both_sides(outline
     np.testing.assert_allclose(mesh.center_mass[2], 0, atol=1e-9)
     front = mesh.face_normals[mesh.triangles_center[:, 2] > 1e-3]
     assert (front[:, 2] > 0).mean() > 0.9
-
-
-@pytest.mark.parametrize("outline", [disc(), boot()], ids=["disc", "boot"])
-def test_a_pillows_volume_is_twice_the_sum_of_its_half_thickness(outline):
-    half = inflated(outline, PX_M, 0.008)
-
-    mesh, _ = pillow(outline, half.astype(np.float32), PX_M)
-
-    assert mesh.volume == pytest.approx(2 * float(half.sum()) * PX_M**2, rel=0.05)
 
 
 @pytest.mark.parametrize("outline", [disc(), boot()], ids=["disc", "boot"])

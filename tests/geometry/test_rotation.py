@@ -30,39 +30,6 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (scipy_of(a).inv() * scipy_of(b)).magnitude()
 
 
-def test_a_product_is_a_unit_quaternion():
-    out = rotation.product(random_quats("a"), random_quats("b"))
-
-    np.testing.assert_allclose(np.linalg.norm(out, axis=0), 1, atol=1e-12)
-
-
-def test_products_are_associative():
-    a, b, c = (random_quats(name) for name in "abc")
-
-    left = rotation.product(rotation.product(a, b), c)
-    right = rotation.product(a, rotation.product(b, c))
-
-    np.testing.assert_allclose(left, right, atol=1e-12)
-
-
-def test_the_identity_changes_nothing_and_an_inverse_undoes():
-    a = random_quats("a")
-    one = np.tile([[1.0], [0.0], [0.0], [0.0]], N)
-
-    np.testing.assert_allclose(rotation.product(one, a), a, atol=1e-15)
-    np.testing.assert_allclose(rotation.product(a, one), a, atol=1e-15)
-    np.testing.assert_allclose(rotation.product(a, rotation.conjugates(a)), one, atol=1e-12)
-
-
-def test_the_matrix_of_a_product_is_the_product_of_the_matrices():
-    a, b = random_quats("a"), random_quats("b")
-
-    whole = np.moveaxis(rotation.matrices(rotation.product(a, b)), -1, 0)
-    parts = [np.moveaxis(rotation.matrices(quat), -1, 0) for quat in (a, b)]
-
-    np.testing.assert_allclose(whole, parts[0] @ parts[1], atol=1e-12)
-
-
 def test_products_and_matrices_are_those_of_scipy():
     a, b = random_quats("a"), random_quats("b")
 

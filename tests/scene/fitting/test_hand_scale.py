@@ -6,11 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from v2p_data.errors import V2PError
 from v2p_data.scene.data_types import RestingObject
-from v2p_data.scene.fitting import hand_scale
 from v2p_data.scene.fitting.hand_scale import (
-    hand_scale_network,
     height_from_hand,
     planes_of,
     view_hand,
@@ -104,17 +101,3 @@ def test_a_hand_that_touches_nothing_says_nothing():
     away[:, 5:20, 5:20] = True  # where no hand comes
     far = replace(resting, masks=away, rests=[(away[0], resting.rests[0][1])])
     assert height_from_hand(working, segmentation, far, height) is None
-
-
-def test_missing_weights_are_one_clear_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(hand_scale, "HAND_SCALE_WEIGHTS", tmp_path / "some.safetensors")
-    hand_scale_network.cache_clear()
-
-    with pytest.raises(V2PError, match=r"some\.safetensors .*train_hand_ruler\.py"):
-        hand_scale_network()
-
-    hand_scale_network.cache_clear()
-
-
-def test_the_weights_are_small_enough_to_travel_with_the_code():
-    assert hand_scale.HAND_SCALE_WEIGHTS.stat().st_size < 1_000_000

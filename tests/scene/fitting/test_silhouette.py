@@ -13,7 +13,6 @@ from v2p_data.scene.fitting.shape_fit import (
     fit_pose,
     fit_shape,
     lowest,
-    on_wall,
     orientations,
 )
 from v2p_data.scene.fitting.silhouette import Silhouette, camera_above
@@ -46,15 +45,6 @@ def test_the_middle_pixel_meets_the_table_where_trigonometry_says():
     spot = camera.on_plane(np.array([[160.0, 120.0]]))[0]
 
     np.testing.assert_allclose(spot, [0.5 / np.tan(PITCH), 0, 0], atol=1e-9)
-
-
-def test_left_in_the_picture_is_plus_y():
-    camera = camera_above((240, 320), PITCH, FOV)
-
-    left, right = camera.on_plane(np.array([[20.0, 150.0], [300.0, 150.0]]))
-
-    assert left[1] > 0 > right[1]
-    assert on_wall(camera, np.array([160.0, 50.0]), 1.2)[0] == pytest.approx(1.2)
 
 
 def test_a_box_is_found_again_from_its_silhouette():
@@ -286,13 +276,6 @@ def test_a_hand_that_is_not_recognised_for_a_moment_takes_nothing_elsewhere():
 )  # fmt: skip
 def test_nothing_goes_with_a_fist_that_does_not_lift_it_out_of_sight(rises_px, seen_rising):
     assert carried_by_hand(*lifted_in_a_fist(rises_px, seen_rising=seen_rising)) == []
-
-
-def test_nothing_goes_with_a_hand_that_does_not_come_to_it():
-    thing, segmentation = lifted_in_a_fist(50)
-    away = np.roll(segmentation.shares, 60, axis=2)
-
-    assert carried_by_hand(thing, replace(segmentation, shares=away)) == []
 
 
 def test_what_is_still_in_sight_is_not_in_the_fist():

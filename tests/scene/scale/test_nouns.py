@@ -172,12 +172,6 @@ def test_standards_are_quoted_to_the_millimetre():
         assert all(min(abs(side - s) for s in size_mm) <= 1 for side in sides), word
 
 
-def test_a_round_thing_shows_a_circle_from_above():
-    for phrase in ("plate", "bowl", "cup", "pan", "coaster", "lid", "can"):
-        assert noun_for(phrase).form == "cylinder"
-    assert noun_for("book").form != "cylinder"
-
-
 def test_a_handle_or_spout_takes_symmetry_away():
     assert noun_for("bowl").symmetry == "round"
     assert noun_for("mug").symmetry == "none"
