@@ -141,11 +141,6 @@ class Silhouette:
         x, y, w, h = self.box
         return np.array([x + w / 2, y + h / 2])
 
-    def nearest_to(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        """Return the point of the mask that is nearest to a point of the picture [px]."""
-        spots = np.argwhere(self.mask)[:, ::-1] + 0.5
-        return spots[np.linalg.norm(spots - pixel, axis=1).argmin()]
-
 
 def _filled(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Return the mask without holes: what is fitted is convex, a ring's hole says nothing against it."""

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import mesh_for, parts_for
 from v2p_data.scene.frames.mask_ops import handle_of
-from v2p_data.scene.scale.nouns import Form, Noun
+from v2p_data.scene.scale.nouns import Noun
 from v2p_data.scene.shapes.handles import handle_of_body, with_handle
 from v2p_data.scene.shapes.inflation import inflation
 from v2p_data.scene.shapes.mesh_hypothesis import Kind, MeshHypothesis, Size, iou_of
@@ -54,8 +54,6 @@ class ShapeChoice:
     """The mesh that covers the outline best for what it costs."""
 
     kind: Kind
-    form: Form
-    """The primitive that is nearest, which other modules compute with."""
     mesh: trimesh.Trimesh
     """Closed, turned outwards, centred on its bounding box, in its own frame [m]."""
     parts: tuple[trimesh.Trimesh, ...]
@@ -66,8 +64,6 @@ class ShapeChoice:
     """From the mesh's frame to the fitted primitive's: poses become `T_world_obj @ T_obj_shape`."""
     iou: float
     """Overlap of the mesh's silhouette with the mask where it can be seen, averaged over the views."""
-    confidence: float
-    """0 to 1."""
     reason: str
     """Why this shape, with the numbers."""
 
@@ -117,17 +113,14 @@ def best_shape(
             if handled is not None and iou > best_iou + handle.gain:
                 best, best_iou = handled, iou
                 reason += f"; with a handle to {iou:.2f}"
-    confidence = float(np.clip((best_iou - 0.4) / 0.5, 0.05, 1) * (1 - 0.6 * hidden))
     x, y, z = (float(v) for v in best.mesh.extents)
     return ShapeChoice(
         kind=best.kind,
-        form=noun.form,
         mesh=best.mesh,
         parts=best.parts,
         size_m=(x, y, z) if best is not primitive else size_m,
         T_obj_shape=best.T_obj_shape,
         iou=best_iou,
-        confidence=round(confidence, 3),
         reason=reason,
     )
 
