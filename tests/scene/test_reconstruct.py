@@ -5,7 +5,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import trimesh
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.config import SceneConfig
@@ -206,15 +205,6 @@ def test_mujoco_loads_the_scene_and_the_box_stays_where_it_stands(folder):
     mujoco.mj_step(model, data, 200)
 
     np.testing.assert_allclose(data.qpos[:3], start[:3], atol=0.003)
-
-
-def test_mujoco_and_trimesh_load_the_single_object(folder):
-    scene = Scene.load(folder)
-    model = mujoco.MjModel.from_xml_path(str(folder / scene.manipulated.urdf))
-
-    assert model.nmesh == 1
-    mesh = trimesh.load_mesh(folder / scene.manipulated.mesh)
-    np.testing.assert_allclose(mesh.extents, scene.manipulated.size_m, rtol=1e-4)
 
 
 @pytest.mark.slow

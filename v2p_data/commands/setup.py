@@ -13,7 +13,13 @@ from v2p_data.cli import parse
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends import hands_setup, mobile_sam_setup
 from v2p_data.scene.config import SceneConfig
-from v2p_data.scene.preset import UNWANTED_FILES, checkpoints_of, missing, told, with_preset
+from v2p_data.scene.preset import (
+    UNWANTED_FILES,
+    checkpoints_of,
+    missing,
+    named_with_sizes,
+    with_preset,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +43,8 @@ def setup_command(argv: list[str]) -> int:
     absent = missing(models)
     print(f"hands     MediaPipe; {_place(hands_setup, hands)}")  # noqa: T201
     print(f"outlines  MobileSAM; {_outlines()}")  # noqa: T201
-    print(f"learned   {told(models)}; {f'missing: {told(absent)}' if absent else 'all are here'}")  # noqa: T201
+    state = f"missing: {named_with_sizes(absent)}" if absent else "all are here"
+    print(f"learned   {named_with_sizes(models)}; {state}")  # noqa: T201
     print("Next: v2p setup NAME, or v2p scene VIDEOS --out DIR: what is set up is used")  # noqa: T201
     return 0
 
@@ -60,7 +67,7 @@ def fetch_learned(models: Sequence[str]) -> None:
     """
     from v2p_data.episodes.hub.hub import fetch_model
 
-    print(f"downloading learned models: {told(models)}", file=sys.stderr, flush=True)  # noqa: T201
+    print(f"downloading learned models: {named_with_sizes(models)}", file=sys.stderr, flush=True)  # noqa: T201
     try:
         for model in models:
             fetch_model(model, ignore=UNWANTED_FILES)

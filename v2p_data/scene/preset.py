@@ -15,14 +15,6 @@ from v2p_data.scene.config import SceneConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class Machine:
-    """What decides which sizes are taken."""
-
-    gpu_memory_gb: float = 0.0
-    """Memory of the first CUDA device [GB]; 0 without one."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Size:
     """Checkpoints for machines with at least so much GPU memory."""
 
@@ -63,21 +55,21 @@ UNWANTED_FILES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.msgpack", "*.h5", "*.on
 """The same weights in other formats."""
 
 
-def this_machine() -> Machine:
-    """Return what this machine has."""
+def gpu_memory_gb() -> float:
+    """Return the memory of the first CUDA device [GB]; 0 without one."""
     import torch
 
     if not torch.cuda.is_available():
-        return Machine()
-    return Machine(gpu_memory_gb=torch.cuda.get_device_properties(0).total_memory / 1e9)
+        return 0.0
+    return torch.cuda.get_device_properties(0).total_memory / 1e9
 
 
-def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machine) -> SceneConfig:
+def with_preset(cfg: SceneConfig, memory_gb: Callable[[], float] = gpu_memory_gb) -> SceneConfig:
     """Return the settings with what the preset and this machine choose written out.
 
     Args:
         cfg: settings; a stage with a backend of its own keeps it.
-        machine_of: asked only where the preset is `learned`.
+        memory_gb: of the GPU, asked only where the preset is `learned`.
     """
     found = {
         "hands": "mediapipe" if installed_worker() else "none",
@@ -88,8 +80,8 @@ def with_preset(cfg: SceneConfig, machine_of: Callable[[], Machine] = this_machi
             cfg = replace(cfg, **{stage: replace(getattr(cfg, stage), backend=backend)})
     if cfg.preset != "learned":
         return cfg
-    machine = machine_of()
-    size = next(s for s in SIZES if machine.gpu_memory_gb >= s.least_gpu_gb)
+    memory = memory_gb()
+    size = next(s for s in SIZES if memory >= s.least_gpu_gb)
     ground, segment, depth = cfg.ground, cfg.segment, cfg.depth
     if ground.backend == "network":
         ground = replace(
@@ -132,7 +124,7 @@ def missing(models: Iterable[str]) -> tuple[str, ...]:
     )
 
 
-def told(models: Iterable[str]) -> str:
+def named_with_sizes(models: Iterable[str]) -> str:
     """Return a line that names checkpoints with their sizes [GB], for a person who waits for a download."""
     sizes = {model: WEIGHTS_GB.get(model) for model in models}
     words = ", ".join(

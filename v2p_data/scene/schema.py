@@ -125,12 +125,12 @@ def parsed[T: FileModel](
         faults = error.errors(include_url=False, include_context=False)
         if any(f["loc"] == (version_field,) for f in faults):
             raise V2PError(f"{path} was written by another version; {then}") from None
-        told = "; ".join(_told(f, kind) for f in faults[:ERRORS_SHOWN])
+        words = "; ".join(_in_words(f, kind) for f in faults[:ERRORS_SHOWN])
         more = f"; and {len(faults) - ERRORS_SHOWN} more" if len(faults) > ERRORS_SHOWN else ""
-        raise V2PError(f"{path}: {told}{more}; {then}") from None
+        raise V2PError(f"{path}: {words}{more}; {then}") from None
 
 
-def _told(fault: Any, kind: type[FileModel]) -> str:
+def _in_words(fault: Any, kind: type[FileModel]) -> str:
     *_, last = ("", *fault["loc"])
     parts = [str(part) for part in fault["loc"]]
     where = ".".join(p for p in parts if not p.startswith("("))  # names of alternatives

@@ -23,14 +23,14 @@ from v2p_data.scene.backends.config import (
     SegmentConfig,
 )
 from v2p_data.scene.config import SceneConfig
-from v2p_data.scene.preset import SIZES, WEIGHTS_GB, Machine, checkpoints_of, missing, with_preset
+from v2p_data.scene.preset import SIZES, WEIGHTS_GB, checkpoints_of, missing, with_preset
 from v2p_data.scene.reconstruct import reconstruct
 
 LEARNED = SceneConfig(preset="learned")
 
 
 def on(gpu_memory_gb: float, cfg: SceneConfig = LEARNED) -> SceneConfig:
-    return with_preset(cfg, lambda: Machine(gpu_memory_gb=gpu_memory_gb))
+    return with_preset(cfg, lambda: gpu_memory_gb)
 
 
 def tiny(checkpoint) -> SceneConfig:
@@ -72,7 +72,7 @@ def test_a_stage_that_was_set_keeps_its_backend():
 
 
 def test_without_the_preset_nothing_changes_and_the_machine_is_not_asked():
-    def machine() -> Machine:
+    def machine() -> float:
         raise AssertionError
 
     without_models = SceneConfig(
