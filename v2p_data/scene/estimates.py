@@ -2,11 +2,10 @@
 
 import keyword
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-import trimesh
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import mesh_for, parts_for
@@ -26,7 +25,7 @@ from v2p_data.scene.fitting.shape_fit import three
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.meshes import MeshedObject
 from v2p_data.scene.scale.nouns import Noun
-from v2p_data.scene.schema import Observed, Shape
+from v2p_data.scene.schema import Shape
 from v2p_data.scene.shapes.by_worker import mesh_by_worker
 from v2p_data.video.clip import Clip
 
@@ -36,24 +35,6 @@ _STRAIGHT = 0.06
 """Tapers by less than this share are simulated as cylinders."""
 _LEAST_QUALITY = 0.4
 """Quality, 0 to 1, of a mask that is kept in an object's mask track."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Solid:
-    """An object's mesh and poses [m], which the user's size and workers may override."""
-
-    size_m: tuple[float, float, float]
-    mesh: trimesh.Trimesh
-    parts: tuple[trimesh.Trimesh, ...]
-    is_primitive: bool
-    """Whether the mesh is the noun's primitive of this size."""
-    T_world_objs: Float[np.ndarray, "pose 4 4"]
-    frames: tuple[int, ...]
-    """Working frames with a pose."""
-    confidences: tuple[float, ...]
-    observed: tuple[Observed, ...]
-    source: str
-    """Where the mesh comes from, in words."""
 
 
 def estimates_of(
@@ -75,23 +56,22 @@ def estimates_of(
     for s, placed, made in zip(grounded.objects, placement.objects, meshed, strict=True):
         name = slug_for(s.phrase, taken)
         taken.add(name)
-        solid = _from_outline(s, placed, made)
+        thing = _outlined(name, grounded.working, s, placed, made)
         if s.known_m:  # the user's word on the size outranks the outline's
             size = three(placement.height_m * np.array(placed.first.size))
-            solid = _stretched(solid, s.noun, size)
+            thing = _stretched(thing, size, is_primitive=_is_primitive(s, made))
         if s.noun.hollow and s.role in ("manipulated", "cover") and KINDS[kind].has_cover:
-            solid = _mouth_down(solid)
+            thing = _mouth_down(thing)
         if cfg.mesh.worker:
-            solid = _meshed_by_worker(clip, grounded.working, s, solid, cfg)
+            thing = _meshed_by_worker(clip, grounded.working, s, thing, cfg)
         if cfg.pose.worker and s.moves:
-            solid = _posed_by_worker(
-                clip, grounded.working, s, solid, clip_camera(clip, placement), cfg
-            )
+            camera = clip_camera(clip, placement)
+            thing = _posed_by_worker(clip, grounded.working, s, thing, camera, cfg)
         masks = _mask_track(grounded.working, s, placed)
         if s.noun.bore:
             work = metric_camera(placement.camera, scene_origin(placement), placement.height_m)
-            masks = _with_hole(masks, s.noun.bore, solid, grounded.working, work)
-        out.append(_estimate(name, grounded.working, s, solid, masks))
+            masks = _with_hole(masks, thing, work)
+        out.append(replace(thing, masks=masks, mass_kg=_mass(s.noun, thing.size_m)))
     return out
 
 
@@ -106,60 +86,80 @@ def slug_for(phrase: str, taken: set[str]) -> str:
     return name
 
 
-def _from_outline(s: ObjectTrack, placed: PlacedObject, made: MeshedObject) -> _Solid:
+def _outlined(
+    name: str, working: WorkingClip, s: ObjectTrack, placed: PlacedObject, made: MeshedObject
+) -> Estimate:
+    """Return an object as its outlines show it, without masks yet."""
+    image = working.rgb[s.at] if s.moves else working.late if s.at else working.early
     shape = made.shape
-    return _Solid(
+    return Estimate(
+        name=name,
+        label=s.phrase,
+        role=s.role,
+        noun=s.noun,
         size_m=shape.size_m,
+        rgba=_colour_in(image, s.first),
+        frames=tuple(int(working.frame_idx[i]) for i in placed.frames),
+        T_world_objs=made.T_world_objs,
+        confidences=tuple(round(one, 3) for one in placed.confidences),
+        masks={},
+        source={**_sources(s), "shape": shape.reason},
+        mass_kg=s.noun.mass_kg,
+        shape=_simulated_as(s.noun) if _is_primitive(s, made) else "mesh",
         mesh=shape.mesh,
         parts=shape.parts,
-        is_primitive=shape.kind == "primitive" and not s.noun.bore,
-        T_world_objs=made.T_world_objs,
-        frames=placed.frames,
-        confidences=placed.confidences,
+        symmetry=s.noun.symmetry,
         observed=placed.observed,
-        source=shape.reason,
     )
 
 
-def _stretched(solid: _Solid, noun: Noun, size_m: tuple[float, float, float]) -> _Solid:
-    """Return the mesh and its parts brought to these extents."""
-    if solid.is_primitive:
-        mesh, *parts = (
-            mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
-            *parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
-        )
-        return replace(solid, size_m=size_m, mesh=mesh, parts=tuple(parts))
-    T = np.diag([*(np.array(size_m) / solid.mesh.extents), 1.0])
-    mesh, *parts = (one.copy().apply_transform(T) for one in (solid.mesh, *solid.parts))
-    return replace(solid, size_m=size_m, mesh=mesh, parts=tuple(parts))
+def _is_primitive(s: ObjectTrack, made: MeshedObject) -> bool:
+    """Return whether the mesh is the noun's primitive of its size."""
+    return made.shape.kind == "primitive" and not s.noun.bore
 
 
-def _mouth_down(solid: _Solid) -> _Solid:
+def _simulated_as(noun: Noun) -> Shape:
+    """Return what a noun's primitive is in the simulator: `mesh` for what is hollow or tapers."""
+    if noun.hollow or (noun.form == "cylinder" and abs(noun.taper - 1) >= _STRAIGHT):
+        return "mesh"
+    return noun.form
+
+
+def _stretched(
+    thing: Estimate, size_m: tuple[float, float, float], *, is_primitive: bool
+) -> Estimate:
+    """Return the object with its mesh and parts brought to these extents."""
+    noun = thing.noun
+    if is_primitive:
+        mesh = mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper)
+        parts = parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper)
+        return replace(thing, size_m=size_m, mesh=mesh, parts=parts)
+    T = np.diag([*(np.array(size_m) / thing.mesh.extents), 1.0])
+    mesh, *parts = (one.copy().apply_transform(T) for one in (thing.mesh, *thing.parts))
+    return replace(thing, size_m=size_m, mesh=mesh, parts=tuple(parts))
+
+
+def _mouth_down(thing: Estimate) -> Estimate:
     """Return a cover in a frame of its own that has its mouth below, as it lies: so the simulator builds it."""
-    mesh, *parts = (one.copy().apply_transform(_OVER) for one in (solid.mesh, *solid.parts))
-    return replace(
-        solid,
-        mesh=mesh,
-        parts=tuple(parts),
-        T_world_objs=solid.T_world_objs @ _OVER,
-        is_primitive=False,
-    )
+    mesh, *parts = (one.copy().apply_transform(_OVER) for one in (thing.mesh, *thing.parts))
+    poses = thing.T_world_objs @ _OVER
+    return replace(thing, shape="mesh", mesh=mesh, parts=tuple(parts), T_world_objs=poses)
 
 
 def _meshed_by_worker(
-    clip: Clip, working: WorkingClip, s: ObjectTrack, solid: _Solid, cfg: SceneConfig
-) -> _Solid:
-    mesh, repair = mesh_by_worker(clip, working, s, solid.size_m, cfg.mesh)
+    clip: Clip, working: WorkingClip, s: ObjectTrack, thing: Estimate, cfg: SceneConfig
+) -> Estimate:
+    mesh, repair = mesh_by_worker(clip, working, s, thing.size_m, cfg.mesh)
     source = "made by the mesh worker from one picture, scaled to the outline"
     if repair != "none":
         source += f"; its mesh was not closed and was mended ({repair})"
     return replace(
-        solid,
+        thing,
         size_m=three(mesh.extents),
+        shape="mesh",
         mesh=mesh,
-        parts=(),
-        is_primitive=False,
-        source=source,
+        parts=(mesh.convex_hull,),
+        source={**thing.source, "shape": source},
     )
 
 
@@ -167,54 +167,18 @@ def _posed_by_worker(
     clip: Clip,
     working: WorkingClip,
     s: ObjectTrack,
-    solid: _Solid,
+    thing: Estimate,
     camera: Camera,
     cfg: SceneConfig,
-) -> _Solid:
-    poses, sure = poses_by_worker(clip, working, s.masks, solid.mesh, camera, cfg.pose)
+) -> Estimate:
+    poses, sure = poses_by_worker(clip, working, s.masks, thing.mesh, camera, cfg.pose)
     return replace(
-        solid,
+        thing,
         T_world_objs=poses,
-        frames=tuple(range(len(poses))),
-        confidences=tuple(float(one) for one in sure),
+        frames=tuple(working.frame_idx.tolist()),
+        confidences=tuple(round(float(one), 3) for one in sure),
         observed=("full",) * len(poses),
     )
-
-
-def _estimate(
-    name: str,
-    working: WorkingClip,
-    s: ObjectTrack,
-    solid: _Solid,
-    masks: dict[int, Bool[np.ndarray, "h w"]],
-) -> Estimate:
-    image = working.rgb[s.at] if s.moves else working.late if s.at else working.early
-    return Estimate(
-        name=name,
-        label=s.phrase,
-        role=s.role,
-        noun=s.noun,
-        size_m=solid.size_m,
-        rgba=_colour_in(image, s.first),
-        frames=tuple(int(working.frame_idx[i]) for i in solid.frames),
-        T_world_objs=solid.T_world_objs,
-        confidences=tuple(round(one, 3) for one in solid.confidences),
-        masks=masks,
-        source={**_sources(s), "shape": solid.source},
-        mass_kg=_mass(s.noun, solid.size_m),
-        shape=_shape_of(solid, s.noun),
-        mesh=solid.mesh,
-        parts=solid.parts or (solid.mesh.convex_hull,),
-        symmetry=s.noun.symmetry,
-        observed=solid.observed,
-    )
-
-
-def _shape_of(solid: _Solid, noun: Noun) -> Shape:
-    """Return the primitive that says all of an object, or `mesh`."""
-    if not solid.is_primitive or noun.hollow:
-        return "mesh"
-    return "mesh" if noun.form == "cylinder" and abs(noun.taper - 1) >= _STRAIGHT else noun.form
 
 
 def _mask_track(
@@ -233,17 +197,13 @@ def _mask_track(
 
 
 def _with_hole(
-    masks: dict[int, Bool[np.ndarray, "h w"]],
-    bore: float,
-    solid: _Solid,
-    working: WorkingClip,
-    camera: Camera,
+    masks: dict[int, Bool[np.ndarray, "h w"]], thing: Estimate, camera: Camera
 ) -> dict[int, Bool[np.ndarray, "h w"]]:
     """Return a ring's masks without what is seen through it, posed as in the nearest frame that has a pose."""
-    posed = working.frame_idx[list(solid.frames)]
+    posed, poses = np.array(thing.frames), thing.T_world_objs
     return {
         i: without_hole(
-            mask, solid.size_m, bore, solid.T_world_objs[int(np.abs(posed - i).argmin())], camera
+            mask, thing.size_m, thing.noun.bore, poses[int(np.abs(posed - i).argmin())], camera
         )
         for i, mask in masks.items()
     }
