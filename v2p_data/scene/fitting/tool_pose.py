@@ -192,7 +192,8 @@ class _Views:
     def visible(self, points_world: Float[np.ndarray, "n 3"]) -> float:
         return float(np.mean([one.visible(points_world + gone) for gone, one in self._views]))
 
-    def appearance_cost(self, *_: object) -> float:
+    def appearance_cost(self, form: str, size: np.ndarray, T_world_obj: np.ndarray) -> float:
+        del form, size, T_world_obj
         return 0.0
 
 
