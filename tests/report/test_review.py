@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
 
-from v2p_data.cli import run
+from v2p_data.cli import run as run_command
 from v2p_data.commands.review import scene_stages, summary_of
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.artifact import Record, write_record
 from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime, make_stage, stored_outcome
 from v2p_data.report.media import write_film
@@ -151,7 +150,9 @@ def test_judgements_outlive_the_server_and_the_written_page_shows_them(home, cap
         shown = result_of(review)
 
     assert shown["judgement"] == "right"
-    assert run(["scene", "review", str(home / "run"), "--videos", str(home / "videos")]) == 0
+    assert (
+        run_command(["scene", "review", str(home / "run"), "--videos", str(home / "videos")]) == 0
+    )
     assert "1 accepted: right 100.0 %" in capsys.readouterr().out
 
 
@@ -216,64 +217,33 @@ def test_the_written_page_shows_the_film_of_each_clip_and_takes_no_mark(made, tm
 class Made:
     """A folder of videos and the run that was made from it."""
 
-    def __init__(self, home) -> None:
-        self.videos, self.root = home / "my videos", home / "run"
+    def __init__(self, home, run) -> None:
+        self.videos, self.root, self.run = home / "my videos", run.root, run
         self.videos.mkdir(parents=True)
-        (self.root / "scene").mkdir(parents=True)
 
-    def video(self, item, entry=None):
-        path = self.videos / f"{item}.mp4"
+    def _recorded(self, folder, entry, **more):
+        """Make the video of a scene, with its caption, and the record that names both."""
+        path = self.videos / f"{folder.name.rpartition('-')[0]}.mp4"
         write_film(path, np.zeros((9, 48, 64, 3), np.uint8), 10.0)
         if entry is not None:
             file = self.videos / "captions.json"
             said = json.loads(file.read_text()) if file.is_file() else {}
-            file.write_text(json.dumps({**said, path.name: entry}, indent=1))
-
-    def record(self, item, rejected=None):
-        folder = self.root / "scene" / f"{item}-0a1b2c3d"
-        folder.mkdir(exist_ok=True)
+            file.write_text(json.dumps({**said, path.name: entry}))
         argv = ["v2p", "scene", str(self.videos), "--out", str(self.root), "--seed", "3"]
-        write_record(
-            folder,
-            Record(
-                stage="scene",
-                item=item,
-                version=1,
-                fingerprint="0a1b2c3d",
-                inputs={},
-                seconds=1.0,
-                rejected=rejected,
-                recipe={
-                    "config": {"caption": "as it was", "objects": ["cup"]},
-                    "sources": {"video": file_digest(self.videos / f"{item}.mp4")},
-                },
-                provenance={"time": "2026-01-02T03:04:05Z", "argv": argv},
-            ),
-        )
-        return folder
+        made_from = {"caption": "as it was", "objects": ["cup"]}
+        recipe = {"config": made_from, "sources": {"video": file_digest(path)}}
+        provenance = {"time": "2026-01-02T03:04:05Z", "argv": argv}
+        return self.run.record(folder, recipe=recipe, provenance=provenance, **more)
 
     def accepted(self, item, entry=None):
-        self.video(item, entry)
-        folder = self.record(item)
-        write_film(folder / "overlay.mp4", np.zeros((9, 48, 64, 3), np.uint8), 10.0)
-        cup = {"name": "cup", "label": "red cup", "size_m": [0.08, 0.08, 0.1], "mass_kg": 0.2}
-        scene = {
-            "kind": "push_left",
-            "confidence": 0.81,
-            "warnings": ["a weak shadow"],
-            "confidences": {"pose": {"value": 0.4, "reason": "the hand hides half of it"}},
-            "objects": [cup],
-        }
-        (folder / "scene.json").write_text(json.dumps(scene))
-        return folder
+        return self._recorded(self.run.scene(item), entry)
 
     def rejected(self, item, entry=None, **words):
-        self.video(item, entry)
         given = {"reason": "object_not_found", "detail": "no cup was found", "value": 2.93}
-        return self.record(item, {**given, **words})
+        return self._recorded(self.run.folder("scene", item), entry, rejected={**given, **words})
 
     def page(self, *flags):
-        assert run(["scene", "review", str(self.root), *map(str, flags)]) == 0
+        assert run_command(["scene", "review", str(self.root), *map(str, flags)]) == 0
         return (self.root / PAGE_FILE).read_text()
 
     def clips(self, *flags):
@@ -283,8 +253,8 @@ class Made:
 
 
 @pytest.fixture
-def made(tmp_path):
-    return Made(tmp_path)
+def made(tmp_path, run):
+    return Made(tmp_path, run)
 
 
 def test_the_page_holds_what_was_understood_and_links_the_videos_beside_it(made):
@@ -295,15 +265,9 @@ def test_the_page_holds_what_was_understood_and_links_the_videos_beside_it(made)
 
     push, lift = clips["push"], clips["lift"]
     assert list(clips) == ["push", "lift"]
-    assert (push["caption"], push["kind"], push["confidence"]) == (
-        "Pushing red cup",
-        "push_left",
-        0.81,
-    )
-    assert push["things"] == [{"name": "red cup", "size_cm": [8.0, 8.0, 10.0], "mass_kg": 0.2}]
-    assert push["stages"] == [
-        {"name": "pose", "value": 0.4, "reason": "the hand hides half of it"}
-    ]
+    assert (push["caption"], push["kind"]) == ("Pushing red cup", "lift_up")
+    assert push["confidence"] == pytest.approx(0.77)
+    assert push["things"] == [{"name": "a mug", "size_cm": [8.0, 8.0, 10.0], "mass_kg": 0.25}]
     assert push["film"] == "scene/push-0a1b2c3d/overlay.mp4"
     assert (lift["reason"], lift["value"], lift["film"]) == (
         "object_not_found",
@@ -359,7 +323,7 @@ def test_a_run_whose_videos_are_elsewhere_is_shown_all_the_same(made, tmp_path):
 
 
 def test_a_folder_without_scenes_is_named(tmp_path, capsys):
-    assert run(["scene", "review", str(tmp_path)]) == 2
+    assert run_command(["scene", "review", str(tmp_path)]) == 2
     assert "holds no scenes" in capsys.readouterr().err
 
 
