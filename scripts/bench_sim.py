@@ -3,7 +3,6 @@
     python scripts/bench_sim.py             # the table, with a policy in training; 3 minutes
     python scripts/bench_sim.py --quick     # the table without training, within 45 s
     python scripts/bench_sim.py --scaling   # cost and memory per world, 64 to 4096 worlds
-    python scripts/bench_sim.py --peers     # beside the lifting environments of gym-hil and robosuite
 
 The environment is `BatchEnv.step`: clipping and noise, targets, physics, states, observation, the task's success
 and reward, and the reset of the worlds whose episode ended. The limit is `Batch.step` alone on the same model
@@ -47,8 +46,6 @@ from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 from v2p_data.task.task import TaskBundle
 from v2p_data.task.templates.write import write_samples
 
-PEERS = ("gym-hil", "robosuite")
-PEER_SCRIPT = Path(__file__).parent / "peer_steps.py"
 CHUNK = 4
 QUICK_SECONDS = 26.0
 """With --quick, a row is left out that would not be done by then, if it took half as long again as the slowest so far."""
@@ -64,12 +61,6 @@ class BenchConfig:
     """Fewer turns, and no training."""
     scaling: bool = False
     """Cost and memory per world against the number of worlds."""
-    peers: bool = False
-    """Compare with other projects' lifting environments."""
-    peer_python: Path = Path(sys.executable)
-    """The interpreter in which the other projects are installed."""
-    peer_seconds: float = 20.0
-    """For how long each of them runs."""
     one_size: bool = False
     """One row of `--scaling`, as JSON."""
     worlds: int = 512
@@ -164,8 +155,6 @@ def main(cfg: BenchConfig) -> None:
             show_scaling(cfg)
         elif cfg.one_size:
             show_one_size(cfg)
-        elif cfg.peers:
-            show_peers(cfg)
         else:
             show_table(cfg, Path(name))
 
@@ -544,55 +533,6 @@ def show_one_size(cfg: BenchConfig) -> None:
 def _resident_bytes() -> int:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-def show_peers(cfg: BenchConfig) -> None:
-    """Print control steps and simulated seconds per second and core, beside other projects' environments."""
-    cores = os.cpu_count() or 1
-    ours = measure(_env(lift_box(), cfg), random_policy(cfg.worlds), cfg)
-    rate = ours.num_worlds * ours.env.shape[1] / np.median(ours.env, axis=0).sum() / cores
-    dt = 0.05
-    print(
-        f"{'per second and core, median':28s} {'control steps':>14s} {'simulated s':>12s}  ours is faster by"
-    )
-    print(f"{'this environment':28s} {rate:14,.0f} {rate * dt:12,.0f}")
-    for name in PEERS:
-        found = _peer_rates(cfg, name, cores)
-        if found is None:
-            print(
-                f"{name:28s} is not installed in {cfg.peer_python}: make a virtual environment, install {name} there "
-                "('uv pip install gym-hil robosuite'), and pass --peer-python=ITS/bin/python"
-            )
-            continue
-        theirs, their_dt = found
-        print(
-            f"{name:28s} {theirs:14,.0f} {theirs * their_dt:12,.1f}  {rate / theirs:,.0f} times in control steps, "
-            f"{rate * dt / (theirs * their_dt):,.0f} times in simulated time"
-        )
-
-
-def _peer_rates(cfg: BenchConfig, name: str, cores: int) -> tuple[float, float] | None:
-    """Return control steps per second and core, and the control period [s]; nothing if it is not installed."""
-    module = name.replace("-", "_")
-    probe = f"import importlib.util, sys; sys.exit(importlib.util.find_spec('{module}') is None)"
-    if subprocess.run([cfg.peer_python, "-c", probe], check=False).returncode:
-        return None
-    one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    running = [
-        subprocess.Popen(
-            [cfg.peer_python, PEER_SCRIPT, name, str(cfg.peer_seconds)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            env=one_thread,
-        )
-        for _ in range(cores)
-    ]
-    answers = [process.communicate()[0] for process in running]
-    if any(process.returncode for process in running):
-        raise RuntimeError(f"{name} failed; see '{cfg.peer_python} {PEER_SCRIPT} {name} 1'")
-    rows = [next(json.loads(x) for x in a.splitlines() if x.startswith("{")) for a in answers]
-    return sum(r["steps_per_s"] for r in rows) / cores, rows[0]["control_dt_s"]
 
 
 def _env(bundle: TaskBundle, cfg: BenchConfig) -> BatchEnv:

@@ -95,11 +95,6 @@ class TaskKind:
         return self.end == "beside"
 
     @property
-    def ends_near(self) -> bool:
-        """Whether the manipulated object, or the tool that pushes it, is near the other one at the end."""
-        return self.comes_near or self.touches or self.grasps == "tool"
-
-    @property
     def locates_other(self) -> bool:
         """Whether the object's path tells where the other one is."""
         return self.comes_near or self.touches or self.starts_over

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
-from scipy import stats
 
 from v2p_data.errors import V2PError
 
@@ -123,12 +122,3 @@ def commit() -> str:
     return (git("rev-parse", "--short=12", "HEAD") or "unknown") + (
         "+" if git("status", "--porcelain", "--", "v2p_data", "policies", "scripts") else ""
     )
-
-
-def mean_over_seeds(values: Iterable[float]) -> tuple[str, str]:
-    """Return the mean of one number per seed and its 95 % t-interval, `-` for a single seed."""
-    found = np.array(list(values))
-    if len(found) < 2:
-        return f"{found.mean():+.3f}", "-"
-    half = stats.t.ppf(0.975, len(found) - 1) * found.std(ddof=1) / np.sqrt(len(found))
-    return f"{found.mean():+.3f}", f"{found.mean() - half:+.3f} to {found.mean() + half:+.3f}"
