@@ -67,7 +67,13 @@ from v2p_data.seeds import rng_for, seed_for
 from v2p_data.sim.robot.arms import RobotConfig, robot_to_json
 from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.llm.config import VlmConfig
-from v2p_data.task.task import CODE_FILE, REWARD_SEARCH_FOLDER, SCENE_FOLDER, TaskBundle, told_of
+from v2p_data.task.task import (
+    CODE_FILE,
+    REWARD_SEARCH_FOLDER,
+    SCENE_FOLDER,
+    TaskBundle,
+    errors_naming,
+)
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig, read_clip
 
@@ -676,7 +682,7 @@ def make_evaluation(
     for index, (name, folder) in enumerate(tasks.items()):
         bundle = TaskBundle.load(folder)
         seed = seed_for(cfg.seed, "evaluation", name) % 2**31
-        with told_of(folder):
+        with errors_naming(folder):
             judged = judge_task(
                 play,
                 bundle,

@@ -157,7 +157,14 @@ def pixel_sums_by_products(
         right = width - 1 - seen.flip(2).to(torch.uint8).argmax(2).double()
         ends = torch.maximum(left[..., None] * along[:, 0], right[..., None] * along[:, 0])
         ends = (ends + y[:, None] * along[:, 1]).masked_fill((by_row == 0)[..., None], -torch.inf)
-        numbers = [by_row.sum(1), by_column @ x, by_row @ y, by_column @ x**2, by_row @ y**2, x_by_row @ y]  # fmt: skip
+        numbers = [
+            by_row.sum(1),
+            by_column @ x,
+            by_row @ y,
+            by_column @ x**2,
+            by_row @ y**2,
+            x_by_row @ y,
+        ]
         out.append(torch.cat([torch.stack(numbers, -1), ends.amax(1).clamp(min=-1e12)], -1))
     return torch.stack(out, 1).long()
 

@@ -269,7 +269,9 @@ class _Run:
                 rate = len(losses) * cfg.batch_size / part_s
                 loss = self._note(losses, rate, part_loader_s / part_s, writer)
                 loader_s += part_loader_s
-                left_s = (time.monotonic() - started) / (self.step - first) * (cfg.steps - self.step)  # fmt: skip
+                left_s = (
+                    (time.monotonic() - started) / (self.step - first) * (cfg.steps - self.step)
+                )
                 self.on_progress(
                     self.step / cfg.steps,
                     f"loss {loss:.3f}, {rate:.0f} samples/s, {left_s:.0f} s left",
@@ -308,7 +310,7 @@ class _Run:
                 f"the loss is {loss} at step {self.step} of {self.cfg.steps}; columns were finite, so lower"
                 " optimizer_lr"
             )
-        row = (self.step, loss, self.optimizer.param_groups[0]["lr"], rate, loader_share)  # fmt: skip
+        row = (self.step, loss, self.optimizer.param_groups[0]["lr"], rate, loader_share)
         self.rows.append(row)
         if writer is not None:
             for name, value in zip(CURVE_FIELDS[1:], row[1:], strict=True):

@@ -165,7 +165,10 @@ def test_joint_angles_follow_the_tool_in_the_state(roots):
 
 
 def test_states_with_and_without_joints_do_not_go_together(roots, tmp_path):
-    staged = [staged_episodes(next((roots[a] / "episodes").glob("toy-*")))[k] for k, a in enumerate(("delta_tool", "joints"))]  # fmt: skip
+    staged = [
+        staged_episodes(next((roots[a] / "episodes").glob("toy-*")))[k]
+        for k, a in enumerate(("delta_tool", "joints"))
+    ]
     without = [replace(Episode.load(staged[1]), actions=()).save(tmp_path / "staged")]
 
     with pytest.raises(V2PError, match=r"states of 18 numbers, .* of 11 numbers; .*joint-state"):
@@ -216,7 +219,10 @@ def test_datasets_of_two_kinds_do_not_go_together(roots, tmp_path):
     for one, other, words in ((steps, joints, "the list of columns"), (joints, tool, "names of")):
         with pytest.raises(V2PError, match=f"do not go together: {words}"):
             merge([one, other], "me/both", tmp_path / "both")
-    staged = [staged_episodes(next((roots[a] / "episodes").glob("toy-*")))[k] for k, a in enumerate(KINDS)]  # fmt: skip
+    staged = [
+        staged_episodes(next((roots[a] / "episodes").glob("toy-*")))[k]
+        for k, a in enumerate(KINDS)
+    ]
     with pytest.raises(V2PError, match=r"collect all episodes with one --episodes\.actions"):
         pack(staged, "me/both", tmp_path / "both")
 

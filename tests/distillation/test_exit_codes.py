@@ -33,7 +33,13 @@ def chain(video: VideoItem, cfg: EngineConfig) -> Stage:
     """Return the toy task's chain, with a scene before it."""
     name = video.path.stem
     scene = Stage(name="scene", item=name, config={}, make=partial(make_scene, item=name))
-    task = Stage(name="task", item=name, config={}, inputs={"scene": scene}, make=partial(make_task, item=name))  # fmt: skip
+    task = Stage(
+        name="task",
+        item=name,
+        config={},
+        inputs={"scene": scene},
+        make=partial(make_task, item=name),
+    )
     learned = Stage(name="expert", item=name, config={}, inputs={"task": task}, make=make_expert)
     return episodes_stage(task, learned, QUICK)
 
@@ -129,8 +135,10 @@ def test_a_failed_scene_beside_whole_ones_leaves_3_and_alone_2(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(
-        commands, "scene_stage", lambda video, cfg: chain(video, cfg).inputs["task"].inputs["scene"]
-    )  # fmt: skip
+        commands,
+        "scene_stage",
+        lambda video, cfg: chain(video, cfg).inputs["task"].inputs["scene"],
+    )
     (place / "videos" / "broken.mp4").write_bytes(b"x")
 
     assert run(["scene", str(place / "videos"), "--out", str(place / "run")]) == 3

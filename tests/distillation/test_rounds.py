@@ -25,7 +25,15 @@ class Killed(Exception):  # noqa: N818 - it stands for a kill
     pass
 
 
-def run(out: Path, pupil: Pupil | None = None, *, train=None, episodes=EPISODES, num_threads=1, cfg=DISTILLATION):  # fmt: skip
+def run(
+    out: Path,
+    pupil: Pupil | None = None,
+    *,
+    train=None,
+    episodes=EPISODES,
+    num_threads=1,
+    cfg=DISTILLATION,
+):
     pupil = pupil or Pupil()
     lessons = {"toy": rollouts.Lesson(bundle=toy_run.bundle(), expert=StateActor(act))}
     course = Course(lessons=lessons, cfg=cfg, episodes=episodes, seed=7, num_threads=num_threads)
@@ -60,7 +68,11 @@ def test_successful_episodes_are_staged_with_who_acted(calm: Path):
         episode = Episode.load(path)
         assert episode.is_handover
         assert episode.intervention is not None
-        at = int(np.argmax(episode.intervention)) if episode.intervention.any() else episode.num_frames  # fmt: skip
+        at = (
+            int(np.argmax(episode.intervention))
+            if episode.intervention.any()
+            else episode.num_frames
+        )
         assert episode.intervention.tolist() == [t >= at for t in range(episode.num_frames)]
         assert 3 <= at <= 15
         assert (episode.action[:, 1] > 0).all()  # the expert's, also where the student went right

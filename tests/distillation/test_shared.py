@@ -49,7 +49,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         provenance.cache_clear()
         worker = {"worker": shlex.join([f"{root}/venv/bin/python", f"{root}/worker.py"])}
         task = Stage(name="task", item=ITEM, config=worker, make=make_task)
-        learned = Stage(name="expert", item=ITEM, config=worker, inputs={"task": task}, make=make_expert)  # fmt: skip
+        learned = Stage(
+            name="expert", item=ITEM, config=worker, inputs={"task": task}, make=make_expert
+        )
         stage = dataset_stage([episodes_stage(task, learned, ENGINE)], "user/toys")
         outcomes = made([stage], Runtime(root=root))
         assert all(o.is_usable for o in outcomes.values()), outcomes

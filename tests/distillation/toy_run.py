@@ -135,9 +135,12 @@ def made(
         bad = blocked_by(stage, outcomes)
         if outcome is None and bad is not None:
             outcome = Outcome(
-                stage=stage.name, item=stage.item, status="blocked",
-                folder=stage.folder(runtime.root), detail=f"needs {bad.stage} of {bad.item}",
-            )  # fmt: skip
+                stage=stage.name,
+                item=stage.item,
+                status="blocked",
+                folder=stage.folder(runtime.root),
+                detail=f"needs {bad.stage} of {bad.item}",
+            )
         outcome = outcome or make_stage(stage, runtime)
         outcomes[(stage.name, stage.folder_name)] = outcome
     return outcomes

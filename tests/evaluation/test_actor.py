@@ -35,12 +35,15 @@ def checkpoint(folder, cameras=(MASK,), state_dim=11, act_dim=7):
 @pytest.mark.parametrize(
     ("odd", "said"),
     [
-        ({"state_dim": 7}, r"'observation\.state' of shape \(7,\), and the simulator gives \(11,\)"),
+        (
+            {"state_dim": 7},
+            r"'observation\.state' of shape \(7,\), and the simulator gives \(11,\)",
+        ),
         ({"act_dim": 8}, r"'action' of shape \(8,\), and the simulator gives \(7,\)"),
         ({"cameras": ["observation.images.rgb"]}, r"'observation\.images\.rgb' \(3, 48, 64\)"),
         ({"cameras": []}, r"has no camera 'observation\.images\.mask'"),
     ],
-)  # fmt: skip
+)
 def test_a_policy_that_wants_something_else_is_told_what_there_is(tmp_path, odd, said):
     from policies.evaluation.actor import UnsuitablePolicyError, load_actor
 

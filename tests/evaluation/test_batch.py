@@ -63,7 +63,9 @@ class Drive:
 def bundle() -> TaskBundle:
     found = load_benchmark("lift_up")
     thing = found.scene.manipulated
-    still = replace(thing, poses_world=thing.poses_world[:1] * 2, frames=(0, 1), confidences=(1.0, 1.0))  # fmt: skip
+    still = replace(
+        thing, poses_world=thing.poses_world[:1] * 2, frames=(0, 1), confidences=(1.0, 1.0)
+    )
     scene = replace(found.scene, kind="generic", objects=(still,))
     task = replace(found, code=HIGH_TOOL, class_name="HighTool")
     return replace(task, kind="generic", scene=scene, horizon_steps=12)

@@ -37,7 +37,12 @@ def left_folder(benchmark_folder: Path) -> Path:
     from dataclasses import replace
 
     bundle = TaskBundle.load(benchmark_folder)
-    still = replace(bundle.scene.manipulated, poses_world=bundle.scene.manipulated.poses_world[:1] * 2, frames=(0, 1), confidences=(1.0, 1.0))  # fmt: skip
+    still = replace(
+        bundle.scene.manipulated,
+        poses_world=bundle.scene.manipulated.poses_world[:1] * 2,
+        frames=(0, 1),
+        confidences=(1.0, 1.0),
+    )
     scene = replace(
         bundle.scene, kind="generic", objects=(still,), folder=benchmark_folder.parent / "resting"
     )

@@ -69,7 +69,7 @@ def config(
     camera: str = MASK, *, state: int = 3, size_px: int = SIZE_PX, **settings
 ) -> V2PBCConfig:
     """Return settings of a policy that is quick to train, with its features filled in."""
-    settings = {"input_size_px": 32, "pretrained_backbone_weights": None, **settings}  # fmt: skip
+    settings = {"input_size_px": 32, "pretrained_backbone_weights": None, **settings}
     cfg = V2PBCConfig(device="cpu", head_dim=32, state_dim=16, **settings)
     cfg.input_features = {
         camera: PolicyFeature(FeatureType.VISUAL, (3, size_px, size_px)),

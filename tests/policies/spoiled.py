@@ -150,8 +150,12 @@ for _type, _setting in {
 }.items():
     POLICIES[f"{_type} whose {_setting} is somebody's"] = changed(
         CONFIG,
-        lambda data, t=_type, s=_setting: {"type": t, s: "evil/model", **{k: data[k] for k in ("input_features", "output_features")}},
-    )  # fmt: skip
+        lambda data, t=_type, s=_setting: {
+            "type": t,
+            s: "evil/model",
+            **{k: data[k] for k in ("input_features", "output_features")},
+        },
+    )
 
 # --- processors ----------------------------------------------------------------------------------------------
 
@@ -171,27 +175,54 @@ for _file in (BEFORE, AFTER):
     for _name, _step in {
         "that is a program": POPEN,
         "that is a program beside a name": {**POPEN, "registry_name": "to_batch_processor"},
-        "whose name is a program": {"registry_name": "subprocess.Popen", "config": POPEN["config"]},
-        "that writes a file": {"class": "pathlib.Path.write_text", "config": {"self": "CANARY", "data": ""}},
+        "whose name is a program": {
+            "registry_name": "subprocess.Popen",
+            "config": POPEN["config"],
+        },
+        "that writes a file": {
+            "class": "pathlib.Path.write_text",
+            "config": {"self": "CANARY", "data": ""},
+        },
         "of somebody's repository": {
             "registry_name": "action_tokenizer_processor",
             "config": {"action_tokenizer_name": "evil/tokenizer", "trust_remote_code": True},
         },
-        "whose tokenizer is somebody's": {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil"}},
-        "whose tokenizer is a folder": {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "./here"}},
-        "of a reward model": {"registry_name": "reward_classifier_processor", "config": {"pretrained_path": "evil/model"}},
+        "whose tokenizer is somebody's": {
+            "registry_name": "tokenizer_processor",
+            "config": {"tokenizer_name": "evil"},
+        },
+        "whose tokenizer is a folder": {
+            "registry_name": "tokenizer_processor",
+            "config": {"tokenizer_name": "./here"},
+        },
+        "of a reward model": {
+            "registry_name": "reward_classifier_processor",
+            "config": {"pretrained_path": "evil/model"},
+        },
         "without a name": {"config": {}},
         "that is a number": 7,
         "that is empty": {},
         "with an unknown setting": {"registry_name": "to_batch_processor", "config": {"x": 1}},
         "whose settings are a list": {"registry_name": "to_batch_processor", "config": []},
         "whose file is outside": {"registry_name": "to_batch_processor", "state_file": OUTSIDE},
-        "whose file is above": {"registry_name": "normalizer_processor", "state_file": "../x.safetensors"},
+        "whose file is above": {
+            "registry_name": "normalizer_processor",
+            "state_file": "../x.safetensors",
+        },
         "whose file is a pickle": {"registry_name": "normalizer_processor", "state_file": "x.pkl"},
-        "whose file is missing": {"registry_name": "normalizer_processor", "state_file": "x.safetensors"},
-        "with a number of 10**9": {"registry_name": "tokenizer_processor", "config": {"max_length": 10**9}},
-        "whose features are a list": {"registry_name": "normalizer_processor", "config": {"features": [1]}},
-    }.items():  # fmt: skip
+        "whose file is missing": {
+            "registry_name": "normalizer_processor",
+            "state_file": "x.safetensors",
+        },
+        "with a number of 10**9": {
+            "registry_name": "tokenizer_processor",
+            "config": {"max_length": 10**9},
+        },
+        "whose features are a list": {
+            "registry_name": "normalizer_processor",
+            "config": {"features": [1]},
+        },
+    }.items():
         POLICIES[f"{_file}: a step {_name}"] = with_step(_file, _step)
 POLICIES["100 steps"] = with_value(
     BEFORE, "steps", [{"registry_name": "to_batch_processor"}] * 100
@@ -238,11 +269,19 @@ for _file in (WEIGHTS, STATE):
         "has a header of 2**60 bytes": header({}, 2**60),
         "has a header of no JSON": header(b"{" * 30),
         "holds no tensors": header({}),
-        "says 10**12 numbers": header({"a": {"dtype": "F32", "shape": [10**12], "data_offsets": [0, 4 * 10**12]}}),
-        "says what overlaps": header({k: {"dtype": "F32", "shape": [8], "data_offsets": [0, 32]} for k in "ab"}),
-        "says negative sizes": header({"a": {"dtype": "F32", "shape": [-8], "data_offsets": [0, 32]}}),
-        "is of another number format": header({"a": {"dtype": "X7", "shape": [8], "data_offsets": [0, 32]}}),
-    }.items():  # fmt: skip
+        "says 10**12 numbers": header(
+            {"a": {"dtype": "F32", "shape": [10**12], "data_offsets": [0, 4 * 10**12]}}
+        ),
+        "says what overlaps": header(
+            {k: {"dtype": "F32", "shape": [8], "data_offsets": [0, 32]} for k in "ab"}
+        ),
+        "says negative sizes": header(
+            {"a": {"dtype": "F32", "shape": [-8], "data_offsets": [0, 32]}}
+        ),
+        "is of another number format": header(
+            {"a": {"dtype": "X7", "shape": [8], "data_offsets": [0, 32]}}
+        ),
+    }.items():
         POLICIES[f"{_file} {_name}"] = written(_file, _content)
 POLICIES["weights lack one"] = with_tensors(
     WEIGHTS, lambda tensors: tensors.pop("net.head.0.bias")

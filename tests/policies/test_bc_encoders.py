@@ -110,7 +110,9 @@ def test_a_grown_ellipse_has_the_moments_of_the_larger_one_and_an_absent_label_s
     ellipses = [((x - 120) / a) ** 2 + ((y - 100) / b) ** 2 <= 1 for a, b in ((20, 10), (23, 13))]
     small, large = mask_moments(torch.from_numpy(np.array(ellipses, np.uint8)), 3).flatten(1)
     # Neither moved nor scaled, grown by 3 px.
-    monkeypatch.setattr(torch, "rand", lambda *shape, device: torch.tensor([0.5, 0.5, 1.0, 0.5]).expand(shape))  # fmt: skip
+    monkeypatch.setattr(
+        torch, "rand", lambda *shape, device: torch.tensor([0.5, 0.5, 1.0, 0.5]).expand(shape)
+    )
 
     grown = jittered(small[None, None], 3.0, 256)[0, 0]
 

@@ -26,19 +26,39 @@ from v2p_data.evaluation.judging import contestant, play_of
 
 TINY: dict[str, dict[str, Any]] = {
     "act": {
-        "chunk_size": 2, "n_action_steps": 2, "dim_model": 16, "n_heads": 2, "dim_feedforward": 16,
-        "n_encoder_layers": 1, "n_vae_encoder_layers": 1,
+        "chunk_size": 2,
+        "n_action_steps": 2,
+        "dim_model": 16,
+        "n_heads": 2,
+        "dim_feedforward": 16,
+        "n_encoder_layers": 1,
+        "n_vae_encoder_layers": 1,
     },
     "diffusion": {
-        "horizon": 8, "n_action_steps": 4, "down_dims": (16, 32), "n_groups": 4, "diffusion_step_embed_dim": 16,
+        "horizon": 8,
+        "n_action_steps": 4,
+        "down_dims": (16, 32),
+        "n_groups": 4,
+        "diffusion_step_embed_dim": 16,
         "spatial_softmax_num_keypoints": 4,
     },
     "vqbet": {
-        "gpt_n_layer": 1, "gpt_hidden_dim": 16, "gpt_input_dim": 16, "gpt_output_dim": 16, "gpt_n_head": 2,
-        "vqvae_embedding_dim": 16, "vqvae_enc_hidden_dim": 16, "crop_shape": (64, 64),
+        "gpt_n_layer": 1,
+        "gpt_hidden_dim": 16,
+        "gpt_input_dim": 16,
+        "gpt_output_dim": 16,
+        "gpt_n_head": 2,
+        "vqvae_embedding_dim": 16,
+        "vqvae_enc_hidden_dim": 16,
+        "crop_shape": (64, 64),
     },
-    "tdmpc": {"mlp_dim": 16, "latent_dim": 8, "image_encoder_hidden_dim": 4, "state_encoder_hidden_dim": 8},
-}  # fmt: skip
+    "tdmpc": {
+        "mlp_dim": 16,
+        "latent_dim": 8,
+        "image_encoder_hidden_dim": 4,
+        "state_encoder_hidden_dim": 8,
+    },
+}
 
 
 def opened(folder: Path) -> Any:
@@ -225,4 +245,7 @@ def test_what_is_read_is_told(good: Path):
     assert found.config.type == "v2p_bc"
     assert found.config.output_features is not None
     assert found.config.output_features["action"].shape == (7,)
-    assert [s.registry_name for s in found.steps[spoiled.AFTER]] == ["unnormalizer_processor", "device_processor"]  # fmt: skip
+    assert [s.registry_name for s in found.steps[spoiled.AFTER]] == [
+        "unnormalizer_processor",
+        "device_processor",
+    ]

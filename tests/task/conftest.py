@@ -28,9 +28,17 @@ def thing(name, size, start, end=None, quat_end=UPRIGHT, role="manipulated", sha
         for t in np.linspace(0, 1, 12)
     )
     return SceneObject(
-        name=name, label=name.replace("_", " "), role=role, shape=shape, size_m=size, mass_kg=0.1,
-        friction=0.8, frames=tuple(range(12)), poses_world=poses, confidences=(1.0,) * 12,
-    )  # fmt: skip
+        name=name,
+        label=name.replace("_", " "),
+        role=role,
+        shape=shape,
+        size_m=size,
+        mass_kg=0.1,
+        friction=0.8,
+        frames=tuple(range(12)),
+        poses_world=poses,
+        confidences=(1.0,) * 12,
+    )
 
 
 OBJECTS = {
@@ -40,7 +48,14 @@ OBJECTS = {
         thing("can", (0.06, 0.06, 0.12), (0, 0, 0.06), (0.02, -0.2, 0.05), shape="cylinder"),
     ),
     "tip_over": (
-        thing("bottle", (0.06, 0.06, 0.2), (0, 0, 0.1), (0, 0.12, 0.03), ON_ITS_SIDE, shape="cylinder"),
+        thing(
+            "bottle",
+            (0.06, 0.06, 0.2),
+            (0, 0, 0.1),
+            (0, 0.12, 0.03),
+            ON_ITS_SIDE,
+            shape="cylinder",
+        ),
     ),
     "push_next_to": (
         thing("can", (0.06, 0.06, 0.12), (0, 0, 0.06), (0, 0.14, 0.06)),
@@ -67,7 +82,7 @@ OBJECTS = {
         thing("cube", (0.03, 0.03, 0.03), (0, 0.2, 0.015), role="reference"),
     ),
     "generic": (thing("box", (0.05, 0.05, 0.05), (0, 0, 0.025), (0.1, 0.1, 0.03)),),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="session")
@@ -76,14 +91,22 @@ def scene_of() -> Callable[..., Scene]:
 
     def make(kind: str, *objects: SceneObject, description: str = "") -> Scene:
         camera = Camera(
-            width_px=64, height_px=48, K=intrinsics(64, 48, 1.0),
+            width_px=64,
+            height_px=48,
+            K=intrinsics(64, 48, 1.0),
             T_world_cam=look_at(np.array([-0.5, 0.0, 0.5]), np.zeros(3)),
-        )  # fmt: skip
+        )
         return Scene(
-            title=f"clip_{kind}", video="clip.mp4", description=description or kind.replace("_", " "),
-            kind=kind, objects=objects or OBJECTS[kind], camera=camera, fps=20.0, num_frames=12,
+            title=f"clip_{kind}",
+            video="clip.mp4",
+            description=description or kind.replace("_", " "),
+            kind=kind,
+            objects=objects or OBJECTS[kind],
+            camera=camera,
+            fps=20.0,
+            num_frames=12,
             confidence=1.0,
-        )  # fmt: skip
+        )
 
     return make
 

@@ -430,70 +430,171 @@ CONTAINED: dict[str, tuple[str, str]] = {
     "memory: one tensor too large": (program("y = torch.zeros(1000000, 1000000)"), "memory"),
     "memory: a size calculated": (program("n = int(1e12)\ny = torch.zeros(n)"), "memory"),
     "memory: doubled by cat": (
-        program("y = x\nfor i in range(60):\n    y = torch.cat([y, y])"), ""),
+        program("y = x\nfor i in range(60):\n    y = torch.cat([y, y])"),
+        "",
+    ),
     "memory: tile": (program("y = torch.tile(x, (100000, 100000))"), "memory"),
     "memory: outer product": (
-        program("y = torch.arange(300000.0)\ny = torch.outer(y, y)"), "memory"),
+        program("y = torch.arange(300000.0)\ny = torch.outer(y, y)"),
+        "memory",
+    ),
     "memory: a view spelled out": (
-        program("y = torch.zeros(1).expand(1000000, 100000).tolist()"), ""),
+        program("y = torch.zeros(1).expand(1000000, 100000).tolist()"),
+        "",
+    ),
     "memory: a view made solid": (
-        program("y = torch.zeros(1).expand(1000000, 1000000).contiguous()"), "memory"),
+        program("y = torch.zeros(1).expand(1000000, 1000000).contiguous()"),
+        "memory",
+    ),
     "memory: distances of all to all": (
-        program("y = torch.zeros(200000, 3)\ny = torch.cdist(y, y)"), "memory"),
+        program("y = torch.zeros(200000, 3)\ny = torch.cdist(y, y)"),
+        "memory",
+    ),
     "memory: meshgrid": (
-        program("y = torch.arange(100000.0)\na, b = torch.meshgrid(y, y, indexing='ij')\ny = a + b"), "memory"),
+        program(
+            "y = torch.arange(100000.0)\na, b = torch.meshgrid(y, y, indexing='ij')\ny = a + b"
+        ),
+        "memory",
+    ),
     "memory: einsum": (
-        program("y = torch.ones(5000)\ny = torch.einsum('a,b,c->abc', y, y, y)"), "memory"),
+        program("y = torch.ones(5000)\ny = torch.einsum('a,b,c->abc', y, y, y)"),
+        "memory",
+    ),
     "memory: list doubled": (program(_BUILD.replace("{seed}", "[0]")), ""),
     "memory: list by assignment": (program("y = [0]\ny *= 999999\ny *= 999999"), "memory"),
     "memory: keys without end": (
-        program("def compute_observation_key(self, states):\n    y = ['base_observation']\n    for i in range(24):\n        y = y + y\n    return y", "MEMBER"), ""),
-    "memory: components without end": (
-        program("y = {}\nfor i in range(1000):\n    y[str(i)] = actions[:, 0]\nreturn actions[:, 0], y", "REWARD"), "components"),
-    "memory: kept on self": (
-        program("self.kept = [x]\nfor i in range(999):\n    self.kept = [self.kept, torch.zeros(100000, 1000)]"), "memory"),
-    "memory: a tuple times a number": (program("y = (0, 0)\ny = y * int(1e12)"), "memory"),
-    "memory: width put together": (program("y = '%9'\nfor i in range(9):\n    y = y + '9'\nz = (y + 'd') % 1"), ""),
-    "time: squares of a whole number": (
-        program("y = 3\nfor i in range(99):\n    y = y * y"), "took more than"),
-    "time: loops called by loops": (
         program(
-            "y = [loop(1) for i in range(999)]"
-        ).replace("#TOP", "def loop(n):\n    y = [inner(i) for i in range(999)]\n    return y\ndef inner(n):\n    y = [i for i in range(999)]\n    return n"), "took more than"),
-    "time: calls that double": (program("y = twice(60)").replace("#TOP", _TWICE), "took more than"),
+            "def compute_observation_key(self, states):\n    y = ['base_observation']\n    for i in range(24):\n        y = y + y\n    return y",
+            "MEMBER",
+        ),
+        "",
+    ),
+    "memory: components without end": (
+        program(
+            "y = {}\nfor i in range(1000):\n    y[str(i)] = actions[:, 0]\nreturn actions[:, 0], y",
+            "REWARD",
+        ),
+        "components",
+    ),
+    "memory: kept on self": (
+        program(
+            "self.kept = [x]\nfor i in range(999):\n    self.kept = [self.kept, torch.zeros(100000, 1000)]"
+        ),
+        "memory",
+    ),
+    "memory: a tuple times a number": (program("y = (0, 0)\ny = y * int(1e12)"), "memory"),
+    "memory: width put together": (
+        program("y = '%9'\nfor i in range(9):\n    y = y + '9'\nz = (y + 'd') % 1"),
+        "",
+    ),
+    "time: squares of a whole number": (
+        program("y = 3\nfor i in range(99):\n    y = y * y"),
+        "took more than",
+    ),
+    "time: loops called by loops": (
+        program("y = [loop(1) for i in range(999)]").replace(
+            "#TOP",
+            "def loop(n):\n    y = [inner(i) for i in range(999)]\n    return y\ndef inner(n):\n    y = [i for i in range(999)]\n    return n",
+        ),
+        "took more than",
+    ),
+    "time: calls that double": (
+        program("y = twice(60)").replace("#TOP", _TWICE),
+        "took more than",
+    ),
     "time: slow beside the limit": (
-        program("y = torch.ones(1500, 1500)\nfor i in range(999):\n    y = y.matmul(y).clamp(0, 1)"), "took more than"),
-    "time: the constructor never ends": (program("self.y = twice(60)", "INIT").replace("#TOP", _TWICE), "took more than"),
-    "depth: recursion without end": (program("return self.compute_success(states)"), "RecursionError"),
+        program(
+            "y = torch.ones(1500, 1500)\nfor i in range(999):\n    y = y.matmul(y).clamp(0, 1)"
+        ),
+        "took more than",
+    ),
+    "time: the constructor never ends": (
+        program("self.y = twice(60)", "INIT").replace("#TOP", _TWICE),
+        "took more than",
+    ),
+    "depth: recursion without end": (
+        program("return self.compute_success(states)"),
+        "RecursionError",
+    ),
     "depth: two functions that call each other": (
-        program("y = ping(1)").replace("#TOP", "def ping(n):\n    return pong(n)\ndef pong(n):\n    return ping(n)"), "RecursionError"),
+        program("y = ping(1)").replace(
+            "#TOP", "def ping(n):\n    return pong(n)\ndef pong(n):\n    return ping(n)"
+        ),
+        "RecursionError",
+    ),
     "depth: printing a list in lists": (
-        program("y = []\nfor i in range(999):\n    for j in range(999):\n        y = [y]\nz = str(y)"), ""),
+        program(
+            "y = []\nfor i in range(999):\n    for j in range(999):\n        y = [y]\nz = str(y)"
+        ),
+        "",
+    ),
     "depth: kinds in kinds": (
-        program("y = (int, float)\nfor i in range(999):\n    for j in range(50):\n        y = (y, y)\nz = isinstance(states, y)"), ""),
+        program(
+            "y = (int, float)\nfor i in range(999):\n    for j in range(50):\n        y = (y, y)\nz = isinstance(states, y)"
+        ),
+        "",
+    ),
     "depth: lists that hold themselves": (
-        program("y = []\ny.append(y)\nz = []\nz.append(z)\nif y == z:\n    y = 1"), "RecursionError"),
-    "range: a million steps": (program("for i in range(999999):\n    pass"), "range of 999999 steps"),
-    "range: backwards": (program("for i in range(999999, 0, -1):\n    pass"), "range of 999999 steps"),
+        program("y = []\ny.append(y)\nz = []\nz.append(z)\nif y == z:\n    y = 1"),
+        "RecursionError",
+    ),
+    "range: a million steps": (
+        program("for i in range(999999):\n    pass"),
+        "range of 999999 steps",
+    ),
+    "range: backwards": (
+        program("for i in range(999999, 0, -1):\n    pass"),
+        "range of 999999 steps",
+    ),
     "states: written into": (program("x[0, 0] = 1"), "changes states['box_pos'] in place"),
-    "states: written into by a view": (program("y = x[:, 2]\ny += 1"), "changes states['box_pos'] in place"),
-    "states: written into by a method": (program("x.zero_()"), "changes states['box_pos'] in place"),
-    "states: written into by clamp": (program("torch.where(x > 9, x, x)\nx.view(-1).clamp_(0, 1)"), "changes states['box_pos'] in place"),
-    "states: another key replaced": (program("states['eef_pos'] = x + 1"), "changes states['eef_pos'] in place"),
-    "states: a key taken out": (program("states.pop('eef_pos')"), "changes states['eef_pos'] in place"),
-    "states: all replaced": (program("states.update({'table_height': x[:, 0]})"), "changes states['table_height'] in place"),
+    "states: written into by a view": (
+        program("y = x[:, 2]\ny += 1"),
+        "changes states['box_pos'] in place",
+    ),
+    "states: written into by a method": (
+        program("x.zero_()"),
+        "changes states['box_pos'] in place",
+    ),
+    "states: written into by clamp": (
+        program("torch.where(x > 9, x, x)\nx.view(-1).clamp_(0, 1)"),
+        "changes states['box_pos'] in place",
+    ),
+    "states: another key replaced": (
+        program("states['eef_pos'] = x + 1"),
+        "changes states['eef_pos'] in place",
+    ),
+    "states: a key taken out": (
+        program("states.pop('eef_pos')"),
+        "changes states['eef_pos'] in place",
+    ),
+    "states: all replaced": (
+        program("states.update({'table_height': x[:, 0]})"),
+        "changes states['table_height'] in place",
+    ),
     "states: the observation replaced": (
-        program("states['base_observation'] = states['base_observation'] * 0"), "changes states['base_observation'] in place"),
+        program("states['base_observation'] = states['base_observation'] * 0"),
+        "changes states['base_observation'] in place",
+    ),
     "states: written into by the reward": (
-        program("states['box_pos'][:, 2] += 1", "REWARD"), "changes states['box_pos'] in place"),
+        program("states['box_pos'][:, 2] += 1", "REWARD"),
+        "changes states['box_pos'] in place",
+    ),
     "states: written into by a helper": (
-        program("states['box_pos'].fill_(0.0)", "FUNCTION"), "changes states['box_pos'] in place"),
+        program("states['box_pos'].fill_(0.0)", "FUNCTION"),
+        "changes states['box_pos'] in place",
+    ),
     "states: an action written into": (
-        program("actions.fill_(0.0)", "REWARD"), "changes the actions in place"),
+        program("actions.fill_(0.0)", "REWARD"),
+        "changes the actions in place",
+    ),
     "states: an action written into by a view": (
-        program("actions[:, 6] = 1.0", "FUNCTION"), "changes the actions in place"),
+        program("actions[:, 6] = 1.0", "FUNCTION"),
+        "changes the actions in place",
+    ),
     "states: a key that is no text": (
-        program("states[1] = x\nreturn states"), "compute_success must be a tensor, not dict"),
+        program("states[1] = x\nreturn states"),
+        "compute_success must be a tensor, not dict",
+    ),
     "answer: a text": (program("return 'yes'"), "must be a tensor, not str"),
     "answer: a number": (program("return True"), "must be a tensor, not bool"),
     "answer: the task itself": (program("return self"), "must be a tensor, not Lift"),
@@ -502,30 +603,70 @@ CONTAINED: dict[str, tuple[str, str]] = {
     "answer: a function": (program("return reward_function"), "must be a tensor, not function"),
     "answer: nested tuples": (program("return (x, (x, (x,)))"), "must be a tensor, not tuple"),
     "answer: a tensor without numbers": (program("return x.to('meta')[:, 0] > 0"), ""),
-    "answer: not finite": (program("r = torch.log(-1 - states['progress'])", "FUNCTION"), "not finite"),
+    "answer: not finite": (
+        program("r = torch.log(-1 - states['progress'])", "FUNCTION"),
+        "not finite",
+    ),
     "answer: names that are no text": (
-        program("return actions[:, 0], {1: actions[:, 0]}", "REWARD"), "no name for a reward component"),
-    "answer: a reward and no parts": (program("return actions[:, 0]", "REWARD"), "must return the reward and a dict"),
+        program("return actions[:, 0], {1: actions[:, 0]}", "REWARD"),
+        "no name for a reward component",
+    ),
+    "answer: a reward and no parts": (
+        program("return actions[:, 0]", "REWARD"),
+        "must return the reward and a dict",
+    ),
     "answer: memory as it was": (program("y = Tensor(5)"), "made of a list of numbers"),
-    "answer: memory as it was, by another name": (program("y = torch.FloatTensor(5)"), "made of a list of numbers"),
+    "answer: memory as it was, by another name": (
+        program("y = torch.FloatTensor(5)"),
+        "made of a list of numbers",
+    ),
     "answer: a reset that gives states away": (
-        program("def reset_objects_states(self, env_ids):\n    return self.scene_info", "MEMBER"), "must return a pose per object"),
+        program("def reset_objects_states(self, env_ids):\n    return self.scene_info", "MEMBER"),
+        "must return a pose per object",
+    ),
     "answer: a reset of texts": (
-        program("def reset_objects_states(self, env_ids):\n    return {'box': 'here'}", "MEMBER"), "must be a tensor of shape"),
+        program("def reset_objects_states(self, env_ids):\n    return {'box': 'here'}", "MEMBER"),
+        "must be a tensor of shape",
+    ),
     "answer: a reset to nowhere": (
-        program("def reset_objects_states(self, env_ids):\n    return {'box': torch.full((len(env_ids), 7), torch.nan)}", "MEMBER"), "not finite"),
+        program(
+            "def reset_objects_states(self, env_ids):\n    return {'box': torch.full((len(env_ids), 7), torch.nan)}",
+            "MEMBER",
+        ),
+        "not finite",
+    ),
     "answer: observations of another length": (
-        program("def get_observation_space(self):\n    return 1000", "MEMBER"), "says 1000"),
+        program("def get_observation_space(self):\n    return 1000", "MEMBER"),
+        "says 1000",
+    ),
     "answer: a key of nothing": (
-        program("def compute_observation_key(self, states):\n    return ['nothing']", "MEMBER"), "is not in states"),
+        program("def compute_observation_key(self, states):\n    return ['nothing']", "MEMBER"),
+        "is not in states",
+    ),
     "answer: differs from call to call": (
-        program("self.calls = self.calls + 1\nx = x * self.calls").replace("#INIT", "self.calls = 0"), "two calls"),
-    "answer: depends on the order": (program("x = x * torch.arange(len(x)).reshape(-1, 1)"), "order"),
-    "environment: more of it than there is": (program("y = self.envs.sample_object_poses(torch.arange(9999))"), "in reset_objects_states only"),
-    "environment: a text for numbers": (program("y = self.envs.sample_object_poses('all')"), "in reset_objects_states only"),
+        program("self.calls = self.calls + 1\nx = x * self.calls").replace(
+            "#INIT", "self.calls = 0"
+        ),
+        "two calls",
+    ),
+    "answer: depends on the order": (
+        program("x = x * torch.arange(len(x)).reshape(-1, 1)"),
+        "order",
+    ),
+    "environment: more of it than there is": (
+        program("y = self.envs.sample_object_poses(torch.arange(9999))"),
+        "in reset_objects_states only",
+    ),
+    "environment: a text for numbers": (
+        program("y = self.envs.sample_object_poses('all')"),
+        "in reset_objects_states only",
+    ),
     "error: unknown state": (program("y = states['nothing']"), "line 15: KeyError"),
     "error: a division by zero": (program("y = 1 / 0"), "line 15: ZeroDivisionError"),
     "error: a device that is not there": (program("y = x.to('cuda:63')"), ""),
-    "error: a kernel that does not fit": (program("y = x.gather(1, torch.full((4, 4), 99))"), "Error"),
-}  # fmt: skip
+    "error: a kernel that does not fit": (
+        program("y = x.gather(1, torch.full((4, 4), 99))"),
+        "Error",
+    ),
+}
 """What passes the reader and must fail in the child, with words of the sentence ('' where there are several)."""

@@ -28,18 +28,82 @@ SAFE_NAMES = [
     "sorted",
 ]
 SAFE_ATTRIBUTES = [
-    "T", "norm", "clone", "sum", "shape", "device", "dtype", "values", "keys", "get", "pop", "update", "to", "view",
-    "tolist", "item", "fill_", "append", "envs", "scene_info", "sample_object_poses", "urdf_assets_root", "type",
-]  # fmt: skip
+    "T",
+    "norm",
+    "clone",
+    "sum",
+    "shape",
+    "device",
+    "dtype",
+    "values",
+    "keys",
+    "get",
+    "pop",
+    "update",
+    "to",
+    "view",
+    "tolist",
+    "item",
+    "fill_",
+    "append",
+    "envs",
+    "scene_info",
+    "sample_object_poses",
+    "urdf_assets_root",
+    "type",
+]
 HOSTILE_NAMES = [
-    "open", "eval", "exec", "compile", "__import__", "getattr", "setattr", "globals", "vars", "type", "object", "super",
-    "torch", "math", "__builtins__", "print", "input", "breakpoint", "Task", "os", "sys",
-]  # fmt: skip
+    "open",
+    "eval",
+    "exec",
+    "compile",
+    "__import__",
+    "getattr",
+    "setattr",
+    "globals",
+    "vars",
+    "type",
+    "object",
+    "super",
+    "torch",
+    "math",
+    "__builtins__",
+    "print",
+    "input",
+    "breakpoint",
+    "Task",
+    "os",
+    "sys",
+]
 HOSTILE_ATTRIBUTES = [
-    "__class__", "__globals__", "__dict__", "__init__", "__subclasses__", "__mro__", "f_back", "gi_frame", "numpy",
-    "tofile", "data", "storage", "untyped_storage", "load", "save", "ops", "hub", "utils", "system", "format", "bundle",
-    "_envs", "register_hook", "data_ptr", "share_memory_", "from_file", "__reduce__",
-]  # fmt: skip
+    "__class__",
+    "__globals__",
+    "__dict__",
+    "__init__",
+    "__subclasses__",
+    "__mro__",
+    "f_back",
+    "gi_frame",
+    "numpy",
+    "tofile",
+    "data",
+    "storage",
+    "untyped_storage",
+    "load",
+    "save",
+    "ops",
+    "hub",
+    "utils",
+    "system",
+    "format",
+    "bundle",
+    "_envs",
+    "register_hook",
+    "data_ptr",
+    "share_memory_",
+    "from_file",
+    "__reduce__",
+]
 STATES = [
     "box_pos",
     "eef_pos",
@@ -67,8 +131,9 @@ class Maker:
         self._real = _trees([*real, *ACCEPTED.values()])
         self._strange = _trees(escapes)
         self._pool: dict[bool, tuple[list[ast.expr], list[ast.stmt]]] = {
-            hostile: _parts(trees) for hostile, trees in ((False, self._real), (True, self._strange))
-        }  # fmt: skip
+            hostile: _parts(trees)
+            for hostile, trees in ((False, self._real), (True, self._strange))
+        }
 
     def make(self) -> str:
         """Return one program; most of what it is made of is harmless, or nothing would get past the reader."""
@@ -101,8 +166,9 @@ class Maker:
             for node in ast.walk(tree)
             for name, value in ast.iter_fields(node)
             for k, child in enumerate(value if isinstance(value, list) else [value])
-            if isinstance(child, ast.expr) and isinstance(getattr(child, "ctx", ast.Load()), ast.Load)
-        ]  # fmt: skip
+            if isinstance(child, ast.expr)
+            and isinstance(getattr(child, "ctx", ast.Load()), ast.Load)
+        ]
         if not places:
             return
         node, name, k = places[self._rng.integers(len(places))]
@@ -117,10 +183,16 @@ class Maker:
             return copy.deepcopy(self._any(1))
         value = ast.unparse(self._expression(3))
         texts = [
-            f"y = {value}", f"{value}", f"x[:, 0] = {value}", f"states['{self._pick(STATES)}'] = {value}",
-            f"self.{self._pick(['kept', 'height', *HOSTILE_ATTRIBUTES])} = {value}", f"y += {value}", f"return {value}",
-            f"Tensor.{self._pick(SAFE_ATTRIBUTES)} = {value}", f"for i in {value}:\n    y = i",
-        ]  # fmt: skip
+            f"y = {value}",
+            f"{value}",
+            f"x[:, 0] = {value}",
+            f"states['{self._pick(STATES)}'] = {value}",
+            f"self.{self._pick(['kept', 'height', *HOSTILE_ATTRIBUTES])} = {value}",
+            f"y += {value}",
+            f"return {value}",
+            f"Tensor.{self._pick(SAFE_ATTRIBUTES)} = {value}",
+            f"for i in {value}:\n    y = i",
+        ]
         try:
             return ast.parse(str(self._pick(texts))).body[0]
         except SyntaxError:

@@ -43,23 +43,50 @@ def good_scene(folder: Path) -> Scene:
     mesh.export(folder / "meshes/cube.ply")
     mesh.export(folder / "meshes/part.stl")
     cube = SceneObject(
-        name="cube", label="cube", role="manipulated", shape="mesh", size_m=(0.04, 0.04, 0.05), mass_kg=0.12,
-        friction=0.8, mesh="meshes/cube.obj", mesh_ply="meshes/cube.ply", parts=("meshes/part.stl",),
-        frames=(0, 10), confidences=(1.0, 1.0),
+        name="cube",
+        label="cube",
+        role="manipulated",
+        shape="mesh",
+        size_m=(0.04, 0.04, 0.05),
+        mass_kg=0.12,
+        friction=0.8,
+        mesh="meshes/cube.obj",
+        mesh_ply="meshes/cube.ply",
+        parts=("meshes/part.stl",),
+        frames=(0, 10),
+        confidences=(1.0, 1.0),
         poses_world=((0.0, 0.0, 0.025, *UPRIGHT), (0.0, 0.0, 0.2, *UPRIGHT)),
-    )  # fmt: skip
+    )
     plate = replace(
-        cube, name="plate", label="plate", role="reference", shape="box", size_m=(0.1, 0.1, 0.02),
-        mesh="", mesh_ply="", parts=(), poses_world=((0.0, 0.2, 0.01, *UPRIGHT),) * 2,
-    )  # fmt: skip
+        cube,
+        name="plate",
+        label="plate",
+        role="reference",
+        shape="box",
+        size_m=(0.1, 0.1, 0.02),
+        mesh="",
+        mesh_ply="",
+        parts=(),
+        poses_world=((0.0, 0.2, 0.01, *UPRIGHT),) * 2,
+    )
     camera = Camera(
-        width_px=64, height_px=48, K=intrinsics(64, 48, 1.0),
+        width_px=64,
+        height_px=48,
+        K=intrinsics(64, 48, 1.0),
         T_world_cam=look_at(np.array([-0.5, 0.0, 0.5]), np.zeros(3)),
-    )  # fmt: skip
+    )
     return Scene(
-        title="lift_cube", video="clip.mp4", description="lifting a cube", kind="lift_up", objects=(cube, plate),
-        camera=camera, fps=20.0, num_frames=11, confidence=1.0, folder=folder,
-    )  # fmt: skip
+        title="lift_cube",
+        video="clip.mp4",
+        description="lifting a cube",
+        kind="lift_up",
+        objects=(cube, plate),
+        camera=camera,
+        fps=20.0,
+        num_frames=11,
+        confidence=1.0,
+        folder=folder,
+    )
 
 
 def good_task(folder: Path) -> Path:
@@ -69,9 +96,14 @@ def good_task(folder: Path) -> Path:
     scene.save(place)
     code = write_samples(scene, 1)[0]
     TaskBundle(
-        title=scene.title, description=scene.description, kind=scene.kind, class_name=class_name(code), code=code,
-        scene=scene, horizon_steps=60,
-    ).save(folder)  # fmt: skip
+        title=scene.title,
+        description=scene.description,
+        kind=scene.kind,
+        class_name=class_name(code),
+        code=code,
+        scene=scene,
+        horizon_steps=60,
+    ).save(folder)
     shutil.rmtree(place)
     return folder
 
@@ -471,10 +503,16 @@ CASES["PLY of negative counts"] = with_mesh("a.ply", _PLY.format("ascii", -8, -1
 # --- robots -----------------------------------------------------------------------------------------------------
 
 ROBOT_ENTRY: dict[str, Any] = {
-    "path": ROBOT, "eef_site": "tcp", "eef_offset_m": [0, 0, 0], "eef_turn_wxyz": [1, 0, 0, 0],
-    "fingers": ["left", "right"], "pads": ["pad_left", "pad_right"], "home_qpos": [0, 0, 0, 0, 0, 0],
-    "base_pos_m": [0, 0, 0], "base_yaw_rad": 0,
-}  # fmt: skip
+    "path": ROBOT,
+    "eef_site": "tcp",
+    "eef_offset_m": [0, 0, 0],
+    "eef_turn_wxyz": [1, 0, 0, 0],
+    "fingers": ["left", "right"],
+    "pads": ["pad_left", "pad_right"],
+    "home_qpos": [0, 0, 0, 0, 0, 0],
+    "base_pos_m": [0, 0, 0],
+    "base_yaw_rad": 0,
+}
 ARM = (
     '<mujoco model="arm"><worldbody><body name="a"><geom size="0.1"/></body></worldbody></mujoco>'
 )
@@ -655,15 +693,20 @@ def code_with(**lines: str) -> str:
 
 CODE: dict[str, str] = {
     **{f"loops in {m}": code_with(**{m: "busy(torch.zeros(1000))"}) for m in METHODS},
-    **{f"asks for memory in {m}": code_with(**{m: "torch.zeros(1000000, 100000)"}) for m in METHODS},
+    **{
+        f"asks for memory in {m}": code_with(**{m: "torch.zeros(1000000, 100000)"})
+        for m in METHODS
+    },
     **{f"raises in {m}": code_with(**{m: "torch.zeros(2)[5]"}) for m in METHODS},
     "success of numbers": code_with(success='return states["cube_pos"][:, 2]'),
     "success of one": code_with(success="return torch.zeros(1) > 1"),
     "success of nothing": code_with(success="return None"),
     "reward of nothing": code_with(reward="return None"),
-    "reward of NaN": code_with(reward='return torch.log(states["eef_pos"][:, 0] * 0 - 1), {"a": states["eef_pos"][:, 0]}'),
+    "reward of NaN": code_with(
+        reward='return torch.log(states["eef_pos"][:, 0] * 0 - 1), {"a": states["eef_pos"][:, 0]}'
+    ),
     "unknown key": code_with(keys='return ["nothing"]'),
     "other length": code_with(space="return 7"),
     "poses of nobody": code_with(reset="return {}"),
     "writes into states": code_with(success='states["cube_pos"].mul_(2)'),
-}  # fmt: skip
+}

@@ -13,9 +13,19 @@ from v2p_data.task.benchmark import FOLDER, benchmark_names, load_benchmark
 from v2p_data.task.sandbox.reader.check import check_code
 
 PAPER_KINDS = {
-    "cover", "drop_in_front_of", "insert", "lift_up", "push_left", "push_next_to", "push_right",
-    "push_with", "slide_to", "throw_into", "tip_over", "uncover",
-}  # fmt: skip
+    "cover",
+    "drop_in_front_of",
+    "insert",
+    "lift_up",
+    "push_left",
+    "push_next_to",
+    "push_right",
+    "push_with",
+    "slide_to",
+    "throw_into",
+    "tip_over",
+    "uncover",
+}
 """The task names in the paper's tables."""
 
 

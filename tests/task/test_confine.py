@@ -98,7 +98,7 @@ FILES: dict[str, Callable[[Path], object]] = {
     "changes another user's rights": lambda p: os.chown(p, 1, 1),
     "reads": lambda p: p.read_text(),
     "lists": lambda p: list(p.parent.iterdir()),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("attempt", FILES)
@@ -135,7 +135,7 @@ REACHES: dict[str, Callable[[], object]] = {
     "the memory of the parent": lambda: open(f"/proc/{os.getppid()}/mem"),  # noqa: PTH123, SIM115
     "more memory": spend_memory,
     "more mapped memory": spend_mapped_memory,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("attempt", REACHES)

@@ -14,8 +14,10 @@ SCRIPT = Path(__file__).parents[2] / "scripts" / "fuzz_sandbox.py"
 def test_no_random_program_gets_anywhere_and_the_witness_hears_what_plain_python_does():
     ended = subprocess.run(
         [sys.executable, str(SCRIPT), "--programs", "60", "--executed", "6", "--seed", "0"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
     assert ended.returncode == 0, ended.stderr[-2000:] + ended.stdout
     result = json.loads(ended.stdout)

@@ -216,7 +216,7 @@ RESETS = {
         "poses['can'][:, :2] = poses['bowl'][:, :2] - torch.tensor([0.0, 0.081])",
         "in success",
     ),
-}  # fmt: skip
+}
 
 
 def test_resets_that_make_the_task_easy_are_refused(scene_of):

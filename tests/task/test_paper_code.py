@@ -219,16 +219,18 @@ def scenes(scene_of, make_thing):
     box = ("storage_box", (0.3, 0.2, 0.1), (0.0, 0.3, 0.05))
     return {
         FIGURE_7: scene_of(
-            "insert", make_thing("fork", (0.02, 0.18, 0.02), (0, 0, 0.01)),
+            "insert",
+            make_thing("fork", (0.02, 0.18, 0.02), (0, 0, 0.01)),
             make_thing(*box, role="container"),
         ),
         THROW: scene_of(
-            "throw_into", make_thing("garlic", (0.05, 0.05, 0.05), (0, 0, 0.025)),
+            "throw_into",
+            make_thing("garlic", (0.05, 0.05, 0.05), (0, 0, 0.025)),
             make_thing("bowl", (0.16, 0.16, 0.06), (0.2, 0.2, 0.03), role="container"),
         ),
         FIGURE_11_1: scene_of("lift_up", make_thing("card", (0.06, 0.09, 0.01), (0, 0, 0.005))),
         FIGURE_11_2: scene_of("lift_up", make_thing("card", (0.06, 0.09, 0.01), (0, 0, 0.005))),
-    }  # fmt: skip
+    }
 
 
 CODES = {
@@ -273,19 +275,32 @@ def test_every_state_it_reads_is_in_the_table_or_of_its_own_making(code, scenes)
     ("code", "observation", "names"),
     [
         (FIGURE_7, 92, {"dist_to_fork"}),
-        (THROW, 91, {
-            "dist_grasp_reward", "dist_garlic_to_bowl", "vel_reward", "final_position_reward",
-            "total_reward", "step_penalty",
-        }),
+        (
+            THROW,
+            91,
+            {
+                "dist_grasp_reward",
+                "dist_garlic_to_bowl",
+                "vel_reward",
+                "final_position_reward",
+                "total_reward",
+                "step_penalty",
+            },
+        ),
         (FIGURE_11_1, 90, {"height"}),
         (FIGURE_11_2, 91, {"height"}),
     ],
     ids=CODES,
-)  # fmt: skip
+)
 def test_it_is_simulated_unchanged(code, observation, names, scenes):
     bundle = TaskBundle(
-        title="paper", description="paper", kind=scenes[code].kind, class_name="", code=code, scene=scenes[code]
-    )  # fmt: skip
+        title="paper",
+        description="paper",
+        kind=scenes[code].kind,
+        class_name="",
+        code=code,
+        scene=scenes[code],
+    )
     env = BatchEnv(bundle, num_envs=4, seed=0, num_threads=1)
 
     results = [env.step(np.zeros((4, 7))) for _ in range(5)]

@@ -13,21 +13,37 @@ LYING = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)
 
 def thing(name: str, size=(0.04, 0.04, 0.04), role="manipulated", shape="box") -> SceneObject:
     return SceneObject(
-        name=name, label=name, role=role, shape=shape, size_m=size, mass_kg=0.1, friction=0.8,
-        frames=(0, 1), poses_world=((0.0, 0.0, 0.02, *UPRIGHT), (0.0, 0.12, 0.02, *UPRIGHT)),
+        name=name,
+        label=name,
+        role=role,
+        shape=shape,
+        size_m=size,
+        mass_kg=0.1,
+        friction=0.8,
+        frames=(0, 1),
+        poses_world=((0.0, 0.0, 0.02, *UPRIGHT), (0.0, 0.12, 0.02, *UPRIGHT)),
         confidences=(1.0, 1.0),
-    )  # fmt: skip
+    )
 
 
 def scene(kind: str, *objects: SceneObject) -> Scene:
     camera = Camera(
-        width_px=64, height_px=48, K=intrinsics(64, 48, 1.0),
+        width_px=64,
+        height_px=48,
+        K=intrinsics(64, 48, 1.0),
         T_world_cam=look_at(np.array([-0.5, 0.0, 0.5]), np.zeros(3)),
-    )  # fmt: skip
+    )
     return Scene(
-        title="clip", video="clip.mp4", description="", kind=kind, objects=objects, camera=camera,
-        fps=20.0, num_frames=2, confidence=1.0,
-    )  # fmt: skip
+        title="clip",
+        video="clip.mp4",
+        description="",
+        kind=kind,
+        objects=objects,
+        camera=camera,
+        fps=20.0,
+        num_frames=2,
+        confidence=1.0,
+    )
 
 
 def track(
@@ -142,9 +158,15 @@ def test_inserted_means_carried_in_let_go_and_above_the_floor():
     assert not verdict("insert", [track(HERE, (0.5, 0.12, 0.02)), bowl_track()], BOX, BOWL)
 
 
-@pytest.mark.parametrize(("lift_m", "thick_m", "counts"), [
-    (0.028, 0.011, True), (0.018, 0.011, False), (0.028, 0.025, False), (0.035, 0.025, True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("lift_m", "thick_m", "counts"),
+    [
+        (0.028, 0.011, True),
+        (0.018, 0.011, False),
+        (0.028, 0.025, False),
+        (0.035, 0.025, True),
+    ],
+)
 def test_what_is_put_onto_something_low_needs_no_higher_lift(lift_m, thick_m, counts):
     size = (0.12, 0.12, thick_m)
     there = (0.5, 0.2, thick_m / 2)

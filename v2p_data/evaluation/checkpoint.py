@@ -36,13 +36,21 @@ MAX_SEEN = 32_000_000
 ANEW = "copy the policy anew"
 Type = Literal[
     "v2p_bc", "act", "diffusion", "vqbet", "tdmpc", "multi_task_dit", "smolvla", "pi0", "pi05"
-]  # fmt: skip
+]
 """LeRobot's other types run code of repositories that a setting names, or have not been looked at."""
 StepName = Literal[
-    "rename_observations_processor", "to_batch_processor", "device_processor", "normalizer_processor",
-    "unnormalizer_processor", "tokenizer_processor", "smolvla_new_line_processor", "pi0_new_line_processor",
-    "pi05_prepare_state_tokenizer_processor_step", "relative_actions_processor", "absolute_actions_processor",
-]  # fmt: skip
+    "rename_observations_processor",
+    "to_batch_processor",
+    "device_processor",
+    "normalizer_processor",
+    "unnormalizer_processor",
+    "tokenizer_processor",
+    "smolvla_new_line_processor",
+    "pi0_new_line_processor",
+    "pi05_prepare_state_tokenizer_processor_step",
+    "relative_actions_processor",
+    "absolute_actions_processor",
+]
 """What LeRobot writes for these types. `action_tokenizer_processor` is none: it runs code of a repository."""
 OTHER_MODELS = (
     "HuggingFaceTB/SmolVLM2-500M-Video-Instruct",

@@ -100,9 +100,11 @@ def interface_of(policy: Path) -> tuple[ArmInterface, int, int]:
     num_actions = int(does.get(ACTION_KEY, {}).get("shape", [len(DELTA_NAMES)])[0])
     is_ours = facts.state[: len(STATE_NAMES)] in ((), STATE_NAMES)
     interface = ArmInterface(
-        actions=(actions_named(facts.action) or "delta_tool") if facts.action else _guessed_actions(policy, num_actions),
+        actions=(actions_named(facts.action) or "delta_tool")
+        if facts.action
+        else _guessed_actions(policy, num_actions),
         joint_state=is_ours and num_states > len(STATE_NAMES),
-    )  # fmt: skip
+    )
     return interface, num_states, num_actions
 
 

@@ -100,8 +100,13 @@ def play_of(who: Contestant, seed: int, device: str) -> Play:
 
 
 def judge_task(
-    play: Play, bundle: TaskBundle, cfg: EvaluationConfig, first_seed: int, runtime: Runtime, told: Callable[[float], None]
-) -> Judged:  # fmt: skip
+    play: Play,
+    bundle: TaskBundle,
+    cfg: EvaluationConfig,
+    first_seed: int,
+    runtime: Runtime,
+    told: Callable[[float], None],
+) -> Judged:
     """Judge a contestant in one task."""
     actor, size_px = play(bundle)
     return judge(

@@ -107,9 +107,12 @@ def learn(
     if cfg.teacher == "programs":
         trial_env = worlds.make(cfg.trial_worlds, "trials")
         taught = teach(
-            worlds, trial_env, cfg, out / TAUGHT_FOLDER,
+            worlds,
+            trial_env,
+            cfg,
+            out / TAUGHT_FOLDER,
             on_progress=lambda share, words: on_progress(PROGRESS_TAUGHT * share, words),
-        )  # fmt: skip
+        )
         del trial_env
     student = taught.folder if taught else None
     env = _training_worlds(worlds, cfg, device, is_taught=student is not None)

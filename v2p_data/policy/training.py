@@ -302,7 +302,10 @@ def _num_labels(dataset: Path) -> int | None:
     from v2p_data.episodes.dataset.about import read_about
 
     about = read_about(dataset)
-    return max((1 + int(label) for e in (about or {}).get("episodes", ()) for label in e["labels"]), default=None)  # fmt: skip
+    return max(
+        (1 + int(label) for e in (about or {}).get("episodes", ()) for label in e["labels"]),
+        default=None,
+    )
 
 
 @contextmanager

@@ -236,7 +236,7 @@ class TaskBundle:
 
 
 @contextmanager
-def told_of(folder: Path) -> Iterator[None]:
+def errors_naming(folder: Path) -> Iterator[None]:
     """Let every error of what is done with a task begin with its folder."""
     try:
         yield

@@ -68,13 +68,18 @@ def said(text, *, finish="stop", tokens=(1000, 500), refusal=None):
     """Return a reply with one choice."""
     message = {"role": "assistant", "content": text, "refusal": refusal}
     data = {
-        "id": "1", "object": "chat.completion", "created": 1, "model": "small-1",
+        "id": "1",
+        "object": "chat.completion",
+        "created": 1,
+        "model": "small-1",
         "choices": [{"index": 0, "message": message, "finish_reason": finish}],
-    }  # fmt: skip
+    }
     if tokens:
         data["usage"] = {
-            "prompt_tokens": tokens[0], "completion_tokens": tokens[1], "total_tokens": sum(tokens),
-        }  # fmt: skip
+            "prompt_tokens": tokens[0],
+            "completion_tokens": tokens[1],
+            "total_tokens": sum(tokens),
+        }
     return {"json": data}
 
 
@@ -118,11 +123,16 @@ def secret():
 def settings_for(server, **changes) -> VlmConfig:
     return VlmConfig(
         **{
-            "base_url": server.url, "model": "small", "key_env": "V2P_TEST_KEY", "max_retries": 2, "timeout_s": 20.0, "price_in_per_million": 2.0,
+            "base_url": server.url,
+            "model": "small",
+            "key_env": "V2P_TEST_KEY",
+            "max_retries": 2,
+            "timeout_s": 20.0,
+            "price_in_per_million": 2.0,
             "price_out_per_million": 8.0,
         }
         | changes
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")

@@ -269,8 +269,10 @@ def test_a_scene_is_shown_by_what_lies_in_its_folder(filmed, chat, client, say):
     asking.ask([{"role": "user", "content": content}], "look", plain)
 
     assert [p.shows.split(",")[0] for p in pictures] == [
-        "the first frame", "the last frame with the manipulated object", "4 moments of the video",
-    ]  # fmt: skip
+        "the first frame",
+        "the last frame with the manipulated object",
+        "4 moments of the video",
+    ]
     stored = sorted(
         (asking.store.folder / "images").iterdir(), key=lambda p: cv2.imread(str(p)).mean()
     )

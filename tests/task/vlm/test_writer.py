@@ -78,9 +78,13 @@ def written(serve, settings, say, tmp_path_factory):
     made = generate_task(scene, cfg, 5, calls=folder / "calls")
     made.save(folder / "task")
     return SimpleNamespace(
-        server=server, scene=scene, cfg=cfg, made=made, folder=folder,
+        server=server,
+        scene=scene,
+        cfg=cfg,
+        made=made,
+        folder=folder,
         audit=json.loads((folder / "task" / "audit.json").read_text()),
-    )  # fmt: skip
+    )
 
 
 def test_samples_that_do_not_run_go_back_with_their_error_and_line_until_they_run(written):
@@ -121,8 +125,11 @@ def test_useless_samples_are_counted_before_and_after_sending_back(written):
     rates = written.audit["rates"]
 
     assert rates["first_answers"] == {
-        "samples": 3, "non_runnable": 0.3333, "zero_score": 0.3333, "hallucination": 0.6667,
-    }  # fmt: skip
+        "samples": 3,
+        "non_runnable": 0.3333,
+        "zero_score": 0.3333,
+        "hallucination": 0.6667,
+    }
     assert (rates["before_pick"]["non_runnable"], rates["before_pick"]["zero_score"]) == (
         0,
         0.3333,
@@ -305,7 +312,11 @@ def test_without_visual_information_only_the_caption_and_the_objects_are_told(ch
 def test_without_visual_information_the_audit_that_knows_the_video_is_not_told_of_either(
     chat, client, say
 ):
-    chat.script = [say(fenced(GRASP_A_BLOCK)), say(fenced(GRASP_A_BLOCK)), say(json.dumps(CHOICE | {"index": 1}))]  # fmt: skip
+    chat.script = [
+        say(fenced(GRASP_A_BLOCK)),
+        say(fenced(GRASP_A_BLOCK)),
+        say(json.dumps(CHOICE | {"index": 1})),
+    ]
     blind = client(tracking=False, images=False)
 
     write_samples(blind, lifting_scene(), 2, [], runs, lambda written: ["it went 0.1 m"] * 2)
@@ -363,9 +374,13 @@ def test_better_rewards_come_as_whole_tasks_that_run_and_whose_success_is_the_pa
 
 def lifting_task(scene=None):
     return TaskBundle(
-        title="lift", description="lift up the block", kind="lift_up", class_name="GraspABlock",
-        code=GRASP_A_BLOCK, scene=scene or lifting_scene(),
-    )  # fmt: skip
+        title="lift",
+        description="lift up the block",
+        kind="lift_up",
+        class_name="GraspABlock",
+        code=GRASP_A_BLOCK,
+        scene=scene or lifting_scene(),
+    )
 
 
 def test_questions_for_rewards_show_the_scene_its_pictures_a_refinement_and_rewards_of_solved_tasks(

@@ -26,7 +26,7 @@ from v2p_data.scene.files import own_file
 from v2p_data.sim.model.world import build_world
 from v2p_data.sim.robot.robot import FINE
 from v2p_data.task.sandbox.trial import demand_trial
-from v2p_data.task.task import TASK_FILE, TaskBundle, told_of
+from v2p_data.task.task import TASK_FILE, TaskBundle, errors_naming
 
 SOURCE = Path(__file__).parents[2]
 DISTRIBUTION = "lerobot_policy_v2p"
@@ -81,7 +81,7 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
                 f"task '{name}' is for the arm in {bundle.robot['path']}, a file that may not be yours to give away; "
                 "only tasks of the built-in arm can be shared"
             )
-        with told_of(folder):
+        with errors_naming(folder):
             demand_trial(bundle)
             world = build_world(bundle.scene, FINE)
         _copy_task(bundle, partial / "tasks" / name)

@@ -32,7 +32,7 @@ from v2p_data.sim.model.world import World
 from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS, MaskRenderer, labels_to_rgb
 from v2p_data.sim.robot.action_names import Actions
 from v2p_data.sim.robot.interface import ArmInterface
-from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, told_of
+from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, errors_naming
 
 ENV_ID = "v2p/Task-v0"
 CONTROL_HZ = 20
@@ -122,7 +122,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             camera_fovy_deg=camera_fovy_deg,
         )
         sim = SimConfig(fine=True, randomization=randomization)
-        with told_of(bundle.folder):
+        with errors_naming(bundle.folder):
             self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
         self._referee = RefereeRecord(self._world)
         self._masks = MaskRenderer(self._world.world, size_px, wrist=wrist)

@@ -23,7 +23,7 @@ from v2p_data.sim.robot.action_names import Actions, action_names, actions_named
 from v2p_data.sim.robot.robot import NUM_ARM_JOINTS
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_LOW, V2PEnv
 from v2p_data.task.sandbox.trial import demand_trial
-from v2p_data.task.task import POLICY_HORIZON_SCALE, TASK_FILE, TaskBundle, told_of
+from v2p_data.task.task import POLICY_HORIZON_SCALE, TASK_FILE, TaskBundle, errors_naming
 
 TASKS_IN_DATASET = Path("v2p/tasks")
 
@@ -144,7 +144,7 @@ class V2PEnvConfig(EnvConfig):
             raise V2PError("say which tasks: --env.tasks=FOLDER")
         folders = find_tasks(Path(self.tasks))
         for folder in folders:  # once here, and not in every process of a vector
-            with told_of(folder):
+            with errors_naming(folder):
                 demand_trial(TaskBundle.load(folder))
         return {
             "v2p": {

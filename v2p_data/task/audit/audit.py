@@ -102,10 +102,13 @@ class Audit:
 
 
 MARGINS = {
-    "accepts_end": ("does it stay true at the video's last pose, disturbed by the error of measurement?", 0.4),
+    "accepts_end": (
+        "does it stay true at the video's last pose, disturbed by the error of measurement?",
+        0.4,
+    ),
     "rejects_start": ("does it stay false at the first pose, disturbed alike?", 0.15),
     "rejects_near_misses": ("does it stay false at near misses, disturbed alike?", 0.2),
-}  # fmt: skip
+}
 """What is asked of disturbed poses, and its weight."""
 
 
@@ -150,8 +153,10 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
             share=-1.0 if threshold is None else threshold,
             weight=0.05,
         ),
-        *_minor_checks(answers, result, _reward_rises(probes, np.array(result.probe_reward), num_hands)),
-    )  # fmt: skip
+        *_minor_checks(
+            answers, result, _reward_rises(probes, np.array(result.probe_reward), num_hands)
+        ),
+    )
     failed = [VETO_WORDS[c.name] for c in checks if c.is_veto and not c.passed]
     if success.all():
         failed = [ALWAYS_TRUE]
@@ -169,7 +174,9 @@ def audit(scene: Scene, probes: AuditProbes, result: SmokeResult) -> Audit:
 def _vetoes(answers: dict[str, np.ndarray], *, can_be_reached: bool) -> tuple[Check, ...]:
     """Return the checks each of which refuses a sample by itself."""
     return (
-        _must_be_false("first_pose", "false at the video's first pose?", answers["first"], 0.0, veto=True),
+        _must_be_false(
+            "first_pose", "false at the video's first pose?", answers["first"], 0.0, veto=True
+        ),
         _must_be_false("reset", "false at every reset?", answers["reset"], 0.0, veto=True),
         Check(
             name="reachable",
@@ -179,9 +186,11 @@ def _vetoes(answers: dict[str, np.ndarray], *, can_be_reached: bool) -> tuple[Ch
             weight=0.0,
             is_veto=True,
         ),
-        _must_be_false("touched", "false when merely touched?", answers["touched"], 0.0, veto=True),
+        _must_be_false(
+            "touched", "false when merely touched?", answers["touched"], 0.0, veto=True
+        ),
         _must_be_false("flung", "false when it flies past?", answers["flung"], 0.0, veto=True),
-    )  # fmt: skip
+    )
 
 
 def _minor_checks(
@@ -189,7 +198,12 @@ def _minor_checks(
 ) -> tuple[Check, ...]:
     """Return the checks that cost a sample little."""
     return (
-        _must_be_false("in_the_air", "false where it should stand, or barely lifted?", answers["in_the_air"], 0.05),
+        _must_be_false(
+            "in_the_air",
+            "false where it should stand, or barely lifted?",
+            answers["in_the_air"],
+            0.05,
+        ),
         _must_be_false("off_the_table", "false off the table?", answers["off_the_table"], 0.05),
         Check(
             name="reward_rises",
@@ -205,7 +219,7 @@ def _minor_checks(
             share=float(len(result.warnings)),
             weight=0.05,
         ),
-    )  # fmt: skip
+    )
 
 
 def _is_plausible(threshold_m: float | None, scene: Scene, probes: AuditProbes) -> bool:
@@ -238,13 +252,37 @@ def _margin(name: str, right: np.ndarray) -> Check:
 def _of_reset(found: ResetFindings) -> list[Check]:
     """Return the checks of a sample's own reset, all of them vetoes."""
     table = {
-        "starts_false": ("false at every start of its own reset?", found.solved == 0, found.solved),
-        "starts_far": ("does its reset leave the way to do?", found.near_goal == 0, found.near_goal),
-        "starts_upright": ("does its reset turn things as in the video?", found.leaning <= 0.5, found.leaning),
-        "starts_possible": ("can things start as its reset says?", found.impossible == 0, found.impossible),
-        "starts_differ": ("does its reset spread the object?", found.spread_m >= SPREAD_M, found.spread_m),
-        "starts_like_video": ("is the video's start among its starts?", found.outside_m <= AROUND_VIDEO_M, found.outside_m),
-    }  # fmt: skip
+        "starts_false": (
+            "false at every start of its own reset?",
+            found.solved == 0,
+            found.solved,
+        ),
+        "starts_far": (
+            "does its reset leave the way to do?",
+            found.near_goal == 0,
+            found.near_goal,
+        ),
+        "starts_upright": (
+            "does its reset turn things as in the video?",
+            found.leaning <= 0.5,
+            found.leaning,
+        ),
+        "starts_possible": (
+            "can things start as its reset says?",
+            found.impossible == 0,
+            found.impossible,
+        ),
+        "starts_differ": (
+            "does its reset spread the object?",
+            found.spread_m >= SPREAD_M,
+            found.spread_m,
+        ),
+        "starts_like_video": (
+            "is the video's start among its starts?",
+            found.outside_m <= AROUND_VIDEO_M,
+            found.outside_m,
+        ),
+    }
     return [
         Check(name=name, asks=asks, passed=passed, share=share, weight=0.0, is_veto=True)
         for name, (asks, passed, share) in table.items()

@@ -186,9 +186,13 @@ class VlmClient:
             estimated = 1
         money = sent * self.cfg.price_in_per_million + received * self.cfg.price_out_per_million
         return Usage(
-            calls=1, prompt_tokens=sent, completion_tokens=received, money=money / 1e6,
-            seconds=seconds, estimated=estimated,
-        )  # fmt: skip
+            calls=1,
+            prompt_tokens=sent,
+            completion_tokens=received,
+            money=money / 1e6,
+            seconds=seconds,
+            estimated=estimated,
+        )
 
     def _check_budget(self) -> None:
         total = self.store.spent()

@@ -7,9 +7,21 @@ from typing import Literal
 from urllib.parse import urlsplit
 
 HOW = (
-    "base_url", "key_env", "token_limit_name", "connect_timeout_s", "timeout_s", "max_retries", "parallel", "max_money", "max_total_tokens", "max_total_s", "price_in_per_million",
-    "price_out_per_million", "mode", "calls",
-)  # fmt: skip
+    "base_url",
+    "key_env",
+    "token_limit_name",
+    "connect_timeout_s",
+    "timeout_s",
+    "max_retries",
+    "parallel",
+    "max_money",
+    "max_total_tokens",
+    "max_total_s",
+    "price_in_per_million",
+    "price_out_per_million",
+    "mode",
+    "calls",
+)
 """Settings that change nothing about what is asked."""
 
 
@@ -101,8 +113,14 @@ class VlmConfig:
         for name in ("max_tokens", "parallel", "image_side_px", "sheet_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("max_retries", "max_reasks", "max_regenerations", "num_examples",
-                     "price_in_per_million", "price_out_per_million"):  # fmt: skip
+        for name in (
+            "max_retries",
+            "max_reasks",
+            "max_regenerations",
+            "num_examples",
+            "price_in_per_million",
+            "price_out_per_million",
+        ):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         if not (self.timeout_s > 0 and self.connect_timeout_s > 0):

@@ -189,14 +189,31 @@ def block_scene() -> Scene:
     """Return a table with one block of 5 cm that is raised by 10 cm: where the basic examples are at home."""
     poses = tuple((0.0, 0.0, 0.025 + z, 1.0, 0.0, 0.0, 0.0) for z in np.linspace(0, 0.1, 5))
     block = SceneObject(
-        name="block", label="block", role="manipulated", shape="box", size_m=(0.05, 0.05, 0.05),
-        mass_kg=0.1, friction=0.8, frames=tuple(range(5)), poses_world=poses, confidences=(1.0,) * 5,
-    )  # fmt: skip
+        name="block",
+        label="block",
+        role="manipulated",
+        shape="box",
+        size_m=(0.05, 0.05, 0.05),
+        mass_kg=0.1,
+        friction=0.8,
+        frames=tuple(range(5)),
+        poses_world=poses,
+        confidences=(1.0,) * 5,
+    )
     camera = Camera(
-        width_px=640, height_px=480, K=intrinsics(640, 480, 1.0),
+        width_px=640,
+        height_px=480,
+        K=intrinsics(640, 480, 1.0),
         T_world_cam=look_at(np.array([-0.6, 0.0, 0.6]), np.zeros(3)),
-    )  # fmt: skip
+    )
     return Scene(
-        title="block", video="", description="grasp the block", kind="generic", objects=(block,), camera=camera,
-        fps=20.0, num_frames=5, confidence=1.0,
-    )  # fmt: skip
+        title="block",
+        video="",
+        description="grasp the block",
+        kind="generic",
+        objects=(block,),
+        camera=camera,
+        fps=20.0,
+        num_frames=5,
+        confidence=1.0,
+    )

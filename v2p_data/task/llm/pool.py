@@ -77,8 +77,13 @@ def examples_for(scene: Scene, solved: list[TaskBundle], count: int) -> list[Exa
     The scene's own task is not among them: its answer would only be copied.
     """
     new = TaskBundle(
-        title=scene.title, description=scene.description, kind=scene.kind, class_name="", code="", scene=scene,
-    )  # fmt: skip
+        title=scene.title,
+        description=scene.description,
+        kind=scene.kind,
+        class_name="",
+        code="",
+        scene=scene,
+    )
     others = [s for s in solved if s.title != scene.title]
     nearest = sorted(others, key=lambda s: (-likeness(new, s), s.title))[:count]
     return [*BASIC_EXAMPLES, *(_example(s) for s in reversed(nearest))]

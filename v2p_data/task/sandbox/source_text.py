@@ -11,7 +11,13 @@ from contextlib import suppress
 
 MAX_WORD_CHARS = 100
 _FINE = frozenset("\n\t")
-_HIDDEN = {"Cc": "a control character", "Cf": "an invisible character", "Cs": "half a character", "Zl": "a hidden line end", "Zp": "a hidden line end"}  # fmt: skip
+_HIDDEN = {
+    "Cc": "a control character",
+    "Cf": "an invisible character",
+    "Cs": "half a character",
+    "Zl": "a hidden line end",
+    "Zp": "a hidden line end",
+}
 _TURNING = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 """What makes a line read in another order than it runs (Boucher & Anderson 2023, Trojan Source)."""
 
