@@ -1,12 +1,16 @@
 """Rigid transforms drawn at random; MuJoCo, OpenCV and school formulas are the oracles."""
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
 from v2p_data.seeds import rng_for
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 def rigid(rng: np.random.Generator) -> np.ndarray:

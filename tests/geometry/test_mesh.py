@@ -4,6 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import trimesh
+from parts import outside
 
 from v2p_data.geometry.mesh import (
     box,
@@ -35,17 +36,6 @@ BOTTLE = np.array([(0.03, 0.0), (0.035, 0.01), (0.035, 0.13), (0.014, 0.17), (0.
 VASE = np.array([(0.03, 0.0), (0.06, 0.06), (0.05, 0.12), (0.03, 0.16), (0.035, 0.18)])
 
 
-def depth_in_parts(points, parts):
-    """How far each point lies outside the nearest convex part [m]; negative inside."""
-    out = np.full(len(points), np.inf)
-    for part in parts:
-        planes = (points @ part.face_normals.T) - np.einsum(
-            "fk,fk->f", part.face_normals, part.triangles[:, 0]
-        )
-        out = np.minimum(out, planes.max(axis=1))
-    return out
-
-
 @pytest.mark.parametrize(("form", "size", "hollow", "taper"), SHAPES)
 def test_a_mesh_is_one_closed_surface_turned_outwards(form, size, hollow, taper):
     mesh = mesh_for(form, size, hollow=hollow, taper=taper)
@@ -63,11 +53,11 @@ def test_convex_parts_cover_the_mesh_and_leave_its_inside_free(form, size, hollo
 
     surface = mesh.sample(2000, seed=0)
     assert all(p.is_convex and p.is_watertight and p.volume > 0 for p in parts)
-    assert depth_in_parts(surface, parts).max() < 0.02 * max(size)
+    assert outside(surface, parts).max() < 0.02 * max(size)
     assert sum(p.volume for p in parts) == pytest.approx(mesh.volume, rel=0.05)
     if hollow:
         inside = np.array([[0.0, 0.0, z] for z in np.linspace(-0.2, 0.5, 8) * size[2]])
-        assert depth_in_parts(inside, parts).min() > 0
+        assert outside(inside, parts).min() > 0
 
 
 def test_a_bottle_is_cut_at_its_shoulder_into_few_convex_parts():
@@ -89,9 +79,9 @@ def test_a_vase_has_a_wall_of_even_thickness_and_room_inside():
     side = 2 * math.pi * sum((a[0] + b[0]) / 2 * math.hypot(*(b - a)) for a, b in pairwise(VASE))
     assert vase.is_watertight
     assert vase.volume == pytest.approx(0.004 * (side + math.pi * 0.03**2), rel=0.12)
-    assert depth_in_parts(vase.sample(2000, seed=0), parts).max() < 0.003
+    assert outside(vase.sample(2000, seed=0), parts).max() < 0.003
     axis = np.array([[0.0, 0.0, z] for z in np.linspace(0.006, 0.18, 20)])
-    assert depth_in_parts(axis, parts).min() > 0.001
+    assert outside(axis, parts).min() > 0.001
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0])
@@ -231,8 +221,8 @@ def test_the_parts_of_a_ring_cover_it_and_leave_its_hole_free(bore: float):
     hole = np.stack([np.cos(around), np.sin(around), 0 * around], axis=1) * 0.075 * bore * 0.99
     surface = ring(0.15, 0.04, bore).sample(500, seed=0)
     assert all(p.is_convex and p.is_watertight for p in parts)
-    assert depth_in_parts(hole, parts).min() > -1e-9
-    assert depth_in_parts(surface, parts).max() < 0.08 * 0.075
+    assert outside(hole, parts).min() > -1e-9
+    assert outside(surface, parts).max() < 0.08 * 0.075
     volume = sum(p.volume for p in parts)
     assert volume == pytest.approx(np.pi * 0.075**2 * 0.04 * (1 - bore**2), rel=0.2)
     of_form = parts_for("cylinder", (0.15, 0.15, 0.04), bore=bore)

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from parts import outside
 
 from v2p_data.geometry.pillow import MAX_PARTS, inflated, pillow
 
@@ -26,15 +27,6 @@ def boot() -> np.ndarray:
 
 def made(outline: np.ndarray, *, cap_m: float = NO_CAP, px_m: float = PX_M):
     return pillow(outline, inflated(outline, px_m, cap_m).astype(np.float32), px_m)
-
-
-def outside(points: np.ndarray, parts) -> np.ndarray:
-    """Return how far each point lies outside the nearest convex part [m]."""
-    far = np.full(len(points), np.inf)
-    for part in parts:
-        offset = np.einsum("fk,fk->f", part.face_normals, part.triangles[:, 0])
-        far = np.minimum(far, (points @ part.face_normals.T - offset).max(axis=1))
-    return far
 
 
 def test_a_disc_is_inflated_to_a_ball():

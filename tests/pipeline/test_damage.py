@@ -13,7 +13,6 @@ import pytest
 from v2p_data.errors import UnusableError
 from v2p_data.pipeline.artifact import (
     SCHEMA,
-    Record,
     demand_whole,
     read_record,
     write_record,
@@ -278,11 +277,3 @@ def as_before(folder: Path) -> None:
     data = json.loads(path.read_text())
     del data["files"], data["checksum"]
     path.write_text(json.dumps(data | {"schema": 1}))
-
-
-def test_a_record_says_what_it_was_given(root, stages):
-    record = read_record(stages[0].folder(root))
-
-    assert isinstance(record, Record)
-    assert record.counts == {"letters": 200}
-    assert list(record.files or {}) == ["text"]

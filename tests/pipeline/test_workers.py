@@ -22,11 +22,6 @@ def statuses(stages, root: Path, workers: int = 1) -> list[str]:
     return [o.status for o in run_stages(stages, runtime, lambda event: None).values()]
 
 
-def test_a_result_is_made_once_and_then_kept(tmp_path):
-    assert statuses([chain(Recipe(), Recipe())], tmp_path) == ["made", "made"]
-    assert statuses([chain(Recipe(), Recipe())], tmp_path) == ["kept", "kept"]
-
-
 def test_a_changed_recipe_remakes_it_and_everything_after_it_only(tmp_path):
     statuses([chain(Recipe(), Recipe())], tmp_path)
 

@@ -152,19 +152,6 @@ def test_any_mix_of_cameras_works_and_only_masks_are_split_into_labels():
     assert small.select_action(observation(cameras=cameras)).shape == (2, 7)
 
 
-def test_the_papers_preset_is_the_papers_network():
-    cfg = V2PBCConfig(device="cpu", preset="paper", encoder="none", head="bins")
-
-    assert (cfg.encoder, cfg.head, cfg.input_size_px, cfg.n_obs_steps) == (
-        "resnet18",
-        "regression",
-        256,
-        2,
-    )
-    assert (cfg.optimizer_lr, cfg.optimizer_lr_backbone) == (3e-4, None)
-    assert not cfg.mask_moments
-
-
 def test_states_beyond_those_used_change_nothing():
     net = policy(state_entries=3)
     obs = observation()

@@ -35,13 +35,6 @@ def test_both_ends_are_z_standard_errors_of_their_own_away_from_the_rate(success
         assert abs(end - rate.value) == pytest.approx(Z_95 * math.sqrt(end * (1 - end) / trials))
 
 
-def test_success_and_failure_mirror_each_other():
-    a, b = wilson(3, 20), wilson(17, 20)
-
-    assert a.low == pytest.approx(1 - b.high)
-    assert a.high == pytest.approx(1 - b.low)
-
-
 @pytest.mark.parametrize(("successes", "trials"), [(0, 0), (-1, 5), (6, 5)])
 def test_impossible_counts_are_refused(successes, trials):
     with pytest.raises(ValueError, match="trials"):
