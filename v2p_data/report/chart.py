@@ -1,7 +1,7 @@
 """Line charts as inline SVG: they take the page's colours, light or dark, and stay sharp on any screen."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,6 +86,35 @@ def line_chart(
         f'<svg viewBox="0 0 {width_px} {height_px}" role="img" aria-label="{escape(_in_words(title, lines))}">'
         f"{''.join(parts)}</svg>{_legend(lines)}</figure>"
     )
+
+
+def training_charts(curve: Mapping[str, np.ndarray]) -> list[Markup]:
+    """Return success, return and reward parts over control steps."""
+    steps = curve.get("steps")
+    if steps is None or not len(steps):
+        return []
+
+    def lines(names: Mapping[str, str]) -> list[Line]:
+        return [Line(name=words, x=steps, y=curve[k]) for k, words in names.items() if k in curve]
+
+    parts = {
+        k: k.removeprefix("reward_").replace("_", " ") for k in curve if k.startswith("reward_")
+    }
+    charts = [
+        line_chart(
+            lines({"success_deterministic": "deterministic", "success_stochastic": "exploring"}),
+            title="Success while training",
+            x_label="control steps",
+            y_range=(0.0, 1.0),
+        ),
+        line_chart(
+            lines({"return": "mean return"}), title="Return per episode", x_label="control steps"
+        ),
+        line_chart(
+            lines(parts)[:NUM_STYLES], title="Reward parts, mean per step", x_label="control steps"
+        ),
+    ]
+    return [chart for chart in charts if chart]
 
 
 def _legend(lines: Sequence[Line]) -> str:

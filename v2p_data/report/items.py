@@ -13,8 +13,7 @@ from v2p_data.episodes.dataset.features import ACTION_NAMES, EXECUTED_KEY, FPS
 from v2p_data.episodes.staging import Episode, staged_episodes
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
-from v2p_data.report.audits import AuditView, audit_view
-from v2p_data.report.chart import Line, line_chart
+from v2p_data.report.chart import Line, line_chart, training_charts
 from v2p_data.report.media import (
     MediaBudget,
     Medium,
@@ -36,7 +35,6 @@ from v2p_data.report.reading import (
     read_curve,
 )
 from v2p_data.report.rewards import RewardView, reward_view
-from v2p_data.report.training import training_charts
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.task import REWARD_SEARCH_FOLDER
 
@@ -63,7 +61,8 @@ class ItemView:
     objects: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     code: str = ""
     task: dict[str, Any] = field(default_factory=dict[str, Any])
-    audit: AuditView | None = None
+    audit: dict[str, Any] = field(default_factory=dict[str, Any])
+    """The score of the success function, and the answer to each question."""
     samples: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     """The task codes that were written."""
     pick: str = ""
@@ -175,7 +174,11 @@ def _add_task(view: ItemView, result: Result) -> None:
     view.code = code.read_text(errors="replace") if code.is_file() else ""
     view.task = as_dict(json_or_none(result.folder / "task.json"))
     view.kind = str(view.task.get("kind") or view.kind)
-    view.audit = audit_view(view.task.get("audit"))
+    audit = as_dict(view.task.get("audit"))
+    view.audit = {
+        "score": number(audit.get("score")),
+        "checks": [_check_view(check) for check in as_dicts(audit.get("checks"))],
+    }
     table = as_dict(json_or_none(result.folder / "audit.json"))
     view.samples = [
         _sample_view(sample, k == table.get("picked"))
@@ -260,6 +263,26 @@ def _note_older_inputs(view: ItemView) -> None:
 
 
 # --- pieces --------------------------------------------------------------------------------------------------
+
+
+def _check_view(check: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a line of the audit with what was measured in words."""
+    name, share = check.get("name"), number(check.get("share"))
+    if share is None:
+        measured = ""
+    elif name == "becomes_true":
+        measured = f"after {100 * share:.1f} cm" if share >= 0 else "never"
+    elif name == "reward_rises":
+        measured = f"by {share:.3g}"
+    elif name == "no_warnings":
+        measured = f"{share:.0f} warnings" if share != 1 else "1 warning"
+    else:
+        measured = f"true in {100 * share:.0f} % of moments"
+    return {
+        "asks": str(check.get("asks") or name or ""),
+        "passed": check.get("passed") is True,
+        "measured": measured,
+    }
 
 
 def _sample_view(sample: Mapping[str, Any], is_picked: bool) -> dict[str, Any]:

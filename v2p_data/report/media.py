@@ -193,11 +193,8 @@ def draw_mesh(
 
 
 def _frame_rate(path: Path) -> float:
-    container = av.open(str(path))
-    try:
+    with av.open(str(path)) as container:
         return float(container.streams.video[0].average_rate or 20)
-    finally:
-        container.close()
 
 
 def _decoded(path: Path) -> Iterator[av.VideoFrame]:

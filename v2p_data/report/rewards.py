@@ -17,9 +17,8 @@ from markupsafe import Markup
 
 from v2p_data.errors import V2PError
 from v2p_data.json_files import MAX_BYTES, json_or_none
-from v2p_data.report.chart import Line, line_chart
+from v2p_data.report.chart import Line, line_chart, training_charts
 from v2p_data.report.reading import as_dict, as_dicts, as_list, number, read_curve
-from v2p_data.report.training import training_charts
 from v2p_data.report.words import NO_BREAK, percent
 from v2p_data.scene.files import own_file
 
@@ -58,21 +57,6 @@ class RewardRow:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartView:
-    """What one component of the reward did."""
-
-    name: str
-    share: float | None
-    means: tuple[float | None, float | None, float | None]
-    """Over all, over successful and over failed trajectories."""
-    correlations: tuple[float | None, float | None]
-    """With success, per step and per episode."""
-    saturated: tuple[float | None, float | None]
-    """Share of steps near its maximum and its minimum."""
-    is_dead: bool
-
-
-@dataclass(frozen=True, kw_only=True)
 class RewardView:
     """A search, and the candidate that leads it."""
 
@@ -91,7 +75,8 @@ class RewardView:
     """Of the leader's training."""
     facts: list[str]
     """What the leader's policy did, one sentence each."""
-    parts: list[PartView]
+    parts: list[dict[str, Any]]
+    """What each component of the reward did."""
     lineage: list[tuple[RewardRow, RewardRow, str]]
     """The leader, its parent and the difference of their codes; then the parent's, back to the first round."""
 
@@ -238,18 +223,21 @@ def _facts(feedback: dict[str, Any]) -> list[str]:
     return facts
 
 
-def _part(row: dict[str, Any]) -> PartView:
-    overall, successful, failed = (
-        number(as_dict(row.get(k)).get("mean")) for k in ("overall", "successful", "failed")
-    )
-    return PartView(
-        name=str(row.get("name") or "")[:MAX_NAME_CHARS],
-        share=number(row.get("share")),
-        means=(overall, successful, failed),
-        correlations=(number(row.get("step_correlation")), number(row.get("episode_correlation"))),
-        saturated=(number(row.get("saturated_high")), number(row.get("saturated_low"))),
-        is_dead=row.get("is_dead") is True,
-    )
+def _part(row: dict[str, Any]) -> dict[str, Any]:
+    """Return means over all, over successful and over failed trajectories, and shares of steps near both ends."""
+    return {
+        "name": str(row.get("name") or "")[:MAX_NAME_CHARS],
+        "share": number(row.get("share")),
+        "means": [
+            number(as_dict(row.get(k)).get("mean")) for k in ("overall", "successful", "failed")
+        ],
+        "correlations": [
+            number(row.get("step_correlation")),
+            number(row.get("episode_correlation")),
+        ],
+        "saturated": [number(row.get("saturated_high")), number(row.get("saturated_low"))],
+        "is_dead": row.get("is_dead") is True,
+    }
 
 
 def _own_file(folder: Path, name: str) -> Path | None:
