@@ -1,8 +1,7 @@
 """From a dataset to a policy: sources, the distillation and policy stages with a real student, and their kills."""
 
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from v2p_data.distillation.rounds import handover_episodes
 from v2p_data.episodes.collect import staged_episodes
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.errors import V2PError
-from v2p_data.pipeline.artifact import write_record
 from v2p_data.pipeline.runner import Outcome, Runtime
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.policy.training import POLICY_FOLDER, recorded_under, sources_of
@@ -42,13 +40,6 @@ def make(root: Path, engine=ENGINE) -> dict[str, Outcome]:
     return {stage: outcome for (stage, _), outcome in outcomes.items()}
 
 
-def change_record(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Write a record anew as if the result had been made so."""
-    data = asdict(record_of(folder))
-    change(data)
-    write_record(folder, replace(record_of(folder), recipe=data["recipe"]))
-
-
 def test_the_task_and_expert_behind_a_dataset_are_found(finished: Path):
     (source,) = sources_of(dataset_of(finished), finished)
 
@@ -57,14 +48,6 @@ def test_the_task_and_expert_behind_a_dataset_are_found(finished: Path):
     assert (source.expert / "weights.safetensors").is_file()
     assert staged_episodes(source.episodes)
     assert recorded_under(source) == toy_run.EPISODES
-
-
-@pytest.mark.parametrize("gone", ["expert", "task", "episodes"])
-def test_where_one_of_them_is_gone_there_are_no_sources(root: Path, gone: str):
-    shutil.rmtree(root / gone)
-
-    assert sources_of(dataset_of(root), root) == []
-    assert not stage_of(root).inputs
 
 
 def test_a_dataset_in_another_run_folder_has_no_sources(finished: Path, tmp_path: Path):
@@ -170,30 +153,6 @@ def test_checkpoints_are_judged_in_simulation(agreeing_referee, distilled: Path,
 
     assert [step for step, _ in judged] == [3, 4]
     assert all(0 <= rate <= 1 for _, rate in judged)
-
-
-def test_colours_are_refused_before_anything_is_read(root: Path):
-    def paint(record: dict[str, Any]) -> None:
-        record["recipe"]["config"]["config"]["render"] = "rgb"
-
-    change_record(only(root, "episodes"), paint)
-
-    outcome = make(root)["distillation"]
-
-    assert (outcome.status, outcome.reason) == ("failed", "error")
-    assert "the demonstrations show 'rgb'" in outcome.detail
-    assert "\n" not in outcome.detail
-    assert not (root / "cache").exists()
-
-
-def test_without_rounds_the_policy_clones_the_demonstrations(root: Path):
-    engine = replace(ENGINE, distillation=DistillationConfig(rounds=0))
-
-    outcomes = make(root, engine)
-
-    assert list(outcomes) == ["policy"]
-    frames = record_of(outcomes["policy"].folder).counts["frames"]
-    assert frames == record_of(dataset_of(root)).counts["frames"]
 
 
 def test_a_distillation_belongs_to_its_dataset(finished: Path):

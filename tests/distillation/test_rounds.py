@@ -16,7 +16,6 @@ from v2p_data.distillation import rounds
 from v2p_data.distillation.rounds import Course, distill, handover_episodes, take_in
 from v2p_data.episodes import rollouts
 from v2p_data.episodes.staging import Episode
-from v2p_data.errors import V2PError
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.play import StateActor
 
@@ -195,14 +194,6 @@ def test_half_an_episode_is_no_episode(agreeing_referee, calm: Path, tmp_path: P
     run(tmp_path)
 
     assert contents(tmp_path) == undisturbed(calm)
-
-
-def test_pictures_of_colours_are_refused_in_one_sentence(tmp_path: Path):
-    with pytest.raises(V2PError, match=r"show 'rgb', .*--distillation.rounds=0") as caught:
-        run(tmp_path, episodes=replace(EPISODES, render="rgb"))
-
-    assert "\n" not in str(caught.value)
-    assert not list(tmp_path.iterdir())
 
 
 def test_what_a_student_takes_in_is_what_was_staged(calm: Path):

@@ -154,3 +154,4 @@ def test_why_the_distillation_failed_is_said_and_not_only_that_the_policy_waits_
 
     assert "the demonstrations show 'both'" in message
     assert "--distillation.rounds=0" in message
+    assert not (root / "cache").exists()

@@ -83,19 +83,18 @@ def test_a_point_learns_to_reach_its_goal(tmp_path: Path):
     assert (tmp_path / "curve.png").stat().st_size > 1000
 
 
-def test_a_plateau_does_not_end_a_training_that_is_not_good_enough(tmp_path: Path):
-    cfg = replace(steps(6), plateau_steps=BATCH, plateau_gain=1.0)
-
-    assert train_expert(PointMass(64, seed=1), cfg, tmp_path).stopped_by == "steps"
-
-
-def test_a_plateau_ends_a_training_that_is_good_enough(tmp_path: Path):
-    cfg = replace(steps(60), target_success=0.0, plateau_steps=BATCH, plateau_gain=1.0)
+@pytest.mark.parametrize(
+    ("batches", "target", "stopped_by"), [(6, 2.0, "steps"), (60, 0.0, "plateau")]
+)
+def test_a_plateau_ends_a_training_that_is_good_enough_only(
+    tmp_path: Path, batches: int, target: float, stopped_by: str
+):
+    cfg = replace(steps(batches), target_success=target, plateau_steps=BATCH, plateau_gain=1.0)
 
     result = train_expert(PointMass(64, seed=1), cfg, tmp_path)
 
-    assert result.stopped_by == "plateau"
-    assert result.steps < 60 * BATCH
+    assert result.stopped_by == stopped_by
+    assert (result.steps < batches * BATCH) == (stopped_by == "plateau")
 
 
 def test_the_same_seed_makes_the_same_weights_and_another_seed_others(tmp_path: Path):
