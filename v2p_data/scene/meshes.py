@@ -10,7 +10,7 @@ from v2p_data.scene.data_types import GroundedObjects, Placement
 from v2p_data.scene.fitting.end_poses import UNSEEN_IOU
 from v2p_data.scene.fitting.metric import metric_camera, scene_origin
 from v2p_data.scene.fitting.refine_pose import refine_pose, warped_trajectory
-from v2p_data.scene.shapes.shape import ShapeChoice, ShapeConfig, best_shape
+from v2p_data.scene.shapes.shape import ShapeChoice, best_shape
 from v2p_data.scene.shapes.silhouette_view import SilhouetteView
 
 
@@ -42,11 +42,11 @@ def with_meshes(
             mask=placed.last_mask, T_world_obj=poses[-1], hidden=placed.last_hidden
         )
         shape = best_shape(
-            [last if placed.lifted_off else first],
+            last if placed.lifted_off else first,
             work,
             (length, width, tall),
             s.noun,
-            ShapeConfig(handles=s.known_m is None),
+            handles=s.known_m is None,
         )
         poses = poses @ shape.T_obj_shape
         shows_it = (

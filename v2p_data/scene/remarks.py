@@ -15,9 +15,9 @@ def remarks_on(
 ) -> list[str]:
     """Return what is assumed or hardly seen: scale, unknown nouns, close rivals, hidden ends, two people, lifts."""
     spread = placement.scale_spread
-    by_network = " and from what the network makes of the picture" if grounded.segmentation else ""
     out = [
-        f"scale comes from usual sizes{by_network}: all lengths may be off by {spread:.0%} together"
+        "scale comes from usual sizes and from what the network makes of the picture: "
+        f"all lengths may be off by {spread:.0%} together"
     ]
     out += [
         f"'{s.phrase}' is no known noun; its size is a guess"

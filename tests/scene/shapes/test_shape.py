@@ -16,7 +16,7 @@ from v2p_data.geometry.pose import transform
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.scale.nouns import Noun
 from v2p_data.scene.shapes.inflation import _standing
-from v2p_data.scene.shapes.shape import ShapeChoice, ShapeConfig, SilhouetteView, best_shape
+from v2p_data.scene.shapes.shape import MARGINS, ShapeChoice, SilhouetteView, best_shape
 
 CAMERA = camera_above((240, 320), 0.6, 1.01, 0.5)
 AT = np.array([0.7, 0.05, 0.0])
@@ -113,7 +113,7 @@ def test_a_bottle_gets_its_neck():
     mask = seen([placed(lathe(BOTTLE))])
 
     choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size))],
+        SilhouetteView(mask=mask, T_world_obj=fit(size)),
         CAMERA,
         size,
         noun("cylinder", symmetry="round"),
@@ -134,7 +134,7 @@ def test_a_bowl_bulges_and_can_be_filled():
     mask = seen([placed(lathe(BOWL, 0.004))])
 
     choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size))],
+        SilhouetteView(mask=mask, T_world_obj=fit(size)),
         CAMERA,
         size,
         noun("cylinder", hollow=True, taper=0.5, symmetry="round"),
@@ -152,19 +152,19 @@ def test_a_bowl_bulges_and_can_be_filled():
     np.testing.assert_allclose(winding(choice.mesh, floor), 1, atol=1e-6)
 
 
-def test_a_cup_is_open_as_wide_as_it_is_below_its_rim():
+def test_a_cup_is_open_as_wide_as_it_is_below_its_rim(monkeypatch: pytest.MonkeyPatch):
     """Outlines come out with round corners."""
     size = (0.08, 0.08, 0.1)
     whole = seen([placed(lathe(np.array([(0.032, 0.0), (0.04, 0.1)]), 0.003))])
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (21, 21))
     mask = cv2.morphologyEx(whole.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0
+    monkeypatch.setitem(MARGINS, "revolution", -1.0)
 
     choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size))],
+        SilhouetteView(mask=mask, T_world_obj=fit(size)),
         CAMERA,
         size,
         noun("cylinder", hollow=True, taper=1.0, symmetry="round"),
-        ShapeConfig(revolution_margin=-1.0),
     )
 
     assert choice.kind == "revolution"
@@ -182,7 +182,7 @@ def test_a_bowl_that_lies_on_its_mouth_keeps_its_height():
     T = transform(over, at + np.array([0.0, 0.0, size[2] / 2]))
 
     choice = best_shape(
-        [SilhouetteView(mask=seen([lying], steep), T_world_obj=T)],
+        SilhouetteView(mask=seen([lying], steep), T_world_obj=T),
         steep,
         size,
         noun("cylinder", hollow=True, taper=0.35, symmetry="round"),
@@ -203,7 +203,7 @@ def test_a_mug_stays_a_hollow_cylinder_in_spite_of_its_handle():
     )
 
     choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size))],
+        SilhouetteView(mask=mask, T_world_obj=fit(size)),
         CAMERA,
         size,
         noun("cylinder", hollow=True, taper=0.95),
@@ -234,7 +234,7 @@ def test_a_duck_is_inflated_from_its_outline():
     )
 
     choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size, 90))], CAMERA, size, irregular
+        SilhouetteView(mask=mask, T_world_obj=fit(size, 90)), CAMERA, size, irregular
     )
 
     check_solid(choice)
@@ -259,7 +259,7 @@ def test_what_is_inflated_keeps_the_axes_of_the_fit(yaw_deg):
     )
     T = fit(size, yaw_deg)
 
-    choice = best_shape([SilhouetteView(mask=mask, T_world_obj=T)], CAMERA, size, irregular)
+    choice = best_shape(SilhouetteView(mask=mask, T_world_obj=T), CAMERA, size, irregular)
 
     check_solid(choice)
     assert choice.kind == "inflated"
@@ -288,7 +288,7 @@ def test_a_flat_spoon_comes_out_flat_and_long():
     )
 
     choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size, 80))], CAMERA, size, irregular
+        SilhouetteView(mask=mask, T_world_obj=fit(size, 80)), CAMERA, size, irregular
     )
 
     check_solid(choice)
@@ -312,7 +312,7 @@ def test_a_box_stays_a_box_even_when_its_outline_is_nibbled():
     mask[y.min() : y.min() + 6, x.min() : int(x.mean())] = False
 
     choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size, 30))],
+        SilhouetteView(mask=mask, T_world_obj=fit(size, 30)),
         CAMERA,
         size,
         noun("box", symmetry="box"),
@@ -331,7 +331,7 @@ def test_where_the_hand_hides_much_nothing_fine_is_tried():
     hidden[: int(y.mean())] = True
 
     choice = best_shape(
-        [SilhouetteView(mask=mask & ~hidden, hidden=hidden, T_world_obj=fit(size))],
+        SilhouetteView(mask=mask & ~hidden, hidden=hidden, T_world_obj=fit(size)),
         CAMERA,
         size,
         noun("cylinder", symmetry="round"),
@@ -348,9 +348,7 @@ def test_a_mask_of_a_few_pixels_leaves_the_primitive(form):
     row, column = (int(v) for v in CAMERA.project(AT[None] + np.array([0, 0, 0.002]))[0][::-1])
     mask[row : row + 2, column : column + 2] = True
 
-    choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size))], CAMERA, size, noun(form)
-    )
+    choice = best_shape(SilhouetteView(mask=mask, T_world_obj=fit(size)), CAMERA, size, noun(form))
 
     assert choice.mesh.is_watertight
 
@@ -371,7 +369,7 @@ def test_a_roll_of_tape_has_its_hole():
     mask = seen([placed(ring(0.09, 0.03, bore), AT + np.array([0, 0, 0.015]))])
 
     choice = best_shape(
-        [SilhouetteView(mask=mask, T_world_obj=fit(size))],
+        SilhouetteView(mask=mask, T_world_obj=fit(size)),
         CAMERA,
         size,
         noun("cylinder", symmetry="round", bore=bore),
@@ -389,7 +387,7 @@ def test_a_ball_with_its_shadow_stays_a_ball():
     shadow = placed(ball([0.03, 0.06, 0.001], [0, -0.05, 0]))
 
     choice = best_shape(
-        [SilhouetteView(mask=seen([body, shadow]), T_world_obj=fit(size))],
+        SilhouetteView(mask=seen([body, shadow]), T_world_obj=fit(size)),
         CAMERA,
         size,
         noun("sphere", size_m=size, symmetry="sphere"),
@@ -399,18 +397,20 @@ def test_a_ball_with_its_shadow_stays_a_ball():
     assert choice.size_m == size
 
 
-def test_what_is_low_is_not_inflated_to_any_depth_that_its_outline_allows():
+def test_what_is_low_is_not_inflated_to_any_depth_that_its_outline_allows(
+    monkeypatch: pytest.MonkeyPatch,
+):
     """Were it only for the outline, the block would come out twice as deep as it is."""
     size, yaw_deg = (0.10, 0.07, 0.03), 60.0
     low = camera_above((240, 320), 0.25, 1.01, 0.25)
     body = trimesh.creation.box(size).apply_transform(fit(size, yaw_deg))
+    monkeypatch.setitem(MARGINS, "irregular", -1.0)
 
     choice = best_shape(
-        [SilhouetteView(mask=seen([body], low), T_world_obj=fit(size, yaw_deg))],
+        SilhouetteView(mask=seen([body], low), T_world_obj=fit(size, yaw_deg)),
         low,
         size,
         noun("box", size_m=size),
-        ShapeConfig(irregular_margin=-1.0),
     )
 
     assert choice.kind == "primitive"
@@ -435,9 +435,9 @@ def test_vessels_get_the_handle_that_sticks_out_of_their_outline(profile, handle
     vessel = noun("cylinder", hollow=True, size_m=size)
     view = SilhouetteView(mask=mask, T_world_obj=fit(size))
 
-    with_handle = best_shape([view], CAMERA, size, vessel)
-    round_one = best_shape([view], CAMERA, size, replace(vessel, symmetry="round"))
-    without = best_shape([view], CAMERA, size, vessel, ShapeConfig(handles=False))
+    with_handle = best_shape(view, CAMERA, size, vessel)
+    round_one = best_shape(view, CAMERA, size, replace(vessel, symmetry="round"))
+    without = best_shape(view, CAMERA, size, vessel, handles=False)
 
     check_solid(with_handle, slack_m=0.02 * wide)
     T = view.T_world_obj @ with_handle.T_obj_shape
@@ -454,7 +454,7 @@ def test_vessels_get_the_handle_that_sticks_out_of_their_outline(profile, handle
 def test_a_vessel_without_a_handle_gets_none():
     size = (0.22, 0.22, 0.045)
     choice = best_shape(
-        [SilhouetteView(mask=seen([placed(lathe(PAN))]), T_world_obj=fit(size))],
+        SilhouetteView(mask=seen([placed(lathe(PAN))]), T_world_obj=fit(size)),
         CAMERA,
         size,
         noun("cylinder", hollow=True, size_m=size),

@@ -1,4 +1,4 @@
-"""What is known of the camera before outlines are fitted: measured, seen by the network, or usual."""
+"""What is known of the camera before outlines are fitted: measured, or seen by the network."""
 
 from dataclasses import replace
 
@@ -8,29 +8,21 @@ from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.data_types import CameraGuess
 from v2p_data.scene.scale.camera_height import SeenCamera
 
-_USUAL_PITCH_RAD = 0.61
-"""Pitch of a camera on a stand at a table, 35 degrees below the horizon."""
-_USUAL_FOV_RAD = 1.01
-"""Horizontal field of view of web cameras and of phones that film wide, 58 degrees."""
 _FOCAL_SD = 0.15
 """Standard deviation of the logarithm of a guessed focal length; measured on drawn clips."""
 _WIDTH_DOUBT = 1.4
 """Factor on the network's own standard deviation of the table's width; measured on clips that it was not trained on."""
 
 
-def camera_guess(seen: SeenCamera | None, cfg: SceneConfig) -> CameraGuess:
-    """Return the camera before any outline is fitted: the user's numbers, else the network's (`seen`), else usual ones."""
+def camera_guess(seen: SeenCamera, cfg: SceneConfig) -> CameraGuess:
+    """Return the camera before any outline is fitted: the user's numbers, else the network's (`seen`)."""
     guess = CameraGuess(
-        pitch_rad=_USUAL_PITCH_RAD, pitch_sd_rad=cfg.pitch_spread_rad, fov_rad=_USUAL_FOV_RAD
+        pitch_rad=seen.pitch_rad,
+        pitch_sd_rad=float(np.clip(seen.pitch_sd_rad, 0.05, cfg.pitch_spread_rad)),
+        fov_rad=float(2 * np.arctan(0.5 / seen.focal_widths)),
+        table_width_m=seen.table_width_m,
+        table_width_sd=_WIDTH_DOUBT * seen.table_width_sd,
     )
-    if seen is not None:
-        guess = CameraGuess(
-            pitch_rad=seen.pitch_rad,
-            pitch_sd_rad=float(np.clip(seen.pitch_sd_rad, 0.05, cfg.pitch_spread_rad)),
-            fov_rad=float(2 * np.arctan(0.5 / seen.focal_widths)),
-            table_width_m=seen.table_width_m,
-            table_width_sd=_WIDTH_DOUBT * seen.table_width_sd,
-        )
     return with_measured_camera(guess, cfg)
 
 

@@ -4,9 +4,8 @@ Everything here is in camera heights (the camera stands 1 above the table); `sca
 alone is ambiguous (faces swap, flat things thicken), so the noun's proportions hold the fit.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +23,7 @@ _HIDDEN_WEIGHT = 0.15
 """Weight, 0 to 1, of pixels that may be hidden: without it a shape grows behind the hand."""
 _PRIOR_WEIGHT = 0.03
 """Cost of proportions one standard deviation off the noun's, in units of IoU."""
+_STILL = np.zeros(3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,19 +57,12 @@ def orientations(noun: Noun) -> list[tuple[Float[np.ndarray, "3 3"], float]]:
     return [(upright, 0.0), (lying, cost), (on_side, cost)]
 
 
-class Outline(Protocol):
-    """What a shape is compared with: one `Silhouette`, or several."""
-
-    def iou(self, points_world: Float[np.ndarray, "n 3"], hidden_weight: float = 0.0) -> float: ...
-    def visible(self, points_world: Float[np.ndarray, "n 3"]) -> float: ...
-    def appearance_cost(self, form: str, size: np.ndarray, T_world_obj: np.ndarray) -> float: ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class Fitting:
-    """A shape under an outline, with the numbers that are searched for."""
+    """A shape under its outlines, with the numbers that are searched for."""
 
-    silhouette: Outline
+    views: Sequence[tuple[Float[np.ndarray, "3"], Silhouette]]
+    """By how far the shape has moved from its pose, and its outline then."""
     noun: Noun
     posed: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     """Size and pose `T_world_obj` for these numbers."""
@@ -85,9 +78,15 @@ class Fitting:
 
     def cost(self, v: np.ndarray) -> float:
         size, T = self.posed(v)
-        appearance = self.silhouette.appearance_cost(self.noun.form, size, T)
-        iou = self.silhouette.iou(apply(T, self.outline(size)), _HIDDEN_WEIGHT)
+        appearance = self.views[0][1].appearance_cost(self.noun.form, size, T)
+        iou = self.iou(apply(T, self.outline(size)), _HIDDEN_WEIGHT)
         return 1 - iou + self.held(v, T) + appearance
+
+    def iou(self, points_world: np.ndarray, hidden_weight: float = 0.0) -> float:
+        """Return how well the shape covers its outlines, on average."""
+        return float(
+            np.mean([one.iou(points_world + moved, hidden_weight) for moved, one in self.views])
+        )
 
     def best(self, starts: list[np.ndarray], step: np.ndarray, kept: int = 2) -> Fit:
         """Return the fit that a search from these numbers ends in."""
@@ -97,8 +96,8 @@ class Fitting:
         return Fit(
             size=three(size),
             T_world_obj=T,
-            iou=self.silhouette.iou(points),
-            visible=self.silhouette.visible(points),
+            iou=self.iou(points),
+            visible=float(np.mean([one.visible(points + moved) for moved, one in self.views])),
             cost=self.cost(v),
         )
 
@@ -129,7 +128,11 @@ def fit_shape(
         return _PRIOR_WEIGHT * float((off**2).sum())
 
     fitting = Fitting(
-        silhouette=silhouette, noun=noun, posed=posed, outline=lambda size: unit * size, held=held
+        views=[(_STILL, silhouette)],
+        noun=noun,
+        posed=posed,
+        outline=lambda size: unit * size,
+        held=held,
     )
     starts = [
         _aligned(
@@ -177,7 +180,7 @@ def fit_pose(
         return cost
 
     fitting = Fitting(
-        silhouette=silhouette, noun=noun, posed=posed, outline=lambda _: points, held=held
+        views=[(_STILL, silhouette)], noun=noun, posed=posed, outline=lambda _: points, held=held
     )
     turns = _yaw_starts(noun, rest, thorough=True)
     if yaw_near is not None:
@@ -214,7 +217,7 @@ def fit_lifted(
         return extents, transform(turned, place)
 
     fitting = Fitting(
-        silhouette=silhouette,
+        views=[(_STILL, silhouette)],
         noun=noun,
         posed=posed,
         outline=lambda _: points,

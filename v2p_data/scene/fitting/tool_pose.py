@@ -179,24 +179,6 @@ def _arm_heading(
     return float(np.arctan2(y, x))
 
 
-class _Views:
-    """Outlines of what goes along with the pushed object, compared as one."""
-
-    def __init__(self, views: Sequence[tuple[Float[np.ndarray, "3"], Silhouette]]) -> None:
-        self._views = views
-
-    def iou(self, points_world: Float[np.ndarray, "n 3"], hidden_weight: float = 0.0) -> float:
-        covers = [one.iou(points_world + gone, hidden_weight) for gone, one in self._views]
-        return float(np.mean(covers))
-
-    def visible(self, points_world: Float[np.ndarray, "n 3"]) -> float:
-        return float(np.mean([one.visible(points_world + gone) for gone, one in self._views]))
-
-    def appearance_cost(self, form: str, size: np.ndarray, T_world_obj: np.ndarray) -> float:
-        del form, size, T_world_obj
-        return 0.0
-
-
 def fit_tool(
     views: Sequence[tuple[Float[np.ndarray, "3"], Silhouette]],
     push: PushMotion,
@@ -246,7 +228,7 @@ def fit_tool(
         return _HABIT_WEIGHT * float(tilt**2 + turned**2 + np.log1p(np.square(far)).sum())
 
     fitting = Fitting(
-        silhouette=_Views(views),
+        views=views,
         noun=noun,
         posed=posed,
         outline=lambda sides: unit * sides,

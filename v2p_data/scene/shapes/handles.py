@@ -67,7 +67,7 @@ def with_handle(
             for way, extents in _tries(_spots(spare, crop.matrix @ T, z), kind, body, inner)
             if kind.shortest * diameter < extents[0] < kind.longest * diameter
         ]
-    return max(made, key=lambda one: iou_of(one, [view], [crop]), default=None)
+    return max(made, key=lambda one: iou_of(one, view, crop), default=None)
 
 
 def _tries(

@@ -1,6 +1,5 @@
 """What the shape of an object may be, and how well it covers the object's outlines."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,18 +26,9 @@ class MeshHypothesis:
     """From the mesh's frame to the fitted primitive's."""
 
 
-def iou_of(
-    shape: MeshHypothesis, views: Sequence[SilhouetteView], crops: list[SilhouetteCrop]
-) -> float:
-    """Return how well a shape covers the outlines where they can be seen, averaged over the views."""
-    return float(
-        np.mean(
-            [
-                crop.iou(crop.drawn(shape.mesh, view.T_world_obj @ shape.T_obj_shape))
-                for view, crop in zip(views, crops, strict=True)
-            ]
-        )
-    )
+def iou_of(shape: MeshHypothesis, view: SilhouetteView, crop: SilhouetteCrop) -> float:
+    """Return how well a shape covers the outline where it can be seen."""
+    return crop.iou(crop.drawn(shape.mesh, view.T_world_obj @ shape.T_obj_shape))
 
 
 def turned(mesh: trimesh.Trimesh, rotation: Float[np.ndarray, "3 3"]) -> trimesh.Trimesh:

@@ -5,7 +5,6 @@ banana's bend. The primitive stays unless another shape covers the outline clear
 handle deforms outlines too. One view does not show the back: it is taken to be like the front.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,31 +21,16 @@ from v2p_data.scene.shapes.mesh_hypothesis import Kind, MeshHypothesis, Size, io
 from v2p_data.scene.shapes.revolved import revolution
 from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 
+MARGINS = {"revolution": 0.025, "ball": 0.06, "irregular": -0.06, "regular": 0.15}
+"""By how much another shape must cover the outline better than the primitive, in units of IoU: a solid of revolution; one for round
+fruit, as noise dents most outlines of balls; an inflated silhouette of what has no simple shape, there the primitive must win; and of
+anything else."""
+_MIN_PX = 80
+"""Fewest pixels of a mask; a smaller outline has no form."""
+_MAX_HIDDEN = 0.25
+"""Where more of the primitive than this is hidden, its outline is not trusted to say more."""
 _OTHER_SIDES = 1.8
 """An inflated silhouette's sides are at most by this factor others than the fitted primitive's."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShapeConfig:
-    """By how much another shape must cover the outline better than the primitive, in units of IoU."""
-
-    revolution_margin: float = 0.025
-    ball_margin: float = 0.06
-    """For round fruit: a pear is no ball, but most outlines of balls are dented by noise."""
-    irregular_margin: float = -0.06
-    """For an inflated silhouette of what is known to have no simple shape: there the primitive must cover the outline better."""
-    regular_margin: float = 0.15
-    """For an inflated silhouette of anything else."""
-    min_px: int = 80
-    """Fewest pixels of a mask; a smaller outline has no form."""
-    handles: bool = True
-    """Whether vessels get the handle that their outline shows."""
-    max_hidden: float = 0.25
-    """Where more of the primitive than this is hidden, its outline is not trusted to say more."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.max_hidden <= 1:
-            raise ValueError(f"max_hidden must lie in 0..1, got {self.max_hidden}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,53 +47,53 @@ class ShapeChoice:
     T_obj_shape: Float[np.ndarray, "4 4"]
     """From the mesh's frame to the fitted primitive's: poses become `T_world_obj @ T_obj_shape`."""
     iou: float
-    """Overlap of the mesh's silhouette with the mask where it can be seen, averaged over the views."""
+    """Overlap of the mesh's silhouette with the mask where it can be seen."""
     reason: str
     """Why this shape, with the numbers."""
 
 
 def best_shape(
-    views: Sequence[SilhouetteView],
+    view: SilhouetteView,
     camera: Camera,
     size_m: Size,
     noun: Noun,
-    cfg: ShapeConfig | None = None,
+    *,
+    handles: bool = True,
 ) -> ShapeChoice:
     """Return the mesh of an object that was fitted with its noun's primitive.
 
     Args:
-        views: the first is the one from which shapes are made, resting on the table; all are compared with.
+        view: the object at rest on the table.
         camera: of the masks, in the world frame, the table's top at z = 0 [m].
         size_m: of the fitted primitive, along its own axes.
         noun: which primitive, whether hollow, whether irregular.
-        cfg: how clearly the primitive must be beaten.
+        handles: whether a vessel gets the handle that its outline shows.
     """
-    cfg = cfg or ShapeConfig()
-    crops = [SilhouetteCrop(view, camera) for view in views]
+    crop = SilhouetteCrop(view, camera)
     primitive = _primitive(size_m, noun)
-    plain = iou_of(primitive, views, crops)
-    hidden = crops[0].hidden_share(crops[0].drawn(primitive.mesh, views[0].T_world_obj))
+    plain = iou_of(primitive, view, crop)
+    hidden = crop.hidden_share(crop.drawn(primitive.mesh, view.T_world_obj))
     best, best_iou, best_gain = primitive, plain, 0.0
     reason = f"the {_word(noun)} covers the outline to {plain:.2f}"
-    pixels = int(views[0].mask.sum())
-    if pixels < cfg.min_px:
+    pixels = int(view.mask.sum())
+    if pixels < _MIN_PX:
         reason += f"; with {pixels} pixels it is too small in the picture for anything finer"
-    elif hidden > cfg.max_hidden:
+    elif hidden > _MAX_HIDDEN:
         reason += f"; {hidden:.0%} of it is hidden, so nothing finer was tried"
     else:
-        for candidate, margin in _others(views[0], crops[0], size_m, noun, cfg):
+        for candidate, margin in _others(view, crop, size_m, noun):
             if candidate.kind == "inflated" and not _as_large(candidate, size_m):
                 continue
-            iou = iou_of(candidate, views, crops)
+            iou = iou_of(candidate, view, crop)
             if iou - margin - plain > best_gain:
                 best, best_iou, best_gain = candidate, iou, iou - margin - plain
         if best is not primitive:
             what = {"revolution": "a solid of revolution", "inflated": "the inflated silhouette"}
             reason = f"{what[best.kind]} covers the outline to {best_iou:.2f}, the {_word(noun)} to {plain:.2f}"
-        if cfg.handles and noun.handled:
+        if handles and noun.handled:
             handle = handle_of_body(best)
-            handled = with_handle(best, handle, views[0], crops[0])
-            iou = -1.0 if handled is None else iou_of(handled, views, crops)
+            handled = with_handle(best, handle, view, crop)
+            iou = -1.0 if handled is None else iou_of(handled, view, crop)
             if handled is not None and iou > best_iou + handle.gain:
                 best, best_iou = handled, iou
                 reason += f"; with a handle to {iou:.2f}"
@@ -135,14 +119,14 @@ def _primitive(size_m: Size, noun: Noun) -> MeshHypothesis:
 
 
 def _others(
-    view: SilhouetteView, crop: SilhouetteCrop, size_m: Size, noun: Noun, cfg: ShapeConfig
+    view: SilhouetteView, crop: SilhouetteCrop, size_m: Size, noun: Noun
 ) -> list[tuple[MeshHypothesis, float]]:
     """Return what else the object may be, with the margin by which each must win."""
     if noun.bore:
         return []
     found: list[tuple[MeshHypothesis | None, float]] = []
     if noun.form != "box":
-        margin = cfg.revolution_margin if noun.form == "cylinder" else cfg.ball_margin
+        margin = MARGINS["revolution" if noun.form == "cylinder" else "ball"]
         body = crop
         if noun.handled:
             handle = handle_of(view.mask)
@@ -153,7 +137,7 @@ def _others(
         found.append((revolution(view, body, size_m, noun), margin))
     if not noun.hollow and noun.symmetry != "sphere" and not crop.at_border:
         irregular = noun.form == "box" and noun.symmetry == "none"
-        margin = cfg.irregular_margin if irregular else cfg.regular_margin
+        margin = MARGINS["irregular" if irregular else "regular"]
         found.append((inflation(view, crop, size_m), margin))
     return [(candidate, margin) for candidate, margin in found if candidate is not None]
 
