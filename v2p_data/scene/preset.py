@@ -21,21 +21,17 @@ class Size:
     least_gpu_gb: float
     ground: str
     segment: str
-    depth: str
-    ground_batch: int
-    """Pictures per pass of the detector."""
-    depth_batch: int
-    """Pictures per pass of the depth model."""
+    batch_size: int
+    """Pictures per pass of the detector and of the depth model."""
 
 
-_DEPTH = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
 SIZES = (
     Size(least_gpu_gb=16.0, ground="IDEA-Research/grounding-dino-base", segment="facebook/sam2.1-hiera-large",
-         depth=_DEPTH, ground_batch=8, depth_batch=8),
+         batch_size=8),
     Size(least_gpu_gb=8.0, ground="IDEA-Research/grounding-dino-base", segment="facebook/sam2.1-hiera-base-plus",
-         depth=_DEPTH, ground_batch=4, depth_batch=4),
+         batch_size=4),
     Size(least_gpu_gb=0.0, ground="IDEA-Research/grounding-dino-tiny", segment="facebook/sam2.1-hiera-tiny",
-         depth=_DEPTH, ground_batch=1, depth_batch=1),
+         batch_size=1),
 )  # fmt: skip
 """The largest first. Weights in float32 take 2.0, 1.4 and 0.95 GB; the rest of the memory is for activations."""
 
@@ -85,13 +81,13 @@ def with_preset(cfg: SceneConfig, memory_gb: Callable[[], float] = gpu_memory_gb
     ground, segment, depth = cfg.ground, cfg.segment, cfg.depth
     if ground.backend == "network":
         ground = replace(
-            ground, backend="grounding_dino", model=ground.model or size.ground, batch_size=size.ground_batch
+            ground, backend="grounding_dino", model=ground.model or size.ground, batch_size=size.batch_size
         )  # fmt: skip
     if segment.backend == "flow":
         segment = replace(segment, backend="sam2", model=segment.model or size.segment)
     if depth.backend == "none":
         depth = replace(
-            depth, backend="depth_anything", model=depth.model or size.depth, batch_size=size.depth_batch
+            depth, backend="depth_anything", model=depth.model or DEFAULT_MODELS["depth_anything"], batch_size=size.batch_size
         )  # fmt: skip
     return replace(cfg, preset="builtin", ground=ground, segment=segment, depth=depth)
 

@@ -62,11 +62,6 @@ def make_relative(checkpoint, tmp_path) -> str:
     return str(tmp_path)
 
 
-def test_pictures_of_different_sizes_are_a_clear_error(checkpoint, picture):
-    with pytest.raises(V2PError, match="one size"):
-        predict_depth([picture, picture[1:]], config(checkpoint))
-
-
 def seen(
     pitch: float, roll: float, height: float, *, clutter: bool = True
 ) -> tuple[np.ndarray, Camera]:
@@ -103,7 +98,6 @@ def test_the_table_plane_comes_out_of_noisy_depth_with_things_and_a_wall(pitch, 
     assert plane is not None
     assert plane.height_m == pytest.approx(height, rel=0.01)
     assert plane.pitch_rad == pytest.approx(pitch, abs=0.01)
-    assert plane.roll_rad == pytest.approx(roll, abs=0.02)
     np.testing.assert_allclose(
         plane.normal_cam, camera.T_world_cam[:3, :3].T @ [0, 0, 1], atol=0.01
     )

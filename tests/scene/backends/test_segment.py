@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-from v2p_data.errors import V2PError
 from v2p_data.scene.backends.checkpoint import load_checkpoint
 from v2p_data.scene.backends.config import SegmentConfig
 from v2p_data.scene.backends.segment import Prompt, points_inside, segment_video
@@ -133,16 +132,3 @@ def test_points_in_a_ring_avoid_its_hole_and_a_tiny_mask_repeats_its_own():
 
     assert all(ring[int(v), int(u)] for u, v in points_inside(ring, 5))
     np.testing.assert_array_equal(points_inside(dot, 3), [(9.5, 7.5)] * 3)
-
-
-@pytest.mark.parametrize(
-    ("prompt", "said"),
-    [
-        (outlined(BOXES[0], LENGTH), "frames 0..8"),
-        (Prompt(frame_idx=0, mask=np.ones((32, 64), bool)), "64 x 64"),
-        (Prompt(frame_idx=0, mask=np.zeros((64, 64), bool)), "a pixel set"),
-    ],
-)
-def test_a_prompt_that_points_nowhere_is_a_clear_error(checkpoint, clip, prompt, said):
-    with pytest.raises(V2PError, match=said):
-        segment_video(clip, [prompt], config(checkpoint))

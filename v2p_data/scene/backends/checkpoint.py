@@ -4,14 +4,11 @@ What was loaded stays loaded for the next clip. A checkpoint of another architec
 only warn and leave the missing weights random.
 """
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import UInt8
 
 from v2p_data.errors import V2PError
 from v2p_data.scene.backends.config import DEFAULT_MODELS, DType
@@ -35,8 +32,6 @@ class Checkpoint:
     """Hub id or folder."""
     model: Any
     processor: Any
-    device: torch.device
-    dtype: torch.dtype
 
 
 @lru_cache(maxsize=4)
@@ -86,8 +81,6 @@ def load_checkpoint(backend: str, model: str, device: str, dtype: DType) -> Chec
         name=name,
         model=loaded.to(where).eval(),
         processor=processor,
-        device=where,
-        dtype=getattr(torch, dtype),
     )
 
 
@@ -110,17 +103,3 @@ def device_for(device: str) -> torch.device:
             f"device '{device}' is not here ({here['cuda']} CUDA devices were found); use device=auto or device=cpu"
         )
     return found
-
-
-def batches(
-    images: Iterable[UInt8[np.ndarray, "_h _w 3"]], size: int
-) -> Iterator[list[UInt8[np.ndarray, "_h _w 3"]]]:
-    """Yield the pictures in order, up to `size` of equal shape at a time, so that none is padded."""
-    batch: list[np.ndarray] = []
-    for image in images:
-        if batch and (len(batch) == size or batch[0].shape != image.shape):
-            yield batch
-            batch = []
-        batch.append(image)
-    if batch:
-        yield batch

@@ -12,8 +12,6 @@ type HandsBackend = Literal["auto", "none", "mediapipe", "worker"]
 type OutlineBackend = Literal["auto", "none", "mobile_sam"]
 type DepthBackend = Literal["none", "depth_anything", "worker"]
 
-DETECTORS = ("grounding_dino", "worker")
-"""Backends that return boxes for phrases."""
 DEFAULT_MODELS: dict[str, str] = {
     "grounding_dino": "IDEA-Research/grounding-dino-tiny",
     "sam2": "facebook/sam2.1-hiera-small",

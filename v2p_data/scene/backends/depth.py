@@ -1,4 +1,4 @@
-"""Pictures become metric depth, and depth becomes the table plane: the camera's height, pitch and roll.
+"""Pictures become metric depth, and depth becomes the table plane: the camera's height and pitch.
 
 A metric Depth Anything comes with transformers; any other model answers as a worker.
 """
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.checkpoint import batches, load_checkpoint
+from v2p_data.scene.backends.checkpoint import load_checkpoint
 from v2p_data.scene.backends.config import DEFAULT_MODELS, DepthConfig
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
@@ -43,8 +43,6 @@ class TablePlane:
     """Share of the usable pixels that lie on it."""
     pitch_rad: float
     """How far the camera looks down below the horizon."""
-    roll_rad: float
-    """How far the camera is turned about its axis, clockwise as seen from behind it."""
 
 
 def predict_depth(
@@ -57,14 +55,8 @@ def predict_depth(
 
     Source: Yang et al. 2024 (Depth Anything V2), arXiv:2406.09414.
     """
-    if not len(images) or len({image.shape for image in images}) > 1:
-        raise V2PError(f"depth needs at least one picture and all of one size, got {len(images)}")
     if cfg.backend == "worker":
         return _by_worker(images, cfg)
-    if cfg.backend != "depth_anything":
-        raise V2PError(
-            f"depth backend '{cfg.backend}' predicts nothing; known: depth_anything, worker"
-        )
     checkpoint = load_checkpoint(cfg.backend, cfg.model, cfg.device, cfg.dtype)
     if checkpoint.model.config.depth_estimation_type != "metric":
         raise V2PError(
@@ -72,10 +64,13 @@ def predict_depth(
             f"'{DEFAULT_MODELS['depth_anything']}'"
         )
     depths: list[np.ndarray] = []
-    for batch in batches(images, cfg.batch_size):
-        inputs = checkpoint.processor(images=batch, return_tensors="pt").to(checkpoint.device)
+    for start in range(0, len(images), cfg.batch_size):
+        batch = list(images[start : start + cfg.batch_size])
+        inputs = checkpoint.processor(images=batch, return_tensors="pt").to(
+            checkpoint.model.device
+        )
         with torch.inference_mode():
-            out = checkpoint.model(pixel_values=inputs["pixel_values"].to(checkpoint.dtype))
+            out = checkpoint.model(pixel_values=inputs["pixel_values"].to(checkpoint.model.dtype))
         out.predicted_depth = out.predicted_depth.float()
         sizes = [image.shape[:2] for image in batch]
         done = checkpoint.processor.post_process_depth_estimation(out, target_sizes=sizes)
@@ -139,7 +134,6 @@ def table_from_depth(
         height_m=height,
         inlier_share=float(on_plane.mean()),
         pitch_rad=float(np.arcsin(np.clip(-normal[2], -1, 1))),
-        roll_rad=float(np.arctan2(-normal[0], -normal[1])),
     )
 
 

@@ -14,8 +14,8 @@ from jaxtyping import Float, UInt8
 from scipy.optimize import linear_sum_assignment
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.checkpoint import batches, load_checkpoint
-from v2p_data.scene.backends.config import DETECTORS, GroundConfig
+from v2p_data.scene.backends.checkpoint import load_checkpoint
+from v2p_data.scene.backends.config import GroundConfig
 from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 
 _MAX_TOKENS = 256
@@ -36,11 +36,11 @@ class Detection:
 
 
 def detect(
-    images: Sequence[UInt8[np.ndarray, "_h _w 3"]] | UInt8[np.ndarray, "n h w 3"],
+    images: Sequence[UInt8[np.ndarray, "h w 3"]] | UInt8[np.ndarray, "n h w 3"],
     phrases: Sequence[str],
     cfg: GroundConfig,
 ) -> list[list[list[Detection]]]:
-    """Return per picture, per phrase, the boxes that show it; the first is the phrase's own, then by score.
+    """Return per picture, per phrase, the boxes that show it; the first is the phrase's own, then by score. All pictures have one size.
 
     The rest are alternatives that no other phrase was given. A phrase that the model finds nowhere has none.
 
@@ -49,14 +49,11 @@ def detect(
 
     Source: Liu et al. 2023 (Grounding DINO), arXiv:2303.05499.
     """
-    if cfg.backend not in DETECTORS:
-        raise V2PError(
-            f"ground backend '{cfg.backend}' is no detector; known: {', '.join(DETECTORS)}"
-        )
     if not phrases or not all(re.search(r"\w", phrase) for phrase in phrases):
         raise V2PError(f"every phrase to look for needs a word, got {list(phrases)}")
     found: list[list[list[Detection]]] = []
-    for batch in batches(images, cfg.batch_size):
+    for start in range(0, len(images), cfg.batch_size):
+        batch = list(images[start : start + cfg.batch_size])
         h, w = batch[0].shape[:2]
         for boxes, scores in _tables(batch, phrases, cfg):
             clipped = np.clip(boxes, 0, [w, h, w, h])
@@ -117,8 +114,8 @@ def _tables(
         )
     inputs = checkpoint.processor(
         images=images, text=[prompt] * len(images), return_tensors="pt"
-    ).to(checkpoint.device)
-    inputs["pixel_values"] = inputs["pixel_values"].to(checkpoint.dtype)
+    ).to(checkpoint.model.device)
+    inputs["pixel_values"] = inputs["pixel_values"].to(checkpoint.model.dtype)
     with torch.inference_mode():
         out = checkpoint.model(**inputs)
     tokens = torch.sigmoid(out.logits.float()).cpu().numpy()

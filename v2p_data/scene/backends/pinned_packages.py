@@ -6,8 +6,8 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from v2p_data.errors import V2PError
@@ -36,46 +36,39 @@ def find_uv() -> str | None:
     return shutil.which("uv") or next(beside, None)
 
 
-def pinned(requirements: Path) -> list[str]:
-    """Return the options of `uv pip install` and `pip install` for these packages and no others."""
-    return ["--quiet", "--no-deps", "--require-hashes", "-r", str(requirements)]
-
-
-def keep_one_file(file: Path, fetch: Callable[[Path, Path], None], *, thing: str) -> Path:
-    """Fetch a file, unless it is there; return it.
+def install_pinned(python: str, requirements: Path, *options: str, thing: str, needs: str) -> None:
+    """Install pinned packages and no others for a Python, with uv where there is one.
 
     Args:
-        file: where it is kept.
-        fetch: called with a folder that is deleted afterwards and the file to write.
+        python: the interpreter.
+        requirements: file with one pin per package, each with its hashes.
+        *options: more options of `uv pip install` and `pip install`.
         thing: what is set up, for the message.
+        needs: what the installation needs, for the message.
+
+    Raises:
+        V2PError: the packages cannot be had.
+    """
+    uv = find_uv()
+    words = [uv, "pip", "install", "--python", python] if uv else [python, "-m", "pip", "install"]
+    words += [*options, "--quiet", "--no-deps", "--require-hashes", "-r", str(requirements)]
+    call_installer(words, thing=thing, needs=needs)
+
+
+@contextmanager
+def writing_in(folder: Path, thing: str) -> Iterator[None]:
+    """Make a folder, and say in one sentence where it or what is in it cannot be written.
 
     Raises:
         V2PError: the folder cannot be written to.
     """
-    if file.is_file():
-        return file
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=file.parent, prefix="fetch-") as place:
-            partial = Path(place, file.name)
-            fetch(Path(place), partial)
-            return partial.replace(file)
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
     except OSError as error:
         raise V2PError(
-            f"{thing} cannot be set up in {file.parent}: {error}; V2P_CACHE names another folder"
+            f"{thing} cannot be set up in {folder}: {error}; V2P_CACHE names another folder"
         ) from error
-
-
-def check_sha256(found: str, pinned: str, *, thing: str, name: str) -> None:
-    """Refuse a file of a package that is not the pinned one.
-
-    Raises:
-        V2PError: the digests differ.
-    """
-    if found != pinned:
-        raise V2PError(
-            f"{thing} cannot be set up: {name} of the package has the sha256 {found[:8]}..., not {pinned[:8]}..."
-        )
 
 
 def call_installer(words: list[str], *, thing: str, needs: str) -> None:

@@ -47,19 +47,11 @@ def segment_video(
     `frames` is read one at a time, so it may be anything with a length that gives RGB frames by index.
 
     Raises:
-        V2PError: no prompt, a prompt outside the clip or its pictures, or the model cannot be loaded.
+        V2PError: the model cannot be loaded, or its worker fails.
 
     Source: Ravi et al. 2024 (SAM 2), arXiv:2408.00714.
     """
-    if cfg.backend not in ("sam2", "worker"):
-        raise V2PError(f"segment backend '{cfg.backend}' is no video model; known: sam2, worker")
-    if not len(frames) or not prompts:
-        raise V2PError(
-            f"segmenting needs a frame and a prompt, got {len(frames)} frames and {len(prompts)} prompts"
-        )
     h, w = np.asarray(frames[0]).shape[:2]
-    for i, prompt in enumerate(prompts):
-        _check(prompt, i, len(frames), (h, w))
     if cfg.backend == "worker":
         return _by_worker(frames, prompts, cfg)
     checkpoint = load_checkpoint("sam2", cfg.model, cfg.device, cfg.dtype)
@@ -184,16 +176,18 @@ def _forget(session: Any, now: int, remembered: int) -> None:
 
 def _session(checkpoint: Checkpoint, cfg: SegmentConfig) -> Any:
     return checkpoint.processor.init_video_session(
-        inference_device=checkpoint.device,
-        inference_state_device="cpu" if cfg.offload else checkpoint.device,
-        video_storage_device=checkpoint.device,
-        dtype=checkpoint.dtype,
+        inference_device=checkpoint.model.device,
+        inference_state_device="cpu" if cfg.offload else checkpoint.model.device,
+        video_storage_device=checkpoint.model.device,
+        dtype=checkpoint.model.dtype,
     )
 
 
 def _prepared(checkpoint: Checkpoint, image: np.ndarray) -> torch.Tensor:
-    inputs = checkpoint.processor(images=image, device=checkpoint.device, return_tensors="pt")
-    return inputs["pixel_values"][0].to(checkpoint.dtype)
+    inputs = checkpoint.processor(
+        images=image, device=checkpoint.model.device, return_tensors="pt"
+    )
+    return inputs["pixel_values"][0].to(checkpoint.model.dtype)
 
 
 def _logits(
@@ -211,15 +205,3 @@ def _apart(
     """Return masks in which a pixel goes to the object that claims it most."""
     owner = logits.argmax(0)
     return (logits > threshold) & (owner == np.arange(len(logits))[:, None, None])
-
-
-def _check(prompt: Prompt, i: int, num_frames: int, size: tuple[int, int]) -> None:
-    h, w = size
-    if not 0 <= prompt.frame_idx < num_frames:
-        raise V2PError(
-            f"prompt {i} is at frame {prompt.frame_idx}, but the clip has frames 0..{num_frames - 1}"
-        )
-    if prompt.mask.shape != (h, w) or not prompt.mask.any():
-        raise V2PError(
-            f"the mask of prompt {i} must be {h} x {w} with a pixel set, got {prompt.mask.shape}"
-        )

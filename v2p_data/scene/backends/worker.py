@@ -162,7 +162,6 @@ class WorkerRequest:
 class WorkerResult:
     """What a worker answered, checked."""
 
-    kind: Kind
     arrays: Mapping[str, Shaped[np.ndarray, "..."]]
     fields: Mapping[str, Any]
     mesh: trimesh.Trimesh | None = None
@@ -301,7 +300,7 @@ def _read_result(
             f"'phrase_idx' of result.npz must be below {num_phrases}, the number of phrases"
         )
     mesh, repair = _read_mesh(folder / "mesh.obj") if contract.has_mesh else (None, "none")
-    return WorkerResult(kind=kind, arrays=arrays, fields=fields, mesh=mesh, repair=repair)
+    return WorkerResult(arrays=arrays, fields=fields, mesh=mesh, repair=repair)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
