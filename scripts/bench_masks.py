@@ -37,8 +37,8 @@ from studies.objects import make_toy
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.scene.scene import Scene
 from v2p_data.seeds import rng_for
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.model.world import CAMERA, World
 from v2p_data.sim.render.masks import BACKGROUND, GL_HINT, MaskRenderer, geom_labels
 from v2p_data.task.benchmark import load_benchmark
@@ -344,7 +344,7 @@ def _bundle(folder: Path, name: str, seed: int) -> TaskBundle:
 
 def _states(bundle: TaskBundle, rng: np.random.Generator) -> dict[str, Any]:
     randomization = replace(
-        ranges.recording(), camera_pos_m=0.08, camera_angle_rad=0.08, camera_fovy_deg=5.0
+        RandomizationConfig(), camera_pos_m=0.08, camera_angle_rad=0.08, camera_fovy_deg=5.0
     )
     cfg = SimConfig(fine=True, randomization=randomization)
     env = BatchEnv(bundle, cfg, num_envs=STATES, seed=int(rng.integers(2**31)), num_threads=1)

@@ -17,8 +17,8 @@ from v2p_data.experts.config import ExpertConfig
 from v2p_data.policy.config import PAPER_BATCH_SIZE, PAPER_EPOCHS
 from v2p_data.reward.config import RewardConfig
 from v2p_data.scene.backends.config import SegmentConfig
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import SimConfig
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.task.benchmark import benchmark_names
 from v2p_data.task.generate import TaskConfig
 
@@ -40,8 +40,8 @@ LIKE_THE_PAPER = {
     "recipe/head learning rate": V2PBCConfig(device="cpu", preset="paper").optimizer_lr,
     "recipe/backbone learning rate": PRETRAINED_BACKBONE_LR,
     "recipe/rotation scale": SimConfig().rotation_step_rad,
-    "recipe/action noise": ranges.recording().action_noise,
-    "recipe/delay": list(ranges.recording().delay_s),
+    "recipe/action noise": RandomizationConfig().action_noise,
+    "recipe/delay": list(RandomizationConfig().delay_s),
 }
 """Settings that say they are the paper's."""
 QUOTES = [

@@ -18,7 +18,7 @@ from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
-from v2p_data.sim.env.ranges import recording
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.render.masks import FIRST_OBJECT, PALETTE
 
 
@@ -26,7 +26,9 @@ from v2p_data.sim.render.masks import FIRST_OBJECT, PALETTE
 def toys(tmp_path_factory: pytest.TempPathFactory) -> list[Episode]:
     """Episodes of a task with one cube, seen by cameras that differ from episode to episode."""
     out = tmp_path_factory.mktemp("collected")
-    moved = replace(recording(), camera_pos_m=0.1, camera_angle_rad=0.05, camera_fovy_deg=5.0)
+    moved = replace(
+        RandomizationConfig(), camera_pos_m=0.1, camera_angle_rad=0.05, camera_fovy_deg=5.0
+    )
     collect_toys(out, replace(SMALL, randomization=moved))
     return [Episode.load(path) for path in staged_episodes(out)]
 

@@ -7,9 +7,9 @@ import pytest
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.rotation import quats_about_z
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.actions import bounds_of, joints_near, steps_to, targets_of
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.robot.action_names import DELTA_NAMES, action_names, actions_named
 from v2p_data.sim.robot.robot import HOME_QPOS
 from v2p_data.sim.wrappers.gym_env import V2PEnv
@@ -22,7 +22,7 @@ def worlds_of(make_bundle, lift_task):
     """Return worlds that are commanded exactly, unless noise is asked for."""
 
     def make(noise: float = 0.0) -> BatchEnv:
-        cfg = SimConfig(randomization=replace(ranges.recording(), action_noise=noise))
+        cfg = SimConfig(randomization=replace(RandomizationConfig(), action_noise=noise))
         return BatchEnv(make_bundle(), cfg, num_envs=6, seed=2, num_threads=1, task=lift_task)
 
     return make

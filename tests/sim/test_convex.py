@@ -9,11 +9,11 @@ import trimesh
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import Snapshot
 from v2p_data.sim.env.cpu_physics import CpuPhysics
 from v2p_data.sim.env.physics import SimConfig
 from v2p_data.sim.env.randomize import Randomizer
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.model import convex
 from v2p_data.sim.model.convex import ConvexConfig
 from v2p_data.sim.model.solids import solids_of
@@ -182,7 +182,7 @@ def test_a_mesh_that_takes_too_long_collides_as_its_hull_and_says_so(angle_file:
 def test_the_parts_of_one_object_change_size_together(angle_scene: Scene):
     world = build_world(angle_scene, COARSE)
     physics = CpuPhysics(world, SimConfig(), 1.0, 32, 1)
-    randomizer = Randomizer(world, physics, ranges.training(), rng_for(0, "bank"))
+    randomizer = Randomizer(world, physics, RandomizationConfig(), rng_for(0, "bank"))
 
     randomizer.draw(np.arange(32), rng_for(0, "draw"))
 

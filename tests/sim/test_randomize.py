@@ -31,7 +31,7 @@ def worlds_of(
     physics = CpuPhysics(world, SimConfig(), 1.0, NUM_ENVS, 2)
     batch = physics.batch
     batch.reset(stage=0)
-    randomizer = Randomizer(world, physics, cfg or ranges.training(), rng_for(0, "bank"))
+    randomizer = Randomizer(world, physics, cfg or RandomizationConfig(), rng_for(0, "bank"))
     rng, ids = rng_for(0, "test"), np.arange(NUM_ENVS)
     randomizer.draw(ids, rng)
     poses = randomizer.place(ids, rng)
@@ -175,7 +175,7 @@ def test_a_reference_object_stays_on_its_side(
 
     offset = poses[:, 1, :2] - poses[:, 0, :2]
     angle = np.arctan2(offset[:, 1], offset[:, 0])
-    assert np.abs(angle - np.pi / 2).max() < 3 * ranges.training().layout_angle_rad
+    assert np.abs(angle - np.pi / 2).max() < 3 * RandomizationConfig().layout_angle_rad
 
 
 @pytest.mark.parametrize(("kind", "side"), [("push_left", 1.0), ("push_right", -1.0)])

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.wrappers.gym_env import V2PEnv, stream_seed
 from v2p_data.task.task import TaskBundle
@@ -40,7 +39,7 @@ def folder(make_bundle, make_object, tmp_path) -> Path:
 
 
 def batch_of(folder: Path, num_envs: int) -> BatchEnv:
-    sim = SimConfig(fine=True, randomization=ranges.recording())
+    sim = SimConfig(fine=True)
     bundle = TaskBundle.load(folder)
     return BatchEnv(bundle, sim, num_envs=num_envs, seed=0, num_threads=1)
 

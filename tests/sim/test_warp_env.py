@@ -18,6 +18,7 @@ from v2p_data.errors import V2PError
 from v2p_data.scene.scene import SceneObject
 from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.task import Task, TaskBundle
 
@@ -26,7 +27,7 @@ needs_warp = pytest.mark.skipif(
     reason="MuJoCo Warp is not installed: the extra 'gpu'",
 )
 ON_CUDA = SimConfig(backend="warp")
-NOISELESS = replace(ranges.training(), action_noise=0.0)
+NOISELESS = replace(RandomizationConfig(), action_noise=0.0)
 DOWN = Rotation.from_quat((0, 1, 0, 0), scalar_first=True)
 
 Pair = tuple[BatchEnv, BatchEnv]
@@ -299,7 +300,7 @@ def test_random_actions_and_resets_stay_finite(
     gpu, _ = make_pair(
         make_object("cube"),
         make_object("box", "box", (0.14, 0.12, 0.06), hollow=True, pos=(0, 0.2, 0.03)),
-        randomization=ranges.training(),
+        randomization=RandomizationConfig(),
         horizon=15,
     )
     gpu.stagger()
@@ -336,7 +337,7 @@ def test_torchrl_and_checkpoints_take_it_as_they_take_the_cpus(make_pair: Callab
 
     from v2p_data.sim.wrappers.torchrl_env import TorchRLEnv
 
-    gpu, _ = make_pair(horizon=6, randomization=ranges.training())
+    gpu, _ = make_pair(horizon=6, randomization=RandomizationConfig())
     env = TorchRLEnv(gpu)
     check_env_specs(env)
     still = TensorDict({"action": torch.zeros(8, 7)}, [8], device=gpu.device)

@@ -31,11 +31,9 @@ from v2p_data.episodes.staging import (
 )
 from v2p_data.errors import ItemRejectedError
 from v2p_data.json_files import read_object
-from v2p_data.pipeline.artifact import REJECTS_FILE, write_json_atomically, write_rejects
+from v2p_data.pipeline.artifact import write_json_atomically, write_rejects
 from v2p_data.seeds import seed_for
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import SimConfig
-from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.task.task import TaskBundle
 
 logger = logging.getLogger(__name__)
@@ -140,12 +138,11 @@ def judge_expert(
     episodes: int,
     seed: int,
     num_threads: int = 1,
-    randomization: RandomizationConfig | None = None,
 ) -> Rollouts:
     """Return `episodes` fresh episodes at the fine time step under recording conditions, judged."""
     return roll_out(
         lesson,
-        SimConfig(fine=True, randomization=randomization or ranges.recording()),
+        SimConfig(fine=True),
         num_worlds=episodes,
         seed=seed,
         num_threads=num_threads,
@@ -229,7 +226,6 @@ def _finish(
     bundle: TaskBundle, cfg: EpisodesConfig, out: Path, batches: list[dict[str, Any]]
 ) -> Collected:
     rejected = [row for b in batches for row in b["rejected"]]
-    (out / REJECTS_FILE).unlink(missing_ok=True)
     write_rejects(out, rejected)
     paths = tuple(staged_episodes(out))
     collected = Collected(

@@ -6,7 +6,6 @@ from typing import Literal
 from v2p_data.episodes.rollouts import CutConfig
 from v2p_data.episodes.staging import RGB_CAMERA
 from v2p_data.pipeline.fingerprint import UNSAID_BY_DEFAULT
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig
 from v2p_data.sim.render.masks import MASK_CAMERAS
@@ -39,7 +38,7 @@ class EpisodesConfig:
     joint_state: bool = field(default=False, metadata=UNSAID_BY_DEFAULT)
     """Let the angles of the arm's joints [rad] follow the 11 numbers of `observation.state`."""
     cut: CutConfig = field(default_factory=CutConfig)
-    randomization: RandomizationConfig = field(default_factory=ranges.recording)
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     distractors: DistractorConfig = field(default_factory=DistractorConfig)
     """Things that stand about in the pictures; none by default."""
     look: LookConfig = field(default_factory=LookConfig)

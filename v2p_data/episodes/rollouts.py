@@ -215,16 +215,15 @@ class NotedActor:
     def act(self, view: View) -> Float[np.ndarray, "env 7"]:
         """Return the actor's actions."""
         action = self._actor.act(view)
-        if self._interface.joint_state:
-            self._states.append(state_as_seen(view.state, view.worlds, self._interface))
+        self._states.append(state_as_seen(view.state, view.worlds, self._interface))
         if self._interface.actions != "delta_tool":
             step = np.clip(action, -1.0, 1.0).astype(np.float32)
             self._targets.append(targets_of(view.worlds, step, self._interface.actions))
         return action
 
     def columns(self) -> dict[str, Any]:
-        """Return fields of `Rollouts`: `state` where joints are in it, `names` and `targets` where actions are targets."""
-        found: dict[str, Any] = {"state": np.stack(self._states)} if self._states else {}
+        """Return fields of `Rollouts`: `state`, and `names` and `targets` where actions are targets."""
+        found: dict[str, Any] = {"state": np.stack(self._states)}
         if self._targets:
             found["names"] = action_names(self._interface.actions, self._num_joints)
             found["targets"] = np.stack(self._targets)

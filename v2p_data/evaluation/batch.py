@@ -17,7 +17,6 @@ from jaxtyping import Bool, Int
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.failures import failure_kinds
 from v2p_data.play import Actor, Film, Stopwatch, View, VisionActor, play
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, stream_seed
@@ -171,7 +170,7 @@ def _begun(
     bundle: TaskBundle, seeds: Sequence[int], num_threads: int, *, base_reset: bool
 ) -> BatchEnv:
     """Return worlds at the start of their episodes, one for each seed."""
-    sim = SimConfig(fine=True, randomization=ranges.recording(), base_reset=base_reset)
+    sim = SimConfig(fine=True, base_reset=base_reset)
     env = BatchEnv(bundle, sim, num_envs=len(seeds), seed=0, num_threads=num_threads)
     env.reset_seeded(np.arange(len(seeds)), seeds)
     return env

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-from v2p_data.errors import ItemRejectedError, UnusableError, V2PError
+from v2p_data.errors import UnusableError, V2PError
 from v2p_data.pipeline.contents import (
     FileMark,
     damaged,
@@ -165,16 +165,9 @@ def commit_folder(partial: Path, final: Path) -> None:
         os.close(directory)
 
 
-def rejection(error: ItemRejectedError) -> dict[str, Any]:
-    """Return the JSON form of a rejection."""
-    return {"reason": error.reason, "detail": error.detail, "value": error.value}
-
-
 def write_rejects(folder: Path, rejects: Iterable[dict[str, Any]]) -> None:
-    """Append what was dropped, one JSON object a line: id, reason slug, the number that decided."""
-    with (folder / REJECTS_FILE).open("a") as stream:
-        for reject in rejects:
-            stream.write(json.dumps(reject) + "\n")
+    """Write what was dropped, one JSON object a line: id, reason slug, the number that decided."""
+    (folder / REJECTS_FILE).write_text("".join(json.dumps(reject) + "\n" for reject in rejects))
 
 
 def read_rejects(folder: Path) -> list[dict[str, Any]]:

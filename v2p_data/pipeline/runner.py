@@ -25,7 +25,6 @@ from v2p_data.pipeline.artifact import (
     own_command,
     provenance,
     read_record,
-    rejection,
     write_record,
 )
 from v2p_data.pipeline.contents import damaged, list_files, memory_of, remember_made
@@ -249,7 +248,7 @@ def _made(stage: Stage, runtime: Runtime, partial: Path, folder: Path, started: 
             demand_whole(source, runtime.root)
         counts = stage.make(stage.config, inputs, partial, runtime) or {}
     except ItemRejectedError as error:
-        rejected = rejection(error)
+        rejected = {"reason": error.reason, "detail": error.detail, "value": error.value}
         status, reason, detail = "rejected", error.reason, error.detail
     seconds = time.monotonic() - started
     (partial / TRACEBACK_FILE).unlink(missing_ok=True)  # of an earlier try

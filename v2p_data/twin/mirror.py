@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, StepResult, robot_of
 from v2p_data.sim.env.targets import ToolPose
 from v2p_data.sim.env.task_code import FRESH
@@ -97,7 +96,7 @@ class Mirror:
     """
 
     def __init__(self, bundle: TaskBundle) -> None:
-        sim = SimConfig(fine=True, randomization=ranges.recording())
+        sim = SimConfig(fine=True)
         robot = robot_of(bundle, sim)
         if robot.path:
             raise V2PError(

@@ -81,10 +81,6 @@ class DatasetChecks:
     def add(self, check: str, where: str, detail: str) -> None:
         self.problems.append(Problem(check=check, where=where, detail=detail))
 
-    def episode(self, k: int, start: int, length: int, recorded: Episode | None) -> "EpisodeCheck":
-        """Return what looks at episode `k`, whose rows begin at `start`."""
-        return EpisodeCheck(self, k, start, length, recorded)
-
     def statistics(self, stats: dict[str, Any]) -> None:
         """Compare `meta/stats.json` with the numbers that were read."""
         for key, parts in self.columns.items():
@@ -160,7 +156,7 @@ def wrong_quantiles(values: np.ndarray, stats: dict[str, Any]) -> list[str]:
 
 
 class EpisodeCheck:
-    """One episode; `look_at` takes its rows in order, `finish` judges the whole."""
+    """One episode, whose rows begin at `start`; `look_at` takes them in order, `finish` judges the whole."""
 
     def __init__(
         self, checks: DatasetChecks, k: int, start: int, length: int, recorded: Episode | None

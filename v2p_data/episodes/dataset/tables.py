@@ -111,15 +111,10 @@ def layout_problems(root: Path, info: dict[str, Any]) -> list[Problem]:
 
 
 def _layout_problems(root: Path, info: dict[str, Any]) -> list[Problem]:
-    found = list(_missing(root, info))
-    if found:
-        return found
-    found = list(_unreadable(root))
-    if found:
+    if found := list(_missing(root, info)) or list(_unreadable(root)):
         return found
     episodes = episodes_of(root)
-    found = list(_missing_parts(root, info, episodes))
-    if found:
+    if found := list(_missing_parts(root, info, episodes)):
         return found
     found = [
         *_counts(root, info, episodes),
@@ -275,9 +270,10 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Prob
     where_is: dict[int, set[str]] = {}
     counted: dict[int, int] = {}
     num_tasks = len(tasks_of(root))
+    in_tables = [k for k, f in info["features"].items() if f.get("dtype") != "video"]
     for path in sorted(root.glob(DATA_GLOB)):
         name = _name(root, path)
-        absent = [c for c in _columns(info) if c not in pq.read_schema(path).names]
+        absent = [c for c in in_tables if c not in pq.read_schema(path).names]
         if absent:
             yield Problem(check="missing_column", where=name, detail=f"lacks {', '.join(absent)}")
             return
@@ -309,10 +305,6 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Prob
                 check="index", where=f"episode {k}",
                 detail=f"is noted in {name} and lies in {', '.join(sorted(where_is[k]))}",
             )  # fmt: skip
-
-
-def _columns(info: dict[str, Any]) -> list[str]:
-    return [k for k, f in info["features"].items() if f.get("dtype") != "video"]
 
 
 def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from v2p_data.episodes.dataset.about import about_problems, changed_files, demand_about
 from v2p_data.episodes.dataset.features import INTERVENTION_KEY
-from v2p_data.episodes.dataset.frame_checks import DatasetChecks
+from v2p_data.episodes.dataset.frame_checks import DatasetChecks, EpisodeCheck
 from v2p_data.episodes.dataset.intake import demand_bounded
 from v2p_data.episodes.dataset.reading import Rows, same
 from v2p_data.episodes.dataset.tables import (
@@ -150,7 +150,7 @@ def _changed(root: Path) -> list[Problem]:
 def _check_episode(
     checks: DatasetChecks, rows: Rows, k: int, start: int, length: int, recorded: Episode | None
 ) -> None:
-    episode = checks.episode(k, start, length, recorded)
+    episode = EpisodeCheck(checks, k, start, length, recorded)
     try:
         for row in rows.episode(start, length):
             episode.look_at(row)

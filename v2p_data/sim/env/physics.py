@@ -20,7 +20,6 @@ from v2p_data.geometry.rotation import (
     rotvec_from_down,
     tilt_limited,
 )
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.model.world import World
 from v2p_data.sim.robot.arms import RobotConfig
@@ -48,7 +47,7 @@ class SimConfig:
     """Place objects as the environment does, whatever the task's own reset says."""
     robot: RobotConfig = field(default_factory=RobotConfig)
     """Without a path, the task's own, which is the built-in arm unless the task says otherwise."""
-    randomization: RandomizationConfig = field(default_factory=ranges.training)
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     position_step_m: float = 0.03
     """Target displacement at action 1, per control step."""
     rotation_step_rad: float = 0.2

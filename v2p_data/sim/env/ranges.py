@@ -1,4 +1,4 @@
-"""How much is drawn anew from episode to episode: the ranges, and the three sets of them that the engine uses."""
+"""How much is drawn anew from episode to episode: the ranges, and those without any chance."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,10 @@ from v2p_data.sim.model.world import CAMERA_FOVY_DEG
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfig:
-    """Ranges of what is drawn at each reset. Pairs are (lowest, highest) factors or values."""
+    """Ranges of what is drawn at each reset. Pairs are (lowest, highest) factors or values.
+
+    By default experts train under what is recorded (the paper's list), so that they are at home there.
+    """
 
     size_scale: tuple[float, float] = (0.9, 1.1)
     """Per axis, independently; one factor for both axes of round things, one for all of a mesh."""
@@ -58,16 +61,6 @@ class RandomizationConfig:
                 f"camera_pos_m, camera_angle_rad and camera_fovy_deg must be 0 or more, the last below "
                 f"{CAMERA_FOVY_DEG}, got {moved}"
             )
-
-
-def training() -> RandomizationConfig:
-    """Return what experts train under: the same as is recorded, so that they are at home there."""
-    return RandomizationConfig()
-
-
-def recording() -> RandomizationConfig:
-    """Return what episodes are recorded under (the paper's list)."""
-    return RandomizationConfig()
 
 
 def none() -> RandomizationConfig:

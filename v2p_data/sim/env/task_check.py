@@ -43,7 +43,8 @@ def check_task(
     )
     where = f"success of task '{bundle.title}' ({bundle.kind})"
     at_start = _share(env.task, env.task_states)
-    searched, count = _searched(env, bundle, seed)
+    states = _search_states(bundle, seed)
+    searched, count = _share(env.task, lambda: states), len(states["eef_pos"])
     if at_start == 1 and searched == 1:
         raise ItemRejectedError(
             "success_always_true",
@@ -100,12 +101,6 @@ def check_reward(bundle: TaskBundle, *, seed: int = 0, task: type[Task] | None =
             f"the reward of task '{bundle.title}' ({bundle.kind}) {fault.words}",
             fault.value,
         )
-
-
-def _searched(env: BatchEnv, bundle: TaskBundle, seed: int) -> tuple[float, int]:
-    """Return the share of the audit's states in which success is true, and their number."""
-    states = _search_states(bundle, seed)
-    return _share(env.task, lambda: states), len(states["eef_pos"])
 
 
 def _search_states(bundle: TaskBundle, seed: int) -> dict[str, torch.Tensor]:

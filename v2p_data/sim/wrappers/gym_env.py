@@ -24,9 +24,9 @@ from gymnasium.utils.seeding import np_random
 from jaxtyping import Float, Float32, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.sim.env import ranges
 from v2p_data.sim.env.actions import bounds_of, state_as_seen, steps_to
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
+from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.model.world import World
 from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS, MaskRenderer, labels_to_rgb
@@ -116,7 +116,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         self._max_episode_steps = bundle.policy_steps(horizon_scale)
         self._num_steps = 0
         randomization = replace(
-            ranges.recording(),
+            RandomizationConfig(),
             camera_pos_m=camera_pos_m,
             camera_angle_rad=camera_angle_rad,
             camera_fovy_deg=camera_fovy_deg,
