@@ -143,9 +143,9 @@ def compare(cfg: BenchConfig) -> None:
         staged = staged_episodes(place / "ours")
         pack(staged, "bench/ours", place / "dataset", num_threads=cfg.threads)
         ours_s = time.perf_counter() - started
-        frames = collected.num_frames
+        frames = collected["frames"]
         print(
-            f"{len(staged)} episodes of {collected.num_rollouts}, {frames} frames, {cfg.size_px} x {cfg.size_px}"
+            f"{len(staged)} episodes of {collected['rollouts']}, {frames} frames, {cfg.size_px} x {cfg.size_px}"
         )
         print(
             f"ours: collect {1e3 * staged_s / frames:.2f} ms a frame, pack {1e3 * (ours_s - staged_s) / frames:.2f}"

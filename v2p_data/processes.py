@@ -16,6 +16,13 @@ _PR_SET_PDEATHSIG = 1
 """Number in linux/prctl.h."""
 
 
+def num_cores() -> int:
+    """Return how many cores this process may use."""
+    return (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+
+
 def own_python(module: str, function: str = "main") -> list[str]:
     """Return the command that runs a function of one of our modules in a Python that ignores the user's settings of Python.
 

@@ -464,7 +464,7 @@ def make_episodes(
 ) -> dict[str, Any]:
     """Stage successful episodes one by one; list the failed ones."""
     bundle = TaskBundle.load(inputs["task"])
-    collected = collect(
+    return collect(
         Lesson(bundle=bundle, expert=labeller_of(inputs["expert"])),
         cfg.config,
         out,
@@ -472,7 +472,6 @@ def make_episodes(
         num_threads=runtime.num_threads,
         on_progress=runtime.progress,
     )
-    return collected.counts()
 
 
 # --- episodes -> dataset -------------------------------------------------------------------------------------

@@ -169,7 +169,7 @@ def test_collecting_again_changes_nothing(collected: Path):
     again = collect_toys(collected, SMALL)
 
     assert contents(collected) == before
-    assert again.counts()["episodes"] == SMALL.num_episodes
+    assert again["episodes"] == SMALL.num_episodes
 
 
 def test_the_number_of_threads_changes_nothing(collected: Path, tmp_path: Path):

@@ -76,22 +76,23 @@ def run_folder(tmp_path: Path) -> Path:
 
 
 def test_the_repository_holds_all_that_lerobot_asks_for(run_folder: Path, tmp_path: Path):
-    made = write_envhub(run_folder, "user/tasks", tmp_path / "hub")
+    made = tmp_path / "hub"
+    write_envhub(run_folder, "user/tasks", made)
 
-    assert made.tasks == ("first", "second")
-    names = {p.name for p in made.folder.iterdir()}
+    assert sorted(p.name for p in (made / "tasks").iterdir()) == ["first", "second"]
+    names = {p.name for p in made.iterdir()}
     assert names == {"README.md", "env.py", "mjcf", "requirements.txt", "tasks", "v2p_data"}
     (function,) = [
-        node for node in ast.parse((made.folder / "env.py").read_text()).body
+        node for node in ast.parse((made / "env.py").read_text()).body
         if isinstance(node, ast.FunctionDef) and node.name == "make_env"
     ]  # fmt: skip
     assert [a.arg for a in function.args.args] == ["n_envs", "use_async_envs", "cfg"]
-    model = mujoco.MjModel.from_xml_path(str(made.folder / "mjcf/second.xml"))
+    model = mujoco.MjModel.from_xml_path(str(made / "mjcf/second.xml"))
     assert model.body("cube").id > 0
-    required = (made.folder / "requirements.txt").read_text().splitlines()
+    required = (made / "requirements.txt").read_text().splitlines()
     assert {re.match(r"\w+", line)[0] for line in required} >= {"lerobot", "mujoco", "torch"}
     assert f"mujoco=={mujoco.__version__}" in required
-    assert not [p for p in made.folder.rglob("*") if p.name == "__pycache__"]
+    assert not [p for p in made.rglob("*") if p.name == "__pycache__"]
 
 
 def test_what_does_not_belong_to_a_task_stays_and_a_link_to_outside_is_refused(
@@ -101,12 +102,10 @@ def test_what_does_not_belong_to_a_task_stays_and_a_link_to_outside_is_refused(
     (task / "notes.txt").symlink_to("/etc/passwd")
     (task / "scene/secret.obj").write_text("secret")
 
-    made = write_envhub(run_folder, "user/tasks", tmp_path / "hub")
+    made = tmp_path / "hub"
+    write_envhub(run_folder, "user/tasks", made)
 
-    files = {
-        str(p.relative_to(made.folder / "tasks/first"))
-        for p in made.folder.glob("tasks/first/**/*")
-    }
+    files = {str(p.relative_to(made / "tasks/first")) for p in made.glob("tasks/first/**/*")}
     assert files == {"task.json", "task.py", "scene", "scene/scene.json"}
     (task / "task.py").unlink()
     (task / "task.py").symlink_to("/etc/passwd")
@@ -129,8 +128,9 @@ def test_lerobot_loads_a_pushed_environment_by_its_name_as_our_page_says(
 ):
     monkeypatch.setenv("HF_ENDPOINT", hub.url)
     monkeypatch.setenv("HF_TOKEN", TOKEN)
-    made = write_envhub(run_folder, "user/tasks", tmp_path / "hub")
-    push_envhub(made.folder, "user/tasks", tag="v1.0")
+    made = tmp_path / "hub"
+    write_envhub(run_folder, "user/tasks", made)
+    push_envhub(made, "user/tasks", tag="v1.0")
     cache = tmp_path / "hf"
     env = os.environ | {"HF_HOME": str(cache), "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
     env.pop("HF_HUB_OFFLINE", None)

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from v2p_data.episodes.collect import Collected, EpisodesConfig, collect
+from v2p_data.episodes.collect import EpisodesConfig, collect
 from v2p_data.episodes.rollouts import Lesson, Referee
 from v2p_data.geometry.camera import Camera
 from v2p_data.play import Actor, StateActor
@@ -60,5 +61,5 @@ def lesson(expert: Actor, referee: Referee | None = agree) -> Lesson:
     return Lesson(bundle=bundle(), expert=expert, task=PushTask, referee=referee)
 
 
-def collect_toys(out: Path, cfg: EpisodesConfig, num_threads: int = 1) -> Collected:
+def collect_toys(out: Path, cfg: EpisodesConfig, num_threads: int = 1) -> dict[str, Any]:
     return collect(lesson(StateActor(act)), cfg, out, 11, num_threads=num_threads)

@@ -110,8 +110,9 @@ def _pushed(args: Push) -> tuple["Pushed", str]:
         from v2p_data.episodes.hub.envhub import write_envhub
 
         with tempfile.TemporaryDirectory() as folder:
-            made = write_envhub(args.path, args.repo_id, Path(folder) / "envhub")
-            pushed = push_envhub(made.folder, args.repo_id, private=args.private, tag=args.tag)
+            made = Path(folder) / "envhub"
+            write_envhub(args.path, args.repo_id, made)
+            pushed = push_envhub(made, args.repo_id, private=args.private, tag=args.tag)
         return pushed, f"make_env('{args.repo_id}', trust_remote_code=True)"
     if (args.path / "meta" / "info.json").is_file():
         demand_whole_part(args.path.resolve())

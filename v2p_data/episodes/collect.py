@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,30 +42,6 @@ FAILED_FOLDER = "failed"
 Progress = Callable[[float, str], None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Collected:
-    """What lies in an episodes folder."""
-
-    paths: tuple[Path, ...]
-    num_frames: int
-    num_rollouts: int
-    num_successes: int
-    num_task_successes: int
-    rejected: dict[str, int]
-    """How many episodes were rejected, by reason."""
-
-    def counts(self) -> dict[str, Any]:
-        """Return it for the record."""
-        return {
-            "episodes": len(self.paths),
-            "frames": self.num_frames,
-            "rollouts": self.num_rollouts,
-            "success": round(self.num_successes / self.num_rollouts, 4),
-            "task_success": round(self.num_task_successes / self.num_rollouts, 4),
-            "rejected": self.rejected,
-        }
-
-
 def collect(
     lesson: Lesson,
     cfg: EpisodesConfig,
@@ -75,8 +50,8 @@ def collect(
     *,
     num_threads: int = 1,
     on_progress: Progress = lambda share, words: None,
-) -> Collected:
-    """Stage `cfg.num_episodes` successful episodes under `out`; go on where an earlier call was stopped.
+) -> dict[str, Any]:
+    """Stage `cfg.num_episodes` successful episodes under `out` and count them; go on where an earlier call was stopped.
 
     Args:
         lesson: the task and its deterministic expert.
@@ -101,7 +76,7 @@ def _collect(
     seed: int,
     num_threads: int,
     on_progress: Progress,
-) -> Collected:
+) -> dict[str, Any]:
     folders = [out / name for name in (EPISODES_FOLDER, LEDGER_FOLDER, FAILED_FOLDER)]
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)
@@ -224,27 +199,28 @@ def _keep_aside(
 
 def _finish(
     bundle: TaskBundle, cfg: EpisodesConfig, out: Path, batches: list[dict[str, Any]]
-) -> Collected:
+) -> dict[str, Any]:
     rejected = [row for b in batches for row in b["rejected"]]
     write_rejects(out, rejected)
-    paths = tuple(staged_episodes(out))
-    collected = Collected(
-        paths=paths,
-        num_frames=sum(b["frames"] for b in batches),
-        num_rollouts=sum(b["rollouts"] for b in batches),
-        num_successes=sum(b["successes"] for b in batches),
-        num_task_successes=sum(b["task_successes"] for b in batches),
-        rejected=dict(Counter(row["reason"] for row in rejected).most_common()),
-    )
-    if len(paths) < cfg.min_episodes:
-        reasons = ", ".join(f"{n} {reason}" for reason, n in collected.rejected.items())
+    num_episodes = len(staged_episodes(out))
+    num_rollouts = sum(b["rollouts"] for b in batches)
+    by_reason = dict(Counter(row["reason"] for row in rejected).most_common())
+    if num_episodes < cfg.min_episodes:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in by_reason.items())
         raise ItemRejectedError(
             "too_few_episodes",
-            f"'{bundle.title}': {len(paths)} of {collected.num_rollouts} episodes succeeded ({reasons}), "
+            f"'{bundle.title}': {num_episodes} of {num_rollouts} episodes succeeded ({reasons}), "
             f"fewer than {cfg.min_episodes}",
-            float(len(paths)),
+            float(num_episodes),
         )
-    if len(paths) < cfg.num_episodes:
+    if num_episodes < cfg.num_episodes:
         logger.warning("%s: only %d of %d episodes after %d batches",
-                       bundle.title, len(paths), cfg.num_episodes, len(batches))  # fmt: skip
-    return collected
+                       bundle.title, num_episodes, cfg.num_episodes, len(batches))  # fmt: skip
+    return {
+        "episodes": num_episodes,
+        "frames": sum(b["frames"] for b in batches),
+        "rollouts": num_rollouts,
+        "success": round(sum(b["successes"] for b in batches) / num_rollouts, 4),
+        "task_success": round(sum(b["task_successes"] for b in batches) / num_rollouts, 4),
+        "rejected": by_reason,
+    }

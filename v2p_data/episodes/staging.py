@@ -139,25 +139,18 @@ class Episode:
         Raises:
             V2PError: the file is damaged or was written by another version.
         """
-        try:
-            with np.load(path) as data:
-                about = _about(data, path)
-                names = ARRAYS if pictures else ARRAYS[1:]
-                arrays: dict[str, Any] = {k: data[k] for k in names}
-                arrays["simulated"] = {column: data[KNOWN + column] for column in _known(data)}
-                if INTERVENTION in data:
-                    arrays[INTERVENTION] = data[INTERVENTION]
-                if not pictures:
-                    arrays["labels"] = np.zeros((len(arrays["state"]), 0, 0), np.uint8)
-                    about["cameras"] = ()
-                elif "rgb_mp4" in data:
-                    arrays["rgb_mp4"] = data["rgb_mp4"].tobytes()
-        except FileNotFoundError:
-            raise V2PError(f"there is no staged episode {path}") from None
-        except V2PError:
-            raise
-        except Exception as error:
-            raise _unreadable(path, error) from error
+        with _damage_named(path), np.load(path) as data:
+            about = _about(data, path)
+            names = ARRAYS if pictures else ARRAYS[1:]
+            arrays: dict[str, Any] = {k: data[k] for k in names}
+            arrays["simulated"] = {column: data[KNOWN + column] for column in _known(data)}
+            if INTERVENTION in data:
+                arrays[INTERVENTION] = data[INTERVENTION]
+            if not pictures:
+                arrays["labels"] = np.zeros((len(arrays["state"]), 0, 0), np.uint8)
+                about["cameras"] = ()
+            elif "rgb_mp4" in data:
+                arrays["rgb_mp4"] = data["rgb_mp4"].tobytes()
         return Episode(**about, **arrays)
 
 
@@ -191,7 +184,7 @@ class Heading:
         Raises:
             V2PError: the file is damaged or was written by another version.
         """
-        try:
+        with _damage_named(path):
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             with np.load(path) as data:
                 about = _about(data, path)
@@ -200,12 +193,6 @@ class Heading:
             with zipfile.ZipFile(path) as archive:
                 count, height, width = _shape(archive, "labels")
                 _, num_states = _shape(archive, "state")
-        except FileNotFoundError:
-            raise V2PError(f"there is no staged episode {path}") from None
-        except V2PError:
-            raise
-        except Exception as error:
-            raise _unreadable(path, error) from error
         return Heading(
             path=path,
             id=about["id"],
@@ -281,11 +268,20 @@ def _known(data: Any) -> tuple[str, ...]:
     return tuple(name.removeprefix(KNOWN) for name in data if name.startswith(KNOWN))
 
 
-def _unreadable(path: Path, error: Exception) -> V2PError:
-    return V2PError(
-        f"staged episode {path} cannot be read ({type(error).__name__}: {error}); "
-        "delete it and run the same command again"
-    )
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Turn what a missing or damaged file does to its reader into one sentence."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise V2PError(f"there is no staged episode {path}") from None
+    except V2PError:
+        raise
+    except Exception as error:
+        raise V2PError(
+            f"staged episode {path} cannot be read ({type(error).__name__}: {error}); "
+            "delete it and run the same command again"
+        ) from error
 
 
 def staged_episodes(folder: Path) -> list[Path]:

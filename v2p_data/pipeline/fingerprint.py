@@ -5,14 +5,11 @@ would give two names to one recipe (memory addresses) or one name to two.
 """
 
 import dataclasses
-import enum
 import hashlib
 import json
 import math
 from pathlib import Path, PurePath
 from typing import Any, cast
-
-import numpy as np
 
 FINGERPRINT_LENGTH = 8
 UNSAID_BY_DEFAULT = {"unsaid by default": True}
@@ -31,14 +28,8 @@ def canonical(value: Any) -> Any:
         if not math.isfinite(value):
             raise TypeError(f"{value} in a recipe cannot be compared; use None or a finite number")
         return value
-    if isinstance(value, enum.Enum):
-        return canonical(value.value)
     if isinstance(value, PurePath):
         return value.as_posix()
-    if isinstance(value, np.generic):
-        return canonical(value.item())
-    if isinstance(value, np.ndarray):
-        return canonical(cast(list[Any], value.tolist()))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         said = {
             f.name: getattr(value, f.name)
@@ -51,8 +42,6 @@ def canonical(value: Any) -> Any:
         if not all(isinstance(k, str) for k in items):
             raise TypeError("a recipe's dict needs string keys")
         return {k: canonical(items[k]) for k in sorted(items)}
-    if isinstance(value, set | frozenset):
-        return sorted((canonical(v) for v in cast(set[Any], value)), key=json.dumps)
     if isinstance(value, list | tuple):
         return [canonical(v) for v in cast(list[Any], value)]
     raise TypeError(

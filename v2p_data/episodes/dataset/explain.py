@@ -57,7 +57,9 @@ def explain(records: dict[str, Any]) -> list[str]:
     if "stage" in records:
         recipe = [f"  {name}: {_short(v)}" for name, v in leaves(records["recipe"])]
         return [*_tree(records), "recipe", *recipe]
-    lines = [f"{name}: {_short(v)}" for name, v in leaves(records) if _is_of_itself(name)]
+    elsewhere = ("provenance.items", "episodes.", "made in")
+    own = (pair for pair in leaves(records) if not pair[0].startswith(elsewhere))
+    lines = [f"{name}: {_short(v)}" for name, v in own]
     nodes = records.get("provenance", {}).get("items", {}) or {"": records.get("made in", {})}
     for item, node in nodes.items():
         lines += [f"{item}:" if item else "made in:", *_tree(node, depth=1)]
@@ -92,10 +94,6 @@ def _tree(node: dict[str, Any], depth: int = 0) -> Iterator[str]:
     yield f"{'  ' * depth}{node.get('stage', '?')} {node.get('folder', '?')}: {counts}"
     for source in (node.get("inputs") or {}).values():
         yield from _tree(source, depth + 1)
-
-
-def _is_of_itself(name: str) -> bool:
-    return not name.startswith(("provenance.items", "episodes.", "made in"))
 
 
 def _short(value: Any) -> str:

@@ -26,6 +26,7 @@ from v2p_data.episodes.staging import Episode, Heading
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import write_json_atomically
+from v2p_data.processes import num_cores
 from v2p_data.sim.render.masks import MASK_CAMERAS
 
 SHARD_FRAMES = 4096
@@ -89,7 +90,7 @@ def make_shards(
     missing = [s for s in shards if stats_of(s, folder) is None]
     total = sum(len(s.episodes) for s in shards)
     done = total - sum(len(s.episodes) for s in missing)
-    workers = num_threads or _cores()
+    workers = num_threads or num_cores()
     with ThreadPoolExecutor(workers) as pool:
         jobs = (e for s in missing for e in s.episodes)
         encoded = _in_order(pool, _encode, jobs, ahead=2 * workers)
@@ -184,12 +185,6 @@ def _encode(heading: Heading) -> _Encoded:
     except ValueError as error:
         raise V2PError(f"{heading.path} cannot be packed: {error}") from error
     return _Encoded(videos=videos, stats=stats)
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):  # Linux: those that this process may use
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _in_order(

@@ -7,7 +7,6 @@ model in MJCF of each, and this engine's source, so that nothing of ours must be
 import importlib.metadata
 import re
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
 from v2p_data.episodes.dataset.about import CARRIED_TASKS
@@ -35,16 +34,7 @@ PLACES = (Path(), CARRIED_TASKS, Path("task"))
 MAX_FILE_BYTES = 200_000_000
 
 
-@dataclass(frozen=True, kw_only=True)
-class EnvHub:
-    """A folder ready to be pushed."""
-
-    folder: Path
-    repo_id: str
-    tasks: tuple[str, ...]
-
-
-def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
+def write_envhub(source: Path, repo_id: str, out: Path) -> None:
     """Write the tasks of `source` as an EnvHub repository at `out`.
 
     Args:
@@ -95,7 +85,6 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> EnvHub:
     (partial / "requirements.txt").write_text("\n".join(requirements()) + "\n")
     (partial / "README.md").write_text(_card(repo_id, rows, states, names))
     partial.rename(out)
-    return EnvHub(folder=out, repo_id=repo_id, tasks=tuple(folders))
 
 
 def _copy_task(bundle: TaskBundle, into: Path) -> None:

@@ -10,7 +10,6 @@ Frames are shared out among threads, which run outside Python's lock.
 # pyright: reportAttributeAccessIssue=false
 # mujoco's classes come from a compiled module that declares none of them.
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from v2p_data.errors import V2PError
+from v2p_data.processes import num_cores
 from v2p_data.sim.render.polyhedra import Polyhedra, polyhedra
 from v2p_data.sim.render.raster import LABEL_BITS, paint
 
@@ -97,7 +97,7 @@ class ZBuffer:
                 f"{(1 << LABEL_BITS) - 1}"
             )
         self.height_px, self.width_px = height_px, width_px
-        self.num_threads = num_threads or _cores()
+        self.num_threads = num_threads or num_cores()
         self.geoms = np.flatnonzero(_visible(model))
         self.labels = labels[self.geoms].astype(np.int32)
         self.near_m = float(model.vis.map.znear * model.stat.extent)
@@ -197,9 +197,3 @@ def _visible(model: mujoco.MjModel) -> np.ndarray:
         if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
             shown[geom.objid] = True
     return shown
-
-
-def _cores() -> int:
-    return (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
