@@ -66,45 +66,37 @@ def collect(
         V2PError: the disk is full, or `out` cannot be written to; what was staged is kept.
     """
     with refusals_named("collecting episodes", out):
-        return _collect(lesson, cfg, out, seed, num_threads, on_progress)
-
-
-def _collect(
-    lesson: Lesson,
-    cfg: EpisodesConfig,
-    out: Path,
-    seed: int,
-    num_threads: int,
-    on_progress: Progress,
-) -> dict[str, Any]:
-    folders = [out / name for name in (EPISODES_FOLDER, LEDGER_FOLDER, FAILED_FOLDER)]
-    for folder in folders:
-        folder.mkdir(parents=True, exist_ok=True)
-        for leftover in folder.glob("*.tmp"):
-            leftover.unlink()
-    batches: list[dict[str, Any]] = []
-    for number in range(cfg.max_batches):
-        have = sum(len(b["episodes"]) for b in batches)
-        if have >= cfg.num_episodes:
-            break
-        ledger = out / LEDGER_FOLDER / f"{number:03d}.json"
-        if not ledger.is_file():
-            on_progress(
-                have / cfg.num_episodes, f"{have}/{cfg.num_episodes} episodes, batch {number + 1}"
-            )
-            rollouts = roll_out(
-                lesson,
-                SimConfig(fine=True, randomization=cfg.randomization),
-                num_worlds=cfg.batch_worlds,
-                seed=seed_for(seed, "batch", number),
-                num_threads=num_threads,
-                cut=cfg.cut,
-                interface=cfg.interface,
-            )
-            artist = Artist(lesson.bundle, cfg, num_threads)
-            write_json_atomically(ledger, _stage(artist, rollouts, out, number, have, on_progress))
-        batches.append(read_object(ledger, "delete it; its batch is made again"))
-    return _finish(lesson.bundle, cfg, out, batches)
+        folders = [out / name for name in (EPISODES_FOLDER, LEDGER_FOLDER, FAILED_FOLDER)]
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            for leftover in folder.glob("*.tmp"):
+                leftover.unlink()
+        batches: list[dict[str, Any]] = []
+        for number in range(cfg.max_batches):
+            have = sum(len(b["episodes"]) for b in batches)
+            if have >= cfg.num_episodes:
+                break
+            ledger = out / LEDGER_FOLDER / f"{number:03d}.json"
+            if not ledger.is_file():
+                on_progress(
+                    have / cfg.num_episodes,
+                    f"{have}/{cfg.num_episodes} episodes, batch {number + 1}",
+                )
+                rollouts = roll_out(
+                    lesson,
+                    SimConfig(fine=True, randomization=cfg.randomization),
+                    num_worlds=cfg.batch_worlds,
+                    seed=seed_for(seed, "batch", number),
+                    num_threads=num_threads,
+                    cut=cfg.cut,
+                    interface=cfg.interface,
+                )
+                artist = Artist(lesson.bundle, cfg, num_threads)
+                write_json_atomically(
+                    ledger, _stage(artist, rollouts, out, number, have, on_progress)
+                )
+            batches.append(read_object(ledger, "delete it; its batch is made again"))
+        return _finish(lesson.bundle, cfg, out, batches)
 
 
 def judge_expert(

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.at_work import (
@@ -33,6 +33,7 @@ from v2p_data.pipeline.at_work import (
     write_to,
 )
 from v2p_data.pipeline.leases import Shared
+from v2p_data.pipeline.ray_engine import RayEngine
 from v2p_data.pipeline.runner import (
     Outcome,
     Runtime,
@@ -67,137 +68,6 @@ def only_run_in(root: Path) -> Generator[None]:
         (root / RUN_NAME_FILE).write_text(uuid.uuid4().hex)
         wait_for_workers(root, WORKERS_END_S)
         yield
-
-
-@runtime_checkable
-class Engine(Protocol):
-    """What makes stages: worker processes of this machine, or a cluster."""
-
-    @property
-    def is_busy(self) -> bool: ...
-    @property
-    def has_room(self) -> bool: ...
-    def start(self, stage: Stage) -> None: ...
-    def events(self) -> Iterator[Event]: ...
-    def close(self) -> None: ...
-
-
-def run_stages(
-    stages: Sequence[Stage],
-    runtime: Runtime,
-    on_event: Callable[[Event], None],
-    engine: Engine | None = None,
-) -> dict[Key, Outcome]:
-    """Make every stage and what it needs; return the outcome per (stage name, folder name).
-
-    With a store, what others made is taken and what they are making is waited for, while all else goes on.
-    `engine` is used and left open; without one the runtime's is started where there is something to make.
-    """
-    ordered = list(in_order(stages))
-    with Shared(runtime) as shared:
-        outcomes = _run_stages(ordered, runtime, on_event, shared, engine)
-        shared.fetch_all(ordered, outcomes)
-    return outcomes
-
-
-class _Schedule:
-    """What has ended, what is ready to run, and what still waits for what."""
-
-    def __init__(self, root: Path, on_event: Callable[[Event], None]) -> None:
-        self.outcomes: dict[Key, Outcome] = {}
-        self.ready: list[tuple[int, Stage]] = []
-        """A heap by place: the first item is finished first."""
-        self.num_missing: dict[Key, int] = {}
-        self._needed_by: dict[Key, list[tuple[int, Stage]]] = defaultdict(list)
-        self._root, self._on_event = root, on_event
-
-    def add(self, place: int, stage: Stage, stored: Outcome | None) -> None:
-        """Take in a stage after all that it needs; it has ended already if an outcome is stored."""
-        if stored is None and (blocker := blocked_by(stage, self.outcomes)) is not None:
-            stored = _blocked(stage, blocker, self._root)
-        if stored is not None:
-            self.ended(stage, stored)
-            return
-        missing = {_key(needed) for needed in stage.inputs.values()} - self.outcomes.keys()
-        self.num_missing[_key(stage)] = len(missing)
-        for key in missing:
-            self._needed_by[key].append((place, stage))
-        if not missing:
-            self.ready.append((place, stage))
-
-    def ended(self, stage: Stage, outcome: Outcome) -> None:
-        """Note an outcome; what waited for it is ready or blocked."""
-        key = _key(stage)
-        self.outcomes[key] = outcome
-        self._on_event(Event(kind="ended", stage=stage, outcome=outcome))
-        for place, other in self._needed_by.pop(key, ()):
-            self.num_missing[_key(other)] -= 1
-            if not outcome.is_usable and _key(other) not in self.outcomes:
-                self.ended(other, _blocked(other, outcome, self._root))
-            elif self.num_missing[_key(other)] == 0 and _key(other) not in self.outcomes:
-                heapq.heappush(self.ready, (place, other))
-
-
-def _run_stages(
-    ordered: Sequence[Stage],
-    runtime: Runtime,
-    on_event: Callable[[Event], None],
-    shared: Shared,
-    lent: Engine | None,
-) -> dict[Key, Outcome]:
-    plan = _Schedule(runtime.root, on_event)
-    for place, stage in enumerate(ordered):
-        plan.add(place, stage, shared.stored(stage))
-    if not plan.ready:
-        return plan.outcomes
-    engine = lent or _engine(runtime, num_pending=len(plan.num_missing))
-    try:
-        while plan.ready or engine.is_busy:
-            others: list[tuple[int, Stage]] = []  # at work on another driver
-            while plan.ready and engine.has_room:
-                place, stage = heapq.heappop(plan.ready)
-                claimed = shared.claim(stage)
-                if claimed is None:
-                    others.append((place, stage))
-                elif isinstance(claimed, Outcome):
-                    plan.ended(stage, claimed)
-                else:
-                    engine.start(stage)
-                    on_event(Event(kind="started", stage=stage))
-            for entry in others:
-                heapq.heappush(plan.ready, entry)
-            if not engine.is_busy:
-                time.sleep(0.2 if others else 0.0)
-                continue
-            for event in engine.events():
-                if event.outcome is None:
-                    on_event(event)
-                else:
-                    shared.ended(event.stage)
-                    plan.ended(event.stage, event.outcome)
-    finally:
-        if lent is None:
-            engine.close()
-    return plan.outcomes
-
-
-def _blocked(stage: Stage, blocker: Outcome, root: Path) -> Outcome:
-    return Outcome(
-        stage=stage.name, item=stage.item, status="blocked", folder=stage.folder(root),
-        reason=blocker.reason, detail=f"needs {blocker.stage} of {blocker.item}",
-    )  # fmt: skip
-
-
-def _engine(runtime: Runtime, num_pending: int) -> Engine:
-    if runtime.engine == "ray":
-        from v2p_data.pipeline.ray_engine import RayEngine
-
-        return RayEngine(runtime)
-    return Pool(runtime, size=min(max(1, runtime.workers), num_pending))
-
-
-def _key(stage: Stage) -> Key:
-    return (stage.name, stage.folder_name)
 
 
 @dataclass
@@ -284,6 +154,122 @@ class Pool:
             if worker.process.is_alive():
                 worker.process.kill()
                 worker.process.join(5)
+
+
+def run_stages(
+    stages: Sequence[Stage],
+    runtime: Runtime,
+    on_event: Callable[[Event], None],
+    engine: Pool | None = None,
+) -> dict[Key, Outcome]:
+    """Make every stage and what it needs; return the outcome per (stage name, folder name).
+
+    With a store, what others made is taken and what they are making is waited for, while all else goes on.
+    `engine` is used and left open; without one the runtime's is started where there is something to make.
+    """
+    ordered = list(in_order(stages))
+    with Shared(runtime) as shared:
+        outcomes = _run_stages(ordered, runtime, on_event, shared, engine)
+        shared.fetch_all(ordered, outcomes)
+    return outcomes
+
+
+class _Schedule:
+    """What has ended, what is ready to run, and what still waits for what."""
+
+    def __init__(self, root: Path, on_event: Callable[[Event], None]) -> None:
+        self.outcomes: dict[Key, Outcome] = {}
+        self.ready: list[tuple[int, Stage]] = []
+        """A heap by place: the first item is finished first."""
+        self.num_missing: dict[Key, int] = {}
+        self._needed_by: dict[Key, list[tuple[int, Stage]]] = defaultdict(list)
+        self._root, self._on_event = root, on_event
+
+    def add(self, place: int, stage: Stage, stored: Outcome | None) -> None:
+        """Take in a stage after all that it needs; it has ended already if an outcome is stored."""
+        if stored is None and (blocker := blocked_by(stage, self.outcomes)) is not None:
+            stored = _blocked(stage, blocker, self._root)
+        if stored is not None:
+            self.ended(stage, stored)
+            return
+        missing = {_key(needed) for needed in stage.inputs.values()} - self.outcomes.keys()
+        self.num_missing[_key(stage)] = len(missing)
+        for key in missing:
+            self._needed_by[key].append((place, stage))
+        if not missing:
+            self.ready.append((place, stage))
+
+    def ended(self, stage: Stage, outcome: Outcome) -> None:
+        """Note an outcome; what waited for it is ready or blocked."""
+        key = _key(stage)
+        self.outcomes[key] = outcome
+        self._on_event(Event(kind="ended", stage=stage, outcome=outcome))
+        for place, other in self._needed_by.pop(key, ()):
+            self.num_missing[_key(other)] -= 1
+            if not outcome.is_usable and _key(other) not in self.outcomes:
+                self.ended(other, _blocked(other, outcome, self._root))
+            elif self.num_missing[_key(other)] == 0 and _key(other) not in self.outcomes:
+                heapq.heappush(self.ready, (place, other))
+
+
+def _run_stages(
+    ordered: Sequence[Stage],
+    runtime: Runtime,
+    on_event: Callable[[Event], None],
+    shared: Shared,
+    lent: Pool | None,
+) -> dict[Key, Outcome]:
+    plan = _Schedule(runtime.root, on_event)
+    for place, stage in enumerate(ordered):
+        plan.add(place, stage, shared.stored(stage))
+    if not plan.ready:
+        return plan.outcomes
+    engine = lent or _engine(runtime, num_pending=len(plan.num_missing))
+    try:
+        while plan.ready or engine.is_busy:
+            others: list[tuple[int, Stage]] = []  # at work on another driver
+            while plan.ready and engine.has_room:
+                place, stage = heapq.heappop(plan.ready)
+                claimed = shared.claim(stage)
+                if claimed is None:
+                    others.append((place, stage))
+                elif isinstance(claimed, Outcome):
+                    plan.ended(stage, claimed)
+                else:
+                    engine.start(stage)
+                    on_event(Event(kind="started", stage=stage))
+            for entry in others:
+                heapq.heappush(plan.ready, entry)
+            if not engine.is_busy:
+                time.sleep(0.2 if others else 0.0)
+                continue
+            for event in engine.events():
+                if event.outcome is None:
+                    on_event(event)
+                else:
+                    shared.ended(event.stage)
+                    plan.ended(event.stage, event.outcome)
+    finally:
+        if lent is None:
+            engine.close()
+    return plan.outcomes
+
+
+def _blocked(stage: Stage, blocker: Outcome, root: Path) -> Outcome:
+    return Outcome(
+        stage=stage.name, item=stage.item, status="blocked", folder=stage.folder(root),
+        reason=blocker.reason, detail=f"needs {blocker.stage} of {blocker.item}",
+    )  # fmt: skip
+
+
+def _engine(runtime: Runtime, num_pending: int) -> Pool | RayEngine:
+    if runtime.engine == "ray":
+        return RayEngine(runtime)
+    return Pool(runtime, size=min(max(1, runtime.workers), num_pending))
+
+
+def _key(stage: Stage) -> Key:
+    return (stage.name, stage.folder_name)
 
 
 def _how_it_died(exitcode: int | None, runtime: Runtime, is_late: bool) -> str:

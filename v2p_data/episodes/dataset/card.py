@@ -4,7 +4,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from v2p_data.episodes.dataset.about import read_about
+from v2p_data.episodes.dataset.about import demand_about
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
     ACTION_NAMES,
@@ -12,14 +12,12 @@ from v2p_data.episodes.dataset.features import (
     COLUMNS,
     HANDOVER,
     INTERVENTION_KEY,
-    METADATA_FILE,
     RGB_KEY,
     STATE_KEY,
     WRIST_KEY,
 )
-from v2p_data.episodes.dataset.sheet import SHEET_FILE, write_sheet
+from v2p_data.episodes.dataset.sheet import SHEET_FILE, write_sheet, write_whole
 from v2p_data.episodes.dataset.tables import damage_named, read_info
-from v2p_data.errors import V2PError
 from v2p_data.sim.robot.action_names import TOOL_NAMES, actions_named
 
 CARD_FILE = "README.md"
@@ -62,46 +60,15 @@ def write_card(root: Path, repo_id: str) -> Path:
     """Write `README.md` into a dataset that `writer.pack` made, and return it.
 
     Raises:
-        V2PError: the dataset was not made by this engine.
+        V2PError: the dataset was not made by this engine, or nothing can be written there.
     """
-    about, info = read_about(root), read_info(root)
-    if about is None:
-        raise V2PError(
-            f"{root} was not written by v2p ({METADATA_FILE} is missing); its card must be written by hand"
-        )
-    has_sheet = _drawn(root, info, about)
+    about, info = demand_about(root), read_info(root)
+    has_sheet = (root / SHEET_FILE).is_file() or write_sheet(root, info, about)
     path = root / CARD_FILE
     with damage_named(root):
         card = dataset_card(about, info, repo_id, has_sheet=has_sheet)
-    write_text(path, card)
+    write_whole(path, card.encode())
     return path
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write it beside its place and rename it, so that an older one stays where this fails.
-
-    Raises:
-        V2PError: the folder cannot be written to.
-    """
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        temporary.write_text(text)
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise V2PError(
-            f"cannot write {path} ({error.strerror}); make room or make the folder writable, and run the same "
-            "command again"
-        ) from error
-
-
-def _drawn(root: Path, info: dict[str, Any], about: dict[str, Any]) -> bool:
-    try:
-        return (root / SHEET_FILE).is_file() or write_sheet(root, info, about)
-    except OSError as error:
-        raise V2PError(
-            f"cannot write {root / SHEET_FILE} ({error.strerror}); make room or make the folder writable"
-        ) from error
 
 
 def dataset_card(

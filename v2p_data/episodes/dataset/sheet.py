@@ -1,5 +1,6 @@
 """A picture of what a dataset shows: a row of moments for each task, masks in colours that eyes can tell apart."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from jaxtyping import UInt8
 
 from v2p_data.episodes.dataset.features import MASK_KEY
 from v2p_data.episodes.dataset.tables import camera_keys, episodes_of, video_path
+from v2p_data.errors import V2PError
 from v2p_data.sim.render.masks import rgb_to_labels
 
 SHEET_FILE = "media/episodes.png"
@@ -29,7 +31,7 @@ def write_sheet(root: Path, info: dict[str, Any], about: dict[str, Any]) -> bool
         False where there is nothing to draw: no video, or none that can be decoded here.
 
     Raises:
-        OSError: it cannot be written.
+        V2PError: it cannot be written.
     """
     cameras = camera_keys(info, "video")
     if not cameras:
@@ -44,13 +46,29 @@ def write_sheet(root: Path, info: dict[str, Any], about: dict[str, Any]) -> bool
         rows.append(_row(task, shown))
     if not rows:
         return False
-    path = root / SHEET_FILE
-    path.parent.mkdir(exist_ok=True)
     _, png = cv2.imencode(".png", np.concatenate(rows)[..., ::-1])
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(png.tobytes())
-    temporary.replace(path)
+    write_whole(root / SHEET_FILE, png.tobytes())
     return True
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write it beside its place and rename it, so that an older one stays where this fails.
+
+    Raises:
+        V2PError: the folder cannot be written to.
+    """
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        temporary.write_bytes(content)
+        temporary.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink()
+        raise V2PError(
+            f"cannot write {path} ({error.strerror}); make room or make the folder writable, and run the same "
+            "command again"
+        ) from error
 
 
 def _one_of_each(episodes: list[dict[str, Any]]) -> list[tuple[int, str]]:

@@ -197,7 +197,7 @@ def fetch_model(
     """
     check_repo_id(repo_id)
     endpoint = _endpoint()
-    token = _token()
+    token = next((t for name in TOKEN_VARIABLES if (t := os.environ.get(name, "").strip())), "")
 
     def fetch() -> Path:
         try:
@@ -237,11 +237,6 @@ def push_envhub(
 
 def _push(upload: _Upload, repo_id: str, *, private: bool, waits_s: Sequence[float]) -> Pushed:
     token = _token()
-    if not token:
-        raise V2PError(
-            "pushing needs a token of the Hugging Face Hub with write access: set it as the environment variable "
-            "HF_TOKEN (make one at https://huggingface.co/settings/tokens)"
-        )
     _check_no_secret(upload.folder, token)
     endpoint = _endpoint()
 
@@ -335,8 +330,14 @@ def _patiently[T](send: Callable[[], T], waits_s: Sequence[float]) -> T:
 
 
 def _token() -> str:
-    """Return the token of the environment; empty: there is none."""
-    return next((t for name in TOKEN_VARIABLES if (t := os.environ.get(name, "").strip())), "")
+    for name in TOKEN_VARIABLES:
+        token = os.environ.get(name, "").strip()
+        if token:
+            return token
+    raise V2PError(
+        "pushing needs a token of the Hugging Face Hub with write access: set it as the environment variable "
+        "HF_TOKEN (make one at https://huggingface.co/settings/tokens)"
+    )
 
 
 def _check_no_secret(folder: Path, token: str) -> None:

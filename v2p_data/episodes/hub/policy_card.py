@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from v2p_data.episodes.dataset.card import CARD_FILE, LICENSE, write_text
+from v2p_data.episodes.dataset.card import CARD_FILE, LICENSE
 from v2p_data.episodes.dataset.features import STATE_NAMES, actions_named
+from v2p_data.episodes.dataset.sheet import write_whole
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
 
@@ -95,7 +96,7 @@ def write_policy_card(folder: Path) -> None:
         wrist=" --env.wrist=true" if any("mask_wrist" in name for name in features) else "",
         features="\n".join(f"| `{name}` | {shape} |" for name, shape in features.items()),
     )
-    write_text(folder / CARD_FILE, text)
+    write_whole(folder / CARD_FILE, text.encode())
 
 
 def name_policy(folder: Path, repo_id: str) -> None:
@@ -103,7 +104,7 @@ def name_policy(folder: Path, repo_id: str) -> None:
     path = folder / CARD_FILE
     card = path.read_text(errors="replace")
     if PLACEHOLDER in card:
-        write_text(path, card.replace(PLACEHOLDER, "").replace("POLICY", repo_id))
+        write_whole(path, card.replace(PLACEHOLDER, "").replace("POLICY", repo_id).encode())
 
 
 def note_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -126,7 +127,8 @@ def note_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             f"| {row['task']} | {'yes' if row['seen'] else 'no'} | {row['rate']:.0%} ({row['low']:.0%} to {row['high']:.0%}) |"
             f" {at_end} | {row['trials']} |"
         )
-    write_text(path, f"{before}{begin}\n" + "\n".join(lines) + f"\n{end}{after}")
+    results = "\n".join(lines)
+    write_whole(path, f"{before}{begin}\n{results}\n{end}{after}".encode())
 
 
 def _features(config: Mapping[str, Any]) -> dict[str, str]:
