@@ -670,8 +670,7 @@ def make_evaluation(
     seen: Sequence[str],
 ) -> dict[str, Any]:
     """Judge many episodes of each task; write rates with intervals, kinds of failure, films and contact sheets."""
-    from v2p_data.report.films import write_films
-    from v2p_data.report.sheet import SheetConfig, write_contact_sheet
+    from v2p_data.report.sheet import SheetConfig, write_contact_sheet, write_films
 
     del inputs
     for place in (who.folder, *tasks.values()):

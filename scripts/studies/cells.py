@@ -353,7 +353,7 @@ class Study:
         }
 
     def _judged(self, play: Play, arm: str, count: int, seed: int) -> Row:
-        from v2p_data.report.films import FilmConfig, write_films
+        from v2p_data.report.sheet import FilmConfig, write_films
 
         cfg = self.cfg.unseen
         rows: Row = {}

@@ -216,7 +216,9 @@ def robot_config(words: Sequence[str]) -> Any:
     told = io.StringIO()
     try:
         with contextlib.redirect_stderr(told):
-            return draccus.parse(_holder(RobotConfig), args=list(words)).robot
+            # LeRobot's parser takes no choice by itself.
+            holder = make_dataclass("Holder", [("robot", RobotConfig)])
+            return draccus.parse(holder, args=list(words)).robot
     except SystemExit as error:
         wrong = " ".join(told.getvalue().rpartition("error:")[2].split())
         raise V2PError(f"the robot's settings are wrong: {wrong}") from error
@@ -226,11 +228,6 @@ def robot_config(words: Sequence[str]) -> Any:
         raise V2PError(
             f"the robot's settings are wrong: {reason.strip().splitlines()[0]}"
         ) from error
-
-
-def _holder(kind: type) -> type:
-    """Return a config that has a robot: LeRobot's parser takes no choice by itself."""
-    return make_dataclass("Holder", [("robot", kind)])
 
 
 def loaded_policy(folder: Path, task: str, device: str) -> Any:

@@ -41,24 +41,22 @@ class Display:
             TextColumn("{task.fields[words]}"),
             console=Console(file=self.stream),
             transient=True,
+            disable=not self.is_terminal,
         )
 
     def __enter__(self) -> "Display":
-        if self.is_terminal:
-            self.progress.start()
+        self.progress.start()
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if self.is_terminal:
-            self.progress.stop()
+        self.progress.stop()
 
     def __call__(self, event: Event) -> None:
         name = f"{event.stage.name} {event.stage.item}"
         if event.kind == "started":
             self.started[name] = time.monotonic()
-            if self.is_terminal:
-                self.bars[name] = self.progress.add_task(name, total=1.0, words="")
-            else:
+            self.bars[name] = self.progress.add_task(name, total=1.0, words="")
+            if not self.is_terminal:
                 self.say(f"{name}: started")
         elif event.kind == "progress":
             self._moved(name, event)

@@ -29,7 +29,7 @@ TAIL_STEPS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """The first batch of episodes, to be drawn: what `report.sheet` and `report.films` take."""
+    """The first batch of episodes, to be drawn: what `report.sheet` takes."""
 
     successes: Bool[np.ndarray, "env"]
     num_frames: Int[np.ndarray, "env"]

@@ -7,9 +7,9 @@ from typing import Any
 
 from policies.evaluation.rate import Rate
 from v2p_data.json_files import json_or_none
-from v2p_data.report.films import FAILURE, SUCCESS
 from v2p_data.report.media import MediaBudget, Medium, PageConfig, film_uri, picture_uri
 from v2p_data.report.reading import Run, as_dict, number, rate_of
+from v2p_data.report.sheet import FAILURE, SUCCESS
 
 FILM_SUFFIXES = (".mp4", ".webm", ".mkv", ".avi", ".mov", ".gif")
 VIDEOS_FOLDER, SHEET_FILE = "videos", "sheet.png"

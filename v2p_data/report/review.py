@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -374,7 +375,8 @@ class Review:
             with self._lock:
                 clip.state = "finding objects"
                 if video.hints and not clip.outlines and mark == clip.marks:
-                    clip.outlines = _outlines_or_none(hinted)
+                    with suppress(ItemRejectedError):  # the rebuilding says so
+                        clip.outlines = outlines_of(hinted)
             return hinted
 
         result, trouble = clip.result, ""
@@ -439,13 +441,6 @@ def _with_hints(prepared: Future[PreparedClip], video: VideoItem) -> PreparedCli
         return clip.with_hints(video.hints)
     except V2PError as error:
         raise ItemRejectedError("bad_hint", str(error)) from error
-
-
-def _outlines_or_none(prepared: PreparedClip) -> dict[str, Polygons]:
-    try:
-        return outlines_of(prepared)
-    except ItemRejectedError:
-        return {}  # the rebuilding says so
 
 
 def _result(outcome: Outcome) -> Result:

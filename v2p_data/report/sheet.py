@@ -1,4 +1,4 @@
-"""Contact sheets: episodes as rows, moments as columns, so that one look tells what an expert does."""
+"""Judged episodes as pictures: contact sheets, a row per episode and a column per moment, and films."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from v2p_data.errors import V2PError
+from v2p_data.report.media import write_film
 from v2p_data.sim.model.world import World
 from v2p_data.sim.render.masks import MaskRenderer, Moment, labels_to_rgb
 from v2p_data.task.task import TaskBundle
 
 GROUND, INK, GOOD, BAD = (250, 249, 246), (40, 44, 50), (26, 112, 66), (176, 50, 42)
+SUCCESS, FAILURE = "success", "failure"
 _TEXT_SCALE, _TEXT_WIDTH = 0.42, 1
 
 
@@ -32,6 +34,15 @@ class SheetConfig:
     label_px: int = 112
     """Width of the words at the left."""
     gap_px: int = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmConfig:
+    """Which episodes are filmed, and how."""
+
+    successes: int = 2
+    failures: int = 2
+    size_px: int = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +108,23 @@ def write_contact_sheet(
     if not done:
         raise RuntimeError("OpenCV could not encode the contact sheet")
     path.write_bytes(data.tobytes())
+
+
+def write_films(
+    source: TaskBundle | World, judged: Judged, folder: Path, cfg: FilmConfig | None = None
+) -> None:
+    """Write `success_0007.mp4` and the like, numbered by the episode."""
+    cfg = cfg or FilmConfig()
+    chosen = [(SUCCESS, k) for k in np.flatnonzero(judged.successes)[: cfg.successes]]
+    chosen += [(FAILURE, k) for k in np.flatnonzero(~judged.successes)[: cfg.failures]]
+    folder.mkdir(parents=True, exist_ok=True)
+    with MaskRenderer(source, cfg.size_px) as renderer:
+        for name, world in chosen:
+            snapshots = judged.snapshots[: int(judged.num_frames[world])]
+            seconds = judged.snapshot_seconds
+            fps = 1.0 / (seconds[1] - seconds[0]) if len(seconds) > 1 else 1.0
+            path = folder / f"{name}_{world:04d}.mp4"
+            write_film(path, draw_rollout(renderer, snapshots, int(world)), fps)
 
 
 def draw_rollout(

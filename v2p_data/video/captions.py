@@ -101,7 +101,10 @@ def read_footage(folder: Path) -> Footage:
             f"{folder} {'holds no videos' if folder.is_dir() else 'is no video'}{inside}; "
             f"known endings are {' '.join(VIDEO_SUFFIXES)}"
         )
-    written = _read_captions(home, [p.name for p in here])
+    written = {
+        name: checked_entry(entry, f"{path}, entry '{name}'")
+        for name, (entry, path) in _written(home, [p.name for p in here]).items()
+    }
     files = [p for p in entries if p.suffix.lower() == ".json" and p.name != CAPTIONS_FILE]
     labels = read_labels([p for p in files if p.is_file()], [p.stem for p in here])
     labelled = {stem: (*said, {}) for stem, said in labels.said.items()}
@@ -241,13 +244,6 @@ def _item(item: str, path: Path, said: _Said) -> VideoItem:
             dict.fromkeys([*found, *(name for name in hints if name not in (TABLE, CROP))])
         )
     return VideoItem(item=item, path=path, caption=caption, objects=objects, hints=hints)
-
-
-def _read_captions(folder: Path, names: list[str]) -> dict[str, _Said]:
-    return {
-        name: checked_entry(entry, f"{path}, entry '{name}'")
-        for name, (entry, path) in _written(folder, names).items()
-    }
 
 
 def checked_entry(entry: Any, where: str) -> _Said:
