@@ -78,18 +78,17 @@ def guessed_scenes(run: Path) -> dict[str, tuple[Scene, Record]]:
     """
     if not (run / "scene").is_dir():
         raise V2PError(f"{run} holds no scenes; make some with 'v2p scene VIDEOS --out RUN'")
-    newest: dict[str, tuple[str, Path, Record]] = {}
+    made: list[tuple[str, Path, Record]] = []
     for folder, record in records_in(run, "scene"):
         if isinstance(record, str):
             print(f"left out: {record}", file=sys.stderr)  # noqa: T201
-            continue
-        if record.rejected or _given(record):
-            continue
-        when = str(record.provenance.get("time", ""))
-        if record.item not in newest or when >= newest[record.item][0]:
-            newest[record.item] = when, folder, record
+        elif not record.rejected and not _given(record):
+            made.append((str(record.provenance.get("time", "")), folder, record))
+    made.sort(key=lambda scene: scene[0])
+    newest = {record.item: (folder, record) for _, folder, record in made}
     scenes = {}
-    for item, (_, folder, record) in newest.items():
+    for item in sorted(newest):
+        folder, record = newest[item]
         try:
             scenes[item] = Scene.load(folder), record
         except V2PError as error:

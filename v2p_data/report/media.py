@@ -95,9 +95,14 @@ def jpeg_bytes(image: UInt8[np.ndarray, "h w 3"], max_width_px: int) -> bytes:
 
 def png_uri(image: UInt8[np.ndarray, "h w c"]) -> str:
     """Return an RGB or RGBA image as a PNG."""
+    return _uri("image/png", png_bytes(image))
+
+
+def png_bytes(image: UInt8[np.ndarray, "h w c"]) -> bytes:
+    """Return an RGB or RGBA image as a PNG file."""
     order = [2, 1, 0, 3][: image.shape[2]]
     _, data = cv2.imencode(".png", np.ascontiguousarray(image[..., order]))
-    return _uri("image/png", data.tobytes())
+    return data.tobytes()
 
 
 def film_uri(path: Path, max_width_px: int, max_frames: int) -> str | None:
@@ -194,7 +199,8 @@ def draw_mesh(
 
 def _frame_rate(path: Path) -> float:
     with av.open(str(path)) as container:
-        return float(container.streams.video[0].average_rate or 20)
+        rate = container.streams.video[0].average_rate
+    return float(rate or 20)
 
 
 def _decoded(path: Path) -> Iterator[av.VideoFrame]:

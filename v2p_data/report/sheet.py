@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.report.media import write_film
+from v2p_data.report.media import png_bytes, write_film
 from v2p_data.sim.model.world import World
 from v2p_data.sim.render.masks import MaskRenderer, Moment, labels_to_rgb
 from v2p_data.task.task import TaskBundle
@@ -103,11 +103,7 @@ def write_contact_sheet(
                     seconds=tuple(judged.snapshot_seconds[m] for m in moments),
                 )
             )
-    sheet = contact_sheet(rows, cfg)
-    done, data = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))
-    if not done:
-        raise RuntimeError("OpenCV could not encode the contact sheet")
-    path.write_bytes(data.tobytes())
+    path.write_bytes(png_bytes(contact_sheet(rows, cfg)))
 
 
 def write_films(

@@ -287,9 +287,10 @@ def _decode(path: Path, cfg: VideoConfig) -> _Film:
     av.logging.set_level(av.logging.PANIC)
     try:
         with _opened(path, cfg) as container:
-            return _film_of(container, path, cfg)
+            film = _film_of(container, path, cfg)
     finally:
         av.logging.set_level(level)
+    return film
 
 
 def _opened(path: Path, cfg: VideoConfig) -> "av.container.InputContainer":
@@ -309,10 +310,10 @@ def _opened(path: Path, cfg: VideoConfig) -> "av.container.InputContainer":
             metadata_errors="ignore",
         )
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        if _begins_as_mp4(path):
+        if _is_cut_mp4(path):
             raise ItemRejectedError(
                 "truncated",
-                f"{path.name} is cut off or damaged: it has no index that can be read; copy it again",
+                f"{path.name} is cut off: its index, which stands at the end, is missing; copy it again",
             ) from error
         raise ItemRejectedError(
             "unreadable", f"{path.name} is no video that can be read ({_said(error)})"
@@ -523,10 +524,25 @@ def _check_duration(path: Path, seconds: float, cfg: VideoConfig) -> None:
         )
 
 
-def _begins_as_mp4(path: Path) -> bool:
+def _is_cut_mp4(path: Path) -> bool:
+    """Tell whether the file begins like an mp4 or mov but lacks the index."""
     try:
         with path.open("rb") as file:
-            return file.read(8)[4:] == b"ftyp"
+            if file.read(8)[4:] != b"ftyp":
+                return False
+            size = path.stat().st_size
+            at, boxes = 0, 0
+            while at + 8 <= size and boxes < 1000:
+                file.seek(at)
+                head = file.read(16)
+                length, kind = int.from_bytes(head[:4], "big"), head[4:8]
+                if kind == b"moov":
+                    return at + length > size
+                length = int.from_bytes(head[8:16], "big") if length == 1 else length
+                if length < 8:
+                    return False
+                at, boxes = at + length, boxes + 1
+            return True
     except OSError:
         return False
 
