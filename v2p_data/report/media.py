@@ -198,9 +198,11 @@ def draw_mesh(
 
 
 def _frame_rate(path: Path) -> float:
-    with av.open(str(path)) as container:
-        rate = container.streams.video[0].average_rate
-    return float(rate or 20)
+    container = av.open(str(path))
+    try:
+        return float(container.streams.video[0].average_rate or 20)
+    finally:
+        container.close()
 
 
 def _decoded(path: Path) -> Iterator[av.VideoFrame]:

@@ -286,11 +286,13 @@ def _decode(path: Path, cfg: VideoConfig) -> _Film:
     # libav would write its remarks on damaged files to the terminal; what matters is in our own sentences
     av.logging.set_level(av.logging.PANIC)
     try:
-        with _opened(path, cfg) as container:
-            film = _film_of(container, path, cfg)
+        container = _opened(path, cfg)
+        try:
+            return _film_of(container, path, cfg)
+        finally:
+            container.close()
     finally:
         av.logging.set_level(level)
-    return film
 
 
 def _opened(path: Path, cfg: VideoConfig) -> "av.container.InputContainer":
