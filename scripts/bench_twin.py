@@ -10,6 +10,7 @@ replaces single numbers of the nominal twin. The last line, `sim_to_sim_drop: N`
 
 import json
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -89,7 +90,8 @@ def main(cfg: BenchConfig) -> None:
     )
     twin = judge_in_twin(cfg.task, load, seeds=seeds, cfg=how, setup=setup, workers=cfg.workers)
     _tell("twin", twin.successes, twin.at_end if cfg.at_end else None, time.perf_counter() - start)
-    print(f"failures in the twin: {twin.failure_counts()}")
+    failures = Counter(sorted(kind for kind in twin.failures if kind))
+    print(f"failures in the twin: {dict(failures)}")
     here, there = twin.successes, trained_in.successes
     print(
         f"paired: both {(here & there).sum()}, twin only {(here & ~there).sum()}, "
@@ -120,7 +122,7 @@ def _write(
         "twin": {"digest": parameters.digest(), **parameters.as_dict()},
         "success_step": {"training": trained_in, "twin": twin.success_step.tolist()},
         "twin_at_end": twin.at_end.tolist(),
-        "twin_failures": [e.failure for e in twin.episodes],
+        "twin_failures": list(twin.failures),
     }
     cfg.out.write_text(json.dumps(data, indent=1))
 

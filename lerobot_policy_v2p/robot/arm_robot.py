@@ -40,18 +40,11 @@ class Arm(Protocol):
     is_limited: bool
     """Whether actions pass limits."""
 
-    @property
-    def action_scale(self) -> ActionScale: ...
-
-    @property
-    def has_succeeded(self) -> bool:
-        """Whether a simulated task has; a real one never says so."""
-        ...
-
-    @property
-    def task_description(self) -> str:
-        """The simulated task in words."""
-        ...
+    action_scale: ActionScale
+    has_succeeded: bool
+    """Whether a simulated task has; a real one never says so."""
+    task_description: str
+    """The simulated task in words."""
 
     def state(self) -> Float[np.ndarray, "11"]:
         """Ask the arm and return `observation.state`; what follows belongs to the same moment."""
@@ -84,7 +77,7 @@ class Arm(Protocol):
     def close(self) -> None: ...
 
 
-class ArmRobot[A: Arm](Robot):
+class ArmRobot[A: Arm, C: ArmRobotConfig](Robot):
     """An arm as LeRobot sees it, and as `v2p deploy` does (`v2p_data.twin.interface.RobotWithCamera`)."""
 
     picture_name: str
@@ -92,9 +85,9 @@ class ArmRobot[A: Arm](Robot):
     picture_px: int
     """Its width and height."""
 
-    def __init__(self, config: ArmRobotConfig) -> None:
+    def __init__(self, config: C) -> None:
         super().__init__(config)
-        self.settings = config
+        self.config = config
         is_rgb = config.pictures == "rgb"
         self.picture_name, self.picture_px = (RGB_NAME, RGB_PX) if is_rgb else (MASK_NAME, MASK_PX)
         # With colour pictures it is `v2p deploy` that acts, which makes steps of targets itself.
@@ -148,7 +141,7 @@ class ArmRobot[A: Arm](Robot):
         self.arm = self.make_arm()
         self._state = None
         try:
-            check_policy_of(self.settings, self.action_scale, self.task_description)
+            check_policy_of(self.config, self.action_scale, self.task_description)
             self._rig = None if self.picture_name == RGB_NAME else self._own_rig(self.arm)
         except BaseException:
             self.disconnect()
@@ -240,7 +233,7 @@ class ArmRobot[A: Arm](Robot):
         self._connected().hold()
 
     def _own_rig(self, arm: A) -> Rig:
-        cfg, sight = self.settings, None
+        cfg, sight = self.config, None
         if cfg.clicks:
             clicks = clicks_from(cfg.clicks.split())
             sight = Sight(self.calibration(), clicks, training_view=cfg.training_view)

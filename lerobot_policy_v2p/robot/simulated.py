@@ -26,13 +26,10 @@ class SimulatedArm:
 
     def __init__(self, config: V2PFrankaConfig) -> None:
         self.env = V2PEnv(config.task_folder)
+        self.task_description = self.env.task_description
         scale = TaskBundle.load(Path(config.task_folder)).motion_scale
         self.action_scale = ActionScale(position_step_m=ActionScale.position_step_m * scale)
         self.restart(config.seed)
-
-    @property
-    def task_description(self) -> str:
-        return self.env.task_description
 
     def restart(self, seed: int) -> None:
         """Start the episode of a seed."""

@@ -22,15 +22,11 @@ ARMS: dict[str, Callable[[V2PFrankaConfig], Arm]] = {
 }
 
 
-class V2PFranka(ArmRobot[Arm]):
+class V2PFranka(ArmRobot[Arm, V2PFrankaConfig]):
     """A Franka arm."""
 
     config_class = V2PFrankaConfig
     name = "v2p_franka"
-
-    def __init__(self, config: V2PFrankaConfig) -> None:
-        super().__init__(config)
-        self.config = config
 
     def make_arm(self) -> Arm:
         return ARMS[self.config.backend](self.config)

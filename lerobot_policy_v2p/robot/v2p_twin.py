@@ -32,20 +32,10 @@ class TwinBehindRobot(TwinArm):
     def __init__(self, config: V2PTwinConfig) -> None:
         self.has_succeeded, self.steps = False, 0
         super().__init__(TaskBundle.load(Path(config.task_folder)), changed(config.change))
+        self.action_scale = ActionScale(position_step_m=self.cfg.position_step_m)
+        self.task_description = self.mirror.bundle.description
         self.reset(config.seed)
         self._labels = (allowing_for_place if config.training_view else true_labels)(self)
-
-    @property
-    def action_scale(self) -> ActionScale:
-        return ActionScale(
-            position_step_m=self.cfg.position_step_m,
-            rotation_step_rad=self.cfg.rotation_step_rad,
-            finger_step_m=self.cfg.finger_step_m,
-        )
-
-    @property
-    def task_description(self) -> str:
-        return self.mirror.bundle.description
 
     def mask(self) -> UInt8[np.ndarray, "h w 3"]:
         return labels_to_rgb(self._labels())
@@ -75,15 +65,11 @@ class TwinBehindRobot(TwinArm):
         """Do nothing: time stands still."""
 
 
-class V2PTwin(ArmRobot[TwinBehindRobot]):
+class V2PTwin(ArmRobot[TwinBehindRobot, V2PTwinConfig]):
     """The twin as LeRobot sees it."""
 
     config_class = V2PTwinConfig
     name = "v2p_twin"
-
-    def __init__(self, config: V2PTwinConfig) -> None:
-        super().__init__(config)
-        self.config = config
 
     def make_arm(self) -> TwinBehindRobot:
         return TwinBehindRobot(self.config)

@@ -217,7 +217,7 @@ def reading() -> Callable[..., Reading]:
     def make(pos=(0.5, 0.0, 0.2), lead=(0, 0, 0), turn=(0, 0, 0), force=None) -> Reading:
         state = np.array([*pos, *turn, 1.0, *lead, 1.0], float)
         return Reading(
-            state=state, picture=None, labels=None, joints_rad=None, opening=1.0, force_n=force, time_s=0.0
+            state=state, picture=None, labels=None, joints_rad=None, opening=1.0, force_n=force
         )  # fmt: skip
 
     return make

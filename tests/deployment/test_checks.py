@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from v2p_data.deployment.checks import Offer, check_policy, unknowns
+from v2p_data.deployment.checks import check_policy, unknowns
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.facts import Facts, facts_of_dataset, write_facts
 
-OFFER = Offer(size_px=(256, 256), scale=ActionScale())
+OFFER = (256, 256), ActionScale()
 BEFORE = "policy_preprocessor_step_3_normalizer_processor.safetensors"
 AFTER = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
 
@@ -25,7 +25,7 @@ def policy(policy_folder, tmp_path):
 
 def told(policy, offer=OFFER, task=""):
     with pytest.raises(V2PError) as error:
-        check_policy(policy, offer, task)
+        check_policy(policy, *offer, task)
     sentence = str(error.value)
     assert str(policy) in sentence
     assert "\n" not in sentence
@@ -48,11 +48,11 @@ def with_facts(policy, **fields):
 
 
 def test_a_policy_that_suits_passes_and_what_it_does_not_say_is_named(policy):
-    facts = check_policy(policy, OFFER)
+    facts = check_policy(policy, *OFFER)
 
     assert facts == Facts()
     assert "its rate (taken to be 20 Hz)" in unknowns(facts)
-    assert unknowns(check_policy(with_facts(policy), OFFER)) == ""
+    assert unknowns(check_policy(with_facts(policy), *OFFER)) == ""
 
 
 def test_a_truncated_checkpoint(policy):
@@ -143,7 +143,7 @@ def test_another_action_scale_by_the_statistics(policy):
 def test_another_action_scale_by_what_the_training_says(policy):
     throws = {"throw": 0.06, "lift": 0.03}
     with_facts(policy, position_steps_m=throws)
-    check_policy(policy, OFFER, "lift")
+    check_policy(policy, *OFFER, "lift")
     assert "displacement [m] of 0.06 a step, and on this robot it is 0.03" in told(
         policy, task="throw"
     )
@@ -179,9 +179,7 @@ def test_a_datasets_own_words_are_written_beside_the_policy(policy, tmp_path):
 
     write_facts(policy, dataset)
 
-    facts = check_policy(
-        policy, Offer(size_px=(256, 256), scale=ActionScale(position_step_m=0.06))
-    )
+    facts = check_policy(policy, (256, 256), ActionScale(position_step_m=0.06))
     assert facts == facts_of_dataset(dataset)
     assert facts.position_steps_m == {"throw it": pytest.approx(0.06)}
     assert facts.palette == (0, 64, 9)

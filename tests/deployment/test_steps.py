@@ -16,7 +16,7 @@ from v2p_data.sim.robot.interface import ArmInterface
 def reading(joints=None) -> Reading:
     state = np.array([0.5, 0.1, 0.3, 0.1, -0.2, 0.3, 1.0, 0.01, 0.0, 0.0, 0.8])
     return Reading(
-        state=state, picture=None, labels=None, joints_rad=joints, opening=1.0, force_n=None, time_s=0.0
+        state=state, picture=None, labels=None, joints_rad=joints, opening=1.0, force_n=None
     )  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from v2p_data.sim.robot.gripper_wait import GripperWait, GripperWaitConfig
+from v2p_data.sim.robot.gripper_wait import LATENCY_STEPS, MOST_STEPS, GripperWait
 
 LIFT = np.array([0, 0, 1.0, 0, 0, 0, 0.5])
 
@@ -23,7 +23,7 @@ def test_the_arm_goes_on_when_the_fingers_rest_on_an_object():
 
 
 def test_a_carried_object_is_not_waited_for_again():
-    assert not any(waits([0.5] * 50, target=0.0)[GripperWaitConfig().latency_steps :])
+    assert not any(waits([0.5] * 50, target=0.0)[LATENCY_STEPS:])
 
 
 def test_an_open_gripper_that_stays_open_is_not_waited_for():
@@ -33,7 +33,7 @@ def test_an_open_gripper_that_stays_open_is_not_waited_for():
 def test_a_gripper_that_never_arrives_is_given_up():
     crawl = np.linspace(1.0, 0.4, 60).tolist()
 
-    assert sum(waits(crawl, target=0.0)) == GripperWaitConfig().most_steps
+    assert sum(waits(crawl, target=0.0)) == MOST_STEPS
 
 
 def test_only_the_arm_is_held():

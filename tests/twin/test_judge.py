@@ -64,7 +64,7 @@ def test_a_policy_sees_labels_and_the_datasets_state_and_idling_reaches_nothing(
     judged = judge_in_twin(folders[1], lambda _: (VisionActor(idle), 64), seeds=[3], cfg=ONCE)
 
     assert judged.success_step.tolist() == [NEVER]
-    assert judged.episodes[0].failure == NEVER_REACHED
+    assert judged.failures == (NEVER_REACHED,)
     labels, state = zip(*idle.seen, strict=True)
     assert np.concatenate(labels).shape == (4, 64, 64)
     assert {0, 1, 2} <= set(np.unique(labels[0]))
@@ -78,7 +78,7 @@ def test_a_scripted_lift_is_a_success_of_its_seed(folders):
 
     assert judged.successes.tolist() == [True]
     assert 10 < judged.success_step[0] < 60
-    assert judged.episodes[0].failure == ""
+    assert judged.failures == ("",)
 
 
 def test_an_actor_that_does_not_suit_the_twin_is_told_so(folders):

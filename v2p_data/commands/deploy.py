@@ -91,7 +91,7 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
     Raises:
         V2PError: anything that forbids to begin.
     """
-    from v2p_data.deployment.checks import Offer, check_policy, unknowns
+    from v2p_data.deployment.checks import check_policy, unknowns
     from v2p_data.evaluation.facts import interface_of
 
     rig = Rig(robot, args.limits)
@@ -101,10 +101,8 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
         raise V2PError("the robot gives neither a picture nor a mask, so the policy cannot see")
     task = args.task or str(getattr(robot, "task_description", ""))
     height, width = picture.shape[:2]
-    offer = Offer(
-        size_px=(height, width), scale=rig.scale, gives_joints=reading.joints_rad is not None
-    )
-    facts = check_policy(args.policy, offer, task)
+    gives_joints = reading.joints_rad is not None
+    facts = check_policy(args.policy, (height, width), rig.scale, task, gives_joints=gives_joints)
     if unknowns(facts):
         print(f"The policy does not say {unknowns(facts)}")  # noqa: T201
     policy = loaded_policy(args.policy, task, args.device)

@@ -4,7 +4,6 @@ Files first (whole, with statistics), then what the policy sees and does (featur
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,32 +38,35 @@ LEAST_MOTION = 0.1
 """An action that never goes beyond this is one in metres."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Offer:
-    """What a robot gives and takes."""
-
-    size_px: tuple[int, int]
-    """Height and width of its pictures."""
-    scale: ActionScale
-    gives_joints: bool = False
-    """Whether it gives the angles of its arm's joints."""
-
-
-def check_policy(folder: Path, offer: Offer, task: str = "") -> Facts:
+def check_policy(
+    folder: Path,
+    size_px: tuple[int, int],
+    scale: ActionScale,
+    task: str = "",
+    *,
+    gives_joints: bool = False,
+) -> Facts:
     """Demand that a policy suits a robot; return what is known of its training.
+
+    Args:
+        folder: the policy.
+        size_px: height and width of the robot's pictures.
+        scale: what an action of 1 means on the robot.
+        task: in words; decides where the policy knows several scales.
+        gives_joints: whether the robot gives the angles of its arm's joints.
 
     Raises:
         V2PError: it does not, or its checkpoint is damaged.
     """
     found = check_checkpoint(folder)
     interface, *_ = interface_of(folder)
-    if interface.joint_state and not offer.gives_joints:
+    if interface.joint_state and not gives_joints:
         raise V2PError(
             f"the policy in {folder} was trained with --episodes.joint-state, and this robot gives no angles of joints;"
             " one that segments by itself gives them with --robot.joint_state=true"
         )
-    _check_features(folder, found, offer, interface)
-    return _check_meaning(folder, found, offer.scale, task, interface)
+    _check_features(folder, found, size_px, interface)
+    return _check_meaning(folder, found, scale, task, interface)
 
 
 def check_meaning(
@@ -136,14 +138,14 @@ def names_of(interface: ArmInterface) -> tuple[tuple[str, ...], tuple[str, ...]]
 
 
 def _check_features(
-    folder: Path, found: Checkpoint, offer: Offer, interface: ArmInterface
+    folder: Path, found: Checkpoint, size_px: tuple[int, int], interface: ArmInterface
 ) -> None:
     states, actions = names_of(interface)
     sees, does = (
         {key: feature.shape for key, feature in (features or {}).items()}
         for features in (found.config.input_features, found.config.output_features)
     )
-    given = {MASK_KEY: (3, *offer.size_px), STATE_KEY: (len(states),)}
+    given = {MASK_KEY: (3, *size_px), STATE_KEY: (len(states),)}
     names = ", ".join(f"'{key}' {shape}" for key, shape in given.items())
     for key, shape in sees.items():
         if key not in given and "empty_camera" not in key:
@@ -158,7 +160,7 @@ def _check_features(
         _, height, width = (*sees[MASK_KEY], 0, 0, 0)[:3]
         raise V2PError(
             f"the policy in {folder} was trained on pictures of {width} x {height} pixels, and the robot gives"
-            f" {offer.size_px[1]} x {offer.size_px[0]}; train it on a dataset of that size"
+            f" {size_px[1]} x {size_px[0]}; train it on a dataset of that size"
         )
     if sees.get(STATE_KEY, given[STATE_KEY]) != given[STATE_KEY]:
         raise V2PError(

@@ -29,7 +29,6 @@ LONGEST_LINE = 2**21
 class Hello:
     """What a driver says of its arm."""
 
-    robot: str
     finger_travel_m: float
     """Travel of one finger from closed to open."""
     camera: Camera
@@ -79,7 +78,6 @@ class Driver:
                 f"a picture of {width} x {height} pixels and fingers that travel {travel} m are not possible"
             )
         return Hello(
-            robot=str(said.get("robot", "a robot")),
             finger_travel_m=travel,
             camera=Camera(
                 width_px=width,

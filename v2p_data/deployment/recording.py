@@ -33,27 +33,16 @@ class Recorder:
 
     def __init__(self, task: str) -> None:
         self.task = task
-        self._labels: list[np.ndarray] = []
-        self._pictures: list[np.ndarray] = []
-        self._states: list[np.ndarray] = []
-        self._actions: list[np.ndarray] = []
-        self._acted: list[tuple[str, ...]] = []
-        self._confidences: list[tuple[float, ...]] = []
+        self._steps: list[tuple[Reading, Seen, np.ndarray, tuple[str, ...]]] = []
 
     def add(
         self, reading: Reading, seen: Seen, action: np.ndarray, acted: tuple[str, ...]
     ) -> None:
         """Note one step: what was seen, and what was then done."""
-        self._labels.append(seen.labels)
-        if reading.picture is not None:
-            self._pictures.append(reading.picture)
-        self._states.append(reading.state.astype(np.float32))
-        self._actions.append(action.astype(np.float32))
-        self._acted.append(acted)
-        self._confidences.append(seen.confidences)
+        self._steps.append((reading, seen, action, acted))
 
     def __len__(self) -> int:
-        return len(self._states)
+        return len(self._steps)
 
     def save(
         self, out: Path, repo_id: str, objects: tuple[str, ...], about: Mapping[str, Any]
@@ -72,7 +61,9 @@ class Recorder:
         check_free(out)
         if len(self) < FEWEST_FRAMES:
             return None
-        has_rgb = len(self._pictures) == len(self)
+        readings, seen, actions, acted = zip(*self._steps, strict=True)
+        pictures = [reading.picture for reading in readings]
+        has_rgb = pictures[0] is not None
         staged = out.with_name(out.name + ".partial") / STAGED
         with refusals_named("recording", out.parent):
             episode = Episode(
@@ -80,20 +71,22 @@ class Recorder:
                 item="run",
                 task=self.task,
                 seed=0,
-                labels=np.stack(self._labels),
-                state=np.stack(self._states),
-                action=np.stack(self._actions),
+                labels=np.stack([one.labels for one in seen]),
+                state=np.stack([reading.state for reading in readings]).astype(np.float32),
+                action=np.stack(actions).astype(np.float32),
                 # Nobody judges a run on a robot; what a simulated one says of itself is in `about`.
                 success=np.zeros(len(self), bool),
                 referee=False,
                 objects=objects,
                 params={
                     **about,
-                    "limits_acted": [list(names) for names in self._acted],
-                    "confidences": np.round(np.array(self._confidences), 3).tolist(),
+                    "limits_acted": [list(names) for names in acted],
+                    "confidences": np.round(
+                        np.array([one.confidences for one in seen]), 3
+                    ).tolist(),
                 },
                 cameras=(MASK_CAMERA, RGB_CAMERA) if has_rgb else (MASK_CAMERA,),
-                rgb_mp4=encoding.encode_rgb(np.stack(self._pictures)).mp4 if has_rgb else b"",
+                rgb_mp4=encoding.encode_rgb(np.stack(pictures)).mp4 if has_rgb else b"",
             )
             path = episode.save(staged)
             packed = pack([path], repo_id, out, provenance=json.loads(json.dumps(dict(about))))

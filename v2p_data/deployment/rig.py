@@ -5,7 +5,6 @@ a robot has them: `hold()` stops at once, `force_n()` gives the contact force at
 action of 1 means.
 """
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -121,10 +120,9 @@ class Rig:
         Raises:
             V2PError: it does not answer, or answers something else.
         """
-        asked = time.monotonic()
-        return self.reading_of(self.robot.get_observation(), asked)
+        return self.reading_of(self.robot.get_observation())
 
-    def reading_of(self, seen: dict[str, Any], asked: float | None = None) -> Reading:
+    def reading_of(self, seen: dict[str, Any]) -> Reading:
         """Return an observation of the robot's, checked; one without pictures tells state and force only.
 
         Raises:
@@ -154,7 +152,6 @@ class Rig:
             joints_rad=joints,
             opening=float(state[6]) if picture is None else float(self.robot.opening()),
             force_n=None if force is None else float(force),
-            time_s=time.monotonic() if asked is None else asked,
         )
 
     def act(self, action: Float[np.ndarray, "7"]) -> Float[np.ndarray, "7"]:

@@ -1,4 +1,4 @@
-"""One reading of a robot. World frame: the arm's base, +x forward, +y left, +z up. Times are of `time.monotonic`."""
+"""One reading of a robot. World frame: the arm's base, +x forward, +y left, +z up."""
 
 from dataclasses import dataclass
 
@@ -34,8 +34,6 @@ class Reading:
     opening: float
     force_n: float | None
     """None from a robot that does not report it."""
-    time_s: float
-    """When it was asked for."""
 
     @property
     def tool_pos(self) -> Float[np.ndarray, "3"]:

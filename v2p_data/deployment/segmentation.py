@@ -5,7 +5,7 @@ the object where its colour is likelier under the object's model than under the 
 where the robot is drawn. A robot in front hides the object; what is hidden is not lost.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -23,19 +23,12 @@ OTHER_LIGHT = {0.4: 0.08, 0.55: 0.08, 0.7: 0.08, 0.85: 0.08, 1.2: 0.08}
 GREY = 128.0
 """Where 8-bit Lab has no colour."""
 MOST_GROWTH = 1.5
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackerConfig:
-    """How an object is told from table and robot."""
-
-    click: ClickConfig = field(default_factory=ClickConfig)
-    reach_px: float = 12.0
-    """How far an object may get in one step of 50 ms, at 256 px; 0.6 m/s are about 10."""
-    least_visible: float = 0.12
-    """Share of the expected area: with less the object counts as not seen in this picture."""
-    background_rate: float = 0.15
-    """Share of each new picture in the picture of what is behind."""
+REACH_PX = 12.0
+"""How far an object may get in one step of 50 ms, at 256 px; 0.6 m/s are about 10."""
+LEAST_VISIBLE = 0.12
+"""Share of the expected area: with less the object counts as not seen in this picture."""
+BACKGROUND_RATE = 0.15
+"""Share of each new picture in the picture of what is behind."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +71,6 @@ class StreamTracker(Protocol):
 class ColourTracker:
     """The tracker without weights."""
 
-    def __init__(self, cfg: TrackerConfig | None = None) -> None:
-        self.cfg = cfg or TrackerConfig()
-
     def start(
         self,
         picture: UInt8[np.ndarray, "h w 3"],
@@ -88,7 +78,7 @@ class ColourTracker:
         robot: Bool[np.ndarray, "h w"],
     ) -> Bool[np.ndarray, "h w"]:
         """Return the mask of what was clicked, and learn its colours."""
-        mask = clicked_mask(picture, click_px, robot, self.cfg.click)
+        mask = clicked_mask(picture, click_px, robot, ClickConfig())
         near, touched = grow(mask, 3), grow(robot, 3)
         core = shrink(mask, 1)
         mine = picture[core if core.sum() >= SPECK_PX else mask]
@@ -119,7 +109,7 @@ class ColourTracker:
         seen, should = float(mask.sum()), max(1.0, float(expected.sum()))
         hidden = float((expected & robot & ~mask).sum()) / should
         visible = seen / max(1.0, self._area * (1 - min(0.9, hidden)))
-        found = seen >= SPECK_PX * self._scale**2 and visible >= self.cfg.least_visible
+        found = seen >= SPECK_PX * self._scale**2 and visible >= LEAST_VISIBLE
         if found:
             self._follow(mask, expected, hidden, visible)
             self._learn(lab, mask, robot)
@@ -144,7 +134,7 @@ class ColourTracker:
         arm = np.take(self._robot, cells) + np.where(robot, 0.0, -4.0).astype(np.float32)
         arm[grow(robot, 2) & ~robot] += 2.0
         away = cv2.distanceTransform((~expected).astype(np.uint8), cv2.DIST_L2, 3)
-        reach = self.cfg.reach_px * self._scale
+        reach = REACH_PX * self._scale
         return own + 1.0 - (away / reach) ** 2 - np.maximum(rest, arm)
 
     def _unlike_behind(self, lab: np.ndarray) -> np.ndarray:
@@ -164,7 +154,7 @@ class ColourTracker:
         """Return the part that fits best; nothing grows by half in a step, so what else has come is left out."""
         mask = self._best_part(score, expected)
         if mask.sum() > MOST_GROWTH * self._area:
-            near = grow(expected, round(self.cfg.reach_px * self._scale / 2))
+            near = grow(expected, round(REACH_PX * self._scale / 2))
             mask = self._best_part(np.where((own > 0) & near, score, -1.0), expected)
         return mask
 
@@ -192,7 +182,7 @@ class ColourTracker:
         if hidden < 0.1 and 0.6 < visible < 1.6:
             self._area += 0.1 * (float(mask.sum()) - self._area)
         step = _middle(mask) - _middle(self._mask)
-        fast = self.cfg.reach_px * self._scale
+        fast = REACH_PX * self._scale
         if hidden < 0.4:
             self._motion = 0.5 * self._motion + 0.5 * np.clip(step, -fast, fast)
         else:
@@ -205,7 +195,7 @@ class ColourTracker:
     def _learn(self, lab: np.ndarray, mask: np.ndarray, robot: np.ndarray) -> None:
         """Bring the picture of what is behind up to date where neither object nor robot is near."""
         near = grow(mask | self._mask | robot, 4)
-        rate = np.where(self._known, self.cfg.background_rate, 1.0)[..., None].astype(np.float32)
+        rate = np.where(self._known, BACKGROUND_RATE, 1.0)[..., None].astype(np.float32)
         self._behind += np.where(near[..., None], 0.0, rate) * (lab - self._behind)
         self._known |= ~near
 

@@ -17,7 +17,7 @@ from v2p_data.task.task import TaskBundle
 from v2p_data.twin.control import tool_pose
 from v2p_data.twin.interface import RGB_PX
 from v2p_data.twin.parameters import TwinParameters
-from v2p_data.twin.robot import Measured, TwinRobot
+from v2p_data.twin.robot import TwinRobot
 
 
 class TwinArm:
@@ -27,6 +27,9 @@ class TwinArm:
         bundle: the task.
         parameters: of the twin; by default the nominal one.
         size_px: width and height of pictures and labels.
+
+    Attributes:
+        measured: the last report of the joints and the gripper; pictures are taken with `picture`.
     """
 
     def __init__(
@@ -49,11 +52,6 @@ class TwinArm:
         self.target = replace(self.tool, opening=1.0)
         self.robot.command(self.target)
         self.mirror.begin(self.robot.world, self.robot.truth(), self.target)
-
-    @property
-    def measured(self) -> Measured:
-        """The last report of the joints and the gripper; pictures are taken with `picture`."""
-        return self._measured
 
     def state(self) -> Float32[np.ndarray, "11"]:
         """Return `observation.state`, within the bounds of the training environment's."""
@@ -84,5 +82,5 @@ class TwinArm:
         self.robot.close()
 
     def _measure(self) -> None:
-        self._measured = self.robot.measure()
-        self.tool: ToolPose = tool_pose(self._measured.joints, self._measured.opening)
+        self.measured = self.robot.measure()
+        self.tool: ToolPose = tool_pose(self.measured.joints, self.measured.opening)

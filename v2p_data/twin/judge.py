@@ -5,16 +5,17 @@ sees true masks of the twin's camera here; masks tracked in its pictures are the
 see the twin's truth. All of it is sim-to-sim: no real arm was asked.
 """
 
-import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
+from itertools import repeat
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from v2p_data.errors import V2PError
@@ -53,44 +54,20 @@ class TwinSetup:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TwinEpisode:
-    """What became of one episode."""
-
-    seed: int
-    success_step: int
-    """The control step that led to the first success, from 0; `NEVER` where there was none."""
-    at_end: bool
-    """Success at the last step."""
-    broke: bool
-    failure: str
-    """Kind of failure; empty where the episode succeeded once."""
-    seconds: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class TwinJudged:
     """What became of the episodes of one task, in the order of their seeds."""
 
-    episodes: tuple[TwinEpisode, ...]
-
-    @property
-    def success_step(self) -> Int[np.ndarray, "episode"]:
-        return np.array([e.success_step for e in self.episodes])
+    success_step: Int[np.ndarray, "episode"]
+    """The control step that led to the first success, from 0; `NEVER` where there was none."""
+    at_end: Bool[np.ndarray, "episode"]
+    """Success at the last step."""
+    failures: tuple[str, ...]
+    """Kind of failure; empty where the episode succeeded once."""
 
     @property
     def successes(self) -> Bool[np.ndarray, "episode"]:
         """Which episodes succeeded at some time."""
         return self.success_step != NEVER
-
-    @property
-    def at_end(self) -> Bool[np.ndarray, "episode"]:
-        """Which episodes were a success at their last step."""
-        return np.array([e.at_end for e in self.episodes])
-
-    def failure_counts(self) -> dict[str, int]:
-        """Return how many episodes failed in which way, in the order of the names."""
-        counts = Counter(e.failure for e in self.episodes if e.failure)
-        return dict(sorted(counts.items()))
 
 
 class TwinView(View):
@@ -151,66 +128,43 @@ def judge_in_twin(
     """
     settings = (task_folder, load, cfg, setup or TwinSetup())
     if workers == 1:
-        player = _Player(*settings)
-        try:
-            return TwinJudged(episodes=tuple(player.play(seed) for seed in seeds))
-        finally:
-            player.arm.close()
-    with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_start_worker, initargs=settings
-    ) as pool:
-        return TwinJudged(episodes=tuple(pool.map(_play_here, seeds)))
+        episodes = _played(seeds, *settings)
+    else:
+        shares = [share.tolist() for share in np.array_split(seeds, workers)]
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            played = pool.map(_played_apart, shares, *map(repeat, settings))
+            episodes = [episode for share in played for episode in share]
+    success_step, at_end, failures = zip(*episodes, strict=True)
+    return TwinJudged(
+        success_step=np.array(success_step), at_end=np.array(at_end), failures=failures
+    )
 
 
-class _Player:
-    """A twin and who acts in it."""
-
-    def __init__(
-        self, task_folder: Path, load: Load, cfg: EvaluationConfig, setup: TwinSetup
-    ) -> None:
-        bundle = TaskBundle.load(task_folder)
-        self.actor, size_px = load(bundle)
-        height, width = (size_px, size_px) if isinstance(size_px, int) else size_px
-        if height != width:
-            raise V2PError(
-                f"the policy sees pictures of {height} x {width} px; the twin's rectified pictures are square"
-            )
-        self.cfg = cfg
-        self.steps = bundle.policy_steps(cfg.horizon_scale)
-        self.arm = TwinArm(bundle, setup.parameters, height)
-        self.labels = setup.look(self.arm)
-        self.waits = setup.waits
-
-    def play(self, seed: int) -> TwinEpisode:
-        start = time.perf_counter()
-        self.arm.reset(seed)
-        mirror, at_end = self.arm.mirror, self.cfg.at_end
-        verdicts = Verdicts(mirror.referee, 1, self.steps, at_end=at_end)
-        play(
-            TwinView(self.arm, self.labels, waits=self.waits), self.actor, (), verdicts, self.steps
+def _played(
+    seeds: Sequence[int], task_folder: Path, load: Load, cfg: EvaluationConfig, setup: TwinSetup
+) -> list[tuple[int, bool, str]]:
+    """Play one episode per seed; return for each the step of the first success, success at the end, and the failure."""
+    bundle = TaskBundle.load(task_folder)
+    actor, size_px = load(bundle)
+    height, width = (size_px, size_px) if isinstance(size_px, int) else size_px
+    if height != width:
+        raise V2PError(
+            f"the policy sees pictures of {height} x {width} px; the twin's rectified pictures are square"
         )
-        return TwinEpisode(
-            seed=seed,
-            success_step=int(verdicts.success_step[0]),
-            at_end=bool(verdicts.at_end[0]),
-            broke=bool(verdicts.broke[0]),
-            failure=verdicts.failures(mirror.bundle)[0],
-            seconds=time.perf_counter() - start,
-        )
+    steps = bundle.policy_steps(cfg.horizon_scale)
+    episodes = []
+    with closing(TwinArm(bundle, setup.parameters, height)) as arm:
+        look = setup.look(arm)
+        for seed in seeds:
+            arm.reset(seed)
+            verdicts = Verdicts(arm.mirror.referee, 1, steps, at_end=cfg.at_end)
+            play(TwinView(arm, look, waits=setup.waits), actor, (), verdicts, steps)
+            (failure,) = verdicts.failures(bundle)
+            episodes.append((int(verdicts.success_step[0]), bool(verdicts.at_end[0]), failure))
+    return episodes
 
 
-_player: _Player | None = None
-"""Of this worker process."""
-
-
-def _start_worker(*settings: Any) -> None:
-    global _player
-    import torch
-
+def _played_apart(*settings: Any) -> list[tuple[int, bool, str]]:
+    """Play in a process of its own, on one core."""
     torch.set_num_threads(1)
-    _player = _Player(*settings)
-
-
-def _play_here(seed: int) -> TwinEpisode:
-    assert _player is not None, "the initializer comes first"
-    return _player.play(seed)
+    return _played(*settings)

@@ -23,13 +23,11 @@ from v2p_data.twin.world import TwinWorld
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """How an episode begins in the training simulator."""
+    """How an episode begins."""
 
     joints: Float[np.ndarray, "7"]
     object_poses: Float[np.ndarray, "object 7"]
     """Position [m] and `quat_wxyz` of each object."""
-    rest_height_m: Float[np.ndarray, "object"]
-    """Height of each object's centre at rest on the table, at the size that it has in the training simulator."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,18 +105,16 @@ class Mirror:
         self.env = FollowingEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
         self.referee = RefereeRecord(self.env)
 
-    def start(self, seed: int) -> Start:
-        """Return how the episode of `V2PEnv.reset(seed=seed)` begins."""
+    def start(self, seed: int, world: TwinWorld) -> Start:
+        """Return how the episode of `V2PEnv.reset(seed=seed)` begins, with objects at the heights of the twin's table."""
         self.env.reset_seeded(np.array([0]), [stream_seed(seed)])
         seen = self.env.snapshot(np.array([0])).qpos[0]
         robot, first = self.env.world.robot, self.env.world.objects[0].qpos_adr
         count = len(self.env.world.objects)
-        drawn = self.env.randomizer.per_world_arrays()
-        return Start(
-            rest_height_m=drawn["height_above_table"][0].copy(),
-            joints=seen[robot.arm].copy(),
-            object_poses=seen[first : first + 7 * count].reshape(count, 7).copy(),
-        )
+        poses = seen[first : first + 7 * count].reshape(count, 7).copy()
+        above_table = self.env.randomizer.per_world_arrays()["height_above_table"][0]
+        poses[:, 2] += world.rest_height_m - above_table
+        return Start(joints=seen[robot.arm].copy(), object_poses=poses)
 
     def begin(self, world: TwinWorld, truth: Truth, target: ToolPose) -> None:
         """Take over the first moment of an episode."""
@@ -131,10 +127,3 @@ class Mirror:
         result = self.env.follow(truth, target, action)
         self.referee.note()
         return result
-
-
-def placed(start: Start, world: TwinWorld) -> Float[np.ndarray, "object 7"]:
-    """Return a start's poses for the twin: other heights only, for other sizes and another table."""
-    poses = start.object_poses.copy()
-    poses[:, 2] += world.rest_height_m - start.rest_height_m
-    return poses

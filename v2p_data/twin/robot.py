@@ -21,7 +21,7 @@ from v2p_data.task.task import TaskBundle
 from v2p_data.twin.camera import Optics, TwinCamera
 from v2p_data.twin.control import ArmController, Gripper, reported_opening
 from v2p_data.twin.interface import RGB_PX
-from v2p_data.twin.mirror import Mirror, Truth, placed
+from v2p_data.twin.mirror import Mirror, Truth
 from v2p_data.twin.parameters import TwinParameters, episode_rng, nominal
 from v2p_data.twin.world import TIMESTEP_S, build_twin
 
@@ -79,12 +79,12 @@ class TwinRobot:
 
     def reset(self, seed: int) -> None:
         """Start the episode that `V2PEnv.reset(seed=seed)` starts in the training simulator."""
-        start = self.mirror.start(seed)
+        start = self.mirror.start(seed, self.world)
         data, model = self._data, self.world.model
         mujoco.mj_resetData(model, data)
         data.qpos[ARM] = start.joints
         data.qpos[FINGERS] = FINGER_TRAVEL_M
-        data.qpos[self.world.object_qpos] = placed(start, self.world)
+        data.qpos[self.world.object_qpos] = start.object_poses
         mujoco.mj_forward(model, data)
         self._rng = episode_rng(seed, "latency")
         self.camera.begin(seed)

@@ -58,20 +58,6 @@ def stream_seed(seed: int) -> int:
     return _next_seed(np_random(seed)[0])
 
 
-def demand_no_options(options: dict[str, Any] | None) -> None:
-    """Raise where `reset` is given options: none would be heeded. LeRobot's own tell that a rollout begins.
-
-    Raises:
-        V2PError: names them.
-    """
-    unheeded = [str(name) for name in options or () if not str(name).startswith("lerobot_")]
-    if unheeded:
-        raise V2PError(
-            f"reset takes a seed and no options, got {', '.join(unheeded)}; what can be set is given when the "
-            "environment is made"
-        )
-
-
 class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
     """A single world of one task.
 
@@ -150,7 +136,13 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         Raises:
             V2PError: there are options.
         """
-        demand_no_options(options)
+        # LeRobot's own options tell that a rollout begins.
+        unheeded = [str(name) for name in options or () if not str(name).startswith("lerobot_")]
+        if unheeded:
+            raise V2PError(
+                f"reset takes a seed and no options, got {', '.join(unheeded)}; what can be set is given when the "
+                "environment is made"
+            )
         super().reset(seed=seed)
         self._world.seed(_next_seed(self.np_random))
         self._world.reset(np.array([0]))
@@ -183,9 +175,8 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         """Return a picture for people; the mask where there is no OpenGL."""
         if self.render_mode is None:
             return None
-        snapshot = self._world.snapshot(np.array([0]))
         try:
-            return self._masks.draw_rgb(snapshot, 0)
+            return self.picture()
         except V2PError:  # no OpenGL
             return self._pictures()[MASK_CAMERA]
 
