@@ -5,7 +5,6 @@ Actions become Cartesian targets here, with the scale and the leashes of the tra
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
 from v2p_data.deployment.protocol import Driver, Sample
@@ -13,7 +12,7 @@ from v2p_data.deployment.robot import ActionScale
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.sim.env.batch_env import SimConfig
-from v2p_data.sim.env.targets import ToolPose, next_target
+from v2p_data.sim.env.targets import next_target
 from v2p_data.twin.interface import RGB_PX
 
 
@@ -34,12 +33,12 @@ class NetworkArm:
                 f" policies see {RGB_PX} x {RGB_PX}; let it crop and scale them, and K with them"
             )
         self.seen: Sample = self._read()
-        self.target = self._measured()
+        self.target = self.seen.tool
 
     def state(self) -> Float[np.ndarray, "11"]:
         """Ask the driver and return `observation.state`."""
         self.seen = self._read()
-        return self._measured().state(self.target)
+        return self.seen.tool.state(self.target)
 
     def mask(self) -> np.ndarray:
         raise V2PError("the network driver gives no masks; say what to track with --robot.clicks")
@@ -54,7 +53,7 @@ class NetworkArm:
         return self.seen.joints_rad
 
     def opening(self) -> float:
-        return self.seen.opening
+        return self.seen.tool.opening
 
     def force_n(self) -> float | None:
         return self.seen.force_n
@@ -62,25 +61,17 @@ class NetworkArm:
     def carry_out(self, step: Float[np.ndarray, "7"]) -> None:
         """Send the target after one step."""
         self.target = next_target(
-            self.target, self._measured(), step, self.cfg, self.hello.finger_travel_m
+            self.target, self.seen.tool, step, self.cfg, self.hello.finger_travel_m
         )
-        quat = self.target.rotation.as_quat(canonical=True, scalar_first=True)
-        self.driver.target(self.target.pos, quat, self.target.opening)
+        self.driver.target(self.target)
 
     def hold(self) -> None:
         """Tell the driver to stay."""
         self.driver.hold()
-        self.target = self._measured()
+        self.target = self.seen.tool
 
     def close(self) -> None:
         self.driver.close()
 
     def _read(self) -> Sample:
         return self.driver.read((RGB_PX, RGB_PX))
-
-    def _measured(self) -> ToolPose:
-        return ToolPose(
-            pos=self.seen.pos_m,
-            rotation=Rotation.from_quat(self.seen.quat_wxyz, scalar_first=True),
-            opening=self.seen.opening,
-        )

@@ -26,7 +26,7 @@ def test_targets_move_the_twin_as_the_steps_do_that_lead_to_them(twin, actions):
     by_steps, by_targets = twin(), twin(actions=actions, joint_state=True)
     by_steps.connect()
     by_targets.connect()
-    names, robot = action_names(actions), by_steps.arm.mirror.env.world.robot
+    names, robot = action_names(actions), by_steps.arm.mirror.world.robot
     assert list(by_targets.action_features) == list(names)
     rng = np.random.default_rng(2)
     wanted, start = np.zeros(7), by_steps.arm.target.pos

@@ -89,13 +89,13 @@ def test_a_sweep_changes_one_number_and_refuses_what_is_none():
 
 
 def test_mechanisms_differ_from_the_training_simulators(arm):
-    ours, theirs = arm.robot.world.model, arm.mirror.env.world.model
+    ours, theirs = arm.robot.world.model, arm.mirror.world.model
 
     assert ours.opt.integrator != theirs.opt.integrator
     assert ours.opt.cone != theirs.opt.cone
     assert ours.opt.timestep != theirs.opt.timestep
     mesh = int(mujoco.mjtGeom.mjGEOM_MESH)
-    theirs_first = list(arm.mirror.env.world.objects[0].geom_ids)
+    theirs_first = list(arm.mirror.world.objects[0].geom_ids)
     assert set(theirs.geom_type[theirs_first].tolist()) != {mesh}
     for obj in arm.robot.world.objects:
         assert set(ours.geom_type[list(obj.geom_ids)].tolist()) == {mesh}
@@ -108,9 +108,7 @@ def test_mechanisms_differ_from_the_training_simulators(arm):
 
 def test_a_bevelled_box_fills_its_box_and_weighs_what_it_should(arm):
     world, p = arm.robot.world, nominal()
-    for obj, size, was in zip(
-        world.objects, world.size_m, arm.mirror.env.world.objects, strict=True
-    ):
+    for obj, size, was in zip(world.objects, world.size_m, arm.mirror.world.objects, strict=True):
         np.testing.assert_allclose(size, np.array(was.size_m) * p.size_scale)
         body = world.model.body(obj.name)
         np.testing.assert_allclose(body.mass[0], was.mass_kg * p.mass_scale)
@@ -234,7 +232,7 @@ def test_calibration_errors_are_a_few_pixels():
 def test_episodes_start_as_the_training_simulators_of_the_same_seed(arm, seed):
     arm.reset(seed)
     truth = arm.robot.truth()
-    env = type(arm.mirror)(arm.mirror.bundle).env
+    env = type(arm.mirror)(arm.mirror.bundle)
     env.reset_seeded(np.array([0]), [stream_seed(seed)])
     states = env.states()
 
@@ -259,7 +257,7 @@ def test_objects_start_at_rest_on_the_table(arm):
 
 
 def test_a_scripted_grasp_lifts_and_the_referee_sees_it(arm):
-    teacher = Teacher(arm.mirror.env)
+    teacher = Teacher(arm.mirror)
     teacher.name = "lift"
     arm.reset(0)
     held, deepest = [], 0.0

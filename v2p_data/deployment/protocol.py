@@ -16,9 +16,11 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
+from v2p_data.sim.env.targets import ToolPose
 
 VERSION = 1
 LONGEST_LINE = 2**21
@@ -38,10 +40,8 @@ class Hello:
 class Sample:
     """One reading."""
 
-    pos_m: Float[np.ndarray, "3"]
-    quat_wxyz: Float[np.ndarray, "4"]
-    """Orientation of the tool: z out of the gripper, y along its opening; (0, 1, 0, 0) is straight down."""
-    opening: float
+    tool: ToolPose
+    """Its z axis points out of the gripper, y along its opening."""
     joints_rad: Float[np.ndarray, "7"]
     force_n: float | None
     picture: UInt8[np.ndarray, "h w 3"]
@@ -95,19 +95,20 @@ class Driver:
             raise self._wrong(f"'quat_wxyz' {quat.tolist()} is no unit quaternion")
         force = said.get("force_n")
         return Sample(
-            pos_m=self._numbers(said, "pos_m", 3),
-            quat_wxyz=quat,
-            opening=float(np.clip(self._numbers(said, "opening", 1)[0], 0.0, 1.0)),
+            tool=ToolPose(
+                pos=self._numbers(said, "pos_m", 3),
+                rotation=Rotation.from_quat(quat, scalar_first=True),
+                opening=float(np.clip(self._numbers(said, "opening", 1)[0], 0.0, 1.0)),
+            ),
             joints_rad=self._numbers(said, "joints_rad", 7),
             force_n=None if force is None else float(self._numbers(said, "force_n", 1)[0]),
             picture=self._picture(said.get("picture"), size_px),
         )
 
-    def target(
-        self, pos_m: Float[np.ndarray, "3"], quat_wxyz: Float[np.ndarray, "4"], opening: float
-    ) -> None:
+    def target(self, tool: ToolPose) -> None:
         """Tell the arm where to bring the tool."""
-        self.ask("target", pos_m=pos_m.tolist(), quat_wxyz=quat_wxyz.tolist(), opening=opening)
+        quat = tool.rotation.as_quat(canonical=True, scalar_first=True)
+        self.ask("target", pos_m=tool.pos.tolist(), quat_wxyz=quat.tolist(), opening=tool.opening)
 
     def hold(self) -> None:
         """Tell the arm to stay, over a connection of its own, as another request may be waiting."""

@@ -37,7 +37,7 @@ class TwinArm:
     ) -> None:
         self.robot = TwinRobot(bundle, parameters, size_px)
         self.mirror = self.robot.mirror
-        cfg = self.mirror.env.cfg
+        cfg = self.mirror.cfg
         self.cfg: SimConfig = replace(
             cfg,
             position_step_m=cfg.position_step_m * bundle.motion_scale,

@@ -82,7 +82,7 @@ class TwinView(View):
     def __init__(
         self, arm: TwinArm, look: Callable[[], UInt8[np.ndarray, "h w"]], *, waits: bool
     ) -> None:
-        super().__init__(arm.mirror.env)
+        super().__init__(arm.mirror)
         self._arm, self._look = arm, look
         self._wait = GripperWait() if waits else None
 

@@ -49,41 +49,8 @@ class Truth:
     """The simulation broke down."""
 
 
-class FollowingEnv(BatchEnv):
-    """Worlds of the training simulator in which no physics runs: they are where another simulator says."""
-
-    def begin(self, truth: Truth, target: ToolPose) -> None:
-        """Take over the first moment of an episode, in all worlds."""
-        self._steps[:] = 0
-        self._judgement.held[:] = FRESH
-        self._last_action[:] = 0
-        self._start_pose[:] = truth.object_poses
-        self._take_over(truth, target)
-
-    def follow(self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]) -> StepResult:
-        """Take over the moment that an action led to, and judge it as `step` does."""
-        clipped = np.clip(np.nan_to_num(action[None]), -1.0, 1.0)
-        self._last_action[:] = clipped
-        self._steps += 1
-        self._take_over(truth, target)
-        return self._judged(torch.from_numpy(clipped.astype(np.float32)))
-
-    def _take_over(self, truth: Truth, target: ToolPose) -> None:
-        sim, robot = self._sim, self.world.robot
-        sim.qpos[:, robot.arm] = truth.joints
-        sim.qvel[:, robot.arm_dofs] = truth.joint_speeds
-        sim.qpos[:, robot.fingers] = truth.fingers
-        sim.object_qpos[:], sim.object_qvel[:] = truth.object_poses, truth.object_speeds
-        self._touches[:] = truth.touches
-        sim.target_pos[:] = target.pos
-        sim.target_quat[:] = target.rotation.as_quat(scalar_first=True)
-        sim.target_finger[:] = target.opening * FINGER_TRAVEL_M
-        self.broken_count += sim.look()
-        self._fill(slice(None), sim.tool)
-
-
-class Mirror:
-    """One world of the training simulator that follows the twin.
+class Mirror(BatchEnv):
+    """One world of the training simulator that follows the twin: no physics runs in it.
 
     Args:
         bundle: the task.
@@ -101,29 +68,49 @@ class Mirror:
                 f"task '{bundle.title}' is made for the arm in {robot.path}; the twin is a Franka arm with a parallel "
                 "gripper, so make the task again without --robot.path"
             )
-        self.bundle = bundle
-        self.env = FollowingEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
-        self.referee = RefereeRecord(self.env)
+        super().__init__(bundle, sim, num_envs=1, seed=0, num_threads=1)
+        self.referee = RefereeRecord(self)
 
     def start(self, seed: int, world: TwinWorld) -> Start:
         """Return how the episode of `V2PEnv.reset(seed=seed)` begins, with objects at the heights of the twin's table."""
-        self.env.reset_seeded(np.array([0]), [stream_seed(seed)])
-        seen = self.env.snapshot(np.array([0])).qpos[0]
-        robot, first = self.env.world.robot, self.env.world.objects[0].qpos_adr
-        count = len(self.env.world.objects)
+        self.reset_seeded(np.array([0]), [stream_seed(seed)])
+        seen = self.snapshot(np.array([0])).qpos[0]
+        robot, first = self.world.robot, self.world.objects[0].qpos_adr
+        count = len(self.world.objects)
         poses = seen[first : first + 7 * count].reshape(count, 7).copy()
-        above_table = self.env.randomizer.per_world_arrays()["height_above_table"][0]
+        above_table = self.randomizer.per_world_arrays()["height_above_table"][0]
         poses[:, 2] += world.rest_height_m - above_table
         return Start(joints=seen[robot.arm].copy(), object_poses=poses)
 
     def begin(self, world: TwinWorld, truth: Truth, target: ToolPose) -> None:
         """Take over the first moment of an episode."""
-        self.env.randomizer.size_m[0] = world.size_m
-        self.env.begin(truth, target)
+        self.randomizer.size_m[0] = world.size_m
+        self._steps[:] = 0
+        self._judgement.held[:] = FRESH
+        self._last_action[:] = 0
+        self._start_pose[:] = truth.object_poses
+        self._take_over(truth, target)
         self.referee.restart()
 
     def follow(self, truth: Truth, target: ToolPose, action: Float[np.ndarray, "7"]) -> StepResult:
         """Take over the moment that an action led to, and say what the task's own success says of it."""
-        result = self.env.follow(truth, target, action)
+        clipped = np.clip(np.nan_to_num(action[None]), -1.0, 1.0)
+        self._last_action[:] = clipped
+        self._steps += 1
+        self._take_over(truth, target)
+        result = self._judged(torch.from_numpy(clipped.astype(np.float32)))
         self.referee.note()
         return result
+
+    def _take_over(self, truth: Truth, target: ToolPose) -> None:
+        sim, robot = self._sim, self.world.robot
+        sim.qpos[:, robot.arm] = truth.joints
+        sim.qvel[:, robot.arm_dofs] = truth.joint_speeds
+        sim.qpos[:, robot.fingers] = truth.fingers
+        sim.object_qpos[:], sim.object_qvel[:] = truth.object_poses, truth.object_speeds
+        self._touches[:] = truth.touches
+        sim.target_pos[:] = target.pos
+        sim.target_quat[:] = target.rotation.as_quat(scalar_first=True)
+        sim.target_finger[:] = target.opening * FINGER_TRAVEL_M
+        self.broken_count += sim.look()
+        self._fill(slice(None), sim.tool)

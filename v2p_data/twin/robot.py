@@ -108,7 +108,8 @@ class TwinRobot:
         Raises:
             V2PError: there is no OpenGL.
         """
-        return self.camera.picture(self._shown())
+        p = self.parameters
+        return self.camera.picture(self._late(p.camera_latency_s, p.camera_jitter_s).qpos)
 
     def command(self, target: ToolPose) -> None:
         """Send a tool pose and an opening; they reach the controllers after the command latency."""
@@ -190,7 +191,3 @@ class TwinRobot:
         """Return the sample of some time ago, or the episode's first one."""
         back = round(delay_s / TIMESTEP_S)
         return self._past[max(len(self._past) - 1 - back, 0)]
-
-    def _shown(self) -> Float[np.ndarray, "q"]:
-        p = self.parameters
-        return self._late(p.camera_latency_s, p.camera_jitter_s).qpos
