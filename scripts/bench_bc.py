@@ -30,13 +30,21 @@ from v2p_data.pipeline.artifact import read_record
 
 NETWORKS: dict[str, tuple[int, dict[str, Any]]] = {
     "small (moments)": (256, {"preset": "small"}),
-    "ResNet18 at 64 px": (64, {"encoder": "resnet18", "input_size_px": 64, "mask_moments": False, "pretrained_backbone_weights": None}),
-}  # fmt: skip
+    "ResNet18 at 64 px": (
+        64,
+        {
+            "encoder": "resnet18",
+            "input_size_px": 64,
+            "mask_moments": False,
+            "pretrained_backbone_weights": None,
+        },
+    ),
+}
 """Batch size and settings."""
 GPU_NETWORKS: dict[str, tuple[int, dict[str, Any]]] = {
     "small (moments)": NETWORKS["small (moments)"],
     "ResNet18 at 256 px (paper)": (1024, {"preset": "paper", "pretrained_backbone_weights": None}),
-}  # fmt: skip
+}
 MASK, STATE, ACTION = "observation.images.mask", "observation.state", "action"
 SIZE_PX, STATE_DIM, ACT_DIM = 256, 11, 7
 """Of random frames: those of our datasets."""
@@ -92,7 +100,9 @@ def main() -> None:
             )
         row = {"network": name, "batch_size": batch_size, **_measured(student, batch_size, args)}
         if args.lerobot:
-            row["lerobot_loader"] = _lerobots_loader(args.dataset, _repo_id(args.dataset), batch_size)  # fmt: skip
+            row["lerobot_loader"] = _lerobots_loader(
+                args.dataset, _repo_id(args.dataset), batch_size
+            )
         rows.append(row)
         print(json.dumps(row), flush=True)
     print(

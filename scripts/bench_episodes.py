@@ -4,16 +4,18 @@
     python scripts/bench_episodes.py --quick     # 6 episodes, within 60 s
     python scripts/bench_episodes.py --scaling   # 10, 100, 1,000 episodes and 1, 10, 100 tasks; 10 minutes
 
-A scripted expert lifts the benchmark's box under the recording randomisation. "ours": `collect`, which rolls out,
-draws and stages, then `pack`. "lerobot": the same rollouts (checked: equal actions), masks by `mujoco.Renderer`'s segmentation,
-`LeRobotDataset.add_frame` and `save_episode` with lossless H.264 (crf 0, yuv420p, g 2), the best row of a table of fourteen
-ways to store masks, or with LeRobot's default codec (without `--quick`). Each is given what it can use: ours all cores,
-LeRobot's way its one process and what threads its parts start. Imports, compilation and the making of windows come before the clock.
+A scripted expert lifts the benchmark's box under the recording randomisation. "ours": `collect`,
+which rolls out, draws and stages, then `pack`. "lerobot": the same rollouts (checked: equal
+actions), masks by `mujoco.Renderer`'s segmentation, `LeRobotDataset.add_frame` and `save_episode`
+with lossless H.264 (crf 0, yuv420p, g 2), the best row of a table of fourteen ways to store masks,
+or with LeRobot's default codec (without `--quick`). Each is given what it can use: ours all cores,
+LeRobot's way its one process and what threads its parts start. Imports, compilation and the making
+of windows come before the clock.
 
 Then both datasets are read with LeRobot: every pixel of ours against what was drawn, and random rows with two frames of
-pictures and states, in turns. The scaling packs synthetic episodes (discs and squares, 256 x 256, 30 frames), each size in a
-process of its own, because physics is not the question there; shown are milliseconds per frame, by the clock and of all cores
-together, and the largest memory.
+pictures and states, in turns. The scaling packs synthetic episodes (discs and squares, 256 x 256,
+30 frames), each size in a process of its own, because physics is not the question there; shown are
+milliseconds per frame, by the clock and of all cores together, and the largest memory.
 
 The last line, `expert_to_dataset_over_lerobot: X`, is our frames per second over LeRobot's.
 """
@@ -205,9 +207,13 @@ def lerobots_way(
     wanted = [Episode.load(path, pictures=False) for path in staged]
     started = time.perf_counter()
     dataset = LeRobotDataset.create(
-        f"bench/{root.name}", fps=FPS, features=features(recipe.size_px, is_simulated=True), root=root,
-        robot_type=ROBOT_TYPE, rgb_encoder=codec,
-    )  # fmt: skip
+        f"bench/{root.name}",
+        fps=FPS,
+        features=features(recipe.size_px, is_simulated=True),
+        root=root,
+        robot_type=ROBOT_TYPE,
+        rgb_encoder=codec,
+    )
     made: list[np.ndarray] = []
     for rollouts in batches(bundle, recipe, seed):
         world = build_world(bundle.scene, FINE)
@@ -301,7 +307,8 @@ def scaling(cfg: BenchConfig) -> None:
     """Pack ever more synthetic episodes, of ever more tasks, and print what it costs."""
     print("synthetic episodes: packing only, no physics")
     print(
-        f"{'episodes':>8s} {'tasks':>6s} {'frames':>8s} {'ms/frame':>9s} {'CPU ms':>7s} {'memory MB':>10s} {'more than before':>17s}"
+        f"{'episodes':>8s} {'tasks':>6s} {'frames':>8s} {'ms/frame':>9s} {'CPU ms':>7s} "
+        f"{'memory MB':>10s} {'more than before':>17s}"
     )
     for episodes, tasks in SIZES:
         with tempfile.TemporaryDirectory() as folder:
@@ -317,7 +324,8 @@ def scaling(cfg: BenchConfig) -> None:
         frames = episodes * SYNTHETIC_FRAMES
         print(
             f"{episodes:8d} {tasks:6d} {frames:8d} {1e3 * got['seconds'] / frames:9.3f} "
-            f"{1e3 * got['cpu_seconds'] / frames:7.3f} {got['peak_mb']:10.0f} {got['peak_mb'] - got['before_mb']:17.0f}",
+            f"{1e3 * got['cpu_seconds'] / frames:7.3f} {got['peak_mb']:10.0f} "
+            f"{got['peak_mb'] - got['before_mb']:17.0f}",
             flush=True,
         )
 
@@ -348,12 +356,17 @@ def stage_synthetic(out: Path, episodes: int, tasks: int) -> None:
             )
             cv2.circle(image, (int(x[2]) - t, int(y[2]) + t), 20, 3, -1)
         Episode(
-            id=f"synthetic_{number:05d}", item=f"item_{number % tasks}", task=f"do task {number % tasks}",
-            seed=number, labels=labels,
+            id=f"synthetic_{number:05d}",
+            item=f"item_{number % tasks}",
+            task=f"do task {number % tasks}",
+            seed=number,
+            labels=labels,
             state=rng.normal(size=(SYNTHETIC_FRAMES, 11)).astype(np.float32),
             action=rng.uniform(-1, 1, (SYNTHETIC_FRAMES, 7)).astype(np.float32),
-            success=np.arange(SYNTHETIC_FRAMES) > SYNTHETIC_FRAMES - 8, referee=True, objects=("a", "b"),
-        ).save(out / "episodes")  # fmt: skip
+            success=np.arange(SYNTHETIC_FRAMES) > SYNTHETIC_FRAMES - 8,
+            referee=True,
+            objects=("a", "b"),
+        ).save(out / "episodes")
 
 
 if __name__ == "__main__":

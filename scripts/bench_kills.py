@@ -3,12 +3,13 @@
     python scripts/bench_kills.py --kills=200            # an hour on two cores, most of it in worker processes
     python scripts/bench_kills.py --kills=20 --phases collect pack
 
-Once undisturbed: a scripted expert's episodes are collected (lifting a box, six episodes and some failures), packed (several video
-files), merged with a second dataset, and pushed to a server on the loopback. A toy task becomes a run folder up to its
-dataset, in worker processes; a student is distilled in it, and a policy trained, as `v2p distill` and `v2p train` do.
-Then, over and over: a phase is chosen in
-turn and started on what the undisturbed run had before it, in a child process that is sent SIGKILL at a moment drawn from
-the time the phase takes. What must hold right after the kill:
+Once undisturbed: a scripted expert's episodes are collected (lifting a box, six episodes and some
+    failures), packed (several video
+files), merged with a second dataset, and pushed to a server on the loopback. A toy task becomes a
+run folder up to its dataset, in worker processes; a student is distilled in it, and a policy
+trained, as `v2p distill` and `v2p train` do. Then, over and over: a phase is chosen in turn and
+started on what the undisturbed run had before it, in a child process that is sent SIGKILL at a
+moment drawn from the time the phase takes. What must hold right after the kill:
 
 - collect: every finished episode is there, byte by byte as in the undisturbed run, and every one can be read;
 - pack, merge: the dataset is absent, or it is there whole, byte by byte;
@@ -92,10 +93,13 @@ def main() -> None:
     with running_hub() as hub, tempfile.TemporaryDirectory() as folder:
         # Before anything of Hugging Face is imported, which reads them once.
         os.environ |= {
-            "HF_ENDPOINT": hub.url, "HF_TOKEN": TOKEN, "HF_HOME": f"{folder}/hf",
-            "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1",
+            "HF_ENDPOINT": hub.url,
+            "HF_TOKEN": TOKEN,
+            "HF_HOME": f"{folder}/hf",
+            "HF_HUB_DISABLE_XET": "1",
+            "HF_HUB_DISABLE_TELEMETRY": "1",
             "HF_HUB_DISABLE_PROGRESS_BARS": "1",
-        }  # fmt: skip
+        }
         os.environ.pop("HF_HUB_OFFLINE", None)
         survived, kills = run(cfg, Path(folder), hub)
     print(f"kills_survived: {survived} of {kills}")

@@ -3,16 +3,21 @@
     python scripts/bench_masks.py            # 12 turns
     python scripts/bench_masks.py --quick    # 3 turns, within 45 s; the same 200 states
 
-The states are 20 each of ten scenes: six random toys, which are meshes of convex parts, and four benchmark tasks. Half of them come out of the batched environment after random actions, under the randomisation
-of recording with a moving camera; in the other half the objects float in random orientations. `mujoco.Renderer` draws
-segmentation of the same models in the same states, put there in the same way; turning its ids into labels is not counted.
+The states are 20 each of ten scenes: six random toys, which are meshes of convex parts, and four
+    benchmark tasks. Half of them come out of the batched environment after random actions, under
+    the randomisation
+of recording with a moving camera; in the other half the objects float in random orientations.
+`mujoco.Renderer` draws segmentation of the same models in the same states, put there in the same
+way; turning its ids into labels is not counted.
 
-All take turns at all states, in processes of their own that are ready beforehand. "all cores": our threads against as many
-renderer processes as there are cores. "one core": one of each, held on the same core. The engine's models ask for no
-multisampling, which makes the renderer faster than with MuJoCo's default of 4 samples. Software OpenGL keeps its own number of
-threads: setting `LP_NUM_THREADS` to 0 or 1 changed nothing.
+All take turns at all states, in processes of their own that are ready beforehand. "all cores": our
+threads against as many renderer processes as there are cores. "one core": one of each, held on the
+same core. The engine's models ask for no multisampling, which makes the renderer faster than with
+MuJoCo's default of 4 samples. Software OpenGL keeps its own number of threads: setting
+`LP_NUM_THREADS` to 0 or 1 changed nothing.
 
-The last line, `masks_over_renderer: X`, is the median over the turns of the renderer's seconds per frame over ours, all cores.
+The last line, `masks_over_renderer: X`, is the median over the turns of the renderer's seconds per
+    frame over ours, all cores.
 """
 
 import multiprocessing
@@ -77,7 +82,8 @@ class Stage:
 
     @property
     def num_mesh_geoms(self) -> int:
-        return int((self.world.model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum())  # pyright: ignore[reportAttributeAccessIssue]
+        mesh = mujoco.mjtGeom.mjGEOM_MESH  # pyright: ignore[reportAttributeAccessIssue]
+        return int((self.world.model.geom_type == mesh).sum())
 
 
 def main(cfg: BenchConfig) -> None:

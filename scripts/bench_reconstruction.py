@@ -1,19 +1,22 @@
 """Measure reconstruction on drawn clips with known truth: which stage fails how often, and by how much.
 
-Clips of every kind of task are drawn (and kept: a second run only reconstructs), reconstructed with the gate open, and
-compared with their truth; `drawn_clips.score` says what counts as a failure. Then the gate is asked: which of them
-would have been accepted, and how many of those are usable? Seeds are split: `tune` has the even ones, for looking
-at while working; `final` the odd ones, on which NOTHING may be tuned, neither code nor thresholds. Each run on `final` is
-written down beside its result with the commit that ran it.
+Clips of every kind of task are drawn (and kept: a second run only reconstructs), reconstructed
+with the gate open, and compared with their truth; `drawn_clips.score` says what counts as a
+failure. Then the gate is asked: which of them would have been accepted, and how many of those are
+usable? Seeds are split: `tune` has the even ones, for looking at while working; `final` the odd
+ones, on which NOTHING may be tuned, neither code nor thresholds. Each run on `final` is written
+down beside its result with the commit that ran it.
 
     python scripts/bench_reconstruction.py --split tune --clips 120
     python scripts/bench_reconstruction.py --split tune --clips 120 --boxes
     python scripts/bench_reconstruction.py --quick
 
-The caption is all that a clip comes with. With `--boxes` each named object has one box more, as a person would draw it:
-around what is visible at the first frame, or at the last for what is hidden at first, a few pixels off at each side. With
-`--size` the manipulated object's length, width and height are given as well, as somebody measured them; with `--camera` how
-high the camera stands, how far it looks down and how wide it sees, as somebody with one stand for all videos can measure once.
+The caption is all that a clip comes with. With `--boxes` each named object has one box more, as a
+person would draw it: around what is visible at the first frame, or at the last for what is hidden
+at first, a few pixels off at each side. With `--size` the manipulated object's length, width and
+height are given as well, as somebody measured them; with `--camera` how high the camera stands,
+how far it looks down and how wide it sees, as somebody with one stand for all videos can measure
+once.
 """
 
 import argparse
@@ -487,7 +490,7 @@ def reconstructed(
     pictures: Path,
     camera: SceneConfig | None = None,
 ) -> Row:
-    """Return what becomes of a clip with what is `given` beside its caption, and with the settings of a `camera` that was found out."""
+    """Return what becomes of a clip, with what is `given` beside its caption and the settings of a known `camera`."""
     truth = load_truth(folder, job.name)
     true = true_of(truth)
     said: Row = {"caption": truth.caption}

@@ -10,10 +10,11 @@ with the same per-world values, time steps, threads and controls, in the same st
 is recorded, and the bare physics must end up in the same joint positions to the last bit, or the measurement
 fails. Resets are put into the limit's states while its clock stands still.
 
-The two take turns, `CHUNK` control steps each, and go through the same steps again and again. "best" adds up the fastest
-time of each step, "median" the medians. The share of the limit is taken per pair of neighbouring chunks, the seconds of the
-bare physics divided by those of the environment, so that other load on the machine meets both; shown is the median over
-all pairs. The last line, `env_over_limit: X`, is that share for lifting a box with random actions.
+The two take turns, `CHUNK` control steps each, and go through the same steps again and again.
+"best" adds up the fastest time of each step, "median" the medians. The share of the limit is taken
+per pair of neighbouring chunks, the seconds of the bare physics divided by those of the
+environment, so that other load on the machine meets both; shown is the median over all pairs. The
+last line, `env_over_limit: X`, is that share for lifting a box with random actions.
 """
 
 import json
@@ -48,7 +49,8 @@ from v2p_data.task.templates.write import write_samples
 
 CHUNK = 4
 QUICK_SECONDS = 26.0
-"""With --quick, a row is left out that would not be done by then, if it took half as long again as the slowest so far."""
+"""With --quick, a row is left out that would not be done by then, if it took half as long again as
+the slowest so far."""
 SCALING_WORLDS = (64, 128, 256, 512, 1024, 2048, 4096)
 MESH_FILE = "pebble.obj"
 
@@ -172,8 +174,15 @@ def insert_into_bowl() -> TaskBundle:
     return _task(
         "insert",
         _object("cube", size_m=(0.035, 0.035, 0.035), ends_at=(0.0, 0.2, 0.04)),
-        _object("bowl", "cylinder", size_m=(0.15, 0.15, 0.06), starts_at=(0.0, 0.2), role="container", hollow=True),
-    )  # fmt: skip
+        _object(
+            "bowl",
+            "cylinder",
+            size_m=(0.15, 0.15, 0.06),
+            starts_at=(0.0, 0.2),
+            role="container",
+            hollow=True,
+        ),
+    )
 
 
 def lift_mesh(folder: Path) -> TaskBundle:

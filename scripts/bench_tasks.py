@@ -1,8 +1,9 @@
 """Learn the benchmark tasks and judge the experts: the tables of `docs/experts.md`.
 
-Each task of `v2p_data/task/paper_tasks` is learned with the engine's defaults, once per seed. The scripted program, the
-taught policy, PPO's and the expert play the same fresh episodes at the fine time step; the independent referee judges
-them. Results are appended to a JSON-lines file, so that a stopped run goes on where it was; `--table` prints what is there.
+Each task of `v2p_data/task/paper_tasks` is learned with the engine's defaults, once per seed. The
+scripted program, the taught policy, PPO's and the expert play the same fresh episodes at the fine
+time step; the independent referee judges them. Results are appended to a JSON-lines file, so that
+a stopped run goes on where it was; `--table` prints what is there.
 
     python scripts/bench_tasks.py --out outputs/bench_tasks --tasks lift_up insert --seeds 0 1 2
 """
@@ -163,7 +164,8 @@ def _key(result: dict) -> tuple[str, int, str, float]:
 def table(results: list[dict[str, Any]]) -> str:
     """Return one Markdown row per task: how often each actor succeeds over all seeds, what PPO gained, what it took."""
     lines = [
-        "| task | program | taught | taught + PPO | PPO gains | PPO saves (s) | PPO kept | gradient steps | moved | steps (M) | CPU s "
+        "| task | program | taught | taught + PPO | PPO gains | PPO saves (s) | PPO kept | "
+        "gradient steps | moved | steps (M) | CPU s "
         "| reward alone | its steps (M) | paper |",
         "|" + "---|" * 14,
     ]
@@ -178,7 +180,8 @@ def table(results: list[dict[str, Any]]) -> str:
             for teacher in ("programs", "none")
         }
         lines.append(
-            f"| {task} | {_taught_cells(by_teacher['programs'])} | {_alone_cells(by_teacher['none'])} | {success(task) if task in names else '-'} |"
+            f"| {task} | {_taught_cells(by_teacher['programs'])} | "
+            f"{_alone_cells(by_teacher['none'])} | {success(task) if task in names else '-'} |"
         )
     return "\n".join(lines)
 

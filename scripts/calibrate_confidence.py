@@ -1,7 +1,8 @@
 """Ask how far a scene's confidence can be trusted: each clip is judged by a fit to the clips of all other sources.
 
-Takes the files that `judge_real_clips.py --no-gate --out` (`judged.json`) and `bench_reconstruction.py --out` (`results.json`) write.
-Clips that ended before they had a confidence are counted and left out. The source is what follows the last `__` in a clip's name; a
+Takes the files that `judge_real_clips.py --no-gate --out` (`judged.json`) and
+`bench_reconstruction.py --out` (`results.json`) write. Clips that ended before they had a
+confidence are counted and left out. The source is what follows the last `__` in a clip's name; a
 name without is a source of its own. Four rules are compared:
 
 | rule | probability that the scene is right |
@@ -11,7 +12,8 @@ name without is a source of its own. Four rules are compared:
 | `stages` | the same on the logarithm of each stage's confidence |
 | `threshold` | the confidence itself, accepted from the least value from which nine of ten others are right |
 
-A clip that the default gate turns away for another reason than its confidence is accepted by `shipped` and `threshold` never.
+A clip that the default gate turns away for another reason than its confidence is accepted by
+`shipped` and `threshold` never.
 
     python scripts/calibrate_confidence.py outputs/judged/judged.json outputs/more/judged.json
 """

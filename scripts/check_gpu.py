@@ -2,7 +2,7 @@
 
     python scripts/check_gpu.py                              # on a machine with a CUDA device; half an hour
     python scripts/check_gpu.py --checks warp_speed          # some of them
-    python scripts/check_gpu.py --device cpu --quick         # tries the checks themselves on the CPU; their speeds mean nothing
+    python scripts/check_gpu.py --device cpu --quick         # tries the checks on the CPU; speeds mean nothing
 
 A check is a test or a benchmark that stands elsewhere. One that fails, hangs or crashes does not keep the others from
 running, and the JSON is written after each. Exit code: 0, all passed; 1, some did not; 2, there is no GPU.
@@ -34,7 +34,9 @@ TAIL_CHARACTERS = 3000
 NOT_POSSIBLE = 2
 """Exit code of a benchmark that lacks what it measures."""
 NUMBER = re.compile(r"^(\w+): (-?[\d.]+)$", re.M)
-BACKENDS = [f"tests/scene/backends/test_{k}.py" for k in ("depth", "detect", "segment", "sam2_stream")]  # fmt: skip
+BACKENDS = [
+    f"tests/scene/backends/test_{k}.py" for k in ("depth", "detect", "segment", "sam2_stream")
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +160,10 @@ def _python_path() -> str:
 
 def _read_tests(report: Path, outcome: Outcome) -> None:
     cases = list(ET.parse(report).getroot().iter("testcase"))
-    told = {kind: [(c, f) for c in cases for f in c.iter(kind)] for kind in ("failure", "error", "skipped")}  # fmt: skip
+    told = {
+        kind: [(c, f) for c in cases for f in c.iter(kind)]
+        for kind in ("failure", "error", "skipped")
+    }
     failed = {c.get("name"): f for c, f in (*told["failure"], *told["error"])}
     skipped = {f.get("message", "") for _, f in told["skipped"]}
     count = len(cases) - len(failed) - len(told["skipped"])
@@ -193,8 +198,9 @@ def about(device: str) -> dict[str, Any]:
         "commit": found["commit"],
         "time": found["time"],
         "python": found["python"],
-        "packages": found["packages"] | _versions("torch", "mujoco-warp", "warp-lang", "torchrl", "transformers"),
-    }  # fmt: skip
+        "packages": found["packages"]
+        | _versions("torch", "mujoco-warp", "warp-lang", "torchrl", "transformers"),
+    }
 
 
 def _versions(*packages: str) -> dict[str, str]:
@@ -206,12 +212,17 @@ def main() -> int:
     """Run the checks, print a line for each, write the JSON."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--device", default="cuda", help="cuda, or cpu to try the checks")
-    parser.add_argument("--quick", action="store_true", help="small sizes; the figures mean nothing")  # fmt: skip
+    parser.add_argument(
+        "--quick", action="store_true", help="small sizes; the figures mean nothing"
+    )
     parser.add_argument("--checks", nargs="*", choices=[*CHECKS], default=[*CHECKS])
     parser.add_argument("--out", type=Path, default=Path("outputs/check_gpu.json"))
     args = parser.parse_args()
     if args.device.startswith("cuda") and not torch.cuda.is_available():
-        print("There is no CUDA device here; --device cpu --quick tries the checks on the CPU.", file=sys.stderr)  # fmt: skip
+        print(
+            "There is no CUDA device here; --device cpu --quick tries the checks on the CPU.",
+            file=sys.stderr,
+        )
         return 2
     args.out.parent.mkdir(parents=True, exist_ok=True)
     told: dict[str, Any] = {**about(args.device), "quick": args.quick, "checks": []}
@@ -221,7 +232,10 @@ def main() -> int:
         write_json_atomically(args.out, told)
         word = "passed" if outcome.passed else "FAILED" if outcome.ran else "could not run"
         figures = {k: v for k, v in outcome.figures.items() if k != "rows"}
-        print(f"{name}: {word} in {outcome.seconds:.0f} s {figures or ''} {outcome.error[:300]}", flush=True)  # fmt: skip
+        print(
+            f"{name}: {word} in {outcome.seconds:.0f} s {figures or ''} {outcome.error[:300]}",
+            flush=True,
+        )
     print(f"written: {args.out}")
     return 0 if all(c["passed"] for c in told["checks"]) else 1
 

@@ -1,8 +1,9 @@
 """Name the system libraries that are missing, with the command that installs them, and lend LeRobot the FFmpeg of PyAV.
 
-LeRobot streams datasets, and prints its system report, with torchcodec, which looks for FFmpeg's libraries by their plain names.
-PyAV's wheel holds them under names of its own. Links with the plain names, on the path that an activated shell gives
-to the loader, are enough. Nothing outside the virtual environment is changed.
+LeRobot streams datasets, and prints its system report, with torchcodec, which looks for FFmpeg's
+libraries by their plain names. PyAV's wheel holds them under names of its own. Links with the
+plain names, on the path that an activated shell gives to the loader, are enough. Nothing outside
+the virtual environment is changed.
 """
 
 import ctypes.util
@@ -48,7 +49,8 @@ def main() -> int:
         shutil.rmtree(prefix / FFMPEG_FOLDER, ignore_errors=True)
     elif lend_ffmpeg(prefix, Path(sysconfig.get_path("platlib")) / "av.libs"):
         _say(
-            "setup: FFmpeg is not on this system. In a shell where .venv is activated (source .venv/bin/activate) LeRobot uses"
+            "setup: FFmpeg is not on this system. In a shell where .venv is activated (source "
+            ".venv/bin/activate) LeRobot uses"
             " the one that PyAV brought; elsewhere its dataset streaming and lerobot-info fail, and it says at length"
             " that it decodes with PyAV instead. 'apt-get install -y ffmpeg' (as root) helps everywhere."
         )

@@ -2,8 +2,9 @@
 
     python scripts/example_robot_server.py --task outputs/demo/task/lift_red_box-1a2b3c4d --port 7777
 
-The arm here is the simulated one. Put the calls of a real arm's library into `Arm`; the rest stays. One thread owns the
-arm; connections only hand requests to it. Without a target for `DEADMAN_S` the arm holds, whatever became of the client.
+The arm here is the simulated one. Put the calls of a real arm's library into `Arm`; the rest
+stays. One thread owns the arm; connections only hand requests to it. Without a target for
+`DEADMAN_S` the arm holds, whatever became of the client.
 """
 
 import argparse

@@ -1,15 +1,17 @@
 """Damage files and folders of every kind that the engine reads, and look at what its commands answer.
 
-Corpora of the tests are tried whole or in a random part: task folders, datasets, policies and decoded caches as strangers
-may make them (`tests/task/strangers.py`, `tests/episodes/strange_datasets.py`, `tests/policies/spoiled.py`), odd videos,
-captions, labels and boxes (`tests/video/odd_files.py`), and harms to each kind of file of a finished run
-(`tests/pipeline/damage.py`). Every case runs in a process of its own, whose time and memory are measured.
+Corpora of the tests are tried whole or in a random part: task folders, datasets, policies and
+    decoded caches as strangers
+may make them (`tests/task/strangers.py`, `tests/episodes/strange_datasets.py`,
+`tests/policies/spoiled.py`), odd videos, captions, labels and boxes (`tests/video/odd_files.py`),
+and harms to each kind of file of a finished run (`tests/pipeline/damage.py`). Every case runs in a
+process of its own, whose time and memory are measured.
 
     python scripts/fuzz_artefacts.py --run outputs/demo --harms 200 --seed 1
 
-A case is good if it ends in one sentence and exit code 2, is listed as damaged, or is rightly accepted. Ends with exit
-code 1 if any case ends in a traceback, hangs, takes more than 60 s or 4 GB, or a listed file changes unnoticed. The longest and the
-largest case of each part are printed.
+A case is good if it ends in one sentence and exit code 2, is listed as damaged, or is rightly
+accepted. Ends with exit code 1 if any case ends in a traceback, hangs, takes more than 60 s or 4
+GB, or a listed file changes unnoticed. The longest and the largest case of each part are printed.
 """
 
 import argparse
@@ -239,7 +241,9 @@ def _datasets() -> Iterator[tuple[str, Case]]:
         def verified(folder: Path) -> str:
             spoiled = Path(shutil.copytree(good, folder / "spoiled"))
             spoil(spoiled)
-            return {1: "noticed", 2: "refused"}.get(cli.run(["verify", str(spoiled)]), "violation: accepted")  # fmt: skip
+            return {1: "noticed", 2: "refused"}.get(
+                cli.run(["verify", str(spoiled)]), "violation: accepted"
+            )
 
         return verified
 
@@ -276,9 +280,11 @@ def _harms(args: argparse.Namespace) -> Iterator[tuple[str, Case]]:
         (kind, path, name, harm)
         for kind in damage.KINDS
         for path in kind.files(args.run)[:1]
-        for name, harm in (damage.HARMS | (damage.JSON_HARMS if path.suffix == ".json" else {})).items()
+        for name, harm in (
+            damage.HARMS | (damage.JSON_HARMS if path.suffix == ".json" else {})
+        ).items()
         if path.stat().st_size > 1
-    ]  # fmt: skip
+    ]
     drawn = rng_for(args.seed, "fuzz-artefacts").permutation(len(every))[: args.harms]
 
     def case(kind: Any, path: Path, harm: Callable[[Path], None]) -> Case:

@@ -42,9 +42,30 @@ LIBRARIES = tuple(
     {sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(ROOT / "v2p_data")}
 )
 WATCHED = (
-    "open", "os.", "subprocess.", "socket.", "ctypes.", "shutil.", "tempfile.", "pty.", "mmap.", "pickle.", "marshal.",
-    "exec", "compile", "import", "sys.", "gc.", "fcntl.", "signal.", "urllib.", "http.", "code.", "winreg.", "syslog.",
-)  # fmt: skip
+    "open",
+    "os.",
+    "subprocess.",
+    "socket.",
+    "ctypes.",
+    "shutil.",
+    "tempfile.",
+    "pty.",
+    "mmap.",
+    "pickle.",
+    "marshal.",
+    "exec",
+    "compile",
+    "import",
+    "sys.",
+    "gc.",
+    "fcntl.",
+    "signal.",
+    "urllib.",
+    "http.",
+    "code.",
+    "winreg.",
+    "syslog.",
+)
 SECONDS_EACH = 2.0
 _heard: list[str] | None = None
 
@@ -119,9 +140,12 @@ def fuzz(programs: int, executed: int, seed: int, folder: Path) -> dict[str, Any
             violations.append(f"program {k}: changed the folder: {_look_at(folder)}")
             canaries = _look_at(folder)
     return {
-        "programs": programs, "executed": ran, "outcomes": dict(outcomes), "violations": violations[:20],
+        "programs": programs,
+        "executed": ran,
+        "outcomes": dict(outcomes),
+        "violations": violations[:20],
         "seconds": round(time.monotonic() - begin, 1),
-    }  # fmt: skip
+    }
 
 
 def _listened_to(source: str, request: dict[str, Any]) -> dict[str, Any]:

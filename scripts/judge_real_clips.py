@@ -1,15 +1,17 @@
 """Judge the reconstruction of real clips against boxes that a person drew: the table of `docs/reconstruction.md`.
 
-Each clip is decoded and rebuilt as `v2p scene` does it, without hints, with `--boxes` with one box per object, or with
-`--boxes manipulated` with a box around what is moved and nothing else, as a person in a hurry marks it.
-The boxes are those of `CLIPS/boxes.json` where there is one, drawn by whoever keeps the clips, else those of the clips that we
-have looked at while building (`docs/real_clip_boxes.json`). Only clips that nobody tuned on say what to expect of others.
+Each clip is decoded and rebuilt as `v2p scene` does it, without hints, with `--boxes` with one box
+per object, or with `--boxes manipulated` with a box around what is moved and nothing else, as a
+person in a hurry marks it. The boxes are those of `CLIPS/boxes.json` where there is one, drawn by
+whoever keeps the clips, else those of the clips that we have looked at while building
+(`docs/real_clip_boxes.json`). Only clips that nobody tuned on say what to expect of others.
 
     {"clip1.mp4": {"rating": 4, "objects": {"red box": {"first": [210, 140, 290, 230], "last": null}}}}
 
-Boxes are `[x0, y0, x1, y1]` in the file's pixels, null where nothing of the object is seen; the rating may be left out.
-A clip is right when every outline's box overlaps the drawn one by half or more (intersection over union), at the
-first and at the last frame. Whatever follows the options goes to the engine's settings, e.g. `--scene.min-confidence 0.6`.
+Boxes are `[x0, y0, x1, y1]` in the file's pixels, null where nothing of the object is seen; the
+rating may be left out. A clip is right when every outline's box overlaps the drawn one by half or
+more (intersection over union), at the first and at the last frame. Whatever follows the options
+goes to the engine's settings, e.g. `--scene.min-confidence 0.6`.
 
     python scripts/judge_real_clips.py CLIPS --out outputs/judged
     python scripts/judge_real_clips.py CLIPS --scene.preset learned --out outputs/judged_learned

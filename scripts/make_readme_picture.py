@@ -37,7 +37,12 @@ def row(run: Path, item: str) -> np.ndarray:
         labels_to_rgb(episode.labels[moment])[..., ::-1]
         for moment in np.linspace(0, len(episode.labels) - 1, 3).round().astype(int)
     )
-    return np.hstack([cv2.copyMakeBorder(fitted(p), 3, 3, 3, 3, cv2.BORDER_CONSTANT, value=(PAPER,) * 3) for p in pictures])  # fmt: skip
+    return np.hstack(
+        [
+            cv2.copyMakeBorder(fitted(p), 3, 3, 3, 3, cv2.BORDER_CONSTANT, value=(PAPER,) * 3)
+            for p in pictures
+        ]
+    )
 
 
 def main() -> None:

@@ -69,9 +69,12 @@ def lifting_text() -> str:
         f"{name} {value:.0%}" for name, value in papers_value("table 2/success").items()
     )
     return (
-        f"Beside them the paper's numbers, of other scenes and another robot: {unseen} on {papers_value('recipe/unseen videos')} unseen\n"
-        f"lifts after {papers_value('recipe/lifting videos')} tasks (figure 5); on masks {papers_value('recipe/success on masks'):.0%} in simulation,"
-        f" and on the real robot {real}\n(table 2). Figure 6 rises with the number of tasks; its values are not in the text."
+        f"Beside them the paper's numbers, of other scenes and another robot: {unseen} on "
+        f"{papers_value('recipe/unseen videos')} unseen\n"
+        f"lifts after {papers_value('recipe/lifting videos')} tasks (figure 5); on masks "
+        f"{papers_value('recipe/success on masks'):.0%} in simulation,"
+        f" and on the real robot {real}\n(table 2). Figure 6 rises with the number of tasks; its "
+        "values are not in the text."
     )
 
 

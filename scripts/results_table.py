@@ -22,7 +22,8 @@ def table(results: list[dict[str, Any]]) -> str:
     """Return the results as a Markdown table, a row each, with Wilson 95 % intervals.
 
     Args:
-        results: `about`, `what`, `successes`, `trials`, `unit`, `seeds`, `hardware` and `command` (empty: judged by others) of each.
+        results: `about`, `what`, `successes`, `trials`, `unit`, `seeds`, `hardware` and `command`
+            (empty: judged by others) of each.
     """
     rows = [
         "| | what | result, 95 % interval | of | seeds | command |",
@@ -34,7 +35,8 @@ def table(results: list[dict[str, Any]]) -> str:
         before = result["about"]
         command = f"`{result['command']}`" if result["command"] else "judged by others"
         rows.append(
-            f"| {about} | {result['what']} | {_rate(result)} | {result['trials']} {result['unit']} | {result['seeds']} | {command} |"
+            f"| {about} | {result['what']} | {_rate(result)} | {result['trials']} "
+            f"{result['unit']} | {result['seeds']} | {command} |"
         )
     return "\n".join(rows)
 

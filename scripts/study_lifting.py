@@ -4,7 +4,8 @@ Training tasks come from drawn clips, and real ones where `--videos` gives some,
 training sees are judged, from the scans in `--unseen` or drawn. A cell (arm, N, seed) is one line in `results.jsonl`; a
 stopped study goes on. `--table` shows what is there. `docs/study_lifting.md` explains arms and results.
 
-    python scripts/study_lifting.py --config configs/studies/lifting_laptop.yaml --out outputs/study_lifting --unseen MESHES
+    python scripts/study_lifting.py --config configs/studies/lifting_laptop.yaml --out
+    outputs/study_lifting --unseen MESHES
 """
 
 import argparse

@@ -4,7 +4,8 @@ From a finished run (`make demo`), each variant learns some of its tasks in the 
 distillation included, and is judged by the referee on fresh episodes. Results are appended to a JSON-lines file, so
 that a stopped study goes on where it was; `--table` prints what is there.
 
-    python scripts/study_policy.py --run outputs/demo --tasks lift_red_box --variants small no_distillation --seeds 0 1 2
+    python scripts/study_policy.py --run outputs/demo --tasks lift_red_box --variants small
+    no_distillation --seeds 0 1 2
 """
 
 import argparse
@@ -54,7 +55,11 @@ class Variant:
 
 
 SMALL: dict[str, Any] = {"preset": "small"}
-RESNET: dict[str, Any] = {"encoder": "resnet18", "input_size_px": 64, "pretrained_backbone_weights": None}  # fmt: skip
+RESNET: dict[str, Any] = {
+    "encoder": "resnet18",
+    "input_size_px": 64,
+    "pretrained_backbone_weights": None,
+}
 VARIANTS = {
     "small": Variant(network=SMALL),
     "one_round": Variant(network=SMALL, rounds=1),
@@ -133,7 +138,9 @@ def _one(name: str, seed: int, args: argparse.Namespace) -> None:
     rate = _samples_per_s(student, variant.batch_size, folder / "calibration")
     shares = [SHARES[0] if k == 0 else SHARES[1] for k in range(variant.rounds)]
     shares.append(1 - sum(shares))
-    steps = [max(1, round(share * args.train_seconds * rate / variant.batch_size)) for share in shares]  # fmt: skip
+    steps = [
+        max(1, round(share * args.train_seconds * rate / variant.batch_size)) for share in shares
+    ]
     trained_s: list[float] = []
 
     def train(count: int, out: Path, seed: int, progress: Any) -> None:
@@ -202,7 +209,9 @@ def _samples_per_s(student: Student, batch_size: int, folder: Path) -> float:
 
     probe = replace(student, policy=copy.deepcopy(student.policy))
     probe.train(TrainerConfig(steps=2, batch_size=batch_size), folder, seed=0)
-    trained = probe.train(TrainerConfig(steps=CALIBRATION_STEPS, batch_size=batch_size), folder, seed=0)  # fmt: skip
+    trained = probe.train(
+        TrainerConfig(steps=CALIBRATION_STEPS, batch_size=batch_size), folder, seed=0
+    )
     return trained.samples_per_s
 
 
@@ -236,7 +245,8 @@ def table(results: list[dict[str, Any]]) -> str:
         for item in result["tasks"]:
             groups[(result["variant"], "+".join(result["trained_on"]), item)].append(result)
     lines = [
-        "| variant | trained on | judged on | once, 95 % interval | per seed | within one horizon | at the end | samples | training s | wall s |",
+        "| variant | trained on | judged on | once, 95 % interval | per seed | within one horizon "
+        "| at the end | samples | training s | wall s |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (variant, trained, item), found in groups.items():
@@ -248,7 +258,8 @@ def table(results: list[dict[str, Any]]) -> str:
         end = sum(r["at_end"] for r in rows) / n
         mean = {k: float(np.mean([r[k] for r in found])) for k in ("samples", "train_s", "wall_s")}
         lines.append(
-            f"| {variant} | {trained} | {item} | {once.value:.3f} ({once.low:.2f}-{once.high:.2f}) | {seeds} | {soon:.3f}"
+            f"| {variant} | {trained} | {item} | {once.value:.3f} "
+            f"({once.low:.2f}-{once.high:.2f}) | {seeds} | {soon:.3f}"
             f" | {end:.3f} | {mean['samples']:,.0f} | {mean['train_s']:.0f} | {mean['wall_s']:.0f} |"
         )
     return "\n".join(lines)

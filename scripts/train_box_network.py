@@ -3,10 +3,11 @@
     python scripts/train_box_network.py data --out DATA --scenes 1500 --jobs 2
     python scripts/train_box_network.py train DATA --out v2p_data/scene/fitting/boxes.safetensors --minutes 30
 
-`data` draws random scenes with boxes in them - boxes, books, bins -, each through some cameras, and keeps what a camera that
-looks straight at a box would see of it. `train` shows windows that are a little off, prints how well the network says which
-way the boxes are turned in scenes that it does not train on, and writes the weights every two minutes. Scenes are drawn from
-seeds of their own (`box network`), so that no clip of `bench_reconstruction.py` is among them.
+`data` draws random scenes with boxes in them - boxes, books, bins -, each through some cameras,
+and keeps what a camera that looks straight at a box would see of it. `train` shows windows that
+are a little off, prints how well the network says which way the boxes are turned in scenes that it
+does not train on, and writes the weights every two minutes. Scenes are drawn from seeds of their
+own (`box network`), so that no clip of `bench_reconstruction.py` is among them.
 """
 
 import argparse
@@ -167,7 +168,10 @@ def _row(
     outline: Bool[np.ndarray, "h w"],
     share: float = 1.0,
 ) -> dict[str, np.ndarray] | None:
-    """Return what a camera that looks straight at a box sees, and how that is turned; None where little of it is seen."""
+    """Return what a camera that looks straight at a box sees, and how that is turned.
+
+    None where little of it is seen.
+    """
     up = int(np.abs(T[2, :3]).argmax())
     if abs(T[2, up]) < UPRIGHT:
         return None
@@ -305,8 +309,10 @@ def measure(net: CuboidNetwork, held_out: list[Scene]) -> str:
     sides = torch.hypot(told[:, 2] - ratio * (2 * yaw).cos(), told[:, 3] - ratio * (2 * yaw).sin())
     return (
         f"{len(yaw)} boxes: yaw up to a quarter turn off by {off.median():.1f} deg (median), by more than 15 in "
-        f"{(off > 15).float().mean():.1%}; the long side taken for the short in {(way > 45).float().mean():.1%} of {len(way)}; "
-        f"sides off by {sides.median():.3f}, height by {(told[:, 5] - height).abs().median():.3f} (median of the logarithm)"
+        f"{(off > 15).float().mean():.1%}; the long side taken for the short in "
+        f"{(way > 45).float().mean():.1%} of {len(way)}; "
+        f"sides off by {sides.median():.3f}, height by {(told[:, 5] - height).abs().median():.3f} "
+        "(median of the logarithm)"
     )
 
 

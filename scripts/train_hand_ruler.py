@@ -3,10 +3,11 @@
     python scripts/train_hand_ruler.py data --out DATA --scenes 1500 --jobs 2
     python scripts/train_hand_ruler.py train DATA --out v2p_data/scene/fitting/ruler.safetensors --minutes 30
 
-`data` draws random scenes in moments at which a hand touches a thing at rest, each through twelve cameras, and keeps what
-lies within half a metre around the hand's end. `train` shows windows that are too large or too small by chance, prints how well
-the network says by how much on scenes that it does not train on, and writes the weights every two minutes. Scenes are drawn
-from seeds of their own (`hand network`), so that no clip of `bench_reconstruction.py` is among them.
+`data` draws random scenes in moments at which a hand touches a thing at rest, each through twelve
+cameras, and keeps what lies within half a metre around the hand's end. `train` shows windows that
+are too large or too small by chance, prints how well the network says by how much on scenes that
+it does not train on, and writes the weights every two minutes. Scenes are drawn from seeds of
+their own (`hand network`), so that no clip of `bench_reconstruction.py` is among them.
 """
 
 import argparse
@@ -156,7 +157,7 @@ def _view(
 def varied(
     scene: Scene, k: int, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "4 112 112"], Float32[np.ndarray, "4"], np.float32]:
-    """Return a view of a scene through a window that is too large or small by chance, changed in ways that keep it true.
+    """Return a view of a scene through a window of random size, changed in ways that keep it true.
 
     The last value is the logarithm of true over pretended pixels per metre.
     """
@@ -217,7 +218,8 @@ def measure(net: HandScaleNetwork, held_out: list[Scene]) -> str:
     net.train()
     sure = np.array(stated) < np.median(stated)
     return (
-        f"off by {np.std(off):.3f} (standard deviation of the logarithm; {np.mean(off):+.3f} in the mean), the surer half "
+        f"off by {np.std(off):.3f} (standard deviation of the logarithm; {np.mean(off):+.3f} in "
+        "the mean), the surer half "
         f"by {np.std(np.array(off)[sure]):.3f}, stated {np.mean(stated):.3f}"
     )
 

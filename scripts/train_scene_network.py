@@ -1,16 +1,19 @@
 """Train the scene network (`v2p_data/scene/frames/network.py`) on rendered clips, from nothing, on a CPU.
 
-    python scripts/train_scene_network.py data --out DATA --clips 5500 --jobs 2
-    python scripts/train_scene_network.py data --out DATA --clips 750 --jobs 2 --start 80000 --kind push_with
-    python scripts/train_scene_network.py train DATA --out a.safetensors --minutes 30
-    python scripts/train_scene_network.py train DATA --out b.safetensors --minutes 30 --start-from a.safetensors --seed 1
-    python scripts/train_scene_network.py average a.safetensors b.safetensors --out v2p_data/scene/frames/network.safetensors
-    python scripts/train_scene_network.py camera b.safetensors --out v2p_data/scene/frames/camera.safetensors
+    python scripts/train_scene_network.py data --out DATA --clips 5500 --jobs 2 python
+    scripts/train_scene_network.py data --out DATA --clips 750 --jobs 2 --start 80000 --kind
+    push_with python scripts/train_scene_network.py train DATA --out a.safetensors --minutes 30
+    python scripts/train_scene_network.py train DATA --out b.safetensors --minutes 30 --start-from
+    a.safetensors --seed 1 python scripts/train_scene_network.py average a.safetensors
+    b.safetensors --out v2p_data/scene/frames/network.safetensors python
+    scripts/train_scene_network.py camera b.safetensors --out
+    v2p_data/scene/frames/camera.safetensors
 
-`data` renders clips of all kinds at low resolution and keeps six frames of each with the two stills that the scene room
-makes of the whole clip. `train` prints the intersection over union of each class on clips that it does not train on. No real
-video is used for training. Clips here are drawn from seeds of their own (`network`), so that no clip of
-`bench_reconstruction.py` is among them.
+`data` renders clips of all kinds at low resolution and keeps six frames of each with the two
+stills that the scene room makes of the whole clip. `train` prints the intersection over union of
+each class on clips that it does not train on. No real video is used for training. Clips here are
+drawn from seeds of their own (`network`), so that no clip of `bench_reconstruction.py` is among
+them.
 """
 
 import argparse
@@ -46,7 +49,8 @@ from v2p_data.scene.scale.camera_height import table_width_m
 from v2p_data.seeds import rng_for
 
 DRAWN_OVER_SEEN = 1.5
-"""Clips are drawn larger than the network sees them, so that a part of a picture can be shown enlarged and still sharp."""
+"""Clips are drawn larger than the network sees them, so that a part of a picture can be shown
+enlarged and still sharp."""
 FRAMES_DRAWN = 12
 FRAMES_KEPT = 6
 BATCH = 12
@@ -244,8 +248,9 @@ def turned(
 ) -> tuple[list[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h w"], Float[np.ndarray, "3"]]:
     """Return what another camera at the same place sees, turned and with a longer focal length, and that camera.
 
-    Where a camera stands decides what hides what; where it looks only moves pixels, by a homography. So few clips show many
-    pitches and focal lengths. A camera that would look far beyond the picture is not taken; if none is found, nothing changes.
+    Where a camera stands decides what hides what; where it looks only moves pixels, by a
+    homography. So few clips show many pitches and focal lengths. A camera that would look far
+    beyond the picture is not taken; if none is found, nothing changes.
     """
     h, w = labels.shape
     pitch, log_focal, log_height = (float(v) for v in camera)
@@ -332,7 +337,7 @@ def _labels_at(
 def loss_of(
     logits: Float[torch.Tensor, "n 5 h w"], camera: Float[torch.Tensor, "n 6"], batch: dict
 ) -> torch.Tensor:
-    """Return cross entropy, soft Dice of hand, moved and other, and the Gaussian likelihood of the cameras that are known."""
+    """Return cross entropy, soft Dice of three classes, and the Gaussian likelihood of known cameras."""
     labels = batch["labels"].long()
     ce = F.cross_entropy(logits, labels, torch.tensor(CLASS_WEIGHTS), label_smoothing=0.02)
     share = logits.softmax(1)
@@ -350,7 +355,7 @@ def loss_of(
 
 @torch.inference_mode()
 def measure(net: SceneNetwork, held_out: list[dict[str, torch.Tensor]]) -> str:
-    """Return IoU by class over all held-out pixels, the median IoU of `moved` per frame, and camera errors, in words."""
+    """Return IoU by class over held-out pixels, the median of `moved` by frame, and camera errors, in words."""
     net.eval()
     common, either = np.zeros(len(CLASSES)), np.zeros(len(CLASSES))
     each, off = [], []

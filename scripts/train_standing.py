@@ -1,15 +1,17 @@
-"""Learn from drawn clips which of the things that stand there a caption means (`v2p_data/scene/grounding/static_objects.py`).
+"""Learn from drawn clips which standing thing a caption means (`v2p_data/scene/grounding`).
 
     python scripts/train_standing.py data --out DATA --clips 120 --jobs 2
     python scripts/train_standing.py train DATA --out v2p_data/scene/grounding/standing.json
 
-`data` draws clips with a second object, lets the scene network watch them, and keeps the cues of all candidates with how
-well each overlaps the thing that is meant. `train` fits a conditional logit (McFadden 1974): the odds between candidates are
-exponential in the sums of their weighted cues. Then it fits, by logistic regression on clips left out in turn, how sure one may
-be of the likeliest candidate: once with all candidates, once without those that show the thing that is meant, as where it was
-not seen; both are taken to be as frequent. Where a caption mentions something by the way the task does not tell its place:
-there the odds among the candidates alone say how sure that is. Clips are drawn from seeds of their own (`standing things`), so
-that no clip of `bench_reconstruction.py` is among them.
+`data` draws clips with a second object, lets the scene network watch them, and keeps the cues of
+all candidates with how well each overlaps the thing that is meant. `train` fits a conditional
+logit (McFadden 1974): the odds between candidates are exponential in the sums of their weighted
+cues. Then it fits, by logistic regression on clips left out in turn, how sure one may be of the
+likeliest candidate: once with all candidates, once without those that show the thing that is
+meant, as where it was not seen; both are taken to be as frequent. Where a caption mentions
+something by the way the task does not tell its place: there the odds among the candidates alone
+say how sure that is. Clips are drawn from seeds of their own (`standing things`), so that no clip
+of `bench_reconstruction.py` is among them.
 """
 
 import argparse
@@ -161,8 +163,10 @@ def main() -> None:
     says, is_right = np.array(chances) > 0.5, np.array(right)
     print(
         f"{len(groups)} clips, left out in turn: right on {np.mean([f.right for f in there]):.1%}, overlap "
-        f"{np.mean([f.overlap for f in there]):.3f} (of the best candidates {np.mean([g[1].max() for g in groups]):.3f}); with the "
-        f"right one there or taken away ({len(every)} cases), what is found is told from what is not on {(says == is_right).mean():.1%}; "
+        f"{np.mean([f.overlap for f in there]):.3f} (of the best candidates "
+        f"{np.mean([g[1].max() for g in groups]):.3f}); with the "
+        f"right one there or taken away ({len(every)} cases), what is found is told from what is "
+        f"not on {(says == is_right).mean():.1%}; "
         f"of what is taken for found {is_right[says].mean():.1%} is right"
     )
     choice, doubt = choosing(groups), doubting(every)

@@ -1,4 +1,4 @@
-"""What the scripts that train our small networks share: options, drawing in parallel, changed colours, descent, the weights' file."""
+"""What the training of small networks shares: options, drawing in parallel, colours, descent, weights."""
 
 import argparse
 import os
@@ -184,7 +184,7 @@ def batch_of(
 
 
 def half_precision() -> torch.autocast:
-    """Return a context in which networks compute in half precision, where this CPU knows it: twice as fast there, eight times slower elsewhere."""
+    """Return a context of half precision where this CPU has it; elsewhere it would be eight times slower."""
     return torch.autocast(
         "cpu", torch.bfloat16, enabled=bool(torch.cpu.get_capabilities().get("avx512_bf16"))
     )

@@ -23,8 +23,8 @@ UNCHECKED = (
     "v2p_data.scene.fitting.silhouette",
     "v2p_data.task.sandbox.reader",
 )
-"""Called ten thousand times and more a clip or a reward: checking their arguments takes as long as their work. The first
-sends a function to nodes that may not have the checker."""
+"""Called ten thousand times and more a clip or a reward: checking their arguments takes as long as
+their work. The first sends a function to nodes that may not have the checker."""
 CHECKED_CALLS = 300
 """Arguments of a function are checked on so many calls; some are called a million times by one test."""
 
@@ -35,7 +35,7 @@ def _modules_of(folder: Path) -> list[str]:
 
 
 def checked_at_first(stub: Callable[..., object]) -> Callable[..., object]:
-    """Return the check of a function's arguments, which ends itself after `CHECKED_CALLS`: it costs as much as the work.
+    """Return the check of a function's arguments, which ends itself after `CHECKED_CALLS`.
 
     Args:
         stub: jaxtyping's empty function with the name, place and signature of the one to check.

@@ -1,4 +1,7 @@
-"""The command line from end to end, killed in every stage; the notebook and the page of the Python API as they stand."""
+"""The command line from end to end, killed in every stage.
+
+The notebook and the page of the Python API as they stand.
+"""
 
 import hashlib
 import json

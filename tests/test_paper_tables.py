@@ -45,13 +45,16 @@ LIKE_THE_PAPER = {
 }
 """Settings that say they are the paper's."""
 QUOTES = [
-    ("v2p_data/reward/config.py", "the paper takes {recipe/iterations}, and {recipe/iterations self-collected} for hard"),
+    (
+        "v2p_data/reward/config.py",
+        "the paper takes {recipe/iterations}, and {recipe/iterations self-collected} for hard",
+    ),
     ("v2p_data/task/task.py", "the paper gives {recipe/horizon} steps"),
     ("v2p_data/task/schema.py", "the paper's episodes have {recipe/horizon} steps"),
     ("v2p_data/episodes/config.py", "the paper's policies learn from {recipe/trajectories}"),
     ("v2p_data/policy/config.py", "{recipe/epochs} epochs of batch {recipe/batch}"),
     ("configs/paper.yaml", "{recipe/epochs} epochs of batch {recipe/batch}"),
-]  # fmt: skip
+]
 """Sentences of code and settings that quote the paper."""
 
 

@@ -12,9 +12,14 @@ def test_readme_and_page_show_the_recorded_results():
 
 def test_a_rate_is_shown_with_its_wilson_interval():
     result = {
-        "about": "Policy", "what": "lift", "successes": 98, "trials": 100, "unit": "episodes", "seeds": "0",
+        "about": "Policy",
+        "what": "lift",
+        "successes": 98,
+        "trials": 100,
+        "unit": "episodes",
+        "seeds": "0",
         "command": "make demo",
-    }  # fmt: skip
+    }
 
     (row,) = results_table.table([result]).splitlines()[2:]
 

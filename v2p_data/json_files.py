@@ -1,4 +1,4 @@
-"""JSON files are read here: strictly, where what is wrong is one sentence, or leniently, where a page shows what there is."""
+"""JSON files are read here: strictly, with one sentence on a fault, or leniently, for pages."""
 
 import json
 from pathlib import Path

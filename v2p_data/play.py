@@ -161,7 +161,8 @@ class VisionActor:
         state = within_bounds(state_as_seen(view.state, view.worlds, self.interface))
         if self.num_states not in (None, state.shape[1]):
             raise V2PError(
-                f"the policy sees a state of {self.num_states} numbers, and the arm of task '{view.worlds.bundle.title}'"
+                f"the policy sees a state of {self.num_states} numbers, and the arm of task "
+                f"'{view.worlds.bundle.title}'"
                 f" gives {state.shape[1]}: evaluate the policy with the arm of its dataset"
             )
         return steps_to(view.worlds, self.policy.act(view.labels, state), self.interface.actions)
@@ -184,7 +185,8 @@ class StateActor:
         """
         if self.obs_dim not in (None, worlds.obs_dim):
             raise V2PError(
-                f"the expert knows observations of length {self.obs_dim}, and task '{worlds.bundle.title}' makes ones of"
+                f"the expert knows observations of length {self.obs_dim}, and task "
+                f"'{worlds.bundle.title}' makes ones of"
                 f" length {worlds.obs_dim}: it is another task's expert"
             )
 

@@ -24,7 +24,7 @@ def num_cores() -> int:
 
 
 def own_python(module: str, function: str = "main") -> list[str]:
-    """Return the command that runs a function of one of our modules in a Python that ignores the user's settings of Python.
+    """Return the command that runs a function of our modules in a Python without the user's settings.
 
     It ends when this process does, however that went, from before it imports the module.
     """

@@ -1,7 +1,7 @@
 """START HERE: the engine's stages in the order they happen.
 
-    video --> scene --> task --> (reward -->) expert --> episodes --+--> dataset --> (distillation -->) policy --> evaluation
-    video --> scene --> task --> (reward -->) expert --> episodes --+
+    video --> scene --> task --> (reward -->) expert --> episodes --+--> dataset --> (distillation
+    -->) policy --> evaluation video --> scene --> task --> (reward -->) expert --> episodes --+
           (cousin --> task --> ...) -----------------------------------+
 
 Each stage is a recipe and inputs (what it is) and a `make_*` function (how it comes about). A `make_*` loads
@@ -716,7 +716,10 @@ def with_cousins(stage: Stage, cfg: EngineConfig) -> list[Stage]:
 
 
 def _of_cousin(stage: Stage, cousin: Stage, cfg: EngineConfig) -> Stage:
-    """Return a stage for the cousin; searched rewards and a model's code are the family's, templates write one sample."""
+    """Return a stage for the cousin.
+
+    Searched rewards and a model's code are the family's, templates write one sample.
+    """
     if stage.name == "scene":
         return cousin
     if stage.name in ("task", "reward"):

@@ -1,6 +1,7 @@
 """What the robot types of this plugin share: the dataset's names on an arm that needs no calibration by LeRobot.
 
-Under LeRobot's own tools a robot does by itself what `v2p deploy` does around one: masks, limits, a check of the policy.
+Under LeRobot's own tools a robot does by itself what `v2p deploy` does around one: masks, limits,
+a check of the policy.
 """
 
 import logging
@@ -270,8 +271,9 @@ def check_policy_of(config: ArmRobotConfig, scale: ActionScale, task: str) -> No
         return
     if not Path(path).is_dir():
         logger.warning(
-            "the policy %s is no folder here, so its action scale is not checked; fetch it and say --robot.policy_path=FOLDER",
+            "the policy %s is no folder here, so its action scale is not checked; fetch it and "
+            "say --robot.policy_path=FOLDER",
             path,
-        )  # fmt: skip
+        )
         return
     check_meaning(Path(path), scale, parser.parse_arg("task") or task, config.interface)

@@ -16,8 +16,9 @@ class V2PFrankaConfig(ArmRobotConfig):
     """A Franka arm with a parallel gripper, real or simulated."""
 
     backend: Backend = "sim"
-    """`sim` simulates a task; `network` talks to a driver of yours by the protocol of docs/deploy.md; `franky` drives a
-    real arm through the library franky and has never been run by us. `network` needs `clicks`, or `pictures` to be `rgb`."""
+    """`sim` simulates a task; `network` talks to a driver of yours by the protocol of
+    docs/deploy.md; `franky` drives a real arm through the library franky and has never been run by
+    us. `network` needs `clicks`, or `pictures` to be `rgb`."""
 
     task_folder: str = ""
     """`sim`: the task to simulate, as `v2p task` writes it."""

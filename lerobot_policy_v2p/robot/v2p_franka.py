@@ -1,9 +1,10 @@
 """The robot type `v2p_franka`: the dataset's state and action names on a simulated or a real Franka arm.
 
-The simulated arm runs the very environment that policies are evaluated in. A real one stands behind a driver that speaks
-the protocol of docs/deploy.md (`network`), or is driven by the library `franky` (pip install franky-control); the code for
-`franky` follows its documentation and HAS NEVER BEEN RUN: no arm was at hand. Try it slowly, with the stop button in your
-hand. Run with `v2p deploy`, or with `lerobot-rollout`, always with `--return_to_initial_position=false`: actions are
+The simulated arm runs the very environment that policies are evaluated in. A real one stands
+behind a driver that speaks the protocol of docs/deploy.md (`network`), or is driven by the library
+`franky` (pip install franky-control); the code for `franky` follows its documentation and HAS
+NEVER BEEN RUN: no arm was at hand. Try it slowly, with the stop button in your hand. Run with `v2p
+deploy`, or with `lerobot-rollout`, always with `--return_to_initial_position=false`: actions are
 displacements, so positions must not be played back as actions.
 """
 

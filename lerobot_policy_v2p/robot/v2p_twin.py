@@ -1,7 +1,7 @@
 """The robot type `v2p_twin`: the dataset's state and action names, and masks or a picture, on the twin of a Franka arm.
 
-With `pictures=rgb` it gives what a real arm with a calibrated camera gives. Everything done with it is sim-to-sim. How the
-episode went is logged, and asked of `arm.mirror` by judges.
+With `pictures=rgb` it gives what a real arm with a calibrated camera gives. Everything done with
+it is sim-to-sim. How the episode went is logged, and asked of `arm.mirror` by judges.
 """
 
 import logging

@@ -83,8 +83,8 @@ class V2PBCConfig(PreTrainedConfig):
     """Training only: images are shifted at random by up to this share of their size, all frames of a sample alike.
     Meant for long trainings on few demonstrations; in 300 steps it only slows the fit."""
     mask_jitter_px: float = 0.0
-    """Training only: the moments of each label are moved, grown or shrunk by up to this many of the picture's pixels and
-    scaled by up to `MASK_JITTER_SCALE`, all frames of a sample alike."""
+    """Training only: the moments of each label are moved, grown or shrunk by up to this many of
+    the picture's pixels and scaled by up to `MASK_JITTER_SCALE`, all frames of a sample alike."""
     moments_dropout: float = 0.0
     """Training only: this share of the moments is hidden."""
     pretrained_backbone_weights: str | None = BACKBONE_WEIGHTS
@@ -151,7 +151,8 @@ class V2PBCConfig(PreTrainedConfig):
             )
         if not (0 <= self.mask_jitter_px <= 20 and 0 <= self.moments_dropout < 1):
             raise ValueError(
-                f"mask_jitter_px is {self.mask_jitter_px} and moments_dropout {self.moments_dropout}; they lie between 0 and "
+                f"mask_jitter_px is {self.mask_jitter_px} and moments_dropout "
+                f"{self.moments_dropout}; they lie between 0 and "
                 "20 and between 0 and 1"
             )
         if not 0 <= self.random_shift < 0.5:

@@ -40,7 +40,8 @@ PREPARE_VERSION = 2
 """Raised when `prepare` gives other numbers for the same pictures: caches of them are made anew."""
 
 Prepared = dict[str, Tensor]
-"""`picture`: uint8 `(batch, time, channel, h, w)`; `moments`: float32 `(batch, time, label x 22)`; either may be absent."""
+"""`picture`: uint8 `(batch, time, channel, h, w)`; `moments`: float32 `(batch, time, label x 22)`;
+either may be absent."""
 
 
 def shrink(
@@ -126,7 +127,8 @@ def pixel_sums(
 ) -> Int64[Tensor, "batch label 22"]:
     """Return sums over the pixels of each label but the background.
 
-    Per label: their number, the sums of x, y, x^2, y^2 and x y, then the largest of `d_x x + d_y y` for each direction d
+    Per label: their number, the sums of x, y, x^2, y^2 and x y, then the largest of `d_x x + d_y
+        y` for each direction d
     of `DIRECTIONS`; pixels are counted from 0. On the CPU in one pass over the pixels, elsewhere by matrix products;
     both are exact.
     """

@@ -1,4 +1,6 @@
-"""Train a `v2p_bc` policy on frames in memory; LeRobot's policy, optimiser, schedule and processors, without its loader.
+"""Train a `v2p_bc` policy on frames in memory.
+
+LeRobot's policy, optimiser, schedule and processors, without its loader.
 
 The result is a checkpoint folder as `lerobot-train` writes it. The weights in it are a running mean of the training's
 (EMA). A training that was killed goes on from its last state and ends in the same weights.

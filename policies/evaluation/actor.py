@@ -63,7 +63,8 @@ class PolicyActor:
         height = self.size_px[0] * len(self.cameras)
         if labels.shape[1] != height:
             raise UnsuitablePolicyError(
-                f"the policy sees {' and '.join(self.cameras)}, {height} rows of labels, and is given {labels.shape[1]} rows"
+                f"the policy sees {' and '.join(self.cameras)}, {height} rows of labels, and is "
+                f"given {labels.shape[1]} rows"
             )
         picture = torch.from_numpy(self.values[labels])[:, None]  # numpy's indexing is the faster
         if self.channels > 1:
@@ -116,7 +117,8 @@ def load_actor(
     except Exception as error:  # of LeRobot, of any kind
         reason = re.sub(r"\s+", " ", str(error)).strip()[:200]
         raise UnsuitablePolicyError(
-            f"the policy in {folder} cannot be loaded ({type(error).__name__}: {reason}); its network is of another version,"
+            f"the policy in {folder} cannot be loaded ({type(error).__name__}: {reason}); its "
+            "network is of another version,"
             " or it is damaged: train it anew"
         ) from error
     before, after = make_env_pre_post_processors(config, loaded.policy.config)
@@ -171,7 +173,8 @@ def check_features(folder: Path, config: Any) -> tuple[int, int, tuple[str, ...]
     _, height, width = wanted[MASK_KEY].shape
     if tuple(wanted[cameras[-1]].shape) != tuple(wanted[MASK_KEY].shape):
         raise UnsuitablePolicyError(
-            f"the policy in {folder} wants pictures of the wrist's camera of another size than the table's; the simulator"
+            f"the policy in {folder} wants pictures of the wrist's camera of another size than "
+            "the table's; the simulator"
             " draws both alike"
         )
     return int(height), int(width), cameras

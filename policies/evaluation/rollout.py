@@ -35,8 +35,9 @@ class LoadedPolicy:
 def load_policy(folder: Path, env_config: Any, device: str | None = None) -> LoadedPolicy:
     """Read a checkpoint of any policy type LeRobot knows, checked against the environment's features.
 
-    It runs on `device`, by default where its settings say. Whoever made the checkpoint is trusted: LeRobot runs what its
-    processors name, unless the engine has looked at them before (`v2p_data.evaluation.checkpoint`).
+    It runs on `device`, by default where its settings say. Whoever made the checkpoint is trusted:
+    LeRobot runs what its processors name, unless the engine has looked at them before
+    (`v2p_data.evaluation.checkpoint`).
 
     Raises:
         UnsuitablePolicyError: its weights are not those of the network in its settings.
@@ -50,7 +51,8 @@ def load_policy(folder: Path, env_config: Any, device: str | None = None) -> Loa
     if device is not None:
         config.device = device
     if getattr(config, "pretrained_backbone_weights", None):
-        config.pretrained_backbone_weights = None  # type: ignore[attr-defined] - would be fetched; the checkpoint's follow
+        # They would be fetched; those of the checkpoint follow.
+        config.pretrained_backbone_weights = None  # type: ignore[attr-defined]
     if config.type in SETTINGS_ALONE:
         _check_weights(folder, config)
     policy = make_policy(config, env_cfg=env_config)
@@ -130,7 +132,8 @@ def _check_weights(folder: Path, config: Any) -> None:
             )
         if shapes.get(name, tuple(value.shape)) != tuple(value.shape):
             raise UnsuitablePolicyError(
-                f"'{name}' has shape {shapes[name]} in the weights of the policy in {folder}, and {tuple(value.shape)} in"
+                f"'{name}' has shape {shapes[name]} in the weights of the policy in {folder}, and "
+                f"{tuple(value.shape)} in"
                 " the network of its config.json: weights and settings are not of one training; copy both anew"
             )
 

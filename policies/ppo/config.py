@@ -1,4 +1,4 @@
-"""Settings of actor, imitation and PPO, without the libraries that train: whoever only reads settings need not wait for these."""
+"""Settings of actor, imitation and PPO, without the libraries that train, which load slowly."""
 
 from dataclasses import dataclass, field
 
@@ -71,7 +71,8 @@ class PPOConfig:
     plateau_steps: int = 100_000
     """It stops then, if so many control steps, and eight batches, have brought no better success or time to success."""
     plateau_gain: float = 0.005
-    """What counts as better: so much more success, or a time to success that is shorter by ten times this share of an episode."""
+    """What counts as better: so much more success, or a time to success that is shorter by ten
+    times this share of an episode."""
     window_episodes: int = 128
     """The success rates are taken over this many last episodes (two rounds of the deterministic worlds)."""
     min_window_episodes: int = 64

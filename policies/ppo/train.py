@@ -65,7 +65,8 @@ class ExpertResult:
     folder: Path
     """The best expert."""
     success: float
-    """Highest success at the end of deterministic episodes over a window of training: flattering, as the best of many."""
+    """Highest success at the end of deterministic episodes over a window of training: flattering,
+    as the best of many."""
     actor_updates: int
     """Gradient steps that the best expert's actor took; 0 for an actor that is still as it was at the start."""
     last_actor_updates: int

@@ -156,9 +156,14 @@ class Drawer:
     def _draw(self, data: mujoco.MjData, *, segmentation: bool) -> UInt8[np.ndarray, "h w 3"]:
         self._context.make_current()
         mujoco.mjv_updateScene(
-            self._model, data, self._option, None, self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value, self._scene,
-        )  # fmt: skip
+            self._model,
+            data,
+            self._option,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = segmentation
         self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = segmentation
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not segmentation

@@ -123,10 +123,17 @@ def render(spec: VideoSpec, *, frames: Sequence[int] | None = None) -> Synthetic
     for i, mask in zip(masked, masks, strict=True):
         seen[i] = bool((mask == LABEL_HAND).any())
     return SyntheticVideo(
-        spec=spec, frame_idx=chosen, frames=np.stack(pictures), camera=camera,
-        poses_world=np.stack([[pose_from_transform(T) for T in track] for track in motion.T_world_things]),
-        mask_idx=masked, masks=np.stack(masks), hand_in_view=seen,
-    )  # fmt: skip
+        spec=spec,
+        frame_idx=chosen,
+        frames=np.stack(pictures),
+        camera=camera,
+        poses_world=np.stack(
+            [[pose_from_transform(T) for T in track] for track in motion.T_world_things]
+        ),
+        mask_idx=masked,
+        masks=np.stack(masks),
+        hand_in_view=seen,
+    )
 
 
 def render_views(
@@ -172,8 +179,9 @@ def random_spec(
         kind: what happens.
         rng: where the draws come from.
         others: things that stand around, at most; 0 to 4 by chance where None.
-        beside: a clip of the same folder: the same person filmed this one too, in the same room with the same camera on the same stand,
-            and things lie anywhere on the table that it sees.
+        beside: a clip of the same folder: the same person filmed this one too, in the same room
+            with the same camera on the same stand, and things lie anywhere on the table that it
+            sees.
         brings: whether the hand comes with the thing that it puts down; of kinds in which a thing is carried.
 
     Raises:
@@ -192,10 +200,17 @@ def random_spec(
         timing = replace(_random_timing(rng, kind), brings=brings)
         fps = int(rng.choice([12, 15, 24, 30], p=[0.15, 0.1, 0.35, 0.4]))
         spec = VideoSpec(
-            name=name, story=story, hand=hand, timing=timing,
-            room=random_room(rng, across or bool(rng.random() < 0.15)), sensor=random_sensor(rng),
-            seconds=float(rng.uniform(2.5, 5.0)), fps=fps, hide_m=0.0, seed=int(rng.integers(2**31)),
-        )  # fmt: skip
+            name=name,
+            story=story,
+            hand=hand,
+            timing=timing,
+            room=random_room(rng, across or bool(rng.random() < 0.15)),
+            sensor=random_sensor(rng),
+            seconds=float(rng.uniform(2.5, 5.0)),
+            fps=fps,
+            hide_m=0.0,
+            seed=int(rng.integers(2**31)),
+        )
         if beside is not None:
             same = beside.hand
             hand = replace(
@@ -234,11 +249,13 @@ def _random_hand(rng: np.random.Generator, kind: MotionKind) -> tuple[Hand, bool
     sleeve: Rgb | None = any_colour(rng) if rng.random() < 0.6 else None
     return Hand(
         left=bool(from_left if rng.random() < 0.85 else not from_left),
-        scale=float(rng.uniform(0.9, 1.1)), skin=(r, g, b), sleeve=sleeve,
+        scale=float(rng.uniform(0.9, 1.1)),
+        skin=(r, g, b),
+        sleeve=sleeve,
         sleeve_print=rng.choice(["plain", "plain", "plain", "stripes", "checker"]).item(),
         cuff_m=float(rng.choice([rng.uniform(0.01, 0.06), rng.uniform(0.06, 0.3)])),
         shoulder_m=(float(shoulder[0]), float(shoulder[1]), float(shoulder[2])),
-    ), where == "across"  # fmt: skip
+    ), where == "across"
 
 
 def _random_timing(rng: np.random.Generator, kind: MotionKind) -> Timing:
@@ -248,13 +265,15 @@ def _random_timing(rng: np.random.Generator, kind: MotionKind) -> Timing:
         act_end += 0.1
     leave = act_end + float(rng.uniform(0.05, 0.10))
     return Timing(
-        come=(0.08 + late, 0.26 + late), close=(0.27 + late, 0.33 + late), act=(0.35 + late, act_end),
+        come=(0.08 + late, 0.26 + late),
+        close=(0.27 + late, 0.33 + late),
+        act=(0.35 + late, act_end),
         leave=(leave, min(0.97, leave + float(rng.uniform(0.12, 0.2)))),
         starts_in_view=bool(rng.random() < (0.4 if kind == "push_with" else 0.15)),
         stays_in_view=bool(rng.random() < 0.25),
         from_side=bool(rng.random() < 0.65),
         push=str(rng.choice(["palm", "fingers"])),
-    )  # fmt: skip
+    )
 
 
 _SIZES = ((640, 480), (854, 480), (480, 640), (426, 240), (640, 360), (320, 240), (360, 640))
@@ -331,9 +350,13 @@ def _random_view(rng: np.random.Generator) -> tuple[View, Float[np.ndarray, "2"]
     roll = float(np.radians(rng.normal(0, 0.9)))
     fovy = float(np.radians(rng.uniform(35, 60)))
     view = View(
-        height_m=camera_height, pitch_rad=pitch, roll_rad=roll,
-        fovy_rad=fovy, width_px=width, height_px=height,
-    )  # fmt: skip
+        height_m=camera_height,
+        pitch_rad=pitch,
+        roll_rad=roll,
+        fovy_rad=fovy,
+        width_px=width,
+        height_px=height,
+    )
     return view, aside
 
 
@@ -413,9 +436,14 @@ class _Stage:
         props = [a.prop for a in spec.story.actors]
         self.spec, self.motion, self.with_hand = spec, motion, with_hand
         self.model = build(
-            props, spec.room, spec.hand, motion.gestures, view.fovy_rad,
-            (view.width_px, view.height_px), rng_for(spec.seed, "textures"),
-        )  # fmt: skip
+            props,
+            spec.room,
+            spec.hand,
+            motion.gestures,
+            view.fovy_rad,
+            (view.width_px, view.height_px),
+            rng_for(spec.seed, "textures"),
+        )
         self.data = mujoco.MjData(self.model)
         self.camera = view.camera()
         self.drawer = Drawer(self.model, labels_of(self.model))

@@ -119,9 +119,12 @@ def _away(out: Float[np.ndarray, "3"], ahead: Float[np.ndarray, "3"]) -> Float[n
 
 
 def _by_rim(
-    actor: Actor, T: Float[np.ndarray, "4 4"], axis: Float[np.ndarray, "3"],
-    ahead: Float[np.ndarray, "3"], down: Float[np.ndarray, "3"],
-) -> Grasp:  # fmt: skip
+    actor: Actor,
+    T: Float[np.ndarray, "4 4"],
+    axis: Float[np.ndarray, "3"],
+    ahead: Float[np.ndarray, "3"],
+    down: Float[np.ndarray, "3"],
+) -> Grasp:
     """Return a pinch of the wall at the side of the arm."""
     p, top = actor.prop, T[2, 3] + actor.extents_m[2] / 2
     inward = ahead
@@ -156,8 +159,11 @@ def _width(actor: Actor, share: float) -> float:
 
 
 def _held(
-    T: Float[np.ndarray, "4 4"], spot: list[float], fingers: Float[np.ndarray, "3"],
-    gap: Float[np.ndarray, "3"], width: float,
-) -> Grasp:  # fmt: skip
+    T: Float[np.ndarray, "4 4"],
+    spot: list[float],
+    fingers: Float[np.ndarray, "3"],
+    gap: Float[np.ndarray, "3"],
+    width: float,
+) -> Grasp:
     anchor = transform(frame_of(fingers, gap), np.array(spot))
     return Grasp(T_obj_anchor=np.linalg.inv(T) @ anchor, width_m=min(width, GRIP_MAX_M))

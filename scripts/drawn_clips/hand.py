@@ -188,8 +188,12 @@ def _thumb(tip: Float[np.ndarray, "3"]) -> list[tuple[np.ndarray, np.ndarray, fl
     elbow = _THUMB_BASE + along * forward / d + out * bulge
     middle = elbow + 0.55 * (tip - elbow) + 0.003 * bulge
     root = np.array([-0.045, 0.012, 0.008])
-    return [(root, _THUMB_BASE, 0.017, 0.015), (_THUMB_BASE, elbow, 0.0145, 0.0115),
-            (elbow, middle, 0.0112, 0.0104), (middle, tip, 0.0104, 0.0090)]  # fmt: skip
+    return [
+        (root, _THUMB_BASE, 0.017, 0.015),
+        (_THUMB_BASE, elbow, 0.0145, 0.0115),
+        (elbow, middle, 0.0112, 0.0104),
+        (middle, tip, 0.0104, 0.0090),
+    ]
 
 
 def _palm(p: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:

@@ -67,8 +67,14 @@ def animate(
     t = np.arange(n) / (n - 1)
     things = np.stack([np.tile(standing(a), (n, 1, 1)) for a in story.actors])
     arm = unit(np.array(hand.shoulder_m) - things[0, 0, :3, 3])
-    plan = {"push_left": _push, "push_right": _push, "push_next_to": _push, "slide_to": _push,
-            "push_with": _push_with, "tip_over": _tip}.get(story.kind, _carry)  # fmt: skip
+    plan = {
+        "push_left": _push,
+        "push_right": _push,
+        "push_next_to": _push,
+        "slide_to": _push,
+        "push_with": _push_with,
+        "tip_over": _tip,
+    }.get(story.kind, _carry)
     things, anchors, gestures, gesture, aside = plan(story, hand, timing, t, seconds, things, arm)
     T_anchor_hands = np.stack([np.linalg.inv(anchor_of(g, hand)) for g in gestures])
 

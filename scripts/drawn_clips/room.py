@@ -117,9 +117,14 @@ def random_room(rng: np.random.Generator, person: bool) -> Room:
 
 
 def build(
-    props: list[Prop], room: Room, hand: Hand, gestures: tuple[Pose, ...], fovy_rad: float,
-    size_px: tuple[int, int], rng: np.random.Generator,
-) -> mujoco.MjModel:  # fmt: skip
+    props: list[Prop],
+    room: Room,
+    hand: Hand,
+    gestures: tuple[Pose, ...],
+    fovy_rad: float,
+    size_px: tuple[int, int],
+    rng: np.random.Generator,
+) -> mujoco.MjModel:
     """Return the model. Mocap bodies: `thing<i>`, `hand`, `arm`, `trunk`, `camera`; camera `view`; geoms `hand<k>`."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -167,15 +172,21 @@ def _rgb(values: Float[np.ndarray, "3"]) -> Rgb:
 
 
 def _add_lamps(spec: mujoco.MjSpec, room: Room) -> None:
-    lamps = ((room.lamp_azimuth_rad, room.lamp_elevation_rad, room.lamp, True),
-             (room.second_azimuth_rad, 0.9, room.second_lamp, False))  # fmt: skip
+    lamps = (
+        (room.lamp_azimuth_rad, room.lamp_elevation_rad, room.lamp, True),
+        (room.second_azimuth_rad, 0.9, room.second_lamp, False),
+    )
     for azimuth, elevation, colour, shadow in lamps:
         c = math.cos(elevation)
         towards = np.array([c * math.cos(azimuth), c * math.sin(azimuth), math.sin(elevation)])
         spec.worldbody.add_light(
-            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=2.0 * towards, dir=-towards,
-            diffuse=list(colour), specular=[0.25 if shadow else 0.0] * 3, castshadow=shadow,
-        )  # fmt: skip
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            pos=2.0 * towards,
+            dir=-towards,
+            diffuse=list(colour),
+            specular=[0.25 if shadow else 0.0] * 3,
+            castshadow=shadow,
+        )
 
 
 def _add_surroundings(
@@ -243,13 +254,23 @@ def _add_surroundings(
 
 
 def _add_mesh(
-    spec: mujoco.MjSpec, body: Any, name: str, shape: Shape, material: str, *, smooth: bool,
-) -> Any:  # fmt: skip
+    spec: mujoco.MjSpec,
+    body: Any,
+    name: str,
+    shape: Shape,
+    material: str,
+    *,
+    smooth: bool,
+) -> Any:
     spec.add_mesh(
-        name=name, uservert=shape.vertices.ravel().tolist(), usertexcoord=shape.uv.ravel().tolist(),
-        userface=shape.faces.ravel().tolist(), userfacetexcoord=shape.faces.ravel().tolist(),
-        smoothnormal=smooth, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-    )  # fmt: skip
+        name=name,
+        uservert=shape.vertices.ravel().tolist(),
+        usertexcoord=shape.uv.ravel().tolist(),
+        userface=shape.faces.ravel().tolist(),
+        userfacetexcoord=shape.faces.ravel().tolist(),
+        smoothnormal=smooth,
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+    )
     return body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_MESH,
@@ -324,9 +345,12 @@ def _add_material(
     repeat: float = 1.0,
 ) -> None:
     texture = spec.add_texture(
-        name=name, type=mujoco.mjtTexture.mjTEXTURE_2D,
-        width=pixels.shape[1], height=pixels.shape[0], nchannel=3,
-    )  # fmt: skip
+        name=name,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=pixels.shape[1],
+        height=pixels.shape[0],
+        nchannel=3,
+    )
     texture.data = pixels.tobytes()
     material = spec.add_material(
         name=name, texrepeat=[repeat, repeat], specular=specular, shininess=0.4

@@ -95,10 +95,12 @@ def turn_between(
 ) -> float:
     """Return the angle between two posed objects [rad], up to what cannot be told apart.
 
-    A ball has no orientation; where one was found for an egg, that shows in its shape. Of a round thing only the axis counts, and which way it points only where it is open on
-    one side. A box, and anything without symmetry, is compared as a posed box: the found one's axes are renamed so that
-    its sides fit the true ones, the six ways of equal sides and turns by 180 degrees included; what is open on one
-    side keeps the side. Where a solid of revolution was found for it, that one's axis counts alone.
+    A ball has no orientation; where one was found for an egg, that shows in its shape. Of a round
+    thing only the axis counts, and which way it points only where it is open on one side. A box,
+    and anything without symmetry, is compared as a posed box: the found one's axes are renamed so
+    that its sides fit the true ones, the six ways of equal sides and turns by 180 degrees
+    included; what is open on one side keeps the side. Where a solid of revolution was found for
+    it, that one's axis counts alone.
     """
     if true.symmetry == "sphere" or found.is_ball:
         return 0.0
@@ -259,7 +261,10 @@ def _seen_frames(true: TrueThing) -> list[int]:
 
 
 def _seen_at_first(true: TrueThing) -> bool:
-    """Return whether it is in the picture when the clip begins; a tool comes later, or is hidden by what it lies under."""
+    """Return whether it is in the picture when the clip begins.
+
+    A tool comes later, or is hidden by what it lies under.
+    """
     frames = _seen_frames(true)
     return not frames or frames[0] == min(true.masks)
 
@@ -274,7 +279,7 @@ def _mask_ious(true: TrueThing, found: FoundThing) -> list[float]:
 
 
 def shown_at(true: TrueThing) -> int | None:
-    """Return the frame of the file in which a person would point at it: the first, or the one that shows most of what comes later.
+    """Return the frame in which a person would point at it: the first, or the one that shows most of it.
 
     None where it is never seen. Of equals the latest: what is uncovered lies free at the end.
     """

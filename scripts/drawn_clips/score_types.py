@@ -84,7 +84,8 @@ class FoundThing:
     last_frame: int
     """Of the file."""
     first_depth_seen: bool = True
-    """Whether the reconstruction says that it knows how far away the first pose is; of what is in a hand it does not."""
+    """Whether the reconstruction says that it knows how far away the first pose is; of what is in
+    a hand it does not."""
     last_depth_seen: bool = True
     """The same for the last pose; in mid-air it does not."""
     masks: Mapping[int, Bool[np.ndarray, "h w"]] = field(repr=False)
@@ -119,8 +120,8 @@ class ThingScore:
     size_right: bool = False
     """Every side within MAX_SIZE_RATIO or SIZE_SLACK_M."""
     position_first_m: float | None = None
-    """Of the centre of the bounding box, in the scene frame; of a pose whose depth the scene declares unseen, across the
-    line of sight."""
+    """Of the centre of the bounding box, in the scene frame; of a pose whose depth the scene
+    declares unseen, across the line of sight."""
     position_last_m: float | None = None
     position_first_depth_m: float | None = None
     """Of such a pose, along the line of sight: what it declares not to know."""

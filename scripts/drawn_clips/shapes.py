@@ -92,9 +92,11 @@ def bin_shape(size: Vector, wall: float, taper: float = 0.0) -> Shape:
     """Return a box without a lid; `taper` is how much narrower each side is at the floor."""
     x, y, z = np.asarray(size) / 2
     rings = [  # (half x, half y, height, patch)
-        (x - taper, y - taper, -z, 0), (x, y, z, 0), (x - wall, y - wall, z, 1),
+        (x - taper, y - taper, -z, 0),
+        (x, y, z, 0),
+        (x - wall, y - wall, z, 1),
         (x - wall - taper, y - wall - taper, -z + wall, 1),
-    ]  # fmt: skip
+    ]
     signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     parts = []
     for (ax, ay, az, _), (bx, by, bz, patch) in itertools.pairwise(rings):
@@ -135,9 +137,12 @@ def revolved(profile: Profile, patches: Sequence[int], sides: int = 40) -> Shape
     parts, angle = [], 2 * np.pi * np.arange(sides + 1) / sides
     ring = np.stack([np.cos(angle), np.sin(angle)], 1)
     k = np.arange(sides)
-    faces = np.concatenate([
-        np.stack([k, k + 1, k + sides + 2], 1), np.stack([k, k + sides + 2, k + sides + 1], 1),
-    ])  # fmt: skip
+    faces = np.concatenate(
+        [
+            np.stack([k, k + 1, k + sides + 2], 1),
+            np.stack([k, k + sides + 2, k + sides + 1], 1),
+        ]
+    )
     length = np.array([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(profile)])
     share = {}
     for patch in set(patches):
@@ -164,8 +169,10 @@ def revolved(profile: Profile, patches: Sequence[int], sides: int = 40) -> Shape
 def ellipsoid(size: Vector, patch: int = 0, sides: int = 24) -> Shape:
     """Return an ellipsoid with these extents."""
     polar = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)
-    profile = [(max(float(np.cos(a)), 0.0) / 2 if 0 < k < len(polar) - 1 else 0.0, float(np.sin(a)) / 2)
-               for k, a in enumerate(polar)]  # fmt: skip
+    profile = [
+        (max(float(np.cos(a)), 0.0) / 2 if 0 < k < len(polar) - 1 else 0.0, float(np.sin(a)) / 2)
+        for k, a in enumerate(polar)
+    ]
     unit = revolved(profile, [patch] * (len(profile) - 1), sides)
     return Shape(vertices=unit.vertices * np.asarray(size), uv=unit.uv, faces=unit.faces)
 

@@ -9,29 +9,103 @@ from jaxtyping import Float
 from drawn_clips.props import NOUNS, Noun, Prop, prop_called, shape_of
 from v2p_data.video.meaning import Kind
 
-MotionKind = Literal["push_left", "push_right", "lift_up", "tip_over", "cover", "uncover", "push_with", "push_next_to",
-                     "drop_in_front_of", "insert", "slide_to", "throw_into", "place_onto"]  # fmt: skip
+MotionKind = Literal[
+    "push_left",
+    "push_right",
+    "lift_up",
+    "tip_over",
+    "cover",
+    "uncover",
+    "push_with",
+    "push_next_to",
+    "drop_in_front_of",
+    "insert",
+    "slide_to",
+    "throw_into",
+    "place_onto",
+]
 MOTION_KINDS: tuple[MotionKind, ...] = (
-    "push_left", "push_right", "lift_up", "tip_over", "cover", "uncover", "push_with", "push_next_to",
-    "drop_in_front_of", "insert", "slide_to", "throw_into", "place_onto",
-)  # fmt: skip
+    "push_left",
+    "push_right",
+    "lift_up",
+    "tip_over",
+    "cover",
+    "uncover",
+    "push_with",
+    "push_next_to",
+    "drop_in_front_of",
+    "insert",
+    "slide_to",
+    "throw_into",
+    "place_onto",
+)
 Role = Literal["manipulated", "reference", "tool", "container", "cover", "bystander"]
 
 CAPTIONS: dict[Kind, tuple[str, ...]] = {
-    "push_left": ("Pushing {a} from right to left", "Moving {a} from right to left", "Pushing {a} to the left", "Sliding {a} to the left", "Pulling {a} from right to left"),
-    "push_right": ("Pushing {a} from left to right", "Moving {a} from left to right", "Pushing {a} to the right", "Sliding {a} to the right", "Pulling {a} from left to right"),
-    "lift_up": ("Lifting {a} up", "Picking {a} up", "Lifting up {a}", "Lifting {a}", "Raising {a}"),
-    "tip_over": ("Tipping {a} over", "Pushing {a} over", "Knocking {a} over", "Tipping over {a}", "Pushing {a} so that it falls over"),
+    "push_left": (
+        "Pushing {a} from right to left",
+        "Moving {a} from right to left",
+        "Pushing {a} to the left",
+        "Sliding {a} to the left",
+        "Pulling {a} from right to left",
+    ),
+    "push_right": (
+        "Pushing {a} from left to right",
+        "Moving {a} from left to right",
+        "Pushing {a} to the right",
+        "Sliding {a} to the right",
+        "Pulling {a} from left to right",
+    ),
+    "lift_up": (
+        "Lifting {a} up",
+        "Picking {a} up",
+        "Lifting up {a}",
+        "Lifting {a}",
+        "Raising {a}",
+    ),
+    "tip_over": (
+        "Tipping {a} over",
+        "Pushing {a} over",
+        "Knocking {a} over",
+        "Tipping over {a}",
+        "Pushing {a} so that it falls over",
+    ),
     "cover": ("Covering {b} with {a}", "Putting {a} over {b}", "Covering {b} using {a}"),
-    "uncover": ("Uncovering {b} by lifting {a}", "Lifting {a} up to reveal {b}", "Lifting {a}, revealing {b}", "Uncovering {b}"),
+    "uncover": (
+        "Uncovering {b} by lifting {a}",
+        "Lifting {a} up to reveal {b}",
+        "Lifting {a}, revealing {b}",
+        "Uncovering {b}",
+    ),
     "push_with": ("Pushing {a} with {b}", "Moving {a} with {b}", "Pushing {a} using {b}"),
-    "push_next_to": ("Pushing {a} next to {b}", "Moving {a} closer to {b}", "Moving {a} next to {b}", "Pushing {a} close to {b}"),
+    "push_next_to": (
+        "Pushing {a} next to {b}",
+        "Moving {a} closer to {b}",
+        "Moving {a} next to {b}",
+        "Pushing {a} close to {b}",
+    ),
     "drop_in_front_of": ("Dropping {a} in front of {b}", "Putting {a} in front of {b}"),
-    "insert": ("Putting {a} into {b}", "Dropping {a} into {b}", "Placing {a} in {b}", "Putting {a} inside {b}"),
-    "slide_to": ("Sliding {a} to {b}", "Sliding {a} towards {b}", "Pushing {a} towards {b}", "Moving {a} towards {b}"),
+    "insert": (
+        "Putting {a} into {b}",
+        "Dropping {a} into {b}",
+        "Placing {a} in {b}",
+        "Putting {a} inside {b}",
+    ),
+    "slide_to": (
+        "Sliding {a} to {b}",
+        "Sliding {a} towards {b}",
+        "Pushing {a} towards {b}",
+        "Moving {a} towards {b}",
+    ),
     "throw_into": ("Throwing {a} into {b}", "Tossing {a} into {b}", "Throwing {a} in {b}"),
-    "place_onto": ("Putting {a} onto {b}", "Placing {a} on {b}", "Putting {a} on top of {b}", "Placing {a} on top of {b}", "Stacking {a} on {b}"),
-}  # fmt: skip
+    "place_onto": (
+        "Putting {a} onto {b}",
+        "Placing {a} on {b}",
+        "Putting {a} on top of {b}",
+        "Placing {a} on top of {b}",
+        "Stacking {a} on {b}",
+    ),
+}
 """Wordings after Something-Something v2's templates; a moves, b is the other thing."""
 
 GRIP_MAX_M = 0.088
@@ -96,8 +170,12 @@ def random_story(
     phrase_b = _phrase(b, bool(says_colour[1])) if b is not None else ""
     caption = wording.format(a=phrase_a, b=phrase_b)
     role: dict[str, Role] = {"insert": "container", "throw_into": "container", "push_with": "tool"}
-    first = Actor(prop=a, role="cover" if kind in ("cover", "uncover") else "manipulated",
-                  phrase=phrase_a if "{a}" in wording else None, yaw_rad=_yaw(a, rng))  # fmt: skip
+    first = Actor(
+        prop=a,
+        role="cover" if kind in ("cover", "uncover") else "manipulated",
+        phrase=phrase_a if "{a}" in wording else None,
+        yaw_rad=_yaw(a, rng),
+    )
     second = None
     if b is not None:
         second = Actor(
@@ -149,7 +227,8 @@ def _words(prop: Prop) -> str:
 
 def _graspable(p: Prop) -> bool:
     return p.kind not in ("stick", "spoon", "pan", "pot", "lid", "coaster") and (
-        min(p.size_m[:2]) < GRIP_MAX_M or p.hollow)  # fmt: skip
+        min(p.size_m[:2]) < GRIP_MAX_M or p.hollow
+    )
 
 
 def _small(p: Prop) -> bool:
@@ -281,8 +360,14 @@ def _placed(
             sign = 1 if kind == "push_left" else -1
             to = (float(rng.normal(0, 0.02)), sign * float(rng.uniform(0.09, 0.26)))
             return Story(kind=kind, caption=caption, actors=(a,), target_xy_m=to, turn_rad=turn)
-        return Story(kind=kind, caption=caption, actors=(a,), turn_rad=turn, lift_m=float(rng.uniform(0.08, 0.22)),
-                     target_xy_m=(float(rng.normal(0, 0.03)), float(rng.normal(0, 0.03))))  # fmt: skip
+        return Story(
+            kind=kind,
+            caption=caption,
+            actors=(a,),
+            turn_rad=turn,
+            lift_m=float(rng.uniform(0.08, 0.22)),
+            target_xy_m=(float(rng.normal(0, 0.03)), float(rng.normal(0, 0.03))),
+        )
     gap = float(rng.uniform(0.04, 0.16))
     far = a.radius_m + b.radius_m + gap
     there = (far * np.cos(away), far * np.sin(away))
@@ -301,8 +386,15 @@ def _placed(
         b = replace(b, xy_m=there)
         body = _body(b) if lid else np.array(there)
         own = body - (_body(a) - np.array(a.xy_m))
-        return Story(kind=kind, caption=caption, actors=(a, b), target_bottom_m=float(bottom),
-                     target_xy_m=(float(own[0]), float(own[1])), turn_rad=0.0 if a.prop.kind == "mug" else turn, lift_m=lift + b.extents_m[2])  # fmt: skip
+        return Story(
+            kind=kind,
+            caption=caption,
+            actors=(a, b),
+            target_bottom_m=float(bottom),
+            target_xy_m=(float(own[0]), float(own[1])),
+            turn_rad=0.0 if a.prop.kind == "mug" else turn,
+            lift_m=lift + b.extents_m[2],
+        )
     if kind == "uncover":
         lid = a.prop.kind == "lid"
         a = replace(a, upside_down=not lid, bottom_m=b.prop.size_m[2] - 0.001 if lid else 0.0)
@@ -356,8 +448,15 @@ def _placed(
         )
     to = _body(b) - (_body(a) - np.array(a.xy_m)) + rng.normal(0, 0.003, 2)
     bottom = b.prop.floor_m()
-    return Story(kind=kind, caption=caption, actors=(a, b), target_xy_m=(float(to[0]), float(to[1])), target_bottom_m=float(bottom), turn_rad=turn,
-                 lift_m=b.extents_m[2] + lift)  # fmt: skip
+    return Story(
+        kind=kind,
+        caption=caption,
+        actors=(a, b),
+        target_xy_m=(float(to[0]), float(to[1])),
+        target_bottom_m=float(bottom),
+        turn_rad=turn,
+        lift_m=b.extents_m[2] + lift,
+    )
 
 
 def _body(actor: Actor) -> Float[np.ndarray, "2"]:

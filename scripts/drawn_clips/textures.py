@@ -12,8 +12,15 @@ from drawn_clips.shapes import PATCH_ROWS
 Rgb = tuple[float, float, float]
 Print = Literal["plain", "label", "stripes", "checker", "speckle", "gradient", "photo", "wood"]
 PRINTS: tuple[Print, ...] = (
-    "plain", "label", "stripes", "checker", "speckle", "gradient", "photo", "wood",
-)  # fmt: skip
+    "plain",
+    "label",
+    "stripes",
+    "checker",
+    "speckle",
+    "gradient",
+    "photo",
+    "wood",
+)
 
 _HSV: dict[str, tuple[float, float, float, float, float, float]] = {
     "red": (-0.02, 0.02, 0.65, 0.95, 0.40, 0.85),
@@ -125,10 +132,16 @@ def _label(
     ink = base if rng.random() < 0.6 else np.array(any_colour(rng))
     scratch = np.ascontiguousarray(canvas.astype(np.float32))
     cv2.ellipse(
-        scratch, (int(w * rng.uniform(0.3, 0.7)), int(h * rng.uniform(0.2, 0.8))),
+        scratch,
+        (int(w * rng.uniform(0.3, 0.7)), int(h * rng.uniform(0.2, 0.8))),
         (int(w * rng.uniform(0.1, 0.3)), int(h * rng.uniform(0.06, 0.16))),
-        float(rng.uniform(0, 90)), 0, 360, [float(c) for c in any_colour(rng)], -1, cv2.LINE_AA,
-    )  # fmt: skip
+        float(rng.uniform(0, 90)),
+        0,
+        360,
+        [float(c) for c in any_colour(rng)],
+        -1,
+        cv2.LINE_AA,
+    )
     word = "".join(rng.choice(list("ABCDEFGHIKLMNOPRSTUVWZ"), int(rng.integers(3, 7))))
     scale = 0.85 * w / (20.0 * len(word))
     at = (int(0.08 * w), int((top + bottom) / 2))

@@ -56,11 +56,15 @@ class Truth:
     mask_idx: Int[np.ndarray, "some_time"]
     """The frames that have masks, the first and the last among them."""
     masks: UInt8[np.ndarray, "some_time h w"] = field(repr=False)
-    """0 background, 1 hand and arm, 2 and on the things in their order, 255 the bare table; seen from the first frame's camera."""
+    """0 background, 1 hand and arm, 2 and on the things in their order, 255 the bare table; seen
+    from the first frame's camera."""
 
 
 def write(video: SyntheticVideo, folder: Path) -> Path:
-    """Write `<name>.mp4`, and under `truth/` its `<name>.json`, `<name>_masks.npz` and `<name>_<i>.obj`; return the mp4."""
+    """Write `<name>.mp4`, and under `truth/` its `<name>.json`, `<name>_masks.npz` and `<name>_<i>.obj`.
+
+    Return the mp4.
+    """
     spec, camera = video.spec, video.camera
     truth = folder / "truth"
     truth.mkdir(parents=True, exist_ok=True)

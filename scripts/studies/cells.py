@@ -1,7 +1,8 @@
-"""One cell of the study: training objects are found, a policy is made by the engine's stages, and judged on unseen objects.
+"""One cell of the study: training objects are found, a policy is made and judged on unseen objects.
 
-Everything but the judgement is stages in `<out>/run`, so that arms, numbers and seeds share what they have in common and a
-stopped study goes on. A candidate that the engine rejects, at any stage, is counted and skipped; nothing stands in for it.
+Everything but the judgement is stages in `<out>/run`, so that arms, numbers and seeds share what
+they have in common and a stopped study goes on. A candidate that the engine rejects, at any stage,
+is counted and skipped; nothing stands in for it.
 """
 
 import logging
@@ -197,7 +198,7 @@ class Study:
     def find(
         self, source: Source, count: int, seed: int, engine: EngineConfig | None = None
     ) -> Found:
-        """Return the first `count` usable objects of a seed's order: with a scene, a task, an expert and demonstrations.
+        """Return the first `count` objects of a seed's order that have a task, an expert and demonstrations.
 
         Raises:
             V2PError: the pool is too small.
@@ -211,7 +212,8 @@ class Study:
             numbers = order[tried : tried + max(count - len(kept), self.runtime.workers)]
             if not numbers:
                 raise V2PError(
-                    f"only {len(kept)} of {tried} {source} became tasks with an expert (rejected: {dict(rejected)}), and "
+                    f"only {len(kept)} of {tried} {source} became tasks with an expert (rejected: "
+                    f"{dict(rejected)}), and "
                     f"N is {count}; raise pool.{'toys' if source == 'toys' else 'clips'}"
                 )
             found = self._candidates(source, numbers, engine)

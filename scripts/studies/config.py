@@ -192,7 +192,7 @@ class LiftingConfig:
         return replace(self.engine, seed=self.pool.seed)
 
     def pool_engine_of(self, arm: Arm) -> EngineConfig:
-        """Return the settings up to the demonstrations of an arm's tasks: with cousins the program labels all of them."""
+        """Return the settings up to an arm's demonstrations: with cousins the program labels all of them."""
         engine = self.pool_engine
         if arm not in WITH_COUSINS:
             return engine

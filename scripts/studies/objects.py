@@ -170,7 +170,7 @@ TOY_FORMS = ("box", "cylinder", "sphere", "ring", "cup")
 
 
 def toy_stage(number: int, pool: PoolConfig) -> Stage:
-    """Return the stage that makes a random toy: a cup, or one to three boxes, cylinders, balls and rings on each other."""
+    """Return the stage that makes a random toy: a cup, or up to three boxes, cylinders, balls and rings."""
     return Stage(
         name="scene",
         item=f"toy_{number:04d}",
@@ -183,7 +183,10 @@ def toy_stage(number: int, pool: PoolConfig) -> Stage:
 def make_toy(
     cfg: dict[str, Any], inputs: Mapping[str, Path], out: Path, runtime: Runtime
 ) -> dict[str, Any]:
-    """Write a toy's scene. Sizes are drawn blindly; what no gripper takes, the task stage refuses as it does videos'."""
+    """Write a toy's scene. Sizes are drawn blindly.
+
+    What no gripper takes, the task stage refuses as it does videos'.
+    """
     del inputs, runtime
     item = out.name.split("-")[0]
     rng = rng_for(cfg["seed"], "study_lifting", item)
@@ -396,9 +399,15 @@ def _write_scene(
     things = [thing]
     if asked.onto_m is not None:
         block = SceneObject(
-            name="block", label="block", role="reference", shape="box", size_m=asked.onto_m,
-            mass_kg=0.4, friction=FRICTION, source=dict.fromkeys(("size", "mass", "friction"), "stated"),
-        )  # fmt: skip
+            name="block",
+            label="block",
+            role="reference",
+            shape="box",
+            size_m=asked.onto_m,
+            mass_kg=0.4,
+            friction=FRICTION,
+            source=dict.fromkeys(("size", "mass", "friction"), "stated"),
+        )
         under = (*asked.move_m[:2], 0.0)
         things.append(_between(block, under, under))
     Scene(

@@ -1,9 +1,10 @@
 """Code-as-Policies with our primitives: a scripted program per world, chosen anew every 50 control steps.
 
-A language model would write the program from the caption and the states; offline, the choice is between the programs
-that a scene offers (`experts.teacher`). Those that the caption names come first. At each choice a world keeps its program
-where the object has moved since the last one or the task's success holds, and takes the next program otherwise. In
-between the program sees the robot and the objects at every step, as the paper's closed-loop baseline does.
+A language model would write the program from the caption and the states; offline, the choice is
+between the programs that a scene offers (`experts.teacher`). Those that the caption names come
+first. At each choice a world keeps its program where the object has moved since the last one or
+the task's success holds, and takes the next program otherwise. In between the program sees the
+robot and the objects at every step, as the paper's closed-loop baseline does.
 """
 
 import numpy as np

@@ -39,7 +39,8 @@ def paper_text(rows: list[Row]) -> str:
 def rates_table(rows: list[Row]) -> str:
     """Return success on the unseen objects by arm and N."""
     lines = [
-        "| arm | N | unseen, once (95 %) | per seed | new shapes | new categories | at the end | mean expert | trajectories a task | frames learned |",
+        "| arm | N | unseen, once (95 %) | per seed | new shapes | new categories | at the end | "
+        "mean expert | trajectories a task | frames learned |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for arm in ARMS:
@@ -48,7 +49,8 @@ def rates_table(rows: list[Row]) -> str:
             learned = [row["frames"] for row in found if "frames" in row]
             experts = [row["expert"]["mean"] for row in found if "expert" in row]
             lines.append(
-                f"| {arm} | {n or '-'} | {_with_interval(rate(found))} | {seeds} | {_plain(rate(found, group='shape'))} | "
+                f"| {arm} | {n or '-'} | {_with_interval(rate(found))} | {seeds} | "
+                f"{_plain(rate(found, group='shape'))} | "
                 f"{_plain(rate(found, group='category'))} | {_plain(rate(found, 'at_end'))} | "
                 f"{f'{sum(experts) / len(experts):.0%}' if experts else '-'} | {found[0].get('trajectories', '-')} | "
                 f"{f'{sum(learned) / len(learned):,.0f}' if learned else '-'} |"
@@ -115,9 +117,11 @@ def costs_table(rows: list[Row]) -> str:
         "judging",
     )
     lines = [
-        "| arm | N | candidates tried | rejected | " + " | ".join(f"{s}, s" for s in stages) + " | all, min |",
+        "| arm | N | candidates tried | rejected | "
+        + " | ".join(f"{s}, s" for s in stages)
+        + " | all, min |",
         "|---|---|---|---|" + "---|" * (len(stages) + 1),
-    ]  # fmt: skip
+    ]
     for arm in ARMS:
         for n, found in by_count(rows, arm).items():
             mean = {

@@ -51,18 +51,34 @@ def thing(name: str, rgba: tuple[float, ...], y: float, role: str) -> SceneObjec
 
 def write_task(folder: Path, *objects: SceneObject) -> Path:
     camera = Camera(
-        width_px=64, height_px=48, K=np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), T_world_cam=np.eye(4)
-    )  # fmt: skip
+        width_px=64,
+        height_px=48,
+        K=np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]),
+        T_world_cam=np.eye(4),
+    )
     scene = Scene(
-        title="rest", video="rest.mp4", description="lifting the red box", kind="generic", objects=objects,
-        camera=camera, fps=20.0, num_frames=2, confidence=1.0, folder=folder / "scene",
-    )  # fmt: skip
+        title="rest",
+        video="rest.mp4",
+        description="lifting the red box",
+        kind="generic",
+        objects=objects,
+        camera=camera,
+        fps=20.0,
+        num_frames=2,
+        confidence=1.0,
+        folder=folder / "scene",
+    )
     scene.folder.mkdir(parents=True)
     scene.save(scene.folder)
     TaskBundle(
-        title="rest", description=scene.description, kind="generic", class_name="Rest", code=CODE, scene=scene,
+        title="rest",
+        description=scene.description,
+        kind="generic",
+        class_name="Rest",
+        code=CODE,
+        scene=scene,
         horizon_steps=100,
-    ).save(folder / "rest")  # fmt: skip
+    ).save(folder / "rest")
     return folder / "rest"
 
 
@@ -218,6 +234,6 @@ def reading() -> Callable[..., Reading]:
         state = np.array([*pos, *turn, 1.0, *lead, 1.0], float)
         return Reading(
             state=state, picture=None, labels=None, joints_rad=None, opening=1.0, force_n=force
-        )  # fmt: skip
+        )
 
     return make

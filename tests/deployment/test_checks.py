@@ -40,9 +40,13 @@ def changed(policy, **fields):
 
 def with_facts(policy, **fields):
     known = {
-        "fps": 20.0, "state": STATE_NAMES, "action": ACTION_NAMES, "position_steps_m": {"lift": 0.03},
-        "rotation_step_rad": 0.2, "finger_step_m": 0.012,
-    }  # fmt: skip
+        "fps": 20.0,
+        "state": STATE_NAMES,
+        "action": ACTION_NAMES,
+        "position_steps_m": {"lift": 0.03},
+        "rotation_step_rad": 0.2,
+        "finger_step_m": 0.012,
+    }
     (policy / "v2p.json").write_text(json.dumps({"schema": 1, **known, **fields}))
     return policy
 

@@ -20,8 +20,10 @@ def page():
     picture[60:80, 50:75] = (20, 40, 190)
     nothing = np.zeros((96, 96), bool)
     with ClickPage(
-        picture, ["red <box>", "brick"], lambda click: clicked_mask(picture, click, nothing, ClickConfig())
-    ) as page:  # fmt: skip
+        picture,
+        ["red <box>", "brick"],
+        lambda click: clicked_mask(picture, click, nothing, ClickConfig()),
+    ) as page:
         yield page
 
 

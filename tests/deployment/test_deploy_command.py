@@ -20,10 +20,17 @@ pytestmark = pytest.mark.slow
 def words(policy_folder, task_folder, tmp_path, seeing_robot):
     """Return the command's words for the simulated arm; `seeing_robot` has skipped where there is no OpenGL."""
     return [
-        "deploy", str(policy_folder), "--robot.type=v2p_franka", f"--robot.task_folder={task_folder}",
-        f"--robot.calibration_dir={tmp_path}", "--slow", "--max-seconds", "0.4",
-        "--limits.max-silence-ms", "60000",
-    ]  # fmt: skip
+        "deploy",
+        str(policy_folder),
+        "--robot.type=v2p_franka",
+        f"--robot.task_folder={task_folder}",
+        f"--robot.calibration_dir={tmp_path}",
+        "--slow",
+        "--max-seconds",
+        "0.4",
+        "--limits.max-silence-ms",
+        "60000",
+    ]
 
 
 @pytest.fixture
@@ -61,13 +68,19 @@ def test_a_policy_runs_from_one_click_and_its_run_is_recorded(words, click, tmp_
         (["--click", "250,250"], "on the table or the background"),
         (["--click", "here"], "a click is X,Y"),
         (["--click", "128,100", "--limits.max-speed-m-s", "-1"], "--limits.max-speed-m-s must be"),
-        (["--click", "128,100", "--limits.workspace-low-m", "0.65", "-0.3", "0.0"], "outside the workspace"),
+        (
+            ["--click", "128,100", "--limits.workspace-low-m", "0.65", "-0.3", "0.0"],
+            "outside the workspace",
+        ),
         (["--robot.type=v2p_frank"], "Did you mean 'v2p_franka'?"),
         (["--robot.backend=network"], "--robot.address=HOST:PORT"),
         (["--robot.colour=red"], "colour"),
-        (["--robot.backend=network", "--robot.address=127.0.0.1:9"], "no driver answers at 127.0.0.1:9"),
+        (
+            ["--robot.backend=network", "--robot.address=127.0.0.1:9"],
+            "no driver answers at 127.0.0.1:9",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_input_gets_one_sentence(words, more, told, capsys):
     assert run([*words, *more]) == 2
 
@@ -99,7 +112,11 @@ def test_the_robots_words_are_told_from_the_others():
 
 
 def test_a_robot_is_disconnected_whatever_happens(task_folder, tmp_path):
-    words = ["--robot.type=v2p_franka", f"--robot.task_folder={task_folder}", f"--robot.calibration_dir={tmp_path}"]  # fmt: skip
+    words = [
+        "--robot.type=v2p_franka",
+        f"--robot.task_folder={task_folder}",
+        f"--robot.calibration_dir={tmp_path}",
+    ]
     seen = []
 
     def fail() -> None:
@@ -135,12 +152,21 @@ def test_lerobots_own_rollout_sees_by_tracking_from_a_click(
     monkeypatch.setattr(
         "sys.argv",
         [
-            "lerobot-rollout", "--strategy.type=base", f"--policy.path={policy_folder}", "--robot.type=v2p_franka",
-            f"--robot.task_folder={task_folder}", f"--robot.clicks={click[1]}", f"--robot.calibration_dir={tmp_path}",
-            "--task=lifting the red box", "--duration=3", "--fps=20", "--device=cpu", "--play_sounds=false",
+            "lerobot-rollout",
+            "--strategy.type=base",
+            f"--policy.path={policy_folder}",
+            "--robot.type=v2p_franka",
+            f"--robot.task_folder={task_folder}",
+            f"--robot.clicks={click[1]}",
+            f"--robot.calibration_dir={tmp_path}",
+            "--task=lifting the red box",
+            "--duration=3",
+            "--fps=20",
+            "--device=cpu",
+            "--play_sounds=false",
             "--return_to_initial_position=false",
         ],
-    )  # fmt: skip
+    )
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -26,9 +26,11 @@ from v2p_data.errors import V2PError
 ROOT = Path(__file__).parents[2]
 PATIENT = LimitsConfig(max_silence_ms=60_000.0)
 CAMERA = {
-    "width_px": 256, "height_px": 256, "K": [300, 0, 128, 0, 300, 128, 0, 0, 1],
+    "width_px": 256,
+    "height_px": 256,
+    "K": [300, 0, 128, 0, 300, 128, 0, 0, 1],
     "T_world_cam": np.eye(4).ravel().tolist(),
-}  # fmt: skip
+}
 
 
 class Served:
@@ -37,8 +39,11 @@ class Served:
     def __init__(self, task: Path, *flags: str) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "scripts/example_robot_server.py", "--task", str(task), *flags],
-            cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
         assert self.process.stdout is not None
         self.address = self.process.stdout.readline().strip()
 
@@ -51,7 +56,10 @@ class Served:
 
 @pytest.fixture(scope="module")
 def server(task_folder, seeing_robot):
-    """Return a server whose time passes only when a target comes; `seeing_robot` has skipped where there is no OpenGL."""
+    """Return a server whose time passes only when a target comes.
+
+    `seeing_robot` has skipped where there is no OpenGL.
+    """
     served = Served(task_folder, "--lockstep")
     yield served
     served.end()
@@ -142,11 +150,13 @@ def test_a_real_arm_takes_no_more_than_twenty_actions_a_second_from_lerobots_too
         (b'{"v": 2, "id": 1, "do": "read"}\n', "speaks version 1"),
         (b'{"v": 1, "id": 1, "do": "explode"}\n', "there is no request 'explode'"),
         (b'{"v": 1, "id": 1, "do": "target", "pos_m": [1, 2]}\n', "'quat_wxyz' must be 4"),
-        (b'{"v": 1, "id": 1, "do": "target", "quat_wxyz": [0, 1, 0, 0], "opening": 1, "pos_m": [NaN, 0, 0]}\n',
-         "'pos_m' must be 3 finite numbers"),
+        (
+            b'{"v": 1, "id": 1, "do": "target", "quat_wxyz": [0, 1, 0, 0], "opening": 1, "pos_m": [NaN, 0, 0]}\n',
+            "'pos_m' must be 3 finite numbers",
+        ),
         (b"[" * 60000 + b"\n", ""),
     ],
-)  # fmt: skip
+)
 def test_the_server_answers_what_it_does_not_understand_and_stays(server, line, words):
     host, port = server.address.split(":")
     with socket.create_connection((host, int(port)), 20) as connection:
@@ -203,9 +213,17 @@ def told(address, do="hello", timeout_s=0.5):
 
 
 GOOD = {
-    "v": 1, "ok": True, "pos_m": [0.5, 0, 0.2], "quat_wxyz": [0, 1, 0, 0], "opening": 1, "joints_rad": [0] * 7,
-    "force_n": None, "picture": "", "finger_travel_m": 0.04, "camera": CAMERA,
-}  # fmt: skip
+    "v": 1,
+    "ok": True,
+    "pos_m": [0.5, 0, 0.2],
+    "quat_wxyz": [0, 1, 0, 0],
+    "opening": 1,
+    "joints_rad": [0] * 7,
+    "force_n": None,
+    "picture": "",
+    "finger_travel_m": 0.04,
+    "camera": CAMERA,
+}
 
 
 def with_(**fields) -> bytes:
@@ -221,7 +239,11 @@ def with_(**fields) -> bytes:
         (b"[]\n", "hello", "an answer is no JSON object"),
         (b'{"v": 3, "id": %d, "ok": true}\n', "hello", "speaks version 3, and this is version 1"),
         (b'{"v": 1, "id": 0, "ok": true}\n', "hello", "answers request 0 instead of 1"),
-        (b'{"v": 1, "id": %d, "ok": false, "error": "brakes"}\n', "hello", "refuses 'hello': brakes"),
+        (
+            b'{"v": 1, "id": %d, "ok": false, "error": "brakes"}\n',
+            "hello",
+            "refuses 'hello': brakes",
+        ),
         (with_(camera=None), "hello", "'camera' is missing"),
         (with_(camera={**CAMERA, "K": [1, 2]}), "hello", "'K' must be 9 finite numbers"),
         (with_(finger_travel_m=4), "hello", "are not possible"),
@@ -233,7 +255,7 @@ def with_(**fields) -> bytes:
         (b"", "hello", "did not answer 'hello' within 0.5 s"),
         (b"a" * (LONGEST_LINE + 70000), "hello", "a line is longer than"),
     ],
-)  # fmt: skip
+)
 def test_a_driver_that_does_not_keep_to_the_protocol_is_told_so(odd_driver, answer, do, words):
     assert words in told(odd_driver(answer), do, 5.0 if answer else 0.5)
 

@@ -17,7 +17,7 @@ def reading(joints=None) -> Reading:
     state = np.array([0.5, 0.1, 0.3, 0.1, -0.2, 0.3, 1.0, 0.01, 0.0, 0.0, 0.8])
     return Reading(
         state=state, picture=None, labels=None, joints_rad=joints, opening=1.0, force_n=None
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.slow

@@ -133,7 +133,11 @@ def test_clicks_are_followed_by_the_twin_itself_and_a_bad_one_is_refused(twin):
 def test_v2p_deploy_asks_the_twin_for_pictures_unless_it_is_told_otherwise(task_folder, tmp_path):
     from v2p_data.commands.deploy import connected
 
-    words = ["--robot.type=v2p_twin", f"--robot.task_folder={task_folder}", f"--robot.calibration_dir={tmp_path}"]  # fmt: skip
+    words = [
+        "--robot.type=v2p_twin",
+        f"--robot.task_folder={task_folder}",
+        f"--robot.calibration_dir={tmp_path}",
+    ]
     with connected(words) as robot:
         assert [*robot.observation_features][-1] == "rgb"
     with connected([*words, "--robot.pictures=mask"]) as robot:

@@ -1,4 +1,4 @@
-"""Datasets whose actions are targets: same episodes, played again from their steps, trained on and evaluated as others are."""
+"""Datasets whose actions are targets: the same episodes, replayed, trained on and evaluated as others."""
 
 import json
 import shutil

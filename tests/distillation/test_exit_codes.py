@@ -56,7 +56,10 @@ def generate(videos: Path, root: Path) -> int:
 
 @pytest.fixture(scope="module")
 def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """Videos and a run of two whole items and a rejected one, beside each other, and its exit code; do not write into it."""
+    """Videos and a run of two whole items and a rejected one, beside each other, and its exit code.
+
+    Do not write into it.
+    """
     place = tmp_path_factory.mktemp("first")
     (place / "videos").mkdir()
     for name in CLIPS:

@@ -199,9 +199,12 @@ def test_a_reconstruction_that_stops_before_the_motion_fails_its_pose():
             found_thing(T_world_last=transform(about("z", 40), np.array([0.1, 0, 0.02]))),
             "pose",
         ),
-        (found_thing(mesh=trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 1]], [[0, 1, 2]])), "mesh"),
+        (
+            found_thing(mesh=trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 1]], [[0, 1, 2]])),
+            "mesh",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_scene_with_one_fault_is_not_usable(found, stage):
     trouble = scored(true_thing(), found).trouble
 

@@ -62,7 +62,8 @@ class Hub:
     passing_faults: list[tuple[str, int]] = field(default_factory=list)
     """The same, each for one request only, whose method may stand before the address.
 
-    `CUT` is no answer but half a request read and the line cut; with `LOST` the request is obeyed before the line is cut.
+    `CUT` is no answer but half a request read and the line cut; with `LOST` the request is obeyed
+    before the line is cut.
     """
 
     def count(self, start: str, part: str = "") -> int:
@@ -223,8 +224,19 @@ class _Handler(BaseHTTPRequestHandler):
             return self._json(404, {"error": "no revision"}, {"X-Error-Code": "RevisionNotFound"})
         if verb in ("", "revision"):
             siblings = [{"rfilename": path} for path in repo.commits[commit]]
-            return self._json(200, {"id": repo_id, "sha": commit, "siblings": siblings, "tags": [], "downloads": 0, "likes": 0,
-                                    "private": repo.private, "gated": repo.gated})  # fmt: skip
+            return self._json(
+                200,
+                {
+                    "id": repo_id,
+                    "sha": commit,
+                    "siblings": siblings,
+                    "tags": [],
+                    "downloads": 0,
+                    "likes": 0,
+                    "private": repo.private,
+                    "gated": repo.gated,
+                },
+            )
         if verb == "tree":
             return self._json(
                 200, [self._tree_entry(repo, p, d) for p, d in repo.commits[commit].items()]
@@ -257,8 +269,14 @@ class _Handler(BaseHTTPRequestHandler):
             elif entry["key"] == "deletedFile":
                 repo.files.pop(value["path"], None)
         commit = repo.commit()
-        return self._json(200, {"success": True, "commitOid": commit,
-                                "commitUrl": f"{self.state.url}/{repo_id}/commit/{commit}"})  # fmt: skip
+        return self._json(
+            200,
+            {
+                "success": True,
+                "commitOid": commit,
+                "commitUrl": f"{self.state.url}/{repo_id}/commit/{commit}",
+            },
+        )
 
     def _file(self, key: str, revision: str, path: str) -> None:
         repo = self.state.repos.get(key)

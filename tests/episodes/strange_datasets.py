@@ -1,6 +1,7 @@
 """Datasets that are damaged or malicious: each case spoils a good one, which `good_dataset` makes.
 
-`REFUSED` maps a name to a function that spoils a folder so that no command may read its tables: one sentence, exit code 2.
+`REFUSED` maps a name to a function that spoils a folder so that no command may read its tables:
+  one sentence, exit code 2.
 What `FOUND` spoils can be read; `v2p verify` lists it, exit code 1.
 """
 
@@ -37,11 +38,18 @@ def good_dataset(folder: Path) -> Path:
         for t in range(FRAMES):
             labels[t, 4 + t : 12 + t, 6 : 14 + number] = 2
         Episode(
-            id=f"toy_{number:05d}", item="toy", task="lift the toy up", seed=number, labels=labels,
+            id=f"toy_{number:05d}",
+            item="toy",
+            task="lift the toy up",
+            seed=number,
+            labels=labels,
             state=rng.normal(size=(FRAMES, 11)).astype(np.float32),
             action=rng.uniform(-1, 1, (FRAMES, 7)).astype(np.float32),
-            success=np.arange(FRAMES) > 3, referee=True, objects=("toy",), params={},
-        ).save(folder / "staged")  # fmt: skip
+            success=np.arange(FRAMES) > 3,
+            referee=True,
+            objects=("toy",),
+            params={},
+        ).save(folder / "staged")
     staged = sorted((folder / "staged").glob("*.npz"))
     pack(staged, "user/strange", folder / "good")
     shutil.rmtree(folder / "staged")
@@ -164,18 +172,39 @@ REFUSED: dict[str, Spoil] = {
         "data_files_size_in_mb": (0, 10**12),
         "video_files_size_in_mb": (-5,),
         "data_path": (
-            "{chunk_index:>3000000000}/file.parquet", "{chunk_index:3000000000d}/file.parquet",
-            "{chunk_index:03d}/../../../etc/{file_index}", "/etc/passwd", "{chunk_index.__class__}/x",
-            "{chunk_index!r:>900000000}", "{0}{1}", "{unknown}", "data/{", "a" * 100_000, 7, "\0",
+            "{chunk_index:>3000000000}/file.parquet",
+            "{chunk_index:3000000000d}/file.parquet",
+            "{chunk_index:03d}/../../../etc/{file_index}",
+            "/etc/passwd",
+            "{chunk_index.__class__}/x",
+            "{chunk_index!r:>900000000}",
+            "{0}{1}",
+            "{unknown}",
+            "data/{",
+            "a" * 100_000,
+            7,
+            "\0",
         ),
         "video_path": (
-            "{video_key:>3000000000}.mp4", "../{video_key}/{file_index:03d}.mp4", "{video_key[0]}", ["a"],
+            "{video_key:>3000000000}.mp4",
+            "../{video_key}/{file_index:03d}.mp4",
+            "{video_key[0]}",
+            ["a"],
             "{file_index:999999999d}",
         ),
         "features": ([], None, "x"),
         "features/action": (None, [], "float32"),
         "features/action/dtype": (["float32"], None, 32, "FLOAT32", "f" * 1000),
-        "features/action/shape": ([-1], [0], [10**12], [100_000, 100_000], "7", None, [1] * 9, [7.5]),
+        "features/action/shape": (
+            [-1],
+            [0],
+            [10**12],
+            [100_000, 100_000],
+            "7",
+            None,
+            [1] * 9,
+            [7.5],
+        ),
         "features/../..": ({"dtype": "float32", "shape": [1]},),
         "features/observation.images.mask/info": ([], "x"),
         "robot_type": (["v2p"], "x" * 5000),
@@ -185,7 +214,12 @@ REFUSED: dict[str, Spoil] = {
     if "../.." not in path
     for new in options
 } | {
-    "a column called ../..": lambda root: value(INFO, "features", json.loads((root / INFO).read_text())["features"] | {"../..": {"dtype": "video", "shape": [32, 32, 3]}})(root),
+    "a column called ../..": lambda root: value(
+        INFO,
+        "features",
+        json.loads((root / INFO).read_text())["features"]
+        | {"../..": {"dtype": "video", "shape": [32, 32, 3]}},
+    )(root),
     "info.json of text": content(INFO, "hello"),
     "info.json nested": content(INFO, DEEP),
     "info.json of 8 GB": huge(INFO),
@@ -226,9 +260,23 @@ REFUSED: dict[str, Spoil] = {
     "lengths are fractions": cells(TABLE, "length", lambda c: pa.array([6.5, float("nan")])),
     "lengths are texts": cells(TABLE, "length", lambda c: pa.array(["six", "six"])),
     "tasks are numbers": cells(TABLE, "tasks", lambda c: pa.array([1, 2])),
-    "the label 4000000000": value(ABOUT, "episodes", [{"id": "a", "item": "toy", "task": "lift the toy up", "seed": 0, "length": FRAMES, "labels": {"4000000000": "toy"}, "params": {}}]),
+    "the label 4000000000": value(
+        ABOUT,
+        "episodes",
+        [
+            {
+                "id": "a",
+                "item": "toy",
+                "task": "lift the toy up",
+                "seed": 0,
+                "length": FRAMES,
+                "labels": {"4000000000": "toy"},
+                "params": {},
+            }
+        ],
+    ),
     "a length is missing": cells(TABLE, "length", lambda c: pa.array([6, None])),
-}  # fmt: skip
+}
 """No command reads these."""
 
 FOUND: dict[str, Spoil] = {
@@ -240,7 +288,9 @@ FOUND: dict[str, Spoil] = {
     "stats.json without actions": without(STATS, "action"),
     "a mean of NaN": value(STATS, "action/mean", [float("nan")] * 7),
     "a mean of seven hundred numbers": value(STATS, "action/mean", [0.0] * 700),
-    "pictures of 3,000 px said": value(INFO, "features/observation.images.mask/shape", [3000, 2000, 3]),
+    "pictures of 3,000 px said": value(
+        INFO, "features/observation.images.mask/shape", [3000, 2000, 3]
+    ),
     "a table of noise": content(DATA, b"PAR1" + b"\x00\xff" * 500 + b"PAR1"),
     "an empty table": content(DATA, b""),
     "the episode table of text": content(TABLE, "hello"),
@@ -251,9 +301,14 @@ FOUND: dict[str, Spoil] = {
     "no rows": lambda root: shutil.rmtree(root / "data"),
     "no episodes": lambda root: shutil.rmtree(root / "meta/episodes"),
     "a type that is none": value(INFO, "features/action/dtype", "float9999"),
-    "a column that is missing": lambda root: value(INFO, "features", json.loads((root / INFO).read_text())["features"] | {"more": {"dtype": "float32", "shape": [1], "names": None}})(root),
+    "a column that is missing": lambda root: value(
+        INFO,
+        "features",
+        json.loads((root / INFO).read_text())["features"]
+        | {"more": {"dtype": "float32", "shape": [1], "names": None}},
+    )(root),
     "times are NaN": cell(TABLE, "videos/observation.images.mask/from_timestamp", float("nan")),
     "times of 10^30 s": cell(TABLE, "videos/observation.images.mask/from_timestamp", 1e30),
     "a task of number 10^9": cell(DATA, "task_index", 10**9),
-}  # fmt: skip
+}
 """These can be read, and are not as they should be."""

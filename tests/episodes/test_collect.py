@@ -64,9 +64,10 @@ def test_an_episode_ends_six_steps_after_success_held(rollouts):
     assert rollouts.successes.any()
     for world in np.flatnonzero(rollouts.successes):
         first_held = next(
-            t for t in range(len(rollouts.success))
+            t
+            for t in range(len(rollouts.success))
             if t + 1 >= HELD_STEPS and rollouts.success[t + 1 - HELD_STEPS : t + 1, world].all()
-        )  # fmt: skip
+        )
         assert rollouts.num_frames[world] == max(10, first_held + 1 + 6)
 
 

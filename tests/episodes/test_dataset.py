@@ -108,9 +108,13 @@ def test_tables_and_metadata_are_what_lerobots_writer_makes(
 
     root = tmp_path / "lerobots"
     dataset = LeRobotDataset.create(
-        "user/toys", fps=20, features=features(64, is_simulated=True), root=root, robot_type="v2p_franka",
+        "user/toys",
+        fps=20,
+        features=features(64, is_simulated=True),
+        root=root,
+        robot_type="v2p_franka",
         rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=0, pix_fmt="yuv420p", g=2),
-    )  # fmt: skip
+    )
     for episode in map(Episode.load, staged):
         for t, picture in enumerate(labels_to_rgb(episode.labels)):
             dataset.add_frame(
@@ -276,7 +280,11 @@ def test_masks_of_two_cameras_are_two_features_and_each_is_compared(tmp_path: Pa
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     table, wrist = (make_episode(k).labels for k in (0, 1))
-    both = replace(make_episode(0), labels=np.concatenate([table, wrist], axis=1), cameras=("mask", "mask_wrist"))  # fmt: skip
+    both = replace(
+        make_episode(0),
+        labels=np.concatenate([table, wrist], axis=1),
+        cameras=("mask", "mask_wrist"),
+    )
     staged, root = both.save(tmp_path), tmp_path / "toys"
 
     pack([staged], "user/toys", root)
@@ -286,7 +294,9 @@ def test_masks_of_two_cameras_are_two_features_and_each_is_compared(tmp_path: Pa
         grey = np.asarray(row[f"observation.images.{key}"])[0] * 255
         assert np.abs(grey - np.asarray(PALETTE)[labels[7]]).max() < 1e-3
     assert verify(root, [staged]).is_good
-    swapped = replace(both, labels=np.concatenate([wrist, table], axis=1)).save(tmp_path / "swapped")  # fmt: skip
+    swapped = replace(both, labels=np.concatenate([wrist, table], axis=1)).save(
+        tmp_path / "swapped"
+    )
     assert not verify(root, [swapped]).is_good
 
 
@@ -348,7 +358,14 @@ def test_the_card_tells_tasks_palette_and_ranges(packed: Path, tmp_path: Path):
     assert "| objects toy mass_kg | 0.1 | 0.12 |" in card
     assert "license: apache-2.0" in card.split("---")[1]
     assert "- LeRobot" in card.split("---")[1]
-    parts = ["visualize_dataset?path=user/toys", "## Tasks", 'root="FOLDER"', "## Limits", "<details>", "mass_kg"]  # fmt: skip
+    parts = [
+        "visualize_dataset?path=user/toys",
+        "## Tasks",
+        'root="FOLDER"',
+        "## Limits",
+        "<details>",
+        "mass_kg",
+    ]
     assert [card.index(p) for p in parts] == sorted(card.index(p) for p in parts)
 
 
@@ -403,8 +420,11 @@ def test_what_is_pushed_is_loaded_back_equal(packed: Path, tmp_path: Path, hub: 
 
     done = subprocess.run(
         [sys.executable, "-c", PUSH_AND_LOAD, str(root), str(policy)],
-        env=env, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
     assert done.returncode == 0, done.stderr[-3000:]
     said = dict(line.split(" ", 1) for line in done.stdout.splitlines() if " " in line)

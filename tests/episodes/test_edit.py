@@ -235,12 +235,21 @@ def test_datasets_of_other_meaning_do_not_go_together(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda i: i.update(robot_type="so101"), "robot_type is v2p_franka in the first and so101"),
-        (lambda i: i["features"]["action"].update(names=list("abcdefg")), r"names of action is \['delta_x.pos', .* in the first and \['a', 'b', 'c', 'd', 'e', 'f', 'g'\] in the"),
-        (lambda i: i["features"]["action"].update(dtype="float64"), "dtype of action is float32 in the first"),
+        (
+            lambda i: i.update(robot_type="so101"),
+            "robot_type is v2p_franka in the first and so101",
+        ),
+        (
+            lambda i: i["features"]["action"].update(names=list("abcdefg")),
+            r"names of action is \['delta_x.pos', .* in the first and \['a', 'b', 'c', 'd', 'e', 'f', 'g'\] in the",
+        ),
+        (
+            lambda i: i["features"]["action"].update(dtype="float64"),
+            "dtype of action is float32 in the first",
+        ),
         (lambda i: i["features"].pop("next.success"), "the list of columns"),
     ],
-)  # fmt: skip
+)
 def test_the_first_field_that_differs_is_named_with_both_values(
     packed: Path, more: Path, tmp_path: Path, change, words: str
 ):
@@ -369,10 +378,16 @@ def test_what_another_tool_left_out_or_changed_is_named_with_what_helps(
     write_record(
         root,
         Record(
-            stage="dataset", item="toys", version=1, fingerprint="0" * 8, recipe={}, inputs={}, seconds=1.0,
+            stage="dataset",
+            item="toys",
+            version=1,
+            fingerprint="0" * 8,
+            recipe={},
+            inputs={},
+            seconds=1.0,
             files={"meta/tasks.parquet": list_files(root)["meta/tasks.parquet"]},
         ),
-    )  # fmt: skip
+    )
     (root / gone).unlink()
 
     with pytest.raises(V2PError, match=rf"{gone} is missing.*lerobot-edit-dataset"):

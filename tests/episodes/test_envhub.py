@@ -83,9 +83,10 @@ def test_the_repository_holds_all_that_lerobot_asks_for(run_folder: Path, tmp_pa
     names = {p.name for p in made.iterdir()}
     assert names == {"README.md", "env.py", "mjcf", "requirements.txt", "tasks", "v2p_data"}
     (function,) = [
-        node for node in ast.parse((made / "env.py").read_text()).body
+        node
+        for node in ast.parse((made / "env.py").read_text()).body
         if isinstance(node, ast.FunctionDef) and node.name == "make_env"
-    ]  # fmt: skip
+    ]
     assert [a.arg for a in function.args.args] == ["n_envs", "use_async_envs", "cfg"]
     model = mujoco.MjModel.from_xml_path(str(made / "mjcf/second.xml"))
     assert model.body("cube").id > 0
@@ -139,8 +140,12 @@ def test_lerobot_loads_a_pushed_environment_by_its_name_as_our_page_says(
 
     done = subprocess.run(
         [sys.executable, "-c", code, str(cache)],
-        cwd=tmp_path, env=env, capture_output=True, text=True, timeout=500,
-    )  # fmt: skip
+        cwd=tmp_path,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
 
     assert done.returncode == 0, done.stderr[-3000:]
     assert [line for line in done.stdout.splitlines() if ": " in line] == [

@@ -14,20 +14,38 @@ from v2p_data.pipeline.artifact import Record, write_record
 def dataset(root: Path, *, mass_kg: float = 0.1, commit: str = "abc") -> Path:
     """Write what `v2p explain` reads of a dataset, as `v2p generate` leaves it."""
     (root / "meta").mkdir(parents=True)
-    info = {"codebase_version": "v3.0", "fps": 20, "features": {}, "total_episodes": 2,
-            "total_frames": 50, "robot_type": "v2p_franka"}  # fmt: skip
+    info = {
+        "codebase_version": "v3.0",
+        "fps": 20,
+        "features": {},
+        "total_episodes": 2,
+        "total_frames": 50,
+        "robot_type": "v2p_franka",
+    }
     (root / "meta/info.json").write_text(json.dumps(info))
     scene = {"stage": "scene", "folder": "mug-11111111", "counts": {"objects": 2}}
     stages = {"task": {"stage": "task", "folder": "mug-22222222", "inputs": {"scene": scene}}}
     stages["expert"] = {"stage": "expert", "folder": "mug-33333333", "counts": {"steps": 40000}}
     history = {"stage": "episodes", "folder": "mug-44444444", "inputs": stages}
     episodes = [
-        {"id": f"mug_{k:05d}", "item": "mug", "task": "lift the mug", "seed": 77, "length": 20,
-         "labels": {"2": "mug"}, "params": {"objects": {"mug": {"mass_kg": mass_kg + k / 10}}}}
+        {
+            "id": f"mug_{k:05d}",
+            "item": "mug",
+            "task": "lift the mug",
+            "seed": 77,
+            "length": 20,
+            "labels": {"2": "mug"},
+            "params": {"objects": {"mug": {"mass_kg": mass_kg + k / 10}}},
+        }
         for k in range(2)
-    ]  # fmt: skip
-    about = {"schema": 1, "repo_id": "user/mugs", "palette": {"0": 0}, "episodes": episodes,
-             "provenance": {"items": {"mug": history}, "commit": commit, "time": root.name}}  # fmt: skip
+    ]
+    about = {
+        "schema": 1,
+        "repo_id": "user/mugs",
+        "palette": {"0": 0},
+        "episodes": episodes,
+        "provenance": {"items": {"mug": history}, "commit": commit, "time": root.name},
+    }
     (root / "meta/v2p.json").write_text(json.dumps(about))
     return root
 
@@ -75,9 +93,17 @@ def test_a_result_of_a_run_shows_its_recipe_and_its_sibling_what_was_changed(tmp
         recipe = {"config": {"ppo": {"steps": steps, "seed": 0}}, "sources": {"video": "12ab"}}
         write_record(
             tmp_path / "expert" / name,
-            Record(stage="expert", item="mug", version=2, fingerprint="x", recipe=recipe,
-                   inputs={}, seconds=float(steps), counts={"rate": 0.9}),
-        )  # fmt: skip
+            Record(
+                stage="expert",
+                item="mug",
+                version=2,
+                fingerprint="x",
+                recipe=recipe,
+                inputs={},
+                seconds=float(steps),
+                counts={"rate": 0.9},
+            ),
+        )
     one, two = tmp_path / "expert/a", tmp_path / "expert/b"
 
     lines = explain(records_of(one))

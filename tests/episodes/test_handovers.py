@@ -114,9 +114,17 @@ def test_a_policy_of_lerobots_learns_from_it(mixed: Path):
         "user/mixed", root=mixed, delta_timestamps={"action": [0.0, 0.05]}
     )
     cfg = ACTConfig(
-        device="cpu", chunk_size=2, n_action_steps=2, dim_model=16, n_heads=2, dim_feedforward=16,
-        n_encoder_layers=1, n_vae_encoder_layers=1, pretrained_backbone_weights=None, push_to_hub=False,
-    )  # fmt: skip
+        device="cpu",
+        chunk_size=2,
+        n_action_steps=2,
+        dim_model=16,
+        n_heads=2,
+        dim_feedforward=16,
+        n_encoder_layers=1,
+        n_vae_encoder_layers=1,
+        pretrained_backbone_weights=None,
+        push_to_hub=False,
+    )
     policy = make_policy(cfg, ds_meta=dataset.meta)
     prepare, _ = make_pre_post_processors(cfg, dataset_stats=dataset.meta.stats)
 
@@ -142,7 +150,10 @@ def test_demonstrations_alone_have_no_such_column(packed: Path, tmp_path: Path):
 def test_the_file_and_the_card_tell_who_acted(mixed: Path, tmp_path: Path):
     root = Path(shutil.copytree(mixed, tmp_path / "mixed"))
 
-    told = [(e["source"], e["student_frames"]) for e in json.loads((root / "meta/v2p.json").read_text())["episodes"]]  # fmt: skip
+    told = [
+        (e["source"], e["student_frames"])
+        for e in json.loads((root / "meta/v2p.json").read_text())["episodes"]
+    ]
     card = write_card(root, "user/mixed").read_text()
 
     assert told == [("demonstration", 0), ("handover", 5)]
@@ -188,8 +199,13 @@ def test_a_column_that_was_staged_and_is_missing_is_noticed(
 @pytest.mark.slow
 @pytest.mark.parametrize("plain_first", [True, False])
 def test_demonstrations_get_the_column_when_they_are_merged_with_handovers(
-    packed: Path, staged: list[Path], mixed: Path, mixed_staged: list[Path], tmp_path: Path, plain_first: bool
-):  # fmt: skip
+    packed: Path,
+    staged: list[Path],
+    mixed: Path,
+    mixed_staged: list[Path],
+    tmp_path: Path,
+    plain_first: bool,
+):
     plain = [True] * 3 * NUM_FRAMES
     parts = [(packed, staged, plain), (mixed, mixed_staged, MIXED)]
     (one, ones, first), (two, twos, second) = parts if plain_first else parts[::-1]
@@ -214,10 +230,14 @@ def test_a_merge_of_demonstrations_is_equal_to_packing_them_with_the_column(
     merge([packed, mixed], "user/all", tmp_path / "merged")
 
     made, wanted = (
-        pq.read_table(tmp_path / name / "data/chunk-000/file-000.parquet") for name in ("merged", "packed")
-    )  # fmt: skip
+        pq.read_table(tmp_path / name / "data/chunk-000/file-000.parquet")
+        for name in ("merged", "packed")
+    )
     assert made.to_pydict() == wanted.to_pydict()
-    stats = [json.loads((tmp_path / name / "meta/stats.json").read_text())["intervention"] for name in ("merged", "packed")]  # fmt: skip
+    stats = [
+        json.loads((tmp_path / name / "meta/stats.json").read_text())["intervention"]
+        for name in ("merged", "packed")
+    ]
     assert stats[0].keys() == stats[1].keys()
     for name, value in stats[1].items():
         assert np.allclose(stats[0][name], value), name

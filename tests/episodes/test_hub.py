@@ -392,7 +392,9 @@ def test_a_policys_card_names_its_type_and_dataset(
 
 def test_an_evaluation_is_noted_in_a_policys_card_and_nothing_else_of_it_changes(tmp_path: Path):
     row = {"task": "lift", "seen": False, "rate": 0.5, "low": 0.25, "high": 0.75, "trials": 8}
-    (tmp_path / "config.json").write_text('{"type": "act", "input_features": {"x": {"shape": [3, 4]}}}')  # fmt: skip
+    (tmp_path / "config.json").write_text(
+        '{"type": "act", "input_features": {"x": {"shape": [3, 4]}}}'
+    )
     write_policy_card(tmp_path)
     card = tmp_path / "README.md"
     card.write_text(card.read_text() + "\nA sentence of its owner.\n")

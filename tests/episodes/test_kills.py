@@ -1,4 +1,7 @@
-"""Killed and started again, collecting and packing end like an undisturbed run. Hundreds more: scripts/bench_kills.py."""
+"""Killed and started again, collecting and packing end like an undisturbed run.
+
+Hundreds more: scripts/bench_kills.py.
+"""
 
 import os
 import resource

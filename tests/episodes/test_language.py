@@ -41,8 +41,11 @@ def test_parts_begin_where_contacts_and_places_say():
     found = subtasks("cup", places, touches, np.arange(10) >= 8)
 
     assert list(found.items()) == [
-        (0, "reach for the cup"), (3, "grasp the cup"), (6, "carry the cup up"), (9, "stay"),
-    ]  # fmt: skip
+        (0, "reach for the cup"),
+        (3, "grasp the cup"),
+        (6, "carry the cup up"),
+        (9, "stay"),
+    ]
     assert subtasks("cup", places, touches, np.zeros(10, bool))[9] == "let go of the cup"
     one_pad = subtasks("cup", places[:, [2, 1, 0]], touches & [True, False], np.zeros(10, bool))
     assert list(one_pad.values())[1:3] == ["touch the cup", "push the cup forward"]
@@ -75,11 +78,15 @@ def test_lerobot_reads_the_words_and_a_recipe_of_its_own_uses_them(packed: Path,
     )
     told = [
         render_sample(
-            recipe=recipe, persistent=row["language_persistent"], events=row["language_events"],
-            t=float(row["timestamp"]), sample_idx=k, task=row["task"],
+            recipe=recipe,
+            persistent=row["language_persistent"],
+            events=row["language_events"],
+            t=float(row["timestamp"]),
+            sample_idx=k,
+            task=row["task"],
         )
         for k, row in enumerate(rows)
-    ]  # fmt: skip
+    ]
 
     said = [t["messages"][1]["content"] for t in told if t]
     assert said[5] == "reach for the toy"  # both pads touch it from row 6 on

@@ -11,9 +11,29 @@ from v2p_data.errors import V2PError
 from v2p_data.seeds import rng_for
 
 BAD = (
-    *("toys", "me/", "/toys", "a/b/c", "me/my toys", "-me/toys", "me/-toys", "me/toys-", "me/toys.", ".me/toys"),
-    *("me/a--b", "me/a..b", "me/toys.git", "me/to\u00f6ys", "me/toys\n", "", "me/" + "x" * 94, "http://me/toys"),
-)  # fmt: skip
+    *(
+        "toys",
+        "me/",
+        "/toys",
+        "a/b/c",
+        "me/my toys",
+        "-me/toys",
+        "me/-toys",
+        "me/toys-",
+        "me/toys.",
+        ".me/toys",
+    ),
+    *(
+        "me/a--b",
+        "me/a..b",
+        "me/toys.git",
+        "me/to\u00f6ys",
+        "me/toys\n",
+        "",
+        "me/" + "x" * 94,
+        "http://me/toys",
+    ),
+)
 GOOD = ("me/toys", "a/b", "Me_1/to-ys_2.x", "0/1", "me/toys_", "me/" + "x" * 93)
 
 

@@ -38,8 +38,12 @@ def spoiled(good: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", strange_datasets.REFUSED)
 def test_no_command_reads_what_asks_for_too_much(
-    name: str, spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-):  # fmt: skip
+    name: str,
+    spoiled: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
     monkeypatch.delenv("HF_TOKEN", raising=False)
     strange_datasets.REFUSED[name](spoiled)
     began = time.process_time()

@@ -102,33 +102,80 @@ def test_lossy_masks_are_one_line_for_all_episodes(packed: Path, tmp_path: Path)
     [
         ("finite", "episode 0", rows(DATA, put("action", 3, [float("nan")] * 7))),
         ("statistics", "meta/stats.json", rows(DATA, put("action", 3, [0.99] * 7))),
-        ("statistics", "meta/stats.json", entry("meta/stats.json", lambda s: s["action"].update(mean=[0.0] * 7))),
-        ("statistics", "meta/stats.json", entry("meta/stats.json", lambda s: s.pop("observation.state"))),
-        ("statistics", "meta/stats.json", entry("meta/stats.json", lambda s: s[FRONT].update(mean=[[[0.9]]] * 3, max=[[[1.0]]] * 3))),
+        (
+            "statistics",
+            "meta/stats.json",
+            entry("meta/stats.json", lambda s: s["action"].update(mean=[0.0] * 7)),
+        ),
+        (
+            "statistics",
+            "meta/stats.json",
+            entry("meta/stats.json", lambda s: s.pop("observation.state")),
+        ),
+        (
+            "statistics",
+            "meta/stats.json",
+            entry(
+                "meta/stats.json", lambda s: s[FRONT].update(mean=[[[0.9]]] * 3, max=[[[1.0]]] * 3)
+            ),
+        ),
         ("action_bounds", "episode 0", rows(DATA, put("action", 3, [1.5] * 7))),
         ("success", "episode 1", rows(DATA, put("next.success", 23, False))),
-        ("duplicate", "episode 1", rows(DATA, lambda c: [c[k].__setitem__(slice(12, 24), c[k][:12]) for k in FLOATS])),
+        (
+            "duplicate",
+            "episode 1",
+            rows(DATA, lambda c: [c[k].__setitem__(slice(12, 24), c[k][:12]) for k in FLOATS]),
+        ),
         ("index", "episode 1", rows(DATA, put("frame_index", 15, 7))),
         ("index", "episode 2", rows(TABLE, put("dataset_from_index", 2, 20))),
         ("index", "meta/episodes", rows(TABLE, put("episode_index", 2, 5))),
-        ("index", "meta/tasks.parquet", rows("meta/tasks.parquet", lambda t: t["task_index"].reverse())),
+        (
+            "index",
+            "meta/tasks.parquet",
+            rows("meta/tasks.parquet", lambda t: t["task_index"].reverse()),
+        ),
         ("task", DATA, rows(DATA, put("task_index", 0, 9))),
         ("length", "episode 0", rows(DATA, put("episode_index", 0, 1))),
-        ("missing_rows", "episode 1", rows(DATA, lambda c: c.update(episode_index=[2 if k == 1 else k for k in c["episode_index"]]))),
+        (
+            "missing_rows",
+            "episode 1",
+            rows(
+                DATA,
+                lambda c: c.update(episode_index=[2 if k == 1 else k for k in c["episode_index"]]),
+            ),
+        ),
         ("video_times", "episode 1", rows(TABLE, put(f"videos/{FRONT}/to_timestamp", 1, 9.0))),
-        ("video_times", "episode 2", rows(TABLE, lambda c: (put(f"videos/{FRONT}/from_timestamp", 2, 0.6)(c), put(f"videos/{FRONT}/to_timestamp", 2, 1.2)(c)))),
+        (
+            "video_times",
+            "episode 2",
+            rows(
+                TABLE,
+                lambda c: (
+                    put(f"videos/{FRONT}/from_timestamp", 2, 0.6)(c),
+                    put(f"videos/{FRONT}/to_timestamp", 2, 1.2)(c),
+                ),
+            ),
+        ),
         ("does_not_read", "episode 0", rows(DATA, put("timestamp", 5, 0.273))),
         ("does_not_read", "episode 2", cut_short(VIDEO)),
         ("unreadable_file", DATA, cut_short(DATA)),
         ("unreadable_file", TABLE, cut_short(TABLE)),
         ("unreadable_file", "meta/stats.json", cut_short("meta/stats.json")),
-        ("missing_file", "meta/tasks.parquet", lambda root: (root / "meta/tasks.parquet").unlink()),
+        (
+            "missing_file",
+            "meta/tasks.parquet",
+            lambda root: (root / "meta/tasks.parquet").unlink(),
+        ),
         ("missing_file", f"videos/{FRONT}/*/*.mp4", lambda root: (root / VIDEO).unlink()),
-        ("missing_file", "data/chunk-000/file-003.parquet", rows(TABLE, put("data/file_index", 1, 3))),
+        (
+            "missing_file",
+            "data/chunk-000/file-003.parquet",
+            rows(TABLE, put("data/file_index", 1, 3)),
+        ),
         ("counts", "meta/info.json", entry("meta/info.json", lambda i: i.update(total_frames=99))),
         ("counts", "meta/info.json", entry("meta/info.json", lambda i: i.update(total_tasks=5))),
     ],
-)  # fmt: skip
+)
 def test_each_fault_is_found_by_its_name(
     packed: Path, tmp_path: Path, check: str, where: str, fault: Change
 ):

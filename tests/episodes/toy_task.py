@@ -32,18 +32,37 @@ class PushTask(Task):
 
 def bundle() -> TaskBundle:
     cube = SceneObject(
-        name="cube", label="cube", role="manipulated", shape="box", size_m=(0.04, 0.04, 0.04),
-        mass_kg=0.1, friction=0.8, frames=(0,), poses_world=(POSE,), confidences=(1.0,),
-    )  # fmt: skip
+        name="cube",
+        label="cube",
+        role="manipulated",
+        shape="box",
+        size_m=(0.04, 0.04, 0.04),
+        mass_kg=0.1,
+        friction=0.8,
+        frames=(0,),
+        poses_world=(POSE,),
+        confidences=(1.0,),
+    )
     scene = Scene(
-        title="toy", video="toy.mp4", description="pushing a cube", kind="push_left", objects=(cube,),
+        title="toy",
+        video="toy.mp4",
+        description="pushing a cube",
+        kind="push_left",
+        objects=(cube,),
         camera=Camera(width_px=64, height_px=48, K=np.eye(3), T_world_cam=np.eye(4)),
-        fps=20.0, num_frames=2, confidence=1.0,
-    )  # fmt: skip
+        fps=20.0,
+        num_frames=2,
+        confidence=1.0,
+    )
     return TaskBundle(
-        title="toy", description="push the cube to the left", kind="push_left",
-        class_name="PushTask", code="", scene=scene, horizon_steps=30,
-    )  # fmt: skip
+        title="toy",
+        description="push the cube to the left",
+        kind="push_left",
+        class_name="PushTask",
+        code="",
+        scene=scene,
+        horizon_steps=30,
+    )
 
 
 def act(obs: np.ndarray) -> np.ndarray:

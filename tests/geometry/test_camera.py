@@ -111,9 +111,11 @@ def test_a_camera_looks_at_its_target_with_the_horizon_level_and_the_world_uprig
     T = look_at(eye, target)
 
     camera = Camera(
-        width_px=WIDTH_PX, height_px=HEIGHT_PX, K=intrinsics(WIDTH_PX, HEIGHT_PX, FOVY_RAD),
+        width_px=WIDTH_PX,
+        height_px=HEIGHT_PX,
+        K=intrinsics(WIDTH_PX, HEIGHT_PX, FOVY_RAD),
         T_world_cam=T,
-    )  # fmt: skip
+    )
     way = (target - eye) / np.linalg.norm(target - eye)
     left_of_way = np.cross([0, 0, 1.0], way)
     pixels = camera.project(target + 0.01 * np.array([[0, 0, 0], [0, 0, 1.0], left_of_way]))

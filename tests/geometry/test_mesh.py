@@ -136,9 +136,11 @@ def test_a_box_weighs_around_its_middle_as_the_school_book_says():
 
     np.testing.assert_allclose(centre, 0, atol=1e-12)
     np.testing.assert_allclose(
-        inertia, 0.3 / 12 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b]), rtol=1e-9,
+        inertia,
+        0.3 / 12 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b]),
+        rtol=1e-9,
         atol=1e-12,
-    )  # fmt: skip
+    )
 
 
 def test_a_profile_turns_with_its_first_point_at_the_bottom():

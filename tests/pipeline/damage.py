@@ -1,7 +1,8 @@
 """Ways in which files of a run get damaged, and the files that a run holds: a corpus for tests and for fuzzing.
 
-`HARMS` harm any file, `JSON_HARMS` one that holds a JSON object; `KINDS` names the files by what they are. Each harm leaves
-a file that differs from what was written, so whatever lists sizes and digests must notice.
+`HARMS` harm any file, `JSON_HARMS` one that holds a JSON object; `KINDS` names the files by what
+they are. Each harm leaves a file that differs from what was written, so whatever lists sizes and
+digests must notice.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""A real Ray cluster on this machine: a head and raylets, without the dashboard and the agents, of which each is a Python
+"""A real Ray cluster on this machine: a head and raylets, without dashboard and agents, each of which is a Python
 process that takes seconds to start and that no task needs."""
 
 import inspect
@@ -10,13 +10,22 @@ from typing import Any
 from unittest.mock import patch
 
 AGENTS = ("dashboard", "dashboard_agent", "runtime_env_agent")
-PORT_FILES = ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port", "runtime_env_agent_port")  # fmt: skip
+PORT_FILES = (
+    "metrics_agent_port",
+    "metrics_export_port",
+    "dashboard_agent_listen_port",
+    "runtime_env_agent_port",
+)
 """Files in which a raylet looks for where its agents listen."""
 NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_log_monitor": False}
 
 
 def patiently[T](start: Callable[[], T]) -> T:
-    """Return what starts; try again where Ray gives a raylet up, which it does after half a minute, on a busy machine too."""
+    """Return what starts.
+
+    Try again where Ray gives a raylet up, which it does after half a minute, on a busy machine
+    too.
+    """
     for _ in range(2):
         with suppress(Exception):
             return start()

@@ -104,7 +104,9 @@ def test_status_tells_machines_how_far_a_run_is(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(time, "time", lambda: now + 36.0)  # a hundredth of an hour later
 
     def ended(stage, status, seconds):
-        outcome = Outcome(stage="scene", item=stage.item, status=status, folder=tmp_path, seconds=seconds)  # fmt: skip
+        outcome = Outcome(
+            stage="scene", item=stage.item, status=status, folder=tmp_path, seconds=seconds
+        )
         progress(Event(kind="ended", stage=stage, outcome=outcome))
 
     for scene in scenes[:2]:

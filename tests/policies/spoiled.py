@@ -1,8 +1,8 @@
 """Policies and decoded caches that are damaged or malicious: each case spoils a good one.
 
-`POLICIES` maps a name to a function that spoils the folder of `good_policy`. Opening it must end in a `V2PError` that names
-the folder, within seconds; the program of `canary` must not run. `CACHES` spoils a camera's folder of decoded pictures,
-which must then be made anew.
+`POLICIES` maps a name to a function that spoils the folder of `good_policy`. Opening it must end
+in a `V2PError` that names the folder, within seconds; the program of `canary` must not run.
+`CACHES` spoils a camera's folder of decoded pictures, which must then be made anew.
 """
 
 import json

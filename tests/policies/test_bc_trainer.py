@@ -96,7 +96,9 @@ def test_the_same_seed_gives_the_same_weights_and_another_one_others(tmp_path: P
 def test_a_training_that_was_killed_while_it_saved_ends_in_the_same_files(
     tmp_path: Path, monkeypatch, step: int, net: int
 ):
-    """Killed by the kernel, with half of a state written. The batches cross the end of the table; only the first state is
+    """Killed by the kernel, with half of a state written. The batches cross the end of the table.
+
+    Only the first state is
     preceded by none, so that the first weights matter."""
 
     def files(out: Path, net: int) -> dict[str, bytes]:

@@ -151,7 +151,8 @@ class FakeRun:
             "steps,seconds,success_deterministic,success_stochastic,return,reward_reach,reward_lift"
         ]
         lines += [
-            f"{s:.6g},{s / 2e4:.4g},{'nan' if k < 5 else f'{0.97 * r:.4g}'},{0.8 * r:.4g},{5 * r:.4g},{0.3 * r:.4g},{r * r:.4g}"
+            f"{s:.6g},{s / 2e4:.4g},{'nan' if k < 5 else f'{0.97 * r:.4g}'},"
+            f"{0.8 * r:.4g},{5 * r:.4g},{0.3 * r:.4g},{r * r:.4g}"
             for k, (s, r) in enumerate(zip(steps, rise, strict=True))
         ]
         (folder / "curve.csv").write_text("\n".join(lines) + "\n2e6,100,0.9")

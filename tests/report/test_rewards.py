@@ -36,8 +36,13 @@ class FakeSearch:
     def save(self) -> None:
         self.write(
             "search.json",
-            {"title": "lift", "rungs": [0.1, 0.2, 0.4, 1.0], "candidates": self.rows, "found": self.found},
-        )  # fmt: skip
+            {
+                "title": "lift",
+                "rungs": [0.1, 0.2, 0.4, 1.0],
+                "candidates": self.rows,
+                "found": self.found,
+            },
+        )
 
     def candidate(
         self, successes=(), iteration=0, why="", code=CODE, origin="template", **more
@@ -54,22 +59,46 @@ class FakeSearch:
             for k, s in enumerate(successes)
         ]
         self.rows.append(
-            {"number": number, "iteration": iteration, "parent": None, "origin": origin, "reasons": [], "code": code,
-             "why": why, "results": results, "is_finished": len(results) == 4} | more
-        )  # fmt: skip
+            {
+                "number": number,
+                "iteration": iteration,
+                "parent": None,
+                "origin": origin,
+                "reasons": [],
+                "code": code,
+                "why": why,
+                "results": results,
+                "is_finished": len(results) == 4,
+            }
+            | more
+        )
         self.save()
 
     def feedback(self, name="reach") -> None:
         spread = {"mean": 0.25, "std": 0.1, "min": 0.0, "max": 1.0}
         part = {
-            "name": name, "overall": spread, "successful": spread | {"mean": 0.75}, "failed": None, "is_dead": False,
-            "share": 0.4, "step_correlation": 0.5, "episode_correlation": None, "saturated_high": 0.1, "saturated_low": 0.0,
-        }  # fmt: skip
+            "name": name,
+            "overall": spread,
+            "successful": spread | {"mean": 0.75},
+            "failed": None,
+            "is_dead": False,
+            "share": 0.4,
+            "step_correlation": 0.5,
+            "episode_correlation": None,
+            "saturated_high": 0.1,
+            "saturated_low": 0.0,
+        }
         thing = {"name": name, "reached": 1.0, "touched": 0.5, "grasped": 0.25, "raised": 0.0}
         feedback = {
-            "num_episodes": 64, "num_successes": 48, "ever_success": 0.875, "time_to_success_s": 1.25,
-            "reward_ranks": 0.8125, "components": [part], "reward": part | {"name": "total"}, "objects": [thing],
-        }  # fmt: skip
+            "num_episodes": 64,
+            "num_successes": 48,
+            "ever_success": 0.875,
+            "time_to_success_s": 1.25,
+            "reward_ranks": 0.8125,
+            "components": [part],
+            "reward": part | {"name": "total"},
+            "objects": [thing],
+        }
         self.write("candidate/002-rung-3/record.json", {"counts": {"feedback": feedback}})
 
     @property
@@ -83,8 +112,12 @@ class FakeSearch:
         self.candidate([0.1, 0.2], origin="given")
         self.candidate(why="crashed: the worker process was killed")
         self.candidate(
-            [0.2, 0.3, 0.5, 0.75], iteration=1, parent=0, origin="model", code=CODE.replace("1.0", "0.5"),
-        )  # fmt: skip
+            [0.2, 0.3, 0.5, 0.75],
+            iteration=1,
+            parent=0,
+            origin="model",
+            code=CODE.replace("1.0", "0.5"),
+        )
         self.feedback()
         self.found = {"chosen": 2, "success": 0.75, "stopped_by": "rounds", "steps": 1600}
         self.save()
@@ -104,13 +137,22 @@ def test_a_finished_search_shows_choice_analysis_origin_and_code(run):
 
     for words in (
         "Candidate 2 of 3 was chosen (written by a language model): 75 % success",
-        "after its last round and trained for 1,600 control steps", "3 rewards in 2 rounds", "stopped at rung 2 of 4",
-        "10, 20 %", "failed", "the worker process was killed", "trained to the end", "a language model, from 0",
-        "5 min 00 s", "Of 64 episodes of its last policy 48 succeeded; 88 % had success at some step; it took 1.2 s (median).",
-        "with probability 0.81; chance is 0.50", "reach: reached in 100 %, touched in 50 %, grasped in 25 %, raised in 0 %",
-        "Candidate 2 was written from candidate 0 by a language model.", "- reach = 1.0 + reach = 0.5",
+        "after its last round and trained for 1,600 control steps",
+        "3 rewards in 2 rounds",
+        "stopped at rung 2 of 4",
+        "10, 20 %",
+        "failed",
+        "the worker process was killed",
+        "trained to the end",
+        "a language model, from 0",
+        "5 min 00 s",
+        "Of 64 episodes of its last policy 48 succeeded; 88 % had success at some step; it took 1.2 s (median).",
+        "with probability 0.81; chance is 0.50",
+        "reach: reached in 100 %, touched in 50 %, grasped in 25 %, raised in 0 %",
+        "Candidate 2 was written from candidate 0 by a language model.",
+        "- reach = 1.0 + reach = 0.5",
         "Code of candidate 2, 3 lines",
-    ):  # fmt: skip
+    ):
         assert words in text
     charts = [str(a["aria-label"]) for a in page.of("svg") if a.get("role") == "img"]
     assert any(
@@ -130,8 +172,11 @@ def test_a_half_finished_search_shows_what_is_there(run):
 
     for words in (
         "The search is not finished; the same command goes on with it. So far candidate 0 leads with 25 % success.",
-        "2 rewards in 1 round", "under way, 2 of 4 rungs", "waits", "0, leads",
-    ):  # fmt: skip
+        "2 rewards in 1 round",
+        "under way, 2 of 4 rungs",
+        "waits",
+        "0, leads",
+    ):
         assert words in text
 
 
@@ -163,7 +208,17 @@ def test_hostile_words_of_a_search_are_shown_and_never_run(run):
     assert len(page.of("title")) == 1
 
 
-BROKEN = ["[]", "3", "null", "{", '{"candidates": [{"number": "x"}]}', "[[[1]]]", '{"candidates": [3], "rungs": 1e999}', "1" * 5000, "[" * 9000]  # fmt: skip
+BROKEN = [
+    "[]",
+    "3",
+    "null",
+    "{",
+    '{"candidates": [{"number": "x"}]}',
+    "[[[1]]]",
+    '{"candidates": [3], "rungs": 1e999}',
+    "1" * 5000,
+    "[" * 9000,
+]
 
 
 @pytest.mark.parametrize("content", BROKEN, ids=lambda c: c[:12])
@@ -215,9 +270,12 @@ def test_a_search_of_forty_rewards_stays_small(run):
     long_code = "\n".join(f"    part_{k} = {k} * states['eef_pos'][:, 0]" for k in range(120))
     for number in range(40):
         search.candidate(
-            [0.1, 0.2, 0.3, 0.4], iteration=number // 8, code=long_code, parent=number - 8 if number > 7 else None,
+            [0.1, 0.2, 0.3, 0.4],
+            iteration=number // 8,
+            code=long_code,
+            parent=number - 8 if number > 7 else None,
             reasons=("because " * 15,),
-        )  # fmt: skip
+        )
     search.found = {"chosen": 39, "success": 0.4}
     search.save()
     run.record(search.stage)

@@ -138,8 +138,12 @@ def test_how_far_the_policy_came_is_read_from_the_states():
     (obj,) = feedback_of(trajectories, 0.05).objects
 
     assert (obj.name, obj.reached, obj.touched, obj.grasped, obj.raised) == (
-        "cube", 0.5, 0.5, 0.5, 0.5,
-    )  # fmt: skip
+        "cube",
+        0.5,
+        0.5,
+        0.5,
+        0.5,
+    )
     assert obj.nearest_m == pytest.approx(0.1)
     assert obj.moved_m == pytest.approx(0.05)
 
@@ -156,9 +160,14 @@ def test_curves_are_thinned_to_ten_values_with_the_last_one_among_them():
 def test_recorded_states_are_those_that_the_reward_was_paid_for(scene_of):
     scene = scene_of("lift_up")
     bundle = TaskBundle(
-        title="lift", description="lift", kind="lift_up", class_name="", scene=scene,
-        code=write_samples(scene)[0], horizon_steps=12,
-    )  # fmt: skip
+        title="lift",
+        description="lift",
+        kind="lift_up",
+        class_name="",
+        scene=scene,
+        code=write_samples(scene)[0],
+        horizon_steps=12,
+    )
     env = BatchEnv(bundle, SimConfig(), num_envs=4, seed=0, num_threads=1)
 
     recorded = record_trajectories(

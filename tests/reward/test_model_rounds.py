@@ -1,7 +1,8 @@
-"""Two rounds by a stand-in for a model: who descends from whom, what is turned away, what the model is told, what the page shows.
+"""Two rounds by a stand-in for a model: parents, refusals, what the model is told, what the page shows.
 
-The given reward is constant. The model adds two rewards, one of them without bounds, and then will not; a template fills the
-round. In the second round it answers twice, from what training with the best one showed.
+The given reward is constant. The model adds two rewards, one of them without bounds, and then will
+not; a template fills the round. In the second round it answers twice, from what training with the
+best one showed.
 """
 
 import json
@@ -32,11 +33,19 @@ Outline = runpy.run_path(str(TESTS / "report" / "test_page.py"))["Outline"]
 
 NUM_ENVS, EVAL_WORLDS = 24, 16
 TINY = (
-    f"--reward.steps={16 * NUM_ENVS}", "--reward.rungs", "1.0", f"--reward.num-envs={NUM_ENVS}",
-    f"--reward.eval-worlds={EVAL_WORLDS}", "--reward.iterations=2", "--reward.candidates=4",
-    "--reward.target-success=1.0", "--task.writer=vlm", "--task.vlm.key-env=", "--task.vlm.max-reasks=0",
+    f"--reward.steps={16 * NUM_ENVS}",
+    "--reward.rungs",
+    "1.0",
+    f"--reward.num-envs={NUM_ENVS}",
+    f"--reward.eval-worlds={EVAL_WORLDS}",
+    "--reward.iterations=2",
+    "--reward.candidates=4",
+    "--reward.target-success=1.0",
+    "--task.writer=vlm",
+    "--task.vlm.key-env=",
+    "--task.vlm.max-reasks=0",
     "--task.vlm.max-regenerations=0",
-)  # fmt: skip
+)
 BY_CHANCE = "(states['tea_box_start_pos'][:, 1] < 0) & (states['progress'] > 0.06)"
 """From the second step on, where the box happens to lie decides: successes and failures without any training."""
 FLAT = "0 * states['eef_pos'][:, 2] + 5"
@@ -106,8 +115,11 @@ def test_the_second_round_descends_from_the_best_of_the_first(searched: Searched
 
     assert [row["origin"] for row in first] == ["given", "model", "model", "template"]
     assert [row["why"].partition(":")[0] for row in first] == [
-        "reward_constant", "", "reward_unbounded", "",
-    ]  # fmt: skip
+        "reward_constant",
+        "",
+        "reward_unbounded",
+        "",
+    ]
     assert [(row["origin"], row["parent"]) for row in second] == [("model", best["number"])] * 2
     assert "the model gave 2 of 3 rewards that could be used" in first[3]["reasons"][0]
     assert len({reward_part(row["code"]) for row in searched.rows}) == 6

@@ -1,4 +1,7 @@
-"""A search without a model, with tiny budgets: one round, halved; a failure is one candidate's; a kill loses nothing."""
+"""A search without a model, with tiny budgets: one round, halved; a failure is one candidate's.
+
+A kill loses nothing.
+"""
 
 import contextlib
 import os

@@ -103,7 +103,7 @@ type Parts = list[tuple[np.ndarray, tuple[int, int, int], int]]
 
 @pytest.fixture(scope="session")
 def segmentation_of() -> Callable[[list[Parts]], tuple[WorkingClip, Segmentation]]:
-    """Return what makes working clip of coloured masks on a table, and the word of a network that sees their classes."""
+    """Return what makes a working clip of coloured masks on a table, and what a network sees of it."""
 
     def make(parts_by_frame: list[Parts]) -> tuple[WorkingClip, Segmentation]:
         frames, planes = [], []

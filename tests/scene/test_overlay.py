@@ -138,9 +138,13 @@ def test_a_tool_is_drawn_only_while_the_hand_holds_it(pushed):
     box = pushed.objects[0]
     some = slice(5, 10)
     held = replace(
-        box, frames=box.frames[some], T_world_objs=box.T_world_objs[some], masks={},
-        confidences=box.confidences[some], observed=("no_depth",) * 5,
-    )  # fmt: skip
+        box,
+        frames=box.frames[some],
+        T_world_objs=box.T_world_objs[some],
+        masks={},
+        confidences=box.confidences[some],
+        observed=("no_depth",) * 5,
+    )
     unheld = replace(held, observed=("full",) * 5)
 
     drawn = {

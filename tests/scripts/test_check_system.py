@@ -85,18 +85,31 @@ def test_lerobot_streams_every_frame_of_joined_shards_and_reports_in_an_activate
     from v2p_data.sim.render.masks import PALETTE
 
     done = subprocess.run(
-        ["bash", "-c", 'source "$0/bin/activate"; exec "$@"', str(lent), sys.executable, "-c", READ, str(dataset)],
+        [
+            "bash",
+            "-c",
+            'source "$0/bin/activate"; exec "$@"',
+            str(lent),
+            sys.executable,
+            "-c",
+            READ,
+            str(dataset),
+        ],
         capture_output=True,
         text=True,
         check=False,
         timeout=300,
         env={**os.environ, "HF_HUB_OFFLINE": "1"},
-    )  # fmt: skip
+    )
 
     assert done.returncode == 0, done.stderr[-2000:]
     assert "Could not load libtorchcodec" not in done.stderr
     assert "LeRobot version" in done.stdout
-    rows = [[int(n) for n in line.split()[1:]] for line in done.stdout.splitlines() if line.startswith("row")]  # fmt: skip
+    rows = [
+        [int(n) for n in line.split()[1:]]
+        for line in done.stdout.splitlines()
+        if line.startswith("row")
+    ]
     episode_of = np.repeat(np.arange(len(LENGTHS)), LENGTHS)
     assert len(list(dataset.glob("videos/*/*/*.mp4"))) == 1
     assert sorted(rows) == [

@@ -96,7 +96,7 @@ def test_a_toys_scene_is_of_the_kind_that_is_studied_and_its_task_passes_the_aud
     out = tmp_path / "toy_0004-x"
     asked = parts.config.ASKED[kind]
 
-    parts.objects.make_toy({"seed": 0, "kind": kind}, {}, out, Runtime(root=tmp_path))  # fmt: skip
+    parts.objects.make_toy({"seed": 0, "kind": kind}, {}, out, Runtime(root=tmp_path))
 
     scene = Scene.load(out)
     toy = scene.manipulated
@@ -112,7 +112,9 @@ def test_a_toys_scene_is_of_the_kind_that_is_studied_and_its_task_passes_the_aud
 
 def test_each_cousin_goes_through_the_same_stages_as_its_scene(parts):
     cfg = replace(EngineConfig(), cousins=CousinsConfig(count=2))
-    candidate = parts.objects.candidate_of(parts.objects.toy_stage(4, parts.config.PoolConfig()), cfg, "lift_up")  # fmt: skip
+    candidate = parts.objects.candidate_of(
+        parts.objects.toy_stage(4, parts.config.PoolConfig()), cfg, "lift_up"
+    )
 
     own, *cousins = with_cousins(episodes_stage(candidate.task, candidate.expert, cfg), cfg)
 
@@ -251,9 +253,12 @@ def test_rejected_objects_are_counted_and_skipped_and_smaller_sets_are_parts_of_
 
     def outcome(stage, *, is_good: bool):
         return Outcome(
-            stage=stage.name, item=stage.item, folder=tmp_path,
-            status="made" if is_good else "rejected", reason="" if is_good else "expert_not_learned",
-        )  # fmt: skip
+            stage=stage.name,
+            item=stage.item,
+            folder=tmp_path,
+            status="made" if is_good else "rejected",
+            reason="" if is_good else "expert_not_learned",
+        )
 
     def run(stages, root=None):
         """Every other expert learns nothing, and what needs it is blocked."""
@@ -278,10 +283,19 @@ def test_rejected_objects_are_counted_and_skipped_and_smaller_sets_are_parts_of_
 
 def arguments(out: Path, **given) -> argparse.Namespace:
     usual = {
-        "config": ROOT / "configs/studies/lifting_tiny.yaml", "out": out, "unseen": None, "videos": None,
-        "arms": None, "counts": None, "seeds": None, "max_cells": None, "workers": 1, "threads": 1,
-        "device": "cpu", "table": True,
-    }  # fmt: skip
+        "config": ROOT / "configs/studies/lifting_tiny.yaml",
+        "out": out,
+        "unseen": None,
+        "videos": None,
+        "arms": None,
+        "counts": None,
+        "seeds": None,
+        "max_cells": None,
+        "workers": 1,
+        "threads": 1,
+        "device": "cpu",
+        "table": True,
+    }
     return argparse.Namespace(**usual | given)
 
 
@@ -357,14 +371,19 @@ def test_a_cell_learns_from_a_toy_and_is_judged_on_an_unseen_object_that_nothing
                 min_success=0.0,
                 imitation=ImitationConfig(rounds=8, least_rounds=8, teacher_rounds=6),
                 ppo=PPOConfig(
-                    total_steps=512, window_episodes=4, min_window_episodes=2, num_deterministic=4,
+                    total_steps=512,
+                    window_episodes=4,
+                    min_window_episodes=2,
+                    num_deterministic=4,
                 ),
             ),
             episodes=EpisodesConfig(num_episodes=2, batch_worlds=8, max_batches=4),
-            distillation=DistillationConfig(rounds=1, episodes=4, worlds=4, first_steps=2, round_steps=2),
+            distillation=DistillationConfig(
+                rounds=1, episodes=4, worlds=4, first_steps=2, round_steps=2
+            ),
             policy=PolicyConfig(preset="small", steps=4, batch_size=16),
         ),
-    )  # fmt: skip
+    )
     made = parts.cells.Study(cfg=cfg, out=tmp_path, runtime=Runtime(root=tmp_path))
 
     found = made.cell("toys", 1, 0)

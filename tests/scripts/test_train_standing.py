@@ -12,7 +12,10 @@ def trainer(load_script):
 
 
 def group(rng, n=6):
-    """Return candidates of which the one with the largest first cue is right; the second is chance, the third the same for all."""
+    """Return candidates of which the one with the largest first cue is right.
+
+    The second is chance, the third the same for all.
+    """
     cues = np.column_stack([rng.normal(size=n), rng.normal(size=n), np.full(n, 0.7)])
     right = np.full(n, 0.02)
     right[cues[:, 0].argmax()] = 0.95

@@ -102,8 +102,13 @@ def world_of(make_object: Callable[..., SceneObject], make_scene: Callable[..., 
 def env_with(make_bundle: Callable[..., TaskBundle], lift_task: type[Task]):
     def make(robot: RobotConfig, cfg: SimConfig = CALM, num_envs: int = 8) -> BatchEnv:
         return BatchEnv(
-            make_bundle(), replace(cfg, robot=robot), num_envs=num_envs, seed=0, num_threads=1, task=lift_task,
-        )  # fmt: skip
+            make_bundle(),
+            replace(cfg, robot=robot),
+            num_envs=num_envs,
+            seed=0,
+            num_threads=1,
+            task=lift_task,
+        )
 
     return make
 

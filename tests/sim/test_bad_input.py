@@ -239,10 +239,18 @@ def test_a_file_too_large_to_be_read_is_refused_unread(world_of, ball, monkeypat
         ({"mass_kg": float("nan")}, "mass_impossible", "at least 0.1 g"),
         ({"size_m": (0.12, 0.1, 0.05)}, "not_graspable", "100 mm wide"),
         ({"size_m": (0.1, 0.1, 0.001)}, "not_graspable", "100 mm wide"),
-        ({"shape": "cylinder", "size_m": (0.1, 0.1, 0.1)}, "not_graspable", "gripper opens by 85 mm"),
-        ({"shape": "sphere", "size_m": (0.12, 0.12, 0.12)}, "not_graspable", "gripper opens by 85"),
+        (
+            {"shape": "cylinder", "size_m": (0.1, 0.1, 0.1)},
+            "not_graspable",
+            "gripper opens by 85 mm",
+        ),
+        (
+            {"shape": "sphere", "size_m": (0.12, 0.12, 0.12)},
+            "not_graspable",
+            "gripper opens by 85",
+        ),
     ],
-)  # fmt: skip
+)
 def test_an_object_the_robot_cannot_handle_is_refused_with_the_number(
     change: dict,
     reason: str,
@@ -332,8 +340,12 @@ class Stacked(Liftable):
     ids=["each other", "table", "off"],
 )
 def test_task_code_that_starts_objects_where_they_cannot_be_is_refused(
-    offset, reason, says, make_object: Callable[..., SceneObject], make_bundle: Callable[..., TaskBundle]
-):  # fmt: skip
+    offset,
+    reason,
+    says,
+    make_object: Callable[..., SceneObject],
+    make_bundle: Callable[..., TaskBundle],
+):
     bundle = make_bundle(make_object("cube"), make_object("can", role="reference"))
     task = type("Moved", (Stacked,), {"offset": offset})
 

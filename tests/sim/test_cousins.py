@@ -88,7 +88,9 @@ def test_the_files_of_a_cousin_weigh_and_turn_like_its_mesh(
     root = ET.parse(tmp_path / scene.manipulated.urdf).getroot()
     moments = root.find("link/inertial/inertia")
     assert moments is not None
-    assert float(moments.attrib["izz"]) == pytest.approx(density * mesh.moment_inertia[2, 2], rel=0.01)  # fmt: skip
+    assert float(moments.attrib["izz"]) == pytest.approx(
+        density * mesh.moment_inertia[2, 2], rel=0.01
+    )
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
     body = model.body("bottle")
     assert body.mass[0] == pytest.approx(thing.mass_kg, rel=1e-4)

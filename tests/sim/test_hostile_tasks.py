@@ -1,4 +1,4 @@
-"""Task code that cheats, or answers what it may not: in the simulator, past the trial run, which it may have deceived."""
+"""Task code that cheats in the simulator, past the trial run, which it may have deceived."""
 
 import contextlib
 from collections.abc import Callable
@@ -101,7 +101,8 @@ FORGERIES = {
         "reset": "for old in self.kept:\n    for key in old:\n        old[key].fill_(1.0)",
     },
     "the poses of the last reset, kept and lifted": {
-        "reset": "for old in self.kept:\n    old.add_(1.0)\nself.kept.append(self.envs.sample_object_poses(env_ids)['cube'])",
+        "reset": "for old in self.kept:\n    "
+        "old.add_(1.0)\nself.kept.append(self.envs.sample_object_poses(env_ids)['cube'])",
     },
     "the actions": {"reward": "actions.fill_(1.0)"},
     "success for everybody": {"success": "success = states['cube_pos'][:, 2] > -1.0"},
@@ -137,9 +138,13 @@ return poses"""
 STARTS = {
     "held above the table": ("poses['cube'][-1, 2] += 0.09", "starts_in_the_air", "90 mm above"),
     "in the table": ("poses['cube'][-1, 2] -= 0.01", "starts_in_the_table", "inside the table"),
-    "far under the table": ("poses['cube'][-1, 2] -= 900.0", "starts_in_the_table", "inside the table"),
+    "far under the table": (
+        "poses['cube'][-1, 2] -= 900.0",
+        "starts_in_the_table",
+        "inside the table",
+    ),
     "900 km away": ("poses['cube'][-1, 0] += 900000.0", "starts_off_the_table", "1.4 m"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("cheat", "reason", "words"), STARTS.values(), ids=STARTS)
@@ -255,13 +260,22 @@ def test_the_worlds_numbers_are_the_same_whatever_a_task_does_in_between(
 
 LATER = "if self.count > 4:\n    "
 ANSWERS = {
-    "success of one row": ({"success": LATER + "success = success[:1]"}, "one row per environment"),
-    "success of a number": ({"success": LATER + "success = success[0]"}, "one row per environment"),
+    "success of one row": (
+        {"success": LATER + "success = success[:1]"},
+        "one row per environment",
+    ),
+    "success of a number": (
+        {"success": LATER + "success = success[0]"},
+        "one row per environment",
+    ),
     "success n x n": (
         {"success": LATER + "success = success[:, None] == success[None]"},
         "one row per environment",
     ),
-    "success of floats": ({"success": LATER + "success = success.float() * float('nan')"}, "torch.bool"),
+    "success of floats": (
+        {"success": LATER + "success = success.float() * float('nan')"},
+        "torch.bool",
+    ),
     "success of integers": ({"success": LATER + "success = success.int() + 1"}, "torch.bool"),
     "success is a list": ({"success": LATER + "success = [True]"}, "must be a tensor"),
     "success is None": ({"success": LATER + "success = None"}, "must be a tensor"),
@@ -282,32 +296,64 @@ ANSWERS = {
         "not finite in world 0 although",
     ),
     "an unknown key": ({"observe": LATER + "keys.append('<b>')"}, "'<b>' is not in states"),
-    "keys that are no list": ({"observe": LATER + "keys = ('base_observation',)"}, "a list of keys"),
+    "keys that are no list": (
+        {"observe": LATER + "keys = ('base_observation',)"},
+        "a list of keys",
+    ),
     "no key": ({"observe": LATER + "keys = []"}, "at least one key"),
     "a reward of one row": ({"reward": LATER + "reward = reward[:1]"}, "one row per environment"),
-    "a reward n x n": ({"reward": LATER + "reward = reward[:, None] + reward"}, "one row per environment"),
+    "a reward n x n": (
+        {"reward": LATER + "reward = reward[:, None] + reward"},
+        "one row per environment",
+    ),
     "a reward of doubles": ({"reward": LATER + "reward = reward.double()"}, "torch.float32"),
     "a reward that is infinite": ({"reward": LATER + "reward = reward / 0"}, "is inf in world 0"),
-    "a component of one row": ({"reward": LATER + "parts['height'] = reward[:1]"}, "one row per environment"),
-    "a component that is no tensor": ({"reward": LATER + "parts['height'] = 1.0"}, "must be a tensor"),
+    "a component of one row": (
+        {"reward": LATER + "parts['height'] = reward[:1]"},
+        "one row per environment",
+    ),
+    "a component that is no tensor": (
+        {"reward": LATER + "parts['height'] = 1.0"},
+        "must be a tensor",
+    ),
     "a new component": ({"reward": LATER + "parts['more'] = reward"}, "change from call to call"),
     "a component gone": ({"reward": LATER + "parts = {}"}, "change from call to call"),
     "the reward alone": ({"reward": LATER + "return reward"}, "a dict of its components"),
-    "a component called like markup": ({"reward": "parts['<script>'] = reward"}, "no name for a reward"),
+    "a component called like markup": (
+        {"reward": "parts['<script>'] = reward"},
+        "no name for a reward",
+    ),
     "a component with a line end": ({"reward": "parts['a\\nb'] = reward"}, "no name for a reward"),
     "a component with a comma": ({"reward": "parts['a,b'] = reward"}, "no name for a reward"),
-    "a component of 41 letters": ({"reward": f"parts['{'a' * 41}'] = reward"}, "no name for a reward"),
+    "a component of 41 letters": (
+        {"reward": f"parts['{'a' * 41}'] = reward"},
+        "no name for a reward",
+    ),
     "a component called by a number": ({"reward": "parts[7] = reward"}, "no name for a reward"),
     "33 components": (
         {"reward": "for i in range(33):\n    parts['a' + str(i)] = reward"},
         "more than 32 components",
     ),
-    "success without numbers": ({"success": LATER + "success = success.to('meta')"}, "device of the states"),
-    "a reward without numbers": ({"reward": LATER + "reward = reward.to('meta')"}, "device of the states"),
-    "a component without numbers": ({"reward": LATER + "parts['height'] = reward.to('meta')"}, "device of"),
+    "success without numbers": (
+        {"success": LATER + "success = success.to('meta')"},
+        "device of the states",
+    ),
+    "a reward without numbers": (
+        {"reward": LATER + "reward = reward.to('meta')"},
+        "device of the states",
+    ),
+    "a component without numbers": (
+        {"reward": LATER + "parts['height'] = reward.to('meta')"},
+        "device of",
+    ),
     "an observation without numbers": (
-        {"observe": "states['more'] = states['cube_pos']\n" + LATER + "states['more'] = states['more'].to('meta')\n"
-         "keys.append('more')", "size": "93"},
+        {
+            "observe": "states['more'] = states['cube_pos']\n"
+            + LATER
+            + "states['more'] = states['more'].to('meta')\n"
+            "keys.append('more')",
+            "size": "93",
+        },
         "device of the states",
     ),
     "a success of named rows": (
@@ -318,18 +364,30 @@ ANSWERS = {
         {"observe": "states['more'] = torch.zeros(6, 5000)\nkeys.append('more')", "size": "5090"},
         "5090 numbers; at most 4096",
     ),
-    "poses without numbers": ({"reset": "return {'cube': torch.ones(6, 7).to('meta')}"}, "a plain tensor"),
+    "poses without numbers": (
+        {"reset": "return {'cube': torch.ones(6, 7).to('meta')}"},
+        "a plain tensor",
+    ),
     "a size that is no number": ({"size": "'90'"}, "a whole number"),
     "poses of no object": ({"reset": "return {}"}, "a pose per object: cube"),
-    "poses of other objects": ({"reset": "return {'can': torch.zeros(6, 7)}"}, "a pose per object: cube"),
+    "poses of other objects": (
+        {"reset": "return {'can': torch.zeros(6, 7)}"},
+        "a pose per object: cube",
+    ),
     "poses of one row": (
         {"reset": "return {'cube': torch.ones(1, 7)}"},
         r"the reset pose of cube must be a tensor of shape \(6, 7\), not \(1, 7\)",
     ),
-    "a pose that is no number": ({"reset": "return {'cube': torch.ones(6, 7) / 0}"}, "is not finite"),
+    "a pose that is no number": (
+        {"reset": "return {'cube': torch.ones(6, 7) / 0}"},
+        "is not finite",
+    ),
     "a pose of integers": ({"reset": "return {'cube': torch.ones(6, 7).int()}"}, "is not finite"),
-    "a quaternion of length 2": ({"reset": "return {'cube': torch.ones(6, 7)}"}, "not of length 1"),
-}  # fmt: skip
+    "a quaternion of length 2": (
+        {"reset": "return {'cube': torch.ones(6, 7)}"},
+        "not of length 1",
+    ),
+}
 
 
 @pytest.mark.filterwarnings("ignore:Named tensors")

@@ -48,9 +48,17 @@ class Moments:
 
 def an_object(name: str, role: str, shape: str, size_m: tuple, **more) -> SceneObject:
     return SceneObject(
-        name=name, label=name, role=role, shape=shape, size_m=size_m, mass_kg=0.1, friction=0.8,
-        frames=(0,), poses_world=((0.0, 0.0, size_m[2] / 2, 1.0, 0.0, 0.0, 0.0),), **more,
-    )  # fmt: skip
+        name=name,
+        label=name,
+        role=role,
+        shape=shape,
+        size_m=size_m,
+        mass_kg=0.1,
+        friction=0.8,
+        frames=(0,),
+        poses_world=((0.0, 0.0, size_m[2] / 2, 1.0, 0.0, 0.0, 0.0),),
+        **more,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -59,17 +67,23 @@ def world(tmp_path_factory) -> World:
     trimesh.creation.icosphere(2, radius=0.04).export(folder / "ball.obj")
     return build_world(
         Scene(
-            title="masks", video="masks.mp4", description="lifting a box", kind="lift_up",
+            title="masks",
+            video="masks.mp4",
+            description="lifting a box",
+            kind="lift_up",
             objects=(
                 an_object("box", "manipulated", "box", (0.05, 0.06, 0.08)),
                 an_object("ball", "reference", "mesh", (0.08, 0.08, 0.08), mesh="ball.obj"),
                 an_object("bowl", "container", "cylinder", (0.12, 0.12, 0.06), hollow=True),
             ),
             camera=Camera(width_px=64, height_px=48, K=np.eye(3), T_world_cam=np.eye(4)),
-            fps=20.0, num_frames=2, confidence=1.0, folder=folder,
+            fps=20.0,
+            num_frames=2,
+            confidence=1.0,
+            folder=folder,
         ),
         FINE,
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")

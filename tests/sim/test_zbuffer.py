@@ -53,8 +53,19 @@ def cast(model: mujoco.MjModel, labels: list[int]) -> np.ndarray:
     beams = np.ascontiguousarray(beams.reshape(-1, 3))
     geoms, distances = np.full(len(beams), -1, np.int32), np.zeros(len(beams))
     mujoco.mj_multiRay(
-        model, data, np.zeros(3), beams.ravel(), None, 1, -1, geoms, distances, None, len(beams), 1e9
-    )  # fmt: skip
+        model,
+        data,
+        np.zeros(3),
+        beams.ravel(),
+        None,
+        1,
+        -1,
+        geoms,
+        distances,
+        None,
+        len(beams),
+        1e9,
+    )
     return np.append(np.array(labels, np.uint8), np.uint8(0))[geoms].reshape(HEIGHT, WIDTH)
 
 
@@ -92,9 +103,13 @@ def test_up_and_right_are_up_and_right():
 def random_geoms(rng: np.random.Generator) -> str:
     """Return one of each kind, turned at random and overlapping, some of them beyond the image's edge."""
     sizes = {
-        "box": "0.1 0.06 0.14", "sphere": "0.11", "ellipsoid": "0.06 0.1 0.16",
-        "capsule": "0.06 0.12", "cylinder": "0.09 0.1", "mesh": "",
-    }  # fmt: skip
+        "box": "0.1 0.06 0.14",
+        "sphere": "0.11",
+        "ellipsoid": "0.06 0.1 0.16",
+        "capsule": "0.06 0.12",
+        "cylinder": "0.09 0.1",
+        "mesh": "",
+    }
     geoms = ""
     for kind, size in sizes.items():
         x, y, z = rng.uniform((-0.6, -0.4, -1.6), (0.6, 0.4, -0.7))

@@ -464,7 +464,8 @@ CONTAINED: dict[str, tuple[str, str]] = {
     "memory: list by assignment": (program("y = [0]\ny *= 999999\ny *= 999999"), "memory"),
     "memory: keys without end": (
         program(
-            "def compute_observation_key(self, states):\n    y = ['base_observation']\n    for i in range(24):\n        y = y + y\n    return y",
+            "def compute_observation_key(self, states):\n    y = ['base_observation']\n    for i "
+            "in range(24):\n        y = y + y\n    return y",
             "MEMBER",
         ),
         "",
@@ -494,7 +495,8 @@ CONTAINED: dict[str, tuple[str, str]] = {
     "time: loops called by loops": (
         program("y = [loop(1) for i in range(999)]").replace(
             "#TOP",
-            "def loop(n):\n    y = [inner(i) for i in range(999)]\n    return y\ndef inner(n):\n    y = [i for i in range(999)]\n    return n",
+            "def loop(n):\n    y = [inner(i) for i in range(999)]\n    return y\ndef inner(n):\n  "
+            "  y = [i for i in range(999)]\n    return n",
         ),
         "took more than",
     ),
@@ -530,7 +532,8 @@ CONTAINED: dict[str, tuple[str, str]] = {
     ),
     "depth: kinds in kinds": (
         program(
-            "y = (int, float)\nfor i in range(999):\n    for j in range(50):\n        y = (y, y)\nz = isinstance(states, y)"
+            "y = (int, float)\nfor i in range(999):\n    for j in range(50):\n        y = (y, "
+            "y)\nz = isinstance(states, y)"
         ),
         "",
     ),

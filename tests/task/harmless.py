@@ -54,7 +54,8 @@ ACCEPTED: dict[str, str] = {
     .replace("x, states", "states['box_pos'], states")
     .replace(
         "#TOP",
-        "@torch.jit.script\ndef near(a, b):\n    # type: (Tensor, Tensor) -> Tensor\n    return torch.exp(-10.0 * torch.norm(a - b, dim=-1))",
+        "@torch.jit.script\ndef near(a, b):\n    # type: (Tensor, Tensor) -> Tensor\n    return "
+        "torch.exp(-10.0 * torch.norm(a - b, dim=-1))",
     ),
     "a dict of components built up": program(
         "parts = {}\nfor name, w in [('reach', 0.3), ('lift', 0.7)]:\n    parts[name] = w * r\n"
@@ -99,7 +100,8 @@ ACCEPTED: dict[str, str] = {
         "s = 0.05\ng = torch.exp(-0.5 * (torch.norm(x - states['eef_pos'], dim=-1) / s) ** 2)"
     ),
     "stages of a reward": program(
-        "grasped = states['box_grasped'] > 0.5\nlift = (states['box_pos'][:, 2] - states['box_start_pos'][:, 2]).clamp(min=0)\n"
+        "grasped = states['box_grasped'] > 0.5\nlift = (states['box_pos'][:, 2] - "
+        "states['box_start_pos'][:, 2]).clamp(min=0)\n"
         "stage = torch.where(grasped, 1.0 + lift * 5.0, r)\n"
         "penalty = 0.01 * torch.sum(actions ** 2, dim=-1)\n"
         "return stage - penalty, {'stage': stage, 'penalty': -penalty}",
@@ -126,10 +128,12 @@ ACCEPTED: dict[str, str] = {
     "types from typing": program("w: float = 1.0").replace(
         "#TOP",
         "from typing import Dict, Tuple\nfrom torch import Tensor\nfrom factory.tasks.task import Task\n"
-        "def f(states: Dict[str, Tensor], k: float = 2.0) -> Tuple[Tensor, Dict[str, Tensor]]:\n    return states['eef_pos'], states",
+        "def f(states: Dict[str, Tensor], k: float = 2.0) -> Tuple[Tensor, Dict[str, Tensor]]:\n  "
+        "  return states['eef_pos'], states",
     ),
     "a docstring with signs": program(
-        'def f(d):\n    r"""Angle \\d in {degrees}, 50 % of it: 1\u00b0, \u2264 2 \u00b5m\u00a0-\u2013 "good"."""\n    return d',
+        'def f(d):\n    r"""Angle \\d in {degrees}, 50 % of it: 1\u00b0, \u2264 2 '
+        '\u00b5m\u00a0-\u2013 "good"."""\n    return d',
         "TOP",
     ),
     "a percent sign in a text": program("y = 'box_%s' % 'pos'\nz = states[y]"),

@@ -1,7 +1,8 @@
 """Task folders that are damaged or malicious: each case spoils a good one, which `good_task` makes.
 
-`CASES` maps a name to a function that spoils a folder. Opening any of them must end in a `V2PError` that names a file or
-the folder, within seconds. `CODE` holds task codes that only the trial run can find out, as replacements of `task.py`.
+`CASES` maps a name to a function that spoils a folder. Opening any of them must end in a
+`V2PError` that names a file or the folder, within seconds. `CODE` holds task codes that only the
+trial run can find out, as replacements of `task.py`.
 """
 
 import gzip

@@ -20,7 +20,17 @@ def _json(value: object) -> bytes:
 REFUSED: dict[str, tuple[str, bytes]] = {
     **{
         f"table in {encoding}": (CSV, GERMAN.encode(encoding))
-        for encoding in ("latin-1", "cp1252", "cp850", "mac-roman", "utf-16", "utf-32", "utf-16-le", "utf-16-be", "cp037")
+        for encoding in (
+            "latin-1",
+            "cp1252",
+            "cp850",
+            "mac-roman",
+            "utf-16",
+            "utf-32",
+            "utf-16-le",
+            "utf-16-be",
+            "cp037",
+        )
     },
     "table in utf-16 of English": (CSV, ROW.encode("utf-16-le")),
     "table in utf-16 without its mark, big end": (CSV, ROW.encode("utf-16-be")),
@@ -75,33 +85,63 @@ REFUSED: dict[str, tuple[str, bytes]] = {
     "object of a name of hidden letters": (JSON, json.dumps({"\u202e.mp4": SAID}).encode()),
     "object of objects without a caption": (JSON, _json({})),
     "object of a list of objects": (JSON, _json({"caption": SAID, "objects": {"a": 1}})),
-    "object of an object of hidden letters": (JSON, _json({"caption": SAID, "objects": ["\u2060"]})),
-    "object of two objects that differ in hidden letters": (JSON, _json({"caption": SAID, "objects": ["box", "b\u00adox"]})),
+    "object of an object of hidden letters": (
+        JSON,
+        _json({"caption": SAID, "objects": ["\u2060"]}),
+    ),
+    "object of two objects that differ in hidden letters": (
+        JSON,
+        _json({"caption": SAID, "objects": ["box", "b\u00adox"]}),
+    ),
     "object of hints as text": (JSON, _json({"caption": SAID, "hints": "box"})),
     "text that is called an object": (JSON, SAID.encode()),
     "a number": (JSON, b"7"),
     "a deep list": (JSON, b"[" * 200_000),
     "a deep object": (JSON, b'{"a":' * 200_000),
-}  # fmt: skip
+}
 
 READ: dict[str, tuple[str, bytes, str]] = {
     "table": (CSV, ROW.encode(), SAID),
     "table with titles": (CSV, f"file,caption\n{ROW}\n".encode(), SAID),
     "table with other titles": (CSV, f"Video, Caption\n{ROW}\n".encode(), SAID),
     "table with a byte order mark": (CSV, codecs.BOM_UTF8 + ROW.encode(), SAID),
-    "table as Windows writes it": (CSV, codecs.BOM_UTF8 + f"file,caption\r\n{ROW}\r\n".encode(), SAID),
+    "table as Windows writes it": (
+        CSV,
+        codecs.BOM_UTF8 + f"file,caption\r\n{ROW}\r\n".encode(),
+        SAID,
+    ),
     "table with old line ends": (CSV, f"file,caption\r{ROW}\r".encode(), SAID),
-    "table with semicolons": (CSV, f"file;caption\n{PLAIN};Lifting box, red\n".encode(), "Lifting box, red"),
-    "table with semicolons alone": (CSV, f"{PLAIN};Lifting box, red, up\n".encode(), "Lifting box, red, up"),
+    "table with semicolons": (
+        CSV,
+        f"file;caption\n{PLAIN};Lifting box, red\n".encode(),
+        "Lifting box, red",
+    ),
+    "table with semicolons alone": (
+        CSV,
+        f"{PLAIN};Lifting box, red, up\n".encode(),
+        "Lifting box, red, up",
+    ),
     "table with tabs": (CSV, f"{PLAIN}\t{SAID}\n".encode(), SAID),
     "table with empty lines": (CSV, f"\n\n{ROW}\n,\n\n".encode(), SAID),
     "table with spaces": (CSV, f"  {PLAIN} ,  {SAID}  \n".encode(), SAID),
-    "table with quotation marks": (CSV, f'"{PLAIN}","Lifting ""red"" box, up"\n'.encode(), 'Lifting "red" box, up'),
+    "table with quotation marks": (
+        CSV,
+        f'"{PLAIN}","Lifting ""red"" box, up"\n'.encode(),
+        'Lifting "red" box, up',
+    ),
     "table with a caption of two lines": (CSV, f'{PLAIN},"Lifting\nred box up"\n'.encode(), SAID),
     "table with a formula": (CSV, f"{PLAIN},=Lifting red box\n".encode(), "=Lifting red box"),
     "Persian": (CSV, f"{PLAIN},می\u200cرود\n".encode(), "می\u200cرود"),
     "joined emoji": (JSON, _json(f"{SAID} 👩\u200d🍳"), f"{SAID} 👩\u200d🍳"),
-    "hidden letters": (JSON, _json("Lif\u00adting\u202e red\u200b \U000e0068\U000e0069box\ufeff up"), SAID),
-    "joiners at the ends of words": (JSON, _json("\u200dLifting\u200c \u200cred\u200c\u200d box up"), SAID),
+    "hidden letters": (
+        JSON,
+        _json("Lif\u00adting\u202e red\u200b \U000e0068\U000e0069box\ufeff up"),
+        SAID,
+    ),
+    "joiners at the ends of words": (
+        JSON,
+        _json("\u200dLifting\u200c \u200cred\u200c\u200d box up"),
+        SAID,
+    ),
     "wide spaces": (JSON, _json("Lifting\u00a0red\u3000box\u2028up\ue000"), SAID),
-}  # fmt: skip
+}

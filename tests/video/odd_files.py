@@ -1,4 +1,6 @@
-"""Folders of odd and damaged videos, captions, labels and boxes, as other people's are; each is made anew, by PyAV and by hand.
+"""Folders of odd and damaged videos, captions, labels and boxes, as other people's are.
+
+Each is made anew, by PyAV and by hand.
 
 `odd_folders()` gives pairs of a name and a function that fills an empty folder. Whatever reads such a folder ends in
 clips, or in a `V2PError` whose sentence names the file.

@@ -13,24 +13,45 @@ POSTED = {
         ("putting the spoon into the mug ✨ (4k 60fps)", "putting the spoon into the mug"),
         ("Tipping bottle over | watch till the end!!", "Tipping bottle over"),
         ("Lifting can up. Link in bio 👉 https://linktr.ee/canlady", "Lifting can up"),
-        ("@mike_builds look: pushing toy car from right to left", "pushing toy car from right to left"),
-        ("Stacking red block onto green block - shot on iPhone 15 Pro", "Stacking red block onto green block"),
-        ("🔥🔥 lifting my new watering can up 🔥🔥 like and subscribe", "lifting new watering can up"),
+        (
+            "@mike_builds look: pushing toy car from right to left",
+            "pushing toy car from right to left",
+        ),
+        (
+            "Stacking red block onto green block - shot on iPhone 15 Pro",
+            "Stacking red block onto green block",
+        ),
+        (
+            "🔥🔥 lifting my new watering can up 🔥🔥 like and subscribe",
+            "lifting new watering can up",
+        ),
         ("Covering phone with cloth (slow motion)", "Covering phone with cloth"),
-        ("Dropping card in front of matchbox, top view, no sound", "Dropping card in front of matchbox"),
+        (
+            "Dropping card in front of matchbox, top view, no sound",
+            "Dropping card in front of matchbox",
+        ),
         ("slow mo: tipping the milk carton over", "tipping the milk carton over"),
         ("Part 2 | Putting egg into pan 🍳 youtu.be/dQw4w9WgXcQ", "Putting egg into pan"),
         ("Put #sponge into the bowl #cleantok #asmr", "Put sponge into the bowl"),
         ("wait for it... pushing book off the table", "pushing book off the table"),
-        ("Pulling camera next to phone, sorry for the bad lighting", "Pulling camera next to phone"),
+        (
+            "Pulling camera next to phone, sorry for the bad lighting",
+            "Pulling camera next to phone",
+        ),
         ("Day 12 of moving things: lifting stapler up", "lifting stapler up"),
-        ("Uncovering ball by lifting cup. Thanks for watching ❤️ follow @cupguy for more", "Uncovering ball by lifting cup"),
+        (
+            "Uncovering ball by lifting cup. Thanks for watching ❤️ follow @cupguy for more",
+            "Uncovering ball by lifting cup",
+        ),
         ("#shorts #viral #foryou", ""),
         ("Sliding remote to mouse [HD] [unedited]", "Sliding remote to mouse"),
     ],
     "German": [
         ("Rote Kiste hochheben #fürdich #roboter", "Rote Kiste hochheben"),
-        ("Blaue Tasse nach rechts schieben, mit dem Handy gefilmt", "Blaue Tasse nach rechts schieben"),
+        (
+            "Blaue Tasse nach rechts schieben, mit dem Handy gefilmt",
+            "Blaue Tasse nach rechts schieben",
+        ),
         ("POV: gelber Becher kippt um 😅", "gelber Becher kippt um"),
         ("Dose auf Teller stellen | bis zum Ende schauen!", "Dose auf Teller stellen"),
         ("Löffel wird angehoben (in 4K, ohne Ton)", "Löffel wird angehoben"),
@@ -52,9 +73,15 @@ POSTED = {
     ],
     "French": [
         ("Soulever la boîte rouge #pourtoi #robotique", "Soulever la boîte rouge"),
-        ("Pousser la tasse bleue vers la droite, filmé avec mon téléphone", "Pousser la tasse bleue vers la droite"),
+        (
+            "Pousser la tasse bleue vers la droite, filmé avec mon téléphone",
+            "Pousser la tasse bleue vers la droite",
+        ),
         ("POV : tu renverses la bouteille 😂", "tu renverses la bouteille"),
-        ("Poser la canette sur la table | regardez jusqu'à la fin", "Poser la canette sur la table"),
+        (
+            "Poser la canette sur la table | regardez jusqu'à la fin",
+            "Poser la canette sur la table",
+        ),
         ("Je soulève la cuillère (en 4K)", "Je soulève la cuillère"),
         ("Au ralenti : le gobelet tombe", "le gobelet tombe"),
         ("Lever la pomme verte ✨ lien en bio", "Lever la pomme verte"),
@@ -116,27 +143,51 @@ POSTED = {
         ("#搞笑 #手工 #生活", ""),
         ("俯拍｜拿起锅", "拿起锅"),
     ],
-}  # fmt: skip
+}
 LATER = {
     "English": [
         ("ok so this is me lifting a yellow mug up lol", "lifting a yellow mug up"),
-        ("Pushing toy truck to the left (recorded on my old Nokia, don't judge)", "Pushing toy truck to the left"),
-        ("New vid!! Putting ping pong ball into cup 🏓 comment what to do next ⬇️⬇️", "Putting ping pong ball into cup"),
+        (
+            "Pushing toy truck to the left (recorded on my old Nokia, don't judge)",
+            "Pushing toy truck to the left",
+        ),
+        (
+            "New vid!! Putting ping pong ball into cup 🏓 comment what to do next ⬇️⬇️",
+            "Putting ping pong ball into cup",
+        ),
         ("tipping juice box over [OC] [no audio]", "tipping juice box over"),
-        ("Moving eraser next to ruler - GoPro Hero 11, 120fps, wide angle", "Moving eraser next to ruler"),
+        (
+            "Moving eraser next to ruler - GoPro Hero 11, 120fps, wide angle",
+            "Moving eraser next to ruler",
+        ),
         ("*** lifting teapot up *** IG: @teatime.daily", "lifting teapot up"),
         ("Covering bowl with plate – first take, one shot, no edits", "Covering bowl with plate"),
-        ("how to drop a coin behind the box (easy tutorial) #lifehack", "drop a coin behind the box"),
-        ("Day 3/30 ➡️ put the lemon into the basket, tripod is broken sorry", "put the lemon into the basket"),
-        ("Pulling tape from right to left. Camera: Canon R5. Music: none.", "Pulling tape from right to left"),
+        (
+            "how to drop a coin behind the box (easy tutorial) #lifehack",
+            "drop a coin behind the box",
+        ),
+        (
+            "Day 3/30 ➡️ put the lemon into the basket, tripod is broken sorry",
+            "put the lemon into the basket",
+        ),
+        (
+            "Pulling tape from right to left. Camera: Canon R5. Music: none.",
+            "Pulling tape from right to left",
+        ),
         ("me, pouring nothing, just lifting a vase up (ignore the mess)", "lifting a vase up"),
         ("Knocking over a tin :) rate it 1-10", "Knocking over a tin"),
-        ("Reposting: slide coaster from left to right // tripod shot", "slide coaster from left to right"),
+        (
+            "Reposting: slide coaster from left to right // tripod shot",
+            "slide coaster from left to right",
+        ),
         ("lift the soap up >>> full vid on my channel", "lift the soap up"),
         ("Throwing dice into tray!!! who else does this?", "Throwing dice into tray"),
     ],
     "German": [
-        ("Zitrone in den Korb legen 🍋 schreibt mir in die Kommentare", "Zitrone in den Korb legen"),
+        (
+            "Zitrone in den Korb legen 🍋 schreibt mir in die Kommentare",
+            "Zitrone in den Korb legen",
+        ),
         ("Spielzeugauto schieben (Kamera wackelt etwas)", "Spielzeugauto schieben"),
         ("Teekanne anheben, gefilmt von meiner Schwester", "Teekanne anheben"),
         ("Saftpackung umkippen - Folge mir für mehr", "Saftpackung umkippen"),
@@ -146,7 +197,10 @@ LATER = {
         ("Würfel in Schale werfen!!! wer kennt es?", "Würfel in Schale werfen"),
     ],
     "French": [
-        ("Mettre le citron dans le panier 🍋 dites-moi en commentaire", "Mettre le citron dans le panier"),
+        (
+            "Mettre le citron dans le panier 🍋 dites-moi en commentaire",
+            "Mettre le citron dans le panier",
+        ),
         ("Pousser la petite voiture (caméra qui tremble)", "Pousser la petite voiture"),
         ("Soulever la théière, filmé par ma sœur", "Soulever la théière"),
         ("Renverser la brique de jus - suivez-moi pour plus", "Renverser la brique de jus"),
@@ -175,13 +229,17 @@ LATER = {
         ("滑动杯垫～完整版在我主页", "滑动杯垫"),
         ("把骰子扔进盘子！！！你们呢？", "把骰子扔进盘子"),
     ],
-}  # fmt: skip
+}
 """Written when the rule was made, in another manner: 32 of these 47 were read right before they were looked at."""
 
 
 HALVES = [
-    [(language, *pair) for k, (language, pairs) in enumerate(POSTED.items()) for pair in pairs[(k + half) % 2 :: 2]]
+    [
+        (language, *pair)
+        for k, (language, pairs) in enumerate(POSTED.items())
+        for pair in pairs[(k + half) % 2 :: 2]
+    ]
     for half in (0, 1)
-]  # fmt: skip
+]
 TRIED_ON, JUDGED_ON = HALVES
 SEEN_LATER = [(language, *pair) for language, pairs in LATER.items() for pair in pairs]

@@ -1,4 +1,7 @@
-"""The committed sample clips: the truth beside them is the truth in them. They are kept as they are; nothing draws them anew."""
+"""The committed sample clips: the truth beside them is the truth in them. They are kept as they are.
+
+Nothing draws them anew.
+"""
 
 import itertools
 import json

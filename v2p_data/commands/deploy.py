@@ -34,7 +34,8 @@ class Deploy:
     """Folder of a LeRobot policy that sees masks. The robot is given by --robot.type=v2p_franka (or v2p_twin) and that
     robot's own settings, such as --robot.address=HOST:PORT."""
     click: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """X,Y: a pixel of the 256 x 256 picture on an object; once per object, the moved one first. Without it a page asks."""
+    """X,Y: a pixel of the 256 x 256 picture on an object; once per object, the moved one first.
+    Without it a page asks."""
     objects: tuple[str, ...] = ("object",)
     """What the page asks to click on, in order, and what the recording calls them."""
     task: str = ""
@@ -115,7 +116,8 @@ def deploy(args: Deploy, robot: Any) -> Outcome:
     num_labels = getattr(policy.loaded.policy.config, "num_labels", None)
     if sight is not None and num_labels is not None and len(sight.clicks_px) + 2 > num_labels:
         raise V2PError(
-            f"{len(sight.clicks_px)} objects are clicked, and the policy was trained to tell {num_labels - 2} apart; click"
+            f"{len(sight.clicks_px)} objects are clicked, and the policy was trained to tell "
+            f"{num_labels - 2} apart; click"
             " on those of the task only"
         )
     recorder = None if args.record is None else Recorder(task)

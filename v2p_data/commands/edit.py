@@ -60,9 +60,13 @@ def drop_command(argv: list[str]) -> int:
         check_repo_id(args.repo_id)
     with telling("drop") as progress:
         made = drop(
-            args.dataset, args.tasks, args.out, args.repo_id,
-            episodes=args.episodes, on_progress=progress,
-        )  # fmt: skip
+            args.dataset,
+            args.tasks,
+            args.out,
+            args.repo_id,
+            episodes=args.episodes,
+            on_progress=progress,
+        )
     return _tell(made)
 
 

@@ -39,7 +39,8 @@ class Replay:
 @dataclass(frozen=True, kw_only=True)
 class Push:
     path: tyro.conf.Positional[Path]
-    """Folder of a dataset or of a policy; with --envhub of a task, of tasks, of a run, or of a dataset with its tasks."""
+    """Folder of a dataset or of a policy; with --envhub of a task, of tasks, of a run, or of a
+    dataset with its tasks."""
     repo_id: str
     """Where to: USER/NAME. The token comes from the environment variable HF_TOKEN."""
     private: bool = False
@@ -121,7 +122,10 @@ def _pushed(args: Push) -> tuple["Pushed", str]:
     if (args.path / "model.safetensors").is_file():
         demand_whole_part(args.path.resolve())
         pushed = push_policy(args.path, args.repo_id, private=args.private, tag=args.tag)
-        return pushed, f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS"  # fmt: skip
+        return (
+            pushed,
+            f"lerobot-eval --policy.path={args.repo_id} --env.type=v2p --env.tasks=TASKS",
+        )
     raise V2PError(
         f"{args.path} is neither a LeRobot dataset (meta/info.json) nor a policy (model.safetensors); tasks are pushed "
         "with --envhub"

@@ -215,12 +215,14 @@ def _check_statistic(
     value = stats.get(f"{key}.{statistic}")
     if value is None:
         raise V2PError(
-            f"{state} lacks the statistic '{statistic}' of '{key}', which the policy normalises by; train it on a dataset"
+            f"{state} lacks the statistic '{statistic}' of '{key}', which the policy normalises "
+            "by; train it on a dataset"
             " with statistics"
         )
     if len(shape) == 1 and value.shape != shape:
         raise V2PError(
-            f"the statistic '{statistic}' of '{key}' in {state} has shape {value.shape}, and the policy's feature {shape}"
+            f"the statistic '{statistic}' of '{key}' in {state} has shape {value.shape}, and the "
+            f"policy's feature {shape}"
         )
 
 
@@ -270,6 +272,7 @@ def _check_scale(folder: Path, facts: Facts, scale: ActionScale, task: str) -> N
         if not all(abs(value - ours) <= 0.01 * ours for value in theirs):
             numbers = ", ".join(f"{value:g}" for value in sorted(theirs))
             raise V2PError(
-                f"the policy in {folder} was trained with another action scale: an action of 1 was a {what} of {numbers}"
+                f"the policy in {folder} was trained with another action scale: an action of 1 "
+                f"was a {what} of {numbers}"
                 f" a step, and on this robot it is {ours:g}"
             )

@@ -49,7 +49,8 @@ class ClickPage(LocalPage):
         """
         if not self._done.wait(timeout_s):
             raise V2PError(
-                f"{len(self.clicks)} of {len(self.objects)} objects were clicked within {timeout_s:g} s; start again, or give"
+                f"{len(self.clicks)} of {len(self.objects)} objects were clicked within "
+                f"{timeout_s:g} s; start again, or give"
                 " the pixels with --click X,Y"
             )
         return tuple(self.clicks)

@@ -37,7 +37,8 @@ class LimitsConfig:
     """Bounds of every action and of what the robot reports."""
 
     max_speed_m_s: float = 1.04
-    """Speed of the tool's target. The default is a full action of the training along all axes; begin with 0.1 on a real arm."""
+    """Speed of the tool's target. The default is a full action of the training along all axes;
+    begin with 0.1 on a real arm."""
     max_turn_rad_s: float = 4.0
     """Of the tool's target, about any axis; a full action of the training about one. Whichever of the two limits acts
     slows both motions down alike."""
@@ -48,19 +49,28 @@ class LimitsConfig:
     max_tilt_rad: float = SimConfig.tilt_limit_rad
     """How far the gripper may lean from straight down."""
     max_force_n: float = 60.0
-    """Contact force at the tool that stops the run, on robots that report it, when it lasts for two readings: the peak of
-    a touch is shorter."""
+    """Contact force at the tool that stops the run, on robots that report it, when it lasts for
+    two readings: the peak of a touch is shorter."""
     wait_for_gripper: bool = True
     """The arm waits while the gripper travels: real ones are slower than that of the training."""
     max_silence_ms: float = 300.0
     """Without a reading for so long the robot is told to hold and the run ends."""
 
     def __post_init__(self) -> None:
-        for name in ("max_speed_m_s", "max_turn_rad_s", "max_tilt_rad", "max_force_n", "max_silence_ms"):  # fmt: skip
+        for name in (
+            "max_speed_m_s",
+            "max_turn_rad_s",
+            "max_tilt_rad",
+            "max_force_n",
+            "max_silence_ms",
+        ):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be a number above 0, got {value}")
-        if not all(low < high for low, high in zip(self.workspace_low_m, self.workspace_high_m, strict=True)):  # fmt: skip
+        if not all(
+            low < high
+            for low, high in zip(self.workspace_low_m, self.workspace_high_m, strict=True)
+        ):
             raise ValueError(
                 f"workspace_low_m {self.workspace_low_m} must lie below workspace_high_m {self.workspace_high_m}"
             )
@@ -139,7 +149,8 @@ class Guard:
         if outside > ESCAPED_M:
             raise LimitStop(
                 "workspace",
-                f"the tool is {outside:.2f} m outside the workspace, at {_place(reading.tool_pos)}: something else moves"
+                f"the tool is {outside:.2f} m outside the workspace, at "
+                f"{_place(reading.tool_pos)}: something else moves"
                 " the arm, or its calibration is off",
             )
         lean = _from_down(_pointing(reading))
@@ -155,7 +166,8 @@ class Guard:
             if speed > OVERSPEED * max(cfg.max_speed_m_s, 0.1):
                 raise LimitStop(
                     "speed",
-                    f"the tool moves at {speed:.2f} m/s, and {cfg.max_speed_m_s:g} m/s are allowed: something else moves"
+                    f"the tool moves at {speed:.2f} m/s, and {cfg.max_speed_m_s:g} m/s are "
+                    "allowed: something else moves"
                     " the arm, or readings were lost",
                 )
 

@@ -146,7 +146,10 @@ class Run:
                 raise
             if watchdog.has_bitten and late:
                 outcome.ending = "slow"
-                outcome.sentence = f"{late} took more than {silence:g} ms in one step, so no reading was asked for; {FASTER}"
+                outcome.sentence = (
+                    f"{late} took more than {silence:g} ms in one step, so no "
+                    f"reading was asked for; {FASTER}"
+                )
             elif watchdog.has_bitten:
                 outcome.ending = "silence"
                 outcome.sentence = (
@@ -231,6 +234,7 @@ class Run:
 
 def _too_slow(seconds: float, consequence: str) -> str:
     return (
-        f"20 Hz cannot be kept: a step takes {1000 * seconds:.0f} ms ({1 / seconds:.1f} Hz) and {consequence}; {FASTER}, or go on slower"
+        f"20 Hz cannot be kept: a step takes {1000 * seconds:.0f} ms ({1 / seconds:.1f} Hz) and "
+        f"{consequence}; {FASTER}, or go on slower"
         " with --slow"
     )

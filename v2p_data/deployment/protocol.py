@@ -143,7 +143,8 @@ class Driver:
             except TimeoutError as error:
                 self.close()
                 raise V2PError(
-                    f"the robot's driver at {self.address} did not answer '{do}' within {self.timeout_s:g} s; look after"
+                    f"the robot's driver at {self.address} did not answer '{do}' within "
+                    f"{self.timeout_s:g} s; look after"
                     " the robot, start the driver again, and try once more"
                 ) from error
             except OSError as error:
@@ -171,7 +172,8 @@ class Driver:
             raise self._wrong(f"it answers request {said.get('id')!r} instead of {request['id']}")
         if said.get("ok") is not True:
             raise V2PError(
-                f"the robot's driver at {self.address} refuses '{request['do']}': {said.get('error', 'no reason given')}"
+                f"the robot's driver at {self.address} refuses '{request['do']}': "
+                f"{said.get('error', 'no reason given')}"
             )
         return said
 
@@ -195,7 +197,8 @@ class Driver:
             raise self._wrong("'picture' is no PNG or JPEG in base64")
         if image.shape[:2] != size_px:
             raise self._wrong(
-                f"a picture has {image.shape[1]} x {image.shape[0]} pixels, and 'hello' said {size_px[1]} x {size_px[0]}"
+                f"a picture has {image.shape[1]} x {image.shape[0]} pixels, and 'hello' said "
+                f"{size_px[1]} x {size_px[0]}"
             )
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 

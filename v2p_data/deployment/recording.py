@@ -1,4 +1,4 @@
-"""What was seen and done becomes a LeRobot dataset of one episode: masks, colour pictures, states, actions as carried out.
+"""What was seen and done becomes a LeRobot dataset of one episode: pictures, states, actions.
 
 It is staged and packed as demonstrations are, so that `v2p verify`, `v2p merge` and LeRobot read it.
 """

@@ -1,8 +1,8 @@
 """A connected robot as policies use it: it sees by tracking, and its actions pass limits.
 
-`v2p deploy` and the robots of LeRobot's own tools use the same `Rig`. Beyond `RobotWithCamera` three things are used where
-a robot has them: `hold()` stops at once, `force_n()` gives the contact force at the tool, `action_scale` says what an
-action of 1 means.
+`v2p deploy` and the robots of LeRobot's own tools use the same `Rig`. Beyond `RobotWithCamera`
+three things are used where a robot has them: `hold()` stops at once, `force_n()` gives the contact
+force at the tool, `action_scale` says what an action of 1 means.
 """
 
 from collections.abc import Iterator
@@ -73,7 +73,8 @@ class Rig:
         self._is_seeing = True
         if max(seen.missed) >= LOST_AFTER:
             raise LostError(
-                f"object {int(np.argmax(seen.missed)) + 1} was lost from sight: it is hidden or has left the picture; put it"
+                f"object {int(np.argmax(seen.missed)) + 1} was lost from sight: it is hidden or "
+                "has left the picture; put it"
                 " back and start again"
             )
         return seen

@@ -1,6 +1,7 @@
 """SAM 2 as a stream tracker: the clicked pixel prompts it, each picture is seen once, memory stays bounded.
 
-Slower than the tracker without weights: it needs a GPU for 20 Hz. Tested with a tiny random checkpoint of the same class;
+Slower than the tracker without weights: it needs a GPU for 20 Hz. Tested with a tiny random
+    checkpoint of the same class;
 real weights were not run.
 
 Source: Ravi et al. 2024 (SAM 2), arXiv:2408.00714.

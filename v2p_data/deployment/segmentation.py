@@ -1,8 +1,9 @@
 """One object's mask in every picture of a stream, from one clicked pixel: causal, without weights, a few milliseconds.
 
-The first picture gives three colour models (object, robot, rest) and a picture of what is behind. In each later one a pixel goes to
-the object where its colour is likelier under the object's model than under the others', given where the object was and
-where the robot is drawn. A robot in front hides the object; what is hidden is not lost.
+The first picture gives three colour models (object, robot, rest) and a picture of what is behind.
+In each later one a pixel goes to the object where its colour is likelier under the object's model
+than under the others', given where the object was and where the robot is drawn. A robot in front
+hides the object; what is hidden is not lost.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,8 @@
 """Pictures and joint angles become the label image that policies were trained on.
 
-0 background, 1 robot, 2 the manipulated object, 3.. the others in the order of the clicks. The robot's mask is drawn from its
-joints, the objects' are tracked; nothing else of the scene is known.
+0 background, 1 robot, 2 the manipulated object, 3.. the others in the order of the clicks. The
+robot's mask is drawn from its joints, the objects' are tracked; nothing else of the scene is
+known.
 """
 
 import re
@@ -95,7 +96,8 @@ class Sight:
                 if common > SAME_SHARE * min(mask.sum(), masks[other].sum()):
                     u, v = self.clicks_px[k]
                     raise V2PError(
-                        f"the click at ({u:g}, {v:g}) is on the same thing as click {other + 1}; click on each object once"
+                        f"the click at ({u:g}, {v:g}) is on the same thing as click {other + 1}; "
+                        "click on each object once"
                     )
             labels[mask] = FIRST_OBJECT + k
         count = len(masks)

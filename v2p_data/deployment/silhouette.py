@@ -36,7 +36,8 @@ class Silhouette:
         self.data = mujoco.MjData(self.model)
         height, width = camera.height_px, camera.width_px
         (fx, _, cx), (_, fy, cy) = camera.K[:2]
-        # The z-buffer's principal point is its middle: a larger picture is drawn, and the camera's pixels are taken of it.
+        # The z-buffer's principal point is its middle: a larger picture is drawn, and
+        # the camera's pixels are taken of it.
         reach = 2 * int(np.ceil(max(abs(cx - width / 2) * fy / fx, abs(cy - height / 2)))) + 4
         tall, wide = height + reach, int(np.ceil(width * fy / fx)) + reach
         self.columns = np.floor((np.arange(width) + 0.5 - cx) * fy / fx + wide / 2).astype(int)

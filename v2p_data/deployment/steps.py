@@ -1,7 +1,8 @@
 """From what a policy says to the step of the tool that a robot takes, along one run.
 
-`sim.env.actions` does the same in worlds. A robot's state tells where its controller brings the tool, but not how it is turned there:
-the turns that were sent are added up, within the controller's leash. World frame.
+`sim.env.actions` does the same in worlds. A robot's state tells where its controller brings the
+tool, but not how it is turned there: the turns that were sent are added up, within the
+controller's leash. World frame.
 """
 
 import numpy as np

@@ -1,9 +1,10 @@
 """Label images are carried from the robot's camera to the camera that policies were trained with.
 
-A real camera never stands exactly at the training camera's place. Its calibrated pose says by how much it differs. The robot's mask is
-drawn from its joints in the training camera itself. Objects are carried over by the homography of a horizontal plane: exact
-at the plane's height, and off by `shift * (height - plane) / (camera height - height)` elsewhere.
-Source: Hartley & Zisserman 2004, section 13.1.
+A real camera never stands exactly at the training camera's place. Its calibrated pose says by how
+much it differs. The robot's mask is drawn from its joints in the training camera itself. Objects
+are carried over by the homography of a horizontal plane: exact at the plane's height, and off by
+`shift * (height - plane) / (camera height - height)` elsewhere. Source: Hartley & Zisserman 2004,
+section 13.1.
 """
 
 from collections.abc import Callable

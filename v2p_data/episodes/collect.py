@@ -206,8 +206,13 @@ def _finish(
             float(num_episodes),
         )
     if num_episodes < cfg.num_episodes:
-        logger.warning("%s: only %d of %d episodes after %d batches",
-                       bundle.title, num_episodes, cfg.num_episodes, len(batches))  # fmt: skip
+        logger.warning(
+            "%s: only %d of %d episodes after %d batches",
+            bundle.title,
+            num_episodes,
+            cfg.num_episodes,
+            len(batches),
+        )
     return {
         "episodes": num_episodes,
         "frames": sum(b["frames"] for b in batches),

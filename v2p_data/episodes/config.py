@@ -30,7 +30,8 @@ class EpisodesConfig:
     size_px: int = 256
     """Width and height of the pictures; even, as video must be."""
     render: Render = "masks"
-    """Pictures in the dataset: exact label masks, colour pictures (close but not equal), or each as a camera of its own."""
+    """Pictures in the dataset: exact label masks, colour pictures (close but not equal), or each
+    as a camera of its own."""
     wrist: bool = False
     """Masks of a second camera too, which the hand carries: `observation.images.mask_wrist`."""
     actions: Actions = field(default="delta_tool", metadata=UNSAID_BY_DEFAULT)

@@ -1,8 +1,8 @@
 """Published episodes are played again from their seeds and actions: do the same states and successes come back?
 
-An episode's world follows from its batch's seed, its number in that batch and the randomisation that the dataset's record
-names. The tasks are those that the dataset carries. Handovers cannot be played again: where a student acted, the dataset
-holds the expert's labels.
+An episode's world follows from its batch's seed, its number in that batch and the randomisation
+that the dataset's record names. The tasks are those that the dataset carries. Handovers cannot be
+played again: where a student acted, the dataset holds the expert's labels.
 """
 
 import hashlib
@@ -105,7 +105,10 @@ class ReplayReport:
         ]
         same = len(self.episodes) - len(others)
         left = f"; {self.skipped} handovers cannot be replayed" if self.skipped else ""
-        total = f"{same} of {len(self.episodes)} episodes came back with the same states, rewards and success{left}; states {self.digest[:16]}"
+        total = (
+            f"{same} of {len(self.episodes)} episodes came back with the same states, rewards "
+            f"and success{left}; states {self.digest[:16]}"
+        )
         return [*others, *([self.note] if self.note else []), total]
 
     def as_json(self) -> dict[str, Any]:

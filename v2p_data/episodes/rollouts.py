@@ -138,18 +138,27 @@ class Rollouts:
         """Return why the episode of `world` is no demonstration."""
         steps_true = int(self.success[:, world].sum())
         if self.broke[world]:
-            return {"reason": "simulation_broke", "detail": "the state was not finite",
-                    "value": int(self.num_frames[world])}  # fmt: skip
+            return {
+                "reason": "simulation_broke",
+                "detail": "the state was not finite",
+                "value": int(self.num_frames[world]),
+            }
         if not self.task_successes[world]:
             how = (
                 "from the start, which never counts"
                 if self.success[0, world]
                 else "and never held"
             )
-            return {"reason": "not_successful", "value": steps_true,
-                    "detail": f"success was true in {steps_true} steps {how}"}  # fmt: skip
-        return {"reason": "referee_disagrees", "value": int(self.num_frames[world]),
-                "detail": "the task's success held, the independent one did not"}  # fmt: skip
+            return {
+                "reason": "not_successful",
+                "value": steps_true,
+                "detail": f"success was true in {steps_true} steps {how}",
+            }
+        return {
+            "reason": "referee_disagrees",
+            "value": int(self.num_frames[world]),
+            "detail": "the task's success held, the independent one did not",
+        }
 
 
 class EpisodeEnds:

@@ -1,8 +1,9 @@
 """A LeRobot policy that anybody may have made is looked at here before LeRobot opens it, and refused in one sentence.
 
-LeRobot imports and calls what a processor file names, fetches other models that a setting names, and makes a network as large
-as the settings say before it looks at the weights. Hence: plain files, known steps, bounded settings, finite numbers.
-That the weights are those of the network is for `policies.evaluation.rollout`, which makes it without memory first.
+LeRobot imports and calls what a processor file names, fetches other models that a setting names,
+and makes a network as large as the settings say before it looks at the weights. Hence: plain
+files, known steps, bounded settings, finite numbers. That the weights are those of the network is
+for `policies.evaluation.rollout`, which makes it without memory first.
 """
 
 import math
@@ -68,7 +69,8 @@ LIMITS = (
     (r"shape|size_px|resolution|resize", 2048),
     ("", 8192),
 )
-"""Largest number, by a setting's name; the first that fits. A million where it is no whole number and the last one fits."""
+"""Largest number, by a setting's name; the first that fits. A million where it is no whole number
+and the last one fits."""
 LARGEST_FRACTION = 1e6
 MAX_ENTRIES = 256
 """Most entries of a list or an object."""
@@ -149,7 +151,8 @@ class ConfigFile(FileModel):
         seen = sum(math.prod(feature.shape) for feature in (self.input_features or {}).values())
         if self.n_obs_steps * seen > MAX_SEEN:
             raise ValueError(
-                f"an observation of {self.n_obs_steps} steps holds {self.n_obs_steps * seen:.3g} numbers; at most {MAX_SEEN:g}"
+                f"an observation of {self.n_obs_steps} steps holds {self.n_obs_steps * seen:.3g} "
+                f"numbers; at most {MAX_SEEN:g}"
                 " are taken"
             )
         return self

@@ -1,7 +1,7 @@
 """What a policy's training knew that its network does not say: rate, names, palette, action scale. One file beside it.
 
-`v2p train` writes `v2p.json` into the policy's folder. Policies that came without it are traced to their dataset, by the record
-of the run or LeRobot's `train_config.json`, as long as it is there.
+`v2p train` writes `v2p.json` into the policy's folder. Policies that came without it are traced to
+their dataset, by the record of the run or LeRobot's `train_config.json`, as long as it is there.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -88,8 +88,9 @@ def facts_of_dataset(dataset: Path) -> Facts:
 def interface_of(policy: Path) -> tuple[ArmInterface, int, int]:
     """Return what a policy sees of the arm and tells it, and how many entries its states and its actions have.
 
-    Its dataset's names tell. Where nothing knows them the shape tells of joints, and the statistics of the tool's targets:
-    all are in front of the arm, and no episode goes forward in every step.
+    Its dataset's names tell. Where nothing knows them the shape tells of joints, and the
+    statistics of the tool's targets: all are in front of the arm, and no episode goes forward in
+    every step.
 
     Raises:
         V2PError: its file is damaged.

@@ -12,8 +12,9 @@ class ExpertConfig:
     """How an expert is trained and judged."""
 
     teacher: Literal["programs", "none", "as_expert"] = "programs"
-    """`none`: PPO from nothing, as in the paper; ten times slower where it works at all. `as_expert`: no network learns the
-    task; the best program itself demonstrates and labels, alike for all objects, and is named as what it is."""
+    """`none`: PPO from nothing, as in the paper; ten times slower where it works at all.
+    `as_expert`: no network learns the task; the best program itself demonstrates and labels, alike
+    for all objects, and is named as what it is."""
     least_teacher_success: float = 0.1
     """A program that succeeds less often teaches nothing."""
     trial_worlds: int = 64
@@ -26,8 +27,8 @@ class ExpertConfig:
     """Where PPO's worlds are simulated: `warp` is for the GPU of `--device` and 8192 worlds; all else stays on
     the CPU."""
     taught_bonus_factor: float = 100.0
-    """After imitation a step of success pays so many times its usual bonus: what is left to learn is success and its time,
-    not how to get there."""
+    """After imitation a step of success pays so many times its usual bonus: what is left to learn
+    is success and its time, not how to get there."""
     compare_worlds: int = 256
     """Episodes at the fine time step that the taught policy and PPO's both play; the better one becomes the expert."""
     eval_episodes: int = 64

@@ -56,7 +56,7 @@ def labeller_of(folder: Path) -> "Actor":
 
 
 def network_actor(expert: "Expert") -> "Actor":
-    """Return an actor that sees what the expert was trained on: of several tasks, the base observation they begin with."""
+    """Return an actor that sees what the expert was trained on, which may be the first numbers only."""
     from v2p_data.play import StateActor
 
     return StateActor(lambda obs: expert.act(obs[:, : expert.model.obs_dim]))

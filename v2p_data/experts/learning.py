@@ -8,7 +8,8 @@
 * `keep_better`: the taught policy and PPO's play the same episodes at the fine time step, and PPO's is kept if it
   is surely better. Where nobody taught, the better one of PPO's best and its last policy is kept.
 
-The result is a neural network; it is called PPO's only if PPO changed it. Where a program is to act itself, see `labeller`.
+The result is a neural network; it is called PPO's only if PPO changed it. Where a program is to
+act itself, see `labeller`.
 """
 
 import logging
@@ -222,11 +223,14 @@ def improve_by_ppo(
 def keep_better(
     worlds: Worlds, cfg: ExpertConfig, taught: Path, out: Path, improved: ExpertResult
 ) -> tuple[Comparison, int]:
-    """Leave PPO's policy in `out` if it is surely better than the taught one, else that; also return its gradient steps.
+    """Leave PPO's policy in `out` if it is surely better than the taught one, else that.
 
-    Both of PPO's policies, the best in training and the last one, and the taught one play the same episodes at the fine
-    time step. Of PPO's two the one with the higher score is compared with the taught one. Where no difference shows, the
-    taught one is the better teacher: it saw more states, and policies cloned from it lift unseen objects more often.
+    Also return its gradient steps.
+
+    Both of PPO's policies, the best in training and the last one, and the taught one play the same
+    episodes at the fine time step. Of PPO's two the one with the higher score is compared with the
+    taught one. Where no difference shows, the taught one is the better teacher: it saw more
+    states, and policies cloned from it lift unseen objects more often.
     """
     play = _exams(worlds, cfg)
     before, seen = Expert.load(taught), list[np.ndarray]()

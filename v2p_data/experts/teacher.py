@@ -357,7 +357,8 @@ def _check_preferred_programs() -> None:
         for start in kind.programs:
             if not any(name.startswith(start) for name in known):
                 raise ValueError(
-                    f"task kind '{kind.name}' prefers the scripted policy '{start}'; add it to v2p_data/experts/teacher.py "
+                    f"task kind '{kind.name}' prefers the scripted policy '{start}'; add it to "
+                    "v2p_data/experts/teacher.py "
                     f"or name one of: {', '.join(known)}"
                 )
 

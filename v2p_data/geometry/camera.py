@@ -53,9 +53,11 @@ def poses_over_table(
         camera: of the first frame; the table is its plane z = 0.
         to_filmed: per frame the homography from the first frame's pixels on the table to the frame's own.
 
-    The intrinsics are taken to stay. What a homography says beyond a rigid motion, such as zoom, is spread over the pose.
+    The intrinsics are taken to stay. What a homography says beyond a rigid motion, such as zoom,
+    is spread over the pose.
 
-    Source: Zhang 2000, "A flexible new technique for camera calibration", section 3.1, with the nearest rotation by SVD.
+    Source: Zhang 2000, "A flexible new technique for camera calibration", section 3.1, with the
+        nearest rotation by SVD.
     """
     world_to_cam = inverse(camera.T_world_cam)
     plane_to_first = camera.K @ world_to_cam[:3, [0, 1, 3]]
@@ -95,6 +97,6 @@ def mujoco_xyaxes(T_world_cam: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6
 
 
 def between_centres(H: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return a homography between pixels as OpenCV's warps want it: they count from pixel centres, we from the picture's corner."""
+    """Return a homography of pixels as OpenCV wants it: it counts from pixel centres, we from the corner."""
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     return np.linalg.inv(half) @ H @ half

@@ -1,7 +1,7 @@
 """Meshes of simple things and the convex solids that collide for them, in metres, +z up.
 
-Every mesh is one closed surface turned outwards; a hollow one is open at the top, so that its volume is that of its walls.
-Primitives are centred on their bounding box.
+Every mesh is one closed surface turned outwards; a hollow one is open at the top, so that its
+volume is that of its walls. Primitives are centred on their bounding box.
 """
 
 from itertools import pairwise

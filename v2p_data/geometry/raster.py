@@ -1,4 +1,4 @@
-"""Polygons drawn to a sixteenth of a pixel, where pixel centres lie at one half and OpenCV counts them as whole numbers."""
+"""Polygons drawn to a sixteenth of a pixel; pixel centres lie at one half, OpenCV's at whole numbers."""
 
 import cv2
 import numpy as np

@@ -1,7 +1,8 @@
 """The files of a finished folder: listed with size and digest when it is made, compared whenever it is read.
 
 Files may be added later: a card, films, caches of other programs. What was listed must stay as it was. To compare a
-large run costs little after the first time: the run folder remembers which files were found unchanged, by the times that the file
+large run costs little after the first time: the run folder remembers which files were found
+    unchanged, by the times that the file
 system keeps of them.
 """
 

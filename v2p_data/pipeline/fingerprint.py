@@ -13,7 +13,8 @@ from typing import Any, cast
 
 FINGERPRINT_LENGTH = 8
 UNSAID_BY_DEFAULT = {"unsaid by default": True}
-"""Metadata of a dataclass's field that came later: no recipe names it at its default, so that older results stay theirs."""
+"""Metadata of a dataclass's field that came later: no recipe names it at its default, so that
+older results stay theirs."""
 
 
 def canonical(value: Any) -> Any:

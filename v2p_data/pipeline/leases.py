@@ -1,6 +1,7 @@
 """Several drivers at one store: who makes what, by leases that end with their driver.
 
-A lease is an object that its driver created first: STAGE/ITEM-FINGERPRINT.NUMBER below `leases/`. It holds while its driver
+A lease is an object that its driver created first: STAGE/ITEM-FINGERPRINT.NUMBER below `leases/`.
+    It holds while its driver
 gives signs of life, an object that changes four times within `lease_s`. Whoever sees no change for `lease_s` by its own
 clock takes the lease over by creating the next number, so that no two clocks are compared and one driver wins.
 """
@@ -71,7 +72,10 @@ class Shared:
             self.store.delete(f"drivers/{self.owner}.json")
 
     def stored(self, stage: Stage) -> Outcome | None:
-        """Return the outcome of a stage that is complete, here or in the store; None if it has still to run or to be published."""
+        """Return the outcome of a stage that is complete, here or in the store.
+
+        None if it has still to run or to be published.
+        """
         here = stored_outcome(stage, self.root)
         if self.store is None or (here is not None and here.status == "failed"):
             return here

@@ -1,6 +1,7 @@
 """Stages as tasks of a Ray cluster, behind the same interface as the worker processes.
 
-Only a stage and its outcome travel: results lie in the run folder, which all nodes see at the same path. Each task has a
+Only a stage and its outcome travel: results lie in the run folder, which all nodes see at the same
+    path. Each task has a
 fresh process. A task that dies with its process or its node is tried again here, never by Ray; a failure that a stage
 reports itself is not.
 """
@@ -117,7 +118,10 @@ class RayEngine:
                 why = f"its process ended {TRIES} times, last of {how}; its output is in {log}"
                 if log.exists() and OUT_OF_TIME in log.read_bytes()[task.log_bytes :]:
                     reason = "too_long"
-                    why = f"it took longer than --limit-s={self.runtime.limit_s:g} s and was ended; its output is in {log}"
+                    why = (
+                        f"it took longer than --limit-s={self.runtime.limit_s:g} s and was "
+                        f"ended; its output is in {log}"
+                    )
                 elif task.tries < TRIES:
                     self._submit(stage, tries=task.tries + 1)
                     yield Event(kind="progress", stage=stage, words=f"begun again after {how}")
@@ -158,6 +162,7 @@ def _connected(address: str) -> Any:
     except (OSError, RuntimeError, ValueError) as error:
         why = str(error).splitlines()[0]
         raise V2PError(
-            f"no Ray cluster answers at {address} ({why}); start one with 'ray start --head' and name its HOST:PORT in --address"
+            f"no Ray cluster answers at {address} ({why}); start one with 'ray start --head' and "
+            "name its HOST:PORT in --address"
         ) from error
     return ray

@@ -32,7 +32,8 @@ def log_of(stage: Stage, root: Path) -> Path:
 def work(how: bytes, what: bytes) -> Outcome:
     """Make a stage in this process of a node, which does nothing else; return what became of it.
 
-    Two processes never fill one folder: the item's lock is held until the process ends, and a run that has been followed
+    Two processes never fill one folder: the item's lock is held until the process ends, and a run
+        that has been followed
     by another one begins nothing more.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once, not when Python gets round to it
@@ -72,6 +73,10 @@ def _demand_at_work(run: str, root: Path) -> None:
 def failed(stage: Stage, root: Path, reason: str, detail: str) -> Outcome:
     """Return what became of a stage that was not begun, or not ended."""
     return Outcome(
-        stage=stage.name, item=stage.item, status="failed", folder=stage.folder(root),
-        reason=reason, detail=detail,
-    )  # fmt: skip
+        stage=stage.name,
+        item=stage.item,
+        status="failed",
+        folder=stage.folder(root),
+        reason=reason,
+        detail=detail,
+    )

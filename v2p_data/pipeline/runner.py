@@ -161,9 +161,13 @@ def outcome_of(stage: Stage, root: Path, read: Callable[[], Record | None]) -> O
         demand_whole(folder, root)
     except UnusableError as error:
         return Outcome(
-            stage=stage.name, item=stage.item, status="failed", folder=folder,
-            reason=error.reason, detail=error.detail,
-        )  # fmt: skip
+            stage=stage.name,
+            item=stage.item,
+            status="failed",
+            folder=folder,
+            reason=error.reason,
+            detail=error.detail,
+        )
     rejected = record.rejected or {}
     return Outcome(
         stage=stage.name,
@@ -179,8 +183,9 @@ def outcome_of(stage: Stage, root: Path, read: Callable[[], Record | None]) -> O
 def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
     """Make one result whose inputs are complete, and write its record last.
 
-    The inputs are compared with what their records list. A rejected item gets a folder with a record too, so that
-    running again does not try it again. With a store, inputs that are not here are fetched, and the result is published.
+    The inputs are compared with what their records list. A rejected item gets a folder with a
+    record too, so that running again does not try it again. With a store, inputs that are not here
+    are fetched, and the result is published.
     """
     folder = stage.folder(runtime.root)
     partial = folder.with_name(folder.name + ".partial")
@@ -202,9 +207,14 @@ def make_stage(stage: Stage, runtime: Runtime) -> Outcome:
             reason = "error"
             detail = f"{partial} was deleted while it was being filled; run the same command again"
         return Outcome(
-            stage=stage.name, item=stage.item, status="failed", folder=folder,
-            seconds=time.monotonic() - started, reason=reason, detail=detail,
-        )  # fmt: skip
+            stage=stage.name,
+            item=stage.item,
+            status="failed",
+            folder=folder,
+            seconds=time.monotonic() - started,
+            reason=reason,
+            detail=detail,
+        )
 
 
 def _fetch_inputs(stage: Stage, runtime: Runtime) -> None:
@@ -212,7 +222,8 @@ def _fetch_inputs(stage: Stage, runtime: Runtime) -> None:
     for needed in in_order(list(stage.inputs.values())):
         if not open_store(runtime.store).fetch(needed.folder(runtime.root), runtime.root):
             raise V2PError(
-                f"{needed.name} of {needed.item} is neither in {runtime.root} nor in {runtime.store}; run the same command "
+                f"{needed.name} of {needed.item} is neither in {runtime.root} nor in "
+                f"{runtime.store}; run the same command "
                 "again where it was made"
             )
 
@@ -273,9 +284,14 @@ def _made(stage: Stage, runtime: Runtime, partial: Path, folder: Path, started: 
     if (memory := memory_of(folder, runtime.root)) is not None:
         remember_made(folder, files, memory)
     return Outcome(
-        stage=stage.name, item=stage.item, status=status, folder=folder,
-        seconds=seconds, reason=reason, detail=detail,
-    )  # fmt: skip
+        stage=stage.name,
+        item=stage.item,
+        status=status,
+        folder=folder,
+        seconds=seconds,
+        reason=reason,
+        detail=detail,
+    )
 
 
 def in_order(stages: Sequence[Stage]) -> Iterator[Stage]:

@@ -86,7 +86,8 @@ class Store:
             raise V2PError(f"--store {self.url} cannot be written ({_short(error)})") from error
         if self.create(MARK, b""):
             raise V2PError(
-                f"{self.url} lets two programs create one object, so drivers cannot share it; take a folder, or a bucket "
+                f"{self.url} lets two programs create one object, so drivers cannot share it; "
+                "take a folder, or a bucket "
                 "that knows 'If-None-Match' (Amazon S3, MinIO, Cloudflare R2, Google, Azure)"
             )
 
@@ -193,7 +194,8 @@ class Store:
 
     def _named(self, error: UnusableError, place: Path, key: str) -> UnusableError:
         """Return the error with the place in the store in the downloaded copy's stead."""
-        return UnusableError(error.reason, error.detail.replace(str(place), f"{self.url}/{key}"))  # type: ignore[arg-type]
+        detail = error.detail.replace(str(place), f"{self.url}/{key}")
+        return UnusableError(error.reason, detail)  # type: ignore[arg-type]
 
     def _names(self, key: str) -> list[str]:
         """Return the paths of a result's files, without its record."""
@@ -233,7 +235,8 @@ class Store:
                     raise
                 if time.monotonic() - began > PATIENCE_S or _is_final(error):
                     raise V2PError(
-                        f"the store {self.url} does not answer ({_short(error)}); what is finished is kept, and the same "
+                        f"the store {self.url} does not answer ({_short(error)}); what is "
+                        "finished is kept, and the same "
                         "command goes on with it when the store is back"
                     ) from error
                 logger.warning(

@@ -130,11 +130,14 @@ class Pool:
                 seconds, limit_s = time.monotonic() - worker.started, self.runtime.limit_s
                 is_late = worker.process.exitcode == 1 and 0 < limit_s <= seconds
                 outcome = Outcome(
-                    stage=stage.name, item=stage.item, status="failed",
-                    folder=stage.folder(self.runtime.root), seconds=seconds,
+                    stage=stage.name,
+                    item=stage.item,
+                    status="failed",
+                    folder=stage.folder(self.runtime.root),
+                    seconds=seconds,
                     reason="too_long" if is_late else "crashed",
                     detail=_how_it_died(worker.process.exitcode, self.runtime, is_late),
-                )  # fmt: skip
+                )
                 yield Event(kind="ended", stage=stage, outcome=outcome)
                 continue
             if isinstance(message, Outcome):
@@ -257,9 +260,13 @@ def _run_stages(
 
 def _blocked(stage: Stage, blocker: Outcome, root: Path) -> Outcome:
     return Outcome(
-        stage=stage.name, item=stage.item, status="blocked", folder=stage.folder(root),
-        reason=blocker.reason, detail=f"needs {blocker.stage} of {blocker.item}",
-    )  # fmt: skip
+        stage=stage.name,
+        item=stage.item,
+        status="blocked",
+        folder=stage.folder(root),
+        reason=blocker.reason,
+        detail=f"needs {blocker.stage} of {blocker.item}",
+    )
 
 
 def _engine(runtime: Runtime, num_pending: int) -> Pool | RayEngine:

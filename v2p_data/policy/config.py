@@ -28,8 +28,8 @@ class PolicyConfig:
     judge_episodes: int = 32
     """Episodes a task that judge a checkpoint, on seeds of their own."""
     judge_tasks: Path | None = None
-    """Folder of tasks that judge checkpoints instead of the dataset's own: of objects that nobody trains on, and that no
-    evaluation reports."""
+    """Folder of tasks that judge checkpoints instead of the dataset's own: of objects that nobody
+    trains on, and that no evaluation reports."""
 
     encoder: Literal["resnet18", "none"] = "resnet18"
     """Encoder of the whole picture; see `policies/bc/configuration_v2p_bc.py`, as the next ones."""

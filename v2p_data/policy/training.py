@@ -219,7 +219,7 @@ def make_policy(
 
 
 def _seen_from(root: Path, dataset: Path) -> Path:
-    """Return where a dataset lies in the run folder, its name alone elsewhere: what is pushed must not name its maker."""
+    """Return where a dataset lies in the run folder, its name alone elsewhere, for what may be pushed."""
     return dataset.relative_to(root) if dataset.is_relative_to(root) else Path(dataset.name)
 
 

@@ -1,4 +1,4 @@
-"""A reward search as part of the page, finished or not: each round's candidates, and how the best one trained and came about.
+"""A reward search as part of the page, finished or not: candidates by round, and the best one.
 
 Text and numbers only. Trainings were written by processes that ran generated code, so their files are read as a
 stranger's: small, inside the search's folder, and never trusted to be whole.
@@ -107,7 +107,9 @@ def reward_view(folder: Path) -> RewardView | None:
     leader = rows.get(chosen, best) if isinstance(chosen, int) else best
     place = f"candidate/{leader.folder}" if leader and leader.folder else ""
     record = _own_file(folder, f"{place}/record.json")
-    feedback = as_dict(as_dict(as_dict(record and json_or_none(record)).get("counts")).get("feedback"))  # fmt: skip
+    feedback = as_dict(
+        as_dict(as_dict(record and json_or_none(record)).get("counts")).get("feedback")
+    )
     curve = _own_file(folder, f"{place}/train/curve.csv")
     parts = [*as_dicts(feedback.get("components"))[:MAX_PARTS], as_dict(feedback.get("reward"))]
     return RewardView(

@@ -40,8 +40,9 @@ TRAIN_FOLDER = "train"
 LEAST_WAY_M = 0.01
 """The video's displacement says nothing below this."""
 RANKING_WEIGHT = 0.1
-"""So much success is made up for by a reward that pays successes more than failures instead of less: 192 episodes tell no
-smaller difference of success apart (1.96 standard errors of a difference, 0.10)."""
+"""So much success is made up for by a reward that pays successes more than failures instead of
+less: 192 episodes tell no smaller difference of success apart (1.96 standard errors of a
+difference, 0.10)."""
 RIGHTS = {"memory_bytes": 4 * 2**30, "file_bytes": 2 * 2**30, "open_files": 256, "processes": 64}
 """What a process may use that runs a generated reward; the memory is on top of what the libraries take."""
 

@@ -9,7 +9,8 @@ class RewardConfig:
     """What is searched, and with how many control steps."""
 
     iterations: int = 0
-    """Rounds of rewards, 0: no search; the paper takes 5, and 8 for hard tasks. Without a model the first is the only one."""
+    """Rounds of rewards, 0: no search; the paper takes 5, and 8 for hard tasks. Without a model
+    the first is the only one."""
     candidates: int = 8
     """Rewards per round (the paper's number)."""
     steps: int = 400_000

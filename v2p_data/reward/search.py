@@ -1,7 +1,8 @@
 """Rounds of rewards, trained against each other: the worse half stops early, the best of all rounds is never lost.
 
-The search's folder is a run folder of its own: a candidate's rung is one result in it. A search that is killed and started
-again keeps what is complete and goes on from checkpoints. Rewards are written again from the model's stored answers.
+The search's folder is a run folder of its own: a candidate's rung is one result in it. A search
+that is killed and started again keeps what is complete and goes on from checkpoints. Rewards are
+written again from the model's stored answers.
 
     candidate/000-rung-0-1a2b3c4d/ ...   see `candidate`
     search.json                          the table so far, and in the end the choice
@@ -62,9 +63,14 @@ class RewardSearch:
         self.bundle, self.cfg, self.out, self.seed = bundle, cfg, out, seed
         self.on_progress, self.writer = runtime.progress, writer
         self.runtime = replace(
-            runtime, root=out, workers=runtime.num_threads, num_threads=1,
-            engine="local", store="", limit_s=CANDIDATE_LIMIT_S,
-        )  # fmt: skip
+            runtime,
+            root=out,
+            workers=runtime.num_threads,
+            num_threads=1,
+            engine="local",
+            store="",
+            limit_s=CANDIDATE_LIMIT_S,
+        )
         self.num_rounds = max(1, cfg.iterations) if writer else 1
         self.candidates: list[Candidate] = []
         self.stopped_by = ""
@@ -185,10 +191,14 @@ class RewardSearch:
         number = len(self.candidates) + len(made)
         made.append(
             Candidate(
-                number=number, iteration=iteration, code=code,
-                origin=origin, parent=parent, reasons=reasons,
+                number=number,
+                iteration=iteration,
+                code=code,
+                origin=origin,
+                parent=parent,
+                reasons=reasons,
             )
-        )  # fmt: skip
+        )
 
     # -- halving
 

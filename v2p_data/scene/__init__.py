@@ -1,11 +1,13 @@
 """A clip becomes a scene: what moved where, how large it is, and how sure we are.
 
 Comes in: a `video.clip.Clip` (frames, caption, object phrases, optional hints). Goes out: a `Reconstruction`, which
-`export.write_scene` turns into a folder with `scene.json` (the paper's task JSON), `meshes/`, `masks/`, `urdf/`, `mjcf/`,
-`scene.xml` (all objects in MJCF) and the overlay video; or an `ItemRejectedError` with a reason and the number that decided.
+`export.write_scene` turns into a folder with `scene.json` (the paper's task JSON), `meshes/`,
+`masks/`, `urdf/`, `mjcf/`, `scene.xml` (all objects in MJCF) and the overlay video; or an
+`ItemRejectedError` with a reason and the number that decided.
 
-Nothing is downloaded. A small network of our own, trained on rendered clips only, says which pixels are hand, moved thing,
-other thing and table. Everything else is OpenCV, scipy and trimesh. Each step can ask a learned model instead (`backends/`, `docs/backends.md`).
+Nothing is downloaded. A small network of our own, trained on rendered clips only, says which
+pixels are hand, moved thing, other thing and table. Everything else is OpenCV, scipy and trimesh.
+Each step can ask a learned model instead (`backends/`, `docs/backends.md`).
 
 Rooms, each of which imports only those above it:
     backends        learned models and workers

@@ -1,6 +1,7 @@
 """How sure each step of a reconstruction is and why, and whether the motion found is the one that the caption tells of.
 
-A scene's confidence is the product of its cues; each cue belongs to one stage, whose confidence is the product of its own.
+A scene's confidence is the product of its cues; each cue belongs to one stage, whose confidence is
+the product of its own.
 """
 
 from collections.abc import Iterator
@@ -27,7 +28,8 @@ _AWAY_PX = 4.0
 _OUT_OF_SIGHT = 0.8
 """Confidence in an object that nobody sees at one end: in a bin, in a fist, or on the table before a hand brings it."""
 _IN_THE_AIR = 0.6
-"""Confidence in an object that does not rest on the table at first; it falls from 1 where half of what that needs is seen."""
+"""Confidence in an object that does not rest on the table at first; it falls from 1 where half of
+what that needs is seen."""
 _GOOD, _LEAST_CUE = 0.95, 0.01
 """A cue above the first needs no help; the second keeps a ratio finite."""
 
@@ -35,7 +37,9 @@ _GOOD, _LEAST_CUE = 0.95, 0.01
 def cues_of(grounded: GroundedObjects, placement: Placement, kind: Kind) -> tuple[Cue, ...]:
     """Return everything that the scene's confidence is the product of."""
     pairs = zip(grounded.objects, placement.objects, strict=True)
-    of_objects = [cue for s, placed in pairs for cue in _object_cues(grounded, placement, kind, s, placed)]  # fmt: skip
+    of_objects = [
+        cue for s, placed in pairs for cue in _object_cues(grounded, placement, kind, s, placed)
+    ]
     return (*of_objects, *_scene_cues(grounded, placement, kind))
 
 
@@ -44,8 +48,12 @@ def _cue(stage: str, what: str, value: float, advice: str = "") -> Cue:
 
 
 def _object_cues(
-    grounded: GroundedObjects, placement: Placement, kind: Kind, s: ObjectTrack, placed: PlacedObject
-) -> Iterator[Cue]:  # fmt: skip
+    grounded: GroundedObjects,
+    placement: Placement,
+    kind: Kind,
+    s: ObjectTrack,
+    placed: PlacedObject,
+) -> Iterator[Cue]:
     """Yield the cues of one object: found, outlined, touched, sized, placed at the start and the end."""
     which = f"'{s.phrase}'"
     box = "" if s.hinted else f"mark {which} with a box"
@@ -115,7 +123,10 @@ def _scene_cues(grounded: GroundedObjects, placement: Placement, kind: Kind) -> 
 
 
 def _touched_share(grounded: GroundedObjects) -> float | None:
-    """Return in which share of its moving frames a fingertip is at the manipulated object; None where nobody knows, or a tool moves it."""
+    """Return in which share of its moving frames a fingertip is at the manipulated object.
+
+    None where nobody knows, or a tool moves it.
+    """
     thing, hands = grounded.objects[0], grounded.working.hands
     by_tool = any(s.role == "tool" for s in grounded.objects)
     if hands is None or by_tool or thing.hinted:
@@ -131,7 +142,7 @@ def _touched_share(grounded: GroundedObjects) -> float | None:
 
 
 def _seen_on_table(grounded: GroundedObjects) -> float:
-    """Return how far the manipulated object is seen to rest on the table at first, or at the end where a hand brings it, 0 to 1."""
+    """Return how far the object is seen to rest on the table at first, or at the end if a hand brings it."""
     gap_px = {} if grounded.working.outliner is None else {"gap_px": EXACT_GAP_PX}
     thing, seen = grounded.objects[0], grounded.segmentation
     if thing.brought:
@@ -233,7 +244,8 @@ def check_motion(
     if value < least:
         raise ItemRejectedError(
             "motion_contradicts_caption",
-            f"what was followed as '{grounded.objects[0].phrase}' hardly {said} ({value:.2f}, at least {least:.2f} needed), "
+            f"what was followed as '{grounded.objects[0].phrase}' hardly {said} ({value:.2f}, at "
+            f"least {least:.2f} needed), "
             "so it is probably something else; mark it with a box in captions.json",
             round(value, 3),
         )

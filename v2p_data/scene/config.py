@@ -21,8 +21,9 @@ class SceneConfig:
     """How a scene is rebuilt, and how sure we must be."""
 
     preset: Preset = "builtin"
-    """`builtin` downloads nothing. `learned` takes Grounding DINO, SAM 2 and a metric depth model in sizes that fit this machine,
-    for each stage whose backend is not set; 'v2p setup' lists them."""
+    """`builtin` downloads nothing. `learned` takes Grounding DINO, SAM 2 and a metric depth model
+    in sizes that fit this machine, for each stage whose backend is not set; 'v2p setup' lists
+    them."""
     min_confidence: float = 0.52
     """Scenes below are rejected."""
     min_found: float = 0.5
@@ -32,7 +33,8 @@ class SceneConfig:
     check_motion: bool = True
     """Reject what does not move as its caption says."""
     camera_height_m: float | None = None
-    """Height of the camera above the table, where you measured it: with pitch and field of view it gives all sizes, which are guesses otherwise."""
+    """Height of the camera above the table, where you measured it: with pitch and field of view it
+    gives all sizes, which are guesses otherwise."""
     pitch_rad: float | None = None
     """How far the camera looks below the horizon, where you know it."""
     pitch_spread_rad: float = 0.14
@@ -40,8 +42,9 @@ class SceneConfig:
     fov_rad: float | None = None
     """Horizontal field of view of the camera, where you know it."""
     camera_spread: float = 0.02
-    """How far off what you give of the camera may be: standard deviation of the pitch in radians, and of the height's logarithm. 0.02
-    with a tape and a level; 'v2p scene camera' says how sure it is."""
+    """How far off what you give of the camera may be: standard deviation of the pitch in radians,
+    and of the height's logarithm. 0.02 with a tape and a level; 'v2p scene camera' says how sure
+    it is."""
     max_poses: int = 150
     """Poses kept per object, the first and last among them."""
     ground: GroundConfig = field(default_factory=GroundConfig)
@@ -58,9 +61,11 @@ class SceneConfig:
         if not 0 <= self.min_found < 1:
             raise ValueError(f"min_found must lie in 0..1, got {self.min_found}")
         for name, low, high in (
-            ("camera_height_m", 0.05, 5.0), ("pitch_rad", 0.1, 1.5), ("fov_rad", 0.3, 2.2),
+            ("camera_height_m", 0.05, 5.0),
+            ("pitch_rad", 0.1, 1.5),
+            ("fov_rad", 0.3, 2.2),
             ("camera_spread", 0.0, 1.0),
-        ):  # fmt: skip
+        ):
             value = getattr(self, name)
             if value is not None and not low < value < high:
                 raise ValueError(f"{name} must lie in {low}..{high}, got {value}")

@@ -152,7 +152,8 @@ class RestingObject:
     masks: Bool[np.ndarray, "time h w"]
     """Its masks in every working frame."""
     rests: Sequence[tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "3"]]]
-    """Its outline and its position [camera heights] where it rests: at first, and at last where the table carries it there."""
+    """Its outline and its position [camera heights] where it rests: at first, and at last where
+    the table carries it there."""
     camera: Camera
     """One camera height above the table."""
     pitch_rad: float

@@ -1,8 +1,9 @@
 """A reconstruction becomes a folder: `scene.json`, meshes with their convex parts, masks, and models for simulators.
 
-`meshes/` holds per object OBJ, PLY and convex parts, `masks/` its mask track, `urdf/` and `mjcf/` the object alone,
-`scene.xml` all of them in MJCF: the scene as the video showed it, without a robot, with the keyframes `first` and `last`.
-The simulator builds its own worlds from `scene.json`.
+`meshes/` holds per object OBJ, PLY and convex parts, `masks/` its mask track, `urdf/` and `mjcf/`
+the object alone, `scene.xml` all of them in MJCF: the scene as the video showed it, without a
+robot, with the keyframes `first` and `last`. The simulator builds its own worlds from
+`scene.json`.
 """
 
 import shutil

@@ -26,13 +26,25 @@ class Size:
 
 
 SIZES = (
-    Size(least_gpu_gb=16.0, ground="IDEA-Research/grounding-dino-base", segment="facebook/sam2.1-hiera-large",
-         batch_size=8),
-    Size(least_gpu_gb=8.0, ground="IDEA-Research/grounding-dino-base", segment="facebook/sam2.1-hiera-base-plus",
-         batch_size=4),
-    Size(least_gpu_gb=0.0, ground="IDEA-Research/grounding-dino-tiny", segment="facebook/sam2.1-hiera-tiny",
-         batch_size=1),
-)  # fmt: skip
+    Size(
+        least_gpu_gb=16.0,
+        ground="IDEA-Research/grounding-dino-base",
+        segment="facebook/sam2.1-hiera-large",
+        batch_size=8,
+    ),
+    Size(
+        least_gpu_gb=8.0,
+        ground="IDEA-Research/grounding-dino-base",
+        segment="facebook/sam2.1-hiera-base-plus",
+        batch_size=4,
+    ),
+    Size(
+        least_gpu_gb=0.0,
+        ground="IDEA-Research/grounding-dino-tiny",
+        segment="facebook/sam2.1-hiera-tiny",
+        batch_size=1,
+    ),
+)
 """The largest first. Weights in float32 take 2.0, 1.4 and 0.95 GB; the rest of the memory is for activations."""
 
 WEIGHTS_GB = {
@@ -81,14 +93,20 @@ def with_preset(cfg: SceneConfig, memory_gb: Callable[[], float] = gpu_memory_gb
     ground, segment, depth = cfg.ground, cfg.segment, cfg.depth
     if ground.backend == "network":
         ground = replace(
-            ground, backend="grounding_dino", model=ground.model or size.ground, batch_size=size.batch_size
-        )  # fmt: skip
+            ground,
+            backend="grounding_dino",
+            model=ground.model or size.ground,
+            batch_size=size.batch_size,
+        )
     if segment.backend == "flow":
         segment = replace(segment, backend="sam2", model=segment.model or size.segment)
     if depth.backend == "none":
         depth = replace(
-            depth, backend="depth_anything", model=depth.model or DEFAULT_MODELS["depth_anything"], batch_size=size.batch_size
-        )  # fmt: skip
+            depth,
+            backend="depth_anything",
+            model=depth.model or DEFAULT_MODELS["depth_anything"],
+            batch_size=size.batch_size,
+        )
     return replace(cfg, preset="builtin", ground=ground, segment=segment, depth=depth)
 
 

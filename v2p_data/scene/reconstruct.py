@@ -1,8 +1,9 @@
 """The order of steps from a clip to a scene.
 
-Frames, then grounding, then camera and poses in camera heights, then meshes in metres, then how sure all of it is. Where that is
-not sure, the objects are searched once more in the clip's mirror image, and the surer scene is kept. What is turned away all the same
-may show a hand that brings the object: then its end is searched alone.
+Frames, then grounding, then camera and poses in camera heights, then meshes in metres, then how
+sure all of it is. Where that is not sure, the objects are searched once more in the clip's mirror
+image, and the surer scene is kept. What is turned away all the same may show a hand that brings
+the object: then its end is searched alone.
 """
 
 from dataclasses import replace
@@ -53,7 +54,8 @@ _NOT_FOUND = ("object_not_found", "reference_not_found", "motion_contradicts_cap
 _MAY_BE_BROUGHT = ("place_onto", "insert", "cover", "drop_in_front_of", "push_next_to")
 """Kinds of task whose end alone says what is asked for: something is put down at another object."""
 _NOT_SEEN_AT_FIRST = ("not_there_at_first", "low_confidence", *_NOT_FOUND)
-"""Rejections of clips in which a hand may bring the object: the first says so, the others because something else was taken for it."""
+"""Rejections of clips in which a hand may bring the object: the first says so, the others because
+something else was taken for it."""
 _SURE_AT_ONCE = 0.65
 """Confidence from which the first search is taken as it is."""
 
@@ -62,8 +64,9 @@ def reconstruct(clip: Clip, cfg: SceneConfig, rng: np.random.Generator) -> Recon
     """Return the scene that the clip shows.
 
     Raises:
-        ItemRejectedError: `camera_moves`, `nothing_moves`, `no_hand`, `not_there_at_first`, `object_not_found`, `reference_not_found`,
-            `bad_hint`, `motion_contradicts_caption` or `low_confidence`, with the number that decided.
+        ItemRejectedError: `camera_moves`, `nothing_moves`, `no_hand`, `not_there_at_first`,
+            `object_not_found`, `reference_not_found`, `bad_hint`, `motion_contradicts_caption` or
+            `low_confidence`, with the number that decided.
     """
     return reconstruct_prepared(prepared_for(clip, cfg), cfg, rng)
 
@@ -144,7 +147,7 @@ def _with_what_is_brought(
 
 
 def _may_search_again(prepared: PreparedClip, cfg: SceneConfig) -> bool:
-    """Return whether a search in the mirror image can find something else: with our network, and where nobody marked anything."""
+    """Return whether a search in the mirror image can differ: with our network and without marks."""
     return _is_ours(cfg) and not has_marks(prepared.clip)
 
 

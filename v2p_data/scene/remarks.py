@@ -38,12 +38,14 @@ def remarks_on(
     if grounded.objects[0].brought:
         way_m = placement.height_m * (thing.T_world_objs[-1] - thing.T_world_objs[0])[:2, 3]
         out.append(
-            f"a hand brings '{grounded.objects[0].phrase}': nothing shows it on the table at first; its first pose is a place that was chosen, "
+            f"a hand brings '{grounded.objects[0].phrase}': nothing shows it on the table at "
+            "first; its first pose is a place that was chosen, "
             f"{100 * np.linalg.norm(way_m):.0f} cm from where it ends"
         )
     if people_face(grounded.working.hands):
         out.append(
-            "hands reach in from opposite sides at once, as of two people: only one object's motion is understood, and another person's hand may "
+            "hands reach in from opposite sides at once, as of two people: only one object's "
+            "motion is understood, and another person's hand may "
             "have moved it; film one person"
         )
     last_frame = int(grounded.working.frame_idx[thing.last_i])

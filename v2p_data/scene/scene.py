@@ -153,7 +153,7 @@ class SceneObject:
 
     @property
     def laid_pose(self) -> Float[np.ndarray, "7"]:
-        """The first pose, for what starts from there: what a hand holds then lies on its broadest side, the same way round."""
+        """The pose at the start of a task: what a hand holds then lies on its broadest side instead."""
         if self.observed[:1] != ("no_depth",):
             return self.first_pose
         R = Rotation.from_quat(self.first_pose[3:], scalar_first=True).as_matrix()
@@ -239,7 +239,10 @@ def hollow_floor_m(height_m: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]
 
 
 def friction_attribute(sliding: float = 1e-5) -> str:
-    """Return MuJoCo's `friction` of an object; by default the table's, the least that MuJoCo takes: the larger one of two geoms counts."""
+    """Return MuJoCo's `friction` of an object.
+
+    By default the table's, the least that MuJoCo takes: the larger one of two geoms counts.
+    """
     return f"{sliding:.6g} 0.005 0.0001"
 
 
@@ -409,7 +412,8 @@ def _read(folder: Path) -> SceneFile:
     found = parsed(data, SceneFile, path, "remake it with 'v2p scene'", version_field="schema")
     if len(found.camera.T_world_cams) not in (0, found.num_frames):
         raise V2PError(
-            f"{path}: camera.T_world_cams has {len(found.camera.T_world_cams)} poses, but the clip has {found.num_frames} frames"
+            f"{path}: camera.T_world_cams has {len(found.camera.T_world_cams)} poses, but the "
+            f"clip has {found.num_frames} frames"
         )
     if len({o.name for o in found.objects}) < len(found.objects):
         names = ", ".join(o.name for o in found.objects)

@@ -1,6 +1,7 @@
 """The numbers, texts and paths that a JSON file may hold, and how such a file is read: `scene.json` and those like it.
 
-The limits are wide: they keep out what no video can give and what would make this engine hang. Whether a scene suits the
+The limits are wide: they keep out what no video can give and what would make this engine hang.
+    Whether a scene suits the
 robot is asked later, with sentences of its own (`sim.suitability`).
 """
 

@@ -1,8 +1,9 @@
 """From a scene to its task: samples of task code, each tried and audited; one that the audit accepts becomes the task.
 
-Offline samples come from `templates`. The first one is taken where the audit accepts it: in the twelve tasks of the paper
-it does as well as the best of eight by the audit's score (`docs/lab/pick.md`). A model writes all its samples (`llm`), and
-one is picked. Whoever else writes code passes it in as `sources`.
+Offline samples come from `templates`. The first one is taken where the audit accepts it: in the
+twelve tasks of the paper it does as well as the best of eight by the audit's score
+(`docs/lab/pick.md`). A model writes all its samples (`llm`), and one is picked. Whoever else
+writes code passes it in as `sources`.
 """
 
 import json

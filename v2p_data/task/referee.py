@@ -36,8 +36,9 @@ REACHED_M = 0.04
 """The gripper was at a thing if its tool centre came this near its box: fingers also push with their sides, which no
 pad feels. Pushes without a pad came within 2.2 cm in 64 episodes; arms start at least 5 cm away."""
 FINGER_REACHED_M = 0.02
-"""The same for the outer side of a finger, 5.5 cm beside the tool's centre if the gripper is open: its tip is 1.5 cm lower.
-What it hits may be gone at the next sample, so the thing is taken where it was one sample before."""
+"""The same for the outer side of a finger, 5.5 cm beside the tool's centre if the gripper is open:
+its tip is 1.5 cm lower. What it hits may be gone at the next sample, so the thing is taken where
+it was one sample before."""
 FALLEN_RAD = np.deg2rad(60)
 STANDS_RAD = np.deg2rad(25)
 
@@ -202,8 +203,8 @@ Verdict = Bool[np.ndarray, "env"]
 def referee_success(kind: Kind, scene: Scene, trajectory: Trajectory) -> Bool[np.ndarray, "env"]:
     """Return per world whether the robot did what its kind of task says.
 
-    What moves while the robot is away from it does not count. How something was carried is not looked at: a push may be a
-    carry. Docs: `docs/experts.md`.
+    What moves while the robot is away from it does not count. How something was carried is not
+    looked at: a push may be a carry. Docs: `docs/experts.md`.
 
     Raises:
         V2PError: the kind needs an object that the scene lacks.

@@ -190,7 +190,8 @@ def _read(path: Path, main: Path) -> _Text:
         text.bodies += tag == "body"
         if tag in MULTIPLYING:
             raise V2PError(
-                f"robot file {main} has an element <{tag}>, which an arm does not need; leave it out, or save the compiled "
+                f"robot file {main} has an element <{tag}>, which an arm does not need; leave it "
+                "out, or save the compiled "
                 "model as MJCF and use that"
             )
         if depth > MAX_DEPTH or text.elements > MAX_ELEMENTS or text.bodies > MAX_BODIES:

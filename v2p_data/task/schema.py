@@ -14,7 +14,8 @@ MAX_TASK_BYTES = 1_000_000
 MAX_CODE_BYTES = 200_000
 """Task code itself may have 40,000 characters."""
 MAX_HORIZON_STEPS = 2_000
-"""100 s; the paper's episodes have 300 steps, of a length that it does not tell. All steps of all worlds are kept until an episode is judged."""
+"""100 s; the paper's episodes have 300 steps, of a length that it does not tell. All steps of all
+worlds are kept until an episode is judged."""
 
 
 def _robot_path(text: str) -> str:

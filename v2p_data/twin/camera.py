@@ -57,9 +57,13 @@ class Lens:
     def undistort(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """Return rays through raw pixels, with z = 1."""
         points = cv2.undistortPointsIter(
-            np.ascontiguousarray(pixels[:, None]), self.K, self.coefficients, np.eye(3), np.eye(3),
+            np.ascontiguousarray(pixels[:, None]),
+            self.K,
+            self.coefficients,
+            np.eye(3),
+            np.eye(3),
             (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-9),
-        )  # fmt: skip
+        )
         return np.concatenate([points[:, 0], np.ones((len(pixels), 1))], axis=1)
 
 

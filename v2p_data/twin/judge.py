@@ -1,8 +1,9 @@
 """How well something does a task in the twin, from the starts that the training simulator's judge uses.
 
-Episode k starts from `first_seed + k` in both (`evaluation.batch.judge`), so the rates are paired seed by seed. A policy
-sees true masks of the twin's camera here; masks tracked in its pictures are the deployment loop's. Experts and programs
-see the twin's truth. All of it is sim-to-sim: no real arm was asked.
+Episode k starts from `first_seed + k` in both (`evaluation.batch.judge`), so the rates are paired
+seed by seed. A policy sees true masks of the twin's camera here; masks tracked in its pictures are
+the deployment loop's. Experts and programs see the twin's truth. All of it is sim-to-sim: no real
+arm was asked.
 """
 
 from collections.abc import Callable, Sequence

@@ -72,7 +72,7 @@ class Mirror(BatchEnv):
         self.referee = RefereeRecord(self)
 
     def start(self, seed: int, world: TwinWorld) -> Start:
-        """Return how the episode of `V2PEnv.reset(seed=seed)` begins, with objects at the heights of the twin's table."""
+        """Return how the episode of `V2PEnv.reset(seed=seed)` begins, at the heights of the twin's table."""
         self.reset_seeded(np.array([0]), [stream_seed(seed)])
         seen = self.snapshot(np.array([0])).qpos[0]
         robot, first = self.world.robot, self.world.objects[0].qpos_adr

@@ -251,9 +251,13 @@ def _paint_table(spec: Any, p: TwinParameters) -> None:
     colour = p.table_grey * (1.0 + p.table_warmth * np.array([1.0, 0.2, -1.0]))
     pixels = colour * (1.0 + p.grain * streaks[..., None] / 3)
     spec.add_texture(
-        name="grain", type=mujoco.mjtTexture.mjTEXTURE_2D, width=GRAIN_PX, height=GRAIN_PX, nchannel=3,
+        name="grain",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=GRAIN_PX,
+        height=GRAIN_PX,
+        nchannel=3,
         data=(np.clip(pixels, 0, 1) * 255).astype(np.uint8).ravel().tolist(),
-    )  # fmt: skip
+    )
     material = spec.add_material(name="grain", texrepeat=[3, 3], specular=0.1)
     material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "grain"
     spec.geom("table").material = "grain"

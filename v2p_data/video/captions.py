@@ -7,7 +7,8 @@ label file of Something-Something-v2 in the same folder (`labels.py`), else from
      "push.mp4": {"caption": "Pushing blue box next to can", "objects": ["blue box", "can"],
                   "hints": {"can": {"frame": 0, "box": [310, 120, 380, 240], "size_m": [0.066, 0.066, 0.12]}}}}
 
-A hint marks one object: `box`, `click`, `stroke` or `points` in one `frame`, `size_m`, or the `name` of the object where
+A hint marks one object: `box`, `click`, `stroke` or `points` in one `frame`, `size_m`, or the
+    `name` of the object where
 the caption's words do not say it. A hint called `table` marks the table itself. `"crop": [x, y, width, height]` says
 which part of the picture counts.
 """

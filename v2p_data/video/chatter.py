@@ -28,13 +28,19 @@ _WORDS = [
     r"pov|asmr|first[- ]person(?: view)?|第一(?:人称)?视角",
     r"(?:in |en |au |a |à |im )?(?:super )?(?:slow[- ]?mo(?:tion)?|zeitlupe|ralenti|cámara lenta|慢动作|慢镜头)",
     r"(?:in |als |en )?(?:time[- ]?lapse|hyperlapse|zeitraffer|accéléré|cámara rápida|延时(?:摄影)?)",
-    r"(?:vertical|horizontal|portrait|landscape) (?:video|format)|hochformat|querformat|vidéo verticale|v[ií]deo vertical|[竖横]屏",
-    r"top[- ]view|bird'?s[- ]eye view|side view(?! mirror)|close[- ]?up|overhead shot|draufsicht|nahaufnahme|seitenansicht|ansicht von oben",
-    r"vue d[eu] (?:dessus|haut|côté)|gros plan|vista (?:desde arriba|superior|lateral|cenital)|primer plano|[俯侧仰][拍视]|特写",
-    r"(?:sound|audio|volume) (?:on|off|up)|(?:no|without) (?:sound|audio|music|talking|cuts|edits?)|ohne (?:ton|musik|schnitt)",
+    r"(?:vertical|horizontal|portrait|landscape) (?:video|format)|hochformat|querformat|vidéo "
+    r"verticale|v[ií]deo vertical|[竖横]屏",
+    r"top[- ]view|bird'?s[- ]eye view|side view(?! mirror)|close[- ]?up|overhead "
+    r"shot|draufsicht|nahaufnahme|seitenansicht|ansicht von oben",
+    r"vue d[eu] (?:dessus|haut|côté)|gros plan|vista (?:desde "
+    r"arriba|superior|lateral|cenital)|primer plano|[俯侧仰][拍视]|特写",
+    r"(?:sound|audio|volume) (?:on|off|up)|(?:no|without) "
+    r"(?:sound|audio|music|talking|cuts|edits?)|ohne (?:ton|musik|schnitt)",
     r"sans (?:le )?(?:son|musique|coupures?)|sin (?:sonido|audio|música|cortes)|[无没]有?(?:声音?|剪辑|配乐)",
-    r"lol|haha+|lmao|omg|xd|ok(?:ay)?,? so|oc|unedited|uncut|raw footage|original (?:sound|video)|handyvideo|ungeschnitten|non monté|sin editar|原声|未剪辑",
-    r"(?:part|pt|teil|partie|parte|episode|ep|take|vol|folge|épisode|episodio|capítulo)\.? ?#?\d+(?:/\d+)?(?! (?:of|von|de)\b)|第 ?[\d一二三四五六七八九十]+ ?[集期部]",
+    r"lol|haha+|lmao|omg|xd|ok(?:ay)?,? so|oc|unedited|uncut|raw footage|original "
+    r"(?:sound|video)|handyvideo|ungeschnitten|non monté|sin editar|原声|未剪辑",
+    r"(?:part|pt|teil|partie|parte|episode|ep|take|vol|folge|épisode|episodio|capítulo)\.? "
+    r"?#?\d+(?:/\d+)?(?! (?:of|von|de)\b)|第 ?[\d一二三四五六七八九十]+ ?[集期部]",
 ]
 """Remarks of a word or two, which go wherever they stand."""
 
@@ -48,15 +54,25 @@ _ENDINGS = [
 """Remarks that go on to the end of their part."""
 
 _WHOLE = [
-    r"(?:watch|stay|wait)(?: this)? (?:till|until|'?til|to|for) (?:the )?(?:very )?(?:end|it)|like (?:and|&) (?:subscribe|share|follow)",
-    r"(?:don'?t forget to |please |pls )?(?:subscribe|follow (?:me|us|for)|like,? comment|smash that)|link(?:s)? in (?:my |the )?(?:bio|description|comments?)",
-    r"thanks? (?:you )?for watching|thx for watching|sorry (?:for|about) |(?:bad|poor|low) (?:lighting|light|quality|camera)|shaky (?:cam|camera|video)",
-    r"day \d+(?: of .*)?$|my first (?:video|clip|post|try)|test (?:clip|video|footage)|(?:hope|if) you (?:like|enjoy)|credits? (?:to|goes)|not my video",
-    r"bis zum (?:ende|schluss)|(?:link|links) (?:in|im) (?:der |meiner )?(?:bio|beschreibung|kommentar)|danke fürs? (?:zuschauen|zusehen|anschauen)",
-    r"sorry (?:für|wegen)|entschuldigt|(?:schlechte|miese) (?:qualität|beleuchtung)|(?:abo|like)s? (?:da ?lassen|nicht vergessen)|abonnier|folgt (?:mir|uns)|mein erstes video|verwackelt",
-    r"jusqu'?(?:à|au) (?:la )?(?:fin|bout)|attend(?:ez|s) (?:la|jusqu)|lien (?:en|dans (?:la|ma)) (?:bio|description)|merci (?:d'avoir regardé|de regarder|à tous)",
-    r"désolée? pour|mauvaise (?:qualité|lumière)|abonne[zr]?(?:-vous|-toi)?|n'oublie[zs]? pas|(?:ma|mon) premi(?:ère|er) (?:vidéo|clip|essai)|likez|partagez",
-    r"hasta el final|espera(?:d|n)? (?:al|a la|hasta)|(?:link|enlace) en (?:la |mi )?(?:bio|descripción|biografía)|gracias por (?:ver|mirar)|suscr[ií]b|síg(?:ueme|anme|uenos)",
+    r"(?:watch|stay|wait)(?: this)? (?:till|until|'?til|to|for) (?:the )?(?:very "
+    r")?(?:end|it)|like (?:and|&) (?:subscribe|share|follow)",
+    r"(?:don'?t forget to |please |pls )?(?:subscribe|follow (?:me|us|for)|like,? comment|smash "
+    r"that)|link(?:s)? in (?:my |the )?(?:bio|description|comments?)",
+    r"thanks? (?:you )?for watching|thx for watching|sorry (?:for|about) |(?:bad|poor|low) "
+    r"(?:lighting|light|quality|camera)|shaky (?:cam|camera|video)",
+    r"day \d+(?: of .*)?$|my first (?:video|clip|post|try)|test "
+    r"(?:clip|video|footage)|(?:hope|if) you (?:like|enjoy)|credits? (?:to|goes)|not my video",
+    r"bis zum (?:ende|schluss)|(?:link|links) (?:in|im) (?:der |meiner "
+    r")?(?:bio|beschreibung|kommentar)|danke fürs? (?:zuschauen|zusehen|anschauen)",
+    r"sorry (?:für|wegen)|entschuldigt|(?:schlechte|miese) "
+    r"(?:qualität|beleuchtung)|(?:abo|like)s? (?:da ?lassen|nicht vergessen)|abonnier|folgt "
+    r"(?:mir|uns)|mein erstes video|verwackelt",
+    r"jusqu'?(?:à|au) (?:la )?(?:fin|bout)|attend(?:ez|s) (?:la|jusqu)|lien (?:en|dans (?:la|ma)) "
+    r"(?:bio|description)|merci (?:d'avoir regardé|de regarder|à tous)",
+    r"désolée? pour|mauvaise (?:qualité|lumière)|abonne[zr]?(?:-vous|-toi)?|n'oublie[zs]? "
+    r"pas|(?:ma|mon) premi(?:ère|er) (?:vidéo|clip|essai)|likez|partagez",
+    r"hasta el final|espera(?:d|n)? (?:al|a la|hasta)|(?:link|enlace) en (?:la |mi "
+    r")?(?:bio|descripción|biografía)|gracias por (?:ver|mirar)|suscr[ií]b|síg(?:ueme|anme|uenos)",
     r"perdón por|disculp|mala (?:calidad|luz)|mi primer v[ií]deo|(?:dale|dejen?) (?:a )?(?:like|me gusta)|no olvides",
     r"(?:看|等|坚持)到?(?:最后|结尾|结局)|链接(?:在|见)|(?:谢谢|感谢)(?:大家)?(?:的)?(?:观看|收看|支持)|点赞|关注|订阅|转发|画质|光线(?:不好|太暗)|见谅|我的第一[个条次](?:视频|作品)?",
 ]

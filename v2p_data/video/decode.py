@@ -1,8 +1,8 @@
 """A video file becomes a clip: the only place that decodes video.
 
-Reads whatever libav reads from a local file of a known container, one frame at a time. What comes out is RGB,
-turned and mirrored the way a player shows it, scaled down, and evenly spaced in time. Bytes that are no usable video end
-in an `ItemRejectedError`, never in a crash or an endless loop.
+Reads whatever libav reads from a local file of a known container, one frame at a time. What comes
+out is RGB, turned and mirrored the way a player shows it, scaled down, and evenly spaced in time.
+Bytes that are no usable video end in an `ItemRejectedError`, never in a crash or an endless loop.
 """
 
 import logging
@@ -274,7 +274,8 @@ def _demand_usable(film: _Film, name: str, cfg: VideoConfig) -> list[str]:
         share = film.combed_px / film.changed_px
         raise ItemRejectedError(
             "interlaced",
-            f"{name} is interlaced: every second row shows another moment in {share:.0%} of the picture that changes; make whole "
+            f"{name} is interlaced: every second row shows another moment in {share:.0%} of the "
+            "picture that changes; make whole "
             f"pictures of it: ffmpeg -i {name} -vf bwdif whole.mp4",
             share,
         )

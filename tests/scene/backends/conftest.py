@@ -53,8 +53,15 @@ def bert_tokenizer(folder: Path):
 
     # The models know [CLS], [SEP], "." and "?" by their numbers in BERT's own list.
     words = [f"[unused{i}]" for i in range(1030)] + WORDS + ["##" + w for w in WORDS]
-    for number, token in {0: "[PAD]", 100: "[UNK]", 101: "[CLS]", 102: "[SEP]", 103: "[MASK]",
-                          1012: ".", 1029: "?"}.items():  # fmt: skip
+    for number, token in {
+        0: "[PAD]",
+        100: "[UNK]",
+        101: "[CLS]",
+        102: "[SEP]",
+        103: "[MASK]",
+        1012: ".",
+        1029: "?",
+    }.items():
         words[number] = token
     (folder / "vocab.txt").write_text("\n".join(words))
     return BertTokenizerFast(str(folder / "vocab.txt")), len(words)
@@ -139,12 +146,23 @@ def make_depth_anything(folder: Path) -> None:
 
     config = DepthAnythingConfig(
         backbone_config=Dinov2Config(
-            out_features=["stage1", "stage2", "stage3", "stage4"], image_size=56, patch_size=14,
-            reshape_hidden_states=False, hidden_size=16, num_hidden_layers=4, num_attention_heads=2, mlp_ratio=1,
+            out_features=["stage1", "stage2", "stage3", "stage4"],
+            image_size=56,
+            patch_size=14,
+            reshape_hidden_states=False,
+            hidden_size=16,
+            num_hidden_layers=4,
+            num_attention_heads=2,
+            mlp_ratio=1,
         ),
-        patch_size=14, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 8, 8],
-        fusion_hidden_size=8, head_hidden_size=8, depth_estimation_type="metric", max_depth=20,
-    )  # fmt: skip
+        patch_size=14,
+        reassemble_hidden_size=16,
+        neck_hidden_sizes=[8, 8, 8, 8],
+        fusion_hidden_size=8,
+        head_hidden_size=8,
+        depth_estimation_type="metric",
+        max_depth=20,
+    )
     DepthAnythingForDepthEstimation(config).save_pretrained(folder)
     DPTImageProcessor(
         size={"height": 56, "width": 56}, keep_aspect_ratio=True, ensure_multiple_of=14

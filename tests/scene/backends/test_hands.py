@@ -28,7 +28,8 @@ def worker_of(body: str, folder: Path) -> str:
         "images = np.load(given / 'arrays.npz')['images']\n"
         f"{body}\n"
         "np.savez(out / 'result.npz', **answer)\n"
-        "(out / 'result.json').write_text(json.dumps({'schema': 'v2p-worker', 'version': 1, 'kind': 'hands', 'fields': {}}))\n"
+        "(out / 'result.json').write_text(json.dumps({'schema': 'v2p-worker', 'version': 1, "
+        "'kind': 'hands', 'fields': {}}))\n"
     )
     return shlex.join([sys.executable, str(path)])
 
@@ -69,10 +70,13 @@ def test_a_worker_s_hands_belong_to_working_frames_and_pixels(tmp_path, draw):
         ("answer['image_idx'] += len(images)", "'image_idx' of result.npz must"),
         ("answer['scores'] += 1", "'scores' of result.npz must lie in 0..1"),
         ("answer['landmarks_m'] += 2", "'landmarks_m' of result.npz must lie in -1..1"),
-        ("answer['landmarks_px'] = answer['landmarks_px'][:, :20]", "'landmarks_px' of result.npz must be float"),
+        (
+            "answer['landmarks_px'] = answer['landmarks_px'][:, :20]",
+            "'landmarks_px' of result.npz must be float",
+        ),
         ("del answer['is_right']", "lacks the array 'is_right'"),
     ],
-)  # fmt: skip
+)
 def test_a_result_that_breaks_the_contract_is_one_sentence(tmp_path, wrong: str, sentence: str):
     command = worker_of(ONE_HAND + wrong, tmp_path)
     images = np.zeros((2, 24, 32, 3), np.uint8)

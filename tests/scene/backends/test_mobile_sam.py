@@ -149,7 +149,9 @@ def test_a_file_that_is_not_mobile_sam_is_one_sentence(weights, tmp_path, name: 
     elif content is not None:
         path.write_bytes(content)
 
-    with pytest.raises(V2PError, match=r"does not hold MobileSAM's weights .* run 'v2p setup outlines'"):  # fmt: skip
+    with pytest.raises(
+        V2PError, match=r"does not hold MobileSAM's weights .* run 'v2p setup outlines'"
+    ):
         MobileSam(path)
 
 

@@ -1,4 +1,4 @@
-"""Models that are set up into the user's cache: what the settings say with and without them, and what their pins name."""
+"""Models that are set up into the user's cache: settings with and without them, and what their pins name."""
 
 from pathlib import Path
 

@@ -374,10 +374,13 @@ def test_poses_must_be_rigid(worker):
     request = WorkerRequest(
         kind="pose",
         arrays={
-            "images": np.zeros((2, 4, 4, 3), np.uint8), "masks": np.ones((2, 4, 4), bool), "K": np.eye(3),
-            "mesh_vertices": np.array(BOX.vertices), "mesh_faces": np.array(BOX.faces),
+            "images": np.zeros((2, 4, 4, 3), np.uint8),
+            "masks": np.ones((2, 4, 4), bool),
+            "K": np.eye(3),
+            "mesh_vertices": np.array(BOX.vertices),
+            "mesh_faces": np.array(BOX.faces),
         },
-    )  # fmt: skip
+    )
     body = """
     import numpy as np
     T = np.stack([np.eye(4)] * 2); T[1, 2, 2] = {}

@@ -54,7 +54,7 @@ def test_twice_as_many_pixels_per_metre_show_the_same():
 
 
 def seen(item: str):
-    """Return what height_by_hand is asked for a sample clip, with the truth for the thing, and the camera's true height."""
+    """Return the arguments of height_by_hand for a sample clip with a true thing, and the true height."""
     video = next(v for v in find_videos(SAMPLES) if v.item == item)
     truth = json.loads((SAMPLES / "truth" / f"{video.path.stem}.json").read_text())
     labels = cv2.imread(str(SAMPLES / "truth" / truth["masks"]["first"]), cv2.IMREAD_UNCHANGED)

@@ -31,10 +31,20 @@ def block(x: int, y: int, side: int = 36) -> np.ndarray:
 def filmed(frames: np.ndarray) -> Clip:
     n = len(frames)
     return Clip(
-        item="drawn", path=Path("drawn.mp4"), caption="", objects=(), hints={}, frames=frames, fps=12.0,
-        total_frames=n, source_fps=12.0, source_frame=np.arange(n), times_s=np.arange(n) / 12,
-        source_size_px=(W, H), warnings=(),
-    )  # fmt: skip
+        item="drawn",
+        path=Path("drawn.mp4"),
+        caption="",
+        objects=(),
+        hints={},
+        frames=frames,
+        fps=12.0,
+        total_frames=n,
+        source_fps=12.0,
+        source_frame=np.arange(n),
+        times_s=np.arange(n) / 12,
+        source_size_px=(W, H),
+        warnings=(),
+    )
 
 
 def cup_at(x: float, y: float, above: float) -> np.ndarray:
@@ -59,12 +69,21 @@ def test_what_comes_later_hides_nothing_now_but_an_arm_does():
     clip = filmed(frames)
     common = {"quality": np.ones(24), "at": 0, "known_m": None, "sure": 0.9, "why": ""}
     pushed = ObjectTrack(
-        phrase="red block", role="manipulated", noun=noun_for("block"), masks=np.stack(places), moves=True, **common
-    )  # fmt: skip
-    other = ObjectTrack(
-        phrase="blue block", role="reference", noun=noun_for("block"), masks=np.stack([stands] * 24), moves=False,
+        phrase="red block",
+        role="manipulated",
+        noun=noun_for("block"),
+        masks=np.stack(places),
+        moves=True,
         **common,
-    )  # fmt: skip
+    )
+    other = ObjectTrack(
+        phrase="blue block",
+        role="reference",
+        noun=noun_for("block"),
+        masks=np.stack([stands] * 24),
+        moves=False,
+        **common,
+    )
 
     hidden = hidden_around(working_clip_of(clip), (pushed, other), stands, 0)
 
@@ -91,7 +110,7 @@ def resting(phrase: str, role: str, masks: np.ndarray, **given) -> ObjectTrack:
     }
     return ObjectTrack(
         phrase=phrase, role=role, noun=noun_for(phrase), masks=masks, **(common | given)
-    )  # fmt: skip
+    )
 
 
 def test_a_pan_is_fitted_without_its_handle():
@@ -132,11 +151,18 @@ def test_a_lid_that_is_taken_off_lay_on_what_it_covered():
 
     shares = np.zeros((len(frames), len(CLASSES), H, W), np.float32)
     seen = Segmentation(
-        idx=np.arange(len(frames)), shares=shares, early=shares[0], late=shares[-1],
+        idx=np.arange(len(frames)),
+        shares=shares,
+        early=shares[0],
+        late=shares[-1],
         camera=SeenCamera(
-            pitch_rad=PITCH, pitch_sd_rad=0.1, focal_widths=1.0, table_width_m=0.8, table_width_sd=0.2
+            pitch_rad=PITCH,
+            pitch_sd_rad=0.1,
+            focal_widths=1.0,
+            table_width_m=0.8,
+            table_width_sd=0.2,
         ),
-    )  # fmt: skip
+    )
 
     working = working_clip_of(filmed(frames))
     placed, other = place(working, objects, "uncover", guess, 10, seen).objects

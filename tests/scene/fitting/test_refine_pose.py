@@ -1,4 +1,7 @@
-"""Known bodies at known poses, drawn by the rasteriser of `test_shape.py`'s kind; what is recovered is compared with them."""
+"""Known bodies at known poses, drawn by the rasteriser of `test_shape.py`'s kind.
+
+What is recovered is compared with them.
+"""
 
 import cv2
 import numpy as np

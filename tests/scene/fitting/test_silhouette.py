@@ -167,7 +167,7 @@ def test_a_ring_s_hole_says_nothing_against_its_outline():
 
 @pytest.mark.parametrize("yaw_deg", [38, 50, 65])
 def test_the_edges_between_its_faces_tell_how_a_cube_is_turned(yaw_deg):
-    """Its outline, with some shadow taken along, hardly does: one that is turned otherwise and wider covers that as well."""
+    """Its outline with some shadow hardly does: one that is turned otherwise and wider covers that as well."""
     camera, noun = camera_above((240, 320), PITCH, FOV), noun_for("cube")
     side = 0.13
     turn = Rotation.from_euler("z", yaw_deg, degrees=True)
@@ -203,9 +203,17 @@ def test_a_lift_ends_where_the_thing_was_last_seen_highest(believed, ends_at):
         masks[i, top : top + 6, 10:16] = True
     quality = np.where(np.arange(9) <= believed, 1.0, 0.3)
     thing = ObjectTrack(
-        phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks, quality=quality,
-        moves=True, at=0, known_m=None, sure=0.9, why="",
-    )  # fmt: skip
+        phrase="red cube",
+        role="manipulated",
+        noun=noun_for("cube"),
+        masks=masks,
+        quality=quality,
+        moves=True,
+        at=0,
+        known_m=None,
+        sure=0.9,
+        why="",
+    )
 
     assert peak(thing) == ends_at
 
@@ -213,7 +221,10 @@ def test_a_lift_ends_where_the_thing_was_last_seen_highest(believed, ends_at):
 def lifted_in_a_fist(
     rises_px: int, *, seen_rising: bool = False
 ) -> tuple[ObjectTrack, Segmentation]:
-    """Ten frames: a hand comes from the right, takes hold of a cube at (40, 90), stays, and goes up; it hides the cube."""
+    """Ten frames: a hand comes from the right, takes hold of a cube at (40, 90), stays, and goes up.
+
+    It hides the cube.
+    """
     tips = [(110, 90), (70, 96), (40, 90), (40, 90), (40, 90)]
     tips += [(40, 90 - rises_px * k // 5) for k in range(1, 6)]
     masks, shares = (
@@ -226,9 +237,17 @@ def lifted_in_a_fist(
         shares[i, HAND] = cv2.line(np.zeros((120, 160), np.uint8), (159, tip[1]), tip, 1, 16)
     quality = np.where((np.arange(10) < 2) | seen_rising, 1.0, 0.2)
     thing = ObjectTrack(
-        phrase="red cube", role="manipulated", noun=noun_for("cube"), masks=masks, quality=quality,
-        moves=True, at=0, known_m=None, sure=0.9, why="",
-    )  # fmt: skip
+        phrase="red cube",
+        role="manipulated",
+        noun=noun_for("cube"),
+        masks=masks,
+        quality=quality,
+        moves=True,
+        at=0,
+        known_m=None,
+        sure=0.9,
+        why="",
+    )
     seen = SeenCamera(
         pitch_rad=PITCH, pitch_sd_rad=0.1, focal_widths=1.0, table_width_m=0.8, table_width_sd=0.2
     )
@@ -271,9 +290,10 @@ def test_a_hand_that_is_not_recognised_for_a_moment_takes_nothing_elsewhere():
 
 
 @pytest.mark.parametrize(
-    ("rises_px", "seen_rising"), [(0, False), (3, False), (50, True)],
+    ("rises_px", "seen_rising"),
+    [(0, False), (3, False), (50, True)],
     ids=["it stays", "it trembles", "the thing itself is seen"],
-)  # fmt: skip
+)
 def test_nothing_goes_with_a_fist_that_does_not_lift_it_out_of_sight(rises_px, seen_rising):
     assert carried_by_hand(*lifted_in_a_fist(rises_px, seen_rising=seen_rising)) == []
 

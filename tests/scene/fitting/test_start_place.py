@@ -60,7 +60,10 @@ def track(phrase, masks, *, brought):
 
 @pytest.fixture
 def scene(segmentation_of):
-    """Return objects and placement of a block that a hand brings from the right onto a low box; a camera height is 0.5 m."""
+    """Return objects and placement of a block that a hand brings from the right onto a low box.
+
+    A camera height is 0.5 m.
+    """
     working, segmentation = segmentation_of([[]] * 12)
     masks = np.zeros((12, 240, 320), bool)
     masks[3, 100:120, 290:310] = True
@@ -143,7 +146,7 @@ def test_the_scene_says_that_the_first_place_was_chosen(scene):
 
 
 def test_what_is_raised_covers_the_same_pixels_and_is_smaller():
-    """A camera one unit above the table sees a thing on a support of 0.2 as one on the table from 0.8 of that height."""
+    """From height 1 a thing on a support of 0.2 is seen as one on the table from height 0.8."""
     low = fit_at(1.5, 0.2, 0.1, (0.2, 0.3, 0.2))
 
     high = raised(low, 0.2, CAMERA)

@@ -34,14 +34,22 @@ def block(*, still: bool = False) -> PlacedObject:
     fit = Fit(size=(SIDE, SIDE, SIDE), T_world_obj=poses[0], iou=0.9, visible=1.0, cost=0.1)
     nothing = np.zeros((H, W), bool)
     return PlacedObject(
-        first=fit, last=fit, last_i=FRAMES - 1, last_mask=nothing, hidden=nothing, last_hidden=nothing,
-        frames=tuple(range(FRAMES)), T_world_objs=poses, confidences=(1.0,) * FRAMES, observed=("full",) * FRAMES,
+        first=fit,
+        last=fit,
+        last_i=FRAMES - 1,
+        last_mask=nothing,
+        hidden=nothing,
+        last_hidden=nothing,
+        frames=tuple(range(FRAMES)),
+        T_world_objs=poses,
+        confidences=(1.0,) * FRAMES,
+        observed=("full",) * FRAMES,
         rival=None,
-    )  # fmt: skip
+    )
 
 
 def arm_from(spot: np.ndarray | None) -> Segmentation:
-    """Return what the network sees of an arm that comes in from the picture's edge to a spot of the table, or of none."""
+    """Return what the network sees of an arm that reaches from the picture's edge to a spot, or of none."""
     hand = np.zeros((H, W), np.uint8)
     if spot is not None:
         tip = CAMERA.project(spot[None])[0].round().astype(int)
@@ -63,9 +71,17 @@ def pushed(
     u, v = CAMERA.project(np.array([[*tool_xy, 0.0]]))[0].round().astype(int)
     masks[:, v - 1 : v + 2, u - 1 : u + 2] = True
     tool = ObjectTrack(
-        phrase="stick", role="tool", noun=STICK, masks=masks, quality=np.ones(FRAMES), moves=True, at=0, known_m=None,
-        sure=1.0, why="",
-    )  # fmt: skip
+        phrase="stick",
+        role="tool",
+        noun=STICK,
+        masks=masks,
+        quality=np.ones(FRAMES),
+        moves=True,
+        at=0,
+        known_m=None,
+        sure=1.0,
+        why="",
+    )
     return push_motion(block(still=still), "box", tool, CAMERA, HEIGHT_M, arm_from(arm_at))
 
 

@@ -21,10 +21,22 @@ from v2p_data.scene.scale.nouns import (
 
 DOCS = Path(__file__).parents[3] / "docs" / "nouns.md"
 GOOD_ROW = {
-    "noun": "brolly", "form": "box", "length_cm": "27", "width_cm": "5", "height_cm": "5", "spread": "0.25", "mass_g": "350",
-    "friction": "0.5", "hollow": "0", "taper": "1", "matter": "rigid", "colour": "black", "symmetric": "none",
-    "synonyms": "parasol,sun shade", "source": "estimate",
-}  # fmt: skip
+    "noun": "brolly",
+    "form": "box",
+    "length_cm": "27",
+    "width_cm": "5",
+    "height_cm": "5",
+    "spread": "0.25",
+    "mass_g": "350",
+    "friction": "0.5",
+    "hollow": "0",
+    "taper": "1",
+    "matter": "rigid",
+    "colour": "black",
+    "symmetric": "none",
+    "synonyms": "parasol,sun shade",
+    "source": "estimate",
+}
 
 
 def table_with(**changed: str) -> str:
@@ -109,11 +121,21 @@ def test_what_follows_a_preposition_is_not_the_object(phrase, word):
 @pytest.mark.parametrize(
     ("plural", "word"),
     [
-        ("coke cans", "coke can"), ("green boxes", "box"), ("shoes", "shoe"), ("glasses", "glasses"), ("knives", "knife"),
-        ("batteries", "battery"), ("tomatoes", "tomato"), ("toothbrushes", "toothbrush"), ("dice", "die"), ("pens", "pen"),
-        ("chopstick", "chopsticks"), ("mice", "mouse"), ("loaves", "bread loaf"),
+        ("coke cans", "coke can"),
+        ("green boxes", "box"),
+        ("shoes", "shoe"),
+        ("glasses", "glasses"),
+        ("knives", "knife"),
+        ("batteries", "battery"),
+        ("tomatoes", "tomato"),
+        ("toothbrushes", "toothbrush"),
+        ("dice", "die"),
+        ("pens", "pen"),
+        ("chopstick", "chopsticks"),
+        ("mice", "mouse"),
+        ("loaves", "bread loaf"),
     ],
-)  # fmt: skip
+)
 def test_plurals_are_known(plural, word):
     assert noun_for(plural).word == word
 
@@ -163,10 +185,17 @@ def test_an_estimate_does_not_claim_to_be_precise():
 
 def test_standards_are_quoted_to_the_millimetre():
     sides_mm = {
-        "credit card": (85.6, 54.0), "paper": (297.0, 210.0), "envelope": (220.0, 110.0), "passport": (125.0, 88.0),
-        "aaa battery": (10.5, 44.5), "table tennis ball": (40.0, 40.0), "one euro coin": (23.25, 2.33), "quarter": (24.26, 1.75),
-        "ice hockey puck": (76.2, 25.4), "billiard ball": (57.15, 57.15),
-    }  # fmt: skip
+        "credit card": (85.6, 54.0),
+        "paper": (297.0, 210.0),
+        "envelope": (220.0, 110.0),
+        "passport": (125.0, 88.0),
+        "aaa battery": (10.5, 44.5),
+        "table tennis ball": (40.0, 40.0),
+        "one euro coin": (23.25, 2.33),
+        "quarter": (24.26, 1.75),
+        "ice hockey puck": (76.2, 25.4),
+        "billiard ball": (57.15, 57.15),
+    }
     for word, sides in sides_mm.items():
         size_mm = sorted(1000 * side for side in NOUNS[word].size_m)
         assert all(min(abs(side - s) for s in size_mm) <= 1 for side in sides), word

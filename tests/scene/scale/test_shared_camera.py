@@ -29,13 +29,23 @@ def clips(*widths, **others):
 def scene_from(height_m, pitch_rad, spread=0.1):
     eye = np.array([0.0, 0.0, height_m])
     camera = Camera(
-        width_px=640, height_px=480, K=intrinsics(640, 480, 0.8),
+        width_px=640,
+        height_px=480,
+        K=intrinsics(640, 480, 0.8),
         T_world_cam=look_at(eye, eye + np.array([np.cos(pitch_rad), 0.0, -np.sin(pitch_rad)])),
-    )  # fmt: skip
+    )
     return Scene(
-        title="clip", video="clip.mp4", description="Lifting cup", kind="lift_up", objects=(), camera=camera, fps=12.0, num_frames=40,
-        confidence=0.8, scale_spread=spread,
-    )  # fmt: skip
+        title="clip",
+        video="clip.mp4",
+        description="Lifting cup",
+        kind="lift_up",
+        objects=(),
+        camera=camera,
+        fps=12.0,
+        num_frames=40,
+        confidence=0.8,
+        scale_spread=spread,
+    )
 
 
 def test_clips_that_agree_give_the_camera_that_each_says():
@@ -103,9 +113,16 @@ class Filmings:
         settings = {"camera_height_m": None, "pitch_rad": None, "fov_rad": None, **(given or {})}
         argv = ["v2p", "scene", "my videos", "--out", str(self.root), "--seed", "3"]
         record = Record(
-            stage="scene", item=item, version=1, fingerprint=fingerprint, inputs={}, seconds=1.0, rejected=rejected,
-            recipe={"config": {"scene": settings}}, provenance={"time": time, "argv": argv},
-        )  # fmt: skip
+            stage="scene",
+            item=item,
+            version=1,
+            fingerprint=fingerprint,
+            inputs={},
+            seconds=1.0,
+            rejected=rejected,
+            recipe={"config": {"scene": settings}},
+            provenance={"time": time, "argv": argv},
+        )
         write_record(folder, record)
 
     def said(self, capsys, *words):
@@ -134,8 +151,11 @@ def test_the_command_that_comes_next_is_the_one_that_made_the_run_with_the_camer
     assert code == 0
     assert after[:7] == ["v2p", "scene", "my videos", "--out", str(filmings.root), "--seed", "3"]
     assert [word.split("=")[0] for word in after[7:]] == [
-        "--scene.camera-height-m", "--scene.pitch-rad", "--scene.fov-rad", "--scene.camera-spread",
-    ]  # fmt: skip
+        "--scene.camera-height-m",
+        "--scene.pitch-rad",
+        "--scene.fov-rad",
+        "--scene.camera-spread",
+    ]
     assert height_in(said.out) == pytest.approx(0.5, abs=0.001)
     assert re.search(r"one +\+10%", said.out)
     assert re.search(r"two +-9%", said.out)

@@ -15,7 +15,10 @@ SECRET = "sk-test-0123456789abcdef"
 
 
 class ChatServer:
-    """Answers requests from `script`, one entry each, and then from `otherwise`; an entry is a reply or takes the request."""
+    """Answers requests from `script`, one entry each, and then from `otherwise`.
+
+    An entry is a reply or takes the request.
+    """
 
     def __init__(self):
         self.script = []

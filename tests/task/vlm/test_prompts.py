@@ -71,7 +71,8 @@ def test_the_pool_starts_with_two_tasks_and_grows_with_every_solved_one(tmp_path
         add_solved(pool, load_benchmark(name), 0.8)
     shown = examples_for(new, read_pool(pool), 2)
 
-    # Covering carries one of two things, as inserting does; sliding has two things. The task itself is not its own example.
+    # Covering carries one of two things, as inserting does; sliding has two things. The task
+    # itself is not its own example.
     assert [e.source for e in shown] == ["built in", "built in", "slide_to", "cover"]
     assert shown[-1].code == load_benchmark("cover").code
     assert not [p for p in pool.rglob("*") if p.suffix not in ("", ".json", ".py")]

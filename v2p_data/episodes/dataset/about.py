@@ -17,11 +17,20 @@ CARRIED_TASKS = Path("v2p/tasks")
 """Of a dataset: the tasks that its episodes were made in, a folder each."""
 TASK_PARTS = ("task.json", "task.py", "scene/scene.json")
 _KINDS: dict[str, type] = {
-    "repo_id": str, "palette": dict, "episodes": list, "provenance": dict,
-}  # fmt: skip
+    "repo_id": str,
+    "palette": dict,
+    "episodes": list,
+    "provenance": dict,
+}
 _KINDS_OF_ENTRY: dict[str, type] = {
-    "id": str, "item": str, "task": str, "seed": int, "length": int, "labels": dict, "params": dict,
-}  # fmt: skip
+    "id": str,
+    "item": str,
+    "task": str,
+    "seed": int,
+    "length": int,
+    "labels": dict,
+    "params": dict,
+}
 
 
 def read_about(root: Path) -> dict[str, Any] | None:
@@ -82,7 +91,8 @@ def _demand_unchanged(root: Path, memory: Path | None) -> None:
         demand_no(changed_files(root, memory), root)
     except UnusableError as error:
         raise V2PError(
-            f"{error}; where another tool changed it on purpose, go on with that tool (lerobot-edit-dataset, lerobot-train)"
+            f"{error}; where another tool changed it on purpose, go on with that tool "
+            "(lerobot-edit-dataset, lerobot-train)"
         ) from error
 
 
@@ -125,22 +135,26 @@ def about_problems(
     entries = about["episodes"]
     if len(entries) != len(lengths):
         yield Problem(
-            check="about", where=METADATA_FILE,
+            check="about",
+            where=METADATA_FILE,
             detail=f"tells of {len(entries)} episodes, the episode table of {len(lengths)}",
-        )  # fmt: skip
+        )
     for k, (entry, words, length) in enumerate(zip(entries, tasks, lengths, strict=False)):
         if (entry["length"], [entry["task"]]) != (length, list(words)):
             yield Problem(
-                check="about", where=f"episode {k}",
-                detail=f"{METADATA_FILE} says {entry['length']} frames of '{entry['task']}', the episode table {length} "
+                check="about",
+                where=f"episode {k}",
+                detail=f"{METADATA_FILE} says {entry['length']} frames of '{entry['task']}', the "
+                f"episode table {length} "
                 f"of '{'; '.join(words)}'",
-            )  # fmt: skip
+            )
         unknown = [label for label in entry["labels"] if label not in about["palette"]]
         if unknown:
             yield Problem(
-                check="about", where=f"episode {k}",
+                check="about",
+                where=f"episode {k}",
                 detail=f"{METADATA_FILE} gives no grey for label {', '.join(unknown)}",
-            )  # fmt: skip
+            )
     if len({e["id"] for e in entries}) != len(entries):
         yield Problem(check="about", where=METADATA_FILE, detail="names an episode twice")
     if about["provenance"].get("items") or (root / CARRIED_TASKS).is_dir():
@@ -148,9 +162,10 @@ def about_problems(
             for part in TASK_PARTS:
                 if not (root / CARRIED_TASKS / item / part).is_file():
                     yield Problem(
-                        check="missing_file", where=str(CARRIED_TASKS / item / part),
+                        check="missing_file",
+                        where=str(CARRIED_TASKS / item / part),
                         detail=f"is missing, and episodes were made in task '{item}'",
-                    )  # fmt: skip
+                    )
 
 
 def _wrong(data: Any, kinds: Mapping[str, type]) -> str | None:

@@ -84,7 +84,8 @@ def dataset_card(
         "simulated task, an expert learned the task, and its successful episodes were recorded under "
         f"randomisation. {len(episodes)} episodes, {info['total_frames']} frames, {seconds:.0f} s at "
         f"{info['fps']} frames a second.",
-        f"[![Look at it in LeRobot's visualiser, once it is on the Hub]({BADGE})]({VISUALISER}{repo_id})\n\nLicense: {LICENSE}.",
+        "[![Look at it in LeRobot's visualiser, once it is on the "
+        f"Hub]({BADGE})]({VISUALISER}{repo_id})\n\nLicense: {LICENSE}.",
         *([f"![Moments of one episode of each task]({SHEET_FILE})"] if has_sheet else []),
         "## Tasks and results",
         _tasks(episodes),
@@ -101,7 +102,8 @@ def dataset_card(
         _palette(about, episodes),
         "## How it was made",
         _making(about),
-        f"<details><summary>What was drawn for the episodes: ranges</summary>\n\n{_randomisation(episodes)}\n\n</details>",
+        "<details><summary>What was drawn for the episodes: "
+        f"ranges</summary>\n\n{_randomisation(episodes)}\n\n</details>",
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -110,7 +112,8 @@ def _head(num_episodes: int) -> str:
     tags = "\n".join(f"- {tag}" for tag in TAGS)
     size = next((s for n, s in SIZES if num_episodes < n), "n>1M")
     return (
-        f"---\nlicense: {LICENSE}\nlanguage:\n- en\nsize_categories:\n- {size}\ntask_categories:\n- robotics\ntags:\n{tags}\n"
+        f"---\nlicense: {LICENSE}\nlanguage:\n- en\nsize_categories:\n- "
+        f"{size}\ntask_categories:\n- robotics\ntags:\n{tags}\n"
         "configs:\n- config_name: default\n  data_files: data/*/*.parquet\n---"
     )
 
@@ -282,7 +285,9 @@ def _making(about: dict[str, Any]) -> str:
             )
             lines.append(f"Put together by `v2p merge` from {parts}.")
         else:
-            lines.append(f"`v2p drop` took {edit['episodes']} episodes out of {edit['source']}: {'; '.join(edit['tasks'])}.")  # fmt: skip
+            lines.append(
+                f"`v2p drop` took {edit['episodes']} episodes out of {edit['source']}: {'; '.join(edit['tasks'])}."
+            )
     if provenance.get("commit"):
         lines.append(f"Commit {provenance['commit']}.")
     if packages:

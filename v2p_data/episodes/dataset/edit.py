@@ -1,7 +1,7 @@
 """Datasets of ours are put together, and tasks or episodes are taken out of them.
 
-What is written is a new dataset, compared frame by frame with what it was made from and then renamed into place. Nothing
-is overwritten.
+What is written is a new dataset, compared frame by frame with what it was made from and then
+renamed into place. Nothing is overwritten.
 """
 
 import shutil

@@ -1,6 +1,7 @@
 """Statistics of an episode, as LeRobot computes them, without looking at every pixel five times, and of all rows.
 
-LeRobot averages the quantiles of episodes, and most rows may lie outside of such averages; those of all rows are taken here.
+LeRobot averages the quantiles of episodes, and most rows may lie outside of such averages; those
+of all rows are taken here.
 
 LeRobot makes a histogram of all pixels' values, which takes most of the time of its `save_episode`. Pictures
 of bytes hold 256 values at most, so counting them once gives the same histogram. Mean and deviation are exact here;
@@ -81,7 +82,7 @@ def rgb_stats(pictures: UInt8[np.ndarray, "time h w 3"]) -> Stats:
 
 
 def _looked_at(images: np.ndarray) -> np.ndarray:
-    """Return the pixels that LeRobot looks at: of long episodes some frames, of large pictures some rows and columns."""
+    """Return the pixels that LeRobot looks at: some frames of long episodes, some rows and columns."""
     from lerobot.datasets.compute_stats import auto_downsample_height_width, sample_indices
 
     chosen = sample_indices(len(images))

@@ -67,7 +67,10 @@ def explain(records: dict[str, Any]) -> list[str]:
 
 
 def differences(first: Path, second: Path) -> list[tuple[str, Any, Any]]:
-    """Return the fields in which two datasets, or two results of a run, differ, with both values; None where one has none."""
+    """Return the fields in which two datasets, or two results of a run, differ, with both values.
+
+    None where one has none.
+    """
     one, two = dict(leaves(records_of(first))), dict(leaves(records_of(second)))
     return [
         (key, one.get(key), two.get(key))

@@ -38,7 +38,8 @@ DEMONSTRATION, HANDOVER = "demonstration", "handover"
 """Where an episode is from, in `METADATA_FILE` of datasets with handovers."""
 METADATA_FILE = "meta/v2p.json"
 EPISODE_COLUMN = "v2p"
-"""Of the table of episodes: the episode's entry in `METADATA_FILE` as JSON. LeRobot's tools leave the file out more often."""
+"""Of the table of episodes: the episode's entry in `METADATA_FILE` as JSON. LeRobot's tools leave
+the file out more often."""
 METADATA_SCHEMA = 1
 """Palette, provenance and drawn parameters; LeRobot ignores it and uploads it."""
 
@@ -72,7 +73,8 @@ class Column:
     meaning: str
     """For the card."""
     where: Literal["everywhere", "handovers", "simulation", "targets"] = "everywhere"
-    """Which datasets have it: all, those with handovers, those of a simulator alone, those whose actions are targets."""
+    """Which datasets have it: all, those with handovers, those of a simulator alone, those whose
+    actions are targets."""
 
     @property
     def feature(self) -> dict[str, Any]:
@@ -93,12 +95,14 @@ COLUMNS = {
     ),
     DONE_KEY: Column(dtype="bool", meaning="true in the last row of an episode"),
     REWARD_KEY: Column(
-        meaning="the task's own shaped reward of what this action led to, 1 is a full one, and 1 more while it succeeds",
+        meaning="the task's own shaped reward of what this action led to, 1 is a full one, and 1 "
+        "more while it succeeds",
         where="simulation",
     ),
     OBJECT_POSE_KEY: Column(
         names=tuple(f"object_{k}.{axis}" for k in range(1, SLOTS + 1) for axis in _POSE),
-        meaning="not for policies: per object the position of its centre [m] and its quaternion wxyz in the robot's base "
+        meaning="not for policies: per object the position of its centre [m] and its quaternion "
+        "wxyz in the robot's base "
         "frame, before the action; object 1 has the label 2; 0 throughout where there is none",
         where="simulation",
     ),
@@ -115,17 +119,20 @@ COLUMNS = {
     ),
     CAMERA_POSE_KEY: Column(
         names=_POSE,
-        meaning="the camera's position [m] and quaternion wxyz in the robot's base frame; OpenCV's axes: x right, y down, "
+        meaning="the camera's position [m] and quaternion wxyz in the robot's base frame; "
+        "OpenCV's axes: x right, y down, "
         "z forward",
         where="simulation",
     ),
     EXECUTED_KEY: Column(
         names=ACTION_NAMES,
-        meaning="not for policies: the step of the tool that was carried out, each in [-1, 1]; of these episodes `action` is a target",
+        meaning="not for policies: the step of the tool that was carried out, each in [-1, 1]; of "
+        "these episodes `action` is a target",
         where="targets",
     ),
 }
-"""All columns but pictures, state and action, in their order. Shapes do not depend on the task, so that datasets go together.
+"""All columns but pictures, state and action, in their order. Shapes do not depend on the task, so
+that datasets go together.
 
 A new column has an entry here and its values in `Rollouts.simulated`, or, without a simulator, in `columns_of`."""
 SIMULATED = tuple(key for key, column in COLUMNS.items() if column.where == "simulation")

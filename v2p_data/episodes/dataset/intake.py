@@ -1,6 +1,7 @@
-"""A dataset that anybody may have made is looked at before LeRobot, pandas or we read its tables: files, sizes, metadata.
+"""A dataset that anybody may have made is checked before its tables are read: files, sizes, metadata.
 
-Format strings, counts and compressed tables of a few bytes can ask for all memory, and a pipe in a file's place never ends.
+Format strings, counts and compressed tables of a few bytes can ask for all memory, and a pipe in a
+file's place never ends.
 """
 
 import os
@@ -240,7 +241,8 @@ def _check_episodes(root: Path) -> None:
             values = column.to_numpy()
             if len(values) and not 0 <= values.min() <= values.max() <= MAX_COUNT:
                 raise V2PError(
-                    f"{path}: '{name}' runs from {values.min()} to {values.max()}, possible are 0 to {MAX_COUNT:,}; {ADVICE}"
+                    f"{path}: '{name}' runs from {values.min()} to {values.max()}, possible are 0 "
+                    f"to {MAX_COUNT:,}; {ADVICE}"
                 )
 
 

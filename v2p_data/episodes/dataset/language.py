@@ -1,7 +1,8 @@
 """What happens in an episode, in words with exact times: LeRobot's language columns, from contacts, poses and states.
 
-LeRobot fills them with a model that looks at the pictures (`lerobot-annotate`); here each word follows from numbers of the
-dataset. Its own validator and writer are used. In directions of the robot's base: forward is +x, left +y, up +z.
+LeRobot fills them with a model that looks at the pictures (`lerobot-annotate`); here each word
+follows from numbers of the dataset. Its own validator and writer are used. In directions of the
+robot's base: forward is +x, left +y, up +z.
 """
 
 import json
@@ -28,9 +29,17 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform_from_pose
 
 ASKED = (
-    "{}", "please {}", "{}, please", "can you {}?", "could you {}?", "I want you to {}", "now {}",
-    "go ahead and {}", "your task is to {}", "the robot should {}",
-)  # fmt: skip
+    "{}",
+    "please {}",
+    "{}, please",
+    "can you {}?",
+    "could you {}?",
+    "I want you to {}",
+    "now {}",
+    "go ahead and {}",
+    "your task is to {}",
+    "the robot should {}",
+)
 LOSE_E = ("close", "move", "place", "poke", "raise", "remove", "shove", "slide", "take")
 """Verbs whose last letter is lost before -ing."""
 WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))
@@ -130,7 +139,8 @@ def write_language(root: Path, about: Mapping[str, Any] | None) -> None:
     info = read_info(root)
     if about is None or CONTACT_KEY not in info["features"]:
         raise V2PError(
-            f"{INFO_FILE} names no column {CONTACT_KEY}, from which the words' times follow; only episodes that this version "
+            f"{INFO_FILE} names no column {CONTACT_KEY}, from which the words' times follow; only "
+            "episodes that this version "
             "of v2p simulated have it, so leave out --language or collect them anew with 'v2p episodes'"
         )
     records = list(iter_episodes(root))
@@ -189,11 +199,17 @@ def _rows(
             point = {"label": name, "point_format": "xy", "point": seen(places[row : row + 1])[0]}
             trace = {"label": "gripper", "point_format": "xy", "points": seen(state[row:end, :3])}
             events += [
-                {"role": role, "content": content, "style": style, "timestamp": times[row], "camera": camera}
+                {
+                    "role": role,
+                    "content": content,
+                    "style": style,
+                    "timestamp": times[row],
+                    "camera": camera,
+                }
                 for role, style, content in (
                     ("user", "vqa", f"Where is the {name}?"),
                     ("assistant", "vqa", json.dumps(point)),
                     ("assistant", "trace", json.dumps(trace)),
                 )
-            ]  # fmt: skip
+            ]
     return persistent, events

@@ -107,7 +107,13 @@ def layout_problems(root: Path, info: dict[str, Any]) -> list[Problem]:
     try:
         return _layout_problems(root, info)
     except READING_ERRORS as error:
-        return [Problem(check="unreadable_file", where="meta and data", detail=f"cannot be read ({_words(error)})")]  # fmt: skip
+        return [
+            Problem(
+                check="unreadable_file",
+                where="meta and data",
+                detail=f"cannot be read ({_words(error)})",
+            )
+        ]
 
 
 def _layout_problems(root: Path, info: dict[str, Any]) -> list[Problem]:
@@ -159,9 +165,10 @@ def _unreadable(root: Path) -> Iterator[Problem]:
         except (pa.ArrowException, OSError) as error:
             words = str(error).splitlines()[0][:150]
             yield Problem(
-                check="unreadable_file", where=_name(root, path),
+                check="unreadable_file",
+                where=_name(root, path),
                 detail=f"is no whole parquet file ({words}); its writer was killed or the copy was cut",
-            )  # fmt: skip
+            )
     if json_or_none(root / STATS_FILE) is None:
         yield Problem(check="unreadable_file", where=STATS_FILE, detail="is no JSON")
 
@@ -180,8 +187,10 @@ def _missing_parts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iter
         return
     files = {
         data_path(info, int(c), int(f))
-        for c, f in zip(column(episodes, "data/chunk_index"), column(episodes, "data/file_index"), strict=True)
-    }  # fmt: skip
+        for c, f in zip(
+            column(episodes, "data/chunk_index"), column(episodes, "data/file_index"), strict=True
+        )
+    }
     for key in camera_keys(info, "video"):
         pairs = zip(
             column(episodes, f"videos/{key}/chunk_index"),
@@ -225,9 +234,10 @@ def _counts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Pr
     true = len(lengths), int(lengths.sum())
     if noted != true:
         yield Problem(
-            check="counts", where=INFO_FILE,
+            check="counts",
+            where=INFO_FILE,
             detail=f"names {noted} episodes and frames, the episode table {true}",
-        )  # fmt: skip
+        )
     rows = sum(pq.read_metadata(path).num_rows for path in sorted(root.glob(DATA_GLOB)))
     if rows != true[1]:
         yield Problem(
@@ -236,33 +246,38 @@ def _counts(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Pr
     tasks = tasks_of(root)
     if int(info.get("total_tasks", len(tasks))) != len(tasks):
         yield Problem(
-            check="counts", where=INFO_FILE,
+            check="counts",
+            where=INFO_FILE,
             detail=f"names {info['total_tasks']} tasks, {TASKS_FILE} holds {len(tasks)}",
-        )  # fmt: skip
+        )
     numbers = column(pq.read_table(root / TASKS_FILE), "task_index")
     if not np.array_equal(numbers, np.arange(len(numbers))):
         yield Problem(
-            check="index", where=TASKS_FILE,
+            check="index",
+            where=TASKS_FILE,
             detail="tasks are not in the order of their numbers, so LeRobot takes one for another",
-        )  # fmt: skip
+        )
 
 
 def _episode_order(episodes: pa.Table) -> Iterator[Problem]:
     numbers = column(episodes, "episode_index")
     if not np.array_equal(numbers, np.arange(len(numbers))):
         yield Problem(
-            check="index", where="meta/episodes",
+            check="index",
+            where="meta/episodes",
             detail="episode numbers have a gap or are out of order; LeRobot finds episodes by position "
             "and takes one for another",
-        )  # fmt: skip
+        )
     ends = np.cumsum(column(episodes, "length"))
     starts = column(episodes, "dataset_from_index"), column(episodes, "dataset_to_index")
     wrong = np.flatnonzero((starts[1] != ends) | (starts[0] != ends - column(episodes, "length")))
     if len(wrong):
         yield Problem(
-            check="index", where=f"episode {wrong[0]}",
-            detail=f"its rows are noted as {starts[0][wrong[0]]} to {starts[1][wrong[0]]}, which its place and length contradict",
-        )  # fmt: skip
+            check="index",
+            where=f"episode {wrong[0]}",
+            detail=f"its rows are noted as {starts[0][wrong[0]]} to {starts[1][wrong[0]]}, which "
+            "its place and length contradict",
+        )
 
 
 def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
@@ -283,7 +298,9 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Prob
             yield Problem(
                 check="task", where=name, detail=f"names task {tasks.max()} of {num_tasks}"
             )
-        for number, rows in zip(*np.unique(column(table, "episode_index"), return_counts=True), strict=True):  # fmt: skip
+        for number, rows in zip(
+            *np.unique(column(table, "episode_index"), return_counts=True), strict=True
+        ):
             where_is.setdefault(int(number), set()).add(name)
             counted[int(number)] = counted.get(int(number), 0) + int(rows)
     for k, length in enumerate(column(episodes, "length")):
@@ -297,14 +314,17 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Prob
             )
     named = [
         data_path(info, int(c), int(f))
-        for c, f in zip(column(episodes, "data/chunk_index"), column(episodes, "data/file_index"), strict=True)
-    ]  # fmt: skip
+        for c, f in zip(
+            column(episodes, "data/chunk_index"), column(episodes, "data/file_index"), strict=True
+        )
+    ]
     for k, name in enumerate(named):
         if where_is.get(k, {name}) != {name}:
             yield Problem(
-                check="index", where=f"episode {k}",
+                check="index",
+                where=f"episode {k}",
                 detail=f"is noted in {name} and lies in {', '.join(sorted(where_is[k]))}",
-            )  # fmt: skip
+            )
 
 
 def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
@@ -317,9 +337,10 @@ def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
         wrong = np.flatnonzero(np.abs(end - start - seconds) > FRAME_SLACK / fps)
         for k in wrong:
             yield Problem(
-                check="video_times", where=f"episode {k}",
+                check="video_times",
+                where=f"episode {k}",
                 detail=f"{key}: {end[k] - start[k]:.3f} s of video for {seconds[k]:.3f} s of rows",
-            )  # fmt: skip
+            )
         files = np.stack(
             [column(episodes, f"videos/{key}/{p}_index") for p in ("chunk", "file")], axis=1
         )
@@ -327,9 +348,10 @@ def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:
         for a, b in itertools.pairwise(order):
             if (files[a] == files[b]).all() and start[b] < end[a] - FRAME_SLACK / fps:
                 yield Problem(
-                    check="video_times", where=f"episode {b}",
+                    check="video_times",
+                    where=f"episode {b}",
                     detail=f"{key}: begins in the video before episode {a} ends there",
-                )  # fmt: skip
+                )
 
 
 def _video_sizes(root: Path, info: dict[str, Any]) -> Iterator[Problem]:
@@ -344,9 +366,10 @@ def _video_sizes(root: Path, info: dict[str, Any]) -> Iterator[Problem]:
                 size = video.streams.video[0].height, video.streams.video[0].width
             if size not in (shape[:2], shape[1:]):
                 yield Problem(
-                    check="video_size", where=_name(root, path),
+                    check="video_size",
+                    where=_name(root, path),
                     detail=f"has pictures of {size[1]} x {size[0]} px, {INFO_FILE} names {shape}",
-                )  # fmt: skip
+                )
 
 
 def _words(error: Exception) -> str:

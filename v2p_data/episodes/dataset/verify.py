@@ -165,7 +165,8 @@ def _check_episode(
 def difference_of_frames(root: Path, sources: Sequence[tuple[Path, Sequence[int]]]) -> str:
     """Return how the dataset at `root` differs from episodes of other datasets, frame by frame.
 
-    Of a source without the column that says who acted the expert did throughout. One without words says nothing of them.
+    Of a source without the column that says who acted the expert did throughout. One without words
+    says nothing of them.
 
     Args:
         root: the dataset; its episodes are those of `sources`, in order.

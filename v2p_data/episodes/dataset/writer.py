@@ -1,8 +1,9 @@
 """Staged episodes become one LeRobot dataset.
 
-The video is encoded first (`shards`) and put into files; then the tables, by LeRobot's own functions for metadata and statistics. The
-dataset grows in `<root>.partial`, is checked, and is renamed into place at the end, so that what lies at `root` is
-finished. The same episodes give the same bytes, after any number of kills, with any number of threads.
+The video is encoded first (`shards`) and put into files; then the tables, by LeRobot's own
+functions for metadata and statistics. The dataset grows in `<root>.partial`, is checked, and is
+renamed into place at the end, so that what lies at `root` is finished. The same episodes give the
+same bytes, after any number of kills, with any number of threads.
 """
 
 import hashlib
@@ -70,7 +71,8 @@ ALIKE = {
     "actions": ("actions of {}", "--episodes.actions and one arm"),
     "num_states": ("states of {} numbers", "--episodes.joint-state and one arm"),
 }
-"""Fields of `Heading` that are the same in all episodes of a dataset -> what they say, and the options that decide it."""
+"""Fields of `Heading` that are the same in all episodes of a dataset -> what they say, and the
+options that decide it."""
 
 
 def pack(
@@ -111,8 +113,12 @@ def pack(
         partial.mkdir(parents=True, exist_ok=True)
         on_progress(0.0, "starting LeRobot")
         shards = plan_shards(headings)
-        make_shards(shards, partial / "shards", num_threads=num_threads,
-                    on_progress=lambda share, words: on_progress(0.9 * share, words))  # fmt: skip
+        make_shards(
+            shards,
+            partial / "shards",
+            num_threads=num_threads,
+            on_progress=lambda share, words: on_progress(0.9 * share, words),
+        )
         growing = partial / "dataset"
         shutil.rmtree(growing, ignore_errors=True)
         on_progress(0.9, "writing the tables")
@@ -169,7 +175,8 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
             mine, theirs = (getattr(h, name) or ACTION_NAMES for h in (heading, first))
             if mine != theirs:
                 raise V2PError(
-                    f"{heading.path} has {what.format(mine)}, the first episode {what.format(theirs)}; collect all episodes "
+                    f"{heading.path} has {what.format(mine)}, the first episode "
+                    f"{what.format(theirs)}; collect all episodes "
                     f"with one {options}"
                 )
         if heading.num_frames < 2:

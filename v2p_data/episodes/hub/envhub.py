@@ -1,7 +1,8 @@
 """Reconstructed tasks as a repository that LeRobot loads by its name (EnvHub).
 
-The repository holds `env.py` with `make_env(n_envs, use_async_envs)`, the tasks with their scenes and code, a
-model in MJCF of each, and this engine's source, so that nothing of ours must be installed. LeRobot fetches `env.py` alone; it fetches the rest, at the same commit.
+The repository holds `env.py` with `make_env(n_envs, use_async_envs)`, the tasks with their scenes
+and code, a model in MJCF of each, and this engine's source, so that nothing of ours must be
+installed. LeRobot fetches `env.py` alone; it fetches the rest, at the same commit.
 """
 
 import importlib.metadata
@@ -95,7 +96,7 @@ def _copy_task(bundle: TaskBundle, into: Path) -> None:
 
 
 def _not_source(folder: str, names: list[str]) -> list[str]:
-    """Return what of a folder of this engine is neither a folder nor Python: networks and pages, which no task takes."""
+    """Return the entries of a folder that are neither folders nor Python: networks and pages."""
     return [
         n
         for n in names
@@ -104,7 +105,7 @@ def _not_source(folder: str, names: list[str]) -> list[str]:
 
 
 def requirements() -> list[str]:
-    """Return what this engine needs without its extras, MuJoCo in the version that runs here: others make other physics."""
+    """Return what this engine needs without extras, with the exact version of MuJoCo that runs here."""
     lines = [line for line in importlib.metadata.requires(DISTRIBUTION) or [] if ";" not in line]
     others = [line for line in lines if not re.match(r"mujoco\b", line)]
     return sorted([*others, f"mujoco=={importlib.metadata.version('mujoco')}"])

@@ -260,7 +260,8 @@ def _push(upload: _Upload, repo_id: str, *, private: bool, waits_s: Sequence[flo
         visibility = "private" if info.private else "gated" if info.gated else "public"
         if private and not info.private:
             raise V2PError(
-                f"'{repo_id}' exists and is {visibility}, so what is pushed there can be seen; nothing was sent. Make it "
+                f"'{repo_id}' exists and is {visibility}, so what is pushed there can be seen; "
+                "nothing was sent. Make it "
                 f"private at {url}/settings, or choose another --repo-id"
             )
         there = set(api.list_repo_files(repo_id, repo_type=repo_type)) - {

@@ -120,11 +120,15 @@ def note_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     _, end, after = rest.partition(END)
     if not begin or not end:
         return
-    lines = ["| task | in training | success, 95 % interval | at the end | episodes |", "|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        "| task | in training | success, 95 % interval | at the end | episodes |",
+        "|---|---|---|---|---|",
+    ]
     for row in rows:
         at_end = f"{row['at_end']['rate']:.0%}" if row.get("at_end") else ""
         lines.append(
-            f"| {row['task']} | {'yes' if row['seen'] else 'no'} | {row['rate']:.0%} ({row['low']:.0%} to {row['high']:.0%}) |"
+            f"| {row['task']} | {'yes' if row['seen'] else 'no'} | {row['rate']:.0%} "
+            f"({row['low']:.0%} to {row['high']:.0%}) |"
             f" {at_end} | {row['trials']} |"
         )
     results = "\n".join(lines)

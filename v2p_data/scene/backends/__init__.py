@@ -8,7 +8,9 @@ environment of its own answered (`worker`: meshes, poses, and any of the former)
 worker's request and result, in a temporary folder. Only `config` may be imported lightly: the others load torch and
 transformers when they are called, not before. Default checkpoints, licences and memory are in `docs/backends.md`.
 
-Reading order: config, checkpoint (how a model is loaded), detect, segment, depth, worker, pinned_packages (how what is set up beside
-ours is installed), hands_setup (the environment of the hands worker), hands_worker (that worker; it runs there and imports
-nothing of ours), outlines (prompts and masks), mobile_sam_setup (its weights), mobile_sam, tiny_vit (its encoder).
+Reading order: config, checkpoint (how a model is loaded), detect, segment, depth, worker,
+    pinned_packages (how what is set up beside
+ours is installed), hands_setup (the environment of the hands worker), hands_worker (that worker;
+it runs there and imports nothing of ours), outlines (prompts and masks), mobile_sam_setup (its
+weights), mobile_sam, tiny_vit (its encoder).
 """

@@ -110,7 +110,8 @@ class HandsConfig:
     """Who finds hands and their landmarks, which say what a hand takes, carries and puts down."""
 
     backend: HandsBackend = "auto"
-    """`mediapipe` needs 'v2p setup hands' once; `auto` takes it where that was done; `worker` asks a process of yours."""
+    """`mediapipe` needs 'v2p setup hands' once; `auto` takes it where that was done; `worker` asks
+    a process of yours."""
     worker: str = ""
     """Command line of a worker (`docs/workers.md`); with `backend=worker` only."""
     worker_timeout_s: float = 600.0

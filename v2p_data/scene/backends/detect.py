@@ -40,7 +40,9 @@ def detect(
     phrases: Sequence[str],
     cfg: GroundConfig,
 ) -> list[list[list[Detection]]]:
-    """Return per picture, per phrase, the boxes that show it; the first is the phrase's own, then by score. All pictures have one size.
+    """Return per picture, per phrase, the boxes that show it; the first is the phrase's own, then by score.
+
+    All pictures have one size.
 
     The rest are alternatives that no other phrase was given. A phrase that the model finds nowhere has none.
 
@@ -74,8 +76,13 @@ def assign(
     for a phrase. The things go to the phrases such that the sum of scores is largest.
     """
     things = _things(boxes_xyxy, scores.max(1, initial=0.0), max_overlap)
-    best = np.array([[max(things[t], key=lambda i: scores[i, p]) for t in range(len(things))]
-                     for p in range(len(phrases))], int).reshape(len(phrases), len(things))  # fmt: skip
+    best = np.array(
+        [
+            [max(things[t], key=lambda i: scores[i, p]) for t in range(len(things))]
+            for p in range(len(phrases))
+        ],
+        int,
+    ).reshape(len(phrases), len(things))
     value = np.take_along_axis(scores.T, best, axis=1) if len(things) else np.zeros(best.shape)
     rows, columns = linear_sum_assignment(-value)
     own = {int(p): int(t) for p, t in zip(rows, columns, strict=True) if value[p, t] > 0}

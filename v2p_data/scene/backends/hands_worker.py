@@ -2,8 +2,9 @@
 
     python hands_worker.py --request DIR --result DIR
 
-It answers requests of kind `hands` (`docs/workers.md`). The models come with MediaPipe's wheel, and nothing is downloaded.
-`v2p setup hands` makes the environment. This file imports nothing of `v2p_data`, which is not installed there.
+It answers requests of kind `hands` (`docs/workers.md`). The models come with MediaPipe's wheel,
+and nothing is downloaded. `v2p setup hands` makes the environment. This file imports nothing of
+`v2p_data`, which is not installed there.
 """
 
 import argparse

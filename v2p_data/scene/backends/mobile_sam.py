@@ -26,8 +26,16 @@ from v2p_data.scene.backends.tiny_vit import SIDE_PX, TinyViT
 _MEAN, _SD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 """Mean and standard deviation of red, green and blue in the checkpoint's training pictures."""
 _UNREADABLE = (
-    OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, RuntimeError, UnpicklingError, SafetensorError,
-)  # fmt: skip
+    OSError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    KeyError,
+    EOFError,
+    RuntimeError,
+    UnpicklingError,
+    SafetensorError,
+)
 """What files that are cut off or hold something else end with."""
 _ON, _OFF = 1, 0
 """The decoder's labels of points."""
@@ -48,7 +56,8 @@ class MobileSam:
             from transformers import SamConfig, SamModel
         except ImportError:
             raise V2PError(
-                "MobileSAM needs transformers, which is not installed; install it with 'pip install lerobot_policy_v2p[learned]' "
+                "MobileSAM needs transformers, which is not installed; install it with 'pip "
+                "install lerobot_policy_v2p[learned]' "
                 "or give --scene.outline.backend=none"
             ) from None
         config: Any = SamConfig()
@@ -62,7 +71,8 @@ class MobileSam:
             decoder.load_state_dict(theirs)
         except _UNREADABLE as error:
             raise V2PError(
-                f"{weights} does not hold MobileSAM's weights ({type(error).__name__}); if setup wrote it, delete it and run "
+                f"{weights} does not hold MobileSAM's weights ({type(error).__name__}); if setup "
+                "wrote it, delete it and run "
                 "'v2p setup outlines', else name another file with --scene.outline.weights"
             ) from error
         self._encoder = encoder.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -96,7 +106,8 @@ class MobileSam:
         scale = SIDE_PX / max(h, w)
         logits = np.empty((len(prompts), 3, h, w), np.float32)
         ious = np.empty((len(prompts), 3), np.float32)
-        # Points that fill up shorter prompts would change the answer: the decoder does not leave them out of its attention.
+        # Points that fill up shorter prompts would change the answer: the decoder does
+        # not leave them out of its attention.
         for alike in _alike(prompts):
             inputs = _inputs([prompts[k] for k in alike], scale)
             out = self._decoder(image_embeddings=picture.features, multimask_output=True, **inputs)

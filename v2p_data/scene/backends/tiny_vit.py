@@ -32,9 +32,11 @@ class TinyViT(nn.Module):
         stages = [_Stage(k) for k in range(len(_WIDTHS))]
         self.layers = nn.ModuleList(stages)
         self.neck = nn.Sequential(
-            nn.Conv2d(_WIDTHS[-1], _FEATURES, 1, bias=False), _PlaneNorm(_FEATURES),
-            nn.Conv2d(_FEATURES, _FEATURES, 3, padding=1, bias=False), _PlaneNorm(_FEATURES),
-        )  # fmt: skip
+            nn.Conv2d(_WIDTHS[-1], _FEATURES, 1, bias=False),
+            _PlaneNorm(_FEATURES),
+            nn.Conv2d(_FEATURES, _FEATURES, 3, padding=1, bias=False),
+            _PlaneNorm(_FEATURES),
+        )
 
     def forward(self, x: Float[torch.Tensor, "n 3 h w"]) -> Float[torch.Tensor, "n 256 64 64"]:
         """Return the features of normalised pictures of `SIDE_PX`."""
@@ -101,8 +103,12 @@ class _Block(nn.Module):
         self.attn = _WindowAttention(width, heads, window)
         self.local_conv = _conv_bn(width, width, 3, groups=width)
         self.mlp = nn.ModuleDict(
-            {"norm": nn.LayerNorm(width), "fc1": nn.Linear(width, 4 * width), "fc2": nn.Linear(4 * width, width)}
-        )  # fmt: skip
+            {
+                "norm": nn.LayerNorm(width),
+                "fc1": nn.Linear(width, 4 * width),
+                "fc2": nn.Linear(4 * width, width),
+            }
+        )
 
     def forward(self, x: Float[torch.Tensor, "n c h w"]) -> Float[torch.Tensor, "n c h w"]:
         n, c, h, w = x.shape

@@ -1,10 +1,11 @@
 """A model in an environment of its own answers a request: a separate process, one folder in, one folder out.
 
 This is for what has no class in transformers: InstantMesh or TripoSR (mesh), MoGe or UniDepth (depth), FoundationPose
-(pose). `docs/workers.md` is the contract; `scripts/example_worker.py` keeps it. Nothing that comes back is trusted: only
-three fixed file names are opened, no pickle, no link, nothing above a size; every array is checked for name, type, shape,
-finiteness and range; a mesh that is not watertight is repaired. The process runs with the user's rights all the same:
-a worker is a program you chose to run.
+(pose). `docs/workers.md` is the contract; `scripts/example_worker.py` keeps it. Nothing that comes
+back is trusted: only three fixed file names are opened, no pickle, no link, nothing above a size;
+every array is checked for name, type, shape, finiteness and range; a mesh that is not watertight
+is repaired. The process runs with the user's rights all the same: a worker is a program you chose
+to run.
 """
 
 import json
@@ -201,8 +202,13 @@ def run_worker(
         answer.mkdir()
         _write_request(request, given)
         log = Path(folder, "log.txt")
-        code = _run([*words, "--request", str(given), "--result", str(answer)], answer, log,
-                    timeout_s, max_bytes)  # fmt: skip
+        code = _run(
+            [*words, "--request", str(given), "--result", str(answer)],
+            answer,
+            log,
+            timeout_s,
+            max_bytes,
+        )
         if code == EXIT_REFUSED:
             said = _read_json(answer / "result.json").get("message") or "it gave no reason"
             said = " ".join(str(said)[:500].split())
@@ -226,9 +232,13 @@ def _run(words: list[str], answer: Path, log: Path, timeout_s: float, max_bytes:
         )
     with log.open("wb") as out:
         process = subprocess.Popen(
-            ending_with_us(words), stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, env=env,
+            ending_with_us(words),
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            env=env,
             start_new_session=True,
-        )  # fmt: skip
+        )
         try:
             end = time.monotonic() + timeout_s
             while True:

@@ -1,6 +1,7 @@
 """Mask tracks become a camera, sizes and poses, in camera heights: the camera stands 1 above the table.
 
-Comes in: an `ObjectTrack` per object, and a guess of the camera. Goes out: a `Placement` with the camera and a `PlacedObject` per object.
+Comes in: an `ObjectTrack` per object, and a guess of the camera. Goes out: a `Placement` with the
+    camera and a `PlacedObject` per object.
 
 Reading order:
     placement       the order of the steps

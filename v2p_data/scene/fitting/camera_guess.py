@@ -29,7 +29,8 @@ def camera_guess(seen: SeenCamera, cfg: SceneConfig) -> CameraGuess:
 def with_measured_camera(guess: CameraGuess, cfg: SceneConfig) -> CameraGuess:
     """Return a guess of the camera with what the user measured in place of what was guessed.
 
-    How large things are that one sees follows from the height together with pitch and focal length: where these are guessed,
+    How large things are that one sees follows from the height together with pitch and focal
+        length: where these are guessed,
     a measured height says no more than they do.
     """
     spread = cfg.camera_spread

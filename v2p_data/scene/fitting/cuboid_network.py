@@ -1,8 +1,9 @@
 """How a box is turned and how its sides compare, by what it looks like: outlines hardly tell a cube's yaw.
 
-A small network looks at one box as a camera would see it that stands at the same place and looks straight at it, and says
-which way its sides run along the table, which of them is longer, and how high it is. It was trained on rendered boxes only
-(`scripts/train_box_network.py`); its weights lie beside this file.
+A small network looks at one box as a camera would see it that stands at the same place and looks
+straight at it, and says which way its sides run along the table, which of them is longer, and how
+high it is. It was trained on rendered boxes only (`scripts/train_box_network.py`); its weights lie
+beside this file.
 """
 
 import math
@@ -97,7 +98,7 @@ class CuboidNetwork(Encoder):
     def forward(
         self, planes: Float[torch.Tensor, "n 6 h w"], known: Float[torch.Tensor, "n 2"]
     ) -> Float[torch.Tensor, "n 7"]:
-        """Return `fourfold`, `twofold` and the logarithm of its deviation, `height` and the logarithm of its, as in `CuboidGuess`.
+        """Return `fourfold`, `twofold`, `height` and the logarithms of deviations, as in `CuboidGuess`.
 
         `known` is how far the line of sight points below the horizon [rad], and the logarithm of the outline's extent.
         """

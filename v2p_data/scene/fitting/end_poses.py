@@ -21,7 +21,8 @@ UNSEEN_IOU = 0.35
 _LYING_TELLS = 0.1
 """IoU by which lying on the table at first must fit a lid better than lying on what it covered."""
 _HELD_TELLS = 0.1
-"""IoU by which a pose in the air must fit better than one on the table, where the clip may end before it is put down."""
+"""IoU by which a pose in the air must fit better than one on the table, where the clip may end
+before it is put down."""
 _UPRIGHT_TELLS = 0.1
 """IoU by which a cover must fit better with its mouth up, once it is put down."""
 
@@ -45,9 +46,10 @@ class EndPoses:
 def fit_both_ends(
     see: ObjectView, plan: FitPlan, camera: Camera, support: float, within: Within | None
 ) -> EndPoses:
-    """Return the pair of poses that costs least: one outline often fits a standing and a lying box alike, both ends seldom do.
+    """Return the pair of poses that costs least; both ends together seldom fit a wrong pose.
 
-    The last pose is `support` above the table [camera heights], over the disc `within`. Of what is brought there is the last outline alone.
+    The last pose is `support` above the table [camera heights], over the disc `within`. Of what is
+    brought there is the last outline alone.
     """
     options = fits_at_first(see, camera)
     if see.s.brought:

@@ -1,9 +1,10 @@
 """A hand as a ruler: how large it looks where it touches an object on the table says how high the camera stands.
 
-Hands differ by a few percent, household things by far more. How far away a hand is, one view does not show, but it shows
-where a hand touches a thing at rest: as far as the thing's foot. There a small network looks at the hand alone, in a window
-that is 28 cm wide if the camera stands as high as guessed, and says how much too large or too small that window is. It
-was trained on rendered hands only (`scripts/train_hand_ruler.py`); its weights lie beside this file.
+Hands differ by a few percent, household things by far more. How far away a hand is, one view does
+not show, but it shows where a hand touches a thing at rest: as far as the thing's foot. There a
+small network looks at the hand alone, in a window that is 28 cm wide if the camera stands as high
+as guessed, and says how much too large or too small that window is. It was trained on rendered
+hands only (`scripts/train_hand_ruler.py`); its weights lie beside this file.
 """
 
 from dataclasses import dataclass
@@ -50,8 +51,8 @@ class HandView:
     planes: Float32[np.ndarray, "4 112 112"]
     """Its colours, nothing of its surroundings, and its outline."""
     known: Float32[np.ndarray, "4"]
-    """Camera's pitch [rad], how far the thing's foot lies under the picture's middle [picture widths], and where the foot is
-    from the hand's end, (right, down) [windows]."""
+    """Camera's pitch [rad], how far the thing's foot lies under the picture's middle [picture
+    widths], and where the foot is from the hand's end, (right, down) [windows]."""
 
 
 class HandScaleNetwork(Encoder):

@@ -45,7 +45,10 @@ class ObjectView:
 def object_view(
     working: WorkingClip, objects: tuple[ObjectTrack, ...], s: ObjectTrack, plan: FitPlan
 ) -> ObjectView:
-    """Return one of the objects as it is seen at both ends; the first of them is the manipulated one, which has the plan."""
+    """Return one of the objects as it is seen at both ends.
+
+    The first of them is the manipulated one, which has the plan.
+    """
     thing = objects[0]
     hidden = hidden_around(working, objects, s.first, s.at) | other_objects(objects, s, s.at)
     last_i, last_mask = end_of(s, plan)
@@ -99,7 +102,7 @@ def round_body(
 def hidden_around(
     working: WorkingClip, objects: tuple[ObjectTrack, ...], mask: Bool[np.ndarray, "h w"], i: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Return pixels near a mask of frame `i` that say nothing: what passes there (the hand, a shadow) may hide the object.
+    """Return pixels near a mask of frame `i` where the hand or a shadow may hide the object.
 
     What passes differs from the still of the other end, except where that shows what has moved.
     """

@@ -17,7 +17,8 @@ class FitPlan:
     slides: bool = False
     """The object keeps its height all the way."""
     may_end_held: bool = False
-    """The clip may end before the object is put down: then it is fitted in the air where that covers its outline better."""
+    """The clip may end before the object is put down: then it is fitted in the air where that
+    covers its outline better."""
     may_be_hidden: bool = False
     """The goal may hide the object at the end: then it is taken to lie in the goal's middle."""
     starts_on_other: bool = False

@@ -1,7 +1,8 @@
-"""The last pose once more, with the object's own mesh: which way a handle or a beak points, no box and no cylinder tells.
+"""The last pose once more, with the object's own mesh, which tells where a handle or a beak points.
 
-Places and turns come from the fit of a primitive (`placement.py`); the mesh was made from the first outline (`shapes/shape.py`).
-How well it covers the last one says, too, whether both show the same object.
+Places and turns come from the fit of a primitive (`placement.py`); the mesh was made from the
+first outline (`shapes/shape.py`). How well it covers the last one says, too, whether both show the
+same object.
 """
 
 from dataclasses import dataclass

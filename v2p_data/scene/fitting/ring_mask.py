@@ -1,4 +1,7 @@
-"""The hole of a ring is cut out of its masks. Outlines are fitted whole; the hole follows once the ring's pose is known."""
+"""The hole of a ring is cut out of its masks. Outlines are fitted whole.
+
+The hole follows once the ring's pose is known.
+"""
 
 import cv2
 import numpy as np
@@ -12,7 +15,8 @@ from v2p_data.scene.frames.mask_ops import iou
 _AROUND = 32
 """Number of points on a rim."""
 _LIES_THERE = 0.6
-"""IoU of the posed ring with the mask, below which the pose does not tell where the hole is: in a hand a ring is tilted."""
+"""IoU of the posed ring with the mask, below which the pose does not tell where the hole is: in a
+hand a ring is tilted."""
 
 
 def without_hole(
@@ -43,7 +47,10 @@ def seen_through(
     T_world_obj: Float[np.ndarray, "4 4"],
     camera: Camera,
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels in which the camera looks through a ring: within both of its inner rims. Arguments as of `without_hole`."""
+    """Return the pixels in which the camera looks through a ring: within both of its inner rims.
+
+    Arguments as of `without_hole`.
+    """
     below, above = (_hull(rim, camera) for rim in _rims(size_m, bore, T_world_obj))
     return below & above
 
@@ -61,7 +68,10 @@ def _rims(
 
 
 def _hull(points_world: Float[np.ndarray, "n 3"], camera: Camera) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels of the points' convex hull; none where it is not all in front of the camera and near the picture."""
+    """Return the pixels of the points' convex hull.
+
+    None where it is not all in front of the camera and near the picture.
+    """
     drawn = np.zeros((camera.height_px, camera.width_px), np.uint8)
     pixels = camera.project(points_world)
     if np.isfinite(pixels).all() and np.abs(pixels).max() < 4 * max(drawn.shape):

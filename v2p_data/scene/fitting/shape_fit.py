@@ -1,7 +1,8 @@
 """A noun's shape is fitted under one outline: position, yaw and proportions, on the table or in the air.
 
-Everything here is in camera heights (the camera stands 1 above the table); `scale/camera_height.py` turns that into metres. An outline
-alone is ambiguous (faces swap, flat things thicken), so the noun's proportions hold the fit.
+Everything here is in camera heights (the camera stands 1 above the table);
+`scale/camera_height.py` turns that into metres. An outline alone is ambiguous (faces swap, flat
+things thicken), so the noun's proportions hold the fit.
 """
 
 from collections.abc import Callable, Sequence

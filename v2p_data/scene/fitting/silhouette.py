@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 _WORK_PX = 110
 """Longer side of the crop in which silhouettes are compared."""
 _LOOK_WEIGHT = 0.01
-"""Cost in units of IoU of each nat by which the cuboid network finds a box less likely: outlines hardly tell a cube's yaw."""
+"""Cost in units of IoU of each nat by which the cuboid network finds a box less likely: outlines
+hardly tell a cube's yaw."""
 _MOST_BY_LOOK = 0.15
-"""Greatest cost by the cuboid network, in units of IoU: real boxes look different from the drawn ones it learned from."""
+"""Greatest cost by the cuboid network, in units of IoU: real boxes look different from the drawn
+ones it learned from."""
 _LEAST_FACE_PX = 10
 """Side of the outline's bounding box below which a box shows nothing of its turn."""
 
@@ -55,7 +57,11 @@ class Silhouette:
         camera: Camera,
         image: UInt8[np.ndarray, "h w 3"] | None = None,
     ) -> None:
-        """Crop the mask; `unknown` is what may hide the object, `image` shows how a box is turned, where that is asked."""
+        """Crop the mask.
+
+        `unknown` is what may hide the object, `image` shows how a box is turned, where that is
+        asked.
+        """
         x, y, w, h = bounding_box(mask)
         pad = int(0.35 * max(w, h)) + 3
         self.camera, self.box, self.mask = camera, (x, y, w, h), mask

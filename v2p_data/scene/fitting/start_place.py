@@ -1,4 +1,4 @@
-"""Where a task starts whose object a hand brings: a place on the table beside its goal, chosen, since the clip shows none.
+"""Where a task starts whose object a hand brings: a chosen place on the table beside its goal.
 
 Lengths are camera heights unless a name says otherwise.
 """
@@ -19,7 +19,8 @@ from v2p_data.scene.fitting.shape_fit import lowest
 from v2p_data.scene.frames.mask_ops import grow
 
 _GAPS_M, _APART_M = (0.10, 0.06, 0.15, 0.20), 0.02
-"""Free table between the object and its goal, the first tried first; and least free table between the object and any other one."""
+"""Free table between the object and its goal, the first tried first; and least free table between
+the object and any other one."""
 _WAYS = 16
 """Directions from the goal that are tried, those nearest to where the hand came from first."""
 _EDGE_PX, _ON_TABLE_PX = 2.0, 6
@@ -44,7 +45,8 @@ def with_start_place(grounded: GroundedObjects, placement: Placement, kind: Kind
     if not spots:
         raise ItemRejectedError(
             "not_there_at_first",
-            f"there is no free table in the picture where '{grounded.objects[0].phrase}' could start: film from farther away",
+            f"there is no free table in the picture where '{grounded.objects[0].phrase}' could "
+            "start: film from farther away",
             None,
         )
     # What is large may reach out of the picture everywhere: then the first one is taken.

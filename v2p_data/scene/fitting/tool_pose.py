@@ -1,8 +1,9 @@
 """The pose of a tool in a hand, in every frame in which it pushes.
 
-One outline of a thin tool does not show its tilt, nor whether it leans towards the camera or away. Three habits tell more. The tip is
-behind the pushed object and moves with it. The hand holds the tool as high as a fist. The tool points back to where the arm
-comes from. All numbers of these habits were set by hand; real ones were not measured.
+One outline of a thin tool does not show its tilt, nor whether it leans towards the camera or away.
+Three habits tell more. The tip is behind the pushed object and moves with it. The hand holds the
+tool as high as a fist. The tool points back to where the arm comes from. All numbers of these
+habits were set by hand; real ones were not measured.
 """
 
 from collections.abc import Sequence
@@ -36,7 +37,8 @@ _HABIT_WEIGHT = 0.03
 _TIP_AT, _HIGHEST_TIP_M = 0.35, 0.03
 """Height at which the tip touches the pushed object, as a share of that object's height; and the most."""
 _ELBOW_HEIGHT_M, _FARTHEST_M = 0.15, 2.0
-"""Height over the table of an arm where it comes into the picture; and the greatest distance of that place from the camera's foot."""
+"""Height over the table of an arm where it comes into the picture; and the greatest distance of
+that place from the camera's foot."""
 _SETS_OUT = 0.05
 """Share of an object's way that it has gone when the push begins, and that is left when the push ends."""
 _LEAST_TRAVEL = 0.2
@@ -160,7 +162,10 @@ def _arm_heading(
     camera: Camera,
     height_m: float,
 ) -> float | None:
-    """Return the heading from the tool's tip to where the arm comes from; None where none comes in from the picture's edge."""
+    """Return the heading from the tool's tip to where the arm comes from.
+
+    None where none comes in from the picture's edge.
+    """
     ways = []
     for i in segmentation.idx.tolist():
         end = hand_end(hand_at(segmentation, i)) if frames[0] <= i <= frames[1] else None
@@ -196,8 +201,8 @@ def fit_tool(
         push: the pushed object's motion.
         noun: the tool's shape.
         size: its usual size, along its own axes [camera heights].
-        spread: standard deviation of the logarithm of its length. It may be longer than usual; where it seems shorter, the
-            hand or the picture's edge hides the rest.
+        spread: standard deviation of the logarithm of its length. It may be longer than usual;
+            where it seems shorter, the hand or the picture's edge hides the rest.
         height_m: metres per camera height.
     """
     unit, order = outline_points(noun.form, (1.0, 1.0, 1.0), noun.taper), np.argsort(size)[::-1]

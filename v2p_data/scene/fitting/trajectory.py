@@ -127,10 +127,11 @@ def peak(s: ObjectTrack) -> int:
 def carried_by_hand(
     s: ObjectTrack, segmentation: Segmentation
 ) -> list[tuple[int, Float[np.ndarray, "2"]]]:
-    """Return by how far the hand has moved in the picture since it took hold of a thing that it hides, in the frames since.
+    """Return how far the hand moved in the picture since it took hold of a thing that it hides.
 
-    It takes hold where its end stays longest, low and beside the thing. Nothing where the thing itself is seen going up, where
-    no hand comes to it, where that hand does not rise, or where in the end something that moved is in sight.
+    It takes hold where its end stays longest, low and beside the thing. Nothing where the thing
+    itself is seen going up, where no hand comes to it, where that hand does not rise, or where in
+    the end something that moved is in sight.
     """
     i, (_, _, _, tall) = peak(s), bounding_box(s.first)
     if _centre(s.first)[1] - _centre(s.masks[i])[1] > _SEEN_RISING * tall:
@@ -161,7 +162,7 @@ def carried_by_hand(
 
 
 def _tips(segmentation: Segmentation) -> dict[int, Float[np.ndarray, "2"]]:
-    """Return where the hand ends, by working frame, but where that jumps: there something else was taken for the hand."""
+    """Return where the hand ends, by working frame; a jump is left out as another thing."""
     ends = {at: hand_end(hand_at(segmentation, at)) for at in segmentation.idx.tolist()}
     tips = {at: np.array(end.tip_px) for at, end in ends.items() if end is not None}
     if not tips:

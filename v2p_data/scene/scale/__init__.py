@@ -2,6 +2,7 @@
 
 Comes in: fitted sizes in camera heights. Goes out: the camera's height [m] and how sure it is.
 
-Reading order: nouns (`nouns.tsv`: size, mass and shape of household things), camera_height (every object's vote), shared_camera
+Reading order: nouns (`nouns.tsv`: size, mass and shape of household things), camera_height (every
+    object's vote), shared_camera
 (what several clips of one camera say together).
 """

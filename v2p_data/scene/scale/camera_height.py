@@ -63,7 +63,7 @@ def table_width_m(
 
 
 def px_per_m(camera: SeenCamera, shape: tuple[int, int], row_px: float) -> float:
-    """Return how many pixels wide a metre across the view is, on the table where a picture of this shape shows that row."""
+    """Return how many pixels wide a metre of the table is at a row of a picture of this shape."""
     h, w = shape
     middle, there = (
         table_width_m(camera.pitch_rad, camera.focal_widths, 1.0, below)
@@ -78,8 +78,9 @@ def camera_height_m(
 ) -> tuple[float, float]:
     """Return the camera's height [m] and the standard deviation of its logarithm.
 
-    `measured` are such pairs from elsewhere, as from predicted depth. What a noun says counts the less the farther it is from
-    what all say together: a box may be of any size, and what was taken for a pen may be none.
+    `measured` are such pairs from elsewhere, as from predicted depth. What a noun says counts the
+    less the farther it is from what all say together: a box may be of any size, and what was taken
+    for a pen may be none.
     """
     rows = [(float(np.log(_USUAL_HEIGHT_M)), _HEIGHT_SPREAD, 1.0, False)]
     rows += [(float(np.log(height_m)), spread, 1.0, False) for height_m, spread in measured]
@@ -95,9 +96,10 @@ def robust_mean(
     trust: Float[np.ndarray, "n"],
     doubtful: Bool[np.ndarray, "n"],
 ) -> tuple[float, float]:
-    """Return the mean of what several say, each with its standard deviation and its trust of 0 to 1, and the mean's standard deviation.
+    """Return the mean of several guesses with deviations and trusts of 0 to 1, and its deviation.
 
-    What is doubtful counts the less the farther it is from the mean: weights of Student's t with four degrees of freedom.
+    What is doubtful counts the less the farther it is from the mean: weights of Student's t with
+        four degrees of freedom.
 
     Source: Lange, Little and Taylor 1989.
     """

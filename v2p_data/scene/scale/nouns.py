@@ -1,8 +1,9 @@
 """What household nouns usually are: size, shape, mass, friction. The scene's metric scale comes from here.
 
-The table is `nouns.tsv` beside this file, one noun a row, in centimetres and grams for reading; `docs/nouns.md` explains its
-columns and counts its sources. Sizes are (length, width, height) [m] in the pose the thing usually rests in; `spread` is the
-standard deviation of log size within the noun. A word that is not in the table becomes a fist-sized box and costs confidence.
+The table is `nouns.tsv` beside this file, one noun a row, in centimetres and grams for reading;
+`docs/nouns.md` explains its columns and counts its sources. Sizes are (length, width, height) [m]
+in the pose the thing usually rests in; `spread` is the standard deviation of log size within the
+noun. A word that is not in the table becomes a fist-sized box and costs confidence.
 """
 
 import re
@@ -19,26 +20,109 @@ SourceKind = Literal["standard", "YCB", "USDA", "retail", "estimate"]
 
 TABLE = Path(__file__).with_name("nouns.tsv")
 COLUMNS: tuple[str, ...] = (
-    "noun", "form", "length_cm", "width_cm", "height_cm", "spread", "mass_g", "friction", "hollow", "taper", "matter", "colour",
-    "symmetric", "synonyms", "source",
-)  # fmt: skip
-COLOURS = frozenset({
-    "red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "grey",
-})  # fmt: skip
+    "noun",
+    "form",
+    "length_cm",
+    "width_cm",
+    "height_cm",
+    "spread",
+    "mass_g",
+    "friction",
+    "hollow",
+    "taper",
+    "matter",
+    "colour",
+    "symmetric",
+    "synonyms",
+    "source",
+)
+COLOURS = frozenset(
+    {
+        "red",
+        "orange",
+        "yellow",
+        "green",
+        "blue",
+        "purple",
+        "pink",
+        "brown",
+        "black",
+        "white",
+        "grey",
+    }
+)
 _CLEAR_WORDS = {"transparent", "clear", "glass", "crystal"}
 _AFTER_THE_NOUN = re.compile(
     r" (?:with|without|on|in|inside|onto|into|from|at|for|next|near|behind|under|over|above|below|beside|containing|filled|full"
     r"|lying|standing|facing|that|which|made|upright|to|by)(?: .*)?$"
 )
-_MEASURES = frozenset({
-    "piece", "pair", "bit", "slice", "stack", "pile", "bunch", "set", "sheet", "lot", "kind", "type", "row", "group", "couple",
-    "number", "half", "pack", "packet", "heap", "handful", "chunk", "strip", "bar", "roll", "stick", "block", "loaf", "cube",
-})  # fmt: skip
+_MEASURES = frozenset(
+    {
+        "piece",
+        "pair",
+        "bit",
+        "slice",
+        "stack",
+        "pile",
+        "bunch",
+        "set",
+        "sheet",
+        "lot",
+        "kind",
+        "type",
+        "row",
+        "group",
+        "couple",
+        "number",
+        "half",
+        "pack",
+        "packet",
+        "heap",
+        "handful",
+        "chunk",
+        "strip",
+        "bar",
+        "roll",
+        "stick",
+        "block",
+        "loaf",
+        "cube",
+    }
+)
 """Words before `of` that count or portion what follows: a piece of paper is paper, a box of pens is a box."""
-_ADJECTIVES = COLOURS | frozenset({
-    "glass", "tin", "paper", "rubber", "wood", "cardboard", "cotton", "wool", "iron", "card", "clay", "stone", "light", "lime", "peach",
-    "plum", "olive", "lemon", "cherry", "rose", "mint", "chocolate", "coffee", "tea", "milk", "juice", "cell", "foil", "nickel",
-})  # fmt: skip
+_ADJECTIVES = COLOURS | frozenset(
+    {
+        "glass",
+        "tin",
+        "paper",
+        "rubber",
+        "wood",
+        "cardboard",
+        "cotton",
+        "wool",
+        "iron",
+        "card",
+        "clay",
+        "stone",
+        "light",
+        "lime",
+        "peach",
+        "plum",
+        "olive",
+        "lemon",
+        "cherry",
+        "rose",
+        "mint",
+        "chocolate",
+        "coffee",
+        "tea",
+        "milk",
+        "juice",
+        "cell",
+        "foil",
+        "nickel",
+    }
+)
 """Nouns that say what a thing is made of, or its colour, when another word follows them."""
 _KINDS: dict[str, tuple[str, ...]] = {
     "matter": get_args(Matter),
@@ -69,8 +153,9 @@ class Noun:
     matter: Matter = "rigid"
     known: bool = True
     symmetry: Symmetry = "none"
-    """Turns that nobody sees on the real thing: `box` half turns about each axis, `round` any turn about the upright axis, `sphere`
-    any turn. A round thing with `none` has a handle or spout, which the fitted solid of revolution does not show."""
+    """Turns that nobody sees on the real thing: `box` half turns about each axis, `round` any turn
+    about the upright axis, `sphere` any turn. A round thing with `none` has a handle or spout,
+    which the fitted solid of revolution does not show."""
     colours: tuple[str, ...] = ()
     """Colours it has when nobody says which; empty where anything goes."""
     source: str = "estimate"
@@ -78,7 +163,7 @@ class Noun:
 
     @property
     def handled(self) -> bool:
-        """Whether things of that name are vessels with a handle or a spout: nothing else keeps them from being round."""
+        """Whether things of that name are vessels with a handle or a spout, round but for that."""
         return self.form == "cylinder" and self.hollow and self.symmetry == "none"
 
 
@@ -112,8 +197,9 @@ def read_nouns(text: str, where: str) -> tuple[dict[str, Noun], dict[str, Noun]]
 def noun_for(phrase: str) -> Noun:
     """Return the entry for what a phrase is about: its head noun in the longest form known, else the fallback.
 
-    The head is the last word before any preposition ('a red cup with a handle' is a cup, 'chocolate box' a box). Of `X of Y` it is
-    the compound where there is one ('box of tissues' is a tissue box), Y where X only counts, and X otherwise.
+    The head is the last word before any preposition ('a red cup with a handle' is a cup,
+    'chocolate box' a box). Of `X of Y` it is the compound where there is one ('box of tissues' is
+    a tissue box), Y where X only counts, and X otherwise.
     """
     said = " ".join(_words(phrase))
     if found := _INDEX.get(said):

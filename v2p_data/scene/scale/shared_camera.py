@@ -1,8 +1,9 @@
 """Clips filmed from one stand share a camera: what all their scenes say of it is surer than what one says.
 
-How large things are is the least sure of all that a scene says, since one view does not show scale and every clip guesses
-it from other things. How much of the table the picture shows is what hands and things tell; pitch and focal length are what
-outlines and the network tell. Each is put together by itself, and the height follows.
+How large things are is the least sure of all that a scene says, since one view does not show scale
+and every clip guesses it from other things. How much of the table the picture shows is what hands
+and things tell; pitch and focal length are what outlines and the network tell. Each is put
+together by itself, and the height follows.
 """
 
 from collections.abc import Sequence
@@ -21,7 +22,8 @@ _SUREST = 0.05
 _PITCH_SD_RAD, _FOCAL_SD = 0.07, 0.15
 """Standard deviation of one clip's pitch and of the logarithm of its focal length, on drawn clips."""
 _COMMON = 0.05
-"""Standard deviation of what all clips from one stand get wrong alike: the same picture misleads the network in the same way."""
+"""Standard deviation of what all clips from one stand get wrong alike: the same picture misleads
+the network in the same way."""
 _FAR_OFF = 3.0
 """Standard deviations from which on a clip is likely to be from another stand, or misunderstood."""
 _OTHER_SHAPE = 1.02

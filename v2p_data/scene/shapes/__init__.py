@@ -2,6 +2,7 @@
 
 Comes in: one outline with the pose of its primitive [m]. Goes out: a mesh, its parts, and the reason for the choice.
 
-Reading order: shape (which mesh is chosen), silhouette_view (a mesh compared with an outline), mesh_hypothesis, revolved (solids of
+Reading order: shape (which mesh is chosen), silhouette_view (a mesh compared with an outline),
+    mesh_hypothesis, revolved (solids of
 revolution), inflation (an outline is blown up), handles, spoon, by_worker (a model of somebody else's).
 """

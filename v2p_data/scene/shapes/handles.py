@@ -47,8 +47,8 @@ def with_handle(
 ) -> MeshHypothesis | None:
     """Return the vessel with the handle that its outline shows; None where it shows none, or does not stand upright.
 
-    Low vessels have a stick near the rim, tall ones a plate at half height, whose own height hides how far back it reaches:
-    there directions and lengths are tried.
+    Low vessels have a stick near the rim, tall ones a plate at half height, whose own height hides
+    how far back it reaches: there directions and lengths are tried.
     """
     T = view.T_world_obj @ body.T_obj_shape
     if T[2, 2] < 0.9:
@@ -103,7 +103,9 @@ def _spots(
 def _joined(
     body: MeshHypothesis, way: Float[np.ndarray, "2"], inner: float, extents: Size, z: float
 ) -> MeshHypothesis:
-    """Return a vessel with a block beside it, `inner` from its axis and at height `z`, towards `way`; x then points there.
+    """Return a vessel with a block beside it, `inner` from its axis and at height `z`, towards `way`.
+
+    X then points there.
 
     The block touches the wall and goes no further in: two closed surfaces side by side are one closed surface.
     """

@@ -1,4 +1,7 @@
-"""An outline inflated like a pillow: what has no simple shape. One view does not show the back: it is taken to be like the front."""
+"""An outline inflated like a pillow: what has no simple shape.
+
+One view does not show the back: it is taken to be like the front.
+"""
 
 import cv2
 import numpy as np
@@ -91,8 +94,12 @@ def _correction(
     """Return by how much the outline in the plane grows or shrinks, where the silhouette is too small or too large."""
     spots = np.nan_to_num(crop.pixels(plane), nan=0.0).astype(np.float32) - 0.5
     wrong = cv2.remap(
-        goal - _signed(drawn), spots[..., 0], spots[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )  # fmt: skip
+        goal - _signed(drawn),
+        spots[..., 0],
+        spots[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     scale = float(np.abs(np.diff(spots[_PLANE_PX // 2, :, 0])).mean())
     return 0.8 * np.clip(wrong / max(scale, 0.2), -8, 8)
 
@@ -111,7 +118,7 @@ def _along_fit(
     T_world_mesh: Float[np.ndarray, "4 4"],
     T_world_fit: Float[np.ndarray, "4 4"],
 ) -> tuple[list[trimesh.Trimesh], Float[np.ndarray, "4 4"]]:
-    """Return the same solids and pose with the fit's axes for their own: those of the picture's plane are the camera's, not the object's."""
+    """Return the same solids and pose with the axes of the fit instead of the picture's plane."""
     turn = T_world_mesh[:3, :3].T @ T_world_fit[:3, :3]
     solids = [turned(solid, turn.T) for solid in solids]
     middle = _centred(solids)
@@ -151,7 +158,7 @@ def _without_shadows(
 def _plane_points(
     origin: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"], px: float
 ) -> Float[np.ndarray, "h w 3"]:
-    """Return the world points of a square picture's pixels in the plane of the first two axes, `origin` in its middle."""
+    """Return world points of a square picture's pixels in the plane of the first two axes about `origin`."""
     line = (np.arange(_PLANE_PX) - _PLANE_PX / 2 + 0.5) * px
     u, v = np.meshgrid(line, line)
     return origin + u[..., None] * axes[:, 0] + v[..., None] * axes[:, 1]
@@ -160,7 +167,7 @@ def _plane_points(
 def _ground_shift(
     crop: SilhouetteCrop, drawn: Bool[np.ndarray, "i j"], forward: Float[np.ndarray, "3"]
 ) -> float:
-    """Return how much further along the table a thing stands whose foot is drawn too high or too low in the picture [m]."""
+    """Return how much further away a thing stands whose foot is drawn too high or too low [m]."""
     onto = crop.matrix[:, [0, 1, 3]]
     feet = []
     for picture in (drawn, crop.mask):
@@ -207,8 +214,8 @@ def _unsmeared(
 ) -> Bool[np.ndarray, "h w"]:
     """Return the outline without what its thickness adds to it when seen aslant.
 
-    A run of half length s along the view, of a thing half b thick, shows an ellipse of half length a with s² = a² + (b slant)²,
-    and a = b where the thickness is not capped.
+    A run of half length s along the view, of a thing half b thick, shows an ellipse of half length
+    a with s² = a² + (b slant)², and a = b where the thickness is not capped.
     """
     reach = cv2.distanceTransform(np.pad(outline, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     out = np.zeros_like(outline)
@@ -226,7 +233,10 @@ def _unsmeared(
 
 
 def _standing(outline: Bool[np.ndarray, "h w"], table: int) -> Bool[np.ndarray, "h w"]:
-    """Return the outline going straight down below row `table`, so that its base has a thickness; it is cut off later."""
+    """Return the outline going straight down below row `table`, so that its base has a thickness.
+
+    It is cut off later.
+    """
     rows = np.flatnonzero(outline.any(axis=1))
     tall = int(rows[-1]) - table
     if tall < 4:

@@ -17,7 +17,8 @@ _MAX_RADIUS = 0.8
 _BEYOND = 0.35
 """Share of the fitted height: a profile may go on that far beyond the primitive."""
 _RIM = 0.12
-"""Of its height, what is open at the top does not close again so near to its rim: corners of outlines come out round."""
+"""Of its height, what is open at the top does not close again so near to its rim: corners of
+outlines come out round."""
 _RING_INSIDE = 0.94
 """Share of a ring's points that must lie in the mask: a disc half a percent too large has 6 % outside."""
 
@@ -137,7 +138,8 @@ def _needed(
 ) -> tuple[int, int]:
     """Return the first and last disc without which the silhouette would lack something, or the body its fitted height.
 
-    `fitted` is half that height: the base of a bowl that lies on its mouth is seen within the outline, which does not need it.
+    `fitted` is half that height: the base of a bowl that lies on its mouth is seen within the
+      outline, which does not need it.
     """
     covers = stack.sum(axis=0)
     allowed = 0.006 * float(crop.mask.sum())

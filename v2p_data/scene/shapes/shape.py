@@ -22,9 +22,9 @@ from v2p_data.scene.shapes.revolved import revolution
 from v2p_data.scene.shapes.silhouette_view import SilhouetteCrop, SilhouetteView
 
 MARGINS = {"revolution": 0.025, "ball": 0.06, "irregular": -0.06, "regular": 0.15}
-"""By how much another shape must cover the outline better than the primitive, in units of IoU: a solid of revolution; one for round
-fruit, as noise dents most outlines of balls; an inflated silhouette of what has no simple shape, there the primitive must win; and of
-anything else."""
+"""By how much another shape must cover the outline better than the primitive, in units of IoU: a
+solid of revolution; one for round fruit, as noise dents most outlines of balls; an inflated
+silhouette of what has no simple shape, there the primitive must win; and of anything else."""
 _MIN_PX = 80
 """Fewest pixels of a mask; a smaller outline has no form."""
 _MAX_HIDDEN = 0.25

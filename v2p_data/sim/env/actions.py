@@ -1,7 +1,8 @@
-"""What a dataset's or a policy's `action` says, the tool's step or where tool or joints shall be after it, and its state.
+"""What an `action` says: the step of the tool, or where tool or joints shall be after it; and the state.
 
-Worlds carry out steps of the tool alone (`delta_tool`). Targets are those of the controller after a step, leashes included,
-without the noise that randomisation adds; so each is turned back into the step that leads to it. World frame.
+Worlds carry out steps of the tool alone (`delta_tool`). Targets are those of the controller after
+a step, leashes included, without the noise that randomisation adds; so each is turned back into
+the step that leads to it. World frame.
 """
 
 import numpy as np
@@ -112,7 +113,7 @@ def joints_near(
             count, joints, 6
         )
         turn = product(quat_wxyz.T, conjugates(tool.quat_wxyz[::joints].T))
-        error = np.concatenate([pos - tool.pos[::joints], log(turn).T], axis=1)  # fmt: skip
+        error = np.concatenate([pos - tool.pos[::joints], log(turn).T], axis=1)
         if not (np.abs(error) > _NEAR).any():
             break
         square = across.transpose(0, 2, 1) @ across + 1e-12 * np.eye(6)

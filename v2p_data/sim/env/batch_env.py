@@ -85,8 +85,8 @@ class BatchEnv:
 
     Raises:
         ItemRejectedError: an object does not suit the robot, or the objects do not fit on the table.
-        V2PError: the task's observation is not what it says; MuJoCo Warp or the device is missing, or it is another arm's
-            task.
+        V2PError: the task's observation is not what it says; MuJoCo Warp or the device is missing,
+            or it is another arm's task.
     """
 
     act_dim = ACT_DIM

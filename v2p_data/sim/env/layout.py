@@ -1,4 +1,4 @@
-"""Where objects stand on the table at the start of an episode: as in the video, shifted and turned, apart from each other."""
+"""Where objects stand at the start of an episode: as in the video, shifted, turned and apart."""
 
 from itertools import combinations
 

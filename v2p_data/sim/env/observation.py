@@ -45,66 +45,161 @@ def _of_robot() -> tuple[Term, ...]:
     turned = Term(name="", width=3, scale=1.0, frame="world", unit="1", meaning="")
     open_m = 1 / FINGER_TRAVEL_M
     return (
-        Term(name="tool_pos", width=3, scale=5.0, frame="world", unit="m",
-             meaning="position of the tool's centre, from (0.5, 0, 0.15)"),
+        Term(
+            name="tool_pos",
+            width=3,
+            scale=5.0,
+            frame="world",
+            unit="m",
+            meaning="position of the tool's centre, from (0.5, 0, 0.15)",
+        ),
         Term(**{**vars(turned), "name": "tool_axis_x", "meaning": "x axis of the tool"}),
-        Term(**{**vars(turned), "name": "tool_axis_y", "meaning": "y axis of the tool, along which the pads close"}),
-        Term(name="fingers", width=2, scale=open_m, frame="-", unit="m",
-             meaning="travel of both fingers; 1 is open"),
-        Term(name="target_ahead", width=3, scale=20.0, frame="world", unit="m",
-             meaning="target of the tool minus its position"),
-        Term(name="target_finger", width=1, scale=open_m, frame="-", unit="m",
-             meaning="target of the fingers"),
-        Term(name="last_action", width=7, scale=0.5, frame="world", unit="1",
-             meaning="the action before"),
-    )  # fmt: skip
+        Term(
+            **{
+                **vars(turned),
+                "name": "tool_axis_y",
+                "meaning": "y axis of the tool, along which the pads close",
+            }
+        ),
+        Term(
+            name="fingers",
+            width=2,
+            scale=open_m,
+            frame="-",
+            unit="m",
+            meaning="travel of both fingers; 1 is open",
+        ),
+        Term(
+            name="target_ahead",
+            width=3,
+            scale=20.0,
+            frame="world",
+            unit="m",
+            meaning="target of the tool minus its position",
+        ),
+        Term(
+            name="target_finger",
+            width=1,
+            scale=open_m,
+            frame="-",
+            unit="m",
+            meaning="target of the fingers",
+        ),
+        Term(
+            name="last_action",
+            width=7,
+            scale=0.5,
+            frame="world",
+            unit="1",
+            meaning="the action before",
+        ),
+    )
 
 
 def _of_object(slot: str) -> tuple[Term, ...]:
     of = f"of the {slot} object"
     return (
-        Term(name=f"{slot}_away", width=3, scale=10.0, frame="world", unit="m",
-             meaning=f"position {of}, from the tool"),
-        Term(name=f"{slot}_away_in_gripper", width=3, scale=10.0, frame="gripper", unit="m",
-             meaning=f"position {of}, from the tool"),
-        Term(name=f"{slot}_axis_x", width=3, scale=1.0, frame="gripper", unit="1",
-             meaning=f"x axis {of}"),
-        Term(name=f"{slot}_axis_y", width=3, scale=1.0, frame="gripper", unit="1",
-             meaning=f"y axis {of}"),
-        Term(name=f"{slot}_up", width=3, scale=1.0, frame="world", unit="1",
-             meaning=f"z axis {of}"),
-        Term(name=f"{slot}_pos", width=3, scale=5.0, frame="world", unit="m",
-             meaning=f"position {of}, from (0.5, 0, 0.05)"),
-        Term(name=f"{slot}_vel", width=3, scale=1.0, frame="world", unit="m/s",
-             meaning=f"velocity {of}"),
-    )  # fmt: skip
+        Term(
+            name=f"{slot}_away",
+            width=3,
+            scale=10.0,
+            frame="world",
+            unit="m",
+            meaning=f"position {of}, from the tool",
+        ),
+        Term(
+            name=f"{slot}_away_in_gripper",
+            width=3,
+            scale=10.0,
+            frame="gripper",
+            unit="m",
+            meaning=f"position {of}, from the tool",
+        ),
+        Term(
+            name=f"{slot}_axis_x",
+            width=3,
+            scale=1.0,
+            frame="gripper",
+            unit="1",
+            meaning=f"x axis {of}",
+        ),
+        Term(
+            name=f"{slot}_axis_y",
+            width=3,
+            scale=1.0,
+            frame="gripper",
+            unit="1",
+            meaning=f"y axis {of}",
+        ),
+        Term(
+            name=f"{slot}_up", width=3, scale=1.0, frame="world", unit="1", meaning=f"z axis {of}"
+        ),
+        Term(
+            name=f"{slot}_pos",
+            width=3,
+            scale=5.0,
+            frame="world",
+            unit="m",
+            meaning=f"position {of}, from (0.5, 0, 0.05)",
+        ),
+        Term(
+            name=f"{slot}_vel",
+            width=3,
+            scale=1.0,
+            frame="world",
+            unit="m/s",
+            meaning=f"velocity {of}",
+        ),
+    )
 
 
 def _of_both(
     name: str, width: int, scale: float, frame: Frame, unit: str, meaning: str
 ) -> tuple[Term, ...]:
     return tuple(
-        Term(name=f"{slot}_{name}", width=width, scale=scale, frame=frame, unit=unit,
-             meaning=f"{meaning} of the {slot} object")
+        Term(
+            name=f"{slot}_{name}",
+            width=width,
+            scale=scale,
+            frame=frame,
+            unit=unit,
+            meaning=f"{meaning} of the {slot} object",
+        )
         for slot in OBJECT_SLOTS
-    )  # fmt: skip
+    )
 
 
 def _touches(slot: str) -> Term:
     return Term(
-        name=f"{slot}_touches", width=2, scale=1.0, frame="-", unit="1",
+        name=f"{slot}_touches",
+        width=2,
+        scale=1.0,
+        frame="-",
+        unit="1",
         meaning=f"1 where the left, right pad touches the {slot} object",
-    )  # fmt: skip
+    )
 
 
 def _grip(slot: str) -> tuple[Term, ...]:
     of = f"of the {slot} object"
     return (
-        Term(name=f"{slot}_grip_turn", width=1, scale=1.0, frame="world", unit="90 deg",
-             meaning=f"turn about the vertical until the pads fit over a side {of}"),
-        Term(name=f"{slot}_grip_extents", width=3, scale=10.0, frame="gripper", unit="m",
-             meaning=f"extents of the box {of}"),
-    )  # fmt: skip
+        Term(
+            name=f"{slot}_grip_turn",
+            width=1,
+            scale=1.0,
+            frame="world",
+            unit="90 deg",
+            meaning=f"turn about the vertical until the pads fit over a side {of}",
+        ),
+        Term(
+            name=f"{slot}_grip_extents",
+            width=3,
+            scale=10.0,
+            frame="gripper",
+            unit="m",
+            meaning=f"extents of the box {of}",
+        ),
+    )
 
 
 TERMS: tuple[Term, ...] = (
@@ -113,15 +208,27 @@ TERMS: tuple[Term, ...] = (
     *_of_object("other"),
     *_of_both("size", 3, 15.0, "-", "m", "extents along its own axes"),
     _touches("manipulated"),
-    Term(name="progress", width=1, scale=1.0, frame="-", unit="1",
-         meaning="share of the horizon that has passed; experts know values up to 1"),
+    Term(
+        name="progress",
+        width=1,
+        scale=1.0,
+        frame="-",
+        unit="1",
+        meaning="share of the horizon that has passed; experts know values up to 1",
+    ),
     *_of_both("moved", 3, 5.0, "world", "m", "displacement from the start"),
-    Term(name="has_other", width=1, scale=1.0, frame="-", unit="1",
-         meaning="1 if there is an other object"),
+    Term(
+        name="has_other",
+        width=1,
+        scale=1.0,
+        frame="-",
+        unit="1",
+        meaning="1 if there is an other object",
+    ),
     *_grip("manipulated"),
     *_grip("other"),
     _touches("other"),
-)  # fmt: skip
+)
 """All terms in the order of their columns."""
 
 

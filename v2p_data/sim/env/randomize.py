@@ -1,4 +1,4 @@
-"""What differs from world to world and from episode to episode: sizes, masses, friction, servo gains, delay, poses, view.
+"""What differs between worlds and episodes: sizes, masses, friction, servo gains, delay, poses, view.
 
 Every value drawn is kept per world (`Randomizer.drawn`), so that an episode can say what it was recorded
 under. Values are written into the batch's per-simulation model fields; nothing is recompiled.

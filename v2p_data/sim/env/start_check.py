@@ -1,8 +1,9 @@
 """Can an episode start like this? Looks at the poses that task code put its objects into.
 
-`Randomizer.place` never gives such poses; task code of its own making may, and may count its resets. So every world is
-looked at whenever it starts, by arithmetic (`check_poses`); the first worlds also by MuJoCo's collisions (`check_start`).
-Poses that are no finite unit poses are refused at every reset (`task.guarded`).
+`Randomizer.place` never gives such poses; task code of its own making may, and may count its
+resets. So every world is looked at whenever it starts, by arithmetic (`check_poses`); the first
+worlds also by MuJoCo's collisions (`check_start`). Poses that are no finite unit poses are refused
+at every reset (`task.guarded`).
 """
 
 # pyright: reportAttributeAccessIssue=false

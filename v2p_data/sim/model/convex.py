@@ -70,8 +70,12 @@ def convex_parts(
         if why:
             logger.warning(
                 "mesh of '%s' in %s is concave and cannot be split (%s): it collides as its hull. This is kept in "
-                "%s; remove that file to try again", name, path, why, entry,
-            )  # fmt: skip
+                "%s; remove that file to try again",
+                name,
+                path,
+                why,
+                entry,
+            )
         _write(entry, parts)
     return parts
 
@@ -122,7 +126,8 @@ def _write(entry: Path, parts: list[np.ndarray]) -> None:
     try:
         entry.parent.mkdir(parents=True, exist_ok=True)
         partial = entry.with_name(f"{entry.stem}.{os.getpid()}.tmp.npz")
-        np.savez(partial, count=len(parts), **{f"part_{k}": p for k, p in enumerate(parts)})  # pyright: ignore[reportArgumentType]
+        named = {f"part_{k}": p for k, p in enumerate(parts)}
+        np.savez(partial, count=len(parts), **named)  # pyright: ignore[reportArgumentType]
         partial.replace(entry)
     except OSError as error:
         logger.warning("convex parts cannot be kept in %s (%s)", entry.parent, error)

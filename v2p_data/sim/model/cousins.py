@@ -122,8 +122,10 @@ def draw(thing: SceneObject, form: Form, rng: np.random.Generator, opening_m: fl
         size_m=(x, y, z),
         shape=shape,
         mass_scale=float(np.exp(rng.uniform(*np.log(DENSITY_SCALE)))),
-        friction=float(np.clip(thing.friction * np.exp(rng.uniform(*np.log(FRICTION_SCALE))), *FRICTION)),
-    )  # fmt: skip
+        friction=float(
+            np.clip(thing.friction * np.exp(rng.uniform(*np.log(FRICTION_SCALE))), *FRICTION)
+        ),
+    )
 
 
 def mapped(
@@ -163,7 +165,11 @@ def cousin_of(
             f"the mesh of {where} is open, so nobody knows what a stretched one weighs; close it, or leave cousins "
             "out with --cousins.count=0",
         )
-    R = Rotation.from_quat(thing.laid_pose[3:], scalar_first=True).as_matrix() if thing.poses_world else np.eye(3)  # fmt: skip
+    R = (
+        Rotation.from_quat(thing.laid_pose[3:], scalar_first=True).as_matrix()
+        if thing.poses_world
+        else np.eye(3)
+    )
     must_fit = KINDS[scene.kind].must_grasp and not thing.hollow
     form = FORMS[number % len(FORMS)]
     rng = rng_for(seed, "cousin", scene.title, number)
@@ -190,7 +196,9 @@ def _solid(
     """Return an object's mesh and convex parts in its own frame."""
     if not thing.mesh:
         form = {"hollow": thing.hollow}
-        return mesh_for(thing.shape, thing.size_m, **form), parts_for(thing.shape, thing.size_m, **form)  # fmt: skip
+        return mesh_for(thing.shape, thing.size_m, **form), parts_for(
+            thing.shape, thing.size_m, **form
+        )
     path = scene.folder / thing.mesh
     ready = [scene.folder / part for part in thing.parts]
     solids = solids_of(path, thing.name, thing.size_m, ready=ready)
@@ -206,7 +214,7 @@ def _described(
     volume: float,
     R: Float[np.ndarray, "3 3"],
 ) -> SceneObject:
-    """Return the cousin as an object, of so many volumes of the original and on its path, on the table where that one was."""
+    """Return the cousin as an object on the original's path, with so many times its volume."""
     higher = float(np.abs(R[2]) @ (np.array(cousin.size_m) - np.array(thing.size_m))) / 2
     stays = thing.shape == "box" or (thing.hollow and thing.shape != "mesh")
     return replace(

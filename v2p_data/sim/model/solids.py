@@ -1,8 +1,8 @@
 """An object's mesh file becomes convex solids: read, mended, brought to size, split where it is concave.
 
-MuJoCo collides convex shapes only. What is nearly convex becomes one hull; a concave mesh becomes a few parts: those that
-its scene brings along, else some that are found once (`convex`) and then lie in a cache. A mesh that cannot be mended is
-refused in one sentence.
+MuJoCo collides convex shapes only. What is nearly convex becomes one hull; a concave mesh becomes
+a few parts: those that its scene brings along, else some that are found once (`convex`) and then
+lie in a cache. A mesh that cannot be mended is refused in one sentence.
 """
 
 import logging
@@ -170,7 +170,8 @@ def _demand_solid(mesh: trimesh.Geometry, where: str) -> trimesh.Trimesh:
     if bad:
         raise ItemRejectedError(
             "mesh_not_finite",
-            f"{bad} of {len(vertices)} vertices of the {where} are no numbers below {MAX_COORDINATE:g}; export it again",
+            f"{bad} of {len(vertices)} vertices of the {where} are no numbers below "
+            f"{MAX_COORDINATE:g}; export it again",
             float(bad),
         )
     widths = _principal_widths(vertices[np.unique(faces)])
@@ -252,14 +253,20 @@ def _tell_scale(
         near = [word for times, word in units.items() if 0.5 < factor / times < 2]
         logger.warning(
             "mesh of '%s' in %s is %.3g m large and the object %.3g m%s; it is brought to size",
-            name, path, extents.max(), size_m.max(), f": taken to be in {near[0]}" if near else "",
-        )  # fmt: skip
+            name,
+            path,
+            extents.max(),
+            size_m.max(),
+            f": taken to be in {near[0]}" if near else "",
+        )
     stretch = float(factors.max() / factors.min())
     if stretch > 1.5:
         logger.warning(
             "mesh of '%s' in %s is stretched %.1f times along one axis to the object's size",
-            name, path, stretch,
-        )  # fmt: skip
+            name,
+            path,
+            stretch,
+        )
 
 
 def _brought_to_size(

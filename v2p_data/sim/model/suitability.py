@@ -108,8 +108,10 @@ def checked_size(obj: SceneObject, scene: Scene) -> tuple[float, float, float]:
     if min(size) < MIN_THICKNESS_M:
         logger.warning(
             "%s is only %.1f mm thick and is thickened to %.0f mm: the simulation cannot hold thinner things apart",
-            where, min(size) * 1000, MIN_THICKNESS_M * 1000,
-        )  # fmt: skip
+            where,
+            min(size) * 1000,
+            MIN_THICKNESS_M * 1000,
+        )
     return x, y, z
 
 

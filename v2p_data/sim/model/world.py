@@ -1,9 +1,10 @@
 """A scene becomes one MuJoCo model: table, robot, a camera `view`, and every object on a free joint.
 
-Boxes, cylinders and spheres stay primitives; a mesh collides (and is drawn) as its convex hull or, where it is
-concave, as a few convex parts (`solids`); a hollow object becomes a solid floor with walls, so that things can go in. Body `<object>`, geoms `<object>_<k>`, free
-joint `<object>`; the body's origin is the centre of the object's bounding box. Inertias are those of
-uniform density. The manipulated object comes first, as in the scene.
+Boxes, cylinders and spheres stay primitives; a mesh collides (and is drawn) as its convex hull or,
+where it is concave, as a few convex parts (`solids`); a hollow object becomes a solid floor with
+walls, so that things can go in. Body `<object>`, geoms `<object>_<k>`, free joint `<object>`; the
+body's origin is the centre of the object's bounding box. Inertias are those of uniform density.
+The manipulated object comes first, as in the scene.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -148,7 +149,8 @@ def build_world(
     except (ValueError, mujoco.FatalError) as error:
         raise ItemRejectedError(
             "model_not_compiled",
-            f"MuJoCo makes no model of scene '{scene.title}': {' '.join(str(error).split())[:300]}; are its sizes, masses "
+            f"MuJoCo makes no model of scene '{scene.title}': "
+            f"{' '.join(str(error).split())[:300]}; are its sizes, masses "
             "and meshes those of real objects?",
         ) from error
     return World(
@@ -254,7 +256,10 @@ class _Draft:
         o = self.obj
         i = self.form.inertia
         if self.form.kind == "mesh":
-            moments = f'fullinertia="{i[0, 0]:.9g} {i[1, 1]:.9g} {i[2, 2]:.9g} {i[0, 1]:.9g} {i[0, 2]:.9g} {i[1, 2]:.9g}"'
+            moments = (
+                f'fullinertia="{i[0, 0]:.9g} {i[1, 1]:.9g} {i[2, 2]:.9g} {i[0, 1]:.9g} '
+                f'{i[0, 2]:.9g} {i[1, 2]:.9g}"'
+            )
         else:
             moments = f'diaginertia="{i[0, 0]:.9g} {i[1, 1]:.9g} {i[2, 2]:.9g}"'
         geoms = ""
@@ -264,7 +269,10 @@ class _Draft:
                 form = f'type="mesh" mesh="{_mesh_name(o.name, k, MESH_SCALES.index(1.0))}"'
             else:
                 size = {"box": h, "cylinder": (h[0], h[2]), "sphere": (h[0],)}[part.kind]
-                form = f'type="{part.kind}" size="{xml_row(size)}" pos="{xml_row(part.pos)}" euler="0 0 {part.yaw_rad:.9g}"'
+                form = (
+                    f'type="{part.kind}" size="{xml_row(size)}" pos="{xml_row(part.pos)}" '
+                    f'euler="0 0 {part.yaw_rad:.9g}"'
+                )
             geoms += (
                 f'<geom name="{o.name}_{k}" {form} contype="1" conaffinity="3" condim="4" '
                 f'friction="{friction_attribute(o.friction)}" solref="{physics.solref_s} 1" rgba="{xml_row(o.rgba)}"/>'

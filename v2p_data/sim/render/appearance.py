@@ -139,9 +139,14 @@ def _add_thing(
     )
     # It collides with everything here, to find a place; the model is for drawing only.
     body.add_geom(
-        name=name, type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"), size=list(size),
-        rgba=[*colour, 1.0], contype=0xFFFF, conaffinity=0xFFFF, margin=CLEARANCE_M,
-    )  # fmt: skip
+        name=name,
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"),
+        size=list(size),
+        rgba=[*colour, 1.0],
+        contype=0xFFFF,
+        conaffinity=0xFFFF,
+        margin=CLEARANCE_M,
+    )
     return {
         "name": name,
         "shape": shape,
@@ -223,9 +228,14 @@ def _paint(spec: Any, plain: World, look: LookConfig, rng: np.random.Generator) 
     if textured:
         one, other = rng.uniform(0.1, 0.9, (2, 3))
         spec.add_texture(
-            name="table_pattern", type=mujoco.mjtTexture.mjTEXTURE_2D,
-            builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, width=256, height=256, rgb1=one, rgb2=other,
-        )  # fmt: skip
+            name="table_pattern",
+            type=mujoco.mjtTexture.mjTEXTURE_2D,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+            width=256,
+            height=256,
+            rgb1=one,
+            rgb2=other,
+        )
         material = spec.add_material(name="table_pattern", texrepeat=[8, 8])
         material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "table_pattern"
         spec.geom("table").material = "table_pattern"

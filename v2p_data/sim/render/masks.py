@@ -80,7 +80,9 @@ def geom_labels(world: World) -> UInt8[np.ndarray, "geom"]:
 
 
 class WristCamera:
-    """A camera that moves with the tool, beside the hand, and looks between the fingers from above; +y of the tool is up.
+    """A camera that moves with the tool, beside the hand, and looks between the fingers from above.
+
+    +y of the tool is up.
 
     Args:
         robot: whose tool carries it.
@@ -245,9 +247,14 @@ class _GLPainter:
         self.context.make_current()
         snapshot.write(self.model, self.data, index)
         mujoco.mjv_updateScene(
-            self.model, self.data, self.option, None, self.camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value, self.scene,
-        )  # fmt: skip
+            self.model,
+            self.data,
+            self.option,
+            None,
+            self.camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self.scene,
+        )
         mujoco.mjr_render(self.rect, self.scene, self.drawer)
         pixels = np.empty((self.height_px, self.width_px, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self.rect, self.drawer)

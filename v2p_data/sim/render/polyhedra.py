@@ -1,8 +1,8 @@
 """The triangles of each kind of geom, at unit size, as MuJoCo's renderer draws them.
 
 A vertex has a fourth number: how far it moves with its end of a capsule (-1, 0 or 1). Faces are counter-clockwise seen
-from outside. MuJoCo draws round things with `visual/quality` `numslices` and `numstacks`; so do we, because a disc of 28
-corners covers 0.8 % less than a circle, and both pictures shall agree.
+from outside. MuJoCo draws round things with `visual/quality` `numslices` and `numstacks`; so do
+we, because a disc of 28 corners covers 0.8 % less than a circle, and both pictures shall agree.
 """
 
 # pyright: reportAttributeAccessIssue=false

@@ -1,10 +1,12 @@
 """The loops of the z-buffer, compiled by numba: frames, geoms, triangles, rows, pixels.
 
-The machine code is kept beside this file or, where that cannot be written, in the user's cache folder; compiling takes a few
-seconds, once. Functions carry `no_type_check` because a run-time type checker would wrap what numba compiles.
+The machine code is kept beside this file or, where that cannot be written, in the user's cache
+folder; compiling takes a few seconds, once. Functions carry `no_type_check` because a run-time
+type checker would wrap what numba compiles.
 
-Pixel (row, column) looks through its centre (row + 1/2, column + 1/2), rows going down. A triangle covers the centres between
-its left and its right edge, the left included. Along each row the reciprocal of the distance is linear.
+Pixel (row, column) looks through its centre (row + 1/2, column + 1/2), rows going down. A triangle
+covers the centres between its left and its right edge, the left included. Along each row the
+reciprocal of the distance is linear.
 """
 
 # pyright: basic
@@ -136,7 +138,9 @@ def _cut(
             if (seen[here, 2] >= near) != (seen[there, 2] >= near):
                 share = (near - seen[here, 2]) / (seen[there, 2] - seen[here, 2])
                 for i in range(2):
-                    pieces[start + corners, i] = seen[here, i] + share * (seen[there, i] - seen[here, i])  # fmt: skip
+                    pieces[start + corners, i] = seen[here, i] + share * (
+                        seen[there, i] - seen[here, i]
+                    )
                 pieces[start + corners, 2] = near
                 corners += 1
         if corners == 4:  # 0 1 2 3 becomes 0 1 2, 0 2 3
@@ -158,7 +162,10 @@ def _project(
     height: int,
     width: int,
 ) -> bool:
-    """Turn (x, y, distance) into pixels and scaled reciprocal distance; return whether any of it can be in the image."""
+    """Turn (x, y, distance) into pixels and scaled reciprocal distance.
+
+    Return whether any of it can be in the image.
+    """
     low_x, high_x, low_y, high_y = np.inf, -np.inf, np.inf, -np.inf
     for k in range(count):
         reciprocal = 1.0 / points[k, 2]
@@ -224,9 +231,18 @@ def paint(
             for k in range(first, end):
                 a, b, c = triangles[k, 0], triangles[k, 1], triangles[k, 2]
                 _fill(
-                    buffer, labels[geom], points[a, 0], points[a, 1], points[a, 2], points[b, 0],
-                    points[b, 1], points[b, 2], points[c, 0], points[c, 1], points[c, 2],
-                )  # fmt: skip
+                    buffer,
+                    labels[geom],
+                    points[a, 0],
+                    points[a, 1],
+                    points[a, 2],
+                    points[b, 0],
+                    points[b, 1],
+                    points[b, 2],
+                    points[c, 0],
+                    points[c, 1],
+                    points[c, 2],
+                )
         for row in range(height):
             for column in range(width):
                 images[frame, row, column] = buffer[row, column] & _LABELS

@@ -190,8 +190,14 @@ def _visible(model: mujoco.MjModel) -> np.ndarray:
     mujoco.mj_forward(model, data)
     scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + 50)
     mujoco.mjv_updateScene(
-        model, data, mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL.value, scene,
-    )  # fmt: skip
+        model,
+        data,
+        mujoco.MjvOption(),
+        None,
+        mujoco.MjvCamera(),
+        mujoco.mjtCatBit.mjCAT_ALL.value,
+        scene,
+    )
     shown: Any = np.zeros(model.ngeom, bool)
     for geom in scene.geoms[: scene.ngeom]:
         if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:

@@ -25,7 +25,8 @@ TOOL_NAMES = (
     "target_rz.pos",
     "target_gripper.pos",
 )
-"""The tool's position [m], rotation vector from straight down [rad], gripper opening 0 to 1, as in `observation.state`."""
+"""The tool's position [m], rotation vector from straight down [rad], gripper opening 0 to 1, as in
+`observation.state`."""
 JOINT_NAME, OPENING_NAME = "joint_{}.pos", "gripper.pos"
 """The arm's joints from 1 on [rad; m of slides], then the gripper's opening 0 to 1."""
 

@@ -1,9 +1,10 @@
-"""Arms as MJCF, the built-in one (`franka`) or any other: its text, the names of its tool and fingers, and what follows.
+"""Arms as MJCF, the built-in one (`franka`) or any other: text, names of tool and fingers, limits.
 
-The text gives bodies, joints and geoms. Its actuators, tendons, sensors, keyframes and contact excludes are left out, and
-constraints that hold the arm are refused: every arm is driven by the same Cartesian servos, on a site at its tool centre
-point. Gravity is compensated, and only the last three links and the gripper collide, with objects and the table. In the
-model the names of another arm than the built-in one begin with `robot/`.
+The text gives bodies, joints and geoms. Its actuators, tendons, sensors, keyframes and contact
+excludes are left out, and constraints that hold the arm are refused: every arm is driven by the
+same Cartesian servos, on a site at its tool centre point. Gravity is compensated, and only the
+last three links and the gripper collide, with objects and the table. In the model the names of
+another arm than the built-in one begin with `robot/`.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -444,7 +445,10 @@ def _check_free(
     joints: list[int],
     fingers: list[int],
 ) -> None:
-    """Refuse equality constraints that hold arm or fingers; `_strip` leaves out those that couple the fingers' joints."""
+    """Refuse equality constraints that hold arm or fingers.
+
+    `_strip` leaves out those that couple the fingers' joints.
+    """
     bodies = {*chain, *(int(model.jnt_bodyid[j]) for j in fingers)}
     for k in np.flatnonzero(model.eq_active0):
         ends = {int(e) for e in (model.eq_obj1id[k], model.eq_obj2id[k]) if e >= 0}
@@ -459,7 +463,8 @@ def _check_free(
             held = ["a tendon"]
         if held:
             raise V2PError(
-                f"robot file {cfg.path} holds '{held[0]}' by an equality constraint (<{kind}>); arm and fingers must be free "
+                f"robot file {cfg.path} holds '{held[0]}' by an equality constraint (<{kind}>); "
+                "arm and fingers must be free "
                 "to move: take it out, or make one body of what never comes apart"
             )
 

@@ -1,7 +1,8 @@
 """The built-in arm as MJCF: a Franka-Panda-like arm with a 2F-85-like gripper, read as any other arm is (`arms`).
 
-Kinematics, joint limits, link masses and inertias are Franka Emika's published values; `robot` has the kinematics in closed
-form. What touches, what drives it and how its joints are damped is the reader's.
+Kinematics, joint limits, link masses and inertias are Franka Emika's published values; `robot` has
+the kinematics in closed form. What touches, what drives it and how its joints are damped is the
+reader's.
 """
 
 FRANKA_BODIES = """

@@ -1,7 +1,8 @@
 """The arm waits while a slow gripper travels.
 
-The gripper of the training simulator closes within 0.2 s and real ones take up to a second. A policy that lifts as soon as it has closed the
-training gripper would leave a slow one behind. A held arm makes both look alike.
+The gripper of the training simulator closes within 0.2 s and real ones take up to a second. A
+policy that lifts as soon as it has closed the training gripper would leave a slow one behind. A
+held arm makes both look alike.
 """
 
 import numpy as np

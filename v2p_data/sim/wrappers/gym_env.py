@@ -151,7 +151,9 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Carry out one action; a step of the tool is clipped to [-1, 1], a target is gone for as far as one step leads.
+        """Carry out one action.
+
+        A step of the tool is clipped to [-1, 1], a target is gone for as far as one step leads.
 
         Raises:
             V2PError: it has another number of entries.

@@ -84,9 +84,11 @@ class V2PEnvConfig(EnvConfig):
     wrist: bool = False
     """Masks of the camera that the hand carries too, for policies trained on datasets of `--episodes.wrist`."""
     actions: str = ""
-    """What an action says: `delta_tool`, `absolute_tool` or `joints`; by default as in the dataset that carries the tasks."""
+    """What an action says: `delta_tool`, `absolute_tool` or `joints`; by default as in the dataset
+    that carries the tasks."""
     joint_state: bool = False
-    """Add the angles of the arm's joints to the state. A dataset that was made with `--episodes.joint-state` and carries the tasks turns this on."""
+    """Add the angles of the arm's joints to the state. A dataset that was made with
+    `--episodes.joint-state` and carries the tasks turns this on."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {

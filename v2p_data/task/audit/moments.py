@@ -46,8 +46,8 @@ SIZE_SIGMA_M, SIZE_SIGMA_SHARE = SIZE_ERROR_M / 0.674, SIZE_ERROR_SHARE / 0.674
 """The median of a normal number's amount is 0.674 standard deviations. The smaller of the two counts."""
 YAW_SIGMA_RAD = 0.1
 SWAY_M_S, SWAY_RAD_S = 0.016, 0.1
-"""Motion per axis of an object that is held up at the end. In 32 lifts at the fine step 90 % were slower than 0.027 m/s and
-0.15 rad/s over the last quarter of a second."""
+"""Motion per axis of an object that is held up at the end. In 32 lifts at the fine step 90 % were
+slower than 0.027 m/s and 0.15 rad/s over the last quarter of a second."""
 LIFTED_M = 0.02
 """Height above its rest from which an object is off the table; that height may be wrong, too."""
 TURNED_AWAY_M = 0.05
@@ -237,7 +237,10 @@ def _flung(scene: Scene, tracked: list[Poses], moments: list[Poses]) -> Probe:
 
 
 def _outline(scene: Scene) -> float:
-    """Return how far apart the two objects' centres are when they stand side by side [m]; one's half without another."""
+    """Return how far apart the two objects' centres are when they stand side by side [m].
+
+    One's half without another.
+    """
     sizes = [max(o.size_m[:2]) for o in scene.objects[:2]]
     return sum(sizes) / 2
 
@@ -299,9 +302,10 @@ def _disturbed(
 def _near_misses(scene: Scene, tracked: list[Poses], rng: np.random.Generator) -> list[Probe]:
     """Return what is nearly the end of the video and must not count, disturbed like the end itself.
 
-    A third of the way; the way in a wrong direction; beside what it should be in, on or over, or 5 cm further from what it
-    should be next to; toppled where things must stand; let go in mid-air where it must be held up; still held where it
-    must be let go; still in the air above where it must stand.
+    A third of the way; the way in a wrong direction; beside what it should be in, on or over, or 5
+    cm further from what it should be next to; toppled where things must stand; let go in mid-air
+    where it must be held up; still held where it must be let go; still in the air above where it
+    must stand.
     """
     kind, name = KINDS[scene.kind], scene.manipulated.name
     first, end = tracked[0], _end(scene, tracked)

@@ -1,4 +1,6 @@
-"""Every question to a model is an artefact: what was asked, what came back, what it cost; and can be asked again offline.
+"""Every question to a model is an artefact: what was asked, what came back, what it cost.
+
+And can be asked again offline.
 
 A call is named by the hash of what was asked. A folder of calls holds `<key>.json` per answered call and the pictures
 once each in `images/`. A budget for the whole folder is reckoned from its calls, whichever processes made them. Picture

@@ -139,7 +139,8 @@ class VlmClient:
             body = error.body
             words = str(body.get("message") or body) if isinstance(body, dict) else str(body)
             raise V2PError(
-                f"{self.cfg.base_url} refuses the request for model '{self.cfg.model}'; it answered {error.status_code}: "
+                f"{self.cfg.base_url} refuses the request for model '{self.cfg.model}'; it "
+                f"answered {error.status_code}: "
                 f"{self.store.shown(' '.join(words.split())[:300])}"
             ) from error
         except openai.APIConnectionError as error:
@@ -177,7 +178,8 @@ class VlmClient:
     def _usage(self, data: dict[str, Any], request: dict[str, Any], seconds: float) -> Usage:
         counted = data.get("usage")
         try:
-            sent, received = int(counted["prompt_tokens"]), int(counted["completion_tokens"])  # pyright: ignore[reportOptionalSubscript]
+            sent = int(counted["prompt_tokens"])  # pyright: ignore[reportOptionalSubscript]
+            received = int(counted["completion_tokens"])  # pyright: ignore[reportOptionalSubscript]
             estimated = 0
         except (TypeError, KeyError, ValueError):
             bare = json.dumps(without_pictures(request))
@@ -252,12 +254,14 @@ def _useful_text(call: Call) -> str:
     """
     if call.refusal or call.finish_reason == "content_filter":
         raise FaultyAnswerError(
-            "You refused. This is a robot arm in a physics simulation that moves everyday objects on a table; nobody can "
+            "You refused. This is a robot arm in a physics simulation that moves everyday objects "
+            "on a table; nobody can "
             "come to harm. Please answer the question as asked."
         )
     if call.finish_reason == "length":
         raise FaultyAnswerError(
-            f"Your answer was cut off after {call.usage.completion_tokens} tokens. Answer again from the start and much "
+            f"Your answer was cut off after {call.usage.completion_tokens} tokens. Answer again "
+            "from the start and much "
             "shorter: at most five sentences of thought, and code without long comments."
         )
     text = re.sub(r"<think>.*?</think>", "", call.answer, flags=re.DOTALL).strip()

@@ -46,7 +46,8 @@ class VlmConfig:
     timeout_s: float = 180.0
     """The longest silence of the server: answers come in one piece, so until the answer."""
     max_retries: int = 6
-    """Further tries of one request after a busy server or a broken line, with waits as the `openai` package has them."""
+    """Further tries of one request after a busy server or a broken line, with waits as the
+    `openai` package has them."""
     max_reasks: int = 2
     """Times a cut-off, empty, refused or code-free answer is asked for again."""
     max_regenerations: int = 3
@@ -64,7 +65,8 @@ class VlmConfig:
     price_out_per_million: float = 10.0
     """Price of a million tokens received."""
     images: bool = True
-    """Send pictures of the scene; off for models without eyes. With `tracking` off too, only caption and names are told."""
+    """Send pictures of the scene; off for models without eyes. With `tracking` off too, only
+    caption and names are told."""
     tracking: bool = True
     """Send the tracked poses of the first and last frame; off for the ablation without tracking."""
     image_side_px: int = 768

@@ -80,12 +80,18 @@ total: share of the total magnitude 1.000
 block: the gripper came within 4.2 cm of its centre; share of episodes in which it was reached 1.00, touched 0.92, grasped 0.28, raised 0.00; it moved by 3.1 cm
 """,
         thoughts=(
-            "Nothing succeeded, so the reward is designed anew. reach has 97 % of the magnitude and rises to 0.8 of its 0.9: "
-            "the gripper hovers at the block and is paid for staying there, which makes it a place to park. raise is at its "
-            "minimum in 92 % of steps: the block is touched in 92 % of episodes and raised in none, so nothing pulls from "
-            "being there to lifting, and what little raising pays can be had by flinging. effort costs exploration more than "
-            "raise can ever bring. So: reach becomes a fifth, with a steeper slope near the block; a component for grasping "
-            "is the missing step; raising gets most of the weight and counts in the gripper only; effort falls to a tenth."
+            "Nothing succeeded, so the reward is designed anew. reach has 97 % of the magnitude "
+            "and rises to 0.8 of its 0.9: "
+            "the gripper hovers at the block and is paid for staying there, which makes it a "
+            "place to park. raise is at its "
+            "minimum in 92 % of steps: the block is touched in 92 % of episodes and raised in "
+            "none, so nothing pulls from "
+            "being there to lifting, and what little raising pays can be had by flinging. effort "
+            "costs exploration more than "
+            "raise can ever bring. So: reach becomes a fifth, with a steeper slope near the "
+            "block; a component for grasping "
+            "is the missing step; raising gets most of the weight and counts in the gripper only; "
+            "effort falls to a tenth."
         ),
         after=reward_source(GRASP_A_BLOCK),
         came_to="With it a policy succeeded in 61 of 64 episodes after as many steps as before.",

@@ -162,7 +162,8 @@ BASIC_EXAMPLES = (
     Example(
         task="reach the block. Objects: block (box, 5 x 5 x 5 cm).",
         thoughts=(
-            "What must be true at the end? The tool centre point is at the block. How near is near? That depends on the "
+            "What must be true at the end? The tool centre point is at the block. How near is "
+            "near? That depends on the "
             "block, so the threshold comes from block_size. What would fool this? Flying past, so the gripper must be "
             "slow; knocking the block away, so the block must be where it started. Is it false at the start? Yes, the "
             "gripper starts 20 cm above the table. What helps the policy? The vector from the gripper to the block."
@@ -173,7 +174,8 @@ BASIC_EXAMPLES = (
     Example(
         task="grasp the block. Objects: block (box, 5 x 5 x 5 cm).",
         thoughts=(
-            "What must be true at the end? The block is in the gripper. block_grasped says that both pads touch it, but "
+            "What must be true at the end? The block is in the gripper. block_grasped says that "
+            "both pads touch it, but "
             "pads may touch a block without holding it; a held block comes along when the gripper rises, so 3 cm of "
             "height are asked for, measured from where it started, not from the table, because the centre of a resting "
             "block is above the table already. What would fool this? Flinging it up: then it is not grasped, and not "

@@ -1,4 +1,4 @@
-"""What of a scene's folder a model is shown: first and last frame, what was understood drawn over them, a contact sheet.
+"""What a model is shown of a scene: first and last frame, the overlay, a contact sheet.
 
 Only files that lie in the scene's folder are read. Pictures are scaled down and sent as JPEG data URLs.
 """

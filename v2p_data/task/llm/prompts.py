@@ -104,7 +104,8 @@ def system_message(
     parts = [f"{INTERFACE.format(full=FULL_REWARD)}\n{world_words(object_names)}", rules()]
     for number, example in enumerate(examples, 1):
         parts.append(
-            f"Example {number}: {example.task}\n\nThoughts: {example.thoughts}\n\n```python\n{example.code.strip()}\n```"
+            f"Example {number}: {example.task}\n\nThoughts: "
+            f"{example.thoughts}\n\n```python\n{example.code.strip()}\n```"
         )
     for number, refined in enumerate(refinements, 1):
         parts.append(
@@ -153,7 +154,7 @@ def scene_message(
     then: str,
     end: str,
 ) -> Message:
-    """Return the question: the scene in words, what to do, pictures, then `end`, which alone differs between samples."""
+    """Return the question: the scene in words, what to do, pictures, then `end`, which differs by sample."""
     text = f"{scene_words(scene, tracking=tracking, shapes=shapes)}\n\n{then}"
     parts: list[dict[str, object]] = [{"type": "text", "text": text}]
     for picture in pictures:
@@ -194,8 +195,10 @@ def scene_words(scene: Scene, *, tracking: bool, shapes: bool) -> str:
     if tracking and tracked:
         lines += [
             "",
-            "Tracked poses of the video, in a frame with the same axes, its origin on the table under the first object's first "
-            "place. Only differences carry over to the simulator. Tracking errs by a centimetre or two, in height by more.",
+            "Tracked poses of the video, in a frame with the same axes, its origin on the table "
+            "under the first object's first "
+            "place. Only differences carry over to the simulator. Tracking errs by a centimetre "
+            "or two, in height by more.",
             "",
             "| object | frame | x, y, z [m] | qw, qx, qy, qz |",
             "|---|---|---|---|",
@@ -221,7 +224,8 @@ def scene_words(scene: Scene, *, tracking: bool, shapes: bool) -> str:
 def sample_words(index: int, count: int, idea: str) -> str:
     """Return what is said to one sample alone, so that the samples differ."""
     return (
-        f"This is sample {index + 1} of {count}. So that the samples differ, let this one's reward follow this idea if it suits "
+        f"This is sample {index + 1} of {count}. So that the samples differ, let this one's "
+        "reward follow this idea if it suits "
         f"the task: {idea}"
     )
 
@@ -235,7 +239,8 @@ def fault_message(fault: str, code: str) -> Message:
         words += f"\nThat line is: `{lines[int(found[1]) - 1].strip()[:200]}`"
     return {
         "role": "user",
-        "content": f"{words}\nSay in one sentence what is wrong, then answer in the same form as before, with everything.",
+        "content": f"{words}\nSay in one sentence what is wrong, then answer in the same form as "
+        "before, with everything.",
     }
 
 
@@ -244,7 +249,8 @@ def objection_message(table: str) -> Message:
     return {
         "role": "user",
         "content": f"This code runs, but an audit of its success function found fault with it:\n\n{table}\n\n"
-        "Say which condition is wrong or missing and why, then answer in the same form as before, with everything. Do not "
+        "Say which condition is wrong or missing and why, then answer in the same form as before, "
+        "with everything. Do not "
         "fit numbers to the audit: say what must be true.",
     }
 
@@ -355,7 +361,8 @@ def better_reward_question(code: str, feedback: str) -> str:
     return (
         f"Its code:\n\n```python\n{code.strip()}\n```\n\n"
         f"A policy was trained with this reward. What was seen:\n\n{feedback.strip()}\n\n"
-        "Analyse each component first: what do its values in successful and in failed episodes say? A component that hardly "
+        "Analyse each component first: what do its values in successful and in failed episodes "
+        "say? A component that hardly "
         "changes is to be rescaled, given another temperature, rewritten or dropped; one that is far larger than the "
         "others is to be scaled down; one that is highest in failed episodes leads astray; a missing step needs a "
         "component. Successful episodes must earn more than failed ones. If nothing succeeded, design the reward anew. "

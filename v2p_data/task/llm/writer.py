@@ -1,7 +1,8 @@
 """A model writes task codes until enough of them run, chooses among them, and writes rewards for a task that exists.
 
-Whatever it writes is tried in the sandbox before anybody sees it, and goes back to it with the error and the line where it
-does not run. Nothing it says overrules the audit: it chooses among codes that the audit finds acceptable.
+Whatever it writes is tried in the sandbox before anybody sees it, and goes back to it with the
+error and the line where it does not run. Nothing it says overrules the audit: it chooses among
+codes that the audit finds acceptable.
 """
 
 import logging
@@ -211,7 +212,9 @@ def pick_sample(
     *,
     audits_pick: int,
 ) -> Pick:
-    """Return the model's choice among the acceptable samples; the audit's where there is nothing to choose, or no answer.
+    """Return the model's choice among the acceptable samples.
+
+    The audit's where there is nothing to choose, or no answer.
 
     Args:
         client: the model.

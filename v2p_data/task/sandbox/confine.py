@@ -56,7 +56,8 @@ def leave_the_network() -> bool:
 def confine(rights: Rights, *, parent_pid: int, give_up_root: bool = True) -> tuple[str, ...]:
     """Give up, for the rest of this process's life, everything that untrusted code should not have.
 
-    No socket can be opened and no program started afterwards, whatever the arguments are. The process ends with its parent.
+    No socket can be opened and no program started afterwards, whatever the arguments are. The
+    process ends with its parent.
 
     Args:
         rights: what this process may still use.

@@ -15,11 +15,12 @@ What it covers. Three walls, one behind the other:
   file, no socket, no process, no program, an empty folder and environment, and limits on time and memory. What comes
   back is JSON, read as data; nothing is ever unpickled.
 
-What it does not cover. Nothing here is proof against a hole in CPython, torch or the kernel. Code that has passed the
-smoke run is loaded into the training process, where the second wall stands alone unless that process calls
-`confine` too: each call has a time limit (`time_limit`), but code that turns large for large batches ends it. Where the kernel has
-neither Landlock nor seccomp the limits of the third wall remain. Task code may also be *wrong*; that is
-`audit`'s business. `docs/safety.md` says how all this is tested.
+What it does not cover. Nothing here is proof against a hole in CPython, torch or the kernel. Code
+that has passed the smoke run is loaded into the training process, where the second wall stands
+alone unless that process calls `confine` too: each call has a time limit (`time_limit`), but code
+that turns large for large batches ends it. Where the kernel has neither Landlock nor seccomp the
+limits of the third wall remain. Task code may also be *wrong*; that is `audit`'s business.
+`docs/safety.md` says how all this is tested.
 """
 
 import ast

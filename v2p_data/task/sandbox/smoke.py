@@ -1,7 +1,8 @@
 """Runs unknown task code once, in a child process that cannot hurt anyone, and says whether it works.
 
-The child forks for every sample, so that a crash, a hang or a memory bomb in one sample is that sample's own result, and
-torch is imported once for all of them. See `sandbox` for what a fork may not do.
+The child forks for every sample, so that a crash, a hang or a memory bomb in one sample is that
+sample's own result, and torch is imported once for all of them. See `sandbox` for what a fork may
+not do.
 """
 
 import hashlib

@@ -1,8 +1,9 @@
 """Puts a new reward into a task without touching the rest: whoever writes rewards cannot move the goal.
 
-Of the new code, `reward_function` is taken with the functions and constants that it uses, each as a statement of its own
-that binds one name. What has a name that the task uses for something else is renamed, and what could be changed in place
-is copied, so that nothing which the task's success, reset and observations read is replaced or shared.
+Of the new code, `reward_function` is taken with the functions and constants that it uses, each as
+a statement of its own that binds one name. What has a name that the task uses for something else
+is renamed, and what could be changed in place is copied, so that nothing which the task's success,
+reset and observations read is replaced or shared.
 """
 
 import ast
@@ -87,7 +88,8 @@ def _answered(answer: str) -> ast.Module:
         )
         if not is_left_out and not any(_definitions_in(node)):
             raise SpliceError(
-                f"Line {node.lineno} of your code may change what else the task reads ({type(node).__name__}). Write only "
+                f"Line {node.lineno} of your code may change what else the task reads "
+                f"({type(node).__name__}). Write only "
                 "functions without `global`, and constants as NAME = value."
             )
     return tree
@@ -109,7 +111,7 @@ def reward_source(code: str) -> str:
 
 
 def rest_part(code: str) -> str:
-    """Return a normal form of everything but the reward: success, reset, observations, and all that binds what they use."""
+    """Return a normal form of everything but the reward: success, reset, observations and what they use."""
     tree = ast.parse(code)
     methods = [n for n in _class_body(tree) if getattr(n, "name", "") != "compute_reward"]
     kept: list[ast.stmt] = []

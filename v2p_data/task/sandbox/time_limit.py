@@ -1,8 +1,9 @@
 """What is done with loaded task code ends in time, with a result or one sentence.
 
-One watching thread per process counts its own ticks. Who is in task code for too many of them gets an exception between
-two of its bytecodes, which task code cannot catch. A stopped or suspended process is not taken for a slow one, because
-the watching thread stands still with it. A single tensor operation cannot be interrupted: the exception waits for its end.
+One watching thread per process counts its own ticks. Who is in task code for too many of them gets
+an exception between two of its bytecodes, which task code cannot catch. A stopped or suspended
+process is not taken for a slow one, because the watching thread stands still with it. A single
+tensor operation cannot be interrupted: the exception waits for its end.
 """
 
 import ctypes
@@ -104,7 +105,8 @@ def in_time[T](function: Callable[[], T], what: str = "a call") -> T:
         is_late, what = True, method_in_task_code(error) or what
     if is_late:
         raise TaskCodeTooSlowError(
-            f"{what} of the task's code took more than {LIMIT_S:g} s and was ended; does it loop, or make huge tensors? "
+            f"{what} of the task's code took more than {LIMIT_S:g} s and was ended; does it loop, "
+            "or make huge tensors? "
             "Correct it in its task.py, or take another task"
         )
     return result  # pyright: ignore[reportReturnType]

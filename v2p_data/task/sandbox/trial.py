@@ -1,8 +1,8 @@
 """Code in a task folder runs in the confined child before it runs here, whoever made the folder.
 
-What has passed is noted by a digest of code and objects, in this process and in this machine's cache, outside of any task
-folder: so each task is tried once per machine, and no folder can claim that it was. What this engine writes itself is
-noted when it is tried while it is made.
+What has passed is noted by a digest of code and objects, in this process and in this machine's
+cache, outside of any task folder: so each task is tried once per machine, and no folder can claim
+that it was. What this engine writes itself is noted when it is tried while it is made.
 """
 
 import hashlib

@@ -139,7 +139,8 @@ def drop_in_front_of(m: Measured, v: Variant) -> Draft:
         goal=[
             "goal_point = ref_pos.clone()",
             "front = -torch.ones_like(goal_point[:, 0])",
-            "room = torch.maximum(obj_size[:, 0], obj_size[:, 1]) / 2 + torch.maximum(ref_size[:, 0], ref_size[:, 1]) / 2",
+            "room = torch.maximum(obj_size[:, 0], obj_size[:, 1]) / 2 + torch.maximum(ref_size[:, "
+            "0], ref_size[:, 1]) / 2",
             "goal_point[:, 0] = ref_pos[:, 0] + front * (room + 0.02)",
             "goal_point[:, 2] = obj_start[:, 2]",
         ],
@@ -218,7 +219,8 @@ def uncover(m: Measured, v: Variant) -> Draft:
             HEIGHT,
             REF_MOVED,
             "aside = torch.norm((obj_pos - ref_pos)[:, :2], dim=-1)",
-            "room = (torch.maximum(obj_size[:, 0], obj_size[:, 1]) + torch.maximum(ref_size[:, 0], ref_size[:, 1])) / 2",
+            "room = (torch.maximum(obj_size[:, 0], obj_size[:, 1]) + torch.maximum(ref_size[:, "
+            "0], ref_size[:, 1])) / 2",
             "standing = upright(obj_quat, obj_start_quat)",
         ],
         success=[
@@ -232,7 +234,8 @@ def uncover(m: Measured, v: Variant) -> Draft:
         contact="gripped * near",
         pays_contact=True,
         # A factor, not a fine: fined for every tilt, a policy learns to stay away from the cover.
-        progress=f"torch.maximum((height / {height + 0.02:.3f}).clamp(0.0, 1.0) * contact, (aside / (room + 0.03)).clamp(0.0, 1.0) * 0.6) * standing.clamp(0.0, 1.0)",
+        progress=f"torch.maximum((height / {height + 0.02:.3f}).clamp(0.0, 1.0) * contact, (aside "
+        "/ (room + 0.03)).clamp(0.0, 1.0) * 0.6) * standing.clamp(0.0, 1.0)",
         remaining=f"({height} - height).clamp(min=0.0)",
         goal=shifted("obj_start", z=height + 0.03),
         direction=shifted("torch.zeros_like(obj_pos)", z=1.0),
@@ -303,7 +306,7 @@ def _carry(
 
 
 def _carry_stages(falls_m: float) -> list[str]:
-    """Return lines for the reward that measure raising, carrying, lowering, opening, and being low over the other object."""
+    """Return lines of the reward that measure raising, carrying, lowering, opening and being low."""
     return [
         "raised = (height / 0.08).clamp(0.0, 1.0)",
         "way = torch.norm((goal_point - obj_start)[:, :2], dim=-1).clamp(min=0.05)",
@@ -311,7 +314,8 @@ def _carry_stages(falls_m: float) -> list[str]:
         # From any height: with a slope that ended at 15 cm, a matchbox was held 20 cm above its goal for good.
         "lowered = 0.5 * (1 - above_goal / 0.4).clamp(0.0, 1.0) + 0.5 * (1 - above_goal / 0.1).clamp(0.0, 1.0)",
         f"opened = (gripper_width / 0.085).clamp(0.0, 1.0) * (1 - above_goal / {falls_m}).clamp(0.0, 1.0)",
-        "from_other = torch.norm((eef_pos - ref_pos)[:, :2], dim=-1) - torch.maximum(ref_size[:, 0], ref_size[:, 1]) / 2",
+        "from_other = torch.norm((eef_pos - ref_pos)[:, :2], dim=-1) - torch.maximum(ref_size[:, "
+        "0], ref_size[:, 1]) / 2",
         "too_low = ((ref_pos[:, 2] + ref_size[:, 2] / 2 + 0.06 - eef_pos[:, 2]) / 0.06).clamp(0.0, 1.0)",
         "low_over_other = too_low * (1 - from_other / 0.05).clamp(0.0, 1.0)",
     ]

@@ -23,7 +23,8 @@ def grasp_setup(name: str = "obj", *, by_wall: bool = False) -> list[str]:
     """Lines for the point at which the gripper holds an object, `obj` or `ref`, and for the side that it spans.
 
     While the gripper is beside a tall object the point is above that object: whoever comes straight at it presses on
-    its rim and never gets the open fingers over it. `by_wall`: the point is in the nearer of the manipulated object's two walls.
+    its rim and never gets the open fingers over it. `by_wall`: the point is in the nearer of the
+    manipulated object's two walls.
     """
     height = "(tall - 0.035).clamp(min=0.0) + torch.minimum(1.5 * (beside - 0.01).clamp(min=0.0), 2 * tall)"
     lines = [
@@ -47,7 +48,8 @@ def grasp_setup(name: str = "obj", *, by_wall: bool = False) -> list[str]:
 
 def _by_wall(height: str) -> list[str]:
     return [
-        "across = torch.nn.functional.normalize(closing * torch.tensor([1.0, 1.0, 0.0], device=obj_pos.device), dim=-1)",
+        "across = torch.nn.functional.normalize(closing * torch.tensor([1.0, 1.0, 0.0], "
+        "device=obj_pos.device), dim=-1)",
         "side = torch.sign(((eef_pos - obj_pos) * across).sum(dim=-1))",
         "middle = side * (obj_half(obj_quat, obj_size, across) - 0.005)",
         "grasp_point = obj_pos + across * middle.unsqueeze(-1)",

@@ -82,7 +82,8 @@ def tip_over(_: Measured, v: Variant) -> Draft:
         reward_setup=[
             "up = torch.zeros_like(obj_pos)",
             "up[:, 2] = 1",
-            "top = obj_pos + in_world_frame(obj_quat, in_body_frame(obj_start_quat, up)) * (0.7 * half_height).unsqueeze(-1)",
+            "top = obj_pos + in_world_frame(obj_quat, in_body_frame(obj_start_quat, up)) * (0.7 * "
+            "half_height).unsqueeze(-1)",
         ],
         target="top",
         progress="1 - standing.abs()",
@@ -129,10 +130,12 @@ def push_next_to(m: Measured, v: Variant) -> Draft:
         reward_setup=[
             *push_point_setup(clearance_m=0.012),
             "ahead = ((eef_pos - push_point) * goal_direction).sum(dim=-1)",
-            "wanted_height = torch.where(distance_xy < 0.04, push_point[:, 2], torch.where(ahead > 0, push_point[:, 2] + 0.07, push_point[:, 2] + 0.02))",
+            "wanted_height = torch.where(distance_xy < 0.04, push_point[:, 2], torch.where(ahead "
+            "> 0, push_point[:, 2] + 0.07, push_point[:, 2] + 0.02))",
         ],
         target="push_point",
-        progress=f"(0.5 * (1 - gap / 0.15).clamp(-1.0, 1.0) + 0.5 * torch.exp(-gap.clamp(min=0.0) / 0.025)) * {LOW}.float() * {STANDING}",
+        progress="(0.5 * (1 - gap / 0.15).clamp(-1.0, 1.0) + 0.5 * torch.exp(-gap.clamp(min=0.0) "
+        f"/ 0.025)) * {LOW}.float() * {STANDING}",
         remaining="gap.clamp(min=0.0)",
         goal="ref_pos",
         extras=[
@@ -164,7 +167,8 @@ def push_with(m: Measured, v: Variant) -> Draft:
             "between = obj_pos - ref_pos",
             "between[:, 2] = 0",
             "line = torch.nn.functional.normalize(between, dim=-1)",
-            "gap = torch.norm(between, dim=-1) - obj_half(obj_quat, obj_size, line) - ref_half(ref_quat, ref_size, line)",
+            "gap = torch.norm(between, dim=-1) - obj_half(obj_quat, obj_size, line) - "
+            "ref_half(ref_quat, ref_size, line)",
         ],
         success=[
             ("is_there", f"{there} > {far}"),

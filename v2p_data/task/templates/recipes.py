@@ -20,7 +20,10 @@ Recipe = Callable[[Measured, Variant], Draft]
 
 
 def draft_of(measured: Measured, variant: Variant) -> Draft:
-    """Return the task in expressions; a kind that needs a second object follows the tracked motion where there is none."""
+    """Return the task in expressions.
+
+    A kind that needs a second object follows the tracked motion where there is none.
+    """
     lacks_other = KINDS[measured.kind].other == "needed" and measured.ref is None
     recipe = _generic if lacks_other else RECIPES[measured.kind]
     return recipe(measured, variant)
@@ -51,7 +54,8 @@ def _generic(m: Measured, v: Variant) -> Draft:
         thoughts=["Reach the object.", "Move it as in the video.", "Keep it there."],
         setup=[
             f"goal_point = {shifted('obj_start', x=x, y=y, z=z)}",
-            f"goal_direction = torch.nn.functional.normalize({shifted('torch.zeros_like(obj_pos)', x=x, y=y, z=z)}, dim=-1)",
+            "goal_direction = "
+            f"torch.nn.functional.normalize({shifted('torch.zeros_like(obj_pos)', x=x, y=y, z=z)}, dim=-1)",
             "remaining = torch.norm(goal_point - obj_pos, dim=-1)",
         ],
         success=success,

@@ -7,22 +7,27 @@ _TURN = (
     "turn",
     "0.15 * reach * (1 - (pads_apart - 0.07) / (diagonal - 0.07).clamp(min=0.03)).clamp(0.0, 1.0)",
 )
-"""Without it, open fingers get wedged over the diagonal of a wide box, and closing them achieves nothing. It counts near
-the object only: paid everywhere, turning is learned instead of reaching, and after 0.1 million steps the object is in
-the gripper a tenth as often."""
+"""Without it, open fingers get wedged over the diagonal of a wide box, and closing them achieves
+nothing. It counts near the object only: paid everywhere, turning is learned instead of reaching,
+and after 0.1 million steps the object is in the gripper a tenth as often."""
 _FINGERS = (
     "fingers",
     "0.05 * snug * torch.where(distance < 0.025, (gripper_width > pads_apart - 0.004).float()"
     " * (2 - (gripper_width - pads_apart) / 0.085).clamp(0.0, 2.0),"
     " reach * ((gripper_width - pads_apart) / 0.01).clamp(0.0, 1.0))",
 )
-"""Wide enough on the way, then ever closer around the object, for what nearly fills the gripper: fingers that wander do
-not fit over it. Fingers that have closed above it are narrower than it. Paid for a box of 4 x 6 cm too, it teaches to keep
-the fingers open: the box was in them half as often after 0.12 million steps."""
+"""Wide enough on the way, then ever closer around the object, for what nearly fills the gripper:
+fingers that wander do not fit over it. Fingers that have closed above it are narrower than it.
+Paid for a box of 4 x 6 cm too, it teaches to keep the fingers open: the box was in them half as
+often after 0.12 million steps."""
 
-_SIDEWAYS_FIRST = "distance = torch.norm(torch.cat([way_there[:, :2] * (1 + 1.5 * snug).unsqueeze(-1), way_there[:, 2:]], dim=-1), dim=-1)"
-"""The point to reach sinks as the gripper comes over a tall object, and open fingers can follow it only over the middle of one
-that nearly fills them. Counted once, the last three centimetres to the middle lead away from the point: covering ended there."""
+_SIDEWAYS_FIRST = (
+    "distance = torch.norm(torch.cat([way_there[:, :2] * (1 + 1.5 * "
+    "snug).unsqueeze(-1), way_there[:, 2:]], dim=-1), dim=-1)"
+)
+"""The point to reach sinks as the gripper comes over a tall object, and open fingers can follow it
+only over the middle of one that nearly fills them. Counted once, the last three centimetres to the
+middle lead away from the point: covering ended there."""
 
 
 def docstring_lines(v: Variant, d: Draft) -> list[str]:

@@ -1,4 +1,4 @@
-"""The eight samples of a task: what is not sure about the video, how smooth, in which form, with which extra observations.
+"""The eight samples of a task: doubts about the video, smoothness, form, extra observations.
 
 Sample 0 has the shapes that were measured to train fastest. The others differ in what a video leaves open: how far is
 far enough, given the error of what was measured; how still is still; whether the goal is what the words say or where

@@ -59,7 +59,7 @@ def check_amount(tree: ast.Module) -> None:
     line = 1
     for _ in range(allowed.MAX_DEPTH):
         count += len(level)
-        line = next((n.lineno for n in level if hasattr(n, "lineno")), line)  # pyright: ignore[reportAttributeAccessIssue]
+        line = next(filter(None, (getattr(n, "lineno", None) for n in level)), line)
         for node in level:
             longest = max((len(name) for name in _names_of(node)), default=0)
             if longest > source_text.MAX_WORD_CHARS:

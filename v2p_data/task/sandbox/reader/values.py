@@ -51,7 +51,8 @@ class Values:
                 pass
             case int() as number if abs(number) > allowed.MAX_NUMBER:
                 self.here.refuse(
-                    f"the whole number is larger than {allowed.MAX_NUMBER:g}; write it as 1e9 if no size or count is meant"
+                    f"the whole number is larger than {allowed.MAX_NUMBER:g}; write it as 1e9 if "
+                    "no size or count is meant"
                 )
             case int() | float():
                 pass
