@@ -86,9 +86,8 @@ def pack(
 ) -> NewDataset:
     """Write staged episodes, in this order, as a LeRobot v3 dataset at `root`.
 
-    A packing that was stopped goes on where it was when it is called again. Where handovers are among the episodes,
-    all frames have the column `intervention`: whether the expert acted. What only a simulator knows is kept where all
-    episodes have it; those of earlier versions and of robots have not.
+    A packing that was stopped goes on when it is called again. With handovers among the episodes all frames have the
+    column `intervention`: whether the expert acted. What a simulator knows is kept where all episodes have it.
 
     Args:
         staged: files that `Episode.save` wrote.
@@ -99,14 +98,11 @@ def pack(
         on_progress: called with the share that is done and a few words.
 
     Raises:
-        V2PError: there is something at `root`, nothing to pack, the episodes do not go together, or nothing can be
-            written there.
+        V2PError: `root` exists or cannot be written, there is no episode, or they do not go together.
     """
     check_repo_id(repo_id)
     if root.exists():
-        raise V2PError(
-            f"{root} exists already; delete it to write the dataset anew, or choose another place with --out"
-        )
+        raise V2PError(f"{root} exists already; delete it, or choose another place with --out")
     headings = _headings(staged)
     partial = root.with_name(root.name + ".partial")
     with refusals_named("packing", root.parent):
