@@ -31,7 +31,7 @@ from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import StateActor
 from v2p_data.policy.config import PolicyConfig
 from v2p_data.policy.training import POLICY_FOLDER, sources_of
-from v2p_data.sim.env import verdict
+from v2p_data.sim.env import ranges, verdict
 from v2p_data.sim.env.actions import steps_to
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.model.world import build_world
@@ -186,7 +186,7 @@ def test_every_episode_comes_back_from_what_was_carried_out(agreed, roots, actio
 
 @pytest.mark.parametrize("actions", KINDS)
 def test_recorded_targets_bring_the_same_states_back_where_no_noise_is_on_them(actions):
-    calm = replace(RandomizationConfig(), action_noise=0.0)
+    calm = replace(ranges.RandomizationConfig(), action_noise=0.0)
     sim = SimConfig(fine=True, randomization=calm)
 
     class Follow(StateActor):

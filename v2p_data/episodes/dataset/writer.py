@@ -86,8 +86,7 @@ def pack(
 ) -> NewDataset:
     """Write staged episodes, in this order, as a LeRobot v3 dataset at `root`.
 
-    A packing that was stopped goes on when it is called again. With handovers among the episodes all frames have the
-    column `intervention`: whether the expert acted. What a simulator knows is kept where all episodes have it.
+    A packing that was stopped goes on when it is called again. With handovers, `intervention` tells who acted.
 
     Args:
         staged: files that `Episode.save` wrote.
@@ -102,7 +101,9 @@ def pack(
     """
     check_repo_id(repo_id)
     if root.exists():
-        raise V2PError(f"{root} exists already; delete it, or choose another place with --out")
+        raise V2PError(
+            f"{root} exists already; delete it to write the dataset anew, or choose another place with --out"
+        )
     headings = _headings(staged)
     partial = root.with_name(root.name + ".partial")
     with refusals_named("packing", root.parent):
