@@ -24,7 +24,7 @@ BELOW: dict[str, set[str]] = {
     "task": {"scene", "video", "geometry", "seeds", "kinds"},
     # The simulator runs task code, so it knows the task's interface and its sandbox; never the other way round.
     "sim": {"task", "scene", "geometry", "seeds", "kinds"},
-    # It trains policies, as the reward search does: the two rooms below the top that know `policies`.
+    # It trains policies, as the reward search does.
     "experts": {"play", "sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
     "play": {"sim"},
     "episodes": {"play", "sim", "task", "scene", "geometry", "pipeline", "seeds", "kinds"},
