@@ -4,7 +4,7 @@
     python scripts/train_hand_ruler.py train DATA --out v2p_data/scene/fitting/ruler.safetensors --minutes 30
 
 `data` draws random scenes in moments at which a hand touches a thing at rest, each through twelve
-cameras, and keeps what lies within half a metre around the hand's end. `train` shows windows that
+cameras, and keeps the half metre around the hand's end. `train` shows windows that
 are too large or too small by chance, prints how well the network says by how much on scenes that
 it does not train on, and writes the weights every two minutes. Scenes are drawn from seeds of
 their own (`hand network`), so that no clip of `bench_reconstruction.py` is among them.

@@ -2,7 +2,7 @@
 
 The video is encoded first (`shards`) and put into files; then the tables, by LeRobot's own
 functions for metadata and statistics. The dataset grows in `<root>.partial`, is checked, and is
-renamed into place at the end, so that what lies at `root` is finished. The same episodes give the
+renamed into place at the end, so that a folder at `root` is finished. The same episodes give the
 same bytes, after any number of kills, with any number of threads.
 """
 
