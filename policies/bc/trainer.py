@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 STATE_FILE = "training_state.pt"
 BEST_FILE = "best.safetensors"
 CURVE_FILE = "curve.csv"
-TENSORBOARD_FOLDER = "tensorboard"
 STATISTICS = {
     NormalizationMode.MEAN_STD: ("mean", "std"),
     NormalizationMode.MIN_MAX: ("min", "max"),
@@ -197,7 +196,7 @@ def train(
     judge: Judge | None = None,
     on_progress: Progress = lambda share, words: None,
 ) -> Trained:
-    """Train the policy in place, on its own device, and leave curve and TensorBoard log in `out`.
+    """Train the policy in place, on its own device, and leave its curve in `out`.
 
     Args:
         policy: starts as it is; ends with the mean weights of the best checkpoint.
@@ -256,7 +255,6 @@ class _Run:
         loader_s = part_s = part_loader_s = 0.0
         losses: list[Tensor] = []
         first = self.step
-        writer = _tensorboard(self.out / TENSORBOARD_FOLDER)
         self.policy.train()
         while self.step < cfg.steps:
             begun = time.perf_counter()
@@ -269,7 +267,7 @@ class _Run:
             self.step += 1
             if self.step % log_every == 0 or self.step == cfg.steps:
                 rate = len(losses) * cfg.batch_size / part_s
-                loss = self._note(losses, rate, part_loader_s / part_s, writer)
+                loss = self._note(losses, rate, part_loader_s / part_s)
                 loader_s += part_loader_s
                 left_s = (
                     (time.monotonic() - started) / (self.step - first) * (cfg.steps - self.step)
@@ -285,8 +283,6 @@ class _Run:
                 self._save()
                 saved = time.monotonic()
         seconds = time.monotonic() - started
-        if writer is not None:
-            writer.close()
         self._write_curve()
         self._keep_best()
         # In this order: a state without the best checkpoint would end in other weights.
@@ -300,7 +296,7 @@ class _Run:
             judged=tuple(self.judged),
         )
 
-    def _note(self, losses: list[Tensor], rate: float, loader_share: float, writer: Any) -> float:
+    def _note(self, losses: list[Tensor], rate: float, loader_share: float) -> float:
         """Add a row to the curve; return the mean loss since the last one.
 
         Raises:
@@ -314,9 +310,6 @@ class _Run:
             )
         row = (self.step, loss, self.optimizer.param_groups[0]["lr"], rate, loader_share)
         self.rows.append(row)
-        if writer is not None:
-            for name, value in zip(CURVE_FIELDS[1:], row[1:], strict=True):
-                writer.add_scalar(f"train/{name}", value, self.step)
         return loss
 
     def _batch(self, step: int) -> dict[str, Any]:
@@ -466,12 +459,3 @@ def _optimizer(policy: V2PBCPolicy) -> torch.optim.Optimizer:
         weight_decay=preset.weight_decay,
         fused=True,
     )
-
-
-def _tensorboard(folder: Path) -> Any:
-    """Return TensorBoard's writer, None where it is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder))

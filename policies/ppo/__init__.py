@@ -5,5 +5,5 @@ In: a batched TorchRL environment with `observation` (env, obs), actions in [-1,
 optionally `components`, a nested dict of the parts of the reward, and a method `stagger(first)` that puts the
 worlds at random moments of their episodes. Out, in one folder: the best expert
 (`weights.safetensors` + `expert.json`), `last/` (the same, at the end), `checkpoint.pt` to go on from,
-`curve.csv`, `curve.png` and the same curves for TensorBoard.
+`curve.csv` and `curve.png`.
 """

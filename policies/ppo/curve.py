@@ -1,14 +1,10 @@
-"""The learning curve: a CSV that survives a kill, its picture, and its mirror for TensorBoard."""
+"""The learning curve: a CSV that survives a kill, and its picture."""
 
 import csv
-import math
-import time
 from pathlib import Path
 
 CURVE_FILE = "curve.csv"
 PICTURE_FILE = "curve.png"
-EVENT_FILES = "events.out.tfevents.*"
-"""TensorBoard's naming. They hold times and the machine's name: never make them part of a fingerprint."""
 
 Row = dict[str, int | float]
 
@@ -57,44 +53,3 @@ def plot_curve(path: Path, picture: Path) -> None:
     bottom.plot(steps, [row["return"] for row in rows])
     bottom.set(xlabel="control steps [million]", ylabel="return per episode")
     figure.savefig(picture, dpi=100)
-
-
-class EventMirror:
-    """The rows of the CSV as TensorBoard scalars over control steps: `tensorboard --logdir <any parent folder>`.
-
-    The CSV is the truth. Opening the mirror writes all its rows into a new event file and empties the old ones,
-    so that a resumed training, whose CSV was cut to the checkpoint, shows every step once.
-    """
-
-    def __init__(self, curve: Path) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        for old in curve.parent.glob(EVENT_FILES):
-            old.write_bytes(
-                b""
-            )  # not deleted: a TensorBoard that is watching would wait for it forever
-        rows = read_rows(curve)
-        # Times as if all of it had been trained in one go: "relative" in TensorBoard is seconds of training.
-        self.began = time.time() - (rows[-1]["seconds"] if rows else 0.0)
-        # Whoever is watching drops what it has read so far.
-        self.writer = SummaryWriter(str(curve.parent), purge_step=0)
-        for row in rows:
-            self.add(row)
-
-    def add(self, row: Row) -> None:
-        """Write one row at once; a rate that does not exist yet (NaN) is left out."""
-        for column, value in row.items():
-            if column != "steps" and math.isfinite(value):
-                self.writer.add_scalar(
-                    tag_of(column), value, int(row["steps"]), walltime=self.began + row["seconds"]
-                )
-        self.writer.flush()
-
-    def close(self) -> None:
-        self.writer.close()
-
-
-def tag_of(column: str) -> str:
-    """Return TensorBoard's name of a column; what stands before the slash groups the charts."""
-    group, _, rest = column.partition("_")
-    return f"{group}/{rest}" if group in {"success", "reward"} else f"training/{column}"

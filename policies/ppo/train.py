@@ -35,7 +35,6 @@ from policies.ppo.config import PPOConfig
 from policies.ppo.curve import (
     CURVE_FILE,
     PICTURE_FILE,
-    EventMirror,
     Row,
     append_row,
     cut_after,
@@ -168,8 +167,8 @@ def train_expert(
         seed: of weights, exploration and minibatches; the environment has its own.
         warm_start: another expert's folder; its actor and normalisation are the starting point.
         on_progress: called after every batch with steps, total steps and deterministic success (NaN at first).
-        draws: write the curve's picture and its mirror for TensorBoard too; a training that is stopped and gone
-            on with many times would spend much of its time on them.
+        draws: write the curve's picture too; a training that is stopped and gone on with many times would spend
+            much of its time on it.
 
     Raises:
         ValueError: the checkpoint was made with another recipe, or there are too few worlds.
@@ -255,22 +254,17 @@ class _Learner:
         before, started = progress.seconds, time.monotonic()
         last_save = started
         batches = iter(self.collector)
-        events = EventMirror(self.out / CURVE_FILE) if self.draws else None
         while (reason := self._reason_to_stop()) is None:
             row = self._iterate(next(batches))
             progress.seconds = before + time.monotonic() - started
             row = {"steps": progress.steps, "seconds": progress.seconds} | row
             append_row(self.out / CURVE_FILE, row)
-            if events is not None:
-                events.add(row)
             if on_progress is not None:
                 on_progress(progress.steps, cfg.total_steps, progress.success(cfg))
             if time.monotonic() - last_save > cfg.checkpoint_seconds:
                 self._save()
                 last_save = time.monotonic()
         self._save()
-        if events is not None:
-            events.close()
         self.collector.shutdown(close_env=False)
         if self.draws and (self.out / CURVE_FILE).is_file():
             plot_curve(self.out / CURVE_FILE, self.out / PICTURE_FILE)

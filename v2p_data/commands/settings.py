@@ -29,7 +29,7 @@ class How:
     device: str = "cpu"
     """Where the policy trains: cpu, cuda, mps."""
     store: str = ""
-    """Folder or URL (s3://BUCKET/PREFIX) that drivers and machines share results in; each keeps an --out of its own."""
+    """Folder that drivers and machines share results in; each keeps an --out of its own."""
     lease_s: float = 60.0
     """With --store: a driver without a sign of life for so long is taken for dead by the others."""
     limit_s: float = 0.0

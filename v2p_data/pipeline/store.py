@@ -1,21 +1,22 @@
-"""Results that several drivers and machines share, in a folder or a bucket.
+"""Results that several drivers and machines share, in a folder that all of them see.
 
 A store looks like a run folder: STAGE/ITEM-FINGERPRINT/ with a record that is written last, so that a result without
-one does not count. Every write is whole or absent, and who creates an object first is decided by the store itself.
+one does not count. Every write is whole or absent, and who creates a file first is decided by the file system.
 """
 
 import functools
 import logging
+import shutil
 import tempfile
 import time
+import uuid
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-from v2p_data.errors import UnusableError, V2PError, write_refusal
+from v2p_data.errors import V2PError, write_refusal
 from v2p_data.pipeline.artifact import RECORD_FILE, Record, commit_folder, read_record
 from v2p_data.pipeline.contents import (
     damages,
@@ -28,7 +29,9 @@ from v2p_data.pipeline.contents import (
 logger = logging.getLogger(__name__)
 
 MARK = "store.json"
-"""The object that makes a place a store: a disk that is not mounted has none."""
+"""The file that makes a place a store: a disk that is not mounted has none."""
+SENDING_FOLDER = ".sending"
+"""Folder of a store with what is being written."""
 FETCHING_FOLDER = ".fetching"
 """Folder of a run with what is being downloaded."""
 PATIENCE_S = 300.0
@@ -39,91 +42,72 @@ TRANSFERS = 8
 
 
 class Store:
-    """One store, opened by this process.
+    """One store: a folder."""
 
-    Args:
-        url: a folder, or the URL of a bucket: `s3://BUCKET/PREFIX`, `gs://...`, `az://...`.
-    """
-
-    def __init__(self, url: str) -> None:
-        try:
-            self.library: Any = import_module("obstore")
-            stores: Any = import_module("obstore.store")
-        except ModuleNotFoundError as error:
+    def __init__(self, place: str) -> None:
+        if "://" in place:
             raise V2PError(
-                f"--store {url} needs the package obstore: pip install 'lerobot_policy_v2p[store]'"
-            ) from error
-        self.url = url.rstrip("/")
-        self.exists_error: type[Exception] = self.library.exceptions.AlreadyExistsError
-        path = self.url.removeprefix("file://")
-        self.folder = None if "://" in path else Path(path).absolute()
-        if self.folder is not None:
-            self.open: Callable[[], Any] = functools.cache(partial(stores.LocalStore, self.folder))
-            return
-        options = {"disable_bulk_delete": True} if path.startswith("s3") else {}
-        try:
-            bucket: Any = stores.from_url(self.url, retry_config={"max_retries": 1}, **options)
-        except (self.library.exceptions.BaseError, ValueError) as error:
-            raise V2PError(
-                f"--store {url} cannot be opened ({_short(error)}); it is a folder, or a URL such as s3://BUCKET/PREFIX"
-            ) from error
-        self.open = lambda: bucket
+                f"--store {place} is a URL; a store is a folder that all drivers see, on NFS for example"
+            )
+        self.folder = Path(place).absolute()
 
-    # --- objects -------------------------------------------------------------------------------------------------
+    # --- files ---------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Mark the place as a store, where it is none yet.
-
-        Raises:
-            V2PError: it lets two drivers create one object, so that leases would not hold.
-        """
+        """Mark the place as a store, where it is none yet."""
         try:
-            if self.folder:
-                self.folder.mkdir(parents=True, exist_ok=True)
-                (self.folder / MARK).touch()
-            self.create(MARK, b"")
+            (self.folder / SENDING_FOLDER).mkdir(parents=True, exist_ok=True)
+            (self.folder / MARK).touch()
         except OSError as error:
-            raise V2PError(f"--store {self.url} cannot be written ({_short(error)})") from error
-        if self.create(MARK, b""):
-            raise V2PError(
-                f"{self.url} lets two programs create one object, so drivers cannot share it; "
-                "take a folder, or a bucket "
-                "that knows 'If-None-Match' (Amazon S3, MinIO, Cloudflare R2, Google, Azure)"
-            )
+            raise V2PError(f"--store {self.folder} cannot be written ({_short(error)})") from error
 
     def create(self, key: str, content: bytes) -> bool:
-        """Create an object; False where there is one already, which stays."""
+        """Create a file; False where there is one already, which stays."""
         try:
-            self._tried(lambda: self.library.put(self.open(), key, content, mode="create"))
-        except self.exists_error:
+            self._place(
+                key,
+                lambda path: path.write_bytes(content),
+                lambda new, path: path.hardlink_to(new),
+            )
+        except FileExistsError:
             return False
         return True
 
     def write(self, key: str, content: bytes) -> None:
-        self._tried(lambda: self.library.put(self.open(), key, content))
+        self._place(key, lambda path: path.write_bytes(content), Path.replace)
 
     def read(self, key: str) -> bytes | None:
-        """Return an object's content, None where there is no such object."""
+        """Return a file's content, None where there is no such file."""
         try:
-            return bytes(self._tried(lambda: self.library.get(self.open(), key).bytes()))
+            return self._tried((self.folder / key).read_bytes)
         except FileNotFoundError:
             return None
 
     def delete(self, key: str) -> None:
-        try:
-            self._tried(lambda: self.library.delete(self.open(), key))
-        except FileNotFoundError:
-            return
+        self._tried(lambda: (self.folder / key).unlink(missing_ok=True))
+
+    def _place(
+        self, key: str, fill: Callable[[Path], object], put: Callable[[Path, Path], object]
+    ) -> None:
+        """Write a file aside, whole, and put it into its place."""
+
+        def placed() -> None:
+            path, new = self.folder / key, self.folder / SENDING_FOLDER / uuid.uuid4().hex
+            for needed in (path, new):
+                needed.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                fill(new)
+                put(new, path)
+            finally:
+                new.unlink(missing_ok=True)
+
+        self._tried(placed)
 
     # --- results -------------------------------------------------------------------------------------------------
 
     def has(self, key: str) -> bool:
         """Return whether the result STAGE/FOLDER is published."""
-        try:
-            self._tried(lambda: self.library.head(self.open(), f"{key}/{RECORD_FILE}"))
-        except FileNotFoundError:
-            return False
-        return True
+        return self._tried((self.folder / key / RECORD_FILE).is_file)
 
     def record(self, key: str) -> Record | None:
         """Return a published result's record, None where there is none.
@@ -131,8 +115,7 @@ class Store:
         Raises:
             UnusableError: it is not as it was written.
         """
-        with tempfile.TemporaryDirectory() as place:
-            return self._record_in(Path(place), key)
+        return self._tried(lambda: read_record(self.folder / key))
 
     def publish(self, folder: Path) -> None:
         """Send a finished result, the record last; one that is there already stays as it is."""
@@ -142,7 +125,7 @@ class Store:
         def send(path: Path) -> None:
             if not self.has(key):  # perhaps another driver's by now
                 name = path.relative_to(folder).as_posix()
-                self._tried(lambda: self.library.put(self.open(), f"{key}/{name}", path))
+                self._place(f"{key}/{name}", partial(shutil.copyfile, path), Path.replace)
 
         with ThreadPoolExecutor(TRANSFERS) as pool:
             list(pool.map(send, paths))
@@ -156,22 +139,24 @@ class Store:
         """
         if folder.exists():
             return True
-        key = key_of(folder)
+        record = self.record(key_of(folder))
+        if record is None:
+            return False
+        theirs, files = self.folder / key_of(folder), record.files or {}
+        paths = self._tried(lambda: [p for p in theirs.rglob("*") if p.is_file()])
+        names = [p.relative_to(theirs).as_posix() for p in paths]
         (root / FETCHING_FOLDER).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=root / FETCHING_FOLDER) as temporary:
             place = Path(temporary) / folder.name
-            place.mkdir()
-            record = self._record_in(place, key)
-            if record is None:
-                return False
-            files = record.files or {}
-            names = [n for n in self._names(key) if n in files or not must_stay(n)]
+
+            def bring(name: str) -> None:
+                (place / name).parent.mkdir(parents=True, exist_ok=True)
+                self._tried(lambda: shutil.copyfile(theirs / name, place / name))
+
             with ThreadPoolExecutor(TRANSFERS) as pool:
-                list(pool.map(partial(self._download, key, place), names))
-            try:
-                demand_no(damages(place, files), place)
-            except UnusableError as error:
-                raise self._named(error, place, key) from error
+                list(pool.map(bring, [n for n in names if n in files or not must_stay(n)]))
+            found = damages(place, files)
+            demand_no([replace(d, path=theirs / d.path.relative_to(place)) for d in found], theirs)
             folder.parent.mkdir(parents=True, exist_ok=True)
             try:
                 commit_folder(place, folder)
@@ -181,38 +166,6 @@ class Store:
         if (memory := memory_of(folder, root)) is not None:
             remember_made(folder, files, memory)
         return True
-
-    def _record_in(self, place: Path, key: str) -> Record | None:
-        content = self.read(f"{key}/{RECORD_FILE}")
-        if content is None:
-            return None
-        (place / RECORD_FILE).write_bytes(content)
-        try:
-            return read_record(place)
-        except UnusableError as error:
-            raise self._named(error, place, key) from error
-
-    def _named(self, error: UnusableError, place: Path, key: str) -> UnusableError:
-        """Return the error with the place in the store in the downloaded copy's stead."""
-        detail = error.detail.replace(str(place), f"{self.url}/{key}")
-        return UnusableError(error.reason, detail)  # type: ignore[arg-type]
-
-    def _names(self, key: str) -> list[str]:
-        """Return the paths of a result's files, without its record."""
-        listed = self._tried(lambda: list(self.library.list(self.open(), prefix=key)))
-        names = (str(entry["path"]).removeprefix(f"{key}/") for batch in listed for entry in batch)
-        return [name for name in names if name != RECORD_FILE]
-
-    def _download(self, key: str, place: Path, name: str) -> None:
-        path = place / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-
-        def copy() -> None:
-            with path.open("wb") as stream:
-                for chunk in self.library.get(self.open(), f"{key}/{name}").stream():
-                    stream.write(chunk)
-
-        self._tried(copy)
 
     # --- a store that goes away and comes back ---------------------------------------------------------------------
 
@@ -228,19 +181,18 @@ class Store:
                 self._demand_mounted()
                 got = call()
                 self._demand_mounted()  # an unmounted store leaves an empty folder, which accepts the files
-            except (FileNotFoundError, self.exists_error):
-                raise
-            except Exception as error:
-                if write_refusal(error) is not None:
+            except OSError as error:
+                answers = isinstance(error, FileNotFoundError | FileExistsError)
+                if write_refusal(error) or (answers and (self.folder / MARK).exists()):
                     raise
-                if time.monotonic() - began > PATIENCE_S or _is_final(error):
+                if time.monotonic() - began > PATIENCE_S:
                     raise V2PError(
-                        f"the store {self.url} does not answer ({_short(error)}); what is "
+                        f"the store {self.folder} does not answer ({_short(error)}); what is "
                         "finished is kept, and the same "
                         "command goes on with it when the store is back"
                     ) from error
                 logger.warning(
-                    "the store %s does not answer (%s); trying again", self.url, _short(error)
+                    "the store %s does not answer (%s); trying again", self.folder, _short(error)
                 )
                 time.sleep(pause)
                 pause = min(2 * pause, LONGEST_PAUSE_S)
@@ -248,23 +200,19 @@ class Store:
                 return got
 
     def _demand_mounted(self) -> None:
-        if self.folder is not None and not (self.folder / MARK).exists():
+        if not (self.folder / MARK).exists():
             raise ConnectionError(f"there is no {self.folder / MARK}; is the disk mounted?")
 
 
 @functools.cache
-def open_store(url: str) -> Store:
-    """Return the store of this process at a URL."""
-    return Store(url)
+def open_store(place: str) -> Store:
+    """Return the store of this process at a place."""
+    return Store(place)
 
 
 def key_of(folder: Path) -> str:
     """Return what a result's folder is called in the store."""
     return f"{folder.parent.name}/{folder.name}"
-
-
-def _is_final(error: Exception) -> bool:
-    return type(error).__name__ in ("PermissionDeniedError", "UnauthenticatedError")
 
 
 def _short(error: BaseException) -> str:
