@@ -180,6 +180,7 @@ class ArmRobot[A: Arm, C: ArmRobotConfig](Robot):
         arm = self._connected()
         step = np.array([float(action[name]) for name in self.action_features])
         if not np.isfinite(step).all():
+            self.hold()
             raise V2PError(f"an action holds a value that is no number: {action}")
         if self._rig is not None:
             reading = self._rig.reading_of(self._state or self._named_state(arm))

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lerobot_policy_v2p.robot.config_v2p_franka import V2PFrankaConfig
-from v2p_data.deployment.robot import ActionScale
+from v2p_data.deployment.robot import ActionScale, bytes_of
 from v2p_data.errors import V2PError
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.env.targets import ToolPose, next_target
@@ -48,7 +48,7 @@ class FrankyArm:
         return self._measure().state(self.target)
 
     def mask(self) -> np.ndarray:
-        return labels_to_rgb(np.asarray(self.labels(), np.uint8))
+        return labels_to_rgb(bytes_of(self.labels(), self.config.masks, ()))
 
     def _lacks(self) -> NoReturn:
         raise V2PError(

@@ -1,14 +1,19 @@
 """Every limit, on the simulated arm where it is a matter of motion, by hand numbers where it is one of arithmetic."""
 
+import contextlib
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from v2p_data.deployment.limits import Guard, LimitsConfig, LimitStop, Watchdog
 from v2p_data.deployment.loop import LoopConfig, Onlooker, Run
+from v2p_data.deployment.rig import Rig
 from v2p_data.deployment.robot import ActionScale
+from v2p_data.episodes.dataset.features import STATE_NAMES
+from v2p_data.errors import V2PError
 
 PATIENT = 60_000.0
 
@@ -94,6 +99,31 @@ def test_pressing_on_an_object_stops_at_the_force_limit(blind_robot, restarted, 
     assert places[-1, 2] > 0.05  # the box is 8 cm high: the arm was on it, and not through it
 
 
+@pytest.mark.parametrize(
+    ("forces", "stops_at"),
+    [
+        ([500, 500], 1),
+        ([500, 0, 500], 2),
+        ([500, 0, 0, 0, 0, 0, 0, 0, 0, 500], 9),
+        ([-500, -500], 1),
+        ([float("nan")] * 2, 1),
+        ([0, float("inf"), None, -61], 3),
+        ([500, *[59] * 9, -500], None),  # a touch, and half a second later another
+        ([60, -60, 60, None, 0], None),
+    ],
+)
+def test_two_readings_of_ten_above_the_force_limit_stop(reading, forces, stops_at):
+    guard = Guard(LimitsConfig(max_force_n=60.0), ActionScale())
+    looked = 0
+
+    with contextlib.suppress(LimitStop):
+        for force in forces:
+            guard.look(reading(force=None if force is None else float(force)))
+            looked += 1
+
+    assert looked == (len(forces) if stops_at is None else stops_at)
+
+
 def test_an_arm_outside_the_workspace_does_not_begin(blind_robot, restarted, steady):
     rig = restarted(blind_robot)
 
@@ -170,3 +200,49 @@ def test_the_watchdog_bites_once_when_nothing_is_heard():
     assert fed == []
     assert bitten == ["v2p-watchdog"]
     assert dog.has_bitten
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("odd", "words"),
+    [
+        ({"eef_z.pos": NAN}, "'eef_z.pos' = nan, which is no finite number"),
+        ({"eef_z.pos": None}, "'eef_z.pos' = None, which is no finite number"),
+        ({"joints": [0.0, NAN, *[0.0] * 5]}, "= nan, which is no finite number"),
+        ({"joints": [0.0] * 9}, "9 angles of joints; give 7"),
+        ({"opening": NAN}, "'opening' = nan"),
+        ({"opening": "open"}, "'opening' = open"),
+        ({"force_n": NAN}, "'force_n' = nan"),
+        ({"force_n": float("-inf")}, "'force_n' = -inf"),
+        (
+            {"rgb": np.ones((4, 4, 3), np.float32)},
+            "'rgb' holds float32 of shape (4, 4, 3); give uint8",
+        ),
+        ({"rgb": np.zeros((4, 4), np.uint8)}, "'rgb' holds uint8 of shape (4, 4)"),
+        ({"rgb": None, "mask": np.ones((4, 4, 3))}, "'mask' holds float64"),
+        ({"force_n": -9.5}, ""),
+    ],
+)
+def test_a_reading_holds_finite_numbers_and_pictures_of_bytes_or_is_refused(odd, words):
+    state = dict.fromkeys(STATE_NAMES, 0.5)
+    seen = {
+        **state,
+        "rgb": np.zeros((4, 4, 3), np.uint8),
+        "joints": [0.0] * 7,
+        "opening": 1.0,
+        "force_n": None,
+    }
+    seen |= odd
+    asked = {name: lambda name=name: seen[name] for name in ("joints", "opening", "force_n")}
+    asked |= {"send_action": dict, "calibration": lambda: None}
+    rig = Rig(SimpleNamespace(get_observation=lambda: seen, **asked))  # type: ignore[arg-type]
+
+    try:
+        said = ""
+        assert rig.read().force_n == seen["force_n"]
+    except V2PError as error:
+        said = str(error)
+
+    assert (words in said) if words else said == ""

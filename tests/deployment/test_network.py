@@ -249,6 +249,7 @@ def with_(**fields) -> bytes:
         (with_(finger_travel_m=4), "hello", "are not possible"),
         (with_(pos_m=[0.5, None, 0.2]), "read", "'pos_m' must be 3 finite numbers"),
         (with_(joints_rad=[float("inf")] * 7), "read", "'joints_rad' must be 7 finite numbers"),
+        (with_(force_n=10**400), "read", "'force_n' must be 1 finite number"),
         (with_(quat_wxyz=[1, 1, 0, 0]), "read", "no unit quaternion"),
         (with_(picture="%%%"), "read", "no PNG or JPEG"),
         (None, "hello", "is gone"),

@@ -28,6 +28,8 @@ PENDING = 2
 START_OUTSIDE_M = 0.03
 """So far outside the workspace a run may begin; further out it is refused."""
 ESCAPED_M = 0.06
+PRESSES, PRESSES_WITHIN = 2, 10
+"""So many readings above the force limit among so many (0.5 s) stop the run."""
 OVERSPEED = 1.8
 """A tool measured at this multiple of the speed limit stops the run: the policy cannot cause such a speed."""
 
@@ -49,8 +51,8 @@ class LimitsConfig:
     max_tilt_rad: float = SimConfig.tilt_limit_rad
     """How far the gripper may lean from straight down."""
     max_force_n: float = 60.0
-    """Contact force at the tool that stops the run, on robots that report it, when it lasts for
-    two readings: the peak of a touch is shorter."""
+    """Contact force at the tool, of either sign, that stops the run when two of ten readings exceed it:
+    the peak of a touch is one. For robots that report it."""
     wait_for_gripper: bool = True
     """The arm waits while the gripper travels: real ones are slower than that of the training."""
     max_silence_ms: float = 300.0
@@ -111,7 +113,7 @@ class Guard:
         self.cfg, self.scale, self.step_s = cfg, scale, step_s
         self.low, self.high = np.array(cfg.workspace_low_m), np.array(cfg.workspace_high_m)
         self._last: np.ndarray | None = None
-        self._is_pressing = False
+        self._pressing: deque[bool] = deque(maxlen=PRESSES_WITHIN)
         self._turns: deque[np.ndarray] = deque(maxlen=PENDING)
         self._wait = GripperWait() if cfg.wait_for_gripper else None
 
@@ -137,13 +139,13 @@ class Guard:
             LimitStop: too much force, too fast, too far out, leaning too far.
         """
         cfg = self.cfg
-        is_pressing = reading.force_n is not None and reading.force_n > cfg.max_force_n
-        was_pressing, self._is_pressing = self._is_pressing, is_pressing
-        if is_pressing and was_pressing:
+        force = abs(reading.force_n or 0.0)
+        self._pressing.append(not force <= cfg.max_force_n)  # so that no number counts as pressing
+        if sum(self._pressing) >= PRESSES:
             raise LimitStop(
                 "force",
-                f"the contact force is {reading.force_n:.0f} N, above the limit of {cfg.max_force_n:.0f} N: the tool"
-                " presses on something; free it, or raise --limits.max-force-n",
+                f"the contact force was {PRESSES} times above the limit of {cfg.max_force_n:.0f} N within"
+                f" {PRESSES_WITHIN} readings, and is {force:.0f} N now: the tool presses on something; free it, or raise --limits.max-force-n",
             )
         outside = self._outside(reading)
         if outside > ESCAPED_M:

@@ -9,6 +9,7 @@ import binascii
 import contextlib
 import json
 import socket
+import sys
 import threading
 from dataclasses import dataclass
 from typing import Any
@@ -181,7 +182,8 @@ class Driver:
         value = said.get(name)
         flat = value if isinstance(value, list) else [value]
         good = len(flat) == count and all(
-            isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in flat
+            isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= sys.float_info.max
+            for v in flat
         )
         if not good:
             raise self._wrong(f"'{name}' must be {count} finite numbers, got {str(value)[:80]}")

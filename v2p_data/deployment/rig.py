@@ -6,14 +6,14 @@ force at the tool, `action_scale` says what an action of 1 means.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from v2p_data.deployment.limits import Guard, Limited, LimitsConfig
-from v2p_data.deployment.robot import ActionScale, Reading
+from v2p_data.deployment.robot import ActionScale, Reading, bytes_of
 from v2p_data.deployment.sight import LOST_AFTER, Seen, Sight
 from v2p_data.deployment.steps import StepMaker
 from v2p_data.episodes.dataset.features import ACTION_NAMES, STATE_NAMES
@@ -127,32 +127,38 @@ class Rig:
         """Return an observation of the robot's, checked; one without pictures tells state and force only.
 
         Raises:
-            V2PError: entries are missing or no numbers.
+            V2PError: entries are missing, no finite numbers, or no picture of bytes.
         """
         missing = [name for name in STATE_NAMES if name not in seen]
         if missing:
             raise V2PError(
                 f"the robot's observation lacks {', '.join(missing)}; it has {', '.join(seen)}"
             )
-        state = np.array([float(seen[name]) for name in STATE_NAMES])
-        if not np.isfinite(state).all():
-            bad = STATE_NAMES[int(np.flatnonzero(~np.isfinite(state))[0])]
-            raise V2PError(f"the robot reports '{bad}' = {seen[bad]}, which is no finite number")
-        picture, mask = seen.get(RGB_NAME), seen.get(MASK_NAME)
-        joints = None
+        state = _finite({name: seen[name] for name in STATE_NAMES})
+        picture, mask = (
+            bytes_of(seen.get(RGB_NAME), RGB_NAME),
+            bytes_of(seen.get(MASK_NAME), MASK_NAME),
+        )
+        joints, opening = None, float(state[6])
         if picture is not None:
-            joints = np.asarray(self.robot.joints(), float)
+            angles = np.ravel(self.robot.joints()).tolist()
+            if len(angles) != len(JOINTS):
+                raise V2PError(
+                    f"the robot reports {len(angles)} angles of joints; give {len(JOINTS)}"
+                )
+            joints = _finite(dict(zip(JOINTS, angles, strict=True)))
+            opening = float(_finite({"opening": self.robot.opening()})[0])
         elif JOINTS[0] in seen:
-            joints = np.array([float(seen[name]) for name in JOINTS])
+            joints = _finite({name: seen.get(name) for name in JOINTS})
         ask_force = getattr(self.robot, "force_n", None)
         force = None if ask_force is None else ask_force()
         return Reading(
             state=state,
-            picture=None if picture is None else np.asarray(picture, np.uint8),
-            labels=None if mask is None else rgb_to_labels(np.asarray(mask, np.uint8)),
+            picture=picture,
+            labels=None if mask is None else rgb_to_labels(mask),
             joints_rad=joints,
-            opening=float(state[6]) if picture is None else float(self.robot.opening()),
-            force_n=None if force is None else float(force),
+            opening=opening,
+            force_n=None if force is None else float(_finite({"force_n": force})[0]),
         )
 
     def act(self, action: Float[np.ndarray, "7"]) -> Float[np.ndarray, "7"]:
@@ -171,3 +177,17 @@ class Rig:
             self.robot.hold()  # pyright: ignore[reportAttributeAccessIssue]
         else:
             self.act(np.zeros(len(ACTION_NAMES)))
+
+
+def _finite(values: dict[str, Any]) -> Float[np.ndarray, " n"]:
+    """Return what a robot reports as numbers.
+
+    Raises:
+        V2PError: one is no finite number.
+    """
+    for name, value in values.items():
+        with suppress(TypeError, ValueError, OverflowError):
+            if np.isfinite(float(value)):
+                continue
+        raise V2PError(f"the robot reports '{name}' = {value}, which is no finite number")
+    return np.array([float(value) for value in values.values()])

@@ -1,11 +1,13 @@
 """One reading of a robot. World frame: the arm's base, +x forward, +y left, +z up."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
+from v2p_data.errors import V2PError
 from v2p_data.sim.env.batch_env import SimConfig
 from v2p_data.sim.env.targets import DOWN
 from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
@@ -59,3 +61,24 @@ class Reading:
 def fingers_m(opening: float) -> float:
     """Return the travel of one finger of the arm that policies were trained with [m]."""
     return float(np.clip(opening, 0.0, 1.0)) * FINGER_TRAVEL_M
+
+
+def bytes_of(image: Any, name: str, num_channels: tuple[int, ...] = (3,)) -> np.ndarray | None:
+    """Return an image that a robot gives, None where it gives none.
+
+    Raises:
+        V2PError: its values are no bytes: black and white of 0 to 1 would both be read as black.
+    """
+    if image is None:
+        return None
+    found = np.asarray(image)
+    if (
+        found.dtype != np.uint8
+        or found.ndim != 2 + len(num_channels)
+        or found.shape[2:] != num_channels
+    ):
+        raise V2PError(
+            f"the robot's picture '{name}' holds {found.dtype} of shape {found.shape}; give uint8, 0 to 255, of shape"
+            f" {('height', 'width', *num_channels)}"
+        )
+    return found
