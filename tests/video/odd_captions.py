@@ -48,7 +48,16 @@ REFUSED: dict[str, tuple[str, bytes]] = {
     "table with a quotation mark inside": (CSV, f'{PLAIN},"Lifting "red" box"\n'.encode()),
     "table with a comma in a caption": (CSV, f"{ROW}, then down\n".encode()),
     "table of one column": (CSV, f"{PLAIN}\n".encode()),
-    "table of three columns": (CSV, f"file,caption,by\n{ROW},me\n".encode()),
+    "table of three columns without titles": (CSV, f"{ROW},me\n".encode()),
+    "table with titles and a comma in a caption": (CSV, f"file,caption\n{ROW}, up\n".encode()),
+    "table with a row of another separator": (CSV, f"sep=;\n{ROW}\n".encode()),
+    "rows of which one is text": ("captions.jsonl", f'{{"{PLAIN}": "up"}}\n"up"\n'.encode()),
+    "rows of which one is cut": ("captions.jsonl", f'{{"{PLAIN}": "up"}}\n{{"b'.encode()),
+    "rows with a file twice": ("captions.jsonl", f'{{"{PLAIN}": "up"}}\n'.encode() * 2),
+    "rows without a caption": ("captions.jsonl", f'{{"file": "{PLAIN}"}}'.encode()),
+    "rows in Latin-1": ("captions.jsonl", f'{{"{PLAIN}": "Größe"}}'.encode("latin-1")),
+    "object in a text file, cut": ("captions.json.txt", _json(SAID)[:-1]),
+    "table of Hugging Face with a path": ("metadata.csv", f"file_name,text\na/{ROW}".encode()),
     "table with an empty caption": (CSV, f"{PLAIN},\n".encode()),
     "table with a caption of dots": (CSV, f"{PLAIN},...\n".encode()),
     "table with a caption of a hidden letter": (CSV, f"{PLAIN},\u200b\u202e\n".encode()),
@@ -131,6 +140,26 @@ READ: dict[str, tuple[str, bytes, str]] = {
     ),
     "table with a caption of two lines": (CSV, f'{PLAIN},"Lifting\nred box up"\n'.encode(), SAID),
     "table with a formula": (CSV, f"{PLAIN},=Lifting red box\n".encode(), "=Lifting red box"),
+    "table with more columns": (CSV, f"file,caption,by\n{ROW},me\n".encode(), SAID),
+    "table of pandas": (CSV, f",file,caption\n0,{ROW}\n".encode(), SAID),
+    "table of pandas, written twice": (
+        CSV,
+        f",Unnamed: 0,clip,caption\n0,0,{ROW}\n".encode(),
+        SAID,
+    ),
+    "table of pandas without titles": (CSV, f"0,{ROW}\n".encode(), SAID),
+    "table of Hugging Face": (CSV, f"file_name,text\n{ROW}\n".encode(), SAID),
+    "table of Hugging Face, turned round": (
+        CSV,
+        f"text,file_name\n{SAID},{PLAIN}\n".encode(),
+        SAID,
+    ),
+    "table of Excel": (
+        CSV,
+        codecs.BOM_UTF8 + f"sep=;\r\nfile;caption\r\n{PLAIN};Lifting box, red\r\n".encode(),
+        "Lifting box, red",
+    ),
+    "list of rows": (JSON, json.dumps([{"file": PLAIN, "text": SAID}]).encode(), SAID),
     "Persian": (CSV, f"{PLAIN},می\u200cرود\n".encode(), "می\u200cرود"),
     "joined emoji": (JSON, _json(f"{SAID} 👩\u200d🍳"), f"{SAID} 👩\u200d🍳"),
     "hidden letters": (
@@ -145,3 +174,23 @@ READ: dict[str, tuple[str, bytes, str]] = {
     ),
     "wide spaces": (JSON, _json("Lifting\u00a0red\u3000box\u2028up\ue000"), SAID),
 }
+
+ALMOST: dict[str, bytes] = {
+    "captions.json.txt": _json(SAID),
+    "Captions.JSON": _json(SAID),
+    "caption.json": _json(SAID),
+    "captions.csv.txt": ROW.encode(),
+    "captions.tsv": f"{PLAIN}\t{SAID}".encode(),
+    "captions.jsonl": f'{{"file_name": "{PLAIN}", "text": "{SAID}"}}\n\n'.encode(),
+    "captions.jsonl.txt": _json(SAID),
+    "metadata.csv": f"file_name,text\n{ROW}".encode(),
+    "metadata.jsonl": f'{{"file_name": "{PLAIN}", "text": "{SAID}"}}'.encode(),
+}
+"""Caption files that are almost rightly named: all are read, and named in a note."""
+UNREAD = (
+    "captions.txt",
+    "captions (1).json",
+    "my_captions.csv",
+    "captions.xlsx",
+    "captions.json.zip",
+)

@@ -4,7 +4,7 @@ import json
 import unicodedata
 
 import pytest
-from odd_captions import PLAIN, READ, REFUSED
+from odd_captions import ALMOST, PLAIN, READ, REFUSED, SAID, UNREAD
 from pydantic import TypeAdapter
 
 from v2p_data.errors import V2PError
@@ -402,6 +402,33 @@ def test_a_caption_file_as_people_write_it_gives_what_a_scene_may_hold(
     assert footage.notes == ()
     for text in (video.caption, *video.objects):
         assert TypeAdapter(Words).validate_python(text) == text
+
+
+@pytest.mark.parametrize(("file", "content"), ALMOST.items(), ids=ALMOST)
+def test_a_caption_file_almost_rightly_named_is_read_and_named(tmp_path, file, content):
+    (tmp_path / PLAIN).write_bytes(b"x")
+    (tmp_path / file).write_bytes(content)
+    (tmp_path / "captions.json.bak").write_bytes(b"ours")
+
+    footage = read_footage(tmp_path)
+
+    assert [v.caption for v in footage.videos] == [SAID]
+    assert footage.notes == (f"captions are read from {file} in {tmp_path}",)
+    write(tmp_path, {PLAIN: "Lifting cup up"})
+    assert [v.caption for v in find_videos(tmp_path)] == ["Lifting cup up"]
+
+
+@pytest.mark.parametrize("file", UNREAD)
+def test_a_file_that_looks_like_captions_and_is_not_read_is_named(tmp_path, file):
+    (tmp_path / PLAIN).write_bytes(b"x")
+    (tmp_path / "metadata.csv").write_text("frame,exposure\n0,3\n")
+    (tmp_path / file).write_text("{}")
+
+    note, passed = read_footage(tmp_path).notes
+
+    assert file in note
+    assert note.endswith("a caption file is called captions.json or captions.csv")
+    assert passed.endswith("passed over, no videos: metadata.csv")
 
 
 def test_every_character_that_a_caption_keeps_may_stand_in_a_scene():

@@ -213,6 +213,33 @@ FREE = [
     ("red_box_lift", "lift_up", "red box", ""),
     ("tip over carton", "tip_over", "carton", ""),
     ("", "generic", "object", ""),
+    # who acts, where, and which take it is, are no objects
+    ("Lifting cup with my hand", "lift_up", "cup", ""),
+    ("Pushing can with one finger from left to right", "push_right", "can", ""),
+    ("Push the box by hand to the right", "push_right", "box", ""),
+    ("Pushing cup with a pen in my left hand", "push_with", "cup", "pen: tool"),
+    ("Pushing the cup with the palm of my hand", "generic", "cup", ""),
+    ("Covering ball with both hands", "generic", "ball", ""),
+    ("Covering ball with cloth in my hand", "cover", "cloth", "ball: reference"),
+    ("Pushing cup next to hand cream", "push_next_to", "cup", "hand cream: reference"),
+    ("Lifting red box up in my kitchen", "lift_up", "red box", ""),
+    ("Putting spoon into mug in the living room", "insert", "spoon", "mug: container"),
+    ("Pushing mug to the left at home", "push_left", "mug", ""),
+    ("Pushing toy car on the wooden table", "generic", "toy car", ""),
+    ("Putting block into toy kitchen", "insert", "block", "toy kitchen: container"),
+    ("Lifting kitchen roll up", "lift_up", "kitchen roll", ""),
+    ("up 2", "generic", "object", ""),
+    ("Lifting box up 2", "lift_up", "box", ""),
+    ("push can left 03", "push_left", "can", ""),
+    ("Stacking cup 2 on cup 1", "place_onto", "cup 2", "cup 1: reference"),
+    # a decoration within a phrase parts nothing
+    ("Lifting red 🟥 box up", "lift_up", "red box", ""),
+    ("Lifting a 👩\u200d🍳 red box up", "lift_up", "red box", ""),
+    ("Putting red 🍎 apple into green 🥣 bowl", "insert", "red apple", "green bowl: container"),
+    ("Putting cup 🥤 into box 📦", "insert", "cup", "box: container"),
+    ("pushing mug ☕ left", "push_left", "mug", ""),
+    ("Lifting 🟥 red box up 🎉 in the kitchen", "lift_up", "red box", ""),
+    ("Lift red 1️⃣ box up", "lift_up", "red box", ""),
 ]
 
 

@@ -1,7 +1,8 @@
 """Which videos a folder holds, and what a person said about each.
 
-A caption comes from `captions.json` beside the videos, else from a table `captions.csv` (file,caption), else from a
-label file of Something-Something-v2 in the same folder (`labels.py`), else from the file's own name:
+A caption comes from `captions.json` beside the videos, else from a table `captions.csv` or the like
+(`caption_files.py`), else from a label file of Something-Something-v2 in the same folder (`labels.py`), else from the
+file's own name:
 
     {"lift.mp4": "Lifting red box up",
      "push.mp4": {"caption": "Pushing blue box next to can", "objects": ["blue box", "can"],
@@ -13,33 +14,28 @@ the caption's words do not say it. A hint called `table` marks the table itself.
 which part of the picture counts.
 """
 
-import csv
-import io
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError, did_you_mean
-from v2p_data.json_files import read_json
-from v2p_data.video.checked import check_keys, listed, same_name, shortened, type_of, words
+from v2p_data.video.caption_files import CAPTIONS_FILE as CAPTIONS_FILE
+from v2p_data.video.caption_files import (
+    CAPTIONS_TABLE,
+    VIDEO_SUFFIXES,
+    caption_files,
+    written_captions,
+)
+from v2p_data.video.checked import check_keys, listed, same_name, type_of, words
 from v2p_data.video.clip import Hint
 from v2p_data.video.hints import CROP, TABLE, boxes_as_read, read_crop, read_hint
 from v2p_data.video.labels import Labels, read_labels
 from v2p_data.video.meaning import Meaning as Meaning
 from v2p_data.video.meaning import parse_caption as parse_caption
 
-VIDEO_SUFFIXES = (
-    *(".mp4", ".m4v", ".mov", ".qt", ".3gp", ".3g2"),
-    *(".mkv", ".webm", ".avi", ".gif", ".ogv", ".flv", ".wmv", ".asf"),
-    *(".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
-)
-"""In small letters or capitals."""
-CAPTIONS_FILE = "captions.json"
-CAPTIONS_TABLE = "captions.csv"
-MAX_TABLE_BYTES = 20_000_000
 NO_CAPTION = "moving object"
 """What stands for a caption where nobody gave one and the file's name tells nothing."""
 
@@ -104,9 +100,10 @@ def read_footage(folder: Path) -> Footage:
         )
     written = {
         name: checked_entry(entry, f"{path}, entry '{name}'")
-        for name, (entry, path) in _written(home, [p.name for p in here]).items()
+        for name, (entry, path) in written_captions(home, [p.name for p in here]).items()
     }
-    files = [p for p in entries if p.suffix.lower() == ".json" and p.name != CAPTIONS_FILE]
+    read = caption_files(home)
+    files = [p for p in entries if p.suffix.lower() == ".json" and p not in read]
     labels = read_labels([p for p in files if p.is_file()], [p.stem for p in here])
     labelled = {stem: (*said, {}) for stem, said in labels.said.items()}
     ids = dict(zip(here, unique_items([p.stem for p in here]), strict=True))
@@ -114,103 +111,24 @@ def read_footage(folder: Path) -> Footage:
         _item(ids[p], p, written.get(p.name) or labelled.get(p.stem) or (_from_name(p), (), {}))
         for p in wanted
     )
-    passed = _passed_over(entries, labels) if folder.is_dir() else []
+    almost = [p.name for p in read if p.name not in (CAPTIONS_FILE, CAPTIONS_TABLE)]
+    almost = [p.name for p in read if p.name not in (CAPTIONS_FILE, CAPTIONS_TABLE)]
+    others = _passed_over([p for p in entries if p not in read], labels) if folder.is_dir() else []
+    unread = [name for name in others if "caption" in name.lower()]
+    passed = [name for name in others if name not in unread]
     boxes = [box for v in videos for box in boxes_as_read(v.hints, v.path.name)]
-    notes = [
-        *labels.notes,
-        *([f"{len(passed)} in {home} passed over, no videos: {listed(passed)}"] if passed else []),
-        *([f"boxes read as x0, y0, x1, y1 in pixels: {listed(boxes, 3)}"] if boxes else []),
-    ]
-    return Footage(videos=videos, notes=tuple(notes))
-
-
-def written_captions(folder: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Return the content of a folder's caption file, under the names as the folder has them; `{}` where there is none.
-
-    Args:
-        folder: the folder of the videos.
-        names: the videos' file names.
-
-    Raises:
-        V2PError: no JSON object, or it names a file that is not there or names one twice.
-    """
-    return {name: entry for name, (entry, _) in _written(folder, names).items()}
-
-
-def _written(folder: Path, names: Sequence[str]) -> dict[str, tuple[Any, Path]]:
-    """Return each entry with the file that it is from; of two entries for a video that of `captions.json`."""
-    written: dict[str, tuple[Any, Path]] = {}
-    for file, read in ((CAPTIONS_TABLE, _read_table), (CAPTIONS_FILE, read_json)):
-        path = folder / file
-        if path.is_file():
-            data = read(path)
-            if not isinstance(data, dict):
-                raise V2PError(
-                    f"{path} must hold an object, file name -> caption, not a {type_of(data)}"
-                )
-            for name, entry in _of_the_folder(data, path, names).items():
-                written[name] = entry, path
-    return written
-
-
-def _of_the_folder(data: dict[str, Any], path: Path, names: Sequence[str]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for said_name, entry in data.items():
-        name = same_name(said_name, names)
-        if name is None:
-            raise V2PError(
-                f"{path} has a caption for '{shortened(said_name)}', which is not in the folder; "
-                f"rename or remove the entry.{did_you_mean(said_name, names)}"
-            )
-        if name in found:
-            raise V2PError(
-                f"{path} has two entries for '{name}', with its accents encoded in two ways; remove one"
-            )
-        found[name] = entry
-    return found
-
-
-def _read_table(path: Path) -> dict[str, str]:
-    """Return the captions of a table of two columns, with a row of titles or without one."""
-    try:
-        if path.stat().st_size > MAX_TABLE_BYTES:
-            raise V2PError(f"{path} has more than {MAX_TABLE_BYTES // 10**6} MB; split the folder")
-        text = path.read_bytes().decode("utf-8-sig")
-        is_text = "\0" not in text  # UTF-16 of English words decodes
-    except OSError as error:
-        raise V2PError(f"{path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError:
-        text, is_text = "", False
-    if not is_text:
-        raise V2PError(
-            f"{path} is not UTF-8 text; save it as UTF-8 ('CSV UTF-8' in a table program)"
-        )
-    between = next((c for c in text if c in ",;\t"), ",")
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=between, strict=True)
-    try:
-        read = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
-    except csv.Error as error:
-        raise V2PError(
-            f"{path}, line {rows.line_num}, is no row of a table ({error}); is a quotation mark left open?"
-        ) from error
-    table = [(line, cells) for line, cells in read if any(cells)]
-    if table and _are_titles(table[0][1]):
-        del table[0]
-    found: dict[str, str] = {}
-    for line, cells in table:
-        if len(cells) != 2:
-            raise V2PError(
-                f"{path}, line {line}, has {len(cells)} cells, not two, file{between}caption; put a caption that holds "
-                f"'{between}' between quotation marks"
-            )
-        if cells[0] in found:
-            raise V2PError(f"{path} has two entries for '{shortened(cells[0])}'; remove one")
-        found[cells[0]] = cells[1]
-    return found
-
-
-def _are_titles(cells: list[str]) -> bool:
-    return not cells[0].lower().endswith(VIDEO_SUFFIXES) and cells[-1].lower() == "caption"
+    told = (
+        (f"captions are read from {listed(almost)} in {home}", almost),
+        (
+            f"no captions are read from {listed(unread)} in {home}; a caption file is called {CAPTIONS_FILE} or "
+            f"{CAPTIONS_TABLE}",
+            unread,
+        ),
+        (f"{len(passed)} in {home} passed over, no videos: {listed(passed)}", passed),
+        (f"boxes read as x0, y0, x1, y1 in pixels: {listed(boxes, 3)}", boxes),
+    )
+    notes = (*labels.notes, *(note for note, names in told if names))
+    return Footage(videos=videos, notes=notes)
 
 
 def unique_items(stems: list[str]) -> list[str]:
@@ -291,7 +209,7 @@ def _passed_over(entries: list[Path], labels: Labels) -> list[str]:
     for path in entries:
         name = path.name
         if (
-            name.startswith((".", CAPTIONS_FILE, CAPTIONS_TABLE))
+            name.startswith((".", f"{CAPTIONS_FILE}.bak"))
             or name in labels.files
             or _is_video(path)
         ):

@@ -16,8 +16,10 @@ _MENTION = re.compile(r"(?<!\w)[@＠][\w.]*\w")
 _TAG = r"[#＃]\w+"
 _TAGS_AT_AN_END = re.compile(rf"^(?:\s*{_TAG})+|(?:\s*{_TAG})+\s*$")
 _SENTENCE = re.compile(
-    r"[|｜•·~～*^\n]+|\.{2,}|…|\s[-–]\s|—|(?<!\S)[^\w\s]{2,}(?!\S)|(?<!\bno|\bnr|\bst|\bdr|\bmr|\bpt|\bep)(?<!\bvol|\bmrs)[.!?]+(?=\s|$)|[。！？]+|:(?=\s)|："
+    r"[|｜•·~～*^\n\ufffc]+|\.{2,}|…|\s[-–]\s|—|(?<!\S)[^\w\s]{2,}(?!\S)|(?<!\bno|\bnr|\bst|\bdr|\bmr|\bpt|\bep)(?<!\bvol|\bmrs)[.!?]+(?=\s|$)|[。！？]+|:(?=\s)|："
 )
+DECORATION = "(?<![\\s\ufffc\u200d])[\\s\u200d]*+\ufffc[\\s\ufffc\u200d]*+"
+"""Pattern for emoji and arrows, as `sentences_of` marks them, with what is between them."""
 _PART = re.compile(r"(\s*[,;，；、]\s*)")
 """Between parts; where both stay, it stays."""
 _ASIDE = re.compile(r"([(\[（【])([^()\[\]（）【】]*)([)\]）】])")
@@ -40,7 +42,7 @@ _WORDS = [
     r"lol|haha+|lmao|omg|xd|ok(?:ay)?,? so|oc|unedited|uncut|raw footage|original "
     r"(?:sound|video)|handyvideo|ungeschnitten|non monté|sin editar|原声|未剪辑",
     r"(?:part|pt|teil|partie|parte|episode|ep|take|vol|folge|épisode|episodio|capítulo)\.? "
-    r"?#?\d+(?:/\d+)?(?! (?:of|von|de)\b)|第 ?[\d一二三四五六七八九十]+ ?[集期部]",
+    r"?#?\d+(?:/\d+)?(?! (?:of|von|de)\b)|\d+(?:st|nd|rd|th) (?:try|take|attempt)|第 ?[\d一二三四五六七八九十]+ ?[集期部]",
 ]
 """Remarks of a word or two, which go wherever they stand."""
 
@@ -90,12 +92,15 @@ _REMARKS = re.compile(
 _ALL_REMARK = re.compile(_any_of(_WHOLE), re.IGNORECASE)
 
 
-def sentences_of(caption: str) -> list[str]:
+def sentences_of(caption: str, inside: re.Pattern[str]) -> list[str]:
     """Return the sentences of a caption without what tells nothing of the scene; none where there is nothing else.
 
+    A decoration parts two sentences, save where `inside` finds it within a phrase and keeps its group `open`.
     A tag between words stands for its word ("Put #sponge into the bowl").
     """
-    plain = "".join("|" if _is_decoration(c) else c for c in caption)
+    caption = re.sub(r"[\d#*]\ufe0f?\u20e3", "\ufffc", caption)  # a key
+    plain = "".join("\ufffc" if _is_decoration(c) else c for c in caption)
+    plain = inside.sub(lambda found: f"{found['open'] or ''} ", plain)
     plain = _MENTION.sub(" ", _LINK.sub("|", plain))
     plain = _ASIDE.sub(_aside, plain)
     sentences = [_without_remarks(sentence) for sentence in _SENTENCE.split(plain)]

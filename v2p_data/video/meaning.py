@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.video.chatter import sentences_of
+from v2p_data.video.chatter import DECORATION, sentences_of
 
 Role = Literal["reference", "tool", "container", "cover"]
 
@@ -70,6 +70,7 @@ _PREPOSITIONS = {
     "by": r"by",
     "with": r"with|using",
     "carrying": r"carrying",
+    "at": r"at",
 }
 """Preposition or particle -> how it is written. The first that fits at a place is taken."""
 
@@ -115,6 +116,17 @@ _BAD_OUTCOME = r"\bslight|\bfall|\bdrop|\bnot\b|n't\b|\bnothing\b"
 _LIDS = r"\b(?:lid|cover|cap|cloth|napkin|towel|top)(?: of .*)?$"
 _FLAT_LIDS = r"\b(?:lid|cap)$"
 _SURFACES = r"(?:flat |slanted )?(?:table|tabletop|desk|surface|floor|ground|counter|countertop|air|camera|side)$"
+_NO_OBJECT = re.compile(
+    r"(?:[\w' ]+ of (?:\w+ )?)?"
+    r"(?:(?:left|right|both|bare|two|one|single|own|other|gloved|robot|robot's|robotic|index|middle|human) )*"
+    r"(?:hands?|fingers?|finger ?tips?|thumbs?|palms?|fists?|arms?|knuckles?|grippers?|care|ease|caution|force)(?: side| \d+)?"
+    r"|house|home|apartment|flat|lab|laboratory|studio|hall|sofa|couch|bed|carpet|(?!§)[\W\d_]*"
+    r"|(?!.*\b(?:toy|doll|dog|cat|bird|mouse|lego|model|mini\w*|play|pool|pong)\b)(?:.* )?"
+    r"(?:table|tabletop|desk|floor|ground|counter|countertop|worktop|workbench|kitchen|"
+    r"(?:bed|bath|class|work|living )?room|office|garage|garden|yard|workshop|basement)"
+)
+"""What a preposition leads to and yet is no object: who acts, how, where, and bare numbers."""
+_TAKE_NUMBER = re.compile(r"(?<= )(up|down|left|right|over|upright|off) (?:v\.?|no )?\d+(?=$|,)")
 _ARTICLES = r"^(?:a|an|the|some|his|her|its|my|your|their|one|another|of|again|slowly|gently|quickly|completely|carefully)\b"
 _PRONOUNS = {"", "it", "them", "everything"}
 _ANYTHING = ("object", "other object")
@@ -153,11 +165,12 @@ def parse_caption(caption: str, objects: tuple[str, ...] = ()) -> Meaning:
         objects: phrases for the objects, if they are known; those that the caption does not name become
             references, and the first stands in where the caption names nothing that moves.
     """
-    sentences = sentences_of(_marked(caption.replace("§", " ").lower(), objects))
+    sentences = sentences_of(_marked(caption.replace("§", " ").lower(), objects), _INSIDE)
     sentences = [_marked(_normal(sentence), objects) for sentence in sentences]
     # where something is done in one of them, the others are talk
     text = ", ".join([s for s in sentences if _has_verb(s)] or sentences[:1])
     is_negated = re.search(_NEGATIONS, text)
+    text = _TAKE_NUMBER.sub(r"\1", text)
     text = re.sub(r"\bsome(?:thing|one)(?: else)?\b", _ANYTHING[0], text)
     first, *rest = text.split(_ANYTHING[0])
     text = _ANYTHING[0].join([first, _ANYTHING[1].join(rest)]) if rest else text
@@ -209,6 +222,13 @@ _PREPOSITION = re.compile(
     "|".join(rf"(?P<{name}>(?<!\w)(?:{p})(?!\w))" for name, p in _PREPOSITIONS.items())
 )
 
+_INSIDE = re.compile(
+    rf"(?<!\w)(?P<open>{_ANY_VERB}|{'|'.join(sorted(_COLOURS))}|small|big|large|little|tiny|plastic|wooden|metal|toy|"
+    rf"a|an|the|my|his|her|into|onto|in|next to|in front of|behind|with|of|to){DECORATION}(?=\w)"
+    rf"|{DECORATION}(?=(?:{_PREPOSITION.pattern}))"
+)
+"""Decorations within a phrase: behind a word that a noun must follow, or before a preposition."""
+
 
 def _has_verb(text: str) -> bool:
     return any(v.fullmatch(word) for word in text.split() for v in _VERB.values())
@@ -240,6 +260,7 @@ def _read(verb: str, before: str, after: str) -> tuple[Kind, str, list[tuple[str
     parts: list[tuple[str, str]] = []
     for mark, end in zip(marks, ends, strict=True):
         name, phrase = str(mark.lastgroup), _phrase(after[mark.end() : end])
+        phrase = "" if _NO_OBJECT.fullmatch(phrase) else phrase
         if name in _PARTICLES and phrase and not direct:
             direct, phrase = phrase, ""
         parts.append((name, phrase))
@@ -247,6 +268,8 @@ def _read(verb: str, before: str, after: str) -> tuple[Kind, str, list[tuple[str
     others: list[tuple[str, Role]] = [(p, _role(name)) for name, p in parts if p]
 
     kinds = _phrases()
+    if verb == "cover" and ("with", "") in parts and not re.search(r"\bit$", after):
+        return "generic", direct, others  # a hand covers it
     if verb in ("cover", "uncover"):
         hand_moves = {"cover": "with", "uncover": "by"}[verb]
         moved = next((p for name, p in parts if name == hand_moves), "")

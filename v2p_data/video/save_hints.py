@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from v2p_data.errors import V2PError
+from v2p_data.video.caption_files import CAPTIONS_FILE, written_captions
 from v2p_data.video.captions import (
-    CAPTIONS_FILE,
     VideoItem,
     checked_entry,
     find_videos,
-    written_captions,
 )
 from v2p_data.video.clip import Hint
 
@@ -37,7 +36,8 @@ def save_hint(
     """
     folder, name = video.path.parent, video.path.name
     path = folder / CAPTIONS_FILE
-    captions = written_captions(folder, [other.path.name for other in find_videos(folder)])
+    names = [other.path.name for other in find_videos(folder)]
+    captions = {name: entry for name, (entry, _) in written_captions(folder, names).items()}
     old = captions.get(name, {})
     old = old if isinstance(old, dict) else {"caption": old}
     hints = {key: value for key, value in old.get("hints", {}).items() if key != phrase}
