@@ -19,8 +19,7 @@ from v2p_data.scene.data_types import (
     Placement,
 )
 from v2p_data.scene.fitting.by_model import poses_by_worker
-from v2p_data.scene.fitting.metric import clip_camera, metric_camera, scene_origin
-from v2p_data.scene.fitting.ring_mask import without_hole
+from v2p_data.scene.fitting.metric import clip_camera
 from v2p_data.scene.fitting.shape_fit import three
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.meshes import MeshedObject
@@ -68,9 +67,6 @@ def estimates_of(
             camera = clip_camera(clip, placement)
             thing = _posed_by_worker(clip, grounded.working, s, thing, camera, cfg)
         masks = _mask_track(grounded.working, s, placed)
-        if s.noun.bore:
-            work = metric_camera(placement.camera, scene_origin(placement), placement.height_m)
-            masks = _with_hole(masks, thing, work)
         out.append(replace(thing, masks=masks, mass_kg=_mass(s.noun, thing.size_m)))
     return out
 
@@ -115,7 +111,7 @@ def _outlined(
 
 def _is_primitive(s: ObjectTrack, made: MeshedObject) -> bool:
     """Return whether the mesh is the noun's primitive of its size."""
-    return made.shape.kind == "primitive" and not s.noun.bore
+    return made.shape.kind == "primitive"
 
 
 def _simulated_as(noun: Noun) -> Shape:
@@ -194,19 +190,6 @@ def _mask_track(
     if s.moves and not (s.hidden_in_container or placed.hidden_in_hand):
         masks[int(working.frame_idx[placed.last_i])] = placed.last_mask
     return dict(sorted(masks.items()))
-
-
-def _with_hole(
-    masks: dict[int, Bool[np.ndarray, "h w"]], thing: Estimate, camera: Camera
-) -> dict[int, Bool[np.ndarray, "h w"]]:
-    """Return a ring's masks without what is seen through it, posed as in the nearest frame that has a pose."""
-    posed, poses = np.array(thing.frames), thing.T_world_objs
-    return {
-        i: without_hole(
-            mask, thing.size_m, thing.noun.bore, poses[int(np.abs(posed - i).argmin())], camera
-        )
-        for i, mask in masks.items()
-    }
 
 
 def _colour_in(

@@ -187,7 +187,7 @@ def _rebuilt(
     placement = place(grounded.working, tracks, meaning.kind, guess, cfg.max_poses, segmentation)
     if tracks[0].brought:
         placement = with_start_place(grounded, placement, meaning.kind)
-    placement, meshed = with_meshes(grounded, placement)
+    meshed = with_meshes(grounded, placement)
     objects = estimates_of(clip, grounded, placement, meshed, meaning.kind, cfg)
 
     contradiction = _contradiction(meaning, grounded, placement, objects, cfg)

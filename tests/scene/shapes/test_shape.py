@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from v2p_data.geometry.camera import Camera
-from v2p_data.geometry.mesh import lathe, ring
+from v2p_data.geometry.mesh import lathe
 from v2p_data.geometry.pillow import pillow
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.fitting.silhouette import camera_above
@@ -364,23 +364,6 @@ def test_an_outline_with_a_line_one_pixel_wide_still_becomes_a_closed_mesh():
     assert all(part.is_watertight for part in parts)
 
 
-def test_a_roll_of_tape_has_its_hole():
-    size, bore = (0.09, 0.09, 0.03), 0.6
-    mask = seen([placed(ring(0.09, 0.03, bore), AT + np.array([0, 0, 0.015]))])
-
-    choice = best_shape(
-        SilhouetteView(mask=mask, T_world_obj=fit(size)),
-        CAMERA,
-        size,
-        noun("cylinder", symmetry="round", bore=bore),
-    )
-
-    check_solid(choice)
-    assert choice.mesh.volume == pytest.approx(np.pi * 0.045**2 * (1 - bore**2) * 0.03, rel=0.02)
-    through = np.array([[x, 0, z] for x in (0.0, 0.018) for z in (-0.01, 0.0, 0.01)])
-    assert not in_parts(through, choice.parts).any()
-
-
 def test_a_ball_with_its_shadow_stays_a_ball():
     size = (0.07, 0.07, 0.07)
     body = placed(ball(0.035, [0, 0, 0.035]))
@@ -415,49 +398,3 @@ def test_what_is_low_is_not_inflated_to_any_depth_that_its_outline_allows(
 
     assert choice.kind == "primitive"
     assert choice.size_m == size
-
-
-PAN = np.array([(0.1, 0.0), (0.11, 0.045)])
-MUG_LOOP_M, STICK_M = (0.03, 0.012, 0.06), (0.16, 0.02, 0.012)
-
-
-@pytest.mark.parametrize("degrees", [70, 140, 250, 300])
-@pytest.mark.parametrize(
-    ("profile", "handle_m", "up_m"), [(PAN, STICK_M, 0.035), (MUG, MUG_LOOP_M, 0.05)]
-)
-def test_vessels_get_the_handle_that_sticks_out_of_their_outline(profile, handle_m, up_m, degrees):
-    wide, tall = 2 * float(profile[:, 0].max()), float(profile[-1, 1])
-    at = [profile[:, 0].mean() + handle_m[0] / 2, 0, up_m]
-    handle = trimesh.creation.box(extents=handle_m, transform=transform(np.eye(3), np.array(at)))
-    handle.apply_transform(fit((0, 0, 0), degrees, np.zeros(3)))
-    mask = seen([placed(lathe(profile)), placed(handle)])
-    size = (wide, wide, tall)
-    vessel = noun("cylinder", hollow=True, size_m=size)
-    view = SilhouetteView(mask=mask, T_world_obj=fit(size))
-
-    with_handle = best_shape(view, CAMERA, size, vessel)
-    round_one = best_shape(view, CAMERA, size, replace(vessel, symmetry="round"))
-    without = best_shape(view, CAMERA, size, vessel, handles=False)
-
-    check_solid(with_handle, slack_m=0.02 * wide)
-    T = view.T_world_obj @ with_handle.T_obj_shape
-    ahead = (Rotation.from_euler("z", degrees, degrees=True).as_matrix() @ [1, 0, 0])[:2]
-    assert "with a handle" in with_handle.reason
-    assert "handle" not in round_one.reason + without.reason
-    assert float(T[:2, 0] @ ahead) > np.cos(np.radians(15))
-    length = at[0] + handle_m[0] / 2 + wide / 2
-    assert with_handle.size_m[0] == pytest.approx(length, rel=0.12)
-    assert T[:2, 3] == pytest.approx(AT[:2] + (length - wide) / 2 * ahead, abs=0.012)
-    assert with_handle.iou > round_one.iou
-
-
-def test_a_vessel_without_a_handle_gets_none():
-    size = (0.22, 0.22, 0.045)
-    choice = best_shape(
-        SilhouetteView(mask=seen([placed(lathe(PAN))]), T_world_obj=fit(size)),
-        CAMERA,
-        size,
-        noun("cylinder", hollow=True, size_m=size),
-    )
-
-    assert "handle" not in choice.reason

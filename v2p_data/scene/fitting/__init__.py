@@ -12,8 +12,6 @@ Reading order:
     end_poses, trajectory           poses at both ends, and between
     tool_pose                       a tool in a hand
     hand_scale      the hand as a ruler
-    refine_pose     the last pose once more, with the mesh
-    ring_mask       the hole of a ring
     metric          camera heights become metres
     by_model        learned models
 """

@@ -145,8 +145,6 @@ class Noun:
     friction: float
     hollow: bool = False
     """Open at the top, so that something can be put in or it can be put over something."""
-    bore: float = 0.0
-    """Diameter of the hole through a roll or ring, as a share of its own; 0 where there is none."""
     taper: float = 1.0
     """Base diameter over top diameter, for solids of revolution."""
     spread: float = 0.2
@@ -237,9 +235,8 @@ def _noun(cells: list[str]) -> tuple[Noun, list[str]]:
     colours = tuple(word for word in row["colour"].split(",") if word)
     if unknown := set(colours) - COLOURS:
         raise ValueError(f"'{min(unknown)}' is no colour; known: {', '.join(sorted(COLOURS))}")
-    if row["hollow"] not in ("0", "1") and not re.fullmatch(r"0\.\d*[1-9]\d*", row["hollow"]):
-        raise ValueError(f"hollow is '{row['hollow']}', not 0 or 1 or the share of a bore between")
-    bore = 0.0 if row["hollow"] == "1" else float(row["hollow"])
+    if row["hollow"] not in ("0", "1"):
+        raise ValueError(f"hollow is '{row['hollow']}', not 0 or 1")
     value = {column: _positive(row, column) for column in (*COLUMNS[2:8], "taper")}
     form = row["form"]
     if form not in get_args(Form):
@@ -253,7 +250,6 @@ def _noun(cells: list[str]) -> tuple[Noun, list[str]]:
         mass_kg=round(value["mass_g"] / 1000, 9),
         friction=value["friction"],
         hollow=row["hollow"] == "1",
-        bore=bore,
         taper=value["taper"],
         spread=value["spread"],
         matter=row["matter"],  # pyright: ignore[reportArgumentType]
@@ -264,8 +260,6 @@ def _noun(cells: list[str]) -> tuple[Noun, list[str]]:
     round_sides = size_m[:2] if noun.form == "cylinder" else size_m
     if noun.form != "box" and len(set(round_sides)) > 1:
         raise ValueError(f"a {noun.form} has one diameter, its size is {size_m} m")
-    if noun.bore and noun.form != "cylinder":
-        raise ValueError(f"only a cylinder has a bore, not a {noun.form}")
     if noun.form == "sphere" and noun.hollow:
         raise ValueError("a sphere cannot be open at the top")
     if noun.form != "cylinder" and noun.taper != 1:

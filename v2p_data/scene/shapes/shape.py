@@ -15,7 +15,6 @@ from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.mesh import mesh_for, parts_for
 from v2p_data.scene.frames.mask_ops import handle_of
 from v2p_data.scene.scale.nouns import Noun
-from v2p_data.scene.shapes.handles import handle_of_body, with_handle
 from v2p_data.scene.shapes.inflation import inflation
 from v2p_data.scene.shapes.mesh_hypothesis import Kind, MeshHypothesis, Size, iou_of
 from v2p_data.scene.shapes.revolved import revolution
@@ -57,8 +56,6 @@ def best_shape(
     camera: Camera,
     size_m: Size,
     noun: Noun,
-    *,
-    handles: bool = True,
 ) -> ShapeChoice:
     """Return the mesh of an object that was fitted with its noun's primitive.
 
@@ -67,7 +64,6 @@ def best_shape(
         camera: of the masks, in the world frame, the table's top at z = 0 [m].
         size_m: of the fitted primitive, along its own axes.
         noun: which primitive, whether hollow, whether irregular.
-        handles: whether a vessel gets the handle that its outline shows.
     """
     crop = SilhouetteCrop(view, camera)
     primitive = _primitive(size_m, noun)
@@ -90,13 +86,6 @@ def best_shape(
         if best is not primitive:
             what = {"revolution": "a solid of revolution", "inflated": "the inflated silhouette"}
             reason = f"{what[best.kind]} covers the outline to {best_iou:.2f}, the {_word(noun)} to {plain:.2f}"
-        if handles and noun.handled:
-            handle = handle_of_body(best)
-            handled = with_handle(best, handle, view, crop)
-            iou = -1.0 if handled is None else iou_of(handled, view, crop)
-            if handled is not None and iou > best_iou + handle.gain:
-                best, best_iou = handled, iou
-                reason += f"; with a handle to {iou:.2f}"
     x, y, z = (float(v) for v in best.mesh.extents)
     return ShapeChoice(
         kind=best.kind,
@@ -112,8 +101,8 @@ def best_shape(
 def _primitive(size_m: Size, noun: Noun) -> MeshHypothesis:
     return MeshHypothesis(
         kind="primitive",
-        mesh=mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
-        parts=parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper, bore=noun.bore),
+        mesh=mesh_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
+        parts=parts_for(noun.form, size_m, hollow=noun.hollow, taper=noun.taper),
         T_obj_shape=np.eye(4),
     )
 
@@ -122,8 +111,6 @@ def _others(
     view: SilhouetteView, crop: SilhouetteCrop, size_m: Size, noun: Noun
 ) -> list[tuple[MeshHypothesis, float]]:
     """Return what else the object may be, with the margin by which each must win."""
-    if noun.bore:
-        return []
     found: list[tuple[MeshHypothesis | None, float]] = []
     if noun.form != "box":
         margin = MARGINS["revolution" if noun.form == "cylinder" else "ball"]
@@ -149,7 +136,5 @@ def _as_large(shape: MeshHypothesis, size_m: Size) -> bool:
 
 
 def _word(noun: Noun) -> str:
-    if noun.bore:
-        return "ring"
     hollow = "hollow " if noun.hollow else ""
     return hollow + {"box": "box", "cylinder": "cylinder", "sphere": "ball"}[noun.form]
