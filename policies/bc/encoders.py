@@ -30,9 +30,6 @@ DIRECTIONS = np.round(
 """Sixteen directions in the image, of whole numbers, so that sums over pixels are exact."""
 NUM_MOMENTS = NUM_SUMS + len(DIRECTIONS)
 """Numbers that `mask_moments` gives per label."""
-MASK_JITTER_SCALE = 0.05
-LEAST_SPREAD_PX = 0.3
-"""Standard deviation of a line of one pixel."""
 LEAST_PIXELS = 4
 """A label with fewer pixels counts as absent."""
 
@@ -171,48 +168,6 @@ def pixel_sums_by_products(
     return torch.stack(out, 1).long()
 
 
-def shifted(images: Float[Tensor, "batch c h w"], reach_px: int) -> Float[Tensor, "batch c h w"]:
-    """Return each image moved by up to `reach_px` along both axes; its border fills the gap."""
-    batch, _, height, width = images.shape
-    padded = F.pad(images, [reach_px] * 4, mode="replicate")
-    by = torch.randint(0, 2 * reach_px + 1, (2, batch, 1), device=images.device)
-    rows = (by[0] + torch.arange(height, device=images.device))[:, :, None]
-    columns = (by[1] + torch.arange(width, device=images.device))[:, None, :]
-    sample = torch.arange(batch, device=images.device)[:, None, None]
-    return padded[sample, :, rows, columns].permute(0, 3, 1, 2)
-
-
-def jittered(
-    moments: Float[Tensor, "batch time moment"], reach_px: float, longer_side_px: int
-) -> Float[Tensor, "batch time moment"]:
-    """Return `mask_moments` of labels that are moved, grown or shrunk, and scaled at random; absent ones stay absent.
-
-    Args:
-        moments: of all labels, one after the other.
-        reach_px: how far a label and its outline move at most.
-        longer_side_px: of the pictures.
-    """
-    unit = longer_side_px / 8
-    m = moments.unflatten(-1, (-1, NUM_MOMENTS))
-    draw = 2 * torch.rand(len(m), 1, m.shape[2], 4, device=m.device) - 1
-    grown, scale = draw[..., 2:3] * reach_px / (unit / 4), 1 + MASK_JITTER_SCALE * draw[..., 3:]
-    area, spread = m[..., 2:3], m[..., 3:5].clamp(min=LEAST_SPREAD_PX / (unit / 4))
-    # An ellipse's half axis is twice its standard deviation.
-    wider = (spread + grown / 2).clamp(min=LEAST_SPREAD_PX / (unit / 4))
-    larger = (wider / spread).prod(-1, keepdim=True).sqrt()
-    out = torch.cat(
-        [
-            m[..., :2] + draw[..., :2] * reach_px / unit,
-            area * larger * scale,
-            wider * scale,
-            m[..., 5:6],
-            (m[..., NUM_SUMS:] + grown) * scale,
-        ],
-        -1,
-    )
-    return torch.where(area > 0, out, m).flatten(-2)
-
-
 def pretrained_backbone_file() -> Path:
     """Return where torchvision keeps the pretrained ResNet18 on this machine."""
     return (
@@ -282,7 +237,6 @@ class CameraEncoder(nn.Module):
     Args:
         cfg: the policy's settings.
         is_mask: whether the camera shows labels.
-        shape: height and width of its pictures.
         weights: torchvision's pretrained ResNet18, if there is one.
     """
 
@@ -294,7 +248,6 @@ class CameraEncoder(nn.Module):
         cfg: V2PBCConfig,
         *,
         is_mask: bool,
-        shape: tuple[int, int],
         weights: dict[str, Tensor] | None,
     ) -> None:
         super().__init__()
@@ -302,10 +255,7 @@ class CameraEncoder(nn.Module):
         self.greys = tuple(cfg.mask_greys)
         self.num_labels = cfg.num_labels or len(self.greys)
         self.input_size_px = cfg.input_size_px
-        self.random_shift = cfg.random_shift
         self.has_moments = is_mask and cfg.mask_moments
-        self.mask_jitter_px, self.moments_dropout = cfg.mask_jitter_px, cfg.moments_dropout
-        self.longer_side_px = max(shape)
         self.backbone: nn.Module | None = None
         self.dim = 0
         self.standardise: Standardiser | None = None
@@ -346,20 +296,12 @@ class CameraEncoder(nn.Module):
         """Return the features of frames that `prepare` prepared."""
         parts: list[Tensor] = []
         if self.standardise is not None:
-            moments = prepared["moments"]
-            if self.training and self.mask_jitter_px:
-                moments = jittered(moments, self.mask_jitter_px, self.longer_side_px)
-            told = self.standardise(moments.flatten(1))
-            parts.append(F.dropout(told, self.moments_dropout, self.training))
+            parts.append(self.standardise(prepared["moments"].flatten(1)))
         if self.backbone is not None:
             frames = prepared["picture"].to(self.mean.dtype) / 255
             if not self.is_mask:
                 frames = (frames - self.mean) / self.std
-            stacked = frames.flatten(1, 2)
-            reach_px = round(self.random_shift * max(stacked.shape[-2:]))
-            if self.training and reach_px:
-                stacked = shifted(stacked, reach_px)
-            stacked = stacked.contiguous(memory_format=torch.channels_last)
+            stacked = frames.flatten(1, 2).contiguous(memory_format=torch.channels_last)
             parts.append(self.backbone(stacked))
         return torch.cat(parts, 1)
 

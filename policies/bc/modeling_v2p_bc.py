@@ -53,10 +53,9 @@ class BCNet(nn.Module):
             CameraEncoder(
                 cfg,
                 is_mask=cfg.is_mask(key),
-                shape=(feature.shape[1], feature.shape[2]),
                 weights=weights,
             )
-            for key, feature in cfg.image_features.items()
+            for key in cfg.image_features
         ]
         self.cameras = nn.ModuleList(cameras)
         width = sum(camera.dim for camera in cameras)

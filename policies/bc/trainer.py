@@ -334,9 +334,6 @@ class _Run:
         return torch.cat(rows)
 
     def _descend(self, batch: dict[str, Any]) -> Tensor:
-        cfg = self.policy.config
-        if cfg.random_shift or cfg.mask_jitter_px or cfg.moments_dropout:
-            torch.random.default_generator.manual_seed((self.seed ^ self.step) % 2**63)
         with self.autocast():
             loss, _ = self.policy(batch)
         self.optimizer.zero_grad(set_to_none=True)

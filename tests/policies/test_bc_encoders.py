@@ -10,14 +10,12 @@ from policies.bc.encoders import (
     IMAGENET_MEAN,
     IMAGENET_STD,
     Standardiser,
-    jittered,
     label_shares,
     labels_of,
     mask_moments,
     mask_stem,
     pixel_sums,
     pixel_sums_by_products,
-    shifted,
     shrink,
 )
 from policies.bc.heads import BinnedHead
@@ -52,23 +50,6 @@ def test_small_images_are_never_enlarged_and_large_ones_keep_their_aspect():
     assert shrink(torch.zeros(1, 3, 480, 640), 64).shape == (1, 3, 48, 64)
 
 
-def test_shifting_moves_each_image_as_a_whole_and_fills_the_gap_with_its_border():
-    image = torch.arange(12.0).view(1, 1, 3, 4)
-    channels = torch.cat([image, image + 100], 1).expand(50, -1, -1, -1)
-
-    moved = shifted(channels, 1)
-
-    rows, columns = torch.arange(3), torch.arange(4)
-    possible = [
-        image[0, 0][(rows + dy).clamp(0, 2)][:, (columns + dx).clamp(0, 3)]
-        for dy in (-1, 0, 1)
-        for dx in (-1, 0, 1)
-    ]
-    seen = {next(i for i, p in enumerate(possible) if torch.equal(p, m[0])) for m in moved}
-    assert len(seen) > 4
-    assert torch.equal(moved[:, 0] + 100, moved[:, 1])
-
-
 def test_the_mask_stem_sees_labels_as_the_pretrained_one_sees_the_grey_picture():
     rng = torch.Generator().manual_seed(0)
     weight = torch.randn(8, 3, 7, 7, generator=rng)
@@ -101,33 +82,6 @@ def test_moments_measure_a_rectangle():
     assert correlation == pytest.approx(0, abs=1e-6)
     corner = [7.5 * abs(np.cos(a)) + 4.5 * abs(np.sin(a)) for a in np.arange(16) * np.pi / 8]
     assert reach == pytest.approx([c / (unit / 4) for c in corner], rel=2e-3)
-
-
-def test_a_grown_ellipse_has_the_moments_of_the_larger_one_and_an_absent_label_stays_absent(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    y, x = np.mgrid[:256, :256]
-    ellipses = [((x - 120) / a) ** 2 + ((y - 100) / b) ** 2 <= 1 for a, b in ((20, 10), (23, 13))]
-    small, large = mask_moments(torch.from_numpy(np.array(ellipses, np.uint8)), 3).flatten(1)
-    # Neither moved nor scaled, grown by 3 px.
-    monkeypatch.setattr(
-        torch, "rand", lambda *shape, device: torch.tensor([0.5, 0.5, 1.0, 0.5]).expand(shape)
-    )
-
-    grown = jittered(small[None, None], 3.0, 256)[0, 0]
-
-    assert torch.allclose(grown[:22], large[:22], atol=0.05)
-    assert not grown[22:].any()
-
-
-def test_jitter_moves_all_frames_of_a_sample_alike_and_no_further_than_it_may():
-    moments = torch.rand(64, 2, 22) + 1.0
-
-    moved = jittered(moments, 2.0, 256) - moments
-
-    assert torch.allclose(moved[:, 0, :2], moved[:, 1, :2], atol=1e-6)
-    assert 0.5 < moved[..., :2].abs().max() * 256 / 8 <= 2.0 + 1e-4
-    assert len(moved[:, 0, 0].unique()) > 32
 
 
 def test_moments_tell_which_way_a_stick_leans_and_are_zero_without_it():

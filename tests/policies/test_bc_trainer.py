@@ -102,7 +102,7 @@ def test_a_training_that_was_killed_while_it_saved_ends_in_the_same_files(
     preceded by none, so that the first weights matter."""
 
     def files(out: Path, net: int) -> dict[str, bytes]:
-        policy_, processors = policy(small(moments_dropout=0.2), seed=net)
+        policy_, processors = policy(small(), seed=net)
         frames = normalised(table(policy_.net), processors)
         train(policy_, frames, recipe(save_every_s=0.0), out, seed=5)
         save_policy(out / "policy", policy_, processors)
@@ -147,17 +147,16 @@ def test_a_stopped_training_keeps_the_checkpoint_that_an_undisturbed_one_keeps(
 
     calls: list[int] = []
     how = recipe(checkpoints=3, steps=STEPS, save_every_s=0.0)
-    cfg = {"moments_dropout": 0.2}
-    calm, expected = trained(tmp_path / "calm", small(**cfg), how, judge=judge)
+    calm, expected = trained(tmp_path / "calm", small(), how, judge=judge)
     assert [at for at, _ in calm.judged] == [4, 5, 6]
 
     if step < 6:
         with pytest.raises(Stopped):
-            trained(tmp_path / "out", small(**cfg), how, judge=stopping)
+            trained(tmp_path / "out", small(), how, judge=stopping)
     else:
         with pytest.raises(Stopped):
-            trained(tmp_path / "out", small(**cfg), how, judge=judge, on_progress=stop_at(step))
-    told, found = trained(tmp_path / "out", small(**cfg), how, judge=judge, net=9)
+            trained(tmp_path / "out", small(), how, judge=judge, on_progress=stop_at(step))
+    told, found = trained(tmp_path / "out", small(), how, judge=judge, net=9)
 
     assert told.judged == calm.judged
     assert are_equal(found, expected)

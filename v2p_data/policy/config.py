@@ -50,11 +50,7 @@ class PolicyConfig:
     learning_rate: float = 3e-4
     """Learning rate of all but a pretrained backbone."""
     weight_decay: float = 1e-4
-    """Weight decay of AdamW; more, as the next two, keeps a policy from fitting its objects too closely."""
-    mask_jitter_px: float = 0.0
-    """In training each mask is moved, grown or shrunk at random by up to this many pixels, as its moments tell."""
-    moments_dropout: float = 0.0
-    """In training this share of the masks' moments is hidden."""
+    """Weight decay of AdamW; more keeps a policy from fitting its objects too closely."""
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.batch_size < 1 or self.checkpoints < 1 or self.epochs < 0:
@@ -112,6 +108,4 @@ class PolicyConfig:
             "state_entries": self.state_entries,
             "optimizer_lr": self.learning_rate,
             "optimizer_weight_decay": self.weight_decay,
-            "mask_jitter_px": self.mask_jitter_px,
-            "moments_dropout": self.moments_dropout,
         }
