@@ -1,6 +1,8 @@
 """What a folder and its captions become, and what is said when they cannot be used."""
 
 import json
+import os
+import re
 import unicodedata
 
 import pytest
@@ -11,8 +13,8 @@ from v2p_data.errors import V2PError
 from v2p_data.scene.schema import Words
 from v2p_data.video.captions import (
     find_videos,
+    item_of,
     read_footage,
-    unique_items,
 )
 from v2p_data.video.checked import words
 from v2p_data.video.hints import check_hints
@@ -182,14 +184,54 @@ def test_no_folder_and_no_videos_are_said_plainly(tmp_path):
         find_videos(tmp_path / "a.txt")
 
 
-def test_identifiers_are_plain_and_never_the_same_twice():
-    stems = ["Café au lait!", "cafe-au-lait", "cafe_au_lait_2", "日本", "", "x" * 200]
+@pytest.mark.parametrize(
+    ("name", "item"),
+    [
+        ("lift_red_box.mp4", "lift_red_box"),
+        ("place_into__egg_pan__ftf.mp4", "place_into__egg_pan__ftf"),
+        ("x" * 80 + ".mp4", "x" * 80),
+        ("Café au lait!.mp4", "café_au_lait-"),
+        ("日本の箱.mp4", "日本の箱-"),
+        ("हिन्दी कप.mov", "हिन्दी_कप-"),
+        ("🟥🟥.mp4", "video-"),
+        (".mp4.mp4", "mp4-"),
+        ("IMG 1234.MOV", "img_1234-"),
+        ("clip-0123456789.mp4", "clip_0123456789-"),
+        ("x" * 90 + ".mp4", "x" * 80 + "-"),
+        ("日" * 84 + ".mp4", "日" * 26 + "-"),
+    ],
+)
+def test_a_plain_name_is_the_identifier_and_another_keeps_its_letters_before_a_digest(name, item):
+    assert item_of(name) == item or re.fullmatch(re.escape(item) + "[0-9a-f]{10}", item_of(name))
 
-    items = unique_items(stems)
 
-    assert items[:3] == ["cafe_au_lait", "cafe_au_lait_2", "cafe_au_lait_2_2"]
-    assert items[3:5] == ["video", "video_2"]
-    assert len(items[5]) == 80
+def test_a_clip_that_is_added_changes_no_others_identifier(tmp_path):
+    names = [
+        *(
+            "clip.mp4",
+            "clip.mov",
+            "clip.avi",
+            "clip.mkv",
+            "clip.MP4",
+            "CLIP.mp4",
+            "clip .mp4",
+            "_clip.mp4",
+        ),
+        *("日本.mp4", "日本語.mp4", "🟥.mp4", "🟦.mp4", "Café.mp4", "Cafe\u0301.mp4", "cafe.mp4"),
+        *("x" * 90 + ".mp4", "x" * 91 + ".mp4", "x" * 80 + ".mp4"),
+        f"{item_of('CLIP.mp4')}.mp4",
+        os.fsdecode(b"\xff.mp4"),
+    ]
+    before: dict[str, str] = {}
+
+    for name in names:
+        (tmp_path / name).write_bytes(b"")
+        items = {v.path.name: v.item for v in find_videos(tmp_path)}
+        assert before.items() <= items.items()
+        assert find_videos(tmp_path / name)[0].item == items[name]
+        before = items
+
+    assert len(set(before.values())) == len(names)
 
 
 @pytest.mark.parametrize(

@@ -36,14 +36,14 @@ class ReviewServer(LocalPage):
         """
         if path == "":
             request.answer("text/html; charset=utf-8", self.review.page())
-        elif still := re.fullmatch(r"still/([a-z0-9_]+)/(\d{1,3})", path):
+        elif still := re.fullmatch(r"still/([^/.]+)/(\d{1,3})", path):
             request.answer("image/jpeg", self.review.still(still[1], int(still[2])))
-        elif film := re.fullmatch(r"film/([a-z0-9_]+)/[a-z0-9_@:-]*", path):
+        elif film := re.fullmatch(r"film/([^/.]+)/[^/]*", path):
             file = self.review.film(film[1])
             if file is None or not file.is_file():
                 raise LookupError(path)
             request.answer_part("video/mp4", file.read_bytes())
-        elif clip := re.fullmatch(r"clip/([a-z0-9_]+)", path):
+        elif clip := re.fullmatch(r"clip/([^/.]+)", path):
             request.json(self.review.clip(clip[1]))
         else:
             raise LookupError(path)
@@ -54,7 +54,7 @@ class ReviewServer(LocalPage):
         Raises:
             LookupError: it changes what there is not.
         """
-        asked = re.fullmatch(r"(mark|judge)/([a-z0-9_]+)", path)
+        asked = re.fullmatch(r"(mark|judge)/([^/.]+)", path)
         if asked is None:
             raise LookupError(path)
         try:

@@ -14,6 +14,8 @@ the caption's words do not say it. A hint called `table` marks the table itself.
 which part of the picture counts.
 """
 
+import hashlib
+import os
 import re
 import unicodedata
 from collections.abc import Mapping
@@ -36,6 +38,8 @@ from v2p_data.video.labels import Labels, read_labels
 from v2p_data.video.meaning import Meaning as Meaning
 from v2p_data.video.meaning import parse_caption as parse_caption
 
+LONGEST_ITEM = 80
+"""Bytes: names of result folders add up to 40, and some file systems take 143."""
 NO_CAPTION = "moving object"
 """What stands for a caption where nobody gave one and the file's name tells nothing."""
 
@@ -106,9 +110,8 @@ def read_footage(folder: Path) -> Footage:
     files = [p for p in entries if p.suffix.lower() == ".json" and p not in read]
     labels = read_labels([p for p in files if p.is_file()], [p.stem for p in here])
     labelled = {stem: (*said, {}) for stem, said in labels.said.items()}
-    ids = dict(zip(here, unique_items([p.stem for p in here]), strict=True))
     videos = tuple(
-        _item(ids[p], p, written.get(p.name) or labelled.get(p.stem) or (_from_name(p), (), {}))
+        _item(p, written.get(p.name) or labelled.get(p.stem) or (_from_name(p), (), {}))
         for p in wanted
     )
     almost = [p.name for p in read if p.name not in (CAPTIONS_FILE, CAPTIONS_TABLE)]
@@ -131,19 +134,20 @@ def read_footage(folder: Path) -> Footage:
     return Footage(videos=videos, notes=notes)
 
 
-def unique_items(stems: list[str]) -> list[str]:
-    """Return an identifier for each file name; where two would be the same, the later gets a number."""
-    taken: set[str] = set()
-    items: list[str] = []
-    for stem in stems:
-        plain = unicodedata.normalize("NFKD", stem).encode("ascii", "ignore").decode().lower()
-        base = re.sub(r"[^a-z0-9_]+", "_", plain).strip("_")[:80] or "video"
-        item, number = base, 2
-        while item in taken:
-            item, number = f"{base}_{number}", number + 1
-        taken.add(item)
-        items.append(item)
-    return items
+def item_of(name: str) -> str:
+    """Return the identifier of a video, which its own file name alone decides.
+
+    `a-z0-9_.mp4` of up to 80 letters keeps its stem. Another name keeps its letters, and a digest of it follows.
+    """
+    letters = (
+        c if c == "_" or unicodedata.category(c)[0] in "LMN" else " "
+        for c in Path(name).stem.lower()
+    )
+    slug = "_".join("".join(letters).split()).strip("_")
+    slug = slug.encode()[:LONGEST_ITEM].decode(errors="ignore") or "video"
+    if name == f"{slug}.mp4" and slug.isascii():
+        return slug
+    return f"{slug}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:10]}"
 
 
 _Said = tuple[str, tuple[str, ...], dict[str, Hint]]
@@ -155,14 +159,16 @@ def _is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not hidden and path.is_file()
 
 
-def _item(item: str, path: Path, said: _Said) -> VideoItem:
+def _item(path: Path, said: _Said) -> VideoItem:
     caption, objects, hints = said
     if not objects:
         found = parse_caption(caption).phrases
         objects = tuple(
             dict.fromkeys([*found, *(name for name in hints if name not in (TABLE, CROP))])
         )
-    return VideoItem(item=item, path=path, caption=caption, objects=objects, hints=hints)
+    return VideoItem(
+        item=item_of(path.name), path=path, caption=caption, objects=objects, hints=hints
+    )
 
 
 def checked_entry(entry: Any, where: str) -> _Said:
