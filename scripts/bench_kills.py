@@ -317,7 +317,7 @@ def finished(phase: Phase, work: Path) -> bool:
     """Run a phase to its end; tell whether it got there."""
     _, status = os.waitpid(child(phase, work), 0)
     if status:
-        print((work / "log.txt").read_text()[-2000:], flush=True)
+        print((work / "log.txt").read_text(encoding="utf-8")[-2000:], flush=True)
     return status == 0
 
 

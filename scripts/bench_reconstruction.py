@@ -162,7 +162,7 @@ def main() -> None:
         "rows": rows,
     }
     path = args.out / f"{name}.json"
-    path.write_text(json.dumps(result, indent=1) + "\n")
+    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     sheet = args.out / f"worst_{name}.png"
     write_sheet(rows, pictures, sheet)
     print(table(rows, summary, boxes=args.boxes, jobs=args.jobs))
@@ -429,9 +429,9 @@ def _note_final_run(args: argparse.Namespace) -> list[dict[str, Any]]:
         "clips": args.clips,
         **{way: vars(args)[way] for way in WAYS},
     }
-    with path.open("a") as file:
+    with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(run) + "\n")
-    runs = [json.loads(line) for line in path.read_text().splitlines()]
+    runs = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     print(
         f"WARNING: this is run {len(runs)} on the final split, with commit {run['commit']}; nothing may be tuned on it",
         flush=True,
@@ -519,7 +519,9 @@ def reconstructed(
         with tempfile.TemporaryDirectory() as home, _limit(MAX_SECONDS):
             video = Path(home) / f"{job.name}.mp4"
             video.symlink_to((folder / video.name).resolve())
-            (Path(home) / "captions.json").write_text(json.dumps({video.name: said}))
+            (Path(home) / "captions.json").write_text(
+                json.dumps({video.name: said}), encoding="utf-8"
+            )
             clip = read_clip(find_videos(Path(home))[0])
             cfg = settings_for(truth.camera) if "camera" in given else camera or SceneConfig()
             rng = rng_for(job.seed, "scene")

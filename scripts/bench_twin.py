@@ -124,7 +124,7 @@ def _write(
         "twin_at_end": twin.at_end.tolist(),
         "twin_failures": list(twin.failures),
     }
-    cfg.out.write_text(json.dumps(data, indent=1))
+    cfg.out.write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

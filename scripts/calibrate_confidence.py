@@ -71,7 +71,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    read = json.loads(path.read_text())
+    read = json.loads(path.read_text(encoding="utf-8"))
     return read["rows"] if isinstance(read, dict) else read
 
 

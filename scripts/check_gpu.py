@@ -141,7 +141,7 @@ def run_check(name: str, check: Check, device: str, *, quick: bool) -> Outcome:
             finally:
                 end_group(process)
         outcome.seconds = round(time.monotonic() - started, 1)
-        output = told.read_text(errors="replace")
+        output = told.read_text(errors="replace", encoding="utf-8")
         outcome.output = output[-TAIL_CHARACTERS:]
         if code is None:
             outcome.ran, outcome.error = True, f"it took longer than {check.limit_s:g} s"

@@ -107,8 +107,8 @@ def lend_ffmpeg(prefix: Path, wheel_libraries: Path) -> bool:
 
 def name_in_activation(script: Path) -> None:
     """Have a virtual environment's activation name the folder to the loader; nothing is written twice."""
-    if _ACTIVATION not in script.read_text():
-        with script.open("a") as end:
+    if _ACTIVATION not in script.read_text(encoding="utf-8"):
+        with script.open("a", encoding="utf-8") as end:
             end.write(_ACTIVATION)
 
 

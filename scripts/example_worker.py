@@ -33,7 +33,7 @@ def main() -> int:
     parser.add_argument("--request", type=Path, required=True)
     parser.add_argument("--result", type=Path, required=True)
     args = parser.parse_args()
-    request = json.loads((args.request / "request.json").read_text())
+    request = json.loads((args.request / "request.json").read_text(encoding="utf-8"))
     kind = request["kind"]
     if (request["schema"], request["version"]) != (SCHEMA, VERSION) or kind not in ANSWERS:
         print(
@@ -46,13 +46,17 @@ def main() -> int:
     try:
         fields, answer, mesh = ANSWERS[kind](arrays)
     except RefusedError as reason:
-        (args.result / "result.json").write_text(json.dumps({**head, "message": str(reason)}))
+        (args.result / "result.json").write_text(
+            json.dumps({**head, "message": str(reason)}), encoding="utf-8"
+        )
         return REFUSED
     if answer:
         np.savez(args.result / "result.npz", **answer)
     if mesh is not None:
         mesh.export(args.result / "mesh.obj")
-    (args.result / "result.json").write_text(json.dumps({**head, "fields": fields}))
+    (args.result / "result.json").write_text(
+        json.dumps({**head, "fields": fields}), encoding="utf-8"
+    )
     return 0
 
 

@@ -160,7 +160,7 @@ def _listened_to(source: str, request: dict[str, Any]) -> dict[str, Any]:
 def _unheard(request: dict[str, Any]) -> list[str]:
     """Return what the witness misses of things that plain Python does in the fork; silence must mean something."""
     doings = {
-        "open": lambda: Path("/dev/null").read_text(),
+        "open": lambda: Path("/dev/null").read_text(encoding="utf-8"),
         "socket": socket.socket,
         "os.fork": os.fork,
         "subprocess": lambda: subprocess.run(["/bin/true"], check=True),
@@ -210,13 +210,16 @@ def _warm_up(request: dict[str, Any]) -> None:
 def _put_canaries(folder: Path) -> dict[str, tuple[str, int]]:
     folder.chmod(0o777)
     for name in ("canary", "canary.pt", "canary.so"):
-        (folder / name).write_text("alive")
+        (folder / name).write_text("alive", encoding="utf-8")
         (folder / name).chmod(0o666)
     return _look_at(folder)
 
 
 def _look_at(folder: Path) -> dict[str, tuple[str, int]]:
-    return {p.name: (p.read_text(), p.stat().st_mtime_ns) for p in sorted(folder.iterdir())}
+    return {
+        p.name: (p.read_text(encoding="utf-8"), p.stat().st_mtime_ns)
+        for p in sorted(folder.iterdir())
+    }
 
 
 if __name__ == "__main__":

@@ -118,7 +118,7 @@ def main() -> None:
         cfg = replace(cfg, scene=cfg.scene.without_gate())
     beside = (args.videos if args.videos.is_dir() else args.videos.parent) / "boxes.json"
     args.drawn = args.drawn or (beside if beside.is_file() else DRAWN)
-    drawn: dict[str, Any] = json.loads(args.drawn.read_text())
+    drawn: dict[str, Any] = json.loads(args.drawn.read_text(encoding="utf-8"))
     videos = [
         v for v in find_videos(args.videos) if v.path.name in drawn and args.only in v.path.name
     ]
@@ -136,7 +136,8 @@ def main() -> None:
     if args.out:
         args.out.mkdir(parents=True, exist_ok=True)
         (args.out / "judged.json").write_text(
-            json.dumps([{**asdict(v), "accepted": v.accepted} for v in verdicts], indent=1) + "\n"
+            json.dumps([{**asdict(v), "accepted": v.accepted} for v in verdicts], indent=1) + "\n",
+            encoding="utf-8",
         )
         for number, sheet in enumerate(sheets(pictures)):
             cv2.imwrite(str(args.out / f"sheet_{number}.png"), sheet[..., ::-1])

@@ -22,7 +22,7 @@ LIFTING = "the paper's figures on lifting"
 
 @functools.cache
 def _paper() -> dict[str, Any]:
-    data = json.loads(FILE.read_text())
+    data = json.loads(FILE.read_text(encoding="utf-8"))
     shown = {name: table["rows"] for name, table in (data["tables"] | data["figures"]).items()}
     return shown | {"recipe": {name: fact["value"] for name, fact in data["recipe"].items()}}
 
@@ -123,7 +123,7 @@ PAGES: dict[str, Callable[[str], str]] = {
 
 def tables() -> str:
     """Return the paper's tables and figures as Markdown."""
-    data = json.loads(FILE.read_text())
+    data = json.loads(FILE.read_text(encoding="utf-8"))
     parts: list[str] = []
     for name, table in (data["tables"] | data["figures"]).items():
         note = f" {table['note']}" if "note" in table else ""
@@ -160,7 +160,7 @@ def main() -> None:
     for name, filled in PAGES.items():
         page = ROOT / name
         try:
-            page.write_text(filled(page.read_text()))
+            page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")
         except (KeyError, ValueError) as error:
             print(f"error: {name}: {error}", file=sys.stderr)
             sys.exit(2)

@@ -59,10 +59,10 @@ def _rate(result: dict[str, Any]) -> str:
 
 def written_pages() -> dict[Path, str]:
     """Return README and page of results with their tables as `docs/results.json` has them."""
-    results = json.loads(RESULTS.read_text())["results"]
+    results = json.loads(RESULTS.read_text(encoding="utf-8"))["results"]
     return {
-        PAGE: with_block(PAGE.read_text(), "results", table(results)),
-        README: with_block(README.read_text(), "headline", headlines(results)),
+        PAGE: with_block(PAGE.read_text(encoding="utf-8"), "results", table(results)),
+        README: with_block(README.read_text(encoding="utf-8"), "headline", headlines(results)),
     }
 
 
@@ -85,11 +85,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--write", action="store_true", help="write docs/results.md and README.md")
     if not parser.parse_args().write:
-        print(table(json.loads(RESULTS.read_text())["results"]))
+        print(table(json.loads(RESULTS.read_text(encoding="utf-8"))["results"]))
         return
     try:
         for page, text in written_pages().items():
-            page.write_text(text)
+            page.write_text(text, encoding="utf-8")
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -78,7 +78,7 @@ def make_clip(job: tuple[int, Path]) -> str:
             write(render(spec), Path(home))
             truth = load_truth(Path(home), spec.name)
             said = {f"{spec.name}.mp4": {"caption": truth.caption}}
-            (Path(home) / "captions.json").write_text(json.dumps(said))
+            (Path(home) / "captions.json").write_text(json.dumps(said), encoding="utf-8")
             clip = read_clip(find_videos(Path(home))[0])
             things = true_of(truth).things
         if len(things) < 2:
@@ -180,7 +180,7 @@ def main() -> None:
         "sure": sure,
         "aside": {"offset": round(float(offset), 4), "odds": round(float(slope), 4)},
     }
-    args.out.write_text(json.dumps(learned, indent=1) + "\n")
+    args.out.write_text(json.dumps(learned, indent=1) + "\n", encoding="utf-8")
 
 
 def _named(names: list[str], values: Float[np.ndarray, "cue"]) -> dict[str, float]:

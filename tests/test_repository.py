@@ -1,5 +1,6 @@
 """What may not be committed, and what the README promises."""
 
+import ast
 import re
 import shlex
 import subprocess
@@ -33,6 +34,67 @@ def test_no_file_is_larger_than_five_megabytes():
 def test_no_text_names_a_package_index_or_a_machine_of_ours():
     hosts = re.compile(rb"pypi\.or" rb"g|pythonhost" rb"ed|(?<![\w.])/(?:wor" rb"k|far" rb"m)/")
     assert [p for p in tracked_files() if p.is_file() and hosts.search(p.read_bytes())] == []
+
+
+def opens_text_without_encoding(call: ast.Call) -> bool:
+    """Return whether a call opens a text file in the encoding of whoever runs it."""
+    name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+    given = {k.arg: k.value for k in call.keywords}
+    mode = given.get(
+        "mode",
+        next((a for a in call.args if re.fullmatch(r"'[rwaxbt+]{1,3}'", ast.unparse(a))), None),
+    )
+    is_bytes = mode is not None and "b" in ast.unparse(mode)
+    if (
+        "encoding" in given
+        or is_bytes
+        or ast.unparse(call.func).split(".")[0] in ("av", "_av()", "os")
+    ):
+        return False
+    places = {
+        "read_text": 0,
+        "write_text": 1,
+        "open": 99 if isinstance(call.func, ast.Name) or mode else 0,
+    }
+    return len(call.args) <= places.get(name, -1) or (
+        name == "NamedTemporaryFile" and mode is not None
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "is_fault"),
+    [
+        ("open(path)", True),
+        ("path.open()", True),
+        ("path.open('a', newline='')", True),
+        ("path.open(mode='w')", True),
+        ("NamedTemporaryFile('w')", True),
+        ("path.read_text(errors='replace')", True),
+        ("path.write_text(text)", True),
+        ("path.write_text(text, 'utf-8')", False),
+        ("path.read_text('utf-8-sig')", False),
+        ("path.open('rb')", False),
+        ("open(path, 'w', encoding='utf-8')", False),
+        ("av.open(buffer, 'w')", False),
+        ("Image.open(path)", False),
+    ],
+)
+def test_a_text_file_that_is_opened_without_an_encoding_is_found(call, is_fault):
+    assert opens_text_without_encoding(ast.parse(call, mode="eval").body) == is_fault
+
+
+def test_every_text_file_is_opened_as_utf_8():
+    ours = [
+        p for p in tracked_files() if p.suffix == ".py" and "tests" not in p.parts and p.is_file()
+    ]
+    faults = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: say encoding='utf-8'"
+        for path in ours
+        for node in ast.walk(ast.parse(path.read_bytes()))
+        if isinstance(node, ast.Call) and opens_text_without_encoding(node)
+    ]
+
+    assert faults == []
 
 
 def test_the_readme_shows_its_two_commands():

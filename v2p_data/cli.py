@@ -4,6 +4,7 @@ Only light modules are imported here, so that `v2p --help` answers at once; each
 """
 
 import difflib
+import io
 import logging
 import os
 import sys
@@ -66,6 +67,10 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Ninety lines on FFmpeg versions that say what setup says in one.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    if isinstance(
+        sys.stdout, io.TextIOWrapper
+    ):  # a terminal that is not of UTF-8 shows other letters by number
+        sys.stdout.reconfigure(errors="backslashreplace")
     # The Ctrl-C of a pipe's reader (`v2p status | head`) is no error of ours.
     try:
         sys.exit(run(sys.argv[1:]))

@@ -699,7 +699,7 @@ def make_evaluation(
         row = {"task": name, "seen": name in seen, "judged": who.kind, **row_of(judged)}
         own = own_reset_rate(play, bundle, cfg.config, seed, runtime)
         rows.append(row | ({"own_reset": own} if own else {}))
-    (out / EVALUATION_FILE).write_text(json.dumps(rows, indent=1))
+    (out / EVALUATION_FILE).write_text(json.dumps(rows, indent=1), encoding="utf-8")
     return {"tasks": len(rows), "rows": rows}
 
 

@@ -266,7 +266,8 @@ def _cached_pictures(dataset: Path, meta: Any, net: BCNet, key: str, cache: Path
         for array in arrays.values():
             array.flush()  # pyright: ignore[reportAttributeAccessIssue] - a memmap
         (partial / CACHE_FILE).write_text(
-            json.dumps({"identity": identity, "crc32": _checksums(partial)})
+            json.dumps({"identity": identity, "crc32": _checksums(partial)}),
+            encoding="utf-8",
         )
         shutil.rmtree(cache, ignore_errors=True)
         partial.rename(cache)
@@ -304,7 +305,7 @@ def _identity(dataset: Path, meta: Any, net: BCNet, key: str) -> str:
 def _open_cache(cache: Path, identity: str) -> Prepared | None:
     """Return the arrays of a cache, None where it is not of this dataset or damaged."""
     try:
-        described = json.loads((cache / CACHE_FILE).read_text())
+        described = json.loads((cache / CACHE_FILE).read_text(encoding="utf-8"))
         if described["identity"] != identity:
             return None
         if (found := _checksums(cache)) != described["crc32"]:

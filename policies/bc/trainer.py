@@ -411,7 +411,7 @@ class _Run:
             ) from error
 
     def _write_curve(self) -> None:
-        with (self.out / CURVE_FILE).open("w", newline="") as stream:
+        with (self.out / CURVE_FILE).open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
             writer.writerow(CURVE_FIELDS)
             writer.writerows(self.rows)

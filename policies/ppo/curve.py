@@ -12,7 +12,7 @@ Row = dict[str, int | float]
 def append_row(path: Path, row: Row) -> None:
     """Append one line to the CSV; the first line written names the columns."""
     is_new = not path.is_file()
-    with path.open("a", newline="") as file:
+    with path.open("a", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(row))
         if is_new:
             writer.writeheader()
@@ -23,7 +23,7 @@ def read_rows(path: Path) -> list[Row]:
     """Return the rows; a last line that a kill cut short is left out."""
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     return [{k: float(v) for k, v in row.items()} for row in rows if all(row.values())]
 

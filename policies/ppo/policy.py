@@ -154,7 +154,9 @@ class Expert:
             k: v.detach().clone().contiguous() for k, v in _unique_state(self.model).items()
         }
         save_file(weights, folder / f"{WEIGHTS_FILE}.partial")
-        (folder / f"{EXPERT_FILE}.partial").write_text(json.dumps(about, indent=1))
+        (folder / f"{EXPERT_FILE}.partial").write_text(
+            json.dumps(about, indent=1), encoding="utf-8"
+        )
         for name in (WEIGHTS_FILE, EXPERT_FILE):
             (folder / f"{name}.partial").replace(folder / name)
 
@@ -171,7 +173,7 @@ class Expert:
             raise FileNotFoundError(
                 f"{folder} holds no {EXPERT_FILE}: it is no expert; train one first"
             )
-        about: dict[str, Any] = json.loads(path.read_text())
+        about: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if about["schema"] != SCHEMA:
             raise ValueError(
                 f"{path} has schema {about['schema']}, this version reads {SCHEMA}; train the expert anew"

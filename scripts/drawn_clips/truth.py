@@ -88,7 +88,7 @@ def write(video: SyntheticVideo, folder: Path) -> Path:
         lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in shape.vertices]
         lines += [f"f {a} {b} {c}" for a, b, c in shape.faces + 1]
         mesh = f"{spec.name}_{i}.obj"
-        (truth / mesh).write_text("\n".join(lines) + "\n")
+        (truth / mesh).write_text("\n".join(lines) + "\n", encoding="utf-8")
         things.append(
             {
                 "label": actor.prop.noun,
@@ -121,7 +121,7 @@ def write(video: SyntheticVideo, folder: Path) -> Path:
         "mask_labels": {"background": 0, "hand": LABEL_HAND, "table": LABEL_TABLE},
         "things": things,
     }
-    (truth / f"{spec.name}.json").write_text(json.dumps(said) + "\n")
+    (truth / f"{spec.name}.json").write_text(json.dumps(said) + "\n", encoding="utf-8")
     return path
 
 
@@ -135,7 +135,7 @@ def load_truth(folder: Path, name: str) -> Truth:
     if not path.is_file():
         known = sorted(p.stem for p in (folder / "truth").glob("*.json"))[:10]
         raise V2PError(f"no truth for clip '{name}' in {path.parent}; there are {known}")
-    said = json.loads(path.read_text())
+    said = json.loads(path.read_text(encoding="utf-8"))
     with np.load(path.parent / said["masks"]) as saved:
         masks, mask_idx = saved["masks"], saved["frame_idx"]
     things = tuple(

@@ -134,7 +134,7 @@ def make_clip(
             f"no clip that may be trained on after 100 draws: {cfg['held_out']} leave no noun"
         )
     path = write(render(replace(spec, fps=cfg["fps"])), out)
-    (out / CAPTIONS_FILE).write_text(json.dumps({path.name: spec.caption}))
+    (out / CAPTIONS_FILE).write_text(json.dumps({path.name: spec.caption}), encoding="utf-8")
     return {"caption": spec.caption, "noun": spec.story.actors[0].prop.noun}
 
 
@@ -377,7 +377,7 @@ def square_turn(mesh: trimesh.Trimesh) -> Float[np.ndarray, "4 4"]:
 def masses_in(folder: Path) -> dict[str, float]:
     """Return the masses [kg] that a folder of scans states; none where it has no such file."""
     path = next(iter(sorted(folder.glob(MASSES_FILES))), None)
-    return {} if path is None else json.loads(path.read_text())
+    return {} if path is None else json.loads(path.read_text(encoding="utf-8"))
 
 
 def _write_scene(

@@ -26,7 +26,7 @@ def results_in(out: Path) -> list[Row]:
     if not path.is_file():
         return []
     rows: list[Row] = []
-    for line in path.read_text().splitlines():
+    for line in path.read_text(encoding="utf-8").splitlines():
         try:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
@@ -50,7 +50,7 @@ def append_result(out: Path, row: Row) -> None:
     """Add a line, on a line of its own even where a kill left half a one."""
     path = out / RESULTS
     cut = path.is_file() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
-    with path.open("a") as stream:
+    with path.open("a", encoding="utf-8") as stream:
         stream.write(("\n" if cut else "") + json.dumps(row) + "\n")
 
 

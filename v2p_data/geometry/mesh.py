@@ -203,7 +203,7 @@ def outline_points(form: str, size_m: Size, taper: float = 1.0) -> Float[np.ndar
 def write_obj(mesh: trimesh.Trimesh, path: Path) -> None:
     """Write the mesh as OBJ without materials."""
     text = export_obj(mesh, include_texture=False, include_color=False, include_normals=False)
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
 
 
 def write_ply(mesh: trimesh.Trimesh, path: Path) -> None:

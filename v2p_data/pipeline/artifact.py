@@ -73,7 +73,7 @@ def read_record(folder: Path) -> Record | None:
     if path.exists() and not path.is_file():
         raise damaged(folder, f"{path} is no file")  # reading a pipe never ends
     try:
-        data = json.loads(path.read_text())
+        data = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
@@ -148,7 +148,7 @@ def _checksum(record: dict[str, Any]) -> str:
 def write_json_atomically(path: Path, data: Any) -> None:
     """Write JSON beside its place, flush it to disk, then rename it into place."""
     temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w") as stream:
+    with temporary.open("w", encoding="utf-8") as stream:
         json.dump(data, stream, indent=1)
         stream.flush()
         os.fsync(stream.fileno())
@@ -167,7 +167,9 @@ def commit_folder(partial: Path, final: Path) -> None:
 
 def write_rejects(folder: Path, rejects: Iterable[dict[str, Any]]) -> None:
     """Write what was dropped, one JSON object a line: id, reason slug, the number that decided."""
-    (folder / REJECTS_FILE).write_text("".join(json.dumps(reject) + "\n" for reject in rejects))
+    (folder / REJECTS_FILE).write_text(
+        "".join(json.dumps(reject) + "\n" for reject in rejects), encoding="utf-8"
+    )
 
 
 def read_rejects(folder: Path) -> list[dict[str, Any]]:
@@ -175,7 +177,9 @@ def read_rejects(folder: Path) -> list[dict[str, Any]]:
     path = folder / REJECTS_FILE
     if not path.is_file():
         return []
-    return [json.loads(line) for line in path.read_text().splitlines() if line.strip()]
+    return [
+        json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()
+    ]
 
 
 @functools.cache

@@ -45,7 +45,11 @@ def is_at_work(root: Path) -> bool:
 
 def run_name(root: Path) -> str:
     """Return what tells the run that is at work in a folder from earlier and later ones; empty: none began."""
-    return (root / RUN_NAME_FILE).read_text() if (root / RUN_NAME_FILE).exists() else ""
+    return (
+        (root / RUN_NAME_FILE).read_text(encoding="utf-8")
+        if (root / RUN_NAME_FILE).exists()
+        else ""
+    )
 
 
 def held(path: Path, root: Path, wait_s: float) -> AbstractContextManager[object]:
@@ -90,7 +94,7 @@ def no_progress(share: float, words: str) -> None:
 def write_to(log: Path) -> None:
     """Send all that this process says to the end of a log."""
     log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as stream:
+    with log.open("a", encoding="utf-8") as stream:
         os.dup2(stream.fileno(), 1)
         os.dup2(stream.fileno(), 2)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", force=True)

@@ -162,5 +162,5 @@ def _remember(memory: Path, known: Mapping[str, Any]) -> None:
         temporary = memory.with_suffix(
             f".{os.getpid()}.tmp"
         )  # workers may compare the same folder
-        temporary.write_text(json.dumps(known))
+        temporary.write_text(json.dumps(known), encoding="utf-8")
         temporary.replace(memory)

@@ -166,5 +166,5 @@ def _owner_of(root: Path) -> str:
     path = root / OWNER_FILE
     if not path.exists():
         root.mkdir(parents=True, exist_ok=True)
-        path.write_text(uuid.uuid4().hex[:12])
-    return path.read_text()
+        path.write_text(uuid.uuid4().hex[:12], encoding="utf-8")
+    return path.read_text(encoding="utf-8")

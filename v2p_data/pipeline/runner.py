@@ -243,7 +243,8 @@ def _why(error: Exception, partial: Path) -> tuple[str, str]:
     logger.exception("making %s failed", partial)
     said = str(error)
     with contextlib.suppress(OSError):
-        (partial / TRACEBACK_FILE).write_text(traceback.format_exc())
+        told = traceback.format_exc().encode(errors="backslashreplace")
+        (partial / TRACEBACK_FILE).write_bytes(told)
         said += f" (traceback in {partial / TRACEBACK_FILE})"
     return type(error).__name__, said
 

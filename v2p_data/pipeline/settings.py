@@ -18,7 +18,7 @@ def load_settings[T](path: Path, kind: type[T]) -> T:
         V2PError: no such file, no YAML, an unknown setting, or a value of another type.
     """
     try:
-        data = yaml.safe_load(path.read_text())
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise V2PError(f"cannot read the settings file {path}: {error.strerror}") from error
     except yaml.YAMLError as error:

@@ -65,7 +65,7 @@ def only_run_in(root: Path) -> Generator[None]:
             f"cannot write to {root}: {error.strerror}; choose another folder with --out"
         ) from error
     with lock:
-        (root / RUN_NAME_FILE).write_text(uuid.uuid4().hex)
+        (root / RUN_NAME_FILE).write_text(uuid.uuid4().hex, encoding="utf-8")
         wait_for_workers(root, WORKERS_END_S)
         yield
 

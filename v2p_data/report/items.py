@@ -171,7 +171,7 @@ def _mesh_picture(folder: Path, obj: SceneObject, size_px: int) -> str | None:
 
 def _add_task(view: ItemView, result: Result) -> None:
     code = result.folder / "task.py"
-    view.code = code.read_text(errors="replace") if code.is_file() else ""
+    view.code = code.read_text(errors="replace", encoding="utf-8") if code.is_file() else ""
     view.task = as_dict(json_or_none(result.folder / "task.json"))
     view.kind = str(view.task.get("kind") or view.kind)
     audit = as_dict(view.task.get("audit"))

@@ -209,7 +209,7 @@ def read_curve(path: Path) -> dict[str, np.ndarray]:
     """Return a CSV's columns; what is no number is NaN, and a last line that a kill cut short is left out."""
     if not path.is_file() or path.stat().st_size > MAX_BYTES:
         return {}
-    with path.open(newline="", errors="replace") as stream:
+    with path.open(newline="", errors="replace", encoding="utf-8") as stream:
         head, *rows = [*csv.reader(stream)] or [[]]
     whole = [row for row in rows if len(row) == len(head)]
     return {name: np.array([_float(row[k]) for row in whole]) for k, name in enumerate(head)}
@@ -297,7 +297,7 @@ def _from_partials(root: Path) -> list[Result]:
                 continue
             trace = folder / "traceback.txt"
             last = (
-                trace.read_text(errors="replace").strip().splitlines()[-1:]
+                trace.read_text(errors="replace", encoding="utf-8").strip().splitlines()[-1:]
                 if trace.is_file()
                 else []
             )

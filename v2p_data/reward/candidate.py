@@ -181,7 +181,7 @@ def closeness(moved_m: Float[np.ndarray, "env 3"], obj: SceneObject) -> Float[np
 
 def component_curves(curve: Path) -> dict[str, Sequence[float]]:
     """Return per component, and for `success`, its mean in the course of training."""
-    with curve.open(newline="") as stream:
+    with curve.open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     names = {"success_deterministic": "success"} | {
         k: k.removeprefix("reward_") for k in rows[0] if k.startswith("reward_")

@@ -72,7 +72,7 @@ def write_scene(reconstruction: Reconstruction, folder: Path) -> Scene:
         warnings=(*clip.warnings, *reconstruction.warnings),
         folder=folder,
     )
-    (folder / MJCF_FILE).write_text(_xml(_scene_mjcf(scene, bodies)))
+    (folder / MJCF_FILE).write_text(_xml(_scene_mjcf(scene, bodies)), encoding="utf-8")
     write_overlay(reconstruction, folder)
     for name, frame in (("first", clip.frames[0]), ("last", clip.frames[-1])):
         cv2.imwrite(str(folder / f"frame_{name}.jpg"), frame[..., ::-1])
@@ -236,8 +236,8 @@ def _write_models(
     body = _Body(thing=thing, com=com, inertia=inertia)
     write_obj(mesh, folder / thing.mesh)
     write_ply(mesh, folder / thing.mesh_ply)
-    (folder / thing.urdf).write_text(_xml(_urdf(body)))
-    (folder / thing.mjcf).write_text(_xml(_object_mjcf(body)))
+    (folder / thing.urdf).write_text(_xml(_urdf(body)), encoding="utf-8")
+    (folder / thing.mjcf).write_text(_xml(_object_mjcf(body)), encoding="utf-8")
     return body
 
 
@@ -285,7 +285,7 @@ def write_relative(
         objects=tuple(body.thing for body in bodies),
         folder=folder,
     )
-    (folder / MJCF_FILE).write_text(_xml(_scene_mjcf(made, bodies)))
+    (folder / MJCF_FILE).write_text(_xml(_scene_mjcf(made, bodies)), encoding="utf-8")
     made.save(folder)
     return made
 

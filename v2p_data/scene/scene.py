@@ -335,7 +335,7 @@ class Scene:
             if thing.poses_world:
                 written["first_to_last"] = asdict(thing.motion)
         data["schema"] = SCHEMA
-        (folder / SCENE_FILE).write_text(json.dumps(data, indent=1))
+        (folder / SCENE_FILE).write_text(json.dumps(data, indent=1), encoding="utf-8")
 
     @staticmethod
     def load(folder: Path) -> "Scene":

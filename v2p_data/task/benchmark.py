@@ -42,12 +42,16 @@ def load_benchmark(name: str, folder: Path = FOLDER) -> TaskBundle:
             f"there is no benchmark task '{name}' in {folder}.{did_you_mean(name, known)}"
         )
     try:
-        scene = _scene(name, yaml.safe_load(path.read_text()))
+        scene = _scene(name, yaml.safe_load(path.read_text(encoding="utf-8")))
     except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
         words = " ".join(str(error).split())
         raise V2PError(f"{path} is no benchmark task: {type(error).__name__}: {words}") from error
     reference = path.with_suffix(".py")
-    code = reference.read_text() if reference.is_file() else write_samples(scene, 1)[0]
+    code = (
+        reference.read_text(encoding="utf-8")
+        if reference.is_file()
+        else write_samples(scene, 1)[0]
+    )
     return TaskBundle(
         title=name,
         description=scene.description,

@@ -113,14 +113,14 @@ class GeneratedTask:
         samples = folder / SAMPLES_FOLDER
         samples.mkdir()
         for i, sample in enumerate(self.samples):
-            (samples / f"{i}.py").write_text(sample.code)
+            (samples / f"{i}.py").write_text(sample.code, encoding="utf-8")
         table = {
             "picked": self.picked,
             **self.about,
             "rates": self.rates(),
             "samples": [s.as_dict() for s in self.samples],
         }
-        (folder / AUDIT_FILE).write_text(json.dumps(table, indent=1))
+        (folder / AUDIT_FILE).write_text(json.dumps(table, indent=1), encoding="utf-8")
 
 
 def hallucination(samples: Sequence[Sample]) -> dict[str, int | float]:

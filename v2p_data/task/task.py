@@ -183,13 +183,15 @@ class TaskBundle:
         if robot:
             main = copy_robot(Path(robot["path"]), folder / ROBOT_FOLDER)
             robot = {**robot, "path": str(PurePosixPath(ROBOT_FOLDER) / main)}
-        (folder / CODE_FILE).write_text(self.code)
+        (folder / CODE_FILE).write_text(self.code, encoding="utf-8")
         data = {
             k: v
             for k, v in asdict(replace(self, scene=replace(self.scene, folder=Path()))).items()
             if k not in {"scene", "folder", "code"}
         }
-        (folder / TASK_FILE).write_text(json.dumps({**data, "robot": robot}, indent=1))
+        (folder / TASK_FILE).write_text(
+            json.dumps({**data, "robot": robot}, indent=1), encoding="utf-8"
+        )
 
     @staticmethod
     def load(folder: Path) -> "TaskBundle":

@@ -94,7 +94,7 @@ def write_parts(parts: Sequence[Part], entries: Sequence[dict[str, Any]], out: P
         "total_tasks": len(tasks),
         "splits": {"train": f"0:{len(episodes)}"},
     }
-    (out / INFO_FILE).write_text(json.dumps(info, indent=4, ensure_ascii=False))
+    (out / INFO_FILE).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
     write_stats(out)
 
 

@@ -157,7 +157,7 @@ def write_language(root: Path, about: Mapping[str, Any] | None) -> None:
             raise RuntimeError(f"LeRobot finds the words wrong: {report.errors[0]}")
         LanguageColumnsWriter().write_all(records, Path(staging), root)
     info["features"] |= language_feature_info()
-    (root / INFO_FILE).write_text(json.dumps(info, indent=4, ensure_ascii=False))
+    (root / INFO_FILE).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
 def _rows(

@@ -122,4 +122,4 @@ def write_stats(root: Path) -> None:
         for f in info["features"]
         if f in found
     }
-    (root / STATS_FILE).write_text(json.dumps(plain, indent=4))
+    (root / STATS_FILE).write_text(json.dumps(plain, indent=4), encoding="utf-8")

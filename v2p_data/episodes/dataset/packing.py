@@ -70,4 +70,4 @@ def copy_tasks(tasks: Mapping[str, Path], dataset: Path) -> None:
         described = carried / TASK_FILE
         task = read_object(described, "make the task anew")
         if (shareable := without_places(task)) != task:
-            described.write_text(json.dumps(shareable, indent=1))
+            described.write_text(json.dumps(shareable, indent=1), encoding="utf-8")

@@ -77,14 +77,15 @@ def write_envhub(source: Path, repo_id: str, out: Path) -> None:
             world = build_world(bundle.scene, FINE)
         _copy_task(bundle, partial / "tasks" / name)
         (partial / "mjcf").mkdir(exist_ok=True)
-        (partial / "mjcf" / f"{name}.xml").write_text(world.spec.to_xml())
+        (partial / "mjcf" / f"{name}.xml").write_text(world.spec.to_xml(), encoding="utf-8")
         rows.append(f"| {len(rows)} | {bundle.description} | `{name}` | {bundle.policy_steps()} |")
     shutil.copytree(SOURCE, partial / SOURCE.name, ignore=_not_source)
     (partial / "env.py").write_text(
-        ENV_PY.replace("REPO_ID", repo_id).replace("SETTINGS", repr(settings))
+        ENV_PY.replace("REPO_ID", repo_id).replace("SETTINGS", repr(settings)),
+        encoding="utf-8",
     )
-    (partial / "requirements.txt").write_text("\n".join(requirements()) + "\n")
-    (partial / "README.md").write_text(_card(repo_id, rows, states, names))
+    (partial / "requirements.txt").write_text("\n".join(requirements()) + "\n", encoding="utf-8")
+    (partial / "README.md").write_text(_card(repo_id, rows, states, names), encoding="utf-8")
     partial.rename(out)
 
 

@@ -102,7 +102,7 @@ def write_policy_card(folder: Path) -> None:
 def name_policy(folder: Path, repo_id: str) -> None:
     """Put a policy's name on the Hub into the commands of its card; a card of other hands stays as it is."""
     path = folder / CARD_FILE
-    card = path.read_text(errors="replace")
+    card = path.read_text(errors="replace", encoding="utf-8")
     if PLACEHOLDER in card:
         write_whole(path, card.replace(PLACEHOLDER, "").replace("POLICY", repo_id).encode())
 
@@ -115,7 +115,7 @@ def note_results(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         rows: one a task, as in `evaluation.json`.
     """
     path = folder / CARD_FILE
-    card = path.read_text(errors="replace") if path.is_file() else ""
+    card = path.read_text(errors="replace", encoding="utf-8") if path.is_file() else ""
     before, begin, rest = card.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:

@@ -33,7 +33,7 @@ def main() -> int:
     parser.add_argument("--request", type=Path, required=True)
     parser.add_argument("--result", type=Path, required=True)
     args = parser.parse_args()
-    request = json.loads((args.request / "request.json").read_text())
+    request = json.loads((args.request / "request.json").read_text(encoding="utf-8"))
     if (request["schema"], request["version"], request["kind"]) != (SCHEMA, VERSION, KIND):
         sys.stderr.write(f"this worker does '{KIND}' of version {VERSION}\n")
         return BAD_REQUEST
@@ -41,7 +41,7 @@ def main() -> int:
         images = file["images"]
     np.savez(args.result / "result.npz", **hands_in(images))
     head = {"schema": SCHEMA, "version": VERSION, "kind": KIND, "fields": {}}
-    (args.result / "result.json").write_text(json.dumps(head))
+    (args.result / "result.json").write_text(json.dumps(head), encoding="utf-8")
     return 0
 
 

@@ -272,7 +272,7 @@ def _write_request(request: WorkerRequest, folder: Path) -> None:
             k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in request.arrays.items()
         },
     }
-    (folder / "request.json").write_text(json.dumps(head, indent=2))
+    (folder / "request.json").write_text(json.dumps(head, indent=2), encoding="utf-8")
 
 
 def _read_result(

@@ -294,7 +294,7 @@ class _Approach:
 @cache
 def learned() -> dict[str, dict[str, float]]:
     """Return what a unit of each cue counts, for which candidate it is and for whether that is right."""
-    return json.loads(WEIGHTS.read_text())
+    return json.loads(WEIGHTS.read_text(encoding="utf-8"))
 
 
 def weighted(weights: dict[str, float], cues: dict[str, float]) -> float:

@@ -46,7 +46,7 @@ def add_solved(pool: Path, bundle: TaskBundle, success: float) -> Path | None:
         made = Path(place) / "task"
         made.mkdir()
         replace(bundle, scene=replace(bundle.scene, folder=Path(bare))).save(made)
-        (made / SOLVED_FILE).write_text(json.dumps({"success": success}))
+        (made / SOLVED_FILE).write_text(json.dumps({"success": success}), encoding="utf-8")
         if home.is_dir():
             home.rename(Path(place) / "before")
         with suppress(OSError):  # another process put its own there in between

@@ -92,7 +92,10 @@ def confine(rights: Rights, *, parent_pid: int, give_up_root: bool = True) -> tu
 
 def _limits(rights: Rights) -> list[tuple[int, int]]:
     """Return the limits to set, each with its value."""
-    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    mapped = (
+        int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0])
+        * resource.getpagesize()
+    )
     ours = _tasks_of_ours() if rights.processes else 0
     limits = [
         (resource.RLIMIT_CORE, 0),
