@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Generator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from beartype import beartype
@@ -73,6 +74,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def device(pytestconfig: pytest.Config) -> str:
     """Where a test runs that can run anywhere; the CPU unless `--device` says otherwise."""
     return pytestconfig.getoption("--device") or "cpu"
+
+
+@pytest.fixture
+def agreeing_referee(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the referee agree with every success of a task: for tests of the loops around both."""
+
+    def agree(_: object, history: dict[str, np.ndarray]) -> np.ndarray:
+        return np.ones(history["eef_pos"].shape[1], bool)
+
+    monkeypatch.setattr("v2p_data.sim.env.verdict.referee_verdict", agree)
 
 
 @pytest.fixture

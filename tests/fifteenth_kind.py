@@ -50,7 +50,7 @@ def template(measured: Measured, variant: Variant) -> Draft:
 
 def rule(case: referee.Case) -> np.ndarray:
     is_behind = case.thing.pos[-1, :, 0] > case.other.pos[-1, :, 0]
-    return is_behind & (case.gap() < 0.1) & case.thing.is_at_rest
+    return is_behind & (case.gap[-1] < 0.1) & case.thing.is_at_rest
 
 
 def program(m: Moment, k: int) -> np.ndarray:

@@ -226,7 +226,7 @@ def test_lerobots_own_trainer_trains_a_policy_of_ours_anew(run_tool, dataset, tm
 
 
 def test_training_resuming_and_evaluating_with_lerobots_own_tools(
-    run_tool, dataset, task_folder, tmp_path
+    run_tool, dataset, task_folder, tmp_path, agreeing_referee
 ):
     from lerobot.scripts.lerobot_eval import main as lerobot_eval
     from lerobot.scripts.lerobot_train import main as lerobot_train

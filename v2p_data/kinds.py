@@ -39,6 +39,20 @@ _ENDS_AT_OTHER = ("beside", "inside", "on_top", "over", "away")
 
 
 @dataclass(frozen=True, kw_only=True)
+class Meaning:
+    """What an episode of a kind must show and may not show; the referee judges by it."""
+
+    seen: str = ""
+    """What must be seen, in words."""
+    never: str = ""
+    """What must not be seen."""
+    moved_m: float = 0.03
+    """The robot moves the object at least this far from where it settled."""
+    raised_m: float = 0.03
+    """What must be grasped is raised by this in the grip."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TaskKind:
     """What the engine knows of one kind of task.
 
@@ -59,6 +73,9 @@ class TaskKind:
     """The second object: `ignored` unless the caption names it, `needed`, or `welcome`."""
     grasps: Grasps
     """What the gripper must hold. `unknown`: the task's own code tells."""
+    may_drag: bool = False
+    """Grasps nothing, and may drag the object in its grip."""
+    meaning: Meaning = Meaning()
     programs: tuple[str, ...] = ()
     """How the names of the preferred scripted policies begin, the best one first."""
     slides: bool = False
@@ -130,6 +147,13 @@ class TaskKind:
         return self.grasps == "manipulated"
 
     @property
+    def grip(self) -> str:
+        """What the table says of the gripper."""
+        if self.grasps == "nothing":
+            return "allowed" if self.may_drag else "never"
+        return {"manipulated": "needed", "tool": "of the tool"}.get(self.grasps, "allowed")
+
+    @property
     def is_put_down(self) -> bool:
         """Whether the gripper carries the object to the other one and opens there."""
         return self.family == "carry" and (self.comes_near or self.touches)
@@ -155,6 +179,12 @@ _ROWS = (
         grasps="manipulated",
         programs=("lift",),
         horizon_steps=60,
+        meaning=Meaning(
+            seen="held 6 cm above where it settled, steady for 0.25 s",
+            never="waved or thrown past that height",
+            moved_m=0.06,
+            raised_m=0.06,
+        ),
     ),
     TaskKind(
         name="push_left",
@@ -167,6 +197,11 @@ _ROWS = (
         slides=True,
         side=1,
         horizon_steps=60,
+        meaning=Meaning(
+            seen="it slid to the left (+y), at most 0.6 as far forward or back; upright, at rest",
+            never="gripped over 2 cm; raised over 1 cm; toppled; held at the end",
+            moved_m=0.06,
+        ),
     ),
     TaskKind(
         name="push_right",
@@ -179,6 +214,11 @@ _ROWS = (
         slides=True,
         side=-1,
         horizon_steps=60,
+        meaning=Meaning(
+            seen="it slid to the right (-y), at most 0.6 as far forward or back; upright, at rest",
+            never="as `push_left`",
+            moved_m=0.06,
+        ),
     ),
     TaskKind(
         name="tip_over",
@@ -189,6 +229,11 @@ _ROWS = (
         grasps="nothing",
         programs=("tip",),
         horizon_steps=60,
+        meaning=Meaning(
+            seen="turned by over 60 degrees, lies on the table at rest",
+            never="gripped over 2 cm; raised over 3 cm; held at the end",
+            moved_m=0.02,
+        ),
     ),
     TaskKind(
         name="push_next_to",
@@ -199,6 +244,11 @@ _ROWS = (
         grasps="nothing",
         programs=("push next",),
         slides=True,
+        meaning=Meaning(
+            seen="a gap over 3 cm became one below 3 cm; upright, at rest",
+            never="as `push_left`; the other object moved 3 cm",
+            moved_m=0.02,
+        ),
     ),
     TaskKind(
         name="cover",
@@ -209,6 +259,10 @@ _ROWS = (
         grasps="manipulated",
         programs=("put over",),
         end_weight=0.5,
+        meaning=Meaning(
+            seen="carried; let go upright on the table, centres within 2.5 cm",
+            never="pushed after letting go; the other object moved 3 cm",
+        ),
     ),
     TaskKind(
         name="uncover",
@@ -220,6 +274,10 @@ _ROWS = (
         programs=("lift",),
         other_starts="under_manipulated",
         may_end_held=True,
+        meaning=Meaning(
+            seen="carried upright from over the other object to beside it, or held 8 cm high",
+            never="pushed off; the other object moved 3 cm",
+        ),
     ),
     TaskKind(
         name="push_with",
@@ -230,6 +288,11 @@ _ROWS = (
         grasps="tool",
         programs=("push with",),
         slides=True,
+        meaning=Meaning(
+            seen="the gripped tool was within 3 cm of the object, which slid; upright, at rest",
+            never="the arm touched the object; raised over 1 cm; toppled",
+            moved_m=0.06,
+        ),
     ),
     TaskKind(
         name="drop_in_front_of",
@@ -241,6 +304,10 @@ _ROWS = (
         programs=("put in front",),
         other_starts="far_side",
         may_end_held=True,
+        meaning=Meaning(
+            seen="carried; let go; lies on the table within 10 cm of the other object, on the robot's side",
+            never="pushed or dragged over half of its way; pushed after letting go; the other object moved 3 cm",
+        ),
     ),
     TaskKind(
         name="insert",
@@ -257,6 +324,10 @@ _ROWS = (
         grasps="manipulated",
         programs=("put into",),
         end_weight=0.4,
+        meaning=Meaning(
+            seen="carried; let go; at rest, its lowest point between floor and rim",
+            never="pressed through the floor; pushed after letting go; the container moved 6 cm",
+        ),
     ),
     TaskKind(
         name="slide_to",
@@ -267,6 +338,12 @@ _ROWS = (
         grasps="nothing",
         programs=("drag next", "push next"),
         slides=True,
+        may_drag=True,
+        meaning=Meaning(
+            seen="a gap over 3 cm became one below 3 cm; upright, at rest",
+            never="raised over 1 cm; toppled; held at the end; the other object moved 3 cm",
+            moved_m=0.02,
+        ),
     ),
     TaskKind(
         name="throw_into",
@@ -279,6 +356,11 @@ _ROWS = (
         other_starts="beyond_reach",
         motion_scale=2.0,
         end_weight=0.4,
+        meaning=Meaning(
+            seen="let go in the air, over 10 cm before the rim; in the container, not held",
+            never="lowered in; the container moved 6 cm",
+            moved_m=0.1,
+        ),
     ),
     TaskKind(
         name="place_onto",
@@ -289,6 +371,10 @@ _ROWS = (
         grasps="manipulated",
         programs=("put onto",),
         end_weight=0.5,
+        meaning=Meaning(
+            seen="carried; let go; at rest on the other object, over its middle part",
+            never="pushed after letting go; the other object moved 3 cm",
+        ),
     ),
     TaskKind(
         name="generic",
@@ -298,11 +384,31 @@ _ROWS = (
         other="welcome",
         grasps="unknown",
         may_end_held=True,
+        meaning=Meaning(
+            seen="moved as far as half of the video's way, ends near the video's place; at rest",
+            never="left where it was",
+            moved_m=0.0,
+        ),
     ),
 )
 
 KINDS: dict[Kind, TaskKind] = {row.name: row for row in _ROWS}
 """Every kind of task by its name."""
+
+
+def meanings_table() -> str:
+    """Return what each kind means, as Markdown."""
+    lines = [
+        "| kind | moved | raised | grip | must be seen | must not be seen |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, kind in KINDS.items():
+        means = kind.meaning
+        raised = f"{100 * means.raised_m:g} cm" if kind.must_grasp else ""
+        lines.append(
+            f"| `{name}` | {100 * means.moved_m:g} cm | {raised} | {kind.grip} | {means.seen} | {means.never} |"
+        )
+    return "\n".join(lines)
 
 
 def check_every_kind(known: Collection[str], part: str, where: str) -> None:

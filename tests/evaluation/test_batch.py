@@ -37,7 +37,7 @@ class HighTool(Task):
         height = states["eef_pos"][:, 2]
         return height, {"height": height}
 """
-"""Success while the tool is above a height; the video's object rests, and so it does here."""
+"""Success while the tool is above a height."""
 
 
 class Drive:
@@ -60,7 +60,7 @@ class Drive:
 
 
 @pytest.fixture
-def bundle() -> TaskBundle:
+def bundle(agreeing_referee: None) -> TaskBundle:
     found = load_benchmark("lift_up")
     thing = found.scene.manipulated
     still = replace(

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def left_folder(benchmark_folder: Path) -> Path:
+def left_folder(benchmark_folder: Path, agreeing_referee: None) -> Path:
     """Return a task that about half of the worlds do: the tool is at the left, and the object rests."""
     from dataclasses import replace
 

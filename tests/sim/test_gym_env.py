@@ -147,8 +147,8 @@ def test_an_episode_without_success_ends_at_a_multiple_of_the_horizon(
     env.close()
 
 
-def test_success_counts_when_held_and_ends_the_episode(write_task, tmp_path):
-    """From the second of 20 steps on the cube is above -1 m, and it rests, which is all the video shows."""
+def test_success_counts_when_held_and_ends_the_episode(write_task, tmp_path, agreeing_referee):
+    """From the second of 20 steps on the cube is above -1 m."""
     folder = write_task(tmp_path / "easy", height=-1.0, horizon=20, kind="generic", after=0.06)
     env = V2PEnv(str(folder))
     env.reset(seed=0)
@@ -187,7 +187,9 @@ def test_a_folder_without_a_task_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(write_task, tmp_path):
+def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(
+    write_task, tmp_path, agreeing_referee
+):
     from lerobot.envs.factory import make_env_config
 
     import lerobot_policy_v2p  # noqa: F401 - registers the environment

@@ -1,7 +1,8 @@
 """Independent success functions, one per task kind, that no training ever sees.
 
-They look at a whole recorded episode, in numpy, and ask for what the words say: a thing pressed through the
-table is not inserted, a thing toppled is not pushed, a thing still held is not dropped.
+They look at a whole recorded episode, in numpy, and ask for what the words say. `Meaning` in `v2p_data/kinds.py`
+says it in words and numbers. Three things hold for all kinds. The robot's contact, in this episode, moved the
+object from where it lay at rest. The object was not at its goal before. Nothing is pressed through the table.
 """
 
 from collections.abc import Callable
@@ -9,36 +10,39 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import V2PError
-from v2p_data.kinds import KINDS, Kind, check_every_kind
+from v2p_data.kinds import KINDS, Kind, TaskKind, check_every_kind
 from v2p_data.scene.scene import Scene, SceneObject, hollow_floor_m
 
 LAST = 5
 """Samples at the end (0.25 s) over which a final state must hold."""
-CLEAR_M = 0.06
-"""Lifted and pushed things have moved by at least this."""
-SLIDES_M = 0.03
-"""A pushed thing never leaves the table by more than this."""
+LEAVES_M = 0.01
+"""What slides on the table never rises by more than this, and lies no lower at the end."""
+IN_AIR_M = 0.01
+"""What is carried is higher by this than where it lay."""
 NEXT_TO_M = 0.03
 """Largest gap between things that are next to each other."""
 STAYS_M = 0.03
 """A thing that should stay moves by less than this."""
+IN_GRIP_M = 0.02
+"""What is pushed or tipped makes no longer way than this in the grip."""
 REST_M = 0.01
 """Movement over the last samples of a thing at rest."""
+STILL_M = 0.003
+"""Movement in one sample of a thing that lies where it settled: falling for 50 ms alone is 12 mm."""
 BELOW_M = 0.005
 """A thing this far below its support was pressed through it."""
 STEADY_M = 0.05
 """Movement over the last samples (0.2 m/s) of a thing that is held up."""
-REACHED_M = 0.04
-"""The gripper was at a thing if its tool centre came this near its box: fingers also push with their sides, which no
-pad feels. Pushes without a pad came within 2.2 cm in 64 episodes; arms start at least 5 cm away."""
-FINGER_REACHED_M = 0.02
-"""The same for the outer side of a finger, 5.5 cm beside the tool's centre if the gripper is open:
-its tip is 1.5 cm lower. What it hits may be gone at the next sample, so the thing is taken where
-it was one sample before."""
+TIP_BELOW_TCP_M = 0.012
+"""A point between the pads' ends, below the tool's centre."""
+BETWEEN_PADS_M = 0.008
+"""The tool is at most this far outside of what it grips. Pads that push with their edges are 11 mm away."""
+CLOSED_M = 0.003
+"""Between pads that hold nothing but each other."""
 FALLEN_RAD = np.deg2rad(60)
 STANDS_RAD = np.deg2rad(25)
 
@@ -51,27 +55,16 @@ class ObjectTrack:
     quat_wxyz: Float[np.ndarray, "time env 4"]
     size_m: Float[np.ndarray, "env 3"]
     """Full extents along its own axes."""
-    touched: Bool[np.ndarray, "time env 2"]
-    """By either pad."""
-
-    @property
-    def moved(self) -> Float[np.ndarray, "env"]:
-        """Horizontal distance between first and last position [m]."""
-        return np.linalg.norm(self.pos[-1, :, :2] - self.pos[0, :, :2], axis=-1)
+    by_arm: Bool[np.ndarray, "time env"]
+    """Any part of the arm touched it since the sample before."""
+    touched: Bool[np.ndarray, "time env"]
+    """A pad touches it."""
+    grasped: Bool[np.ndarray, "time env"]
+    """Both pads touch it, and the gripper is not fully open."""
 
     @property
     def is_at_rest(self) -> Bool[np.ndarray, "env"]:
         return np.linalg.norm(np.ptp(self.pos[-LAST:], axis=0), axis=-1) < REST_M
-
-    @property
-    def is_free(self) -> Bool[np.ndarray, "env"]:
-        """No pad touches it at the end."""
-        return np.logical_not(self.touched[-LAST:].any(axis=(0, 2)))
-
-    @property
-    def is_held(self) -> Bool[np.ndarray, "env"]:
-        """Both pads touch it at the end."""
-        return np.asarray(self.touched[-LAST:].all(axis=(0, 2)))
 
     @cached_property
     def axes(self) -> Float[np.ndarray, "time env 3 3"]:
@@ -79,16 +72,10 @@ class ObjectTrack:
         flat = Rotation.from_quat(self.quat_wxyz.reshape(-1, 4), scalar_first=True).as_matrix()
         return flat.reshape(*self.quat_wxyz.shape[:2], 3, 3)
 
-    def outside(self, point: Float[np.ndarray, "step env 3"]) -> Float[np.ndarray, "step env"]:
-        """Return how far points are from the object's box at the first samples, as many as there are points [m]."""
-        n = len(point)
-        local = np.einsum("tejk,tej->tek", self.axes[:n], point - self.pos[:n])
-        return np.linalg.norm(np.maximum(np.abs(local) - self.size_m / 2, 0.0), axis=-1)
-
-    def leaned(self) -> Float[np.ndarray, "env"]:
-        """Return the angle between its own z axis at the start and at the end [rad]."""
-        z = self.axes[..., 2]
-        return np.arccos(np.clip((z[0] * z[-1]).sum(-1), -1.0, 1.0))
+    @property
+    def steps(self) -> Float[np.ndarray, "time env 2"]:
+        """Horizontal way since the sample before [m]."""
+        return np.diff(self.pos[..., :2], axis=0, prepend=self.pos[:1, :, :2])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +84,8 @@ class Trajectory:
 
     objects: dict[str, ObjectTrack]
     eef_pos: Float[np.ndarray, "time env 3"]
-    finger_pos: Float[np.ndarray, "time env 2 3"]
-    """Outer sides of the two fingers, at the height of the tool's centre."""
+    opening_m: Float[np.ndarray, "time env"]
+    """Between the pads."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +94,10 @@ class Case:
 
     scene: Scene
     trajectory: Trajectory
+
+    @property
+    def kind(self) -> TaskKind:
+        return KINDS[self.scene.kind]
 
     @property
     def thing(self) -> ObjectTrack:
@@ -130,56 +121,113 @@ class Case:
     def container_is_hollow(self) -> bool:
         return self._other.hollow
 
+    @property
+    def handled(self) -> ObjectTrack:
+        """What the robot itself touches: the object, or the tool that pushes it."""
+        return self.other if self.kind.grasps == "tool" else self.thing
+
+    @cached_property
+    def settled(self) -> Int[np.ndarray, "env"]:
+        """The last sample before the robot first touched what it handles; the first one where it never did."""
+        return np.maximum(self.handled.by_arm.argmax(axis=0) - 1, 0)
+
+    def before(self, values: np.ndarray) -> np.ndarray:
+        """Return values per sample and world as they were when everything had settled."""
+        return values[self.settled, np.arange(values.shape[1])]
+
+    @property
+    def way(self) -> Float[np.ndarray, "env 3"]:
+        """From where the object settled to where it is at the end [m]."""
+        return self.thing.pos[-1] - self.before(self.thing.pos)
+
+    @property
+    def leaned(self) -> Float[np.ndarray, "env"]:
+        """The angle between the object's own z axis as it settled and at the end [rad]; a ball never leans."""
+        z = self.thing.axes[..., 2]
+        angle = np.arccos(np.clip((self.before(z) * z[-1]).sum(-1), -1.0, 1.0))
+        return angle * (self.scene.manipulated.shape != "sphere")
+
     def reach(
-        self, track: ObjectTrack, direction: Float[np.ndarray, "env 3"], time: int
-    ) -> Float[np.ndarray, "env"]:
+        self, track: ObjectTrack, direction: Float[np.ndarray, "time env 3"]
+    ) -> Float[np.ndarray, "time env"]:
         """Return how far an object extends from its centre along unit directions [m]."""
         shape = self.scene.manipulated.shape if track is self.thing else self._other.shape
         half = track.size_m / 2
         if shape == "sphere":
-            return half.max(axis=-1)
-        along = np.einsum("ej,ejk->ek", direction, track.axes[time])
+            return np.broadcast_to(half.max(axis=-1), direction.shape[:2])
+        along = np.einsum("tej,tejk->tek", direction, track.axes)
         if shape == "cylinder":
-            c = np.abs(along[:, 2])
+            c = np.abs(along[..., 2])
             return c * half[:, 2] + np.sqrt(np.clip(1 - c**2, 0, 1)) * half[:, :2].max(axis=-1)
         return (np.abs(along) * half).sum(axis=-1)
 
-    def lowest(self, track: ObjectTrack, time: int = -1) -> Float[np.ndarray, "env"]:
+    def lowest(self, track: ObjectTrack) -> Float[np.ndarray, "time env"]:
         """Return the height of an object's lowest point [m]; of meshes, of their bounding box."""
-        down = np.tile([0.0, 0.0, -1.0], (len(track.size_m), 1))
-        return track.pos[time, :, 2] - self.reach(track, down, time)
+        down = np.zeros_like(track.pos)
+        down[..., 2] = -1.0
+        return track.pos[..., 2] - self.reach(track, down)
 
-    def highest_clearance(self) -> Float[np.ndarray, "env"]:
-        """Return the largest height of the manipulated object's lowest point [m]."""
-        return np.max([self.lowest(self.thing, t) for t in range(len(self.thing.pos))], axis=0)
+    @cached_property
+    def rise(self) -> Float[np.ndarray, "time env"]:
+        """How much higher the object's lowest point is than where it settled [m]; 0 before."""
+        low = self.lowest(self.thing)
+        is_after = np.arange(len(low))[:, None] >= self.settled
+        return (low - self.before(low)) * is_after
 
-    def gap(self, time: int = -1) -> Float[np.ndarray, "env"]:
-        """Return the horizontal distance between the two objects' outlines, along their centres' line [m]."""
-        between = self.other.pos[time] - self.thing.pos[time]
-        between[:, 2] = 0.0
+    @cached_property
+    def gap(self) -> Float[np.ndarray, "time env"]:
+        """The horizontal distance between the two objects' outlines, along their centres' line [m]."""
+        between = self.other.pos - self.thing.pos
+        between[..., 2] = 0.0
         distance = np.linalg.norm(between, axis=-1)
-        u = np.where(distance[:, None] > 1e-6, between, [1.0, 0.0, 0.0])
+        u = np.where(distance[..., None] > 1e-6, between, [1.0, 0.0, 0.0])
         u = u / np.linalg.norm(u, axis=-1, keepdims=True)
-        return distance - self.reach(self.thing, u, time) - self.reach(self.other, -u, time)
+        return distance - self.reach(self.thing, u) - self.reach(self.other, -u)
 
-    def was_reached(self) -> Bool[np.ndarray, "env"]:
-        """Tell whether the robot has been at the object that moved, or has touched the tool that pushed it."""
-        thing, fingers = self.thing, self.trajectory.finger_pos
-        reached = np.linalg.norm(np.ptp(thing.pos, axis=0), axis=-1) < REST_M  # then nothing moved
-        reached |= thing.touched.any(axis=(0, 2))
-        reached |= (thing.outside(self.trajectory.eef_pos) < REACHED_M).any(axis=0)
-        for side in (fingers[1:, :, 0], fingers[1:, :, 1]):
-            reached |= (thing.outside(side) < FINGER_REACHED_M).any(axis=0)
-        if KINDS[self.scene.kind].grasps == "tool":
-            reached |= self.other.touched.any(axis=(0, 2))
-        return reached
+    @property
+    def other_moved(self) -> Float[np.ndarray, "env"]:
+        """How far the other object is from where it settled, horizontally [m]."""
+        return np.linalg.norm((self.other.pos[-1] - self.before(self.other.pos))[:, :2], axis=-1)
 
-    def within(self) -> Bool[np.ndarray, "env"]:
-        """Tell whether the manipulated object's centre lies over the other's footprint at the end."""
-        local = np.einsum(
-            "ejk,ej->ek", self.other.axes[-1], self.thing.pos[-1] - self.other.pos[-1]
+    def gripped(self, track: ObjectTrack) -> Bool[np.ndarray, "time env"]:
+        """Tell when an object is between the pads, which touch it: not when both push it with their edges."""
+        shape = self.scene.manipulated.shape if track is self.thing else self._other.shape
+        away = np.full(track.grasped.shape, np.inf)
+        for below in (0.0, TIP_BELOW_TCP_M):
+            point = self.trajectory.eef_pos - [0.0, 0.0, below] - track.pos
+            local = np.einsum("tejk,tej->tek", track.axes, point)
+            if shape in ("cylinder", "sphere"):  # at an angle, the box about it reaches farther
+                local[..., 0] = np.hypot(local[..., 0], local[..., 1])
+                local[..., 1] = 0.0
+            outside = np.maximum(np.abs(local) - track.size_m / 2, 0.0)
+            away = np.minimum(away, np.linalg.norm(outside, axis=-1))
+        holds = (away < BETWEEN_PADS_M) & (self.trajectory.opening_m > CLOSED_M)
+        return track.grasped & holds
+
+    def is_over(self) -> Bool[np.ndarray, "time env"]:
+        """Tell when the manipulated object's centre lies over the other's footprint."""
+        local = np.einsum("tejk,tej->tek", self.other.axes, self.thing.pos - self.other.pos)
+        return (np.abs(local[..., :2]) < self.other.size_m[:, :2] / 2).all(axis=-1)
+
+    def was_moved(self) -> Bool[np.ndarray, "env"]:
+        """Tell whether the robot's contact moved the object, as far as its kind demands, from where it lay still."""
+        last = np.maximum(self.settled - 1, 0), np.arange(len(self.settled))
+        lay_still = (
+            np.linalg.norm(self.before(self.thing.pos) - self.thing.pos[last], axis=-1) < STILL_M
         )
-        return (np.abs(local[:, :2]) < self.other.size_m[:, :2] / 2).all(axis=-1)
+        moved = np.linalg.norm(self.way, axis=-1) >= self.kind.meaning.moved_m
+        return self.handled.by_arm.any(axis=0) & lay_still & moved & (self.by_others() < STAYS_M)
+
+    def by_others(self) -> Float[np.ndarray, "env"]:
+        """Return how far the object went, after it had settled, in motions that the arm's contact did not begin [m]."""
+        length = np.linalg.norm(np.diff(self.thing.pos, axis=0), axis=-1)
+        driven, total = np.zeros(len(self.settled), bool), np.zeros(len(self.settled))
+        if self.kind.grasps == "tool":
+            return total  # by the tool: see `_pushed_with`
+        for t, step in enumerate(length, start=1):
+            driven = self.thing.by_arm[t] | (driven & (step > STILL_M / 3))
+            total += step * ~driven * (t > self.settled)
+        return total
 
     def is_above_table(self) -> Bool[np.ndarray, "env"]:
         """Tell whether no object is pressed into the table over the last samples."""
@@ -192,85 +240,115 @@ class Case:
                 # Its box reaches lower than it does; the smallest half extent is a bound for every pose.
                 low = track.pos[-LAST:, :, 2].min(axis=0) - track.size_m.min(axis=-1) / 2
             else:
-                low = np.min([self.lowest(track, t) for t in range(-LAST, 0)], axis=0)
+                low = self.lowest(track)[-LAST:].min(axis=0)
             above &= low > -BELOW_M
         return above
 
 
 Verdict = Bool[np.ndarray, "env"]
+Moments = Bool[np.ndarray, "time env"]
 
 
 def referee_success(kind: Kind, scene: Scene, trajectory: Trajectory) -> Bool[np.ndarray, "env"]:
-    """Return per world whether the robot did what its kind of task says.
-
-    What moves while the robot is away from it does not count. How something was carried is not
-    looked at: a push may be a carry. Docs: `docs/experts.md`.
+    """Return per world whether the robot did what its kind of task says. Docs: `docs/experts.md`.
 
     Raises:
         V2PError: the kind needs an object that the scene lacks.
     """
     case = Case(scene=scene, trajectory=trajectory)
-    return np.asarray(RULES[kind](case) & case.is_above_table() & case.was_reached(), bool)
+    return np.asarray(RULES[kind](case) & case.is_above_table() & case.was_moved(), bool)
+
+
+def _arrived(case: Case, there: Moments) -> Verdict:
+    """It is there at the end, and was not when everything had settled."""
+    return there[-1] & ~case.before(there)
 
 
 def _lifted(case: Case) -> Verdict:
-    lows = np.min([case.lowest(case.thing, t) for t in range(-LAST, 0)], axis=0)
+    is_high = case.rise[-LAST:].min(axis=0) > case.kind.meaning.raised_m
     way = np.linalg.norm(np.ptp(case.thing.pos[-LAST:], axis=0), axis=-1)
-    return (lows > CLEAR_M) & (way < STEADY_M) & case.thing.is_held
+    return is_high & (way < STEADY_M) & case.gripped(case.thing)[-LAST:].all(axis=0)
 
 
 def _pushed(side: int) -> Callable[[Case], Verdict]:
     def rule(case: Case) -> Verdict:
-        way = (case.thing.pos[-1] - case.thing.pos[0]) * np.array([1, side, 1])
-        is_sideways = (way[:, 1] >= CLEAR_M) & (np.abs(way[:, 0]) <= 0.6 * way[:, 1])
-        return is_sideways & _slid(case)
+        aside = case.way[:, 1] * side
+        is_sideways = np.abs(case.way[:, 0]) <= 0.6 * aside
+        return is_sideways & (aside >= case.kind.meaning.moved_m) & _slid(case)
 
     return rule
 
 
+def _without_grip(case: Case) -> Verdict:
+    """It made its way out of the grip, and is not gripped at the end."""
+    gripped = case.gripped(case.thing)
+    in_grip = (np.linalg.norm(case.thing.steps, axis=-1) * gripped).sum(axis=0)
+    return ~gripped[-LAST:].any(axis=0) & (case.kind.may_drag | (in_grip < IN_GRIP_M))
+
+
 def _slid(case: Case) -> Verdict:
-    stood = case.thing.leaned() < STANDS_RAD
-    return stood & (case.highest_clearance() < SLIDES_M) & case.thing.is_at_rest
+    """On the table all the way, upright; at rest at the end."""
+    stayed = (case.rise.max(axis=0) < LEAVES_M) & (np.abs(case.way[:, 2]) < LEAVES_M)
+    stood = case.leaned < STANDS_RAD
+    return stood & stayed & case.thing.is_at_rest & _without_grip(case)
 
 
 def _tipped(case: Case) -> Verdict:
-    lies = np.abs(case.lowest(case.thing)) < 2 * REST_M
-    return (case.thing.leaned() > FALLEN_RAD) & case.thing.is_at_rest & lies
+    lies = np.abs(case.lowest(case.thing)[-1]) < 2 * REST_M
+    fell = (case.leaned > FALLEN_RAD) & (case.rise.max(axis=0) < STAYS_M)
+    return fell & case.thing.is_at_rest & lies & _without_grip(case)
 
 
 def _pushed_next_to(case: Case) -> Verdict:
-    was_apart = case.gap(0) > NEXT_TO_M
-    return was_apart & (case.gap() < NEXT_TO_M) & (case.other.moved < STAYS_M) & _slid(case)
+    is_near = _arrived(case, case.gap < NEXT_TO_M)
+    return is_near & (case.other_moved < STAYS_M) & _slid(case)
 
 
 def _pushed_with(case: Case) -> Verdict:
-    """The tool does it: the gripper never touches the thing itself."""
-    by_tool = ~case.thing.touched.any(axis=(0, 2)) & case.other.touched.any(axis=(0, 2))
-    return by_tool & (case.thing.moved >= CLEAR_M) & _slid(case)
+    """The tool does it: it is in the grip and at the thing, which the arm never touches."""
+    by_tool = (case.gripped(case.other) & (case.gap < STAYS_M)).any(axis=0)
+    return by_tool & ~case.thing.by_arm.any(axis=0) & _slid(case)
 
 
-def _put_down(case: Case, lift_m: Float[np.ndarray, "env"] | float = SLIDES_M) -> Verdict:
-    was_carried = case.highest_clearance() > lift_m
-    return was_carried & case.thing.is_free & case.thing.is_at_rest
+def _carried(case: Case, raised_m: Float[np.ndarray, "env"] | float | None = None) -> Verdict:
+    """It was raised in the grip and went half of its way in the air."""
+    is_carried = case.gripped(case.thing)
+    raised = (case.rise * is_carried).max(axis=0)
+    in_air = (case.thing.steps * (is_carried & (case.rise > IN_AIR_M))[..., None]).sum(axis=0)
+    needed = case.kind.meaning.raised_m if raised_m is None else raised_m
+    half = np.linalg.norm(case.way[:, :2], axis=-1) / 2
+    return (raised >= needed) & (np.linalg.norm(in_air, axis=-1) >= half)
+
+
+def _put_down(case: Case, raised_m: Float[np.ndarray, "env"] | float | None = None) -> Verdict:
+    """It was carried, let go and not pushed thereafter."""
+    gripped = case.gripped(case.thing)
+    is_later = np.cumsum(gripped[::-1], axis=0)[::-1] == 0
+    steps = np.linalg.norm(case.thing.steps, axis=-1)
+    pushed = (steps * (is_later & case.thing.by_arm)).sum(axis=0)
+    is_free = ~case.thing.touched[-LAST:].any(axis=0)
+    return _carried(case, raised_m) & is_free & case.thing.is_at_rest & (pushed < STAYS_M)
 
 
 def _dropped_in_front(case: Case) -> Verdict:
     """In front of: on the viewer's and the robot's side, which is -x."""
-    way = case.other.pos[-1] - case.thing.pos[-1]
+    way = case.other.pos - case.thing.pos
     beside = (case.thing.size_m[:, :2].max(-1) + case.other.size_m[:, :2].max(-1)) / 2
-    is_in_front = (way[:, 0] > 0) & (np.abs(way[:, 1]) < beside) & (case.gap() < 0.10)
+    is_in_front = (way[..., 0] > 0) & (np.abs(way[..., 1]) < beside) & (case.gap < 0.10)
     on_table = np.abs(case.lowest(case.thing)) < 2 * REST_M
-    return is_in_front & on_table & (case.other.moved < STAYS_M) & _put_down(case)
+    there = _arrived(case, is_in_front & on_table)
+    return there & (case.other_moved < STAYS_M) & _put_down(case)
 
 
 def _inside(case: Case) -> Verdict:
-    rim = case.other.pos[-1, :, 2] + case.other.size_m[:, 2] / 2
+    rim = case.other.pos[..., 2] + case.other.size_m[:, 2] / 2
     low = case.lowest(case.thing)
     # Pressed through the container's floor is not inside. A mesh reaches less deep than its box.
-    floor = case.other.pos[-1, :, 2] - case.other.size_m[:, 2] / 2
+    floor = case.other.pos[..., 2] - case.other.size_m[:, 2] / 2
     if case.scene.manipulated.shape != "mesh" and case.container_is_hollow:
         floor = floor + hollow_floor_m(case.other.size_m[:, 2])
-    return case.within() & (low < rim) & (low > floor - BELOW_M) & (case.other.moved < 2 * STAYS_M)
+    is_in = case.is_over() & (low < rim) & (low > floor - BELOW_M)
+    return _arrived(case, is_in) & (case.other_moved < 2 * STAYS_M)
 
 
 def _inserted(case: Case) -> Verdict:
@@ -278,46 +356,52 @@ def _inserted(case: Case) -> Verdict:
 
 
 def _thrown(case: Case) -> Verdict:
-    """Released well before the container, not lowered into it."""
-    touched = np.asarray(case.thing.touched.any(axis=2))
+    """Released in the air, well before the container, not lowered into it."""
+    touched = case.thing.by_arm
     last_touch = len(touched) - 1 - np.argmax(touched[::-1], axis=0)
     env = np.arange(touched.shape[1])
-    there = np.linalg.norm(
-        case.thing.pos[last_touch, env, :2] - case.other.pos[last_touch, env, :2], axis=-1
-    )
-    flew = touched.any(axis=0) & (there - case.other.size_m[:, :2].max(-1) / 2 > 0.10)
-    return _inside(case) & flew & case.thing.is_free
+    there = case.thing.pos[last_touch, env] - case.other.pos[last_touch, env]
+    away = np.linalg.norm(there[:, :2], axis=-1) - case.other.size_m[:, :2].max(-1) / 2
+    raised = (case.rise * case.gripped(case.thing)).max(axis=0)
+    flew = (away > 0.10) & (raised >= case.kind.meaning.raised_m)
+    return _inside(case) & flew & ~case.thing.touched[-LAST:].any(axis=0)
 
 
 def _placed_onto(case: Case) -> Verdict:
-    top = case.other.pos[-1, :, 2] + case.other.size_m[:, 2] / 2
+    top = case.other.pos[..., 2] + case.other.size_m[:, 2] / 2
     low = case.lowest(case.thing)
     # A thing may sink a little into a bowl or a tray, but no deeper than the table.
-    on_top = case.within() & (low < top + 0.015) & (low > -BELOW_M)
-    lift_m = np.minimum(SLIDES_M, top + REST_M)  # onto a coaster nobody lifts a mug higher
-    return on_top & (case.other.moved < STAYS_M) & _put_down(case, lift_m)
+    on_top = _arrived(case, case.is_over() & (low < top + 0.015) & (low > -BELOW_M))
+    # Onto a coaster nobody lifts a mug higher.
+    raised_m = np.minimum(case.kind.meaning.raised_m, top[-1] + REST_M)
+    return on_top & (case.other_moved < STAYS_M) & _put_down(case, raised_m)
 
 
 def _covered(case: Case) -> Verdict:
-    off = np.linalg.norm(case.thing.pos[-1, :, :2] - case.other.pos[-1, :, :2], axis=-1)
-    over = (off < 0.025) & (case.thing.leaned() < STANDS_RAD)
+    off = np.linalg.norm(case.thing.pos[..., :2] - case.other.pos[..., :2], axis=-1)
     down = np.abs(case.lowest(case.thing)) < 2 * REST_M
-    return over & down & (case.other.moved < STAYS_M) & _put_down(case)
+    over = _arrived(case, (off < 0.025) & down) & (case.leaned < STANDS_RAD)
+    return over & (case.other_moved < STAYS_M) & _put_down(case)
 
 
 def _uncovered(case: Case) -> Verdict:
-    away = (case.gap() > 0) | ((case.lowest(case.thing) > 0.08) & case.thing.is_held)
-    upright = case.thing.leaned() < STANDS_RAD
-    was_over = case.gap(0) < 0
-    return was_over & away & upright & (case.other.moved < STAYS_M)
+    is_held_high = (case.lowest(case.thing) > 0.08) & case.gripped(case.thing)
+    away = _arrived(case, (case.gap > 0) | is_held_high)
+    stood = (case.leaned < STANDS_RAD) & (case.other_moved < STAYS_M)
+    return away & stood & _carried(case)
 
 
 def _moved_as_in_the_video(case: Case) -> Verdict:
-    obj = case.scene.manipulated
-    wanted = obj.last_pose[:3] - obj.first_pose[:3]
-    got = case.thing.pos[-1] - case.thing.pos[0]
+    poses = np.array(case.scene.manipulated.poses_world)[:, :3]
+    wanted = poses[-1] - poses[0]
     near = max(0.05, 0.5 * float(np.linalg.norm(wanted)))
-    return (np.linalg.norm(got - wanted, axis=-1) < near) & case.thing.is_at_rest
+    # Where it returns to its start in the video, the robot takes it as far away on the way.
+    farthest = 0.5 * float(np.linalg.norm(poses - poses[0], axis=-1).max())
+    went = np.linalg.norm(case.thing.pos - case.before(case.thing.pos), axis=-1)
+    is_after = np.arange(len(went))[:, None] >= case.settled
+    far = (went * is_after).max(axis=0) >= max(STAYS_M, farthest)
+    far &= np.linalg.norm(case.way, axis=-1) >= 0.5 * np.linalg.norm(wanted)
+    return far & (np.linalg.norm(case.way - wanted, axis=-1) < near) & case.thing.is_at_rest
 
 
 RULES: dict[Kind, Callable[[Case], Verdict]] = {

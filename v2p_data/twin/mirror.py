@@ -41,8 +41,8 @@ class Truth:
     object_poses: Float[np.ndarray, "object 7"]
     object_speeds: Float[np.ndarray, "object 6"]
     """Linear in the world frame, angular in the object's frame."""
-    touches: Float[np.ndarray, "object 2"]
-    """1 where the left, right pad touches the object."""
+    touches: Float[np.ndarray, "object 3"]
+    """1 where the left pad, the right pad touches the object, any part of the arm touched it in the last step."""
     deepest_m: float
     """Deepest penetration of any contact."""
     is_broken: bool

@@ -93,6 +93,7 @@ class TwinRobot:
         self._control = ArmController(self.parameters, self._encoders())
         self._gripper = Gripper(self.parameters, 1.0)
         self._due: deque[tuple[int, ToolPose]] = deque()
+        self._arm_touched = np.zeros(len(self.world.objects))
         self._past.clear()
         self._keep()
 
@@ -123,6 +124,7 @@ class TwinRobot:
     def step(self, seconds: float) -> None:
         """Let time pass."""
         data, model = self._data, self.world.model
+        self._arm_touched[:] = 0
         for _ in range(round(seconds / TIMESTEP_S)):
             while self._due and self._due[0][0] <= self._steps:
                 _, target = self._due.popleft()
@@ -131,6 +133,7 @@ class TwinRobot:
             data.ctrl[ARM] = self._control.torque(self._encoders(), data.qvel[ARM])
             data.ctrl[NUM_ARM_JOINTS] = self._gripper.control(self._travel_m())
             mujoco.mj_step(model, data)
+            self._arm_touched = np.maximum(self._arm_touched, self._touches()[:, 2])
             self._steps += 1
             self._keep()
 
@@ -147,11 +150,8 @@ class TwinRobot:
         """Return what only the simulator knows, for the referee and for experts."""
         data, world = self._data, self.world
         mujoco.mj_forward(world.model, data)  # contacts of this state, not of the one before
-        touches = np.zeros((len(world.objects), 2))
-        for geoms in data.contact.geom.tolist():
-            for pad, other in (geoms, geoms[::-1]):
-                if pad in world.pad_geoms and other in world.object_of_geom:
-                    touches[world.object_of_geom[other], world.pad_geoms.index(pad)] = 1.0
+        touches = self._touches()
+        touches[:, 2] = np.maximum(touches[:, 2], self._arm_touched)
         return Truth(
             joints=data.qpos[ARM].copy(),
             joint_speeds=data.qvel[ARM].copy(),
@@ -166,6 +166,19 @@ class TwinRobot:
     def close(self) -> None:
         """Free the graphics memory."""
         self.camera.close()
+
+    def _touches(self) -> Float[np.ndarray, "object 3"]:
+        """Return 1 where the left pad, the right pad, any part of the arm touches each object."""
+        world, touches = self.world, np.zeros((len(self.world.objects), 3))
+        for geoms in self._data.contact.geom.tolist():
+            for part, other in (geoms, geoms[::-1]):
+                is_arm = part not in world.object_of_geom and world.model.geom_bodyid[part] > 0
+                if is_arm and other in world.object_of_geom:
+                    row = touches[world.object_of_geom[other]]
+                    row[2] = 1.0
+                    if part in world.pad_geoms:
+                        row[world.pad_geoms.index(part)] = 1.0
+        return touches
 
     def _travel_m(self) -> float:
         return float(self._data.qpos[FINGERS].mean())

@@ -127,7 +127,7 @@ class BatchEnv:
         """Generators of worlds whose episode was seeded by itself."""
         self._block = StateBlock(self.world, num_envs)
         self._start_pose = np.zeros((num_envs, len(self.object_names), 7))
-        self._touches = np.zeros((num_envs, len(self.object_names), 2))
+        self._touches = np.zeros((num_envs, len(self.object_names), 3))
         self._steps = np.zeros(num_envs, np.int64)
         self._last_action = np.zeros((ACT_DIM, num_envs)).T
         self.task = task_code.load(bundle, self, task)
@@ -229,7 +229,7 @@ class BatchEnv:
         self.broken_count += self._sim.step(moved, moving)
         self._last_action[:] = clipped.T
         self._steps += 1
-        self._touches[:] = self._sim.sensordata.reshape(self.num_envs, -1, 2) > 0
+        self._touches[:] = self._sim.touches()
         self._fill(slice(None), self._sim.tool)
         return self._judged(torch.from_numpy(clipped.astype(np.float32).T))
 
@@ -282,7 +282,11 @@ class BatchEnv:
 
     def touches(self) -> Bool[np.ndarray, "env object 2"]:
         """Return whether the left and the right finger's pad touched each object at the last time step."""
-        return self._touches > 0
+        return self._touches[:, :, :2] > 0
+
+    def arm_touches(self) -> Bool[np.ndarray, "env object"]:
+        """Return whether any part of the arm touched each object during the last control step."""
+        return self._touches[:, :, 2] > 0
 
     def episode_params(self, env: int) -> dict[str, Any]:
         """Return what was drawn for the episode in world `env`, for JSON."""
@@ -355,7 +359,7 @@ class BatchEnv:
                 object_qvel=self._sim.object_qvel[rows],
                 object_size=self.randomizer.size_m[rows],
                 start_pose=self._start_pose[rows],
-                touches=self._touches[rows],
+                touches=self._touches[rows, :, :2],
                 target_pos=self._sim.target_pos[rows],
                 target_finger=self._sim.target_finger[rows],
                 last_action=self._last_action[rows],

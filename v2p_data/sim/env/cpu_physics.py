@@ -43,6 +43,7 @@ class CpuPhysics(Physics):
         self.sensordata = self.batch.bind("sensordata")
         self._history = self.batch.bind("history")
         self._history_values, self._history_ctrl = _history_layout(world.model)
+        self._arm_touched = _sensor_history(world.model)
         super().__init__(world, cfg, motion_scale, num_envs)
 
     def expand(self, name: str) -> np.ndarray:
@@ -61,6 +62,9 @@ class CpuPhysics(Physics):
         """Return the torques; kept from the first call on, so that call itself returns those of no step."""
         return self.batch.bind("qfrc_constraint")[:, self._robot.arm_dofs].copy()
 
+    def _arm_touches(self) -> Bool[np.ndarray, "env object"]:
+        return np.asarray((self._history[:, self._arm_touched] > 0).any(-1))
+
     def _advance(self, moving: Int[np.ndarray, "n"] | None) -> None:
         self.batch.step(moving, nstep=self._substeps)
 
@@ -74,6 +78,13 @@ class CpuPhysics(Physics):
 
 def _log_warning(message: str) -> None:
     logging.getLogger(__name__).debug("MuJoCo: %s", message)
+
+
+def _sensor_history(model: mujoco.MjModel) -> Int[np.ndarray, "sensor sample"]:
+    """Return where `history` holds the values of sensors that keep those of all time steps of a control step."""
+    kept = np.flatnonzero(model.sensor_historyadr >= 0)
+    first = model.sensor_historyadr[kept] + 2 + model.sensor_history[kept, 0]
+    return first[:, None] + np.arange(model.sensor_history[kept[0], 0])
 
 
 def _history_layout(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -119,6 +119,19 @@ class Physics(ABC):
         To go on from another state, write to these arrays and call `resume`.
         """
 
+    def touches(self) -> Float[np.ndarray, "env object 3"]:
+        """Return 1 where the left pad, the right pad, and any part of the arm touch each object.
+
+        The pads at the last time step, the arm at any time step of the last control step.
+        """
+        count = self.object_qpos.shape[1]
+        pads = self.sensordata[:, : 2 * count].reshape(self.num_envs, count, 2)
+        return np.concatenate([pads > 0, self._arm_touches()[:, :, None]], axis=2).astype(float)
+
+    def _arm_touches(self) -> Bool[np.ndarray, "env object"]:
+        """Return whether any part of the arm touched each object; here at the last time step."""
+        return self.sensordata[:, 2 * self.object_qpos.shape[1] :] > 0
+
     @abstractmethod
     def contact_torques(self) -> Float[np.ndarray, "env joint"]:
         """Return the torques that contacts and joint limits put on the arms' joints at the last time step [N m]."""

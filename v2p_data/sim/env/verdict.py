@@ -3,15 +3,14 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
+from jaxtyping import Bool, Int
 
 from v2p_data.sim.env.batch_env import BatchEnv
-from v2p_data.sim.robot.robot import FINGER_THICKNESS_M
 from v2p_data.task.referee import ObjectTrack, Trajectory, referee_success
 from v2p_data.task.task import TaskBundle
 
-GRIPPER_KEYS = ("eef_pos", "eef_quat", "gripper_width")
+GRIPPER_KEYS = ("eef_pos", "gripper_width")
+TOUCH_KEYS = ("by_arm", "touched", "grasped")
 
 
 def referee_verdict(
@@ -23,32 +22,16 @@ def referee_verdict(
             pos=history[f"{obj.name}_pos"].astype(float),
             quat_wxyz=history[f"{obj.name}_quat"].astype(float),
             size_m=history[f"{obj.name}_size"][0].astype(float),
-            # "any pad" and "both pads" stand for the two pads: all rules ask for one or the other.
-            touched=np.stack(
-                [history[f"{obj.name}_{key}"] > 0 for key in ("touched", "grasped")], axis=-1
-            ),
+            **{key: history[f"{obj.name}_{key}"] > 0 for key in TOUCH_KEYS},
         )
         for obj in bundle.scene.objects
     }
     trajectory = Trajectory(
         objects=objects,
         eef_pos=history["eef_pos"].astype(float),
-        finger_pos=outer_sides(*(history[key].astype(float) for key in GRIPPER_KEYS)),
+        opening_m=history["gripper_width"].astype(float),
     )
     return referee_success(bundle.kind, bundle.scene, trajectory)
-
-
-def outer_sides(
-    eef_pos: Float[np.ndarray, "*n 3"],
-    eef_quat: Float[np.ndarray, "*n 4"],
-    gripper_width: Float[np.ndarray, "*n"],
-) -> Float[np.ndarray, "*n 2 3"]:
-    """Return where the outer sides of the two fingers are, at the height of the tool's centre [m]."""
-    apart = np.zeros_like(eef_pos)
-    apart[..., 1] = gripper_width / 2 + FINGER_THICKNESS_M
-    turn = Rotation.from_quat(eef_quat.reshape(-1, 4), scalar_first=True)
-    turned = turn.apply(apart.reshape(-1, 3)).reshape(apart.shape)
-    return np.stack([eef_pos + turned, eef_pos - turned], axis=-2)
 
 
 class RefereeRecord:
@@ -75,7 +58,11 @@ class RefereeRecord:
     def note(self, _: object = None) -> None:
         """Note the present moment; call after each step, or let `play` call it."""
         states = self._env.states()
-        self._moments.append({key: states[key].numpy().astype(float) for key in self._keys})
+        moment = {key: states[key].numpy().astype(float) for key in self._keys}
+        by_arm = self._env.arm_touches()
+        for k, name in enumerate(self._env.object_names):
+            moment[f"{name}_by_arm"] = by_arm[:, k]
+        self._moments.append(moment)
 
     def __len__(self) -> int:
         """Return the number of moments so far."""
@@ -83,7 +70,7 @@ class RefereeRecord:
 
     def history(self, worlds: Int[np.ndarray, "n"] | slice = slice(None)) -> dict[str, np.ndarray]:
         """Return the states of some worlds up to now, per key an array `(time, world, ...)`."""
-        return {key: np.stack([m[key][worlds] for m in self._moments]) for key in self._keys}
+        return {key: np.stack([m[key][worlds] for m in self._moments]) for key in self._moments[0]}
 
     def history_as_cut(self, end: Int[np.ndarray, "env"]) -> dict[str, np.ndarray]:
         """Return the history in which each world stands still from the step `end` on."""

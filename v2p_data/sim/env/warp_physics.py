@@ -367,6 +367,8 @@ def _without_orientation_servo(world: World) -> mujoco.MjModel:
     spec.delete(servo)
     for actuator in spec.actuators:
         actuator.nsample, actuator.delay = 0, 0.0
+    for sensor in spec.sensors:
+        sensor.nsample = 0
     for k in range(3):
         gear = np.zeros(6)
         gear[3 + k] = 1.0

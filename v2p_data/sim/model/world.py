@@ -130,6 +130,12 @@ def build_world(
         for o in scene.objects
         for pad, end in zip(PADS, arm.sensor_ends, strict=True)
     )
+    # Who reads contacts relies on this order: two pads per object, then the whole arm per object.
+    sensors += "".join(
+        f'<contact name="arm_{o.name}" {arm.any_part} body2="{o.name}" num="1" reduce="netforce" data="found" '
+        f'nsample="{physics.substeps}"/>'
+        for o in scene.objects
+    )
     xml = (
         f'<mujoco model={quoteattr(scene.title)}><compiler angle="radian" autolimits="true"/>{option_xml(physics)}'
         '<visual><global offwidth="640" offheight="640"/><quality offsamples="0" shadowsize="1024"/>'

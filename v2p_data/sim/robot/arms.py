@@ -146,6 +146,11 @@ class ArmFile:
         return tuple(f'{self.pad_kind}1="{self.prefix}{pad}"' for pad in self.cfg.pads)
 
     @property
+    def any_part(self) -> str:
+        """The XML attribute of a contact sensor that refers to the whole arm."""
+        return f'subtree1="{self.prefix}{self.chain[0]}"'
+
+    @property
     def bodies_xml(self) -> str:
         """What stands in the `<worldbody>` of a world's text: the built-in arm. Others follow with `put_into`."""
         return "" if self.cfg.path else FRANKA_BODIES
