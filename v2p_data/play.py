@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -75,8 +76,8 @@ class View:
         self._state = worlds.robot_state()
         shape = (size_px, size_px) if isinstance(size_px, int) else size_px
         self._labels = np.zeros((worlds.num_envs, shape[0] * (1 + wrist), shape[1]), np.uint8)
+        self._rgb = np.zeros((worlds.num_envs, *shape, 3), np.uint8)
         self._drawn_at = -1
-        self._renderer: MaskRenderer | None = None
         self._picture_settings = size_px, num_threads, wrist
 
     @property
@@ -90,22 +91,35 @@ class View:
         """The label pictures, drawn when asked for; those of the next moment overwrite them."""
         if self._drawn_at != self.t:
             with self.watch.on("masks"):
-                self._draw(np.flatnonzero(self.going))
+                moments = self._moments()
+                self._labels[self.going] = self._renderer.draw_many(moments)
             self._drawn_at = self.t
         return self._labels
+
+    @property
+    def rgb(self) -> UInt8[np.ndarray, "env h w 3"]:
+        """The colour pictures of now, drawn at each call.
+
+        Raises:
+            V2PError: there is no OpenGL.
+        """
+        with self.watch.on("rgb"):
+            self._rgb[self.going] = [self._renderer.draw_rgb(*m) for m in self._moments()]
+        return self._rgb
 
     def step(self, action: Float[np.ndarray, "env 7"]) -> StepResult:
         """Let 50 ms pass in the worlds that go on; return what the action led to."""
         return self.worlds.step(action, None if self.going.all() else np.flatnonzero(self.going))
 
-    def _draw(self, seen: np.ndarray) -> None:
-        if self._renderer is None:
-            size_px, num_threads, wrist = self._picture_settings
-            self._renderer = MaskRenderer(
-                self.worlds.world, size_px, num_threads=num_threads, wrist=wrist
-            )
+    @cached_property
+    def _renderer(self) -> MaskRenderer:
+        size_px, num_threads, wrist = self._picture_settings
+        return MaskRenderer(self.worlds.world, size_px, num_threads=num_threads, wrist=wrist)
+
+    def _moments(self) -> list[tuple[Snapshot, int]]:
+        seen = np.flatnonzero(self.going)
         snapshot = self.worlds.snapshot(seen)
-        self._labels[seen] = self._renderer.draw_many([(snapshot, k) for k in range(len(seen))])
+        return [(snapshot, k) for k in range(len(seen))]
 
 
 @runtime_checkable
@@ -123,16 +137,19 @@ class Actor(Protocol):
 
 @runtime_checkable
 class Policy(Protocol):
-    """A policy that is told its task: `n` label pictures and robot states at a time are all that it sees."""
+    """A policy that is told its task: `n` pictures and robot states at a time are all that it sees."""
 
     def reset(self, n: int) -> None:
         """Forget the last episodes; `n` new ones begin."""
         ...
 
     def act(
-        self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n state"]
+        self,
+        labels: UInt8[np.ndarray, "n h w"],
+        state: Float32[np.ndarray, "n state"],
+        rgb: UInt8[np.ndarray, "n h2 w 3"] | None = None,
     ) -> Float32[np.ndarray, "n act"]:
-        """Return the next action of every world."""
+        """Return the next action of every world, seen in labels and, where it was asked for, in colour."""
         ...
 
 
@@ -147,6 +164,8 @@ class VisionActor:
     """What it sees of the arm and tells it."""
     num_states: int | None = None
     """Length of the state that it knows; any if None."""
+    rgb: bool = False
+    """Whether it sees the colour picture too."""
 
     def reset(self, worlds: BatchEnv) -> None:
         """Tell the policy that episodes begin."""
@@ -165,7 +184,9 @@ class VisionActor:
                 f"'{view.worlds.bundle.title}'"
                 f" gives {state.shape[1]}: evaluate the policy with the arm of its dataset"
             )
-        return steps_to(view.worlds, self.policy.act(view.labels, state), self.interface.actions)
+        colours = [view.rgb] if self.rgb else []
+        action = self.policy.act(view.labels, state, *colours)
+        return steps_to(view.worlds, action, self.interface.actions)
 
 
 @dataclass(frozen=True)

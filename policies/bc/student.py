@@ -32,6 +32,7 @@ from policies.bc.trainer import (
 from policies.threads import torch_threads
 
 STATE = "observation.state"
+RGB = "observation.images.rgb"
 STATE_STD_FLOOR = 0.01
 """Least standard deviation of a state's entry [m, rad or share]: students visit states that no demonstration shows."""
 
@@ -103,13 +104,18 @@ class Student:
 
     @torch.inference_mode()
     def act(
-        self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n dim"]
+        self,
+        labels: UInt8[np.ndarray, "n h w"],
+        state: Float32[np.ndarray, "n dim"],
+        rgb: UInt8[np.ndarray, "n h2 w 3"] | None = None,
     ) -> Float32[np.ndarray, "n act"]:
         """Return the worlds' next actions; the same worlds in the same order at every call until `reset`."""
         device = next(self.policy.parameters()).device
         batch = self.processors.before({STATE: torch.from_numpy(state)})
         for camera, greys in self._pictures(labels).items():
             batch[camera] = torch.from_numpy(greys)[:, None].to(device)
+        if rgb is not None:
+            batch[RGB] = torch.from_numpy(rgb).permute(0, 3, 1, 2).to(device)
         batch["task"] = [self.task] * len(state)
         with torch_threads(self.num_threads):
             action = self.policy.select_action(batch)
@@ -167,14 +173,15 @@ class Student:
 
     @property
     def cameras(self) -> list[str]:
-        """Whose label pictures it is given, below each other."""
+        """Whose pictures it is given: label pictures below each other, and the colour picture."""
         return sorted(self.policy.net.camera_keys)
 
     def _pictures(
         self, labels: UInt8[np.ndarray, "n h w"]
     ) -> dict[str, UInt8[np.ndarray, "n h2 w"]]:
         greys = np.asarray(self.policy.config.mask_greys, np.uint8)[labels]
-        return dict(zip(self.cameras, np.split(greys, len(self.cameras), axis=1), strict=True))
+        masks = [camera for camera in self.cameras if camera != RGB]
+        return dict(zip(masks, np.split(greys, len(masks) or 1, axis=1), strict=bool(masks)))
 
 
 def fill_in_features(cfg: V2PBCConfig, dataset: Path, repo_id: str) -> dict[str, dict[str, Any]]:

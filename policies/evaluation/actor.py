@@ -1,4 +1,4 @@
-"""A LeRobot policy as something that acts on batches of label pictures and robot states.
+"""A LeRobot policy as something that acts on batches of label pictures, colour pictures and robot states.
 
 Each step is `lerobot-eval`'s: observation, environment's processor, policy's processor, policy, and back; in inference
 mode, at the policy's own precision. Whoever makes the pictures says which grey stands for a label.
@@ -22,6 +22,7 @@ from policies.evaluation.rollout import (
 )
 
 MASK_KEY, WRIST_KEY = "observation.images.mask", "observation.images.mask_wrist"
+RGB_KEY = "observation.images.rgb"
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 GREY_TYPE = "v2p_bc"
@@ -44,7 +45,7 @@ class PolicyActor:
     size_px: tuple[int, int]
     """Height and width of the pictures that the policy was trained on, of each camera."""
     cameras: tuple[str, ...] = (MASK_KEY,)
-    """Whose label pictures it is given, below each other."""
+    """Whose pictures it is given: label pictures below each other, then the colour picture."""
 
     def for_task(self, words: str) -> "PolicyActor":
         """Return the same policy, told another task."""
@@ -57,29 +58,44 @@ class PolicyActor:
         self.loaded.policy.reset()
 
     def act(
-        self, labels: UInt8[np.ndarray, "n h w"], state: Float32[np.ndarray, "n state"]
+        self,
+        labels: UInt8[np.ndarray, "n h w"],
+        state: Float32[np.ndarray, "n state"],
+        rgb: UInt8[np.ndarray, "n h2 w 3"] | None = None,
     ) -> Float32[np.ndarray, "n act"]:
         """Return the next action of every world."""
-        height = self.size_px[0] * len(self.cameras)
-        if labels.shape[1] != height:
-            raise UnsuitablePolicyError(
-                f"the policy sees {' and '.join(self.cameras)}, {height} rows of labels, and is "
-                f"given {labels.shape[1]} rows"
-            )
-        picture = torch.from_numpy(self.values[labels])[:, None]  # numpy's indexing is the faster
-        if self.channels > 1:
-            picture = picture.expand(-1, self.channels, -1, -1).contiguous()
-        observation = {
-            **dict(zip(self.cameras, picture.chunk(len(self.cameras), dim=-2), strict=True)),
+        observation: dict[str, Any] = {
+            **self._label_pictures(labels),
             STATE_KEY: torch.from_numpy(state.copy()),
             "task": [self.task] * len(state),
         }
+        if RGB_KEY in self.cameras:
+            if rgb is None:
+                raise UnsuitablePolicyError(
+                    f"the policy sees '{RGB_KEY}' and is given label pictures only"
+                )
+            observation[RGB_KEY] = torch.from_numpy(rgb).permute(0, 3, 1, 2).float() / 255
         with torch.inference_mode():
             action = self.loaded.policy.select_action(
                 self.loaded.preprocessor(self.before(observation))
             )
             action = self.after({ACTION_KEY: self.loaded.postprocessor(action)})[ACTION_KEY]
         return action.to("cpu").numpy()
+
+    def _label_pictures(self, labels: UInt8[np.ndarray, "n h w"]) -> dict[str, torch.Tensor]:
+        cameras = [key for key in self.cameras if key != RGB_KEY]
+        if not cameras:
+            return {}
+        height = self.size_px[0] * len(cameras)
+        if labels.shape[1] != height:
+            raise UnsuitablePolicyError(
+                f"the policy sees {' and '.join(cameras)}, {height} rows of labels, and is "
+                f"given {labels.shape[1]} rows"
+            )
+        picture = torch.from_numpy(self.values[labels])[:, None]  # numpy's indexing is the faster
+        if self.channels > 1:
+            picture = picture.expand(-1, self.channels, -1, -1).contiguous()
+        return dict(zip(cameras, picture.chunk(len(cameras), dim=-2), strict=True))
 
 
 def load_actor(
@@ -106,7 +122,7 @@ def load_actor(
     """
     from lerobot.envs.factory import make_env_pre_post_processors
 
-    config = env_config(wrist=True)
+    config = env_config(rgb=True)
     for key, count in (("agent_pos", num_states), (ACTION_KEY, num_actions)):
         config.features[key] = replace(config.features[key], shape=(count,))
     try:
@@ -164,17 +180,18 @@ def check_features(folder: Path, config: Any) -> tuple[int, int, tuple[str, ...]
                 f"the policy in {folder} wants '{key}' of shape {shape}, and the simulator gives"
                 f" {tuple(given[key].shape)}: it was trained on a dataset of another version"
             )
-    if MASK_KEY not in wanted:
+    if WRIST_KEY in wanted:  # comes below the table's, whether that is looked at or not
+        wanted.setdefault(MASK_KEY, wanted[WRIST_KEY])
+    cameras = tuple(key for key in (MASK_KEY, WRIST_KEY, RGB_KEY) if key in wanted)
+    if not cameras:
         raise UnsuitablePolicyError(
-            f"the policy in {folder} has no camera '{MASK_KEY}', and masks are the only pictures that the simulator"
-            f" gives; it wants {', '.join(wanted) or 'nothing'}"
+            f"the policy in {folder} has no camera; it wants {', '.join(wanted) or 'nothing'}, and the simulator gives"
+            f" {MASK_KEY}, {WRIST_KEY} and {RGB_KEY}"
         )
-    cameras = tuple(key for key in (MASK_KEY, WRIST_KEY) if key in wanted)
-    _, height, width = wanted[MASK_KEY].shape
-    if tuple(wanted[cameras[-1]].shape) != tuple(wanted[MASK_KEY].shape):
+    sizes = {key: tuple(map(int, wanted[key].shape[1:])) for key in cameras}
+    if len(set(sizes.values())) > 1:
         raise UnsuitablePolicyError(
-            f"the policy in {folder} wants pictures of the wrist's camera of another size than "
-            "the table's; the simulator"
-            " draws both alike"
+            f"the policy in {folder} wants pictures of several sizes, {sizes}; the simulator draws all alike"
         )
-    return int(height), int(width), cameras
+    height, width = sizes[cameras[0]]
+    return height, width, cameras

@@ -19,6 +19,11 @@ def wrist_policy_folder(tmp_path_factory) -> Path:
     return untrained(tmp_path_factory.mktemp("wrist"), "mask", "mask_wrist")
 
 
+@pytest.fixture(scope="session")
+def rgb_policy_folder(tmp_path_factory) -> Path:
+    return untrained(tmp_path_factory.mktemp("rgb"), "rgb")
+
+
 def untrained(folder: Path, *cameras: str) -> Path:
     """Save a checkpoint of an untrained v2p_bc policy whose actions are large enough to move something."""
     from lerobot.configs import FeatureType, PolicyFeature

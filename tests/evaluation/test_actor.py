@@ -12,16 +12,18 @@ from v2p_data.sim.render.masks import PALETTE, labels_to_rgb
 pytestmark = pytest.mark.slow
 
 MASK, STATE = "observation.images.mask", "observation.state"
+WRIST, RGB = "observation.images.mask_wrist", "observation.images.rgb"
 
 
-def checkpoint(folder, cameras=(MASK,), state_dim=11, act_dim=7):
+def checkpoint(folder, cameras=(MASK,), state_dim=11, act_dim=7, sizes=None):
     from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
     from policies.bc.configuration_v2p_bc import V2PBCConfig
 
-    seen = {key: PolicyFeature(FeatureType.VISUAL, (3, 48, 64)) for key in cameras}
+    shapes = dict.fromkeys(cameras, (3, 48, 64)) | (sizes or {})
+    seen = {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in shapes.items()}
     config = V2PBCConfig(
         input_features={**seen, STATE: PolicyFeature(FeatureType.STATE, (state_dim,))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (act_dim,))},
@@ -40,8 +42,12 @@ def checkpoint(folder, cameras=(MASK,), state_dim=11, act_dim=7):
             r"'observation\.state' of shape \(7,\), and the simulator gives \(11,\)",
         ),
         ({"act_dim": 8}, r"'action' of shape \(8,\), and the simulator gives \(7,\)"),
-        ({"cameras": ["observation.images.rgb"]}, r"'observation\.images\.rgb' \(3, 48, 64\)"),
-        ({"cameras": []}, r"has no camera 'observation\.images\.mask'"),
+        (
+            {"cameras": [MASK, "observation.images.top"]},
+            r"wants 'observation\.images\.top' \(3, 48, 64\), which the simulator does not give",
+        ),
+        ({"cameras": []}, r"has no camera; it wants observation\.state"),
+        ({"sizes": {RGB: (3, 48, 48)}, "cameras": [MASK, RGB]}, "wants pictures of several sizes"),
     ],
 )
 def test_a_policy_that_wants_something_else_is_told_what_there_is(tmp_path, odd, said):
@@ -51,14 +57,21 @@ def test_a_policy_that_wants_something_else_is_told_what_there_is(tmp_path, odd,
         load_actor(checkpoint(tmp_path, **odd), greys=PALETTE)
 
 
-def test_a_policy_is_shown_pictures_of_the_size_that_it_knows(tmp_path):
+@pytest.mark.parametrize(
+    ("wanted", "shown"),
+    [([MASK], (MASK,)), ([RGB], (RGB,)), ([RGB, WRIST], (MASK, WRIST, RGB))],
+)
+def test_a_policy_is_shown_the_cameras_and_the_size_that_it_knows(tmp_path, wanted, shown):
     from policies.evaluation.actor import check_features
     from policies.evaluation.rollout import env_config
 
-    assert check_features(checkpoint(tmp_path), env_config()) == (48, 64, (MASK,))
+    found = check_features(checkpoint(tmp_path, wanted), env_config(rgb=True))
+
+    assert found == (48, 64, shown)
 
 
-def test_another_policy_type_sees_what_lerobot_shows_it():
+@pytest.mark.parametrize("cameras", [(MASK,), (RGB,), (MASK, WRIST, RGB)])
+def test_another_policy_type_sees_what_lerobot_shows_it(cameras):
     from lerobot.envs.utils import preprocess_observation
 
     from policies.evaluation.actor import PolicyActor
@@ -78,7 +91,9 @@ def test_another_policy_type_sees_what_lerobot_shows_it():
     def same(data):
         return data
 
-    labels = np.random.default_rng(0).integers(0, len(PALETTE), (2, 12, 16)).astype(np.uint8)
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, len(PALETTE), (2, 12 * (1 + (WRIST in cameras)), 16)).astype(np.uint8)
+    rgb = rng.integers(0, 256, (2, 12, 16, 3)).astype(np.uint8)
     state = np.arange(22, dtype=np.float32).reshape(2, 11)
     policy = Records()
     actor = PolicyActor(
@@ -89,14 +104,15 @@ def test_another_policy_type_sees_what_lerobot_shows_it():
         channels=3,
         task="lifting a cube",
         size_px=(12, 16),
+        cameras=cameras,
     )
     actor.reset(2)
 
-    action = actor.act(labels, state)
+    action = actor.act(labels, state, rgb)
 
-    theirs = preprocess_observation(
-        {"pixels": {"mask": labels_to_rgb(labels)}, "agent_pos": state}
-    )
+    drawn = {MASK: labels_to_rgb(labels[:, :12]), WRIST: labels_to_rgb(labels[:, 12:]), RGB: rgb}
+    pixels = {key.rpartition(".")[2]: drawn[key] for key in cameras}
+    theirs = preprocess_observation({"pixels": pixels, "agent_pos": state})
     assert action.shape == (2, 7)
     assert policy.seen.pop("task") == ["lifting a cube"] * 2
     assert policy.seen.keys() == theirs.keys()

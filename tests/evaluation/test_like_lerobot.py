@@ -75,6 +75,7 @@ def recorded(policy, monkeypatch) -> list[np.ndarray]:
         ("left_folder", False, "policy_folder"),
         ("benchmark_folder", True, "wrist_policy_folder"),
         ("benchmark_folder", False, "wrist_policy_folder"),
+        ("left_folder", True, "rgb_policy_folder"),
     ],
 )
 def test_the_same_seeds_give_the_same_actions_and_the_same_successes(
@@ -91,13 +92,13 @@ def test_the_same_seeds_give_the_same_actions_and_the_same_successes(
 
     judged = judge(
         bundle,
-        VisionActor(actor, wrist=wrist),
+        VisionActor(actor, wrist=wrist, rgb=policy == "rgb_policy_folder"),
         first_seed=FIRST_SEED,
         cfg=EvaluationConfig(episodes=EPISODES, worlds=EPISODES, at_end=at_end),
         size_px=actor.size_px,
     )
 
-    config = rollout.env_config(folder, size_px=64, wrist=wrist)
+    config = rollout.env_config(folder, size_px=64)
     loaded = rollout.load_policy(policy_folder, config)
     theirs = recorded(loaded.policy, monkeypatch)
     envs = config.create_envs(n_envs=EPISODES)

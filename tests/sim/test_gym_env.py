@@ -1,5 +1,7 @@
 """The Gymnasium environment of one task, and the same as a LeRobot environment."""
 
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -11,7 +13,6 @@ from gymnasium.utils.env_checker import check_env
 
 from v2p_data.errors import V2PError
 from v2p_data.sim.render.masks import rgb_to_labels
-from v2p_data.sim.wrappers import gym_env
 from v2p_data.sim.wrappers.gym_env import V2PEnv
 
 LIFT = """
@@ -70,14 +71,69 @@ def test_gymnasium_accepts_the_environment(env):
         check_env(env)
 
 
-def test_it_is_made_by_its_registered_name(write_task, tmp_path):
-    made = gym.make(gym_env.ENV_ID, task_folder=str(write_task(tmp_path / "lift")))
+@pytest.mark.parametrize(
+    ("name", "settings", "shown"),
+    [
+        ("Task", {"wrist": True, "rgb": True}, {"pixels", "agent_pos"}),
+        ("Task", {"observation": "flat", "rgb": True}, {"mask", "rgb", "agent_pos"}),
+        ("States", {}, None),
+    ],
+)
+def test_a_clean_gymnasium_makes_it_and_knows_its_longest_episode(
+    write_task, tmp_path, name, settings, shown
+):
+    """In a process that imported nothing of ours, as a user's first line does."""
+    code = f"""
+import gymnasium as gym, numpy as np
+made = gym.make("v2p_data.sim.wrappers:v2p/{name}-v0", task_folder=r"{write_task(tmp_path / "lift")}",
+                size_px=16, **{settings})
+seen, info = made.reset(seed=3)
+assert seen in made.observation_space and info["is_success"] is False
+shown = {shown}
+if shown is None:
+    assert seen.ndim == 1
+else:
+    assert set(seen) == shown
+    assert isinstance(made.observation_space["agent_pos"], gym.spaces.Box)
+assert made.spec.max_episode_steps == 12, made.spec
+ends = [made.step(made.action_space.sample())[3] for _ in range(12)]
+assert ends == [False] * 11 + [True]
+assert gym.make(made.spec).spec.max_episode_steps == 12
+assert gym.make(made.spec.id, task_folder=made.spec.kwargs["task_folder"], max_episode_steps=5).spec.max_episode_steps == 5
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
-    observation, info = made.reset(seed=3)
 
-    assert observation in made.observation_space
-    assert info["is_success"] is False
-    made.close()
+def test_a_flat_observation_is_what_stable_baselines3_takes(write_task, tmp_path):
+    """Its rules: no space within a space's space, pictures uint8 from 0 to 255 with channels last, bounded actions."""
+    env = V2PEnv(
+        str(write_task(tmp_path / "lift")), observation="flat", wrist=True, rgb=True, size_px=36
+    )
+
+    seen, _ = env.reset(seed=0)
+
+    assert {k: s.shape for k, s in env.observation_space.spaces.items()} == {
+        **dict.fromkeys(("mask", "mask_wrist", "rgb"), (36, 36, 3)),
+        "agent_pos": (11,),
+    }
+    assert all(isinstance(s, gym.spaces.Box) for s in env.observation_space.spaces.values())
+    assert seen in env.observation_space
+    with pytest.raises(V2PError, match="one of pictures, flat, states, got 'nested'"):
+        V2PEnv(str(tmp_path / "lift"), observation="nested")
+
+
+def test_the_colour_picture_is_what_the_renderer_draws_and_shows_the_red_cube(
+    write_task, tmp_path
+):
+    env = V2PEnv(str(write_task(tmp_path / "lift")), rgb=True)
+
+    pixels = env.reset(seed=0)[0]["pixels"]
+
+    assert (pixels["rgb"] == env.render()).all()
+    is_cube = rgb_to_labels(pixels["mask"]) == 2
+    colours = pixels["rgb"].astype(int)
+    assert np.ptp(colours[is_cube].mean(0)) > np.ptp(colours[~is_cube].mean(0)) + 20
+    env.close()
 
 
 def test_the_same_seed_gives_the_same_episode_and_another_seed_another(env):

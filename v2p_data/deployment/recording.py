@@ -16,9 +16,9 @@ from v2p_data.deployment.sight import Seen
 from v2p_data.episodes.dataset import encoding
 from v2p_data.episodes.dataset.layout import NewDataset
 from v2p_data.episodes.dataset.writer import pack
-from v2p_data.episodes.staging import RGB_CAMERA, Episode, refusals_named
+from v2p_data.episodes.staging import Episode, refusals_named
 from v2p_data.errors import V2PError
-from v2p_data.sim.render.masks import MASK_CAMERA
+from v2p_data.sim.render.masks import MASK_CAMERA, RGB_CAMERA
 
 FEWEST_FRAMES = 2
 STAGED = "staged"

@@ -4,11 +4,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from v2p_data.episodes.rollouts import CutConfig
-from v2p_data.episodes.staging import RGB_CAMERA
 from v2p_data.pipeline.fingerprint import UNSAID_BY_DEFAULT
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.render.appearance import DistractorConfig, LookConfig
-from v2p_data.sim.render.masks import MASK_CAMERAS
+from v2p_data.sim.render.masks import MASK_CAMERAS, RGB_CAMERA
 from v2p_data.sim.robot.action_names import Actions
 from v2p_data.sim.robot.interface import ArmInterface
 

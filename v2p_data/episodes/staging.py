@@ -19,14 +19,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from v2p_data.errors import V2PError, write_refusal
-from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS
+from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS, RGB_CAMERA
 
 EPISODES_FOLDER = "episodes"
 SCHEMA = 1
 ARRAYS = ("labels", "state", "action", "success")
 INTERVENTION = "intervention"
 """The array that only handovers have."""
-RGB_CAMERA = "rgb"
 KNOWN = "simulated."
 """How the names of arrays begin that only a simulator can fill; the column's name follows."""
 

@@ -148,7 +148,7 @@ def row_of(judged: Judged) -> dict[str, Any]:
 
 
 def _policy(folder: Path, device: str) -> Play:
-    from policies.evaluation.actor import UnsuitablePolicyError, load_actor
+    from policies.evaluation.actor import RGB_KEY, WRIST_KEY, UnsuitablePolicyError, load_actor
 
     try:
         interface, num_states, num_actions = interface_of(folder)
@@ -161,9 +161,9 @@ def _policy(folder: Path, device: str) -> Play:
         )
     except UnsuitablePolicyError as error:
         raise V2PError(str(error)) from error
-    wrist = len(actor.cameras) > 1
+    wrist, rgb = (key in actor.cameras for key in (WRIST_KEY, RGB_KEY))
     return lambda bundle: (
-        VisionActor(actor.for_task(bundle.description), wrist, interface, num_states),
+        VisionActor(actor.for_task(bundle.description), wrist, interface, num_states, rgb),
         actor.size_px,
     )
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import staged_episodes
 from v2p_data.episodes.config import EpisodesConfig
-from v2p_data.episodes.dataset.features import ArmInterface, interface_in
+from v2p_data.episodes.dataset.features import RGB_KEY, WRIST_KEY, ArmInterface, interface_in
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.checkpoint import check_checkpoint
 from v2p_data.pipeline.artifact import demand_whole, provenance, read_record
@@ -283,8 +283,9 @@ def checkpoint_judge(
                 bundle,
                 VisionActor(
                     replace(student, policy=policy.eval(), task=bundle.description),
-                    wrist=len(student.cameras) > 1,
+                    wrist=WRIST_KEY in student.cameras,
                     interface=interface,
+                    rgb=RGB_KEY in student.cameras,
                 ),
                 first_seed=seed_for(seed, "checkpoints", item) % 2**31,
                 cfg=cfg,

@@ -97,6 +97,11 @@ class TwinView(View):
         """The label picture."""
         return self._look()[None]
 
+    @property
+    def rgb(self) -> UInt8[np.ndarray, "1 h w 3"]:
+        """What the twin's camera gives."""
+        return self._arm.picture()[None]
+
     def step(self, action: Float[np.ndarray, "1 7"]) -> StepResult:
         """Let the twin carry out an action; return what the mirror says of it."""
         arm, wanted = self._arm, action[0].astype(float)

@@ -174,6 +174,7 @@ function agrees.
 | | |
 |---|---|
 | `pixels/mask` | 256 x 256 x 3 uint8: segmentation mask, a grey (R = G = B) per label: 0 background, 64 robot, 128 manipulated object, then 192, 255, 31, 95, 158, 222 |
+| `pixels/mask_wrist`, `pixels/rgb` | masks of a camera on the hand; the first camera in colour, where there is OpenGL |
 | `agent_pos` | {state} |
 | action | {"each in [-1, 1], " * (actions == ACTION_NAMES)}20 Hz: {action} |
 
@@ -202,7 +203,7 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
         sys.path.insert(0, str(folder))
     from v2p_data.sim.wrappers.lerobot_env import V2PEnvConfig
 
-    named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg", "horizon_scale", "wrist")
+    named = ("size_px", "camera_pos_m", "camera_angle_rad", "camera_fovy_deg", "horizon_scale", "wrist", "rgb")
     given = {name: getattr(cfg, name) for name in named if hasattr(cfg, name)}
     return V2PEnvConfig(tasks=str(folder / TASKS), **SETTINGS, **given).create_envs(n_envs, use_async_envs)
 

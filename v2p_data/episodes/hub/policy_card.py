@@ -41,7 +41,7 @@ license: {license}
 
 ```bash
 {fetch}v2p eval POLICY --tasks {tasks}
-lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks={tasks}{wrist}{actions}{joints}
+lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks={tasks}{actions}{joints}
 ```
 
 ## What it sees and does
@@ -93,7 +93,6 @@ def write_policy_card(folder: Path) -> None:
         tasks="dataset/v2p/tasks" if dataset else "TASKS",
         actions=f" --env.actions={actions}" if actions not in (None, "delta_tool") else "",
         joints=" --env.joint_state=true" if len(states) > len(STATE_NAMES) else "",
-        wrist=" --env.wrist=true" if any("mask_wrist" in name for name in features) else "",
         features="\n".join(f"| `{name}` | {shape} |" for name, shape in features.items()),
     )
     write_whole(folder / CARD_FILE, text.encode())

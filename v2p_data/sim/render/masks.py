@@ -13,6 +13,7 @@ import copy
 import os
 import sys
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Protocol, runtime_checkable
 
 import mujoco
@@ -28,6 +29,8 @@ from v2p_data.task.task import TaskBundle
 MASK_CAMERA, WRIST_CAMERA = "mask", "mask_wrist"
 MASK_CAMERAS = MASK_CAMERA, WRIST_CAMERA
 """In the order in which their label images lie below each other."""
+RGB_CAMERA = "rgb"
+"""The table's camera in colour."""
 PALETTE = (0, 64, 128, 192, 255, 31, 95, 158, 222)
 """Grey level of each label."""
 BACKGROUND, ROBOT, FIRST_OBJECT = 0, 1, 2
@@ -264,6 +267,16 @@ class _GLPainter:
         self.context.make_current()
         self.drawer.free()
         self.context.free()
+
+
+@cache
+def has_opengl() -> bool:
+    """Tell whether colour pictures can be drawn here."""
+    try:
+        _gl_context(16, 16).free()
+    except _NoGLError:
+        return False
+    return True
 
 
 def _gl_context(width_px: int, height_px: int) -> Any:

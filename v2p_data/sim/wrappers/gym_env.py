@@ -1,8 +1,10 @@
 """One task as a Gymnasium environment, `v2p/Task-v0`: what a policy sees, does, and is judged by.
 
+`gymnasium.make("v2p_data.sim.wrappers:v2p/Task-v0", task_folder=FOLDER)` makes it.
+
 | | |
 |---|---|
-| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `pixels/mask_wrist`: the same, if asked for; `agent_pos`: 11 float32, see `BatchEnv.robot_state`; with `joint_state` the angles of the arm's joints [rad] follow |
+| Observation | `pixels/mask`: 256 x 256 x 3 uint8, label greys; `pixels/mask_wrist`, `pixels/rgb`: of the same size, if asked for; `agent_pos`: 11 float32, see `BatchEnv.robot_state`; with `joint_state` the angles of the arm's joints [rad] follow. `observation="flat"` puts all of them in one level, as Stable-Baselines3 wants it; `"states"`, of `v2p/States-v0`, shows what experts see |
 | Action | Box(-1, 1, (7,)): delta position, delta rotation, gripper; 20 Hz; with `actions`, a target of the tool (7) or of the joints (8) |
 | Reward | the task's training reward |
 | Start | drawn under the randomisation that episodes are recorded under; `reset(seed=...)` repeats it exactly |
@@ -20,6 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.seeding import np_random
 from jaxtyping import Float, Float32, UInt8
 
@@ -29,13 +32,19 @@ from v2p_data.sim.env.batch_env import BatchEnv, SimConfig, Snapshot
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.env.verdict import RefereeRecord
 from v2p_data.sim.model.world import World
-from v2p_data.sim.render.masks import MASK_CAMERA, MASK_CAMERAS, MaskRenderer, labels_to_rgb
+from v2p_data.sim.render.masks import (
+    MASK_CAMERA,
+    MASK_CAMERAS,
+    RGB_CAMERA,
+    MaskRenderer,
+    labels_to_rgb,
+)
 from v2p_data.sim.robot.action_names import Actions
 from v2p_data.sim.robot.interface import ArmInterface
 from v2p_data.task.task import POLICY_HORIZON_SCALE, TaskBundle, errors_naming
 
-ENV_ID = "v2p/Task-v0"
 CONTROL_HZ = 20
+OBSERVATIONS = ("pictures", "flat", "states")
 STATE_LOW = (-1.5, -1.5, -0.5, -np.pi, -np.pi, -np.pi, 0.0, -1.0, -1.0, -1.0, 0.0)
 STATE_HIGH = (1.5, 1.5, 1.5, np.pi, np.pi, np.pi, 1.0, 1.0, 1.0, 1.0, 1.0)
 """Bounds of `BatchEnv.robot_state`."""
@@ -58,7 +67,7 @@ def stream_seed(seed: int) -> int:
     return _next_seed(np_random(seed)[0])
 
 
-class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
+class V2PEnv(gym.Env[Any, np.ndarray]):
     """A single world of one task.
 
     Args:
@@ -69,6 +78,8 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             `RandomizationConfig`; a policy is evaluated under what its dataset was recorded under.
         horizon_scale: an episode lasts at most this multiple of the task's own horizon.
         wrist: whether masks of the camera that the hand carries are seen too.
+        rgb: whether the colour picture is seen too; needs OpenGL.
+        observation: `pictures` in a level of their own, `flat`, or the simulator's `states` alone.
         actions: what an action says: `delta_tool`, `absolute_tool`, `joints`; see `sim.env.actions`.
         joint_state: whether the angles of the arm's joints [rad] follow in `agent_pos`.
 
@@ -77,6 +88,7 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         ItemRejectedError: the task cannot be simulated.
     """
 
+    _spec: EnvSpec | None = None
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 - Gymnasium's attribute
 
     def __init__(
@@ -90,11 +102,15 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         camera_fovy_deg: float = 0.0,
         horizon_scale: float = POLICY_HORIZON_SCALE,
         wrist: bool = False,
+        rgb: bool = False,
+        observation: str = "pictures",
         actions: Actions = "delta_tool",
         joint_state: bool = False,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise V2PError(f"render_mode is 'rgb_array' or None, got {render_mode!r}")
+        if observation not in OBSERVATIONS:
+            raise V2PError(f"observation is one of {', '.join(OBSERVATIONS)}, got {observation!r}")
         bundle = TaskBundle.load(Path(task_folder))
         self.render_mode = render_mode
         self.task = bundle.title
@@ -112,19 +128,11 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             self._world = BatchEnv(bundle, sim, num_envs=1, seed=0, num_threads=1)
         self._referee = RefereeRecord(self._world)
         self._masks = MaskRenderer(self._world.world, size_px, wrist=wrist)
-        self._cameras = MASK_CAMERAS[: 1 + wrist]
-        mask = spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)
+        self._cameras, self._rgb = MASK_CAMERAS[: 1 + wrist], rgb
+        self._shows = observation
         self._interface = ArmInterface(actions=actions, joint_state=joint_state)
         num_joints = self.world.robot.num_joints
-        state_low, state_high = state_bounds(num_joints * joint_state)
-        self.observation_space = spaces.Dict(
-            {
-                "pixels": spaces.Dict(dict.fromkeys(self._cameras, mask)),
-                "agent_pos": spaces.Box(
-                    state_low.astype(np.float32), state_high.astype(np.float32)
-                ),
-            }
-        )
+        self.observation_space = self._space(size_px, num_joints * joint_state)
         low, high = bounds_of(actions, num_joints)
         self.action_space = spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
@@ -183,6 +191,15 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
             return self._pictures()[MASK_CAMERA]
 
     @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium made it from, with the longest episode of this task."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        self._spec = replace(spec, max_episode_steps=self._max_episode_steps)
+
+    @property
     def world(self) -> World:
         """The compiled model."""
         return self._world.world
@@ -207,19 +224,33 @@ class V2PEnv(gym.Env[dict[str, Any], np.ndarray]):
         """Free the graphics memory."""
         self._masks.close()
 
-    def _observe(self) -> dict[str, Any]:
+    def _space(self, size_px: int, num_joints: int) -> spaces.Space[Any]:
+        if self._shows == "states":
+            return spaces.Box(-np.inf, np.inf, (self._world.obs_dim,), np.float32)
+        low, high = (bound.astype(np.float32) for bound in state_bounds(num_joints))
+        cameras = (*self._cameras, *([RGB_CAMERA] if self._rgb else []))
+        picture = spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)
+        shown: dict[str, spaces.Space[Any]] = dict.fromkeys(cameras, picture)
+        if self._shows == "pictures":
+            shown = {"pixels": spaces.Dict(shown)}
+        return spaces.Dict({**shown, "agent_pos": spaces.Box(low, high)})
+
+    def _observe(self) -> Any:
+        if self._shows == "states":
+            return self._world.observe()[0]
         state = within_bounds(
             state_as_seen(self._world.robot_state(), self._world, self._interface)[0]
         )
-        return {"pixels": self._pictures(), "agent_pos": state}
+        pictures: dict[str, Any] = self._pictures()
+        if self._shows == "pictures":
+            pictures = {"pixels": pictures}
+        return pictures | {"agent_pos": state}
 
     def _pictures(self) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
         drawn = labels_to_rgb(self._masks.draw(self.moment(), 0))
-        return dict(zip(self._cameras, np.split(drawn, len(self._cameras)), strict=True))
+        pictures = dict(zip(self._cameras, np.split(drawn, len(self._cameras)), strict=True))
+        return pictures | ({RGB_CAMERA: self.picture()} if self._rgb else {})
 
 
 def _next_seed(rng: np.random.Generator) -> int:
     return int(rng.integers(2**62))
-
-
-gym.register(id=ENV_ID, entry_point=V2PEnv)  # pyright: ignore[reportArgumentType]

@@ -18,7 +18,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from v2p_data.errors import V2PError
 from v2p_data.json_files import json_or_none
-from v2p_data.sim.render.masks import MASK_CAMERAS
+from v2p_data.sim.render.masks import MASK_CAMERAS, RGB_CAMERA, has_opengl
 from v2p_data.sim.robot.action_names import Actions, action_names, actions_named
 from v2p_data.sim.robot.robot import NUM_ARM_JOINTS
 from v2p_data.sim.wrappers.gym_env import CONTROL_HZ, STATE_LOW, V2PEnv
@@ -81,8 +81,10 @@ class V2PEnvConfig(EnvConfig):
     camera_fovy_deg: float = 0.0
     horizon_scale: float = POLICY_HORIZON_SCALE
     """An episode lasts at most this multiple of the task's own horizon."""
-    wrist: bool = False
+    wrist: bool = True
     """Masks of the camera that the hand carries too, for policies trained on datasets of `--episodes.wrist`."""
+    rgb: bool | None = None
+    """Colour pictures too; by default where there is OpenGL."""
     actions: str = ""
     """What an action says: `delta_tool`, `absolute_tool` or `joints`; by default as in the dataset
     that carries the tasks."""
@@ -121,7 +123,8 @@ class V2PEnvConfig(EnvConfig):
             ACTION: PolicyFeature(FeatureType.ACTION, (len(names),)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(STATE_LOW) + num_joints,)),
         }
-        for camera in MASK_CAMERAS[: 1 + self.wrist]:
+        self.rgb = has_opengl() if self.rgb is None else self.rgb
+        for camera in (*MASK_CAMERAS[: 1 + self.wrist], *([RGB_CAMERA] if self.rgb else [])):
             self.features[f"pixels/{camera}"] = mask
             self.features_map[f"pixels/{camera}"] = f"{OBS_IMAGES}.{camera}"
 
@@ -134,6 +137,7 @@ class V2PEnvConfig(EnvConfig):
             "camera_fovy_deg": self.camera_fovy_deg,
             "horizon_scale": self.horizon_scale,
             "wrist": self.wrist,
+            "rgb": self.rgb,
             "actions": self.actions,
             "joint_state": self.joint_state,
         }
