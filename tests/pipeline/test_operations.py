@@ -1,3 +1,4 @@
+import contextlib
 import json
 import time
 
@@ -55,18 +56,64 @@ def test_gc_lists_what_no_dataset_came_from_and_deletes_it_when_told(run, capsys
     assert not any((run / ".fetching").iterdir())
 
 
-def test_gc_follows_no_link_and_deletes_nothing_that_stages_did_not_make(run, tmp_path_factory):
+@pytest.mark.parametrize(
+    ("how", "where"),
+    [
+        ("link", "scene/linked-00000000.partial"),
+        ("link", "scene/linked-00000000"),
+        ("link", "task"),
+        ("link", ".workers"),
+        ("link", ".fetching"),
+        ("link", ".fetching/linked-00000000"),
+        ("link", "scene/OLD/linked"),
+        ("file", "dataset/notes.partial"),
+        ("file", "dataset/notes-00000000.partial"),
+        ("file", "scene/OLD/notes.partial"),
+        ("file", "scene/OLD/deep/notes.log"),
+        ("file", "scene/OLD/README.md"),
+        ("file", "scene/notes.partial/text"),
+        ("file", ".fetching/mine/text"),
+        ("file", ".fetching"),
+        ("file", "mine-00000000.partial/text"),
+        ("rename", "scene/mine-00000000"),
+        ("rename", "scene/mine-00000000.partial"),
+        ("rename", "task/OLD"),
+        ("outside", "scene"),
+    ],
+)
+def test_gc_deletes_only_what_stages_made_and_follows_no_link(run, tmp_path_factory, how, where):
+    outside = tmp_path_factory.mktemp("outside")
+    (outside / "uv.lock").write_text("mine")
+    old = dataset("old").inputs["clip"].folder(run)
+    mine = run / where.replace("OLD", old.name)
+    mine.parent.mkdir(parents=True, exist_ok=True)
+    if how == "link":
+        mine.symlink_to(outside)
+    elif how == "file":
+        mine.write_text("mine")
+    elif how == "rename":
+        old.rename(mine)
+    else:
+        (run / "scene").rename(outside / "scene")
+        mine.symlink_to(outside / "scene")
+    before = {path: path.read_bytes() for path in outside.rglob("*") if path.is_file()}
+
+    with contextlib.suppress(V2PError):
+        gc_command([str(run), "--delete"])
+
+    assert {path: path.read_bytes() for path in before} == before
+    assert mine.is_symlink() if how in ("link", "outside") else mine.exists()
+
+
+def test_a_link_inside_unfinished_work_goes_and_what_it_leads_to_stays(run, tmp_path_factory):
     outside = tmp_path_factory.mktemp("outside")
     (outside / "text").write_text("mine")
-    (run / "scene" / "linked-00000000.partial").symlink_to(outside)
-    (run / "scene" / "notes.partial").mkdir()
-    (run / "task").symlink_to(outside.parent)
+    (run / "scene/half-00000000.partial/linked").symlink_to(outside)
 
-    assert gc_command([str(run), "--delete"]) == 0
+    gc_command([str(run), "--delete"])
 
+    assert not (run / "scene/half-00000000.partial").exists()
     assert (outside / "text").read_text() == "mine"
-    assert (run / "scene" / "linked-00000000.partial").is_symlink()
-    assert (run / "scene" / "notes.partial").is_dir()
 
 
 def test_gc_keeps_what_the_last_command_asked_for(run, capsys):

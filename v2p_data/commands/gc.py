@@ -10,9 +10,9 @@ from v2p_data.commands.display import STAGE_ORDER
 from v2p_data.commands.status import Shown, run_folder
 from v2p_data.errors import UnusableError, V2PError
 from v2p_data.json_files import json_or_none
-from v2p_data.pipeline.artifact import Record, read_record
+from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record
 from v2p_data.pipeline.run_file import RUN_FILE
-from v2p_data.pipeline.store import FETCHING_FOLDER, MARK
+from v2p_data.pipeline.store import FETCHING_FOLDER, MARK, key_of
 from v2p_data.pipeline.workers import only_run_in
 from v2p_data.report.reading import PARTIAL_SUFFIX
 
@@ -20,6 +20,8 @@ FINAL = ("dataset", "policy", "evaluation")
 """Stages whose results are wanted for themselves."""
 OWN_NAME = re.compile(r".+-[0-9a-f]{8}(\.partial)?")
 """Of folders that stages make."""
+FETCHED_NAME = re.compile(OWN_NAME.pattern + r"|tmp\w{8}")
+"""Of folders below `.fetching`: what `tempfile` calls them, and what a killed `gc` was about to delete."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +51,9 @@ def gc_command(argv: list[str]) -> int:
         raise V2PError(
             f"{run} is a store that other drivers may be using; give the folder of a run"
         )
-    if (run / FETCHING_FOLDER).is_symlink():
-        raise V2PError(f"{run / FETCHING_FOLDER} is a link, which no run makes; remove it")
+    fetching = run / FETCHING_FOLDER
+    if fetching.is_symlink() or (fetching.exists() and not fetching.is_dir()):
+        raise V2PError(f"{fetching} is no folder, which no run makes; remove it")
     with only_run_in(run):
         found = wastes(run)
         if not found:
@@ -63,7 +66,7 @@ def gc_command(argv: list[str]) -> int:
         total, seconds = sum(w.size for w in found), sum(w.seconds for w in found)
         for waste in found if args.delete else ():
             # Moved away first: half a folder would count as damaged.
-            gone = run / FETCHING_FOLDER / waste.folder.name
+            gone = fetching / waste.folder.name
             gone.parent.mkdir(exist_ok=True)
             shutil.rmtree(waste.folder.rename(gone) if waste.folder != gone else gone)
     does = "Deleted" if args.delete else "Could delete"
@@ -77,10 +80,10 @@ def gc_command(argv: list[str]) -> int:
 def wastes(run: Path) -> list[Waste]:
     """Return unfinished work, and results that no dataset, policy, evaluation or rejection came from.
 
-    What the last command asked for is needed too, and without a final result everything finished is. Links, and folders
-    that are not named like a result, are nobody's waste.
+    What the last command asked for is needed too, and without a final result everything finished is. Links, folders that
+    are not named like a result, and results to which somebody added a file are nobody's waste.
     """
-    folders = [folder for stage in STAGE_ORDER for folder in _own_folders(run / stage)]
+    folders = [folder for stage in STAGE_ORDER for folder in _folders(run / stage, OWN_NAME)]
     records = {f.name: record for f in folders if (record := _record_of(f)) is not None}
     asked = json_or_none(run / RUN_FILE)
     needed = {str(entry.get("folder")) for entry in (asked if isinstance(asked, list) else [])}
@@ -95,24 +98,21 @@ def wastes(run: Path) -> list[Waste]:
     is_final = any(record.stage in FINAL for record in records.values())
     found = [
         Waste(folder=f, why="half fetched", seconds=0.0)
-        for f in (run / FETCHING_FOLDER).glob("*")
-        if f.is_dir() and not f.is_symlink()
+        for f in _folders(run / FETCHING_FOLDER, FETCHED_NAME)
     ]
     for folder in folders:
-        if folder.suffix == PARTIAL_SUFFIX:
+        record = records.get(folder.name)
+        if folder.suffix == PARTIAL_SUFFIX and not (folder / RECORD_FILE).exists():
             found.append(Waste(folder=folder, why="unfinished", seconds=0.0))
-        elif is_final and folder.name in records and folder.name not in needed:
-            seconds = records[folder.name].seconds
-            found.append(Waste(folder=folder, why="nothing came of it", seconds=seconds))
+        elif is_final and record and folder.name not in needed and _is_as_made(folder, record):
+            found.append(Waste(folder=folder, why="nothing came of it", seconds=record.seconds))
     return found
 
 
-def _own_folders(place: Path) -> list[Path]:
-    """Return the results and the unfinished work in a stage's folder, none of which is reached by a link."""
-    if place.is_symlink():
-        return []
-    found = sorted(place.glob("*"))
-    return [f for f in found if OWN_NAME.fullmatch(f.name) and f.is_dir() and not f.is_symlink()]
+def _folders(place: Path, names: re.Pattern[str]) -> list[Path]:
+    """Return the folders of these names in a place, none of which is reached by a link."""
+    found = () if place.is_symlink() else sorted(place.glob("*"))
+    return [f for f in found if names.fullmatch(f.name) and f.is_dir() and not f.is_symlink()]
 
 
 def _record_of(folder: Path) -> Record | None:
@@ -121,3 +121,14 @@ def _record_of(folder: Path) -> Record | None:
         return None if folder.suffix == PARTIAL_SUFFIX else read_record(folder)
     except UnusableError:
         return None
+
+
+def _is_as_made(folder: Path, record: Record) -> bool:
+    """Return whether a result bears its own name and holds nothing but what its stage left there."""
+    held = {
+        p.relative_to(folder).as_posix()
+        for p in folder.rglob("*")
+        if p.is_symlink() or not p.is_dir()
+    }
+    own_name = f"{record.stage}/{record.item}-{record.fingerprint}"
+    return key_of(folder) == own_name and held <= {*(record.files or ()), RECORD_FILE}

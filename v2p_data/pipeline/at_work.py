@@ -82,7 +82,7 @@ def wait_for_workers(root: Path, wait_s: float) -> None:
     Raises:
         V2PError: one of them is still at work.
     """
-    for path in (root / WORKERS_FOLDER).glob("*.lock"):
+    for path in (root / WORKERS_FOLDER).glob(f"{'[0-9a-f]' * 32}.lock"):
         with held(path, root, wait_s):
             path.unlink(missing_ok=True)
 
