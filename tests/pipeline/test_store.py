@@ -1,4 +1,6 @@
 import json
+import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -131,6 +133,63 @@ def test_a_killed_driver_that_is_started_again_waits_for_nobody(tmp_path, folder
 
         assert other.claim(stage) is None
         assert again.claim(stage) == "ours"
+
+
+def test_a_copied_run_folder_is_another_driver(tmp_path, folder):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    first = Shared(Runtime(root=tmp_path / "run", store=str(folder)))
+    with first:
+        assert first.claim(stage) == "ours"
+        shutil.copytree(tmp_path / "run", tmp_path / "copy")
+
+        with Shared(Runtime(root=tmp_path / "copy", store=str(folder))) as copied:
+            assert copied.claim(stage) is None
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda lease: lease.write_bytes(b"\xff\xfe"), "names no driver"),
+        (lambda lease: lease.write_bytes(b""), "names no driver"),
+        (lambda lease: lease.write_text("../../etc/pass"), "names no driver"),
+        (lambda lease: lease.mkdir(), "is no file"),
+        (os.mkfifo, "is no file"),
+    ],
+)
+def test_a_lease_that_no_driver_wrote_is_named(tmp_path, folder, spoil, words):
+    stage = marked("a", tmp_path / "marks").inputs["one"]
+    lease = folder / "leases" / "one" / f"{stage.folder_name}.1"
+    lease.parent.mkdir(parents=True)
+    spoil(lease)
+
+    with (
+        Shared(Runtime(root=tmp_path / "run", store=str(folder))) as driver,
+        pytest.raises(V2PError, match=words) as error,
+    ):
+        driver.claim(stage)
+
+    assert str(lease) in str(error.value)
+
+
+def test_a_full_store_is_named_and_what_was_made_is_published_when_there_is_room(tmp_path, folder):
+    stage, root = marked("a" * 200, tmp_path / "marks").inputs["one"], tmp_path / "run"
+    make_stage(stage, Runtime(root=root))
+    runtime = Runtime(root=root, store=str(folder))
+    open_store(str(folder)).begin()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        full = make_stage(stage, runtime)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+        with pytest.raises(V2PError, match=f"cannot write to the store {folder}"):
+            Shared(runtime).__enter__()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    assert (full.status, full.reason) == ("failed", "error")
+    assert f"cannot write to the store {folder}: a file may not grow" in full.detail
+    assert make_stage(stage, runtime).status == "kept"
+    assert (folder / "one" / stage.folder_name / "text").is_file()
 
 
 def test_what_ends_with_nothing_made_may_be_tried_by_whoever_asks_next(tmp_path, folder):

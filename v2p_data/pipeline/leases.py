@@ -7,9 +7,11 @@ clock takes the lease over by creating the next number, so that no two clocks ar
 """
 
 import contextlib
+import hashlib
 import itertools
 import json
 import platform
+import re
 import threading
 import time
 import uuid
@@ -23,8 +25,6 @@ from v2p_data.errors import UnusableError, V2PError
 from v2p_data.pipeline.runner import Outcome, Runtime, Stage, outcome_of, stored_outcome
 from v2p_data.pipeline.store import Store, key_of, open_store
 
-OWNER_FILE = ".owner"
-"""In a run folder: the name of its driver, so that a killed one finds its own leases again."""
 BEATS = 4
 """Signs of life within `lease_s`."""
 POLL_S = 2.0
@@ -136,6 +136,10 @@ class Shared:
                 if store.create(lease, self.owner.encode()):
                     self.held[key] = lease
                 break
+            if holder != FREE and not re.fullmatch(rb"[0-9a-f]{12}", holder):
+                raise V2PError(
+                    f"{store.folder / lease} names no driver; delete that file and run the same command again"
+                )
             # Our own is of a run that was killed.
             if holder not in (FREE, self.owner.encode()) and not self._is_dead(
                 store, holder.decode()
@@ -163,8 +167,8 @@ class Shared:
 
 
 def _owner_of(root: Path) -> str:
-    path = root / OWNER_FILE
-    if not path.exists():
-        root.mkdir(parents=True, exist_ok=True)
-        path.write_text(uuid.uuid4().hex[:12], encoding="utf-8")
-    return path.read_text(encoding="utf-8")
+    """Return the name of a run folder's driver: a killed one finds its leases again, a copied folder has another."""
+    root.mkdir(parents=True, exist_ok=True)
+    place, stat = str(root.resolve()), root.stat()
+    known = [platform.node(), uuid.getnode(), place, stat.st_dev, stat.st_ino]
+    return hashlib.sha256(json.dumps(known).encode()).hexdigest()[:12]

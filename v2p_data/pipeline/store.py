@@ -78,8 +78,14 @@ class Store:
 
     def read(self, key: str) -> bytes | None:
         """Return a file's content, None where there is no such file."""
+
+        def content() -> bytes:
+            if (path := self.folder / key).exists() and not path.is_file():
+                raise V2PError(f"{path} is no file; remove it and run the same command again")
+            return path.read_bytes()
+
         try:
-            return self._tried((self.folder / key).read_bytes)
+            return self._tried(content)
         except FileNotFoundError:
             return None
 
@@ -101,7 +107,15 @@ class Store:
             finally:
                 new.unlink(missing_ok=True)
 
-        self._tried(placed)
+        try:
+            self._tried(placed)
+        except OSError as error:
+            if (refusal := write_refusal(error)) is None:
+                raise
+            raise V2PError(
+                f"cannot write to the store {self.folder}: {refusal}; what is finished is kept in the run folder, and the"
+                " same command publishes it"
+            ) from error
 
     # --- results -------------------------------------------------------------------------------------------------
 
