@@ -161,7 +161,7 @@ def scene_stage(video: VideoItem, cfg: EngineConfig) -> Stage:
         item=video.item,
         config=recipe,
         sources={"video": file_digest(video.path)} | scene_data(),
-        version=5,
+        version=6,
         make=partial(make_scene, video=video),
     )
 

@@ -116,6 +116,111 @@ def test_where_the_rate_varies_time_decides(film):
     assert clip.source_frame[[0, 9, 14, 18, 19, 28]].tolist() == [0, 9, 9, 9, 10, 19]
 
 
+@pytest.mark.parametrize("gap_ms", [1700, 3000, 8000])
+def test_a_gap_of_seconds_is_no_stillness_and_is_named(film, gap_ms):
+    pts = [40 * i + gap_ms * (i >= 20) for i in range(40)]
+    path = film("gap.mkv", squares(40), codec="ffv1", pix_fmt="yuv444p", pts_ms=pts)
+
+    clip = read_clip(item(path))
+
+    assert clip.source_frame.tolist() == list(range(40))
+    assert clip.fps == pytest.approx(25, rel=0.01)
+    # picture 19 comes at 0.76 s
+    said = f"gap.mkv has no picture for {gap_ms / 1000:.1f} s in all, in 1 places, the last after 0.8 s"
+    assert [said in w for w in clip.warnings] == [True]
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [
+        ("a.ts", "libx265"),
+        ("a.mkv", "libx265"),
+        ("a.mp4", "libx265"),
+        ("b.ts", "libx264"),
+        ("a.mov", "mpeg4"),
+        ("a.webm", "libvpx-vp9"),
+        ("a.flv", "flv"),
+        ("a.mpg", "mpeg2video"),
+    ],
+)
+def test_pictures_before_the_first_whole_one_are_left_out_and_named(film, tmp_path, name, codec):
+    keys = "log-level=none:keyint=20:min-keyint=20:scenecut=0"
+    options = {"x265-params": keys} if codec == "libx265" else {"g": "20"}
+    whole = film(name, squares(60), codec=codec, options=options)
+    path, none = tmp_path / f"late{whole.suffix}", tmp_path / f"none{whole.suffix}"
+    for copy, packets in ((path, slice(7, None)), (none, slice(7, 18))):
+        with av.open(str(whole)) as source, av.open(str(copy), "w") as out:
+            stream = out.add_stream_from_template(source.streams.video[0])
+            for packet in [p for p in source.demux(video=0) if p.size][packets]:
+                packet.stream = stream
+                out.mux(packet)
+
+    clip = read_clip(item(path))
+
+    # frame 20 has the square at column 80
+    assert clip.total_frames == 40
+    assert np.flatnonzero(clip.frames[0, 48, :, 0] > 160)[0] == pytest.approx(80, abs=2)
+    assert ["begins between two key pictures" in w for w in clip.warnings] == [True]
+    assert reason_for(none) in ("unreadable", "truncated", "no_video_stream")
+
+
+RED = (191, 98, 98)
+"""255 times (0.5, 0.1, 0.1), light of BT.709, to the power of 1 / 2.4."""
+
+
+@pytest.mark.parametrize(
+    ("matrix", "primaries", "transfer", "signal", "shown"),
+    [
+        # BT.2408, table 1: reference white and a grey card of 26 cd/m2 of 203; 255 (26 / 203) ** (1 / 2.4) = 108
+        (9, 9, 16, (0.58, 0.58, 0.58), (255, 255, 255)),
+        (9, 9, 16, (0.38, 0.38, 0.38), (108, 108, 108)),
+        (9, 2, 16, (0.38, 0.38, 0.38), (108, 108, 108)),
+        (9, 9, 18, (0.75, 0.75, 0.75), (255, 255, 255)),
+        (9, 9, 18, (0.38, 0.38, 0.38), (108, 108, 108)),
+        # 0.627 * 0.5 + 0.329 * 0.1 + 0.043 * 0.1 = 0.351 and so on, to the power of 1 / 2.4
+        (9, 9, 14, (0.647, 0.424, 0.393), RED),
+        (1, 12, 1, (0.703, 0.404, 0.394), RED),
+        # 203 * (0.351, 0.128, 0.107) cd/m2, by the PQ curve of BT.2100
+        (9, 9, 16, (0.474, 0.380, 0.364), RED),
+        (9, 1, 14, (0.8, 0.3, 0.1), (204, 77, 26)),
+        (1, 1, 1, (0.8, 0.3, 0.1), (204, 77, 26)),
+        (5, 1, 6, (0.8, 0.3, 0.1), (204, 77, 26)),
+        (7, 7, 7, (0.8, 0.3, 0.1), (204, 77, 26)),
+        (2, 2, 2, (0.8, 0.3, 0.1), (204, 77, 26)),
+    ],
+)
+@pytest.mark.parametrize("color_range", [1, 2], ids=["16 to 235", "0 to 255"])
+def test_colours_are_those_of_a_plain_screen(
+    tmp_path, matrix, primaries, transfer, signal, shown, color_range
+):
+    weights = {1: (0.2126, 0.0722), 9: (0.2627, 0.0593), 7: (0.212, 0.087)}
+    red, blue = weights.get(matrix, (0.299, 0.114))
+    luma = np.dot(signal, [red, 1 - red - blue, blue])
+    chroma = (signal[2] - luma) / (2 - 2 * blue), (signal[0] - luma) / (2 - 2 * red)
+    low, steps, colour_steps = (16, 219, 224) if color_range == 1 else (0, 255, 255)
+    planes = [low + steps * luma, *(128 + colour_steps * c for c in chroma)]
+    pixels = np.broadcast_to(np.rint(256 * np.array(planes))[:, None, None], (3, 96, 128))
+    path = tmp_path / "clip.mkv"
+    with av.open(str(path), "w") as out:
+        stream: Any = out.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv444p16le"
+        said = stream.codec_context
+        said.colorspace, said.color_primaries = matrix, primaries
+        said.color_trc, said.color_range = transfer, color_range
+        for _ in range(10):
+            frame = av.VideoFrame(128, 96, "yuv444p16le")
+            for plane, values in zip(frame.planes, pixels.astype("<u2"), strict=True):
+                plane.update(np.ascontiguousarray(values))
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+
+    clip = read_clip(item(path))
+
+    assert clip.frames[5, 40, 60].tolist() == pytest.approx(shown, abs=3)
+    converted = transfer in (16, 18) or primaries in (9, 12)
+    assert ["converted to BT.709" in w for w in clip.warnings] == [True] * converted
+
+
 def test_large_pictures_are_scaled_to_even_sizes(film):
     path = film("large.mp4", squares(10, height=402, width=1000))
 
@@ -255,7 +360,8 @@ def test_a_last_picture_that_stays_for_long_is_no_missing_end(film):
     pts = [*(33 * i for i in range(30)), 5000]
     path = film("recording.mkv", squares(31), codec="ffv1", pix_fmt="yuv444p", pts_ms=pts)
 
-    assert read_clip(item(path)).warnings == ()
+    (said,) = read_clip(item(path)).warnings
+    assert "no picture for 4.0 s" in said
 
 
 def test_what_is_transparent_is_white(film):
@@ -476,7 +582,7 @@ def test_pictures_follow_one_another_where_the_clock_does_not(film, times_ms, ju
 
     assert clip.source_frame.tolist() == list(range(40))
     assert clip.fps == pytest.approx(25, rel=0.03)
-    assert [f"by {jump} s in all" in w for w in clip.warnings] == [True] * (jump > 0)
+    assert [f"no picture for {jump}.0 s in all" in w for w in clip.warnings] == [True] * (jump > 0)
 
 
 @pytest.mark.parametrize("name", ["a.mkv", "a.webm", "a.mp4", "a.ts"])

@@ -6,6 +6,7 @@ Bytes that are no usable video end in an `ItemRejectedError`, never in a crash o
 """
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,13 +19,13 @@ import av.error
 import av.logging
 import numpy as np
 from av.video.frame import VideoFrame
-from av.video.reformatter import Colorspace
 from av.video.stream import VideoStream
 from jaxtyping import Bool, Int, UInt8
 
 from v2p_data.errors import ItemRejectedError, V2PError
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.clip import Clip
+from v2p_data.video.colours import Colours
 from v2p_data.video.hints import check_hints, hints_in_clip
 from v2p_data.video.tracks import (
     Orientation,
@@ -43,8 +44,8 @@ _TRUNCATED = 0.8
 """Below this share of the promised frames a file counts as cut off."""
 _UNEVEN = 1.5
 """A gap longer than this many usual gaps makes a file one with varying frame rate."""
-_JUMP_S = 10.0
-"""No picture of a motion stays for longer: the clock jumped."""
+_JUMP_S = 1.5
+"""No picture of a motion stays for longer: pictures are missing, or the clock jumped."""
 _COMBED = 0.2
 """Of the pixels that change, the share that stands out from the rows above and below alike. At most 0.13 in 36 clips as
 they were filmed, at least 0.3 in the same clips with every second row from the next picture."""
@@ -144,8 +145,12 @@ class _Film:
 
     promise: Promise
     notes: tuple[str, ...]
-    """Sentences for a person about the choice of the stream."""
+    """Sentences for a person about the choice of the stream and its colours."""
     seen: int = 0
+    begins_s: float = math.inf
+    """When the first packet so far is shown that no edit list hides."""
+    headless_s: float = 0.0
+    """How long the file lasts before its first whole picture."""
     broken: int = 0
     """Packets that could not be decoded."""
     pixels: UInt8[np.ndarray, "room h w 3"] = field(
@@ -160,7 +165,9 @@ class _Film:
     """From the first frame to the last."""
     jumps: int = 0
     jumped_s: float = 0.0
-    """What the file's clock skipped; left out of the times."""
+    """How long there was no picture; left out of the times."""
+    jump_at_s: float = 0.0
+    """When the last of the jumps began."""
     shown_px: tuple[int, int] = (0, 0)
     changed_px: int = 0
     """Pixels in some columns of all kept pictures that differ from the picture before."""
@@ -180,7 +187,9 @@ class _Film:
         A last picture may be shown for long, and the rate may vary, so neither is enough by itself.
         """
         few = self.seen < _TRUNCATED * self.promise.frames
-        early = self.duration_s + self.jumped_s < _TRUNCATED * self.promise.seconds
+        early = (
+            self.headless_s + self.duration_s + self.jumped_s < _TRUNCATED * self.promise.seconds
+        )
         return few and (early or not self.promise.seconds)
 
     @property
@@ -245,18 +254,24 @@ def _demand_usable(film: _Film, name: str, cfg: VideoConfig) -> list[str]:
         if total < cfg.min_frames:
             raise ItemRejectedError("truncated", f"{detail}; copy it again", float(total))
         warnings.append(f"{detail}; the rest of the motion is missing")
+    elif film.headless_s and total >= cfg.min_frames:
+        warnings.append(
+            f"{name} begins between two key pictures: its first {film.headless_s:.2f} s hold no whole picture and are "
+            "left out"
+        )
     elif film.broken and total >= cfg.min_frames:
         warnings.append(f"{name} has {film.broken} damaged places; frames there may be missing")
     if film.jumps:
         warnings.append(
-            f"the clock of {name} jumps in {film.jumps} places, by {film.jumped_s:.0f} s in all; its pictures are "
-            "taken to follow one another"
+            f"{name} has no picture for {film.jumped_s:.1f} s in all, in {film.jumps} places, the last after "
+            f"{film.jump_at_s:.1f} s; what moved meanwhile is not seen, and its pictures are taken to follow one "
+            "another"
         )
     if total < cfg.min_frames:
         if film.broken:
             raise ItemRejectedError(
                 "unreadable",
-                f"{name} is damaged: only {total} frames can be decoded",
+                f"{name} is damaged: only {total} frames can be decoded; copy it again, from a key picture on",
                 float(total),
             )
         raise ItemRejectedError(
@@ -340,6 +355,7 @@ def _film_of(container: "av.container.InputContainer", path: Path, cfg: VideoCon
         if picture is None:
             picture = _Picture.of(path, frame, stream, cfg)
             film.shown_px = picture.shown_px
+            film.notes += (f"{path.name} {picture.colours.note}",) if picture.colours.note else ()
         picture.check_shape(path, frame, seen_s)
         if film.times_s and seen_s - film.times_s[-1] < 0.75 * step:
             del frame
@@ -370,7 +386,7 @@ def _timed_frames(
     """Yield every frame with its time from the first; count them, and the packets that fail, in `film`."""
     deadline = time.thread_time() + cfg.max_decode_s
     start: float | None = None
-    last, gap = 0.0, 1 / rate
+    last, gap, begun = 0.0, 1 / rate, False
     for packet in _packets(container, stream, film):
         if time.thread_time() > deadline:
             raise ItemRejectedError(
@@ -383,13 +399,21 @@ def _timed_frames(
         except (av.error.FFmpegError, ValueError, MemoryError):
             film.broken += 1
             continue
+        begun = begun or (packet.is_keyframe and packet.is_discard)  # an edit list hides it
         # a picture of 8K takes 50 to 100 MB: none is held while the next one is decoded
         while frames:
             frame = frames.pop(0)
-            if not isinstance(frame, VideoFrame) or is_before_start(container, frame):
+            if not isinstance(frame, VideoFrame):
+                continue
+            begun = begun or bool(frame.key_frame)
+            if is_before_start(container, frame):
+                continue
+            if not begun:
+                film.broken += 1
                 continue
             if start is None:
                 start = frame.time or 0.0
+                film.headless_s = max(0.0, start - film.begins_s)
             else:
                 shown = last if frame.time is None else frame.time - start
                 if shown <= last:  # no time, the same one again, or an earlier one
@@ -397,6 +421,7 @@ def _timed_frames(
                 elif shown - last > _JUMP_S + gap:
                     film.jumps += 1
                     film.jumped_s += shown - last - gap
+                    film.jump_at_s = last
                     start += shown - last - gap
                     last += gap
                 else:  # a jump makes the container's mean rate too low
@@ -411,7 +436,10 @@ def _packets(
     container: "av.container.InputContainer", stream: VideoStream, film: _Film
 ) -> Iterator["av.Packet"]:
     try:
-        yield from container.demux(stream)
+        for packet in container.demux(stream):
+            if packet.pts is not None:
+                film.begins_s = min(film.begins_s, max(0.0, float(packet.pts * packet.time_base)))
+            yield packet
     except (av.error.FFmpegError, ValueError, MemoryError):
         film.broken += 1
 
@@ -425,6 +453,7 @@ class _Picture:
     height_px: int
     orientation: Orientation
     """Applied after scaling."""
+    colours: Colours
     shown_px: tuple[int, int]
 
     @staticmethod
@@ -441,6 +470,7 @@ class _Picture:
             width_px=max(2, 2 * round(width * scale / 2)),
             height_px=max(2, 2 * round(height * scale / 2)),
             orientation=orientation,
+            colours=Colours.of(frame, stream),
             shown_px=(shown[1], shown[0]) if orientation.swaps_axes else shown,
         )
 
@@ -467,10 +497,12 @@ class _Picture:
         scaled = frame.reformat(
             width=self.width_px,
             height=self.height_px,
-            format="rgba" if alpha else "rgb24",
-            src_colorspace=Colorspace.ITU709 if frame.colorspace == Colorspace.ITU709 else None,
+            format="rgba" if alpha else "rgb24" if self.colours.is_plain else "rgb48le",
             interpolation="BICUBIC" if same else "AREA",
+            **self.colours.reformat,
         ).to_ndarray()
+        if not alpha and not self.colours.is_plain:
+            scaled = self.colours.on_screen(scaled)
         if alpha:
             opacity = scaled[..., 3:].astype(np.uint16)
             white = 255 * (255 - opacity)
