@@ -3,15 +3,13 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from types import ModuleType
 from typing import Literal
 
 import tyro
 
 from v2p_data.cli import parse
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends import hands_setup, mobile_sam_setup
+from v2p_data.scene.backends import mobile_sam_setup
 from v2p_data.scene.config import SceneConfig
 from v2p_data.scene.preset import (
     UNWANTED_FILES,
@@ -24,24 +22,20 @@ from v2p_data.scene.preset import (
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    model: tyro.conf.Positional[Literal["hands", "outlines", "learned"] | None] = None
-    """Which to set up: MediaPipe finds hands, MobileSAM outlines objects, `learned` are the models of
+    model: tyro.conf.Positional[Literal["outlines", "learned"] | None] = None
+    """Which to set up: MobileSAM outlines objects, `learned` are the models of
     --scene.preset=learned. What is there already is kept. Without a name all are listed."""
 
 
 def setup_command(argv: list[str]) -> int:
     args = parse(Setup, argv, "setup")
     learned = SceneConfig(preset="learned")
-    if args.model == "hands":
-        hands_setup.set_up_hands(_say)
-    elif args.model == "outlines":
+    if args.model == "outlines":
         mobile_sam_setup.set_up_mobile_sam(_say)
     elif args.model == "learned":
         fetch_preset(learned)
-    hands = hands_setup.hands_folder() if hands_setup.installed_worker() else None
     models = checkpoints_of(with_preset(learned))
     absent = missing(models)
-    print(f"hands     MediaPipe; {_place(hands_setup, hands)}")  # noqa: T201
     print(f"outlines  MobileSAM; {_outlines()}")  # noqa: T201
     state = f"missing: {named_with_sizes(absent)}" if absent else "all are here"
     print(f"learned   {named_with_sizes(models)}; {state}")  # noqa: T201
@@ -84,12 +78,8 @@ def _outlines() -> str:
         return (
             f"in {weights}, but transformers is missing: pip install 'lerobot_policy_v2p[learned]'"
         )
-    return _place(mobile_sam_setup, weights)
-
-
-def _place(model: ModuleType, place: Path | None) -> str:
-    size = f"{model.DOWNLOAD_MB} MB to download, {model.DISK_MB} MB on disk"
-    return f"set up in {place}" if place else f"not set up ({size})"
+    size = f"{mobile_sam_setup.DOWNLOAD_MB} MB to download, {mobile_sam_setup.DISK_MB} MB on disk"
+    return f"set up in {weights}" if weights else f"not set up ({size})"
 
 
 def _say(words: str) -> None:

@@ -15,7 +15,6 @@ from v2p_data.kinds import KINDS, Kind
 from v2p_data.scene.data_types import Cue, GroundedObjects, ObjectTrack, PlacedObject, Placement
 from v2p_data.scene.fitting.placement import vote_of
 from v2p_data.scene.frames.colour import balance, colour_match, named_colours
-from v2p_data.scene.frames.hand_track import contact_share
 from v2p_data.scene.frames.mask_ops import attainable_iou, grow
 from v2p_data.scene.grounding.ground_objects import EXACT_GAP_PX, seen_on_table
 from v2p_data.scene.scale.camera_height import disagreement, height_plausibility
@@ -23,8 +22,6 @@ from v2p_data.scene.scale.nouns import is_clear
 
 _COLOURED = 0.25
 """Share of a thing's pixels that need its colour: few things are one colour all over."""
-_AWAY_PX = 4.0
-"""An object so far from both its ends moves, in a picture 320 px wide."""
 _OUT_OF_SIGHT = 0.8
 """Confidence in an object that nobody sees at one end: in a bin, in a fist, or on the table before a hand brings it."""
 _IN_THE_AIR = 0.6
@@ -54,7 +51,7 @@ def _object_cues(
     s: ObjectTrack,
     placed: PlacedObject,
 ) -> Iterator[Cue]:
-    """Yield the cues of one object: found, outlined, touched, sized, placed at the start and the end."""
+    """Yield the cues of one object: found, outlined, sized, placed at the start and the end."""
     which = f"'{s.phrase}'"
     box = "" if s.hinted else f"mark {which} with a box"
     yield _cue("grounding", f"finding {which}" + (f" ({s.why})" if s.why else ""), s.sure, box)
@@ -66,9 +63,6 @@ def _object_cues(
     if s.moves:
         track = f"track of {which} from start to end"
         yield _cue("segmentation", track, 0.8 + 0.7 * s.agreement, box)
-    touched = _touched_share(grounded) if s is grounded.objects[0] else None
-    if touched is not None:
-        yield _cue("grounding", f"a hand at {which} while it moves", 0.4 + 2 * touched, box)
     off = abs(disagreement(vote_of(s, placed.first), placement.height_m))
     value = np.exp(-0.5 * (max(0.0, off - 2.0) / 2.0) ** 2)
     advice = "" if s.known_m else f"measure {which} and give its size_m"
@@ -120,25 +114,6 @@ def _scene_cues(grounded: GroundedObjects, placement: Placement, kind: Kind) -> 
     if kind == "generic":
         advice = "say what happens with a verb of a known kind of task"
         yield _cue("grounding", "understanding the caption", 0.85, advice)
-
-
-def _touched_share(grounded: GroundedObjects) -> float | None:
-    """Return in which share of its moving frames a fingertip is at the manipulated object.
-
-    None where nobody knows, or a tool moves it.
-    """
-    thing, hands = grounded.objects[0], grounded.working.hands
-    by_tool = any(s.role == "tool" for s in grounded.objects)
-    if hands is None or by_tool or thing.hinted:
-        return None
-    spots = {i: np.argwhere(mask).mean(0) for i, mask in enumerate(thing.masks) if mask.any()}
-    ends = [np.argwhere(mask).mean(0) for mask in (thing.first, thing.last) if mask.any()]
-    moving = [
-        i
-        for i, spot in spots.items()
-        if all(np.linalg.norm(spot - end) > _AWAY_PX for end in ends)
-    ]
-    return contact_share(hands, thing.masks, np.array(moving, int))
 
 
 def _seen_on_table(grounded: GroundedObjects) -> float:

@@ -6,7 +6,6 @@ from typing import Literal
 from v2p_data.scene.backends.config import (
     DepthConfig,
     GroundConfig,
-    HandsConfig,
     MeshConfig,
     OutlineConfig,
     PoseConfig,
@@ -49,7 +48,6 @@ class SceneConfig:
     """Poses kept per object, the first and last among them."""
     ground: GroundConfig = field(default_factory=GroundConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
-    hands: HandsConfig = field(default_factory=HandsConfig)
     outline: OutlineConfig = field(default_factory=OutlineConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)

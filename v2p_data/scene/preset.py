@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from v2p_data.scene.backends.config import DEFAULT_MODELS, OutlineConfig
-from v2p_data.scene.backends.hands_setup import installed_worker
 from v2p_data.scene.backends.mobile_sam_setup import installed_weights, transformers_is_there
 from v2p_data.scene.config import SceneConfig
 
@@ -79,13 +78,9 @@ def with_preset(cfg: SceneConfig, memory_gb: Callable[[], float] = gpu_memory_gb
         cfg: settings; a stage with a backend of its own keeps it.
         memory_gb: of the GPU, asked only where the preset is `learned`.
     """
-    found = {
-        "hands": "mediapipe" if installed_worker() else "none",
-        "outline": "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none",
-    }
-    for stage, backend in found.items():
-        if getattr(cfg, stage).backend == "auto":
-            cfg = replace(cfg, **{stage: replace(getattr(cfg, stage), backend=backend)})
+    if cfg.outline.backend == "auto":
+        here = "mobile_sam" if mobile_sam_is_here(cfg.outline) else "none"
+        cfg = replace(cfg, outline=replace(cfg.outline, backend=here))
     if cfg.preset != "learned":
         return cfg
     memory = memory_gb()

@@ -27,7 +27,7 @@ from v2p_data.scene.fitting.metric import clip_camera
 from v2p_data.scene.fitting.placement import place
 from v2p_data.scene.fitting.start_place import with_start_place
 from v2p_data.scene.frames.prepare import PreparedClip, prepare
-from v2p_data.scene.grounding.by_model import outliner_of, segmented, track_hands
+from v2p_data.scene.grounding.by_model import outliner_of, segmented
 from v2p_data.scene.grounding.ground_objects import (
     ground_brought,
     ground_objects,
@@ -78,9 +78,8 @@ def prepared_for(clip: Clip, cfg: SceneConfig) -> PreparedClip:
         clip,
         max_camera_shift_px=cfg.max_camera_shift_px,
     )
-    hands = track_hands(prepared.clip, prepared.working, cfg.hands)
     outliner = outliner_of(prepared.clip, prepared.working, cfg.outline)
-    working = replace(prepared.working, hands=hands, outliner=outliner)
+    working = replace(prepared.working, outliner=outliner)
     return replace(prepared, working=working)
 
 

@@ -4,7 +4,6 @@ import numpy as np
 
 from v2p_data.kinds import Kind
 from v2p_data.scene.data_types import GroundedObjects, Placement
-from v2p_data.scene.frames.hand_track import people_face
 
 _CLOSE_RIVAL = 0.02
 """IoU: where the next best face down covers the outlines no worse than this, the choice was as good as drawn by lot."""
@@ -41,12 +40,6 @@ def remarks_on(
             f"a hand brings '{grounded.objects[0].phrase}': nothing shows it on the table at "
             "first; its first pose is a place that was chosen, "
             f"{100 * np.linalg.norm(way_m):.0f} cm from where it ends"
-        )
-    if people_face(grounded.working.hands):
-        out.append(
-            "hands reach in from opposite sides at once, as of two people: only one object's "
-            "motion is understood, and another person's hand may "
-            "have moved it; film one person"
         )
     last_frame = int(grounded.working.frame_idx[thing.last_i])
     if kind == "lift_up":

@@ -18,7 +18,6 @@ from v2p_data.scene.backends.checkpoint import load_checkpoint
 from v2p_data.scene.backends.config import (
     DepthConfig,
     GroundConfig,
-    HandsConfig,
     OutlineConfig,
     SegmentConfig,
 )
@@ -76,7 +75,6 @@ def test_without_the_preset_nothing_changes_and_the_machine_is_not_asked():
         raise AssertionError
 
     without_models = SceneConfig(
-        hands=HandsConfig(backend="none"),
         outline=OutlineConfig(backend="none"),
     )
     assert with_preset(SceneConfig(), machine) == without_models

@@ -8,7 +8,6 @@ import pytest
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene import reconstruct as steps
 from v2p_data.scene.config import SceneConfig
-from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.mask_ops import iou
 from v2p_data.scene.grounding.ground_objects import ground_objects
 from v2p_data.scene.grounding.mirror_image import (
@@ -64,18 +63,6 @@ def test_objects_table_and_probabilities_of_the_mirror_image_are_turned_back(pre
     assert iou(straight.table.hull, turned.table.hull) > 0.9
     assert np.abs(straight.segmentation.shares - turned.segmentation.shares).mean() < 0.05
     np.testing.assert_array_equal(turned.working.rgb, prepared.working.rgb)
-
-
-def test_hands_are_mirrored_with_the_picture(prepared):
-    width = prepared.working.shape[1]
-    hand = np.full((1, 21, 2), (30.0, 50.0))
-    hands = HandTrack(at=np.array([0]), px=hand, metres=np.ones((1, 21, 3)), num_sampled=1)
-    known = replace(prepared, working=replace(prepared.working, hands=hands))
-
-    seen = mirrored_clip(known).working.hands
-
-    np.testing.assert_allclose(seen.px[0, 0], [width - 30.0, 50.0])
-    np.testing.assert_allclose(seen.metres[0, 0], [-1.0, 1.0, 1.0])
 
 
 def test_what_was_not_found_as_filmed_is_searched_in_the_mirror_image(prepared, searches):

@@ -1,6 +1,6 @@
 """Learned models for the stages of reconstruction, one option each.
 
-Detector, tracker, depth, mesh and pose are off by default. Hands and outlines are used where they are set up.
+Detector, tracker, depth, mesh and pose are off by default. Outlines are used where they are set up.
 
 Comes in: RGB pictures (uint8, `h w 3`) and phrases, boxes or masks in pixels of these pictures. Goes out: boxes
 (`detect`), mask tracks (`segment`), metric depth and the table plane under it (`depth`), or what a model in an
@@ -9,8 +9,6 @@ worker's request and result, in a temporary folder. Only `config` may be importe
 transformers when they are called, not before. Default checkpoints, licences and memory are in `docs/backends.md`.
 
 Reading order: config, checkpoint (how a model is loaded), detect, segment, depth, worker,
-    pinned_packages (how what is set up beside
-ours is installed), hands_setup (the environment of the hands worker), hands_worker (that worker;
-it runs there and imports nothing of ours), outlines (prompts and masks), mobile_sam_setup (its
+    pinned_packages (how what is set up beside ours is installed), outlines (prompts and masks), mobile_sam_setup (its
 weights), mobile_sam, tiny_vit (its encoder).
 """

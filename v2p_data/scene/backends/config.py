@@ -8,7 +8,6 @@ from typing import Literal
 type DType = Literal["float32", "float16", "bfloat16"]
 type GroundBackend = Literal["network", "grounding_dino", "worker"]
 type SegmentBackend = Literal["flow", "sam2", "worker"]
-type HandsBackend = Literal["auto", "none", "mediapipe", "worker"]
 type OutlineBackend = Literal["auto", "none", "mobile_sam"]
 type DepthBackend = Literal["none", "depth_anything", "worker"]
 
@@ -102,22 +101,6 @@ class DepthConfig:
 
     def __post_init__(self) -> None:
         _check_model(self.device, self.batch_size)
-        _check_worker(self.worker, self.worker_timeout_s, needed=self.backend == "worker")
-
-
-@dataclass(frozen=True, kw_only=True)
-class HandsConfig:
-    """Who finds hands and their landmarks, which say what a hand takes, carries and puts down."""
-
-    backend: HandsBackend = "auto"
-    """`mediapipe` needs 'v2p setup hands' once; `auto` takes it where that was done; `worker` asks
-    a process of yours."""
-    worker: str = ""
-    """Command line of a worker (`docs/workers.md`); with `backend=worker` only."""
-    worker_timeout_s: float = 600.0
-    """After this the worker's whole process group is killed."""
-
-    def __post_init__(self) -> None:
         _check_worker(self.worker, self.worker_timeout_s, needed=self.backend == "worker")
 
 

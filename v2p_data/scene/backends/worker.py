@@ -43,7 +43,7 @@ _MAX_FACES = 2_000_000
 _TAIL = 2000
 _POLL_S = 0.05
 
-type Kind = Literal["mesh", "depth", "pose", "segment", "ground", "hands"]
+type Kind = Literal["mesh", "depth", "pose", "segment", "ground"]
 type Repair = Literal["none", "holes_filled", "convex_hull"]
 
 
@@ -131,18 +131,6 @@ CONTRACTS: dict[str, _Contract] = {
             "phrase_idx": Array(dims=("k",), dtype="int", low=0.0),
         },
         given_fields={"phrases": list},
-        answer_fields={},
-    ),
-    "hands": _Contract(
-        given={"images": _IMAGES},
-        answer={
-            "image_idx": Array(dims=("k",), dtype="int", low=0.0),
-            "landmarks_px": Array(dims=("k", 21, 2), dtype="float", low=-1e5, high=1e5),
-            "landmarks_m": Array(dims=("k", 21, 3), dtype="float", low=-1.0, high=1.0),
-            "scores": Array(dims=("k",), dtype="float", low=0.0, high=1.0),
-            "is_right": Array(dims=("k",), dtype="bool"),
-        },
-        given_fields={},
         answer_fields={},
     ),
 }

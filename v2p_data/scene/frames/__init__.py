@@ -5,6 +5,5 @@ colour, and the network's class probabilities for every frame (`Segmentation`).
 
 Reading order: working_clip, stabilise with camera_motion and edge_fit (a camera that sways),
 colour, table, mask_ops (outlines and small helpers on masks), classes,
-network, segmentation (the network over a whole clip), hand (where a hand ends),
-hand_track (fingertips over a clip).
+network, segmentation (the network over a whole clip), hand (where a hand ends).
 """

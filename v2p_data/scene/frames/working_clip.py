@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from v2p_data.scene.frames.colour import histogram, lab_distance, lab_of
-from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.video.clip import Clip
 
@@ -47,8 +46,6 @@ class WorkingClip:
     """Colour histogram of the hand; zeros until the network has seen it."""
     rest_hist: Float[np.ndarray, "l a b"] = field(repr=False)
     """Colour histogram of what does not move."""
-    hands: HandTrack | None = None
-    """Where a model that knows hands was asked."""
     outliner: Outliner | None = None
     """Where a model that outlines objects was asked for."""
 

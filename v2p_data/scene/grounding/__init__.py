@@ -14,7 +14,6 @@ Reading order:
     outlines            an outline is corrected
     tracking, mask_follower             a mask is carried through the clip
     brought, mirror_image               a search backwards in time, and one in the mirror image
-    handled             where a hand takes an object and puts it down
     marked_table        a person's mark on the bare table
-    by_model            learned models of hands, outlines and masks
+    by_model            learned models of outlines and masks
 """

@@ -1,4 +1,4 @@
-"""Learned models beside the detectors: hands, outlines, and masks carried through the clip.
+"""Learned models beside the detectors: outlines, and masks carried through the clip.
 
 Each function is for one setting and leaves everything else as it is.
 """
@@ -11,49 +11,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.config import HandsConfig, OutlineConfig, SegmentConfig
-from v2p_data.scene.backends.hands_setup import installed_worker
+from v2p_data.scene.backends.config import OutlineConfig, SegmentConfig
 from v2p_data.scene.backends.mobile_sam_setup import installed_weights
-from v2p_data.scene.backends.worker import WorkerRequest, run_worker
 from v2p_data.scene.data_types import ObjectTrack
-from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.outliner import Outliner
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.video.clip import Clip
-
-MOST_FRAMES = 75
-"""Frames of a clip that the model sees: at 40 ms each it takes 3 s."""
-
-
-def track_hands(clip: Clip, working: WorkingClip, cfg: HandsConfig) -> HandTrack | None:
-    """Return the clip's hands; None without a model.
-
-    Raises:
-        V2PError: `mediapipe` is asked for but was not set up, or the worker fails.
-    """
-    command = cfg.worker
-    if cfg.backend in ("auto", "mediapipe"):
-        command = installed_worker()
-        if not command and cfg.backend == "mediapipe":
-            raise V2PError(
-                "scene.hands.backend is 'mediapipe', which was not set up here; run 'v2p setup "
-                "hands', or leave the option out"
-            )
-    if cfg.backend == "none" or not command:
-        return None
-    n = len(working.rgb)
-    picks = np.unique(np.linspace(0, n - 1, min(n, MOST_FRAMES)).round().astype(int))
-    images = clip.frames[working.frame_idx[picks]]
-    answer = run_worker(
-        command, WorkerRequest(kind="hands", arrays={"images": images}), cfg.worker_timeout_s
-    ).arrays
-    order = np.argsort(answer["image_idx"], kind="stable")
-    return HandTrack(
-        at=picks[answer["image_idx"][order]],
-        px=answer["landmarks_px"][order].astype(float) * working.px_scale,
-        metres=answer["landmarks_m"][order].astype(float),
-        num_sampled=len(picks),
-    )
 
 
 def outliner_of(clip: Clip, working: WorkingClip, cfg: OutlineConfig) -> Outliner | None:

@@ -322,13 +322,13 @@ def _unseen_object(clip: Clip, phrase: str, role: Role) -> ObjectTrack:
 
 
 def check_hand(clip: Clip, working: WorkingClip, segmentation: Segmentation) -> None:
-    """Turn away a clip in which neither our network nor a model that knows hands sees one.
+    """Turn away a clip in which our network sees no hand.
 
     Raises:
         ItemRejectedError: `no_hand`, with the share of the picture that a hand covers at most.
     """
     most = float((segmentation.shares[:, HAND] > 0.5).mean((1, 2)).max())
-    if most < _LEAST_HAND and not (working.hands and working.hands.is_seen):
+    if most < _LEAST_HAND:
         where = clip.item if clip.crop is None else f"the part of {clip.item} that was taken"
         raise ItemRejectedError(
             "no_hand",

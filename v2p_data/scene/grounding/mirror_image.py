@@ -13,7 +13,6 @@ import numpy as np
 
 from v2p_data.kinds import Kind
 from v2p_data.scene.data_types import GroundedObjects
-from v2p_data.scene.frames.hand_track import HandTrack
 from v2p_data.scene.frames.prepare import PreparedClip
 from v2p_data.scene.frames.segmentation import Segmentation, segment_clip
 from v2p_data.scene.frames.table import Table
@@ -73,7 +72,6 @@ def _mirrored_pictures[T: np.generic](pictures: "np.ndarray[tuple[int, ...], np.
 
 
 def _mirrored_working(working: WorkingClip) -> WorkingClip:
-    hands = working.hands
     return replace(
         working,
         rgb=_mirrored_pictures(working.rgb),
@@ -81,16 +79,8 @@ def _mirrored_working(working: WorkingClip) -> WorkingClip:
         early=_mirrored_pictures(working.early),
         late=_mirrored_pictures(working.late),
         always=_mirrored_pictures(working.always),
-        hands=None if hands is None else _mirrored_hands(hands, working.shape[1]),
         outliner=None,
     )
-
-
-def _mirrored_hands(hands: HandTrack, width_px: int) -> HandTrack:
-    px, metres = hands.px.copy(), hands.metres.copy()
-    px[..., 0] = width_px - px[..., 0]
-    metres[..., 0] *= -1
-    return replace(hands, px=px, metres=metres)
 
 
 def _mirrored_table(table: Table) -> Table:

@@ -5,7 +5,7 @@ they fit the caption and each other; the product of the cues, 0 to 1, is the sco
 cue is its reason.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -36,7 +36,6 @@ from v2p_data.scene.frames.mask_ops import (
 from v2p_data.scene.frames.segmentation import LEAST_SHARE, Segmentation, hand_at
 from v2p_data.scene.frames.working_clip import WorkingClip
 from v2p_data.scene.grounding.candidates import Candidate, Moved, connected_parts
-from v2p_data.scene.grounding.handled import handling_in
 from v2p_data.scene.grounding.model_outlines import outlines_around
 
 _LIKELY, _POSSIBLE = 0.5, 0.25
@@ -124,13 +123,6 @@ def find_moved_by_network(
         starts, stops = (
             [_alike(blob, given.colour_hist) for blob in ends] for ends in (starts, stops)
         )
-    handling = None if tool else handling_in(working.hands, segmentation)
-    if handling is not None:
-        starts = _by_hand(starts, "taken by a hand", handling.taken_from)
-        if (
-            KINDS[kind].family == "carry"
-        ):  # pushed, tipped and thrown objects move on by themselves
-            stops = _by_hand(stops, "put down by a hand", handling.put_at)
     if starts and not stops and KINDS[kind].hides:
         stops = _last_seen(working, segmentation, phrase, starts[0].area)
     stops = [_hidden_end(blob, KINDS[kind].end_weight) for blob in stops]
@@ -179,8 +171,6 @@ def find_brought_by_network(
         given: its last outline, where a person marked it.
     """
     stops = _ends(working, segmentation, phrase, len(working.rgb) - 1, given)
-    if handling := handling_in(working.hands, segmentation):
-        stops = _by_hand(stops, "put down by a hand", handling.put_at)
     if not stops:
         return None
     best = stops[0]
@@ -331,16 +321,6 @@ def _last_seen(
         if any(blob.area > area / 2 for blob in _ends(quick, segmentation, phrase, i, None)):
             return _ends(working, segmentation, phrase, i, None)
     return []
-
-
-def _by_hand(
-    blobs: list[_Blob], what: str, weight: Callable[[Bool[np.ndarray, "h w"]], float]
-) -> list[_Blob]:
-    """Return blobs weighed by what hands do there, the best one first; what a person marked is left alone."""
-    weighed = [
-        blob if "given" in blob.cues else blob.weighed(what, weight(blob.mask)) for blob in blobs
-    ]
-    return sorted(weighed, key=lambda blob: -blob.rating)
 
 
 def _hidden_end(blob: _Blob, weight: float) -> _Blob:
