@@ -1,11 +1,12 @@
 """The Gymnasium environment of one task, and the same as a LeRobot environment."""
 
+import multiprocessing
 import subprocess
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
-import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -271,17 +272,22 @@ def test_lerobot_gets_one_environment_per_task_and_finished_ones_stand_still(
         env.close()
 
 
-@pytest.mark.slow
-def test_environments_can_be_sent_to_processes_of_their_own(write_task, tmp_path):
-    """Starting those processes takes a minute of imports, so only what is sent to them is tried."""
-    from v2p_data.sim.wrappers.lerobot_env import environment_maker
+@pytest.mark.long
+def test_environments_run_in_processes_of_their_own_however_long_the_temporary_folder_is(
+    write_task, tmp_path, monkeypatch
+):
+    from v2p_data.sim.wrappers.lerobot_env import V2PEnvConfig
 
-    sent = cloudpickle.dumps(environment_maker(write_task(tmp_path / "lift"), {"size_px": 64}))
+    far = tmp_path / ("x" * 120)
+    far.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(far))
+    monkeypatch.setitem(multiprocessing.process.current_process()._config, "tempdir", str(far))
+    write_task(tmp_path / "tasks" / "lift")
 
-    made = cloudpickle.loads(sent)()
+    envs = V2PEnvConfig(tasks=str(tmp_path / "tasks")).create_envs(2, use_async_envs=True)
 
-    assert made.reset(seed=0)[0]["pixels"]["mask"].shape == (64, 64, 3)
-    made.close()
+    assert envs["v2p"][0].reset(seed=[0, 1])[0]["pixels"]["mask"].shape[0] == 2
+    envs["v2p"][0].close()
 
 
 @pytest.mark.slow

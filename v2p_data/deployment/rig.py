@@ -136,8 +136,8 @@ class Rig:
             )
         state = _finite({name: seen[name] for name in STATE_NAMES})
         picture, mask = (
-            bytes_of(seen.get(RGB_NAME), RGB_NAME),
-            bytes_of(seen.get(MASK_NAME), MASK_NAME),
+            None if seen.get(name) is None else bytes_of(seen[name], name)
+            for name in (RGB_NAME, MASK_NAME)
         )
         joints, opening = None, float(state[6])
         if picture is not None:

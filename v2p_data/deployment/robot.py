@@ -63,14 +63,12 @@ def fingers_m(opening: float) -> float:
     return float(np.clip(opening, 0.0, 1.0)) * FINGER_TRAVEL_M
 
 
-def bytes_of(image: Any, name: str, num_channels: tuple[int, ...] = (3,)) -> np.ndarray | None:
-    """Return an image that a robot gives, None where it gives none.
+def bytes_of(image: Any, name: str, num_channels: tuple[int, ...] = (3,)) -> np.ndarray:
+    """Return an image that a robot gives.
 
     Raises:
         V2PError: its values are no bytes: black and white of 0 to 1 would both be read as black.
     """
-    if image is None:
-        return None
     found = np.asarray(image)
     if (
         found.dtype != np.uint8

@@ -188,17 +188,6 @@ def provenance() -> dict[str, Any]:
 
     The command line is as it can be shown to others; `own_command` is the one that was typed.
     """
-    try:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            timeout=5,
-            check=True,
-        ).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        commit = ""
     versions: dict[str, str] = {}
     for package in PACKAGES:
         try:
@@ -206,13 +195,24 @@ def provenance() -> dict[str, Any]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return {
-        "commit": commit,
+        "commit": commit_of(Path(__file__).parents[2]),
         "argv": without_places(own_command()),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "packages": versions,
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
+
+
+def commit_of(root: Path) -> str:
+    """Return the commit of the repository at `root`; empty where it holds no code of ours, or lies further up."""
+    ours = Path(*Path(__file__).parts[-3:]).as_posix()
+    command = ["git", "--git-dir", str(root / ".git"), "rev-parse", "HEAD", f"HEAD:{ours}"]
+    try:
+        said = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return said.stdout.split()[0]
 
 
 def own_command() -> list[str]:

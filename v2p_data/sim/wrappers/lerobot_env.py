@@ -171,5 +171,6 @@ def _vector_env(
     makers = [environment_maker(folder, gym_kwargs)] * n_envs
     mode = gym.vector.AutoresetMode.SAME_STEP
     if use_async_envs and n_envs > 1:
-        return gym.vector.AsyncVectorEnv(makers, context="forkserver", autoreset_mode=mode)
+        # A fork server listens at a path below TMPDIR, of 108 bytes at most.
+        return gym.vector.AsyncVectorEnv(makers, context="spawn", autoreset_mode=mode)
     return gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
