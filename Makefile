@@ -23,7 +23,7 @@ test-long: $(STAMP)
 	@OMP_NUM_THREADS=1 $(PY) -m pytest -q -m long
 
 test-fast: $(STAMP)
-	@$(PY) -m pytest -q -m "not slow and not gpu and not live_llm"
+	@$(PY) -m pytest -q -m "not slow and not long and not gpu and not live_llm"
 
 check: $(STAMP)
 	@$(VENV)/bin/ruff check --no-cache .  # a cached verdict is stale when a module moves

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_simulators_benchmark_ends_with_the_share_of_the_physics_speed():
     tiny = ["--worlds=8", "--threads=1", "--steps=2", "--turns=3", "--warmup-steps=2"]
     command = [sys.executable, "scripts/bench_sim.py", "--quick", *tiny]
@@ -22,7 +22,7 @@ def test_the_simulators_benchmark_ends_with_the_share_of_the_physics_speed():
     assert 0 < float(found[1]) < 1  # Python costs something, and with eight worlds a lot
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_masks_benchmark_ends_with_the_ratio_and_shows_that_both_agree():
     tiny = ["--scenes=1", "--turns=1", "--size-px=64"]
     command = [sys.executable, "scripts/bench_masks.py", "--quick", *tiny]
@@ -55,7 +55,7 @@ def episodes_benchmark(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, s
     return printed.read_text(), classes
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_episodes_benchmark_finds_every_pixel_equal_and_ends_with_its_ratio(
     episodes_benchmark,
 ):
@@ -67,7 +67,7 @@ def test_the_episodes_benchmark_finds_every_pixel_equal_and_ends_with_its_ratio(
     assert float(found[1]) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(
     not hasattr(os, "sched_getscheduler") or os.geteuid() != 0,
     reason="only root on Linux is put into a real-time class by SVT-AV1",

@@ -103,7 +103,6 @@ def content(out: Path) -> dict[str, str]:
 
 
 @pytest.mark.long
-@pytest.mark.slow
 @pytest.mark.e2e
 @pytest.mark.timeout(900)
 def test_a_run_killed_in_every_stage_ends_in_the_dataset_of_an_undisturbed_one(
@@ -131,7 +130,6 @@ def test_a_run_killed_in_every_stage_ends_in_the_dataset_of_an_undisturbed_one(
 
 
 @pytest.mark.long
-@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_notebook_runs_on_a_run_of_one_clip(calm: Path, tmp_path: Path):
     notebook = json.loads((ROOT / "docs" / "quickstart.ipynb").read_text())
@@ -145,7 +143,7 @@ def test_the_notebook_runs_on_a_run_of_one_clip(calm: Path, tmp_path: Path):
     assert re.search(r"expert of .* \(\d+ of 16\)", said)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_blocks_of_the_api_page_run_one_after_the_other(tmp_path: Path):
     page = (ROOT / "docs" / "python_api.md").read_text()
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.S | re.M)

@@ -101,6 +101,7 @@ def test_the_demo_needs_a_clone_and_says_so(v2p: Path, tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_a_video_becomes_a_scene_a_task_and_a_page_without_a_clone(v2p: Path, tmp_path: Path):
     name = "tip_green_carton.mp4"
     caption = json.loads((SAMPLES / "captions.json").read_text())[name]

@@ -38,7 +38,7 @@ def only(root: Path, pattern: str) -> Path:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.e2e
 def test_worker_processes_distil_and_pack_and_the_next_command_is_told(
     capsys, root: Path, monkeypatch: pytest.MonkeyPatch

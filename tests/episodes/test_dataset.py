@@ -401,6 +401,7 @@ print("policy", snapshot_download("user/policy"))
 """
 
 
+@pytest.mark.long
 def test_what_is_pushed_is_loaded_back_equal(packed: Path, tmp_path: Path, hub: Hub):
     root = copied(packed, tmp_path)
     policy = tmp_path / "policy"

@@ -123,7 +123,7 @@ def test_nothing_is_overwritten_and_a_folder_without_tasks_is_refused(
         write_envhub(run_folder, "user/tasks", run_folder)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_lerobot_loads_a_pushed_environment_by_its_name_as_our_page_says(
     run_folder: Path, tmp_path: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch
 ):

@@ -120,6 +120,7 @@ def test_another_policy_type_sees_what_lerobot_shows_it(cameras):
         torch.testing.assert_close(policy.seen[key], value, rtol=0, atol=0)
 
 
+@pytest.mark.long
 def test_lerobots_own_types_are_known_in_a_process_that_has_read_no_policy_yet():
     code = (
         "from policies.evaluation.rollout import env_config; env_config()\n"

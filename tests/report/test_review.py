@@ -156,6 +156,7 @@ def test_judgements_outlive_the_server_and_the_written_page_shows_them(home, cap
     assert "1 accepted: right 100.0 %" in capsys.readouterr().out
 
 
+@pytest.mark.long
 @pytest.mark.skipif(CHROMIUM is None, reason="this machine has no Chromium to click in")
 def test_a_person_goes_through_the_folder_with_clicks_and_keys(home, click, tmp_path):
     threads_of_other_tests = threading.active_count()

@@ -109,6 +109,7 @@ def searched(lifting: Callable[..., TaskBundle], tmp_path_factory) -> Searched:
     return Searched(root, outcome.folder, table["candidates"], table["found"], server.requests)
 
 
+@pytest.mark.long
 def test_the_second_round_descends_from_the_best_of_the_first(searched: Searched):
     first, second = searched.round(0), searched.round(1)
     best = max(first, key=lambda row: row["results"][-1]["rank"] if row["results"] else -1)
@@ -126,6 +127,7 @@ def test_the_second_round_descends_from_the_best_of_the_first(searched: Searched
     assert len({rest_part(row["code"]) for row in searched.rows}) == 1
 
 
+@pytest.mark.long
 def test_the_result_is_the_task_with_the_chosen_reward(searched: Searched):
     chosen = next(row for row in searched.rows if row["number"] == searched.found["chosen"])
     record = read_record(searched.result)
@@ -136,6 +138,7 @@ def test_the_result_is_the_task_with_the_chosen_reward(searched: Searched):
     assert record.counts["success"] == chosen["results"][-1]["success"]
 
 
+@pytest.mark.long
 def test_the_model_is_told_what_each_component_did_and_shown_pictures_and_examples(
     searched: Searched,
 ):
@@ -156,6 +159,7 @@ def test_the_model_is_told_what_each_component_did_and_shown_pictures_and_exampl
     assert len(list((searched.result / "calls").glob("*.json"))) == len(searched.requests) == 3 + 4
 
 
+@pytest.mark.long
 def test_the_page_shows_the_search(searched: Searched):
     html = write_page(searched.root, searched.root / "page.html").read_text()
     page = Outline(html)

@@ -95,7 +95,7 @@ def test_show_gives_the_candidates_the_analysis_and_the_code(searched: RewardSea
     assert "def reward_function" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_search_that_is_killed_goes_on_to_the_same_answer(
     lifting: Callable[..., TaskBundle], tiny: RewardConfig, searched: RewardSearch, tmp_path: Path
 ):
@@ -120,7 +120,7 @@ def test_a_search_that_is_killed_goes_on_to_the_same_answer(
     assert all(torch.equal(a[k], b[k]) for k in a)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bounds_and_memory_are_each_candidates_own_result(
     lifting: Callable[..., TaskBundle], tiny: RewardConfig, tmp_path: Path
 ):

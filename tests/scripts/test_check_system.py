@@ -79,6 +79,7 @@ main()
 """
 
 
+@pytest.mark.long
 def test_lerobot_streams_every_frame_of_joined_shards_and_reports_in_an_activated_shell(
     lent: Path, dataset: Path
 ):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from policies.evaluation.rate import wilson
 from policies.ppo.config import ImitationConfig, PPOConfig
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.config import EpisodesConfig
@@ -18,26 +17,17 @@ from v2p_data.errors import V2PError
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.pipeline.at_work import Event
 from v2p_data.pipeline.runner import (
-    Outcome,
     Runtime,
     blocked_by,
     in_order,
     make_stage,
     stored_outcome,
 )
-from v2p_data.pipeline.settings import load_settings
 from v2p_data.policy.config import PolicyConfig
-from v2p_data.scene.scene import Scene
 from v2p_data.stages import (
-    CousinsConfig,
     EngineConfig,
-    episodes_stage,
-    reward_stage,
-    task_stage,
-    with_cousins,
 )
-from v2p_data.task.generate import TaskConfig, generate_task
-from v2p_data.video.meaning import parse_caption
+from v2p_data.task.generate import TaskConfig
 
 ROOT = Path(__file__).parents[2]
 
@@ -80,79 +70,6 @@ def row(arm: str, n: int, seed: int, once: str, *, other: str = "0000"):
 
 
 # --- settings --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("size", ["tiny", "laptop"])
-def test_every_size_of_the_study_can_be_loaded_and_asks_for_the_arms_of_the_question(size, parts):
-    cfg = load_settings(ROOT / f"configs/studies/lifting_{size}.yaml", parts.config.LiftingConfig)
-
-    assert {"cop", "videos", "toys", "bc"} <= set(cfg.arms)
-
-
-@pytest.mark.parametrize("kind", ["lift_up", "push_left", "place_onto"])
-def test_a_toys_scene_is_of_the_kind_that_is_studied_and_its_task_passes_the_audit(
-    kind, parts, tmp_path
-):
-    out = tmp_path / "toy_0004-x"
-    asked = parts.config.ASKED[kind]
-
-    parts.objects.make_toy({"seed": 0, "kind": kind}, {}, out, Runtime(root=tmp_path))
-
-    scene = Scene.load(out)
-    toy = scene.manipulated
-    first, last = np.array(toy.poses_world)[[0, -1], :3]
-    assert scene.kind == kind == parse_caption(scene.description).kind
-    assert last - first == pytest.approx(asked.move_m)
-    for block in scene.others:  # it stands under the toy's last place
-        top = block.poses_world[-1][2] + block.size_m[2] / 2
-        assert top == pytest.approx(last[2] - toy.size_m[2] / 2)
-    assert len(scene.others) == (asked.onto_m is not None)
-    assert generate_task(scene, TaskConfig(num_samples=1), 0).bundle.kind == kind
-
-
-def test_each_cousin_goes_through_the_same_stages_as_its_scene(parts):
-    cfg = replace(EngineConfig(), cousins=CousinsConfig(count=2))
-    candidate = parts.objects.candidate_of(
-        parts.objects.toy_stage(4, parts.config.PoolConfig()), cfg, "lift_up"
-    )
-
-    own, *cousins = with_cousins(episodes_stage(candidate.task, candidate.expert, cfg), cfg)
-
-    assert [c.item for c in cousins] == ["toy_0004_cousin_000", "toy_0004_cousin_001"]
-    for cousin in cousins:
-        names = [(stage.name, stage.item) for stage in in_order([cousin])]
-        assert names == [
-            ("scene", "toy_0004"),
-            *((n, cousin.item) for n in ("cousin", "task", "instruction", "expert", "episodes")),
-        ]
-        lift = cousin.inputs["task"]
-        assert cousin.inputs["expert"].inputs["task"].folder_name == lift.folder_name
-    assert len({stage.folder_name for stage in (own, *cousins)}) == 3
-    assert with_cousins(own, EngineConfig()) == [own]
-
-
-def test_templates_write_one_code_for_a_cousin_and_a_searched_reward_is_its_familys(parts):
-    cfg = EngineConfig(cousins=CousinsConfig(count=1))
-    toy = parts.objects.toy_stage(4, parts.config.PoolConfig())
-    task = task_stage(toy, cfg)
-    reward = reward_stage(task, cfg)
-
-    _, plain = with_cousins(task, cfg)
-    _, searched = with_cousins(reward, cfg)
-
-    assert (plain.config.config.num_samples, set(plain.inputs)) == (1, {"scene"})
-    assert (searched.name, searched.inputs["family"]) == ("task", reward)
-
-
-def test_the_tasks_of_a_smaller_n_come_first_in_the_order_of_a_larger_one(parts, tmp_path):
-    cfg = parts.config.LiftingConfig(counts=(2, 4))
-    made = parts.cells.Study(cfg=cfg, out=tmp_path, runtime=Runtime(root=tmp_path))
-
-    orders = [made.order("videos", seed) for seed in (0, 1)]
-
-    assert [sorted(order) for order in orders] == [list(range(cfg.pool.clips))] * 2
-    assert orders[0] != orders[1]
-    assert orders[0] == made.order("videos", 0)  # the same for every N: a prefix is a subset
 
 
 def test_all_arms_start_from_the_same_states_and_other_seeds_from_others(parts):
@@ -204,81 +121,7 @@ def test_no_scan_lies_in_the_repository():
 # --- what the lines say together ----------------------------------------------------------------------------------
 
 
-def test_a_rate_counts_episodes_of_all_cells_or_of_one_group(parts):
-    rows = [row("videos", 5, 0, "1110"), row("videos", 5, 1, "1100", other="1000")]
-
-    assert parts.fits.rate(rows) == wilson(6, 16)
-    assert parts.fits.rate(rows, group="shape") == wilson(5, 8)
-    assert parts.fits.rate(rows, "at_end", "category") == wilson(0, 8)
-
-
-def test_a_paired_difference_is_taken_start_by_start(parts):
-    ours = [row("videos", 5, 0, "1110"), row("videos", 5, 1, "1111")]
-    others = [row("toys", 5, 1, "1001"), row("toys", 5, 2, "1111")]
-
-    found = parts.fits.paired(ours, others)
-
-    # seed 1 alone is in both: 1111 0000 against 1001 0000
-    assert found.pairs == 8
-    assert found.value == pytest.approx(2 / 8)
-    assert found.seeds == (0.25,)
-    # two of eight pairs differ, both in our favour; with half a pair more in each cell: (3 - 2^2 / 10) / 10^2
-    assert (found.low + found.high) / 2 == pytest.approx(2 / 10)
-    assert found.high - found.low == pytest.approx(2 * 1.96 * np.sqrt(0.026), rel=1e-3)
-    equal = parts.fits.paired(ours, ours)
-    assert equal.value == 0
-    assert equal.low < -0.05 < 0.05 < equal.high
-    assert parts.fits.paired(ours, [row("toys", 5, 7, "1111")]) is None
-
-
-def test_tables_hold_every_arm(parts):
-    rows = [row(arm, n, 0, "1110") for arm in ("videos", "toys") for n in (5, 10)]
-    rows.append({**row("cop", 0, 0, "1000"), "seconds": {}})
-    text = parts.table.table(rows)
-
-    assert "| videos | 5 | 37.5 % (" not in text  # percentages as the other tables print them
-    assert "| videos | 5 | 37.5% (13.7%-69.4%) | 0.38 | 75% | 0% | 25% | 90% | 4 | 100 |" in text
-    assert "| videos - toys | 10 | +0.0 points" in text
-    assert "of other scenes and another robot" in text
-
-
 # --- a cell, and the study ------------------------------------------------------------------------------------------
-
-
-def test_rejected_objects_are_counted_and_skipped_and_smaller_sets_are_parts_of_larger_ones(
-    parts, tmp_path, monkeypatch
-):
-    cfg = parts.config.LiftingConfig(pool=parts.config.PoolConfig(toys=12))
-    made = parts.cells.Study(cfg=cfg, out=tmp_path, runtime=Runtime(root=tmp_path))
-
-    def outcome(stage, *, is_good: bool):
-        return Outcome(
-            stage=stage.name,
-            item=stage.item,
-            folder=tmp_path,
-            status="made" if is_good else "rejected",
-            reason="" if is_good else "expert_not_learned",
-        )
-
-    def run(stages, root=None):
-        """Every other expert learns nothing, and what needs it is blocked."""
-        return {
-            s.folder_name: outcome(
-                s, is_good=s.name not in ("expert", "episodes") or int(s.item[-1]) % 2 == 0
-            )
-            for s in in_order(stages)
-        }
-
-    monkeypatch.setattr(made, "run", run)
-    two, four = (made.find("toys", count, 0) for count in (2, 4))
-
-    items = [f"toy_{k:04d}" for k in made.order("toys", 0) if k % 2 == 0]
-    assert [c.item for c in four.candidates] == items[:4]
-    assert [c.item for c in two.candidates] == items[:2]
-    assert four.rejected == {"expert: expert_not_learned": four.tried - 4}
-    assert made.order("toys", 0)[four.tried - 1] == int(items[3][-4:])
-    with pytest.raises(V2PError, match=r"only 6 of 12 toys became tasks .* raise pool\.toys"):
-        made.find("toys", 7, 0)
 
 
 def arguments(out: Path, **given) -> argparse.Namespace:
