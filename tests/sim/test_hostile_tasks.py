@@ -129,6 +129,75 @@ def test_no_idle_robot_gets_an_episode_that_counts(
     assert counted == 0
 
 
+GOAL = "if len(self.kept) == 0:\n    self.kept.append(torch.full((1,), 0.2))\n"
+ABOVE = "success = states['cube_pos'][:, 2] > "
+REACHES = {
+    "the task's own tensor among the states": {
+        "observe": GOAL + "states['goal'] = self.kept[0]",
+        "success": ABOVE + "states['goal']",
+        "reward": "states['goal'].fill_(-9.0)",
+    },
+    "a view of it, made by the observation": {
+        "observe": GOAL + "states['goal'] = self.kept[0].view(1, 1)[0]",
+        "success": ABOVE + "self.kept[0]",
+        "reward": "states['goal'].sub_(9.0)",
+    },
+    "an attribute": {
+        "observe": GOAL,
+        "success": ABOVE + "self.kept[0]",
+        "reward": "self.kept[0].fill_(-9.0)",
+    },
+    "an attribute bound anew": {
+        "success": ABOVE + "0.2 - 9.0 * len(self.task_description)",
+        "reward": "self.task_description = 'a'",
+    },
+    "a list": {
+        "observe": GOAL,
+        "success": ABOVE + "self.kept[-1]",
+        "reward": "self.kept.append(torch.full((1,), -9.0))",
+    },
+    "what success kept of the states": {
+        "success": "self.kept.append(states['cube_pos'][:, 2] * 1.0)\nsuccess = self.kept[-1] > self.kept[0] + 0.1",
+        "reward": "self.kept[0].fill_(-9.0)",
+    },
+    "a dict of the module": {
+        "success": ABOVE + "scene_info.get('goal', 0.2)",
+        "reward": "scene_info.update({'goal': -9.0})",
+    },
+    "a list of the module": {
+        "success": ABOVE + "LEVELS[-1]",
+        "reward": "LEVELS.append(-9.0)",
+    },
+    "the default of a function": {
+        "success": ABOVE + "levels_of()[-1]",
+        "reward": "levels_of().append(-9.0)",
+    },
+    "where objects start": {
+        "observe": GOAL,
+        "reset": "poses = self.envs.sample_object_poses(env_ids)\nif len(self.kept) > 1:\n"
+        "    poses['cube'][:, 2] += 0.5\nreturn poses",
+        "reward": "self.kept.append(self.kept[0])",
+    },
+}
+"""Ways from a reward to what success reads."""
+
+
+@pytest.mark.parametrize("bodies", REACHES.values(), ids=REACHES)
+def test_no_reward_reaches_what_success_reads(
+    bodies: dict[str, str], make_bundle: Callable[..., TaskBundle]
+):
+    module = "scene_info = {}\nLEVELS = [0.2]\n\ndef levels_of(levels=[0.2]):\n    return levels\n"
+    text = code(**bodies).replace("scene_info = {}", module)
+    bundle = replace(make_bundle(), code=text, class_name="Lift")
+
+    env = BatchEnv(bundle, num_envs=NUM_WORLDS, seed=0, num_threads=1)
+    for _ in range(3):
+        results = [env.step(np.zeros((NUM_WORLDS, 7))) for _ in range(4)]
+        assert not np.any([r.success for r in results])
+        assert np.isfinite(results[-1].reward).all()
+        env.reset(np.arange(NUM_WORLDS))
+
+
 COUNTING = """
 self.count = self.count + 1
 poses = self.envs.sample_object_poses(env_ids)
@@ -162,6 +231,50 @@ def test_no_world_starts_where_it_cannot_at_any_reset(
 
     assert caught.value.reason == reason
     assert words in caught.value.detail
+
+
+TOWER = """height = 0.0
+    for name in ["cup", "lid", "cube"]:
+        poses[name][-1, 2] += height
+        height = 2 * poses[name][-1, 2] - height
+        poses[name][-1, :2] = torch.tensor([0.51, 0.0])"""
+HOLLOW_STARTS = {
+    "a cube in a cup's wall": (
+        "poses['cube'][-1, :2] = poses['cup'][-1, :2] + torch.tensor([0.03, 0.0])",
+        "each_other",
+    ),
+    "two cups in each other": ("poses['lid'][-1, :3] = poses['cup'][-1, :3] + 0.01", "each_other"),
+    "a tower up to the arm": (TOWER, "arm"),
+}
+
+
+@pytest.mark.parametrize("honest", [0, 2], ids=["at once", "at the third reset"])
+@pytest.mark.parametrize(("place", "reason"), list(HOLLOW_STARTS.values()), ids=HOLLOW_STARTS)
+def test_no_hollow_thing_starts_in_another_or_in_the_arm_in_any_world_at_any_reset(
+    place: str,
+    reason: str,
+    honest: int,
+    make_bundle: Callable[..., TaskBundle],
+    make_object: Callable[..., SceneObject],
+):
+    hollow = {"shape": "cylinder", "role": "reference", "hollow": True}
+    objects = [make_object("cube", size_m=(0.05, 0.05, 0.05))]
+    objects += [
+        make_object(name, size_m=(0.08, 0.08, 0.08), pos=(0.0, y, 0.04), **hollow)
+        for name, y in (("cup", 0.15), ("lid", -0.15))
+    ]
+    text = code(reset=COUNTING.format(honest=honest, cheat=place))
+    bundle = replace(make_bundle(*objects), code=text, class_name="Lift")
+
+    def three_starts() -> None:
+        env = BatchEnv(bundle, num_envs=20, seed=0, num_threads=1)
+        for _ in range(2):
+            env.reset(np.arange(11, 20))
+
+    with pytest.raises(ItemRejectedError, match="task 'test' starts") as caught:
+        three_starts()
+
+    assert reason in caught.value.reason
 
 
 def test_a_thing_may_start_on_another_and_not_above_it(

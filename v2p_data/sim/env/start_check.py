@@ -1,9 +1,9 @@
 """Can an episode start like this? Looks at the poses that task code put its objects into.
 
 `Randomizer.place` never gives such poses; task code of its own making may, and may count its
-resets. So every world is looked at whenever it starts, by arithmetic (`check_poses`); the first
-worlds also by MuJoCo's collisions (`check_start`). Poses that are no finite unit poses are refused
-at every reset (`task.guarded`).
+resets. So every world is looked at whenever it starts: by arithmetic (`check_poses`), and where the
+poses are the task's own, by MuJoCo's collisions (`check_start`). Poses that are no finite unit poses
+are refused at every reset (`task.guarded`).
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -151,7 +151,7 @@ def _solid_pairs(objects: tuple[ObjectModel, ...]) -> list[tuple[int, int]]:
 def check_start(
     world: World, fields: Mapping[str, np.ndarray], qpos: Float[np.ndarray, "env q"], task: str
 ) -> None:
-    """Demand of some worlds, by MuJoCo's collisions, that objects are neither in the table nor in each other.
+    """Demand of some worlds, by MuJoCo's collisions, that objects are in nothing and the arm touches none.
 
     Args:
         world: the model.
@@ -160,7 +160,7 @@ def check_start(
         task: its title, for messages.
 
     Raises:
-        ItemRejectedError: `starts_in_the_table` or `objects_start_in_each_other`.
+        ItemRejectedError: `starts_in_the_table`, `objects_start_in_each_other` or `arm_starts_at_an_object`.
     """
     model, names = copy.copy(world.model), {o.body_id: o.name for o in world.objects}
     data = mujoco.MjData(model)
@@ -172,17 +172,25 @@ def check_start(
         data.qpos[:] = qpos[env]
         mujoco.mj_fwdPosition(model, data)
         for contact in data.contact:
+            one, other = (names.get(int(model.geom_bodyid[g])) for g in contact.geom)
+            is_table = 0 in model.geom_bodyid[contact.geom]
+            depth = f"{-contact.dist * 1000:.0f} mm"
+            if (one is None) != (other is None) and not is_table:
+                raise ItemRejectedError(
+                    "arm_starts_at_an_object",
+                    f"task '{task}' starts '{one or other}' where the arm is; objects must start apart from it: "
+                    f"{ADVICE}",
+                    float(-contact.dist),
+                )
             if contact.dist > -OVERLAP_M:
                 continue
-            one, other = (names.get(int(model.geom_bodyid[g])) for g in contact.geom)
-            depth = f"{-contact.dist * 1000:.0f} mm"
             if one and other:
                 raise ItemRejectedError(
                     "objects_start_in_each_other",
                     f"task '{task}' starts '{one}' {depth} inside '{other}'; objects must start apart: {ADVICE}",
                     float(-contact.dist),
                 )
-            if (one or other) and 0 in model.geom_bodyid[contact.geom]:
+            if (one or other) and is_table:
                 raise ItemRejectedError(
                     "starts_in_the_table",
                     f"task '{task}' starts '{one or other}' {depth} inside the table; objects must stand on it: "

@@ -1,7 +1,8 @@
 """A task whose code may be wrong or hostile: what it is given is its own to keep, what it answers is checked.
 
-Success is judged by the simulator's state, so task code gets copies of that state and never the memory itself. Every
-answer is checked for type, shape and number format, at every call. Now and then a question is asked twice.
+Success is judged by the simulator's state, so task code gets copies of that state and never the memory itself. The
+reward comes from a second copy of the task, made from the same code, which shares no object with the one that judges.
+Every answer is checked for type, shape and number format, at every call. Now and then a question is asked twice.
 
 What the observation adds to `states` may be used by success and reward (as in the paper's figure 8), so the
 observation is always made first.
@@ -110,11 +111,13 @@ class PlacerView:
         envs: the environment.
     """
 
-    __slots__ = ("_envs", "_ids")
+    __slots__ = ("_again", "_drawn", "_envs", "_ids")
 
     def __init__(self, envs: Placer) -> None:
         self._envs = envs
         self._ids: torch.Tensor | None = None
+        self._drawn: list[dict[str, torch.Tensor]] = []
+        self._again: Iterator[dict[str, torch.Tensor]] | None = None
 
     @property
     def num_envs(self) -> int:
@@ -133,13 +136,20 @@ class PlacerView:
             )
         if not isinstance(env_ids, torch.Tensor) or not torch.equal(env_ids, self._ids):
             raise TaskOutputError("sample_object_poses must be given the env_ids of the reset")
-        poses = self._envs.sample_object_poses(self._ids.clone())
+        if self._again is None:
+            self._drawn.append(self._envs.sample_object_poses(self._ids.clone()))
+        poses = self._drawn[-1] if self._again is None else next(self._again, None)
+        if poses is None:
+            raise TaskOutputError("reset_objects_states draws poses that depend on its reward")
         return {name: pose.clone() for name, pose in poses.items()}
 
     @contextlib.contextmanager
-    def during_reset(self, env_ids: torch.Tensor) -> Iterator[None]:
-        """Let poses be drawn for these environments."""
-        self._ids = env_ids
+    def during_reset(
+        self, env_ids: torch.Tensor, like: "PlacerView | None" = None
+    ) -> Iterator[None]:
+        """Let poses be drawn for these environments; the same ones, in turn, that another view drew last."""
+        self._ids, self._drawn = env_ids, []
+        self._again = iter(like._drawn) if like else None
         try:
             yield
         finally:
@@ -182,6 +192,8 @@ class GuardedTask:
         task: the task; nothing else may call its methods.
         view: what the task knows of the environment; None for a task of our own that knows the environment itself.
         title: for messages.
+        rewarder: a second copy of the task that shares no object with the first, and its view. It gives the reward
+            and nothing else. None: a task of our own gives its reward itself.
         is_limited: end calls that take too long, and say in one sentence what they raise.
     """
 
@@ -191,10 +203,12 @@ class GuardedTask:
         view: PlacerView | None = None,
         title: str = "",
         *,
+        rewarder: tuple[Task, PlacerView] | None = None,
         is_limited: bool = False,
     ) -> None:
         self._task = task
         self._view = view
+        self._rewarder = rewarder
         self._title = title
         self._is_limited = is_limited
         self._component_names: tuple[str, ...] | None = None
@@ -216,6 +230,10 @@ class GuardedTask:
         )
         with during:
             poses = self._task.reset_objects_states(env_ids.clone())
+        if self._rewarder:
+            rewarder, view = self._rewarder
+            with view.during_reset(env_ids.clone(), like=self._view):
+                rewarder.reset_objects_states(env_ids.clone())
         if not isinstance(poses, dict) or set(poses) != set(names):
             raise TaskOutputError(
                 f"reset_objects_states must return a pose per object: {', '.join(names)}"
@@ -252,15 +270,15 @@ class GuardedTask:
         """Return the observation; it may share memory with what `show` gave."""
         states = show()  # before `inference_mode`, in which torch does not count writes
         with torch.inference_mode():
-            return _observation(self._keys(_Watch(states)), states)
+            return _observation(_keys(self._task, _Watch(states)), states)
 
     @_guarded
     def succeeds(self, show: Show) -> Bool[torch.Tensor, "env"]:
         """Return the task's success."""
         watch = _Watch(show())
         with torch.inference_mode():
-            self._keys(watch)
-            return self._success(watch)
+            _keys(self._task, watch)
+            return _success(self._task, watch)
 
     @_guarded
     def judge(self, show: Show, actions: Float[torch.Tensor, "env act"]) -> Answers:
@@ -272,23 +290,36 @@ class GuardedTask:
             TaskOutputError: an answer has another type or shape than it must have, the same question got two answers,
                 or a state was written into.
         """
-        answers = self._asked(show(), actions)
+        answers = self._asked(show, actions)
         self._until_twice -= 1
         if self._until_twice < 1:
             self._until_twice = self._draw_until_twice()
             answers = answers.cloned()
-            demand_equal(answers, self._asked(show(), actions))
+            demand_equal(answers, self._asked(show, actions))
         return answers
 
     # -- inside
 
-    @torch.inference_mode()
-    def _asked(self, states: States, actions: torch.Tensor) -> Answers:
-        watch = _Watch(states)
-        observation = _observation(self._keys(watch), states)
-        success = self._success(watch)
+    def _asked(self, show: Show, actions: torch.Tensor) -> Answers:
+        """Ask for the reward first: nothing that it does is left when success is asked for, of states made anew."""
+        states = show()  # before `inference_mode`, in which torch does not count writes
+        with torch.inference_mode():
+            reward, parts = self._reward(_Watch(states), actions)
+        states = show()
+        with torch.inference_mode():
+            watch = _Watch(states)
+            observation = _observation(_keys(self._task, watch), states)
+            success = _success(self._task, watch)
+        return Answers(observation=observation, success=success, reward=reward, components=parts)
+
+    def _reward(
+        self, watch: "_Watch", actions: torch.Tensor
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        task = self._rewarder[0] if self._rewarder else self._task
+        _keys(task, watch)
+        _success(task, watch)  # what it adds to the states or notes may be used by the reward
         count = _count(actions)
-        result = self._task.compute_reward(actions, states)
+        result = task.compute_reward(actions, watch.states)
         watch.check("compute_reward")
         if _count(actions) != count:
             raise StatesChangedError("compute_reward changes the actions in place; work on a copy")
@@ -299,25 +330,7 @@ class GuardedTask:
         reward, parts = result
         check_tensor("the reward", reward, watch.num_envs, watch.device, kind=torch.float32)
         self._check_parts(parts, watch)
-        return Answers(observation=observation, success=success, reward=reward, components=parts)
-
-    def _keys(self, watch: "_Watch") -> list[str]:
-        keys = self._task.compute_observation_key(watch.states)
-        watch.check("compute_observation_key")
-        if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
-            raise TaskOutputError("compute_observation_key must return a list of keys")
-        for key in keys:
-            if key not in watch.states:
-                raise TaskOutputError(f"observation key '{shown(key, 60)}' is not in states")
-            what = f"observation '{shown(key, 60)}'"
-            check_tensor(what, watch.states[key], watch.num_envs, watch.device, max_dim=2)
-        return keys
-
-    def _success(self, watch: "_Watch") -> torch.Tensor:
-        success = self._task.compute_success(watch.states)
-        watch.check("compute_success")
-        check_tensor("compute_success", success, watch.num_envs, watch.device, kind=torch.bool)
-        return success
+        return reward, parts
 
     def _check_parts(self, parts: dict[Any, Any], watch: "_Watch") -> None:
         names = tuple(parts)
@@ -341,6 +354,26 @@ class GuardedTask:
     @staticmethod
     def _draw_until_twice() -> int:
         return 1 + secrets.randbelow(2 * ASKED_TWICE_ONCE_IN)
+
+
+def _keys(task: Task, watch: "_Watch") -> list[str]:
+    keys = task.compute_observation_key(watch.states)
+    watch.check("compute_observation_key")
+    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
+        raise TaskOutputError("compute_observation_key must return a list of keys")
+    for key in keys:
+        if key not in watch.states:
+            raise TaskOutputError(f"observation key '{shown(key, 60)}' is not in states")
+        what = f"observation '{shown(key, 60)}'"
+        check_tensor(what, watch.states[key], watch.num_envs, watch.device, max_dim=2)
+    return keys
+
+
+def _success(task: Task, watch: "_Watch") -> torch.Tensor:
+    success = task.compute_success(watch.states)
+    watch.check("compute_success")
+    check_tensor("compute_success", success, watch.num_envs, watch.device, kind=torch.bool)
+    return success
 
 
 def check_tensor(

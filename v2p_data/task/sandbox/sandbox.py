@@ -56,8 +56,8 @@ def load_task(source: str, envs: Placer, scene: Scene, title: str = "") -> Guard
         TaskCodeError: the code is refused, or it does not load.
         TaskCodeTooSlowError: loading it takes too long.
     """
-    task, view = in_time(lambda: _made(source, envs, str(scene.folder)), "loading")
-    return GuardedTask(task, view, title or scene.title, is_limited=True)
+    judge, rewarder = in_time(lambda: _made(source, envs, str(scene.folder)), "loading")
+    return GuardedTask(*judge, title or scene.title, rewarder=rewarder, is_limited=True)
 
 
 def make_task(source: str, envs: Placer, urdf_assets_root: str) -> GuardedTask:
@@ -66,15 +66,19 @@ def make_task(source: str, envs: Placer, urdf_assets_root: str) -> GuardedTask:
     Raises:
         TaskCodeError: the code is refused, or it does not load.
     """
-    return GuardedTask(*_made(source, envs, urdf_assets_root))
+    judge, rewarder = _made(source, envs, urdf_assets_root)
+    return GuardedTask(*judge, rewarder=rewarder)
 
 
-def _made(source: str, envs: Placer, urdf_assets_root: str) -> tuple[Task, PlacerView]:
-    """Return the task, made as the paper makes it, and what it sees of the environment."""
+def _made(source: str, envs: Placer, urdf_assets_root: str) -> list[tuple[Task, PlacerView]]:
+    """Return the task, made as the paper makes it, and what it sees of the environment: twice, with nothing shared."""
     tree = _Strip().visit(checked_tree(source))
     ast.fix_missing_locations(tree)
+    return [_copy(tree, PlacerView(envs), urdf_assets_root) for _ in range(2)]
+
+
+def _copy(tree: ast.Module, view: PlacerView, urdf_assets_root: str) -> tuple[Task, PlacerView]:
     namespace = _namespace()
-    view = PlacerView(envs)
     try:
         exec(compile(tree, CODE_NAME, "exec", dont_inherit=True), namespace)
         made = [
