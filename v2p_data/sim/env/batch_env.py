@@ -80,7 +80,6 @@ class BatchEnv:
         num_threads: of the backend `cpu`; 0 for all cores; changes no result.
         task: the task, instead of `bundle.code`.
 
-
     Raises:
         ItemRejectedError: an object does not suit the robot, or the objects do not fit on the table.
         V2PError: the task's observation is not what it says; MuJoCo Warp or the device is missing,
@@ -126,7 +125,6 @@ class BatchEnv:
         self._block = StateBlock(self.world, num_envs)
         self._start_pose = np.zeros((num_envs, len(self.object_names), 7))
         self._placed = np.full_like(self._start_pose, np.nan)
-        """The poses that the randomizer drew last."""
         self._touches = np.zeros((num_envs, len(self.object_names), 3))
         self._steps = np.zeros(num_envs, np.int64)
         self._last_action = np.zeros((ACT_DIM, num_envs)).T
@@ -194,10 +192,8 @@ class BatchEnv:
             self._sim.object_qpos[ids, k] = poses[name].numpy()
         self._start_pose[ids] = start = self._sim.object_qpos[ids]
         check_poses(self.world, self.randomizer.size_m[ids], start, self.bundle.title)
-        own = ids[~(start == self._placed[ids]).all((1, 2))]
-        if len(own):  # the randomizer's own poses are apart by construction
-            fields = {name: array[own] for name, array in self.randomizer.fields().items()}
-            check_start(self.world, fields, self._sim.qpos[own], self.bundle.title)
+        own = ids[(start != self._placed[ids]).any((1, 2))]  # what the randomizer placed is apart
+        check_start(self.world, self.randomizer.fields(), self._sim.qpos, own, self.bundle.title)
         self._steps[ids] = 0
         self._judgement.held[ids] = FRESH
         self._last_action[ids] = 0

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from v2p_data.errors import ItemRejectedError
 from v2p_data.geometry.rotation import matrices
@@ -149,7 +149,11 @@ def _solid_pairs(objects: tuple[ObjectModel, ...]) -> list[tuple[int, int]]:
 
 
 def check_start(
-    world: World, fields: Mapping[str, np.ndarray], qpos: Float[np.ndarray, "env q"], task: str
+    world: World,
+    fields: Mapping[str, np.ndarray],
+    qpos: Float[np.ndarray, "env q"],
+    ids: Int[np.ndarray, "n"],
+    task: str,
 ) -> None:
     """Demand of some worlds, by MuJoCo's collisions, that objects are in nothing and the arm touches none.
 
@@ -157,14 +161,17 @@ def check_start(
         world: the model.
         fields: model fields that differ between worlds (`Randomizer.fields`).
         qpos: the worlds' states after a reset.
+        ids: the worlds to look at.
         task: its title, for messages.
 
     Raises:
         ItemRejectedError: `starts_in_the_table`, `objects_start_in_each_other` or `arm_starts_at_an_object`.
     """
+    if not len(ids):
+        return
     model, names = copy.copy(world.model), {o.body_id: o.name for o in world.objects}
     data = mujoco.MjData(model)
-    for env in range(len(qpos)):
+    for env in ids:
         for name, value in fields.items():
             own = getattr(model, name)
             rows = value[env].reshape(-1, *own.shape[1:])
