@@ -117,6 +117,52 @@ def test_one_part_of_a_concave_mesh_is_its_hull_and_does_not_save_it_the_splitti
     assert len(solids_of(angle_file, "angle", SIZE, ready=[hull]).parts) >= 2
 
 
+BOARDS = [
+    ((0.08, 0.08, 0.01), (0.0, 0.0, -0.015)),
+    *(((0.01, 0.08, 0.03), (x, 0.0, 0.005)) for x in (-0.035, 0.035)),
+    *(((0.06, 0.01, 0.03), (0.0, y, 0.005)) for y in (-0.035, 0.035)),
+]
+"""A tray of five boards that share edges: size and centre."""
+
+
+def _tray(apart: bool) -> tuple[list[trimesh.Trimesh], trimesh.Trimesh]:
+    boards = [
+        trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
+        for size, at in BOARDS
+    ]
+    tray = trimesh.Trimesh(
+        *trimesh.util.append_faces([b.vertices for b in boards], [b.faces for b in boards]),
+        process=not apart,
+    )
+    return boards, tray
+
+
+@pytest.mark.parametrize("form", ["obj", "obj with shared corners", "stl", "obj with a hole"])
+@pytest.mark.parametrize("brings_parts", [True, False])
+def test_closed_pieces_that_touch_do_not_become_their_hull(
+    tmp_path: Path, form: str, brings_parts: bool
+):
+    boards, tray = _tray(form != "obj with shared corners")
+    if form == "obj with a hole":
+        tray.update_faces(np.arange(len(tray.faces)) > 0)
+    path = tmp_path / f"tray.{form[:3]}"
+    tray.export(path)
+    ready = [tmp_path / f"board_{k}.obj" for k in range(len(boards))]
+    for file, board in zip(ready, boards, strict=True):
+        board.export(file)
+
+    solids = solids_of(path, "tray", SIZE, ready=ready if brings_parts else ())
+
+    if form == "obj with a hole" and not brings_parts:
+        assert len(solids.parts) == 1
+        return
+    assert len(solids.parts) == 5
+    assert not any(contains(p, np.array([0.0, 0.0, 0.01])) for p in solids.parts)
+    volume = 0.08 * 0.08 * 0.01 + 2 * 0.01 * 0.08 * 0.03 + 2 * 0.06 * 0.01 * 0.03
+    assert sum(p.volume for p in solids.parts) == pytest.approx(volume, rel=1e-6)
+    assert solids.body.volume == pytest.approx(volume, rel=1e-6)
+
+
 def test_a_part_that_is_not_there_is_named(angle_file: Path, leg_files: list[Path]):
     leg_files[1].unlink()
 

@@ -4,6 +4,7 @@ Every mesh is one closed surface turned outwards; a hollow one is open at the to
 volume is that of its walls. Primitives are centred on their bounding box.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -179,6 +180,44 @@ def mass_properties(
     """Return the centre of mass [m] and the inertia about it [kg m2] of a closed mesh of one density."""
     found = trimesh.triangles.mass_properties(mesh.triangles, density=mass_kg / mesh.volume)
     return np.asarray(found.center_mass), np.asarray(found.inertia)
+
+
+def welded(mesh: trimesh.Trimesh, max_faces: int = 50_000, **kept: bool) -> trimesh.Trimesh:
+    """Return the mesh with equal vertices merged; closed pieces that touch keep vertices of their own.
+
+    Where two closed pieces share an edge it has four faces, so that the whole would pass for open.
+
+    Args:
+        mesh: vertices and faces.
+        max_faces: larger meshes are not searched for pieces.
+        kept: of trimesh's `merge_vertices`.
+    """
+    whole = mesh.copy()
+    whole.merge_vertices(**kept)
+    if whole.is_watertight or len(mesh.faces) > max_faces:
+        return whole
+    connected = trimesh.graph.connected_component_labels
+    by_vertex = connected(mesh.edges, len(mesh.vertices))[mesh.faces[:, 0]]
+    by_edge = connected(whole.face_adjacency, len(mesh.faces))
+    for labels in (by_vertex, by_edge):
+        if len(counts := np.bincount(labels)) < 2 or counts[counts > 0].min() < 4:
+            continue
+        pieces = [
+            trimesh.Trimesh(mesh.vertices, mesh.faces[labels == k], process=False)
+            for k in np.unique(labels)
+        ]
+        for piece in pieces:
+            piece.merge_vertices(**kept)
+            piece.remove_unreferenced_vertices()
+        if all(piece.is_watertight for piece in pieces):
+            return joined(pieces)
+    return whole
+
+
+def joined(pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Return several meshes as one; no vertices are merged."""
+    faces = trimesh.util.append_faces([p.vertices for p in pieces], [p.faces for p in pieces])
+    return trimesh.Trimesh(*faces, process=False)
 
 
 def outline_points(form: str, size_m: Size, taper: float = 1.0) -> Float[np.ndarray, "n 3"]:

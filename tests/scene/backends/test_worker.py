@@ -344,6 +344,20 @@ def test_a_mesh_with_a_missing_triangle_is_closed_and_one_turned_inside_out_is_t
         assert result.repair == repair
 
 
+@pytest.mark.parametrize("grouped", [True, False])
+def test_closed_pieces_that_share_an_edge_are_no_mesh_with_holes(worker, grouped):
+    second = BOX.vertices + np.array([0.1, 0.2, 0])
+    one, other = obj(BOX.vertices, BOX.faces), obj(second, BOX.faces + 8)
+    text = obj(np.concatenate([BOX.vertices, second]), np.concatenate([BOX.faces, BOX.faces + 8]))
+    text = f"o a\n{one}\no b\n{other}" if grouped else text
+
+    result = run_worker(mesh_worker(worker, text), mesh_request(np.ones((4, 4), bool)), 30.0)
+
+    assert result.mesh is not None
+    assert result.repair == "none"
+    assert result.mesh.volume == pytest.approx(2 * 0.1 * 0.2 * 0.3)
+
+
 def test_a_mesh_that_is_mostly_holes_becomes_its_convex_hull(worker):
     ring = BOX.faces[np.abs(BOX.face_normals[:, 2]) < 0.5][::2]
 

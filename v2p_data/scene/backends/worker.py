@@ -30,6 +30,7 @@ from jaxtyping import Shaped
 from trimesh.exchange.obj import load_obj
 
 from v2p_data.errors import ItemRejectedError, V2PError
+from v2p_data.geometry.mesh import joined, welded
 from v2p_data.processes import end_group, end_marked, ending_with_us
 
 SCHEMA, VERSION = "v2p-worker", 1
@@ -364,10 +365,7 @@ def _read_mesh(path: Path) -> tuple[trimesh.Trimesh, Repair]:
         # Several groups come as several meshes.
         groups = list(loaded["geometry"].values()) if "geometry" in loaded else [loaded]
         parts = [trimesh.Trimesh(g["vertices"], g["faces"], process=False) for g in groups]
-        mesh = trimesh.Trimesh(
-            *trimesh.util.append_faces([p.vertices for p in parts], [p.faces for p in parts]),
-            process=False,
-        )
+        mesh = joined(parts)
     except Exception as error:
         raise V2PError(f"the worker's mesh.obj cannot be read ({error})") from error
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
@@ -388,7 +386,7 @@ def _read_mesh(path: Path) -> tuple[trimesh.Trimesh, Repair]:
 
 
 def _closed(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Repair]:
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh = welded(mesh, merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
     repair: Repair = "none"

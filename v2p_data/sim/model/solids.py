@@ -15,6 +15,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from v2p_data.errors import ItemRejectedError
+from v2p_data.geometry.mesh import joined, welded
 from v2p_data.sim.model.convex import ConvexConfig, convex_parts
 
 MAX_MESH_MB = 200
@@ -27,6 +28,8 @@ FINE_VERTICES = 20_000
 HULL_DIRECTIONS = 1_000
 MAX_COORDINATE = 1e9
 """In the file's unit; squares of more overflow on the way."""
+_CONVEX_WITHIN = 1.02
+"""A hull of no more than this many times the volume is the thing itself."""
 FLAT_RATIO = 1e-3
 """Thinnest over widest extent, along the mesh's own principal axes, below which it has no volume."""
 
@@ -70,7 +73,7 @@ def solids_of(
         size_m: full extents.
         cfg: how concave meshes are split.
         ready: mesh files of convex parts in the mesh's frame that together are the mesh. They save a concave mesh the
-            splitting; a single one can only be its hull and does not.
+            splitting, and are taken for one with holes; a single one can only be its hull and does neither.
 
     Raises:
         ItemRejectedError: there is no such file, or no solid in it.
@@ -83,19 +86,20 @@ def solids_of(
     outer = np.asarray(mesh.vertices, float)
     outer = outer[_extreme(outer)] if len(outer) > FINE_VERTICES else outer
     found = [_hull(outer, cfg.hull_vertices)]
-    if is_closed:
-        ratio = trimesh.convex.convex_hull(outer).volume / _volume(mesh)
-        if ratio > cfg.concave_above:
-            if len(ready) > 1:
-                parts = [np.asarray(read_mesh(file, name).vertices, float) for file in ready]
-            else:
-                parts = convex_parts(path, *_thinned(mesh), cfg, name)
-            found = [_hull(p, cfg.part_vertices) for p in parts] or found
+    filled = _volume(mesh) if is_closed else 0.0
+    if cfg.concave_above * filled < trimesh.convex.convex_hull(outer).volume:
+        parts = []
+        if len(ready) > 1:
+            parts = [np.asarray(read_mesh(file, name).vertices, float) for file in ready]
+        elif is_closed:
+            parts = _convex_pieces(mesh, filled, cfg.max_parts)
+            parts = parts or convex_parts(path, *_thinned(mesh), cfg, name)
+        found = [_hull(p, cfg.part_vertices) for p in parts] or found
     parts = _brought_to_size(found, size_m)
     if len(parts) == 1:
         return Solids(parts=parts, body=parts[0], hull=np.asarray(parts[0].vertices))
     common = trimesh.convex.convex_hull(np.concatenate([p.vertices for p in parts]))
-    body = _brought_to_size([mesh], size_m)[0]
+    body = _brought_to_size([mesh], size_m)[0] if is_closed else joined(parts)
     return Solids(parts=parts, body=body, hull=np.asarray(common.vertices))
 
 
@@ -107,7 +111,7 @@ def read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     """
     where = f"mesh of '{name}' in {path}"
     mesh = _demand_solid(_loaded(path, name, where), where)
-    mesh.merge_vertices()
+    mesh = welded(mesh, FINE_FACES)
     mesh.remove_unreferenced_vertices()
     return mesh
 
@@ -197,7 +201,11 @@ def _is_closed(mesh: trimesh.Trimesh, path: Path, name: str) -> bool:
         if not is_fine:
             mesh.fill_holes()
         if not mesh.is_watertight:
-            logger.warning("%s has holes (%d open edges): its hull is used", where, open_edges)
+            logger.warning(
+                "%s has holes (%d open edges): its hull, or the parts it brings, are used",
+                where,
+                open_edges,
+            )
             return False
         logger.warning("%s had small holes (%d open edges), which are closed", where, open_edges)
     if not mesh.is_winding_consistent and not is_fine:
@@ -280,6 +288,21 @@ def _brought_to_size(
         trimesh.Trimesh((m.vertices - (low + high) / 2) * factor, m.faces, process=False)
         for m in meshes
     )
+
+
+def _convex_pieces(
+    mesh: trimesh.Trimesh, volume: float, most: int
+) -> list[Float[np.ndarray, "n 3"]]:
+    """Return the corners of a closed mesh's pieces, at most `most`; none where a piece is not convex."""
+    pieces = (
+        [np.asarray(p.vertices, float) for p in mesh.split()]
+        if len(mesh.faces) < FINE_FACES
+        else []
+    )
+    if not 1 < len(pieces) <= most:
+        return []
+    filled = sum(trimesh.convex.convex_hull(piece).volume for piece in pieces)
+    return pieces if filled < _CONVEX_WITHIN * volume else []
 
 
 def _hull(points: Float[np.ndarray, "n 3"], count: int) -> trimesh.Trimesh:
