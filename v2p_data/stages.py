@@ -19,7 +19,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from policies.evaluation.rate import wilson
-from v2p_data.craft_data import scene_data, task_data
+from v2p_data.craft_data import (
+    contents,
+    named_contents,
+    scene_data,
+    task_data,
+    task_digest,
+    tasks_by_name,
+)
 from v2p_data.distillation.config import DistillationConfig
 from v2p_data.episodes.collect import (
     EpisodesConfig,
@@ -68,7 +75,6 @@ from v2p_data.sim.robot.arms import RobotConfig, robot_to_json
 from v2p_data.task.generate import TaskConfig, generate_task
 from v2p_data.task.llm.config import VlmConfig
 from v2p_data.task.task import (
-    CODE_FILE,
     REWARD_SEARCH_FOLDER,
     SCENE_FOLDER,
     TaskBundle,
@@ -148,9 +154,10 @@ def scene_stage(video: VideoItem, cfg: EngineConfig) -> Stage:
     """Return the stage that understands one video; a preset's choice is part of its recipe."""
     from v2p_data.scene.preset import with_preset
 
+    settings = with_preset(cfg.scene)
     recipe = {
         "video": cfg.video,
-        "scene": with_preset(cfg.scene),
+        "scene": settings,
         "seed": cfg.seed,
         "caption": video.caption,
         "objects": video.objects,
@@ -160,7 +167,7 @@ def scene_stage(video: VideoItem, cfg: EngineConfig) -> Stage:
         name="scene",
         item=video.item,
         config=recipe,
-        sources={"video": file_digest(video.path)} | scene_data(),
+        sources={"video": file_digest(video.path)} | scene_data() | named_contents(settings),
         version=6,
         make=partial(make_scene, video=video),
     )
@@ -251,7 +258,7 @@ def _robot_digests(robot: RobotConfig) -> dict[str, str]:
     if not robot.path.is_file():
         raise V2PError(f"there is no robot file {robot.path}; --sim.robot.path names an MJCF file")
     settings = fingerprint({**robot_to_json(robot), "path": ""})
-    return {"robot": settings, "robot file": file_digest(robot.path)}
+    return {"robot": settings} | contents("robot file", robot.path)
 
 
 def make_task(
@@ -571,10 +578,9 @@ def policy_stage(
     Raises:
         V2PError: there are no tasks to judge checkpoints, or the policy learns from one of them.
     """
-    judges = task_folders(cfg.policy.judge_tasks) if cfg.policy.judge_tasks else {}
-    digests = {f"judge {name}": _code_digest(path) for name, path in judges.items()}
-    known = {_code_digest(source.task) for source in sources}
-    if seen := [name for name in judges if digests[f"judge {name}"] in known]:
+    judges = tasks_by_name(task_folders(cfg.policy.judge_tasks) if cfg.policy.judge_tasks else ())
+    known = {task_digest(source.task, with_code=False) for source in sources}
+    if seen := [n for n, task in judges.items() if task_digest(task, with_code=False) in known]:
         raise V2PError(
             f"--policy.judge-tasks={cfg.policy.judge_tasks} holds {', '.join(seen)}, which the policy learns from; "
             "checkpoints are to be judged on tasks of other objects"
@@ -587,7 +593,7 @@ def policy_stage(
         item=record.item,
         config=Seeded(config=replace(cfg.policy, judge_tasks=None), seed=cfg.seed),
         inputs=inputs,
-        sources={"dataset": f"{record.item}-{record.fingerprint}"} | digests,
+        sources={"dataset": f"{record.item}-{record.fingerprint}"} | _contents_of(judges, "judge"),
         version=2,
         on_device=True,
         make=partial(
@@ -605,7 +611,7 @@ def policy_stage(
 
 
 def evaluation_stage(
-    who: Contestant, tasks: Mapping[str, Path], cfg: EngineConfig, seen: Sequence[str]
+    who: Contestant, tasks: Mapping[str, Path], cfg: EngineConfig, seen: Sequence[Path]
 ) -> Stage:
     """Return the stage that judges someone in each task.
 
@@ -613,29 +619,29 @@ def evaluation_stage(
         who: a LeRobot policy, an expert, or the scripted programs.
         tasks: folders of the tasks to try, by name.
         cfg: settings.
-        seen: names of the tasks that the policy's dataset had, or that the expert learned.
+        seen: the tasks that the policy's dataset had, or that the expert learned; known again by their contents.
     """
+    known = {task_digest(path, with_code=False) for path in seen}
+    here = [name for name, path in tasks.items() if task_digest(path, with_code=False) in known]
     return Stage(
         name="evaluation",
         item=_item_of(who),
         config=Seeded(config=cfg.evaluation, seed=cfg.seed),
         sources={
-            **who.sources,
-            **{f"task {name}": _code_digest(path) for name, path in tasks.items()},
+            **({PROGRAMS: ""} if who.kind == PROGRAMS else contents(who.kind, who.folder)),
+            **_contents_of(tasks, "task"),
+            "seen": ", ".join(here),
         },
         version=4,
         on_device=True,
-        make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=tuple(seen)),
+        make=partial(make_evaluation, who=who, tasks=dict(tasks), seen=here),
     )
 
 
-def _code_digest(task: Path) -> str:
-    code = task / CODE_FILE
-    if not code.is_file():
-        raise V2PError(
-            f"{task} holds no {CODE_FILE}, so it is no whole task; make it again or copy it anew"
-        )
-    return file_digest(code)
+def _contents_of(tasks: Mapping[str, Path], name: str) -> dict[str, str]:
+    """Return the digest of each file of each task."""
+    files = (contents(f"{name} {title}", path) for title, path in tasks.items())
+    return {file: digest for those in files for file, digest in those.items()}
 
 
 def demand_whole_part(place: Path, root: Path | None = None) -> None:
@@ -696,7 +702,14 @@ def make_evaluation(
         write_contact_sheet(
             bundle, judged.shown, videos / SHEET_FILE, SheetConfig(successes=3, failures=3)
         )
-        row = {"task": name, "seen": name in seen, "judged": who.kind, **row_of(judged)}
+        row = {
+            "task": name,
+            "folder": folder.resolve().name,
+            "digest": task_digest(folder),
+            "seen": name in seen,
+            "judged": who.kind,
+            **row_of(judged),
+        }
         own = own_reset_rate(play, bundle, cfg.config, seed, runtime)
         rows.append(row | ({"own_reset": own} if own else {}))
     (out / EVALUATION_FILE).write_text(json.dumps(rows, indent=1), encoding="utf-8")

@@ -6,12 +6,15 @@ the same successes (`actor`); this one is what it is compared with. The tasks co
 """
 
 import copy
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import torch
+
+from policies.evaluation.statistics import statistics_fault
 
 ENV_TYPE = "v2p"
 NUM_VIDEOS = 3
@@ -40,7 +43,8 @@ def load_policy(folder: Path, env_config: Any, device: str | None = None) -> Loa
     (`v2p_data.evaluation.checkpoint`).
 
     Raises:
-        UnsuitablePolicyError: its weights are not those of the network in its settings.
+        UnsuitablePolicyError: its weights are not those of the network in its settings, or its statistics do not
+            normalise what the settings say.
     """
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import make_policy, make_pre_post_processors
@@ -56,11 +60,17 @@ def load_policy(folder: Path, env_config: Any, device: str | None = None) -> Loa
     if config.type in SETTINGS_ALONE:
         _check_weights(folder, config)
     policy = make_policy(config, env_cfg=env_config)
+    _load_renamed(folder, policy)
     preprocessor, postprocessor = make_pre_post_processors(
         policy_cfg=config,
         pretrained_path=str(folder),
         preprocessor_overrides={"device_processor": {"device": str(policy.config.device)}},
     )
+    if fault := statistics_fault(policy.config, preprocessor, postprocessor):
+        raise UnsuitablePolicyError(
+            f"the policy in {folder} would see or do numbers of another scale: {fault}; copy both processors with"
+            " their .safetensors files from the training anew"
+        )
     return LoadedPolicy(policy=policy, preprocessor=preprocessor, postprocessor=postprocessor)
 
 
@@ -120,7 +130,10 @@ def _check_weights(folder: Path, config: Any) -> None:
     with torch.device("meta"):
         wanted = kind(copy.deepcopy(config)).state_dict(keep_vars=True)
     with safe_open(folder / "model.safetensors", framework="pt") as file:
-        shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+        shapes = {
+            own: tuple(file.get_slice(name).get_shape())
+            for name, own in _own_names(file.keys(), wanted).items()
+        }
     known = {
         id(wanted[name]) for name in shapes.keys() & wanted.keys()
     }  # tied weights are written once
@@ -136,6 +149,28 @@ def _check_weights(folder: Path, config: Any) -> None:
                 f"{tuple(value.shape)} in"
                 " the network of its config.json: weights and settings are not of one training; copy both anew"
             )
+
+
+def _own_names(names: Iterable[str], wanted: Container[str]) -> dict[str, str]:
+    """Return the network's name of each tensor: `torch.compile` and parallel training put words between."""
+    plain = {
+        name: ".".join(part for part in name.split(".") if part not in ("_orig_mod", "module"))
+        for name in names
+    }
+    return {
+        name: own if name not in wanted and own in wanted else name for name, own in plain.items()
+    }
+
+
+def _load_renamed(folder: Path, policy: Any) -> None:
+    """Load the weights that LeRobot passed over, since it knows them by another name."""
+    from safetensors import safe_open
+
+    with safe_open(folder / "model.safetensors", framework="pt") as file:
+        names = _own_names(file.keys(), policy.state_dict())
+        other = {own: file.get_tensor(name) for name, own in names.items() if own not in names}
+    if other:
+        policy.load_state_dict(other, strict=False)
 
 
 def _register_plugins() -> None:

@@ -243,7 +243,7 @@ def test_handovers_are_labelled_by_targets_too(trained):
 def test_a_policy_that_gives_targets_is_evaluated_like_any_other(agreed, trained):
     actions, root, policy = trained
     tasks = {"toy": dataset_of(root) / ROOT_OF_TASKS / "toy"}
-    stage = evaluation_stage(contestant(policy), tasks, engine(actions), seen=["toy"])
+    stage = evaluation_stage(contestant(policy), tasks, engine(actions), seen=[*tasks.values()])
 
     (judged,) = made([stage], Runtime(root=root)).values()
 

@@ -37,7 +37,7 @@ def test_a_distilled_policy_does_the_task_of_its_expert(
     assert all(o.is_usable for o in outcomes.values()), [o.detail for o in outcomes.values()]
     who = contestant(stage.folder(root) / POLICY_FOLDER)
     tasks = {"toy": dataset / ROOT_OF_TASKS / "toy"}
-    programs = evaluation_stage(who, tasks, LEARNING, seen=["toy"])
+    programs = evaluation_stage(who, tasks, LEARNING, seen=[*tasks.values()])
     (judged,) = made([programs], runtime).values()
 
     assert judged.is_usable, judged.detail

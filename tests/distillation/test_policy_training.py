@@ -1,5 +1,6 @@
 """From a dataset to a policy: sources, the distillation and policy stages with a real student, and their kills."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -175,7 +176,7 @@ def test_checkpoints_are_not_judged_on_what_the_policy_learns_from(root: Path):
         stage_of(root, judged)
 
 
-def test_tasks_that_judge_checkpoints_are_known_by_their_code_and_not_by_their_place(
+def test_tasks_that_judge_checkpoints_are_known_by_their_content_and_not_by_their_place(
     root: Path, tmp_path: Path
 ):
     def judged_by(folder: Path):
@@ -183,10 +184,11 @@ def test_tasks_that_judge_checkpoints_are_known_by_their_code_and_not_by_their_p
         return stage_of(root, replace(ENGINE, policy=policy)).fingerprint
 
     places = [tmp_path / "a" / "other", tmp_path / "b" / "other", tmp_path / "c" / "other"]
-    for place in places:
+    for place, mass_kg in zip(places, (0.2, 0.2, 0.3), strict=True):
         shutil.copytree(next((root / "task").iterdir()), place)
-        (place / "task.py").write_text((place / "task.py").read_text() + "# another object\n")
-    (places[2] / "task.py").write_text("# a third\n")
+        scene = json.loads((place / "scene/scene.json").read_text())
+        scene["objects"][0]["mass_kg"] = mass_kg
+        (place / "scene/scene.json").write_text(json.dumps(scene))
 
     one, two, three = (judged_by(place.parent) for place in places)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from v2p_data.craft_data import contents
 from v2p_data.errors import V2PError
 from v2p_data.evaluation.judging import contestant
 from v2p_data.experts.config import ExpertConfig
@@ -54,7 +55,7 @@ def test_a_judge_takes_it_for_an_expert_and_knows_it_by_its_program(chosen, tmp_
     (tmp_path / PROGRAM_FILE).write_text(json.dumps({"program": "tip over"}))
 
     assert who.kind == "expert"
-    assert who.sources != contestant(tmp_path).sources
+    assert contents("expert", chosen[0]) != contents("expert", tmp_path)
 
 
 def test_a_program_that_the_task_has_not_is_named_with_those_it_has(lift: Worlds, tmp_path: Path):

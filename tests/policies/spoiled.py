@@ -291,6 +291,101 @@ POLICIES["weights of another shape"] = with_tensors(
     WEIGHTS, lambda tensors: tensors.update({"net.head.0.bias": torch.zeros(8)})
 )
 
+# --- statistics ----------------------------------------------------------------------------------------------
+
+STATES = (STATE, "policy_postprocessor_step_0_unnormalizer_processor.safetensors")
+_STD, _LOW = "observation.state.std", "action.min"
+
+
+def under(prefix: str, *, feature: str = "", twice: float = 0.0) -> Spoil:
+    """Return what puts a prefix before all statistics, and writes the points of `feature` as underscores."""
+
+    def change(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        old = feature.replace(".", "_")
+        named = {name.replace(feature, old): value for name, value in tensors.items()}
+        more = {f"other.buffer.{name}": value + twice for name, value in named.items() if twice}
+        return {f"{prefix}{name}": value for name, value in named.items()} | more
+
+    return lambda folder: [with_tensors(file, change)(folder) for file in STATES] and None
+
+
+def normalising(file: str, **settings: Any) -> Spoil:
+    """Return what changes the settings of the step that normalises; `None` takes the step out."""
+
+    def change(data: dict[str, Any]) -> None:
+        step = next(
+            s for s in data["steps"] if s["registry_name"].endswith("normalizer_processor")
+        )
+        step["config"].update(settings)
+        if not settings:
+            data["steps"].remove(step)
+
+    return changed(file, change)
+
+
+def _set(name: str, value: Any) -> Spoil:
+    file = STATES[name.startswith("action")]
+    return with_tensors(file, lambda tensors: tensors.update({name: torch.tensor(value)}))
+
+
+def _lacking(file: str, start: str) -> Spoil:
+    return with_tensors(file, lambda t: {k: v for k, v in t.items() if not k.startswith(start)})
+
+
+for _name, _spoil in {
+    "under another name": under("other."),
+    "with a letter too many": under("x"),
+    "of two robots": under("one.buffer.", twice=1.0),
+    "without the state's": _lacking(STATE, "observation.state."),
+    "without the spread": _lacking(STATE, _STD),
+    "without the action's least": _lacking(STATES[1], _LOW),
+    "with std 0": _set(_STD, [0.0] * 11),
+    "with one std 0": _set(_STD, [0.0] + [1.0] * 10),
+    "with std below 0": _set(_STD, [-1.0] * 11),
+    "with std of one number": _set(_STD, [1.0]),
+    "with std of 7 numbers": _set(_STD, [1.0] * 7),
+    "with actions of one value": _set(_LOW, [1.0] * 7),
+    "upside down": _set(_LOW, [2.0] * 7),
+    "with no step": normalising(BEFORE),
+    "with no step for actions": normalising(AFTER),
+    "twice": changed(BEFORE, lambda data: data["steps"].append(data["steps"][3])),
+    "by another mode": normalising(BEFORE, norm_map={"STATE": "MIN_MAX"}),
+    "of actions by another mode": normalising(AFTER, norm_map={"ACTION": "MEAN_STD"}),
+    "by no mode": normalising(BEFORE, norm_map={}),
+    "left out": normalising(AFTER, norm_map={"ACTION": "IDENTITY"}),
+    "of no features": normalising(BEFORE, features={}),
+    "of other keys": normalising(BEFORE, normalize_observation_keys=["observation.images.mask"]),
+    "drowned": normalising(BEFORE, eps=10.0),
+    "of no file": changed(BEFORE, lambda data: data["steps"][3].pop("state_file") and None),
+}.items():
+    POLICIES[f"statistics {_name}"] = _spoil
+
+
+def renamed_weights(change: Callable[[str], str]) -> Spoil:
+    return with_tensors(WEIGHTS, lambda t: {change(name): value for name, value in t.items()})
+
+
+SAME: dict[str, Spoil] = {
+    "torch.compile": under("_orig_mod."),
+    "parallel training": under("module."),
+    "both": under("module._orig_mod."),
+    "older LeRobot": under("so100.buffer."),
+    "LeRobot of 2024": under("normalize_inputs.buffer_", feature="observation.state"),
+    "an older robot": under("normalize_inputs.so100.buffer_", feature="observation.state"),
+    "two alike": under("one.buffer.", twice=-0.0),
+    "weights of torch.compile": renamed_weights(lambda name: f"_orig_mod.{name}"),
+    "weights of parallel training": renamed_weights(lambda name: f"module.{name}"),
+    "weights of a compiled part": renamed_weights(lambda n: n.replace("net.", "net._orig_mod.")),
+    "an entry that never changes": lambda folder: (
+        [
+            _set(f"observation.state.{name}", [0.0] + [value] * 10)(folder)
+            for name, value in {"std": 1.0, "min": -1.0, "max": 1.0}.items()
+        ]
+        and None
+    ),
+}
+"""What writes a good policy as other versions do, so that it acts as before."""
+
 # --- caches --------------------------------------------------------------------------------------------------
 
 

@@ -101,6 +101,28 @@ def test_a_spoiled_policy_is_refused_in_one_sentence_and_runs_nothing(name: str,
     assert time.process_time() - began < 10
 
 
+@pytest.mark.parametrize("name", spoiled.SAME)
+def test_a_policy_under_the_names_of_other_versions_acts_as_before(
+    name: str, policy: Path, good: Path
+):
+    spoiled.SAME[name](policy)
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 4, (2, 64, 64)).astype(np.uint8)
+    state = rng.normal(size=(2, 11)).astype(np.float32)
+    state[:, 0] = 0.0
+
+    actions = [actor_of(folder).act(labels, state) for folder in (good, policy)]
+
+    assert np.abs(actions[0]).max() > 0
+    np.testing.assert_array_equal(*actions)
+
+
+def actor_of(folder: Path) -> Any:
+    actor, _ = opened(folder)(Described())
+    actor.policy.reset(2)
+    return actor.policy
+
+
 def test_the_program_runs_where_lerobot_opens_the_policy_by_itself(policy: Path):
     """Else the tests above would hold without any check."""
     from policies.evaluation.rollout import env_config, load_policy

@@ -32,23 +32,23 @@ def contestant_at(policy: Path) -> Contestant:
         raise V2PError(f"there is no folder {policy}, and {error}") from error
 
 
-def seen_tasks(who: Contestant) -> dict[str, Path]:
+def seen_tasks(who: Contestant) -> list[tuple[str, Path]]:
     """Return the tasks of a policy's dataset, or the one that an expert learned, as far as its run has them."""
     if who.kind == "programs" or who.repo_id:
-        return {}
+        return []
     root = home_of(who, ())
     record = read_record(who.folder.parent if who.kind == "policy" else who.folder)
     if record is not None and (who.kind, record.stage) == ("policy", "policy"):
         named = (record.recipe.get("sources") or {}).get("dataset")
         for dataset in sorted((root / "dataset").glob(str(named))):
             # The run's own tasks first: those in the dataset do not say where the file of another arm lies.
-            own = {source.item: source.task for source in sources_of(dataset, root)}
+            own = [(source.item, source.task) for source in sources_of(dataset, root)]
             return own or task_folders(dataset / ROOT_OF_TASKS)
     if record is not None and (who.kind, record.stage) == ("expert", "expert"):
         for stage, folder in record.inputs.items():
             if (root / stage / folder / TASK_FILE).is_file():
-                return {record.item: root / stage / folder}
-    return {}
+                return [(record.item, root / stage / folder)]
+    return []
 
 
 def home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
@@ -62,8 +62,7 @@ def home_of(who: Contestant, tasks: Sequence[Path]) -> Path:
     if who.kind == "programs":
         if not tasks:
             raise V2PError(f"the scripted programs need tasks: v2p eval {PROGRAMS} --tasks FOLDER")
-        task = next(iter(task_folders(tasks[0]).values()))
-        return task.resolve().parent.parent
+        return task_folders(tasks[0])[0][1].resolve().parent.parent
     if who.repo_id:
         return Path("outputs") / who.repo_id.split("/")[-1]
     return who.folder.parent.parent.parent if who.kind == "policy" else who.folder.parent.parent

@@ -25,6 +25,7 @@ from v2p_data.commands.judged import contestant_at, home_of, rate_lines, seen_ta
 from v2p_data.commands.progress import Progress
 from v2p_data.commands.settings import How, Running, Settings, goes_on, run_folder_for, with_config
 from v2p_data.commands.setup import fetch_preset
+from v2p_data.craft_data import tasks_by_name
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
 from v2p_data.episodes.hub.policy_card import note_results
 from v2p_data.errors import NotAllError, V2PError
@@ -54,7 +55,6 @@ from v2p_data.stages import (
     task_stage,
     with_cousins,
 )
-from v2p_data.task.task import TaskBundle
 from v2p_data.video.captions import CAPTIONS_FILE, NO_CAPTION, VideoItem, read_footage
 
 
@@ -186,9 +186,9 @@ def eval_command(argv: list[str]) -> int:
     args = with_config(Evaluate, argv, "eval")
     who = contestant_at(args.policy)
     root = run_folder_for(args.out or home_of(who, args.tasks))
-    unseen = {name: path for folder in args.tasks for name, path in task_folders(folder).items()}
+    others = [task for folder in args.tasks for task in task_folders(folder)]
     with only_run_in(root):
-        outcome, rows = evaluate(who, unseen, root, args.engine, args.how.runtime(root))
+        outcome, rows = evaluate(who, others, root, args.engine, args.how.runtime(root))
         page = _page(root)
     goes_on = {
         "policy": f"v2p push {shlex.quote(str(args.policy))} --repo-id USER/NAME",
@@ -292,20 +292,22 @@ def train(dataset: Path, root: Path, cfg: EngineConfig, runtime: Runtime) -> Pat
 
 
 def evaluate(
-    who: Contestant, unseen: dict[str, Path], root: Path, cfg: EngineConfig, runtime: Runtime
+    who: Contestant,
+    others: Sequence[tuple[str, Path]],
+    root: Path,
+    cfg: EngineConfig,
+    runtime: Runtime,
 ) -> tuple[Outcome, list[dict[str, Any]]]:
-    """Judge a policy, an expert or the programs in the tasks that it learned from and in unseen ones."""
+    """Judge a policy, an expert or the programs in the tasks that it learned from and in others."""
     seen = seen_tasks(who)
-    tasks = {**seen, **unseen}
-    for task in tasks.values():
-        demand_whole_part(task.resolve(), root)
-    if not tasks:
+    if not (named := [*seen, *others]):
         raise V2PError(
             f"no task is known for {who.repo_id or who.folder}; name task folders with --tasks"
         )
-    for folder in tasks.values():
-        TaskBundle.load(folder)  # what is wrong with a file is said before anything starts
-    stage = evaluation_stage(who, tasks, cfg, seen=list(seen))
+    for _, task in named:
+        demand_whole_part(task.resolve(), root)
+    # Reads all tasks: what is wrong with a file is said before anything starts.
+    stage = evaluation_stage(who, tasks_by_name(named), cfg, seen=[path for _, path in seen])
     outcome = _run([stage], _all_threads(runtime))[(stage.name, stage.folder_name)]
     _demand(outcome)
     rows = _record(outcome.folder).counts["rows"]
@@ -366,11 +368,11 @@ def _record_to_train(dataset: Path, root: Path) -> Record:
 
 def _unseen_tasks(
     videos: Path, root: Path, cfg: EngineConfig, runtime: Runtime
-) -> tuple[dict[str, Path], int]:
+) -> tuple[list[tuple[str, Path]], int]:
     stages = [task_stage(scene_stage(video, cfg), cfg) for video in _videos(videos)]
     outcomes = _run(stages, runtime)
     usable = [s for s in stages if outcomes[(s.name, s.folder_name)].is_usable]
-    return {s.item: s.folder(root) for s in usable}, exit_code(outcomes.values(), is_made=True)
+    return [(s.item, s.folder(root)) for s in usable], exit_code(outcomes.values(), is_made=True)
 
 
 def _up_to(

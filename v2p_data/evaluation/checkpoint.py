@@ -229,11 +229,16 @@ def check_checkpoint(folder: Path) -> Checkpoint:
             own_file(folder, name, MAX_JSON_BYTES)
     config = _read(folder, CONFIG_FILE, ConfigFile)
     steps = {name: _read(folder, name, ProcessorFile).steps for name in PROCESSOR_FILES}
-    for step in (step for those in steps.values() for step in those):
-        if step.state_file:
-            _check_tensors(own_file(folder, step.state_file, MAX_STATE_BYTES))
+    for name in (name for processor in PROCESSOR_FILES for name in state_files(folder, processor)):
+        _check_tensors(own_file(folder, name, MAX_STATE_BYTES))
     _check_tensors(own_file(folder, WEIGHTS_FILE, MAX_WEIGHTS_BYTES))
     return Checkpoint(config=config, steps=steps)
+
+
+def state_files(folder: Path, processor: str) -> list[str]:
+    """Return the names of the files of tensors that a processor of a policy reads."""
+    steps = _read(folder, processor, ProcessorFile).steps
+    return [step.state_file for step in steps if step.state_file]
 
 
 def _read[T: FileModel](folder: Path, name: str, kind: type[T]) -> T:

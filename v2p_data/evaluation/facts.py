@@ -14,6 +14,13 @@ from safetensors.numpy import load_file
 
 from v2p_data.episodes.dataset.features import ACTION_KEY, METADATA_FILE, STATE_KEY, STATE_NAMES
 from v2p_data.errors import V2PError
+from v2p_data.evaluation.checkpoint import (
+    CONFIG_FILE,
+    OTHER_FILES,
+    PROCESSOR_FILES,
+    WEIGHTS_FILE,
+    state_files,
+)
 from v2p_data.json_files import read_object
 from v2p_data.pipeline.artifact import read_record, write_json_atomically
 from v2p_data.sim.env.batch_env import SimConfig
@@ -29,6 +36,7 @@ from v2p_data.sim.robot.robot import TARGET_LOW_M
 from v2p_data.task.task import TASK_FILE
 
 FACTS_FILE = "v2p.json"
+INFO_FILE = "meta/info.json"
 TASKS_IN_DATASET = Path("v2p/tasks")
 NEAREST_M = TARGET_LOW_M[0] - 1e-3
 """No target of the tool is nearer to the arm's base."""
@@ -58,13 +66,11 @@ def facts_of_dataset(dataset: Path) -> Facts:
     Raises:
         V2PError: a file of it cannot be read.
     """
-    info, ours = _told(dataset / "meta/info.json"), _told(dataset / METADATA_FILE)
+    info, ours = _told(dataset / INFO_FILE), _told(dataset / METADATA_FILE)
     try:
         features: dict[str, Any] = info.get("features", {})
         palette = {int(k): int(grey) for k, grey in ours.get("palette", {}).items()}
-        tasks = [
-            _told(path) for path in sorted((dataset / TASKS_IN_DATASET).glob(f"*/{TASK_FILE}"))
-        ]
+        tasks = [_told(path) for path in _task_files(dataset)]
         return Facts(
             fps=float(info["fps"]) if "fps" in info else None,
             state=_names(features.get(STATE_KEY)),
@@ -113,11 +119,21 @@ def _guessed_actions(policy: Path, count: int) -> Actions:
     """Return what `count` entries of an action whose names nobody knows say."""
     if count == len(action_names("joints")):
         return "joints"
-    for path in policy.glob("policy_postprocessor*.safetensors"):
-        low = load_file(path).get(f"{ACTION_KEY}.min")
+    for name in state_files(policy, PROCESSOR_FILES[1]):
+        low = load_file(policy / name).get(f"{ACTION_KEY}.min")
         if low is not None and low.shape == (count,) == (len(TOOL_NAMES),) and low[0] > NEAREST_M:
             return "absolute_tool"
     return "delta_tool"
+
+
+def policy_files(policy: Path) -> list[Path]:
+    """Return the files that a policy is: its own, and its dataset's where none beside it tells of its training."""
+    states = [name for processor in PROCESSOR_FILES for name in state_files(policy, processor)]
+    names = (CONFIG_FILE, WEIGHTS_FILE, *PROCESSOR_FILES, *OTHER_FILES, *states)
+    found = [policy / name for name in names]
+    if not (policy / FACTS_FILE).is_file() and (dataset := _dataset_of(policy)):
+        found += [dataset / INFO_FILE, dataset / METADATA_FILE, *_task_files(dataset)]
+    return [path for path in found if path.is_file()]
 
 
 def write_facts(policy: Path, dataset: Path) -> None:
@@ -158,6 +174,10 @@ def _dataset_of(policy: Path) -> Path | None:
     config = policy / "train_config.json"
     root = (_told(config).get("dataset") or {}).get("root")
     return Path(root) if root and Path(root).is_dir() else None
+
+
+def _task_files(dataset: Path) -> list[Path]:
+    return sorted((dataset / TASKS_IN_DATASET).glob(f"*/{TASK_FILE}"))
 
 
 def _names(feature: Any) -> tuple[str, ...]:

@@ -18,7 +18,6 @@ from v2p_data.evaluation.checkpoint import WEIGHTS_FILE, check_checkpoint
 from v2p_data.evaluation.config import EvaluationConfig
 from v2p_data.evaluation.facts import interface_of
 from v2p_data.experts.labeller import PROGRAM_FILE, program_in
-from v2p_data.pipeline.fingerprint import file_digest
 from v2p_data.pipeline.runner import Runtime
 from v2p_data.play import Actor, StateActor, VisionActor
 from v2p_data.seeds import seed_for
@@ -30,6 +29,7 @@ from v2p_data.task.task import TASK_FILE, TaskBundle
 PROGRAMS = "programs"
 """What `v2p eval` is told in a policy's place for the scripted programs."""
 EXPERT_FILE, EXPERT_WEIGHTS_FILE = "expert.json", "weights.safetensors"
+EXPERT_FILES = (EXPERT_FILE, EXPERT_WEIGHTS_FILE, PROGRAM_FILE)
 UNSEEN_PX = 256
 """Size of pictures that nobody looks at."""
 Kind = Literal["policy", "expert", "programs"]
@@ -46,22 +46,6 @@ class Contestant:
     """Folder of a policy or an expert."""
     repo_id: str = ""
     """Name on the Hub of a policy that was fetched from there."""
-
-    @property
-    def sources(self) -> dict[str, str]:
-        """Return what identifies it."""
-        match self.kind:
-            case "policy":
-                return {"policy": file_digest(self.folder / WEIGHTS_FILE)}
-            case "expert":
-                is_program = (self.folder / PROGRAM_FILE).is_file()
-                return {
-                    "expert": file_digest(
-                        self.folder / (PROGRAM_FILE if is_program else EXPERT_WEIGHTS_FILE)
-                    )
-                }
-            case "programs":
-                return {"programs": ""}
 
 
 def contestant(path: Path) -> Contestant:
@@ -187,18 +171,19 @@ def _programs(seed: int) -> Play:
     return lambda bundle: (ProgramActor(seed_for(seed, "programs", bundle.title)), UNSEEN_PX)
 
 
-def task_folders(folder: Path) -> dict[str, Path]:
-    """Return the task folders at or below `folder` by name.
+def task_folders(folder: Path) -> list[tuple[str, Path]]:
+    """Return the finished task folders at or below `folder`, each with its item's name.
 
     Raises:
         V2PError: there is none.
     """
     if (folder / TASK_FILE).is_file():
-        return {_item_name(folder): folder}
-    found = {_item_name(p.parent): p.parent for p in sorted(folder.glob(f"*/{TASK_FILE}"))}
+        return [(_item_name(folder.resolve()), folder)]
+    found = [p.parent for p in sorted(folder.glob(f"*/{TASK_FILE}"))]
+    found = [path for path in found if path.suffix != ".partial"]
     if not found:
         raise V2PError(f"{folder} holds no task; tasks are the folders with a {TASK_FILE}")
-    return found
+    return [(_item_name(path), path) for path in found]
 
 
 def _item_name(folder: Path) -> str:

@@ -21,6 +21,8 @@ class EvaluationRow:
     """One task that somebody was judged in."""
 
     task: str
+    folder: str
+    """Name of the task's folder, which ends in what the task came from."""
     judged: str
     """Who: `policy`, `expert` or `programs`."""
     is_seen: bool
@@ -80,6 +82,7 @@ def _row(
     failures = as_dict(row.get("failures"))
     return EvaluationRow(
         task=task,
+        folder=str(row.get("folder", "")),
         judged=judged,
         is_seen=bool(row.get("seen")),
         rate=rate,

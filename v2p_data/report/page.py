@@ -71,7 +71,13 @@ def render_page(root: Path, cfg: PageConfig) -> str:
     run = read_run(root)
     budget = MediaBudget(max_bytes=cfg.max_media_bytes)
     evaluation = evaluation_rows(run, cfg, budget)
-    held_out = {row.task for row in evaluation if row.is_policy and not row.is_seen}
+    unseen = {(row.folder, row.task) for row in evaluation if row.is_policy and not row.is_seen}
+    held_out = {
+        item
+        for item in run.items
+        if ("", item) in unseen
+        or ((task := run.get("task", item)) and task.folder.name in dict(unseen))
+    }
     items = [
         item_view(run, item, f"video-{k}", item in held_out, k <= cfg.max_shown_items, cfg, budget)
         for k, item in enumerate(run.items, 1)

@@ -6,7 +6,6 @@ Task code is a Python text with six parts: scene information, `reset_objects_sta
 device, whose keys `states_table` lists.
 """
 
-import hashlib
 import json
 import os
 import shutil
@@ -154,14 +153,6 @@ class TaskBundle:
         """Return how many control steps a policy gets: this multiple of the task's own horizon."""
         return max(1, round(scale * self.horizon_steps))
 
-    @property
-    def arm(self) -> dict[str, Any]:
-        """Which arm it is for, wherever its file lies: the same for every copy of the file."""
-        if not self.robot or not Path(self.robot["path"]).is_file():
-            return self.robot
-        with Path(self.robot["path"]).open("rb") as stream:
-            return {**self.robot, "path": hashlib.file_digest(stream, "sha256").hexdigest()}
-
     def save(self, folder: Path) -> None:
         """Write the task and copy its scene's files and its robot's.
 
@@ -235,6 +226,13 @@ class TaskBundle:
         return [TASK_FILE, CODE_FILE, f"{SCENE_FOLDER}/{SCENE_FILE}"] + [
             f"{SCENE_FOLDER}/{name}" for name in there
         ]
+
+    def paths(self) -> list[Path]:
+        """Return where these files lie, and those of another arm than the built-in one."""
+        from v2p_data.task.robot_files import robot_files
+
+        arm = robot_files(Path(self.robot["path"])) if self.robot else []
+        return [*(self.folder / name for name in self.files()), *arm]
 
 
 @contextmanager

