@@ -1,7 +1,9 @@
 """Policies that do not suit the robot get one sentence that names what does not."""
 
 import json
+import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -190,3 +192,37 @@ def test_a_datasets_own_words_are_written_beside_the_policy(policy, tmp_path):
     (dataset / "meta/info.json").write_text("[]")
     with pytest.raises(V2PError, match="no JSON object"):
         facts_of_dataset(dataset)
+
+
+@pytest.mark.parametrize(
+    "dataset",
+    [
+        [1],
+        7,
+        "here",
+        {"root": 5},
+        {"root": ["a"]},
+        {"root": {}},
+        {"root": "x" * 5000},
+        {"root": "\0"},
+        None,
+    ],
+)
+def test_a_training_that_names_its_dataset_oddly(policy, dataset):
+    (policy / "train_config.json").write_text(json.dumps({"dataset": dataset}))
+    root = dataset.get("root") if isinstance(dataset, dict) else None
+
+    if dataset is None or isinstance(root, str) or root == {}:
+        assert check_policy(policy, *OFFER) == Facts()
+    else:
+        assert "train_config.json names no dataset" in told(policy)
+
+
+@pytest.mark.parametrize("spoil", [os.mkfifo, Path.mkdir, lambda path: path.write_text("noise")])
+def test_only_files_that_a_processor_names_are_opened(policy, spoil):
+    spoil(policy / "policy_postprocessor_old.safetensors")
+
+    assert check_policy(policy, *OFFER) == Facts()
+    (policy / AFTER).unlink()
+    spoil(policy / AFTER)
+    assert AFTER in told(policy)

@@ -141,6 +141,7 @@ ACCEPTED: dict[str, str] = {
         "k = 1.0\nif x.shape[0] > 8:\n    k = 2.0\nelif len(x) == 1:\n    k = 3.0\nelse:\n    pass"
     ),
     "any and all": program("b = any([k == 'eef_pos' for k in states]) and all([len(x) > 0])"),
+    "a rounding division": program("y = torch.div(x, 2, rounding_mode='floor')"),
     "comments only": program("# type: ignore\n# noqa\ny = 1  # TODO: tune 0.1"),
 }
 """What the reader accepts and what runs in the child."""
@@ -164,6 +165,14 @@ REFUSED_WITH_ADVICE: dict[str, tuple[str, str]] = {
     "a generator": (program("y = sum(v for v in [1, 2])"), "list"),
     "a tensor for a constant": (program("GOAL = torch.tensor([0.5, 0, 0.2])", "TOP"), "constant"),
     "a huge count": (program("y = torch.zeros(100000000)"), "1e+06"),
+    "a division that ends the process": (
+        program("y = torch.div(x.int(), -1, rounding_mode='trunc')"),
+        "torch.trunc(a / b)",
+    ),
+    "its rounding by another name": (
+        program("m = 'trunc'\nd = torch.div\ny = d(x.int(), -1, rounding_mode=m)"),
+        "torch.trunc(a / b)",
+    ),
     "an attribute read in an f-string": (program("y = f'{x.device}'"), "plain names"),
 }
 """What is refused although it means no harm, with words that must be in the sentence."""

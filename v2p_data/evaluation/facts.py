@@ -4,6 +4,7 @@
 their dataset, by the record of the run or LeRobot's `train_config.json`, as long as it is there.
 """
 
+import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -172,8 +173,13 @@ def _dataset_of(policy: Path) -> Path | None:
         if name and found.is_dir():
             return found
     config = policy / "train_config.json"
-    root = (_told(config).get("dataset") or {}).get("root")
-    return Path(root) if root and Path(root).is_dir() else None
+    dataset = _told(config).get("dataset") or {}
+    root = dataset.get("root") or "" if isinstance(dataset, dict) else None
+    if not isinstance(root, str):
+        raise V2PError(
+            f"{config} names no dataset as LeRobot does, by a 'root' that is a text; delete it, or train anew"
+        )
+    return Path(root) if os.path.isdir(root) else None  # noqa: PTH112 - false for any text
 
 
 def _task_files(dataset: Path) -> list[Path]:

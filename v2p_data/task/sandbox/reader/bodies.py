@@ -132,6 +132,11 @@ class Bodies:
         is_off = isinstance(keyword.value, ast.Constant) and keyword.value.value is False
         if name in {"requires_grad", "pin_memory"} and not is_off:
             self.here.refuse(f"argument '{name}' is not allowed; leave it out")
+        if name == "rounding_mode" and ast.unparse(keyword.value) not in ("None", "'floor'"):
+            self.here.refuse(
+                "argument 'rounding_mode' may only be 'floor': the least whole number divided by -1 with 'trunc' ends"
+                " the process; write torch.trunc(a / b)"
+            )
 
 
 def _left_to_read(node: ast.AST) -> list[ast.AST]:
