@@ -1,15 +1,24 @@
 """Each kind of task, played in the real physics by arms that do what its words say, and by arms that do not."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import played
 import pytest
+import torch
 from played import BACK, FORWARD, LEFT, RIGHT, bring, idle, let_go, program, rise, shove, take
+from scipy.spatial.transform import Rotation
 
+from v2p_data.errors import ItemRejectedError
+from v2p_data.experts.primitives import Moment
+from v2p_data.kinds import KINDS
+from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
+from v2p_data.sim.env.start_check import check_poses, check_start
 from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.task import TaskBundle
+from v2p_data.task.task import Task, TaskBundle
 
 pytestmark = pytest.mark.slow
 WORLDS = 4
@@ -97,6 +106,16 @@ SCRIPTS = {
         "lifted aside": (True, [take(), bring(y=0.08, z=0.12), idle(10)]),
     },
     "push_left": PUSHES,
+    "push_left, 13 cm": {
+        "pushed by the palm": (True, [shove(LEFT)]),
+        "pushed by the fingers": (True, [shove(LEFT, high=0.4)]),
+        "pushed too short by the palm": (False, [shove(LEFT, 0.04)]),
+    },
+    "push_right": {
+        "pushed": (True, [shove(RIGHT)]),
+        "to the other side": (False, [shove(LEFT)]),
+        "carried 2 cm high": (False, carry(bring(y=-0.11, z=0.02), bring(y=-0.11), lift_m=0.02)),
+    },
     "tip_over": {
         "nothing": (False, [idle()]),
         "lifted": (False, [take(), bring(z=0.1), idle(5)]),
@@ -166,7 +185,11 @@ SCRIPTS = {
 
 def bundle_of(kind: str) -> TaskBundle:
     """Return the benchmark's task of a kind, or another one's turned into it."""
-    if kind == "generic":
+    if kind == "push_left, 13 cm":
+        found, kind = load_benchmark("push_left"), "push_left"
+        large = replace(found.scene.manipulated, size_m=(0.13, 0.13, 0.13))
+        found = replace(found, scene=replace(found.scene, objects=(large,)))
+    elif kind == "generic":
         found = load_benchmark("push_left")
     elif kind == "place_onto":
         found = load_benchmark("push_next_to")
@@ -201,3 +224,92 @@ def test_a_kind_is_what_its_words_say(worlds: Callable[[str], BatchEnv], kind: s
     at_end, ever = played.play(worlds(kind), script)
 
     assert at_end.mean() >= 0.5 if counts else not ever.any()
+
+
+def odd_starts(worlds: BatchEnv) -> list[np.ndarray]:
+    """Return poses of all objects in which no honest task starts, of those that the checks of starts let pass."""
+    scene, thing = worlds.bundle.scene, worlds.world.objects[0]
+    placed = worlds.object_poses()[0]
+    other = min(1, len(placed) - 1)
+    half = placed[:, 2].copy()
+    wide = (thing.size_m[0] + worlds.world.objects[other].size_m[0]) / 2
+
+    def start(at=None, z: float = 0.0, lean: float = 0.0, of: int = 0) -> np.ndarray:
+        """Put an object at a place from the other's centre, z above the table, turned about x on its lowest edge."""
+        poses, obj = placed.copy(), worlds.world.objects[of]
+        poses[of, 3:] = np.cos(lean / 2), np.sin(lean / 2), 0.0, 0.0
+        turned = Rotation.from_rotvec([lean, 0.0, 0.0]).apply(obj.hull)
+        poses[of, 2] = z - turned[:, 2].min()
+        if at is not None:
+            poses[of, :2] = poses[1 - of if other else 0, :2] + at
+        return poses
+
+    on_top = 2 * half[other]
+    high = [
+        start((x, y), on_top + z)
+        for x, y in ((0, 0), (0.03, 0), (0, 0.04), (-0.04, 0.04))
+        for z in (0.0, 0.009)
+    ]
+    leaning = [start(lean=np.deg2rad(a)) for a in (-80, -50, -35, 10, 20, 35, 50, 65, 80, 90, 180)]
+    leaning += [start((0.0, s * (wide + 0.01)), lean=s * 0.4) for s in (-1, 1)]
+    beside = [start((0.0, -wide - gap)) for gap in (0.001, 0.01, 0.031)] + [
+        start((-wide - 0.02, 0.0))
+    ]
+    inside = [start((x, 0.0), z) for x in (0.0, 0.02) for z in (0.007, 0.012)]
+    under = [start((0.0, 0.0), 2 * half[0], of=other)] if other else []
+    lifted = [start(z=0.009), start((0.4, 0.6)), start((0.0, 0.0))]
+    passed = []
+    for poses in (*high, *leaning, *beside, *inside, *under, *lifted):
+        rows = worlds.motion()[0][:1]
+        first = thing.qpos_adr
+        rows[0, first : first + poses.size] = poses.ravel()
+        sizes, fields = worlds.randomizer.size_m[:1], worlds.randomizer.fields()
+        with contextlib.suppress(ItemRejectedError):
+            check_poses(worlds.world, sizes, poses[None], scene.title)
+            check_start(worlds.world, fields, rows, np.array([0]), scene.title)
+            passed.append(poses)
+    return passed
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_an_arm_that_does_nothing_or_anything_in_the_air_never_succeeds(kind: str):
+    calm = SimConfig(fine=True, randomization=ranges.none())
+    starts = np.array(odd_starts(BatchEnv(bundle_of(kind), calm, num_envs=1, seed=3)))
+
+    class SoonDone(Task):
+        """Starts each world oddly, and would call everything a success."""
+
+        def reset_objects_states(self, env_ids: torch.Tensor) -> dict[str, torch.Tensor]:
+            names = [o.name for o in bundle_of(kind).scene.objects]
+            return {n: torch.from_numpy(starts[env_ids.numpy(), k]) for k, n in enumerate(names)}
+
+        def compute_success(self, states: dict[str, torch.Tensor]) -> torch.Tensor:
+            return states["progress"] > 0.02
+
+        def compute_reward(
+            self, actions: torch.Tensor, states: dict[str, torch.Tensor]
+        ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            return states["progress"], {}
+
+    env = BatchEnv(
+        bundle_of(kind), calm, num_envs=len(starts), seed=3, num_threads=1, task=SoonDone
+    )
+    rng = np.random.default_rng(0)
+
+    def wander(m: Moment) -> np.ndarray:
+        t = 7.0 * m.tool[:, :2].sum(1) + rng.uniform(0, 0.2)
+        to = np.stack([0.5 + 0.15 * np.sin(3 * t), 0.2 * np.cos(t), 0.4 + 0.0 * t], axis=1)
+        return m.go(to, np.sign(np.sin(9 * t)))
+
+    def jerk(m: Moment) -> np.ndarray:
+        action = rng.uniform(-1, 1, (len(m.tool), 7))
+        action[:, 2] = np.abs(action[:, 2])
+        return action
+
+    actors = {"idle": [idle()], "random": [(60, jerk)], "wandering": [(60, wander)]}
+    if KINDS[kind].must_grasp:
+        actors["taking and leaving"] = [take(steps=50), let_go()]
+    counted = {who: int(played.play(env, script)[1].sum()) for who, script in actors.items()}
+
+    assert len(starts) >= 20
+    assert counted == dict.fromkeys(actors, 0)
