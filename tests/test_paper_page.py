@@ -99,15 +99,3 @@ def test_a_row_says_whether_it_is_the_same_and_if_not_why(row: list[str]):
     assert found[1] or len(found[2].split()) >= 3
     assert re.sub(r"<!--.*?-->", "", row[5]).strip()
     assert row[3] != "-" or row[4].startswith("missing")
-
-
-def test_a_figure_is_told_from_a_name_that_holds_digits():
-    assert figures_in("ResNet18, SAM-2 and figure 6: 5 of 8,192, 75 %, 6D.") == [5, 8192, 0.75]
-    assert figures_in("Table 1, figures 7, 8 and 11 and tables 3 and 7.") == []
-
-
-def test_a_member_a_constant_and_a_setting_are_names():
-    assert {"wilson", "Rate.value"} <= names_in("policies/evaluation/rate.py")
-    assert "PAPER_EPOCHS" in names_in("v2p_data/policy/config.py")
-    assert "policy.preset" in names_in("configs/paper.yaml")
-    assert "Rate.colour" not in names_in("policies/evaluation/rate.py")

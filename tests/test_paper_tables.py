@@ -6,7 +6,7 @@ import re
 import pytest
 
 import paper_tables
-from paper_tables import FILE, PAGES, papers_value, success, with_column
+from paper_tables import FILE, PAGES, papers_value
 from policies.bc.configuration_v2p_bc import V2PBCConfig
 from policies.bc.modeling_v2p_bc import PRETRAINED_BACKBONE_LR
 from results_table import ROOT
@@ -91,18 +91,6 @@ def test_a_sentence_in_the_code_quotes_the_paper(file: str, sentence: str):
 
 def test_table_1_has_a_row_for_each_task_of_the_benchmark():
     assert set(TABLES["table 1"]) == {*benchmark_names(), "average"}
-
-
-def test_a_success_is_shown_as_our_tables_show_it():
-    assert success("lift_up") == "0.93"
-    assert success("cover", "Eureka") == "0.00"
-
-
-def test_what_the_paper_does_not_have_is_named():
-    with pytest.raises(KeyError, match="no 'lift_down' of 'table 1/lift_down'"):
-        papers_value("table 1/lift_down")
-    with pytest.raises(ValueError, match="column 'paper'"):
-        with_column("# A page\n", "paper", str)
 
 
 def test_every_table_can_be_shown():

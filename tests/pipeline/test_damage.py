@@ -182,23 +182,6 @@ def test_a_card_and_logs_may_change(tmp_path):
     assert set(record.files or {}) == {"weights"}
 
 
-def test_what_was_compared_is_not_read_again(root, stages, monkeypatch: pytest.MonkeyPatch):
-    read: list[Path] = []
-    from v2p_data.pipeline import contents
-
-    digest = contents.file_digest
-    monkeypatch.setattr(contents, "file_digest", lambda path: read.append(path) or digest(path))
-
-    for _ in range(2):
-        stored_outcome(stages[0], root)
-    assert read == []
-
-    shutil.rmtree(root / MEMORY_FOLDER)
-    for _ in range(2):
-        stored_outcome(stages[0], root)
-    assert read == [stages[0].folder(root) / "text"]
-
-
 def test_bits_that_flip_behind_an_old_time_are_noticed(root, stages):
     path = stages[0].folder(root) / "text"
     stored_outcome(stages[0], root)

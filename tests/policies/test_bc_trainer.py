@@ -162,27 +162,6 @@ def test_a_stopped_training_keeps_the_checkpoint_that_an_undisturbed_one_keeps(
     assert are_equal(found, expected)
 
 
-def test_a_kill_after_the_last_step_keeps_the_best_checkpoint(tmp_path: Path, monkeypatch):
-    def killed(run: trainer._Run) -> None:
-        keep_best(run)
-        raise Stopped
-
-    keep_best = trainer._Run._keep_best
-    how = recipe(checkpoints=3, save_every_s=0.0)
-    told, calm = trained(tmp_path / "calm", small(), how, judge=first_is_best())
-    assert told.judged == ((4, 1.0), (5, 0.0), (6, 0.0))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(trainer._Run, "_keep_best", killed)
-        with pytest.raises(Stopped):
-            trained(tmp_path / "out", small(), how, judge=first_is_best())
-    told, found = trained(tmp_path / "out", small(), how, judge=lambda net: 0.0)
-
-    assert told.judged == ((4, 1.0), (5, 0.0), (6, 0.0))
-    assert are_equal(found, calm)
-    assert not (tmp_path / "out" / BEST_FILE).exists()
-
-
 def first_is_best():
     """Return a judge that likes nothing better than the first checkpoint."""
     rates = iter([1.0, 0.0, 0.0])

@@ -9,16 +9,13 @@ import trimesh
 from v2p_data.errors import ItemRejectedError
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.seeds import rng_for
-from v2p_data.sim.env.batch_env import Snapshot
 from v2p_data.sim.env.cpu_physics import CpuPhysics
 from v2p_data.sim.env.physics import SimConfig
 from v2p_data.sim.env.randomize import Randomizer
 from v2p_data.sim.env.ranges import RandomizationConfig
-from v2p_data.sim.model import convex
 from v2p_data.sim.model.convex import ConvexConfig
 from v2p_data.sim.model.solids import solids_of
-from v2p_data.sim.model.world import CAMERA, MESH_SCALES, build_world
-from v2p_data.sim.render.masks import FIRST_OBJECT, MaskRenderer
+from v2p_data.sim.model.world import MESH_SCALES, build_world
 from v2p_data.sim.robot.robot import COARSE
 from v2p_data.task.cache import cache_folder
 
@@ -194,20 +191,6 @@ def test_a_convex_mesh_stays_one_hull_and_is_not_cached(tmp_path: Path):
     assert not cache_folder("convex").exists()
 
 
-def test_parts_are_found_once_per_mesh_and_settings_whatever_the_size(
-    angle_file: Path, monkeypatch: pytest.MonkeyPatch
-):
-    first = solids_of(angle_file, "angle", SIZE)
-    monkeypatch.setattr(convex, "_split", lambda *_: pytest.fail("it is split again"))
-
-    again = solids_of(angle_file, "angle", (0.16, 0.08, 0.04))
-
-    for a, b in zip(first.parts, again.parts, strict=True):
-        np.testing.assert_allclose(b.vertices, a.vertices * [2, 1, 1], atol=1e-9)
-    with pytest.raises(pytest.fail.Exception):
-        solids_of(angle_file, "angle", SIZE, ConvexConfig(max_parts=4))
-
-
 def test_a_damaged_cache_entry_is_made_again(angle_file: Path):
     solids_of(angle_file, "angle", SIZE)
     (entry,) = cache_folder("convex").glob("*.npz")
@@ -260,28 +243,3 @@ def test_all_sizes_of_a_mesh_are_turned_alike(
     for ids in world.objects[0].mesh_ids:
         quats = world.model.mesh_quat[list(ids)]
         np.testing.assert_allclose(np.abs(quats @ quats[0]), 1.0, atol=1e-6)
-
-
-def test_masks_show_the_notch(angle_scene: Scene, monkeypatch: pytest.MonkeyPatch):
-    def pixels() -> int:
-        world = build_world(angle_scene, COARSE)
-        qpos = world.model.qpos0[None].copy()
-        fields = ("geom_size", "geom_pos", "geom_dataid")
-        view = world.model.camera(CAMERA)
-        still = Snapshot(
-            qpos=qpos,
-            qvel=np.zeros((1, world.model.nv)),
-            camera_pos=view.pos[None],
-            camera_quat=view.quat[None],
-            camera_fovy_deg=view.fovy,
-            **{name: getattr(world.model, name)[None].copy() for name in fields},
-        )
-        with MaskRenderer(world, 128) as renderer:
-            return int((renderer.draw(still, 0) == FIRST_OBJECT).sum())
-
-    with_notch = pixels()
-    monkeypatch.setattr(convex, "_split", lambda *_: ([], "because the test wants the hull"))
-    monkeypatch.setattr(convex, "VERSION", -1)  # another cache entry
-    filled = pixels()
-
-    assert 50 < with_notch < 0.95 * filled

@@ -332,7 +332,8 @@ SCENE_FIELDS: dict[str, tuple[type, ...]] = {
     "objects.0.source": (),
     "objects.0.poses_world": (),
 }
-_FINE = {("objects.0.source", "{'x': 1}"), ("confidence", "True")}
+
+
 for _field, _kinds in SCENE_FIELDS.items():
     for _value in _wrong_for(_kinds)[::3]:
         if _value == [] and _field in ("objects.0.poses_world",):

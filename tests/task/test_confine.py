@@ -17,7 +17,6 @@ import pytest
 from v2p_data.task.sandbox.confine import Rights, confine, leave_the_network
 from v2p_data.task.sandbox.smoke_child import in_a_fork
 
-LIBC = ctypes.CDLL(None, use_errno=True)
 MEGABYTE = 2**20
 
 

@@ -47,16 +47,6 @@ def filmed(frames: np.ndarray) -> Clip:
     )
 
 
-def cup_at(x: float, y: float, above: float) -> np.ndarray:
-    """Return the outline of a cup so far above the table, in camera heights."""
-    camera = camera_above((H, W), PITCH, FOV)
-    noun = noun_for("cup")
-    points = outline_points(noun.form, tuple(2 * np.array(noun.size_m)), noun.taper)
-    points = points + np.array([x, y, above + noun.size_m[2]])
-    hull = cv2.convexHull(camera.project(points).astype(np.float32))
-    return cv2.fillConvexPoly(np.zeros((H, W), np.uint8), hull.round().astype(np.int32), 1) > 0
-
-
 def test_what_comes_later_hides_nothing_now_but_an_arm_does():
     """A red block is pushed beside a blue one; at first an arm lies on the blue one's other side."""
     places = [block(60 + 100 * min(12, max(0, i - 6)) // 12, 100) for i in range(24)]

@@ -98,14 +98,3 @@ def test_doubling_a_picture_takes_pixel_centres_to_pixel_centres():
     # The first pixel spreads over the first two: from centre 0 to the middle of 0 and 1.
     np.testing.assert_allclose(doubled @ [0, 0, 1], [0.5, 0.5, 1])
     np.testing.assert_allclose(between_centres(np.eye(3)), np.eye(3), atol=1e-12)
-
-
-def test_a_far_way_that_the_corners_do_not_confirm_leaves_the_clip_as_it_is(draw, monkeypatch):
-    from v2p_data.scene.frames import stabilise
-
-    clip = draw()
-    motion = type("Motion", (), {"travel": lambda *_: 0.04, "zoom": lambda *_: 0.15})()
-    monkeypatch.setattr(stabilise, "camera_shift_px", lambda working: 5.6)
-    monkeypatch.setattr(stabilise, "camera_motion", lambda greys: motion)
-
-    assert stabilised(clip, working_clip_of(clip)) is clip

@@ -30,8 +30,6 @@ from v2p_data.scene.grounding.static_cues import StaticSearch
 from v2p_data.scene.grounding.static_objects import find_static_object
 from v2p_data.scene.scale.nouns import noun_for
 
-SLEEVE = (90, 90, 100)
-
 
 class TruthModel:
     """Knows which pixels belong together in each frame; half of an object is a part, and all that is drawn a group."""

@@ -13,7 +13,6 @@ from v2p_data.scene.frames.table import find_table
 from v2p_data.scene.grounding.ground_objects import seen_on_table
 from v2p_data.scene.grounding.static_cues import (
     WEIGHTS,
-    StaticCandidate,
     StaticSearch,
     static_share,
     usual_area_px,
@@ -101,31 +100,6 @@ def test_a_named_colour_outweighs_a_little_distance(segmentation_of):
 
     assert iou(blue, large(near, working.shape)) > 0.8
     assert iou(green, large(far, working.shape)) > 0.8
-
-
-def test_a_whole_that_was_cut_out_twice_is_meant_rather_than_something_likelier_by_itself(
-    segmentation_of, monkeypatch
-):
-    """What two candidates nearly agree on is likelier than the one candidate that agrees with none."""
-    ends = square(5, 40), square(50, 40)
-    search = searched(
-        segmentation_of, pushed_to(50, [(square(72, 28, 20), BLUE)]), "box", "push_next_to", ends
-    )
-    usual = candidates(search)[0]
-    shapes = [(square(72, 28, 20), 0.70), (square(73, 29, 19), 0.69), (square(5, 5), 0.75)]
-    found = [
-        StaticCandidate(
-            mask=large(mask, search.working.shape),
-            cues={**dict.fromkeys(usual.cues, 0.0), "seen": seen},
-        )
-        for mask, seen in shapes
-    ]
-    monkeypatch.setattr("v2p_data.scene.grounding.static_objects.candidates", lambda _: found)
-
-    assert iou(find_static_object(search)[0], found[0].mask) > 0.7
-
-    monkeypatch.setattr("v2p_data.scene.grounding.static_objects.candidates", lambda _: found[1:])
-    assert iou(find_static_object(search)[0], found[2].mask) > 0.7
 
 
 def test_one_alone_is_surer_than_one_of_two_that_are_alike(segmentation_of):
