@@ -67,15 +67,6 @@ def test_who_acted_is_staged_and_read_back(handover: Episode, tmp_path: Path):
     assert Heading.read(path).is_handover
 
 
-def test_a_demonstration_is_staged_without_it(make_episode, tmp_path: Path):
-    path = make_episode(4).save(tmp_path)
-
-    with np.load(path) as data:
-        assert "intervention" not in data
-    assert Episode.load(path).intervention is None
-    assert Episode.load(path).expert_acted.all()
-
-
 def test_who_acted_is_as_long_as_the_episode(handover: Episode):
     with pytest.raises((ValueError, TypeError), match=r"(?i)differ in length|type-check error"):
         replace(handover, intervention=np.ones(NUM_FRAMES - 1, bool))
@@ -101,37 +92,6 @@ def test_lerobot_reads_who_acted_and_gives_it_to_no_policy(mixed: Path, handover
     }
     # 12 + 7 of 24 frames
     assert np.allclose(dataset.meta.stats["intervention"]["mean"], 19 / 24)
-
-
-@pytest.mark.slow
-def test_a_policy_of_lerobots_learns_from_it(mixed: Path):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.factory import make_policy, make_pre_post_processors
-    from torch.utils.data import DataLoader
-
-    dataset: Any = LeRobotDataset(
-        "user/mixed", root=mixed, delta_timestamps={"action": [0.0, 0.05]}
-    )
-    cfg = ACTConfig(
-        device="cpu",
-        chunk_size=2,
-        n_action_steps=2,
-        dim_model=16,
-        n_heads=2,
-        dim_feedforward=16,
-        n_encoder_layers=1,
-        n_vae_encoder_layers=1,
-        pretrained_backbone_weights=None,
-        push_to_hub=False,
-    )
-    policy = make_policy(cfg, ds_meta=dataset.meta)
-    prepare, _ = make_pre_post_processors(cfg, dataset_stats=dataset.meta.stats)
-
-    loss, _ = policy.forward(prepare(next(iter(DataLoader(dataset, batch_size=4)))))
-
-    assert loss.isfinite()
-    assert set(cfg.input_features or {}) == {"observation.images.mask", "observation.state"}
 
 
 @pytest.mark.slow
@@ -194,29 +154,6 @@ def test_a_column_that_was_staged_and_is_missing_is_noticed(
     (problem,) = verify(packed, [*staged[:2], acted]).problems
 
     assert problem.detail == "intervention was recorded and is no column"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("plain_first", [True, False])
-def test_demonstrations_get_the_column_when_they_are_merged_with_handovers(
-    packed: Path,
-    staged: list[Path],
-    mixed: Path,
-    mixed_staged: list[Path],
-    tmp_path: Path,
-    plain_first: bool,
-):
-    plain = [True] * 3 * NUM_FRAMES
-    parts = [(packed, staged, plain), (mixed, mixed_staged, MIXED)]
-    (one, ones, first), (two, twos, second) = parts if plain_first else parts[::-1]
-
-    merge([one, two], "user/all", tmp_path / "all")
-
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["all"]
-    assert intervention(tmp_path / "all") == [*first, *second]
-    report = verify(tmp_path / "all", [*ones, *twos])
-    assert report.is_good, report.summary()
-    assert "| demonstrations | 4 | 48 | 0 |" in (tmp_path / "all/README.md").read_text()
 
 
 @pytest.mark.slow

@@ -54,22 +54,6 @@ def test_nothing_is_thicker_than_the_cap_and_what_is_flat_stays_the_same():
     assert not inflated(np.zeros((20, 20), bool), PX_M, NO_CAP).any()
 
 
-@pytest.mark.parametrize("factor", [0.5, 3.0])
-def test_thickness_and_mesh_grow_with_the_pixels_size(factor: float):
-    outline = boot()
-    mesh, _ = made(outline, cap_m=0.006)
-
-    large, _ = made(outline, cap_m=0.006 * factor, px_m=PX_M * factor)
-
-    np.testing.assert_allclose(
-        inflated(outline, PX_M * factor, 0.006 * factor),
-        factor * inflated(outline, PX_M, 0.006),
-        rtol=1e-5,
-    )
-    assert large.volume == pytest.approx(factor**3 * mesh.volume, rel=0.1)
-    np.testing.assert_allclose(large.bounds[:, :2], factor * mesh.bounds[:, :2], rtol=1e-6)
-
-
 def test_columns_run_along_x_and_rows_along_y():
     outline = boot()
     y, x = np.nonzero(outline)
@@ -95,18 +79,6 @@ def test_the_rim_lies_on_the_outline_to_half_a_pixel():
     rim = mesh.vertices[np.unique(mesh.faces[upright]), :2] / PX_M
     radii = np.linalg.norm(rim - [40.5, 30.5], axis=1)  # the middle of the pixel (40, 30)
     np.testing.assert_allclose(radii, np.sqrt(outline.sum() / np.pi), atol=0.5)
-
-
-def test_a_rim_is_at_most_half_as_thick_as_the_middle_and_never_sharp():
-    outline = disc()
-    plate, _ = pillow(outline, np.full(outline.shape, 0.01, np.float32), PX_M)
-    leaf, _ = pillow(outline, np.zeros(outline.shape, np.float32), PX_M)
-
-    upright = np.abs(plate.face_normals[:, 2]) < 1e-6
-    rim = np.abs(plate.vertices[np.unique(plate.faces[upright]), 2])
-    np.testing.assert_allclose(rim, 0.005, rtol=1e-5)
-    assert plate.bounds[1, 2] == pytest.approx(0.01)
-    np.testing.assert_allclose(np.abs(leaf.vertices[:, 2]), 0.0004)
 
 
 @pytest.mark.parametrize("outline", [disc(), boot()], ids=["disc", "boot"])
@@ -137,15 +109,6 @@ def test_a_boot_is_cut_so_that_the_air_above_its_toe_is_free():
 
     assert len(parts) >= 2
     assert outside(np.array([[0.060, 0.020, 0.0]]), parts)[0] > 0.01
-
-
-def test_of_an_outline_in_pieces_the_largest_is_taken():
-    both = disc(8, at=(14, 14)) | disc(20, at=(60, 36))
-
-    mesh, _ = made(both)
-
-    alone, _ = made(disc(20, at=(60, 36)))
-    np.testing.assert_allclose(mesh.bounds[:, :2], alone.bounds[:, :2], atol=1e-6)
 
 
 @pytest.mark.parametrize("pixels", [0, 1])

@@ -162,12 +162,6 @@ def test_a_stopped_training_keeps_the_checkpoint_that_an_undisturbed_one_keeps(
     assert are_equal(found, expected)
 
 
-def first_is_best():
-    """Return a judge that likes nothing better than the first checkpoint."""
-    rates = iter([1.0, 0.0, 0.0])
-    return lambda net: next(rates)
-
-
 def test_the_best_checkpoint_that_was_judged_is_what_remains(tmp_path: Path):
     rates, seen = [0.2, 0.9, 0.5], []
 

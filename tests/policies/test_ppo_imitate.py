@@ -108,14 +108,6 @@ def test_imitation_ends_with_the_first_round_that_succeeds_often_enough(tmp_path
     assert list(rates) == [1.0, 1.0]
 
 
-def test_without_a_trial_all_rounds_are_played(tmp_path: Path):
-    env = PointMass(NUM_ENVS, seed=1)
-
-    result = imitate(env, straight_to(env), replace(CFG, epochs=1), tmp_path, seed=0)
-
-    assert result.steps == 6 * 20 * NUM_ENVS
-
-
 def test_the_round_that_succeeded_most_is_kept(tmp_path: Path):
     seen: list[dict[str, torch.Tensor]] = []
     rates = [0.2, 0.9, 0.5, 0.9]
@@ -211,23 +203,6 @@ def test_the_actor_s_first_step_after_a_warm_start_is_a_careful_one(pupil: Path,
     assert moved("b", 5e-5) == pytest.approx(5e-5, rel=0.05)
 
 
-@pytest.mark.parametrize(("batches", "updates"), [(1, 0), (3, 2)])
-def test_only_gradient_steps_that_move_the_actor_are_counted(
-    pupil: Path, tmp_path: Path, batches: int, updates: int
-):
-    cfg = replace(
-        PPO,
-        total_steps=batches * BATCH,
-        epochs=1,
-        minibatch=BATCH,
-        warm_start_critic_batches=1,
-    )
-
-    result = train_expert(PointMass(NUM_ENVS, seed=2), cfg, tmp_path, warm_start=pupil)
-
-    assert result.last_actor_updates == updates
-
-
 @pytest.mark.slow
 def test_going_on_does_not_lose_a_policy_that_succeeds(pupil: Path, tmp_path: Path):
     before = success(pupil)
@@ -258,14 +233,6 @@ def test_a_warm_training_that_unlearns_is_stopped_and_its_best_is_kept(
     assert result.steps < 200 * BATCH
     assert success(tmp_path) > 0.8
     assert success(tmp_path / "last") < success(tmp_path)
-
-
-def test_a_training_from_nothing_is_not_stopped_for_declining(tmp_path: Path):
-    result = train_expert(
-        UnwantedGoal(NUM_ENVS, seed=2), replace(PPO, total_steps=20 * BATCH), tmp_path
-    )
-
-    assert result.stopped_by == "steps"
 
 
 def test_the_deterministic_worlds_start_at_the_start(tmp_path: Path):

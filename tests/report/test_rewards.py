@@ -233,25 +233,6 @@ def test_a_broken_file_does_not_break_the_page(run, name: str, content: str):
     assert words in text_of(outline(run))
 
 
-def test_a_parent_in_a_circle_ends(run):
-    search = FakeSearch(run).whole()
-    search.rows[2]["parent"] = 2
-    search.save()
-
-    assert "Candidate 2 of 3 was chosen" in text_of(outline(run))
-
-
-def test_numbers_beyond_all_measure_do_not_stop_the_page(run):
-    search = FakeSearch(run).whole()
-    search.curve.write_text(
-        "steps,return,reward_a\n-1e308,1e308,inf\n1e308,-1e308,nan\n3,4,5\n6,7,8\n"
-    )
-    search.rows[2]["results"] = [{"success": 10**400}, {"success": -5}, {"success": 7.0}]
-    search.save()
-
-    assert "0, 100 %" in text_of(outline(run))
-
-
 def test_links_out_of_a_search_are_not_followed(run, tmp_path):
     secret = tmp_path / "secret.json"
     secret.write_text('{"counts": {"feedback": {"objects": [{"name": "stolen"}]}}}')
@@ -262,28 +243,6 @@ def test_links_out_of_a_search_are_not_followed(run, tmp_path):
     os.mkfifo(search.curve)
 
     assert "stolen" not in outline(run).text
-
-
-def test_a_search_of_forty_rewards_stays_small(run):
-    bare = len(outline(run).text)
-    search = FakeSearch(run)
-    long_code = "\n".join(f"    part_{k} = {k} * states['eef_pos'][:, 0]" for k in range(120))
-    for number in range(40):
-        search.candidate(
-            [0.1, 0.2, 0.3, 0.4],
-            iteration=number // 8,
-            code=long_code,
-            parent=number - 8 if number > 7 else None,
-            reasons=("because " * 15,),
-        )
-    search.found = {"chosen": 39, "success": 0.4}
-    search.save()
-    run.record(search.stage)
-
-    text = outline(run).text
-
-    assert "40 rewards in 5 rounds" in text
-    assert bare < (run.root / "report.html").stat().st_size < 80_000
 
 
 def test_a_difference_holds_both_sides_and_little_around_them():

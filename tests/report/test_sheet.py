@@ -17,7 +17,6 @@ from v2p_data.report.sheet import (
     contact_sheet,
     draw_moment,
     draw_rollout,
-    evenly,
     write_contact_sheet,
 )
 from v2p_data.scene.scene import Scene, SceneObject
@@ -54,38 +53,10 @@ def test_rows_are_episodes_and_columns_are_moments():
             assert (below_the_time == value + 10 * column).all()
 
 
-def test_success_and_failure_are_marked_at_the_left():
-    sheet = contact_sheet([a_row(50, succeeded=True), a_row(150, succeeded=False)], CFG)
-
-    assert tuple(sheet[8, 1]) == GOOD
-    assert tuple(sheet[52, 1]) == BAD
-
-
-def test_words_and_times_are_written():
-    sheet = contact_sheet([a_row(50, succeeded=True)], CFG)
-
-    assert (sheet[:40, 4:60] != GROUND).any()
-    assert all((thumbnail(sheet, 0, column)[:18] > 150).any() for column in range(3))
-
-
-def test_a_longer_film_shows_its_first_and_last_moment():
-    sheet = contact_sheet([a_row(0, succeeded=True, count=21)], CFG)
-
-    assert [int(thumbnail(sheet, 0, c)[30, 20, 0]) for c in range(3)] == [0, 100, 200]
-
-
 def test_no_episodes_give_a_sheet_that_says_so():
     sheet = contact_sheet([], CFG)
 
     assert (sheet != GROUND).any()
-
-
-@pytest.mark.parametrize(
-    ("count", "wanted", "expected"),
-    [(101, 3, [0, 50, 100]), (2, 8, [0, 1]), (1, 8, [0]), (0, 8, [])],
-)
-def test_moments_are_evenly_spread(count, wanted, expected):
-    assert evenly(count, wanted) == expected
 
 
 @dataclass

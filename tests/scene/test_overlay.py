@@ -117,23 +117,6 @@ def test_a_mask_track_is_drawn_where_it_says_and_nowhere_between_its_gaps(pushed
     np.testing.assert_allclose(filled - plain, 0.32 * (MAGENTA - plain), atol=6)
 
 
-def test_words_stand_outside_of_the_picture_one_line_per_object(pushed):
-    other = replace(pushed.objects[0], name="x" * 300, role="reference")
-    both = replace(pushed, objects=(pushed.objects[0], other))
-
-    assert draw_over(pushed, 0, SIZE).shape == (480 + 24 + 20, 640, 3)
-    assert draw_over(both, 0, SIZE).shape == (480 + 24 + 40, 640, 3)
-
-
-def test_what_lies_behind_the_camera_is_left_out(pushed):
-    box = pushed.objects[0]
-    T = box.T_world_objs.copy()
-    T[:, 0, 3] = -5.0
-    away = replace(pushed, objects=(replace(box, T_world_objs=T, masks={}),) * 2)
-
-    assert not drawn_over(away, 0).any()
-
-
 def test_a_tool_is_drawn_only_while_the_hand_holds_it(pushed):
     box = pushed.objects[0]
     some = slice(5, 10)

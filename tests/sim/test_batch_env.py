@@ -13,9 +13,7 @@ from v2p_data.sim.env import ranges
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.env.task_code import HELD_STEPS
-from v2p_data.sim.model.world import CAMERA
 from v2p_data.sim.render.masks import FIRST_OBJECT, MaskRenderer
-from v2p_data.sim.robot.robot import FINGER_TRAVEL_M
 from v2p_data.task.sandbox.reader.refusal import TaskCodeError
 from v2p_data.task.task import BASE_OBSERVATION_DIM, OBJECT_STATES, ROBOT_STATES, Task, TaskBundle
 
@@ -283,16 +281,6 @@ def test_an_episode_is_cut_off_at_the_horizon_and_not_before(make_env: Callable[
     assert truncated == [False] * 6 + [True]
 
 
-def test_staggered_worlds_end_at_different_times(make_env: Callable[..., BatchEnv]):
-    env = make_env(horizon=20, num_envs=32)
-    env.stagger()
-
-    ended = [int(env.step(np.zeros((32, 7))).truncated.sum()) for _ in range(20)]
-
-    assert ended[-1] == 32
-    assert len(set(ended)) > 5
-
-
 def test_task_code_is_run_through_the_guard(make_bundle: Callable[..., TaskBundle]):
     code = """
 import torch
@@ -427,20 +415,6 @@ def test_a_delta_action_moves_the_tool_by_its_metres_and_radians(
     assert moved[5] == pytest.approx(0.5 * 0.2, abs=2e-3)
 
 
-def test_a_closed_gripper_begins_to_open_at_once(make_env: Callable[..., BatchEnv]):
-    env = make_env(cfg=SimConfig(fine=True), num_envs=16)
-    scripted_lift(env, steps=45)
-    grasped = env.states()["cube_grasped"].numpy() == 1
-    action = np.zeros((16, 7))
-    action[:, 6] = -1.0
-
-    for _ in range(3):
-        env.step(action)
-
-    assert grasped.any()
-    assert (env.states()["cube_grasped"].numpy()[grasped] == 0).all()
-
-
 def test_a_snapshot_draws_the_same_world(
     make_env: Callable[..., BatchEnv], make_object: Callable[..., SceneObject]
 ):
@@ -494,27 +468,6 @@ def test_a_moved_camera_shows_the_ball_where_a_pinhole_projects_it(
     np.testing.assert_allclose(seen, expected, atol=0.7)
 
 
-def test_a_camera_that_is_not_moved_is_the_models_to_the_pixel_and_moving_it_moves_nothing_else(
-    make_env: Callable[..., BatchEnv], make_object: Callable[..., SceneObject]
-):
-    ball = make_object("cube", "sphere")
-    fixed = make_env(ball)
-    moved = make_env(ball, cfg=SimConfig(randomization=RandomizationConfig(camera_pos_m=0.05)))
-    pos = (0.5, -0.25, 0.02)
-
-    masks, others = ball_at(fixed, pos, 96), ball_at(moved, pos, 96)
-
-    np.testing.assert_array_equal(moved._sim.qpos, fixed._sim.qpos)
-    snapshot, view = fixed.snapshot(np.arange(8)), fixed.world.model.camera(CAMERA)
-    assert (snapshot.camera_pos == view.pos).all()
-    assert (snapshot.camera_quat == view.quat).all()
-    assert (snapshot.camera_fovy_deg == view.fovy).all()
-    assert all((a != b).any() for a, b in zip(masks, others, strict=True))
-    with MaskRenderer(fixed.world, 96) as renderer:
-        renderer.draw(moved.snapshot(np.arange(1)), 0)
-        np.testing.assert_array_equal(renderer.draw(snapshot, 0), masks[0])
-
-
 def test_a_saved_environment_goes_on_exactly(make_env: Callable[..., BatchEnv]):
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (20, 8, 7))
@@ -537,20 +490,6 @@ def test_a_saved_environment_goes_on_exactly(make_env: Callable[..., BatchEnv]):
     second.load_state_dict(saved)
 
     assert play(second, actions[11:]) == rest
-
-
-def test_episode_parameters_are_those_of_the_world(make_env: Callable[..., BatchEnv]):
-    env = make_env()
-
-    params = env.episode_params(4)
-
-    assert params["objects"]["cube"]["size_m"] == pytest.approx(
-        env.states()["cube_size"][4].tolist(), abs=1e-5
-    )
-    assert params["start_poses"]["cube"][:3] == pytest.approx(
-        env.states()["cube_start_pos"][4].tolist(), abs=1e-5
-    )
-    assert env._sim.qpos[4, 7] == FINGER_TRAVEL_M
 
 
 @pytest.mark.parametrize(("away_m", "touches"), [(0.0, True), (0.004, False)])

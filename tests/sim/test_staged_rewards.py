@@ -120,17 +120,6 @@ def test_dragging_costs_more_the_nearer_the_goal_and_what_falls_or_is_carried_co
     assert here < left < up
 
 
-@pytest.mark.parametrize("name", ["cover", "uncover"])
-def test_above_a_cup_that_fills_the_gripper_every_centimetre_towards_its_middle_pays(name):
-    moments = Moments(name)
-    cup = moments.start("cup")
-
-    # Just above its rim, where fingers beside its middle cannot go down.
-    paid = moments.pay([{"eef_pos": cup + [-x, 0, 0.057]} for x in (0.03, 0.02, 0.01, 0.0)])  # noqa: RUF005
-
-    assert all(np.diff(paid) > 0), paid
-
-
 def test_a_thing_to_be_thrown_earns_by_flying_and_not_by_rolling_to_the_container():
     moments = Moments("throw_into")
     start, bowl = moments.start("garlic"), moments.start("bowl")
@@ -141,40 +130,6 @@ def test_a_thing_to_be_thrown_earns_by_flying_and_not_by_rolling_to_the_containe
 
     assert paid[:3] == [0, 0, 0]
     assert 0 < paid[3] < paid[4] < paid[5]
-
-
-def test_fingers_that_close_around_a_wide_thing_earn_more_and_more_and_those_closed_above_it_do_not():
-    moments = Moments("uncover")
-    cup = moments.start("cup")
-    around = {"eef_pos": cup + np.array([0, 0, cup[2] - 0.035])}
-
-    open_wide, halfway, nearly, above = moments.pay(
-        [around | {"gripper_width": width_m} for width_m in (0.085, 0.083, 0.081, 0.0)]
-    )
-
-    assert open_wide < halfway < nearly
-    assert above < open_wide
-
-
-def test_closed_fingers_that_press_on_the_top_of_a_cover_have_not_gripped_it():
-    moments = Moments("uncover")
-    cup = moments.start("cup")
-    touching = {"cup_grasped": 1.0, "cup_touched": 1.0, "gripper_width": 0.0}
-    top = np.array([0, 0, cup[2] + 0.003])
-
-    pressed, near = moments.pay([touching | {"eef_pos": cup + top}, {"eef_pos": cup + top}])
-
-    assert pressed <= near
-
-
-def test_going_straight_at_the_side_of_a_tall_thing_pays_less_than_being_above_it():
-    moments = Moments("uncover")
-    cup = moments.start("cup")
-    grasp = cup + np.array([0, 0, cup[2] - 0.035])
-
-    beside, above = moments.pay([{"eef_pos": grasp + np.array([0.06, 0, z])} for z in (0.0, 0.06)])
-
-    assert above > beside
 
 
 def test_the_way_down_to_a_fork_leads_around_the_container_and_not_over_its_rim():

@@ -147,23 +147,8 @@ def test_what_reaches_past_the_camera_is_cut_at_the_near_plane():
     assert (image != hits).mean() < 0.002
 
 
-def test_what_is_nearer_than_the_near_plane_is_not_seen():
-    geom = '<geom type="box" size="0.05 0.05 0.01" pos="0 0 -0.2"/>'
-
-    assert painted(compiled(geom, near=0.1), [1]).any()
-    assert not painted(compiled(geom, near=0.3), [1]).any()
-
-
 def test_the_inside_of_a_box_is_not_seen_from_within():
     assert not painted(compiled('<geom type="box" size="1 1 1"/>'), [1]).any()
-
-
-def test_background_hides_what_is_behind_it():
-    far = '<geom type="box" size="0.2 0.2 0.05" pos="0 0 -2"/>'
-    model = compiled(far + '<geom type="box" size="0.3 0.3 0.05" pos="0 0 -1"/>')
-
-    assert not painted(model, [1, 0]).any()
-    assert set(np.unique(painted(model, [0, 1]))) == {0, 1}
 
 
 def test_what_mujoco_does_not_show_is_not_drawn():
@@ -231,16 +216,6 @@ def test_a_forked_process_draws_what_its_parent_drew():
 
     assert again is not None
     assert (again == images).all()
-
-
-def test_no_frames_are_no_images():
-    model = compiled('<geom type="sphere" size="0.2"/>')
-
-    assert ZBuffer(model, np.array([1], np.uint8), 4, 6).draw(views_of(model, 0)).shape == (
-        0,
-        4,
-        6,
-    )
 
 
 def test_a_height_field_is_refused_with_the_way_out():

@@ -2,7 +2,6 @@
 
 import contextlib
 import struct
-from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +20,6 @@ from odd_files import (
 from v2p_data.errors import ItemRejectedError
 from v2p_data.video.captions import VideoItem
 from v2p_data.video.decode import VideoConfig, read_clip
-from v2p_data.video.tracks import shown_axes, turned_axes
 
 
 def item(path, **extra):
@@ -273,29 +271,9 @@ def test_a_video_is_shown_as_its_matrix_says(film, way, seen):
     assert clip.frames.shape[1:3] == size[::-1]
 
 
-@pytest.mark.parametrize("way", ["upright", "right", "upside_down", "left"])
-def test_the_angle_that_pyav_gives_is_the_matrix_of_a_turn(film, way):
-    """It stands in where PyAV has no name for other data of the frame."""
-    with av.open(str(set_matrix(film("turned.mp4"), *EIGHT_WAYS[way]))) as container:
-        frame = next(container.decode(video=0))
-
-    axes = shown_axes(frame)
-
-    assert turned_axes(float(frame.rotation)) == pytest.approx(np.eye(2) if axes is None else axes)
-
-
 @pytest.mark.parametrize("matrix", [(0.8, 0.6, -0.6, 0.8), (1, 0, 1, 1), (1, 0, 1, 0)])
 def test_a_video_that_is_to_lean_is_refused(film, matrix):
     assert reason_for(set_matrix(film("leaning.mp4"), *matrix)) == "odd_angle"
-
-
-def test_a_matrix_of_rounded_numbers_or_of_nothing_is_no_angle(film):
-    half_degree = (1, 0.0087, -0.0087, 1)
-
-    assert len(read_clip(item(set_matrix(film("a.mp4"), *half_degree))).frames) == 20
-    assert len(read_clip(item(set_matrix(film("b.mp4"), 0, 0, 0, 0))).frames) == 20
-    # scaled, not turned
-    assert len(read_clip(item(set_matrix(film("c.mp4"), 0.5, 0, 0, 0.5))).frames) == 20
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "first.mp4"])
@@ -328,12 +306,6 @@ def test_sound_that_outlasts_the_picture_is_no_missing_picture(film, name):
     assert (clip.total_frames, clip.warnings) == (20, ())
 
 
-def test_a_long_sound_does_not_make_a_film_too_long(film):
-    clip = read_clip(item(film("song.mp4", sound_s=5)), VideoConfig(max_duration_s=2.0))
-
-    assert clip.total_frames == 20
-
-
 @pytest.mark.parametrize("gop", ["1", "12", "250"])
 def test_an_edit_list_cuts_the_film(film, gop):
     """Trimmed without encoding: frames before the cut are decoded, where others need them, and never shown."""
@@ -345,15 +317,6 @@ def test_an_edit_list_cuts_the_film(film, gop):
     red = clip.frames[..., 0].astype(int) - clip.frames[..., 2] > 80
     # frame 15 of the file has the square at column 60, frame 44 at 176 - 96 = 80
     assert [np.flatnonzero(red[i, 48])[0] for i in (0, 29)] == pytest.approx([60, 80], abs=2)
-
-
-def test_an_edit_list_of_a_fragmented_file_hides_what_is_before_zero(film):
-    fragments = {"movflags": "frag_keyframe+empty_moov+delay_moov"}
-    path = set_edit(film("trimmed.mp4", squares(60), container_options=fragments), 0.5, 0)
-
-    clip = read_clip(item(path))
-
-    assert (clip.total_frames, clip.warnings) == (45, ())
 
 
 def test_a_last_picture_that_stays_for_long_is_no_missing_end(film):
@@ -378,26 +341,6 @@ def test_what_is_transparent_is_white(film):
     assert frame[50, 120].tolist() == [255, 255, 255]
 
 
-@pytest.mark.parametrize(
-    ("pix_fmt", "codec"),
-    [
-        ("gray16le", "ffv1"),
-        ("gbrp10le", "ffv1"),
-        ("yuva444p", "ffv1"),
-        ("yuva444p10le", "prores_ks"),
-    ],
-)
-def test_deep_colours_and_opaque_alpha_give_the_plain_picture(film, pix_fmt, codec):
-    path = film("deep.mkv", squares(10), codec=codec, pix_fmt=pix_fmt)
-
-    frame = read_clip(item(path)).frames[9].astype(int)
-
-    # of (200, 30, 30) a grey picture has the luma, 81
-    inside = [81] * 3 if pix_fmt == "gray16le" else [200, 30, 30]
-    assert np.abs(frame[5, 5] - 120).max() <= 2
-    assert np.abs(frame[48, 50] - inside).max() <= 6
-
-
 def gif(disposal, background):
     """Return a GIF with a grey picture, then nine red squares, each 8 px further right; colour 2 is blue.
 
@@ -416,49 +359,6 @@ def gif(disposal, background):
         parts = [codes[k : k + 255] for k in range(0, len(codes), 255)]
         out += b"".join(bytes([len(part)]) + part for part in parts) + b"\0"
     return out + b";"
-
-
-@pytest.mark.parametrize(
-    ("disposal", "left_behind"),
-    # GIF89a, section 23: not said, keep, back to the background's colour, back to what was there before
-    [(0, (200, 30, 30)), (1, (200, 30, 30)), (2, (30, 30, 200)), (3, (120, 120, 120))],
-)
-def test_a_gif_leaves_behind_what_its_disposal_mode_says(tmp_path, disposal, left_behind):
-    path = tmp_path / "squares.gif"
-    path.write_bytes(gif(disposal, background=2))
-
-    clip = read_clip(item(path))
-
-    assert clip.frames.shape == (10, 96, 128, 3)
-    assert clip.fps == pytest.approx(25)  # 4 hundredths of a second each
-    last = clip.frames[9, 48]
-    assert last[20].tolist() == list(left_behind)
-    assert last[80].tolist() == [200, 30, 30]  # from 72 to 103
-    assert last[110].tolist() == [120, 120, 120]
-
-
-def test_pictures_of_eight_thousand_pixels_are_read(tmp_path):
-    path = tmp_path / "huge.mp4"
-    picture = av.VideoFrame(7680, 4320, "yuvj420p")
-    for plane, value in zip(picture.planes, (90, 128, 128), strict=True):
-        plane.update(bytes([value]) * plane.buffer_size)
-    with av.open(str(path), "w") as out:
-        stream = out.add_stream("mjpeg", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 7680, 4320, "yuvj420p"
-        (packet,) = stream.encode(picture)
-        data = bytes(packet)
-        for i in range(2):
-            again = av.Packet(data)
-            again.stream, again.is_keyframe = stream, True
-            again.pts = again.dts = i
-            again.time_base = Fraction(1, 30)
-            out.mux(again)
-
-    clip = read_clip(item(path), VideoConfig(min_frames=2))
-
-    assert clip.frames.shape == (2, 360, 640, 3)
-    assert clip.source_size_px == (7680, 4320)
-    assert np.abs(clip.frames.astype(int) - 90).max() <= 3
 
 
 def joined(film, tmp_path, *films):

@@ -11,19 +11,14 @@ from v2p_data.scene.frames.classes import CLASSES, HAND, MOVED, OTHER, TABLE
 from v2p_data.scene.frames.colour import histogram
 from v2p_data.scene.frames.mask_ops import iou as mask_iou
 from v2p_data.scene.grounding.candidates import Moved
-from v2p_data.scene.grounding.ground_objects import ground_objects
 from v2p_data.scene.grounding.moved_by_network import Given, find_moved_by_network
 from v2p_data.scene.grounding.moved_object import hidden_in_container
 from v2p_data.scene.grounding.outlines import (
-    completed,
     disjoint_ends,
-    filled,
-    without_shadow,
     without_table,
 )
 from v2p_data.scene.grounding.tracking import carried, track
 from v2p_data.scene.scale.nouns import noun_for
-from v2p_data.video.captions import parse_caption
 
 
 def pushed(colour_a, colour_b):
@@ -50,17 +45,6 @@ def test_of_two_things_that_move_the_one_of_the_named_colour_is_taken(segmentati
 
     assert iou(found.first, square(15, y)) > 0.8
     assert iou(found.last, square(48, y)) > 0.8
-
-
-def test_a_rival_makes_the_finding_less_sure(segmentation_of):
-    working, segmentation = segmentation_of(pushed(RED, BLUE))
-    alone, seen = segmentation_of([[parts[0]] for parts in pushed(RED, BLUE)])
-
-    between_two, _ = find_moved_by_network(working, segmentation, "box", "push_right")
-    only_one, _ = find_moved_by_network(alone, seen, "box", "push_right")
-
-    assert between_two.cues["no rival"] < 0.7 < only_one.cues["no rival"]
-    assert between_two.score < only_one.score
 
 
 def test_the_wrong_direction_makes_the_finding_less_sure(segmentation_of):
@@ -290,34 +274,12 @@ def test_where_a_thing_will_stand_is_not_part_of_its_first_outline(segmentation_
     assert (disjoint_ends(working, moved, keep=(0,)).first == (first | last)).all()
 
 
-def test_what_is_covered_by_both_outlines_stays_with_both_where_it_shows_the_thing_twice(
-    segmentation_of,
-):
-    working, _ = segmentation_of([[(square(30 + i, 40), RED, MOVED)] for i in range(8)])
-    first, last = large(square(30, 40), working.shape), large(square(37, 40), working.shape)
-
-    same = disjoint_ends(
-        working, Moved(first=first, last=last, score=1.0, colour_hist=np.zeros((12, 24, 24)))
-    )
-
-    assert (same.first == first).all()
-    assert (same.last == last).all()
-
-
 def seen_as(**sure):
     """Return what the network says of every pixel: each class where its mask is, `table` elsewhere, 0.95 sure."""
     label = np.full((H, W), TABLE)
     for what, mask in sure.items():
         label[mask] = {"moved": MOVED, "other": OTHER}[what]
     return (0.0125 + 0.9375 * (label == np.arange(len(CLASSES))[:, None, None])).astype(np.float32)
-
-
-def test_a_shadow_in_the_outline_that_the_network_sees_as_table_is_cut_off():
-    thing, shadow = square(40, 30, 20), square(60, 36, 14)
-
-    found = without_shadow(thing | shadow, seen_as(moved=thing))
-
-    assert np.array_equal(found, thing)
 
 
 def test_a_marked_outline_loses_what_surely_is_table_but_no_part_of_the_thing():
@@ -330,39 +292,6 @@ def test_a_marked_outline_loses_what_surely_is_table_but_no_part_of_the_thing():
     assert not found[beside & ~handle].any()
     assert found[body].all()
     assert found[handle].mean() > 0.9
-
-
-def test_a_thin_thing_that_is_marked_stays_what_it_was():
-    pen, shadow = np.zeros((2, H, W), bool)
-    pen[40:42, 20:80] = True
-    shadow[42:44, 20:80] = True
-
-    assert np.array_equal(without_table(pen, seen_as(moved=pen)), pen)
-    assert np.array_equal(without_table(pen | shadow, seen_as(moved=pen)), pen)
-
-
-def test_where_the_network_does_not_know_the_thing_its_outline_stays():
-    thing = square(40, 30, 20)
-
-    assert np.array_equal(without_shadow(thing, seen_as(moved=square(40, 30, 6))), thing)
-
-
-def test_what_adjoins_an_outline_and_surely_is_a_thing_belongs_to_it():
-    whole, part = square(40, 30, 20), square(40, 30, 20) & ~square(56, 30, 20)
-    far = square(80, 30, 10)
-    shares = seen_as(other=whole | far)
-
-    assert np.array_equal(completed(part, shares[OTHER]), whole)
-    assert np.array_equal(completed(part, 0.9 * shares[OTHER]), part), "not sure enough"
-
-
-def test_an_outline_is_completed_within_its_box_and_by_its_own_kind():
-    whole, inside = square(40, 30, 20), square(40, 30, 30)
-    part, behind = whole & ~square(54, 30, 20), square(40, 20, 30) & ~whole
-    shares = seen_as(other=behind, moved=whole)
-
-    assert np.array_equal(filled(part, shares, inside), whole)
-    assert np.array_equal(filled(part, shares, part), part), "nothing beyond the box"
 
 
 def test_what_is_hidden_at_the_end_is_found_by_where_it_was_last_seen(segmentation_of):
@@ -393,26 +322,6 @@ def test_a_tool_marked_in_one_frame_is_followed_both_ways_until_it_is_gone(segme
     assert tracked.quality[5] == 1
 
 
-def test_what_a_hand_uncovers_elsewhere_is_not_what_went_into_the_marked_goal(segmentation_of):
-    frames = pushed(RED, RED)
-    working, segmentation = segmentation_of(frames)
-    start, near, far = square(15, 20), square(44, 14, 26), square(44, 54, 26)
-    first, goals = (
-        large(start, working.shape),
-        [large(goal, working.shape) for goal in (near, far)],
-    )
-
-    ends = [
-        find_moved_by_network(
-            working, segmentation, "red box", "insert", marked=Given(first=first, goal=goal)
-        )[0].last
-        for goal in goals
-    ]
-
-    assert iou(ends[0], square(48, 20)) > 0.8
-    assert iou(ends[1], square(48, 60)) > 0.8
-
-
 def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(segmentation_of):
     """Of two that move alike the blue one is meant: a mark in the middle says so, and is no outline of either end."""
     frames = pushed(RED, BLUE)
@@ -429,30 +338,6 @@ def test_a_thing_marked_on_its_way_is_found_at_both_ends_by_how_it_looks(segment
 
     assert iou(moved.first, square(15, 60)) > 0.8
     assert iou(moved.last, square(15 + 33, 60)) > 0.8
-
-
-def test_a_box_says_more_than_an_outline_that_fills_half_of_it(segmentation_of, draw):
-    """A cube whose top has the table's colour: neither edges nor the network show more than its front."""
-    fronts = [square(20 + 3 * i, 40, 20) & (np.arange(H) >= 50)[:, None] for i in range(12)]
-    working, segmentation = segmentation_of([[(front, RED, MOVED)] for front in fronts])
-    clip = replace(
-        draw(num_frames=12),
-        caption="Pushing cube from left to right",
-        hints={"cube": {"frame": 0, "box": [20.0, 40.0, 40.0, 60.0]}},
-    )
-    hand = segmentation.shares.copy()
-    hand[6, HAND, :20] = 1.0
-
-    seen = ground_objects(
-        clip,
-        working,
-        parse_caption(clip.caption, ()),
-        replace(segmentation, shares=hand),
-        min_found=0.5,
-    )
-
-    assert iou(seen.objects[0].first, square(20, 40, 20)) > 0.7
-    assert iou(seen.objects[0].last, fronts[-1]) > 0.7
 
 
 def test_a_thing_is_cut_by_its_colour_from_the_arm_that_was_taken_along(segmentation_of):

@@ -15,7 +15,6 @@ from v2p_data.geometry.pillow import pillow
 from v2p_data.geometry.pose import transform
 from v2p_data.scene.fitting.silhouette import camera_above
 from v2p_data.scene.scale.nouns import Noun
-from v2p_data.scene.shapes.inflation import _standing
 from v2p_data.scene.shapes.shape import MARGINS, ShapeChoice, SilhouetteView, best_shape
 
 CAMERA = camera_above((240, 320), 0.6, 1.01, 0.5)
@@ -172,27 +171,6 @@ def test_a_cup_is_open_as_wide_as_it_is_below_its_rim(monkeypatch: pytest.Monkey
     assert r[z > 0.49].max() >= r[(z > 0.3) & (z < 0.38)].max() - 1e-6
 
 
-def test_a_bowl_that_lies_on_its_mouth_keeps_its_height():
-    """From steeply above, its base is seen within the outline of its rim."""
-    steep, size = camera_above((240, 320), 1.0, 1.01, 0.5), (0.158, 0.158, 0.06)
-    at = np.array([0.32, 0.05, 0.0])
-    over = np.diag([1.0, -1.0, -1.0])
-    bowl = lathe(BOWL, 0.004)
-    lying = trimesh.Trimesh(bowl.vertices @ over + at + [0, 0, size[2]], bowl.faces, process=False)
-    T = transform(over, at + np.array([0.0, 0.0, size[2] / 2]))
-
-    choice = best_shape(
-        SilhouetteView(mask=seen([lying], steep), T_world_obj=T),
-        steep,
-        size,
-        noun("cylinder", hollow=True, taper=0.35, symmetry="round"),
-    )
-
-    check_solid(choice)
-    assert choice.kind == "revolution"
-    assert choice.size_m[2] > 0.9 * size[2]
-
-
 def test_a_mug_stays_a_hollow_cylinder_in_spite_of_its_handle():
     size = (0.082, 0.082, 0.095)
     handle = trimesh.creation.torus(0.026, 0.005)
@@ -247,60 +225,6 @@ def test_a_duck_is_inflated_from_its_outline():
     assert lowest == pytest.approx(0, abs=1e-6)
 
 
-@pytest.mark.parametrize("yaw_deg", [20, 60, 110])
-def test_what_is_inflated_keeps_the_axes_of_the_fit(yaw_deg):
-    """The plane that it is inflated in is the camera's: its axes say nothing of how the object is turned."""
-    size, irregular = (0.07, 0.055, 0.07), noun("box", symmetry="none")
-    mask = seen(
-        [
-            ball([0.03, 0.042, 0.03], AT + np.array([0, 0, 0.03])),
-            ball(0.02, AT + np.array([0, 0.02, 0.065])),
-        ]
-    )
-    T = fit(size, yaw_deg)
-
-    choice = best_shape(SilhouetteView(mask=mask, T_world_obj=T), CAMERA, size, irregular)
-
-    check_solid(choice)
-    assert choice.kind == "inflated"
-    np.testing.assert_allclose(choice.T_obj_shape[:3, :3], np.eye(3), atol=1e-6)
-    low, high = AT - [0.06, 0.06, 0.01], AT + np.array([0.06, 0.06, 0.1])
-    assert overlap(choice, T, duck_like, low, high) > 0.5
-
-
-def test_an_outline_that_is_all_below_the_table_keeps_a_base():
-    outline = np.zeros((200, 200), bool)
-    outline[190:200, 90:110] = True
-
-    standing = _standing(outline, 100)
-
-    assert standing[190:, 90:110].all()
-
-
-def test_a_flat_spoon_comes_out_flat_and_long():
-    size, irregular = (0.15, 0.035, 0.012), noun("box", symmetry="none")
-    handle = trimesh.creation.box((0.012, 0.13, 0.006))
-    mask = seen(
-        [
-            ball([0.02, 0.03, 0.006], AT + np.array([0, 0.06, 0.006])),
-            placed(handle, AT + np.array([0, -0.02, 0.006])),
-        ]
-    )
-
-    choice = best_shape(
-        SilhouetteView(mask=mask, T_world_obj=fit(size, 80)), CAMERA, size, irregular
-    )
-
-    check_solid(choice)
-    assert choice.kind == "inflated"
-    assert choice.size_m[2] < 0.014
-    assert choice.size_m[0] == pytest.approx(0.175, rel=0.12)
-    assert choice.size_m[1] == pytest.approx(0.04, rel=0.3)
-    hull = choice.mesh.convex_hull.volume
-    assert choice.mesh.volume < 0.75 * hull  # the handle is thinner than the bowl
-    assert sum(part.volume for part in choice.parts) < 0.85 * hull
-
-
 def test_a_box_stays_a_box_even_when_its_outline_is_nibbled():
     size = (0.09, 0.07, 0.05)
     box = trimesh.creation.box(size)
@@ -339,18 +263,6 @@ def test_where_the_hand_hides_much_nothing_fine_is_tried():
 
     assert choice.kind == "primitive"
     assert "hidden" in choice.reason
-
-
-@pytest.mark.parametrize("form", ["box", "cylinder", "sphere"])
-def test_a_mask_of_a_few_pixels_leaves_the_primitive(form):
-    size = (0.004, 0.004, 0.004)
-    mask = np.zeros((240, 320), bool)
-    row, column = (int(v) for v in CAMERA.project(AT[None] + np.array([0, 0, 0.002]))[0][::-1])
-    mask[row : row + 2, column : column + 2] = True
-
-    choice = best_shape(SilhouetteView(mask=mask, T_world_obj=fit(size)), CAMERA, size, noun(form))
-
-    assert choice.mesh.is_watertight
 
 
 def test_an_outline_with_a_line_one_pixel_wide_still_becomes_a_closed_mesh():
