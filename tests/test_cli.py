@@ -18,6 +18,8 @@ import pytest
 from v2p_data import cli
 from v2p_data.cli import parse, run
 from v2p_data.commands import display
+from v2p_data.commands.pace import Pace
+from v2p_data.commands.pace import said as said_of
 from v2p_data.commands.run import FromVideos
 from v2p_data.commands.settings import changed_flags
 from v2p_data.errors import V2PError
@@ -288,3 +290,61 @@ def test_a_user_without_a_home_is_told_what_to_set(monkeypatch):
 
     with pytest.raises(V2PError, match="no home folder to keep files in; set V2P_CACHE_DIR to"):
         cache_folder("convex")
+
+
+# (seconds since the item began, share done) of the demo's stages on two cores, and how long each took
+PACES = {
+    "expert a": ([(17, 0.11), (34, 0.53), (51, 0.76), (66, 0.95)], 75),
+    "expert b": ([(15, 0.08), (33, 0.47), (49, 0.67), (66, 0.88), (78, 0.95)], 83),
+    "distillation demo": (
+        [
+            (35, 0.06),
+            (52, 0.18),
+            (170, 0.33),
+            (245, 0.42),
+            (279, 0.5),
+            (306, 0.6),
+            (386, 0.83),
+            (460, 0.92),
+        ],
+        471,
+    ),
+    "policy demo": (
+        [
+            (100, 0.02),
+            (116, 0.14),
+            (132, 0.3),
+            (147, 0.44),
+            (164, 0.54),
+            (179, 0.66),
+            (195, 0.78),
+            (212, 0.94),
+        ],
+        223,
+    ),
+    "evaluation demo": ([(46, 0.24), (61, 0.42), (75, 0.61), (90, 0.75), (104, 0.86)], 121),
+    "waited for": ([(600, 0.02), (620, 0.3), (650, 0.7)], 670),
+    "expert that ends early": ([(60, 0.1), (230, 0.4), (420, 0.7)], 440),
+}
+
+
+def test_a_range_of_time_left_holds_what_was_left_and_tells_nothing_where_nobody_knows():
+    told = 0
+    for name, (trace, took) in PACES.items():
+        pace = Pace()
+        for passed, share in trace:
+            left = pace.left_s(name.split()[0], name, float(passed), share)
+            told += left is not None
+            assert left is None or left[0] <= took - passed <= left[1], (name, passed, left)
+    assert told >= 20
+
+
+def test_finished_items_tell_how_long_the_next_one_takes():
+    pace = Pace()
+    pace.finished["expert"] = [75.0, 83.0]
+
+    assert pace.left_s("expert", "c", 18.0, 0.16) == pytest.approx((75 / 1.5 - 18, 83 * 1.5 - 18))
+    assert said_of(pace.left_s("expert", "c", 18.0, 0.16)) == ", 30 to 110 s left"
+    assert said_of(pace.left_s("expert", "c", 60.0, 0.7)) == ", up to 65 s left"
+    assert said_of(pace.left_s("policy", "p", 300.0, 0.25)) == ", 9 to 23 min left"
+    assert said_of(pace.left_s("policy", "q", 3.0, 0.01)) == ""

@@ -269,13 +269,7 @@ class _Run:
                 rate = len(losses) * cfg.batch_size / part_s
                 loss = self._note(losses, rate, part_loader_s / part_s)
                 loader_s += part_loader_s
-                left_s = (
-                    (time.monotonic() - started) / (self.step - first) * (cfg.steps - self.step)
-                )
-                self.on_progress(
-                    self.step / cfg.steps,
-                    f"loss {loss:.3f}, {rate:.0f} samples/s, {left_s:.0f} s left",
-                )
+                self.on_progress(self.step / cfg.steps, f"loss {loss:.3f}, {rate:.0f} samples/s")
                 losses, part_s, part_loader_s = [], 0.0, 0.0
             if self.judge is not None and cfg.checkpoints > 1 and self.step in moments:
                 self._judge()

@@ -10,8 +10,9 @@ from typing import TextIO
 
 import rich.progress
 from rich.console import Console
-from rich.progress import BarColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TaskID, TextColumn
 
+from v2p_data.commands.pace import Pace, said
 from v2p_data.errors import NOT_ALL, NOTHING
 from v2p_data.pipeline.at_work import Event
 from v2p_data.pipeline.runner import Outcome, Progress
@@ -33,11 +34,11 @@ class Display:
         self.bars: dict[str, TaskID] = {}
         self.started: dict[str, float] = {}
         self.spoken: dict[str, float] = {}
+        self.pace = Pace()
         self.progress = rich.progress.Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
             TextColumn("{task.percentage:>3.0f} %"),
-            TimeRemainingColumn(),
             TextColumn("{task.fields[words]}"),
             console=Console(file=self.stream),
             transient=True,
@@ -63,21 +64,21 @@ class Display:
         elif event.outcome is not None:
             if name in self.bars:
                 self.progress.remove_task(self.bars.pop(name))
+            if event.outcome.status == "made":
+                self.pace.finished[event.stage.name].append(event.outcome.seconds)
             self.say(f"{name}: {describe(event.outcome)}")
 
     def _moved(self, name: str, event: Event) -> None:
-        if self.is_terminal:
-            self.progress.update(self.bars[name], completed=event.share, words=event.words)
-            return
         now = time.monotonic()
+        passed_s = now - self.started[name]
+        words = event.words + said(self.pace.left_s(event.stage.name, name, passed_s, event.share))
+        if self.is_terminal:
+            self.progress.update(self.bars[name], completed=event.share, words=words)
+            return
         if now - self.spoken.get(name, self.started.get(name, now)) < PLAIN_EVERY_S:
             return
         self.spoken[name] = now
-        left = ""
-        if event.share > 0.02:
-            passed = now - self.started[name]
-            left = f", about {passed * (1 - event.share) / event.share:.0f} s left"
-        self.say(f"{name}: {event.share:.0%} {event.words}{left}")
+        self.say(f"{name}: {event.share:.0%} {words}")
 
     def say(self, line: str) -> None:
         """Print a line that stays."""
