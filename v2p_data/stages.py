@@ -460,7 +460,7 @@ def episodes_stage(task: Stage, expert: Stage, cfg: EngineConfig) -> Stage:
         item=task.item,
         config=Seeded(config=cfg.episodes, seed=cfg.seed),
         inputs={"task": task, "expert": expert},
-        version=3,
+        version=4,
         make=make_episodes,
         resumes=True,
     )
@@ -543,7 +543,7 @@ def distillation_stage(
             config={"distillation": cfg.distillation, "policy": cfg.policy.student}, seed=cfg.seed
         ),
         sources={"dataset": f"{record.item}-{record.fingerprint}"},
-        version=1,
+        version=2,
         on_device=True,
         make=partial(
             make_distillation,

@@ -48,12 +48,12 @@ def some_truths(num_frames: int, rng: np.random.Generator) -> dict[str, np.ndarr
     poses = np.zeros((num_frames, 7, 7), np.float32)
     poses[:, :2, :3] = rng.normal(size=(num_frames, 2, 3))
     poses[:, :2, 3] = 1
-    touches = np.zeros((num_frames, 7, 2), bool)
+    touches = np.zeros((num_frames, 7, 3), bool)
     touches[num_frames // 2 :, 0] = True
     return {
         "next.reward": rng.uniform(size=num_frames).astype(np.float32),
         "privileged.object_pose": poses.reshape(num_frames, 49),
-        "privileged.contact": touches.reshape(num_frames, 14),
+        "privileged.contact": touches.reshape(num_frames, 21),
         "camera.intrinsics": np.tile(np.float32([70, 70, 32, 32]), (num_frames, 1)),
         "camera.pose": np.tile(np.float32([0.5, 0, 1, 0, 1, 0, 0]), (num_frames, 1)),
     }

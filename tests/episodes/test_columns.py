@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -11,8 +11,19 @@ from test_dataset import copied, edit_table
 from toy_task import collect_toys
 
 from v2p_data.episodes.collect import staged_episodes
+from v2p_data.episodes.dataset.card import dataset_card
 from v2p_data.episodes.dataset.edit import merge
-from v2p_data.episodes.dataset.features import SIMULATED, SLOTS, features
+from v2p_data.episodes.dataset.features import (
+    COLUMNS,
+    FRAMES,
+    SIMULATED,
+    SLOTS,
+    STATE_NAMES,
+    action_column,
+    features,
+    state_column,
+    state_names,
+)
 from v2p_data.episodes.dataset.tables import read_info
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
@@ -20,6 +31,7 @@ from v2p_data.episodes.staging import Episode
 from v2p_data.errors import V2PError
 from v2p_data.sim.env.ranges import RandomizationConfig
 from v2p_data.sim.render.masks import FIRST_OBJECT, PALETTE
+from v2p_data.sim.robot.action_names import Actions, action_names
 
 
 @pytest.fixture(scope="module")
@@ -112,17 +124,69 @@ def test_damage_is_named_with_its_column(packed: Path, tmp_path: Path):
         assert any(check == c and column in detail for c, detail in found), column
 
 
+@pytest.mark.parametrize("narrow", [False, True])
+def test_no_column_is_dropped_in_silence(make_episode, tmp_path: Path, narrow: bool):
+    """Staged by an earlier version: without a column, or with contacts of the pads alone; then a robot's recording."""
+    new = make_episode(7)
+    columns = dict(new.simulated)
+    lost = "privileged.contact" if narrow else "next.reward"
+    told = columns.pop(lost)
+    if narrow:
+        columns[lost] = told[:, :14]
+    old, robots = (
+        replace(make_episode(8), simulated=columns),
+        replace(make_episode(9), simulated={}),
+    )
+
+    for others, words in (
+        ([old], rf"toy_00008.npz is of another version: it has no {lost} as this one records it"),
+        ([new, old], rf"toy_00008.npz is of another version: it has no {lost}"),
+        ([new, robots], "one has the columns of a simulator and one has none"),
+        ([robots, new], "one has the columns of a simulator and one has none"),
+    ):
+        paths = [e.save(tmp_path / "staged") for e in others]
+        with pytest.raises(V2PError, match=words):
+            pack(paths, "user/mixed", tmp_path / "mixed")
+    assert not (tmp_path / "mixed").exists()
+
+
 @pytest.mark.slow
-def test_with_an_episode_that_lacks_the_columns_none_has_them(
+def test_a_robots_recordings_have_no_columns_of_a_simulator(
     make_episode, packed: Path, tmp_path: Path
 ):
-    paths = [
-        e.save(tmp_path / "staged")
-        for e in (make_episode(7), replace(make_episode(8), simulated={}))
-    ]
-    pack(paths, "user/mixed", tmp_path / "mixed")
+    paths = [replace(make_episode(k), simulated={}).save(tmp_path / "staged") for k in (7, 8)]
 
-    assert not set(SIMULATED) & set(read_info(tmp_path / "mixed")["features"])
-    assert verify(tmp_path / "mixed", paths).is_good
+    pack(paths, "user/robot", tmp_path / "robot")
+
+    assert not set(SIMULATED) & set(read_info(tmp_path / "robot")["features"])
+    assert verify(tmp_path / "robot", paths).is_good
     with pytest.raises(V2PError, match="do not go together: the list of columns"):
-        merge([packed, tmp_path / "mixed"], "user/both", tmp_path / "both")
+        merge([packed, tmp_path / "robot"], "user/both", tmp_path / "both")
+
+
+@pytest.mark.parametrize("actions", get_args(Actions))
+def test_info_card_and_docs_say_the_same_of_every_entry(actions: Actions):
+    states, names = state_names(18), action_names(actions)
+    table = features(64, states=states, actions=names, has_handovers=True, is_simulated=True)
+    episode = {"item": "toy", "task": "lift it", "length": 1500, "labels": {}, "params": {}}
+    about = {"episodes": [episode], "palette": {}, "provenance": {}}
+    info = {"features": table, "total_frames": 1500, "fps": 20}
+    card = dataset_card(about, info, "user/toys")
+    docs = (Path(__file__).parents[2] / "docs/datasets.md").read_text("utf-8")
+
+    told = {
+        **COLUMNS,
+        "observation.state": state_column(STATE_NAMES),
+        "action": action_column(names),
+    }
+    for key, column in told.items():
+        if key in table:
+            assert column.entries in card, key
+            assert column.entries in docs, key
+    for key in {*table} - {"observation.images.mask"}:
+        width, said = table[key]["shape"][0], table[key]["info"]
+        assert said["meaning"] in card
+        if table[key]["names"] is not None:
+            assert {len(table[key]["names"]), len(said["units"]), len(said["frames"])} == {width}
+            assert {*said["frames"]} <= {*FRAMES, ""}
+    assert "size_categories:\n- 1K<n<10K" in card

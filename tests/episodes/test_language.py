@@ -13,6 +13,7 @@ from v2p_data.episodes.dataset.language import direction, motions, paraphrases, 
 from v2p_data.episodes.dataset.verify import verify
 from v2p_data.episodes.dataset.writer import pack
 from v2p_data.errors import V2PError
+from v2p_data.geometry.rotation import product
 
 
 @pytest.mark.parametrize(
@@ -33,12 +34,12 @@ def test_a_caption_is_asked_for_in_ten_ways(caption: str, asked: str):
 
 
 def test_parts_begin_where_contacts_and_places_say():
-    places = np.zeros((10, 3))
-    places[5:, 2] = [0.004, 0.006, 0.1, 0.1, 0.1]
-    touches = np.zeros((10, 2), bool)
-    touches[3:9, 0] = touches[4:9, 1] = True
+    poses = np.tile([0.0, 0, 0, 1, 0, 0, 0], (10, 1))
+    poses[5:, 2] = [0.004, 0.006, 0.1, 0.1, 0.1]
+    touches = np.zeros((10, 3), bool)
+    touches[3:9, [0, 2]] = touches[4:9, 1] = True
 
-    found = subtasks("cup", places, touches, np.arange(10) >= 8)
+    found = subtasks("cup", poses, touches, np.arange(10) >= 8)
 
     assert list(found.items()) == [
         (0, "reach for the cup"),
@@ -46,9 +47,41 @@ def test_parts_begin_where_contacts_and_places_say():
         (6, "carry the cup up"),
         (9, "stay"),
     ]
-    assert subtasks("cup", places, touches, np.zeros(10, bool))[9] == "let go of the cup"
-    one_pad = subtasks("cup", places[:, [2, 1, 0]], touches & [True, False], np.zeros(10, bool))
-    assert list(one_pad.values())[1:3] == ["touch the cup", "push the cup forward"]
+    assert subtasks("cup", poses, touches, np.zeros(10, bool))[9] == "let go of the cup"
+    pushed = poses[:, [2, 1, 0, 3, 4, 5, 6]]
+    for parts in ([True, False, True], [False, False, True]):  # a pad, the palm alone
+        found = subtasks("cup", pushed, touches & parts, np.zeros(10, bool))
+        assert list(found.values())[1:3] == ["touch the cup", "push the cup forward"]
+
+
+@pytest.mark.parametrize(
+    ("turn", "height_m", "does"),
+    [
+        ([0.7071, 0.7071, 0, 0], 0.03, "tip the carton left"),  # a quarter turn about x
+        ([0.7071, 0, 0, 0.7071], 0.03, "push the carton left"),  # turned on the spot
+        ([0.9659, 0.2588, 0, 0], 0.03, "push the carton left"),  # leans by 30 degrees
+        ([0.7071, 0.7071, 0, 0], 0.05, "push the carton left"),  # a ball rolls: as high as before
+    ],
+)
+def test_what_ends_on_another_side_was_tipped_also_by_the_palm_alone(turn, height_m, does):
+    """The carton stood turned by 90 degrees about z, and falls on after the hand has left it."""
+    stood = np.array([0.7071, 0, 0, 0.7071])
+    poses = np.tile([0.5, 0, 0.05, *stood], (12, 1))
+    poses[4:6, 1] = [0.01, 0.02]
+    lies = product(np.array(turn)[:, None], stood[:, None])[:, 0]
+    poses[6:] = [0.5, 0.06, height_m, *lies]
+    touches = np.zeros((12, 3), bool)
+    touches[3:6, 2] = True
+
+    found = subtasks("carton", poses, touches, np.arange(12) >= 8)
+
+    assert list(found.values()) == [
+        "reach for the carton",
+        "touch the carton",
+        does,
+        "let go of the carton",
+        "stay",
+    ]
 
 
 def test_motions_are_named_from_the_row_in_which_they_begin():

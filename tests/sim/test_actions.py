@@ -2,15 +2,18 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from v2p_data.episodes.dataset.features import STATE_NAMES, action_column, state_column
 from v2p_data.errors import V2PError
 from v2p_data.geometry.rotation import quats_about_z
 from v2p_data.sim.env.actions import bounds_of, joints_near, steps_to, targets_of
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.ranges import RandomizationConfig
-from v2p_data.sim.robot.action_names import DELTA_NAMES, action_names, actions_named
+from v2p_data.sim.robot.action_names import DELTA_NAMES, TOOL_NAMES, action_names, actions_named
 from v2p_data.sim.robot.robot import HOME_QPOS
 from v2p_data.sim.wrappers.gym_env import V2PEnv
 
@@ -163,3 +166,54 @@ def test_the_environment_goes_for_targets(actions, make_bundle, tmp_path):
         np.testing.assert_allclose(here["agent_pos"][:6], there["agent_pos"][:6], atol=1e-4)
     with pytest.raises(V2PError, match="an action has 3 entries"):
         by_targets.step(np.zeros(3))
+
+
+def tool_sites(worlds: BatchEnv) -> tuple[np.ndarray, Rotation]:
+    """Return where MuJoCo has the tools' sites, and how they are turned, in the robot's base frame."""
+    data = mujoco.MjData(worlds.world.model)
+    pos, turned = [], []
+    for qpos in worlds.motion()[0]:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(worlds.world.model, data)
+        pos.append(data.site("tcp").xpos.copy())
+        turned.append(data.site("tcp").xmat.reshape(3, 3).copy())
+    return np.stack(pos), Rotation.from_matrix(np.stack(turned))
+
+
+def test_the_tool_moves_and_turns_in_the_frames_and_units_that_the_table_of_features_says(
+    worlds_of,
+):
+    """About x, y and z of the base, both ways, after a turn that makes the tool's axes other ones than the base's."""
+    worlds = worlds_of()
+    action, state = (c.feature for c in (action_column(DELTA_NAMES), state_column(STATE_NAMES)))
+    frame = dict(zip(action["names"], action["info"]["frames"], strict=True))
+    frame |= dict(zip(state["names"], state["info"]["frames"], strict=True))
+    still, turn, step = (np.zeros((6, 7), np.float32) for _ in range(3))
+    turn[:, 5] = 0.8
+    step[range(6), [3, 3, 4, 4, 5, 5]] = np.tile([0.5, -0.5], 3)
+    step[:, :3] = [[0.2, 0.1, 0.3]]
+    for each in [turn] * 5 + [still] * 20:
+        worlds.step(each)
+
+    begun, before = tool_sites(worlds)
+    for each in [step] * 3 + [still] * 20:
+        worlds.step(each)
+    ended, after = tool_sites(worlds)
+
+    assert action["info"]["units"][:6] == ["x 0.03 m"] * 3 + ["x 0.2 rad"] * 3
+    assert frame["delta_x.pos"] == "base"
+    way = 3 * step[:, :3] * 0.03 * worlds.bundle.motion_scale
+    np.testing.assert_allclose(ended - begun, way, atol=4e-3)
+    in_frame = {"base": after * before.inv(), "tool": before.inv() * after}
+    for k, name in enumerate(DELTA_NAMES[3:6]):
+        turned = in_frame[frame[name]].as_rotvec()[:, k]
+        np.testing.assert_allclose(turned, 3 * step[:, 3 + k] * 0.2, atol=0.03)
+    seen = worlds.robot_state()
+    assert frame["eef_x.pos"] == frame["lead_x.pos"] == "base"
+    np.testing.assert_allclose(seen[:, :3], ended, atol=1e-5)
+    np.testing.assert_allclose(seen[:, 7:10], worlds.targets[0] - ended, atol=1e-5)
+    down, vector = Rotation.from_quat([1, 0, 0, 0]), Rotation.from_rotvec(seen[:, 3:6])
+    said = {"tool": down * vector, "base": vector * down}[frame["eef_rz.pos"]]
+    assert (said.inv() * after).magnitude().max() < 1e-4
+    target = action_column(TOOL_NAMES).feature["info"]["frames"]
+    assert target[3:6] == state["info"]["frames"][3:6]  # as targets_of makes them, see above

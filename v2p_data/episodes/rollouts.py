@@ -77,7 +77,8 @@ class Rollouts:
     reward: Float32[np.ndarray, "time env"]
     """What action `t` earned, as environments give it; see `StepResult.reward`."""
     object_pose: Float[np.ndarray, "time env object 7"]
-    touches: Bool[np.ndarray, "time env object 2"]
+    touches: Bool[np.ndarray, "time env object 3"]
+    """By the left pad, the right pad, the whole hand; see `BatchEnv.touches`."""
     snapshots: tuple[Snapshot, ...]
     """All worlds, before action `t`."""
     num_frames: Int[np.ndarray, "env"]
@@ -118,7 +119,7 @@ class Rollouts:
             size_px: width and height of the pictures.
         """
         length, count = int(self.num_frames[world]), self.object_pose.shape[2]
-        pose, touches = np.zeros((length, SLOTS, 7)), np.zeros((length, SLOTS, 2), bool)
+        pose, touches = np.zeros((length, SLOTS, 7)), np.zeros((length, SLOTS, 3), bool)
         pose[:, :count] = self.object_pose[:length, world]
         touches[:, :count] = self.touches[:length, world]
         start = self.snapshots[0]

@@ -7,6 +7,7 @@ content alone.
 
 import hashlib
 import json
+import math
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -171,8 +172,8 @@ class Heading:
     """Entries of the state."""
     is_handover: bool
     """It holds who acted."""
-    known: tuple[str, ...]
-    """Columns that only a simulator can fill."""
+    known: Mapping[str, int]
+    """Columns that only a simulator can fill, and how many entries a row of each has; none in a robot's recording."""
     digest: str
     """SHA-256 of the file."""
 
@@ -188,8 +189,9 @@ class Heading:
             with np.load(path) as data:
                 about = _about(data, path)
                 is_handover = INTERVENTION in data
-                known = _known(data)
+                columns = _known(data)
             with zipfile.ZipFile(path) as archive:
+                known = {c: math.prod(_shape(archive, KNOWN + c)[1:]) for c in columns}
                 count, height, width = _shape(archive, "labels")
                 _, num_states = _shape(archive, "state")
         return Heading(

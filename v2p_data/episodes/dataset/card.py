@@ -7,18 +7,19 @@ from typing import Any
 from v2p_data.episodes.dataset.about import demand_about
 from v2p_data.episodes.dataset.features import (
     ACTION_KEY,
-    ACTION_NAMES,
-    CAMERA_OF_MASKS,
     COLUMNS,
+    FRAMES,
     HANDOVER,
     INTERVENTION_KEY,
+    MASK_KEY,
     RGB_KEY,
     STATE_KEY,
     WRIST_KEY,
+    action_column,
+    state_column,
 )
 from v2p_data.episodes.dataset.sheet import SHEET_FILE, write_sheet, write_whole
 from v2p_data.episodes.dataset.tables import damage_named, read_info
-from v2p_data.sim.robot.action_names import TOOL_NAMES, actions_named
 
 CARD_FILE = "README.md"
 TAGS = ("LeRobot", "robotics", "segmentation", "simulation", "mujoco", "video2policy")
@@ -43,17 +44,13 @@ lerobot-eval --policy.path=POLICY --env.type=v2p --env.tasks=FOLDER/v2p/tasks
 
 Masks are no photographs: give `lerobot-train` also `--dataset.use_imagenet_stats=false --policy.pretrained_backbone_weights=null`, and
 a `--policy.chunk_size` below the episodes' length."""
+PICTURES = {
+    MASK_KEY: "segmentation mask as grey video, lossless",
+    WRIST_KEY: "segmentation mask as grey video, lossless, of a camera that the hand carries",
+    RGB_KEY: "picture of the same camera at the same moment",
+}
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-"""The Hub's words for how many episodes there are."""
-STATE_UNITS = (
-    *("m", "m", "m", "rad", "rad", "rad", "0 closed to 1 open"),
-    *("m, target minus tool", "m", "m", "0 closed to 1 open"),
-)
-ACTION_UNITS = (
-    *("x 0.03 m",) * 3,
-    *("x 0.2 rad",) * 3,
-    "x 0.012 m of finger travel, + closes",
-)
+"""The Hub's words for how many rows there are."""
 
 
 def write_card(root: Path, repo_id: str) -> Path:
@@ -78,7 +75,7 @@ def dataset_card(
     episodes: list[dict[str, Any]] = about["episodes"]
     seconds = info["total_frames"] / info["fps"]
     sections = [
-        _head(len(episodes)),
+        _head(info["total_frames"]),
         f"# {repo_id}",
         "Demonstrations of a simulated Franka-like arm, made from ordinary videos: each video was rebuilt as a "
         "simulated task, an expert learned the task, and its successful episodes were recorded under "
@@ -108,9 +105,9 @@ def dataset_card(
     return "\n\n".join(sections) + "\n"
 
 
-def _head(num_episodes: int) -> str:
+def _head(num_rows: int) -> str:
     tags = "\n".join(f"- {tag}" for tag in TAGS)
-    size = next((s for n, s in SIZES if num_episodes < n), "n>1M")
+    size = next((s for n, s in SIZES if num_rows < n), "n>1M")
     return (
         f"---\nlicense: {LICENSE}\nlanguage:\n- en\nsize_categories:\n- "
         f"{size}\ntask_categories:\n- robotics\ntags:\n{tags}\n"
@@ -132,39 +129,22 @@ def _tasks(episodes: list[dict[str, Any]]) -> str:
 
 
 def _frame(info: dict[str, Any]) -> str:
-    lines = ["| column | shape | meaning |", "|---|---|---|"]
+    lines = ["| column | shape | entries [unit, frame] | meaning |", "|---|---|---|---|"]
     for key, feature in info["features"].items():
-        if key in CAMERA_OF_MASKS:
-            meaning = "segmentation mask as grey video, lossless"
-            meaning += ", of a camera that the hand carries" if key == WRIST_KEY else ""
-        elif key == RGB_KEY:
-            meaning = "picture of the same camera at the same moment"
-        elif key == STATE_KEY:
-            # Datasets of earlier versions have the first seven.
-            names = tuple(feature["names"])
-            units = (*STATE_UNITS, *("rad",) * len(names))
-            meaning = _named(names, units[: len(names)])
+        told, names = COLUMNS.get(key), feature.get("names") or ()
+        if key == STATE_KEY:
+            told = state_column(names)  # datasets of earlier versions have the first seven
         elif key == ACTION_KEY:
-            meaning = _action(feature["names"])
-        elif key in COLUMNS:
-            meaning = COLUMNS[key].meaning
+            told = action_column(names)
+        if key in PICTURES:
+            words = f" | {PICTURES[key]}"
+        elif told is not None:
+            words = f"{told.entries} | {told.meaning}"
         else:
             continue
-        lines.append(f"| `{key}` | {list(feature['shape'])} | {meaning} |")
-    return "\n".join(lines)
-
-
-def _action(names: list[str]) -> str:
-    match actions_named(names):
-        case "absolute_tool":
-            return "where the tool shall be after this step: " + _named(
-                TOOL_NAMES, STATE_UNITS[:7]
-            )
-        case "joints":
-            units = ("rad",) * (len(names) - 1) + STATE_UNITS[6:7]
-            return "where the joints shall be after this step: " + _named(tuple(names), units)
-        case _:
-            return "each in [-1, 1]: " + _named(ACTION_NAMES, ACTION_UNITS)
+        lines.append(f"| `{key}` | {list(feature['shape'])} | {words} |")
+    frames = "\n".join(f"- {name}: {words}" for name, words in FRAMES.items())
+    return "\n".join(lines) + f"\n\nFrames:\n\n{frames}"
 
 
 def _who_acted(episodes: list[dict[str, Any]]) -> str:
@@ -293,10 +273,6 @@ def _making(about: dict[str, Any]) -> str:
     if packages:
         lines.append(f"Versions: {packages}.")
     return "\n".join(lines)
-
-
-def _named(names: tuple[str, ...], units: tuple[str, ...]) -> str:
-    return ", ".join(f"{name} ({unit})" for name, unit in zip(names, units, strict=True))
 
 
 def _cell(text: str) -> str:

@@ -6,13 +6,13 @@ and ours, take as inputs what begins with `observation.`; no other column may be
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from v2p_data.episodes.staging import Episode
 from v2p_data.sim.robot.action_names import DELTA_NAMES as ACTION_NAMES
-from v2p_data.sim.robot.action_names import Actions, actions_named, joint_names
+from v2p_data.sim.robot.action_names import TOOL_NAMES, Actions, actions_named, joint_names
 from v2p_data.sim.robot.interface import ArmInterface
 
 FPS = 20
@@ -43,22 +43,43 @@ the file out more often."""
 METADATA_SCHEMA = 1
 """Palette, provenance and drawn parameters; LeRobot ignores it and uploads it."""
 
-STATE_NAMES = (
-    "eef_x.pos",
-    "eef_y.pos",
-    "eef_z.pos",
-    "eef_rx.pos",
-    "eef_ry.pos",
-    "eef_rz.pos",
-    "gripper.pos",
-    "lead_x.pos",
-    "lead_y.pos",
-    "lead_z.pos",
-    "target_gripper.pos",
+BASE, TOOL = "base", "tool"
+FRAMES = {
+    BASE: "the robot's base: x forward, y left, z up; turns are about these axes",
+    TOOL: "the tool, which points straight down in the vector 0: x forward, y right, z down; turns are about these axes",
+}
+OPENING = "0 closed to 1 open"
+
+
+class Part(NamedTuple):
+    """Entries of a column that follow each other, of one unit and one frame of `FRAMES`."""
+
+    names: tuple[str, ...]
+    unit: str = ""
+    frame: str = ""
+
+
+STATE_PARTS = (
+    Part(("eef_x.pos", "eef_y.pos", "eef_z.pos"), "m", BASE),
+    Part(("eef_rx.pos", "eef_ry.pos", "eef_rz.pos"), "rad", TOOL),
+    Part(("gripper.pos",), OPENING),
+    Part(("lead_x.pos", "lead_y.pos", "lead_z.pos"), "m", BASE),
+    Part(("target_gripper.pos",), OPENING),
 )
-"""Tool position [m], rotation vector from straight down [rad], gripper opening 0 to 1; then the controller's command:
-target position minus tool position [m], target opening 0 to 1. Robot base frame."""
-_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+STATE_NAMES = tuple(name for part in STATE_PARTS for name in part.names)
+ACTION_PARTS: dict[Actions, tuple[Part, ...]] = {
+    "delta_tool": (
+        Part(ACTION_NAMES[:3], "x 0.03 m", BASE),
+        Part(ACTION_NAMES[3:6], "x 0.2 rad", BASE),
+        Part(ACTION_NAMES[6:], "x 0.012 m of finger travel, + closes"),
+    ),
+    "absolute_tool": (
+        Part(TOOL_NAMES[:3], "m", BASE),
+        Part(TOOL_NAMES[3:6], "rad", TOOL),
+        Part(TOOL_NAMES[6:], OPENING),
+    ),
+}
+TOUCHING = ("pad_left", "pad_right", "hand")
 SLOTS = 7
 """Objects that masks can tell apart; slot 1 has the label 2, slot 2 the label 3, and so on."""
 
@@ -68,8 +89,8 @@ class Column:
     """A column of numbers, one a frame."""
 
     dtype: str = "float32"
-    names: tuple[str, ...] | None = None
-    """Of the entries; None for a single number."""
+    parts: tuple[Part, ...] = ()
+    """The entries, in order; empty for a single number."""
     meaning: str
     """For the card."""
     where: Literal["everywhere", "handovers", "simulation", "targets"] = "everywhere"
@@ -77,10 +98,34 @@ class Column:
     actions are targets."""
 
     @property
+    def width(self) -> int:
+        """How many entries a row has."""
+        return sum(len(part.names) for part in self.parts) or 1
+
+    @property
     def feature(self) -> dict[str, Any]:
-        """In LeRobot's words."""
-        names = None if self.names is None else list(self.names)
-        return {"dtype": self.dtype, "shape": (len(self.names or " "),), "names": names}
+        """In LeRobot's words; `info` tells what each entry is."""
+        each = [(name, part.unit, part.frame) for part in self.parts for name in part.names]
+        names, units, frames = map(list, zip(*each, strict=True)) if each else (None, None, None)
+        info = {"units": units, "frames": frames, "meaning": self.meaning}
+        return {"dtype": self.dtype, "shape": (self.width,), "names": names, "info": info}
+
+    @property
+    def entries(self) -> str:
+        """The entries in words; of many objects those of the first."""
+        shown = [
+            f"{', '.join(names)} [{', '.join(told)}]"
+            if (told := [*filter(None, of)])
+            else ", ".join(names)
+            for names, *of in self.parts
+        ]
+        return "; ".join(shown if len(shown) < SLOTS else [*shown[: len(shown) // SLOTS], "..."])
+
+
+def _pose(of: str) -> tuple[Part, ...]:
+    """Return the entries of a position and a quaternion."""
+    groups = ((("x", "y", "z"), "m"), (("qw", "qx", "qy", "qz"), ""))
+    return tuple(Part(tuple(of + name for name in names), unit, BASE) for names, unit in groups)
 
 
 COLUMNS = {
@@ -100,32 +145,32 @@ COLUMNS = {
         where="simulation",
     ),
     OBJECT_POSE_KEY: Column(
-        names=tuple(f"object_{k}.{axis}" for k in range(1, SLOTS + 1) for axis in _POSE),
-        meaning="not for policies: per object the position of its centre [m] and its quaternion "
-        "wxyz in the robot's base "
-        "frame, before the action; object 1 has the label 2; 0 throughout where there is none",
+        parts=tuple(part for k in range(1, SLOTS + 1) for part in _pose(f"object_{k}.")),
+        meaning="not for policies: each object's centre and quaternion before the action; object 1 has the label 2; "
+        "0 throughout where there is none",
         where="simulation",
     ),
     CONTACT_KEY: Column(
         dtype="bool",
-        names=tuple(f"object_{k}.{s}" for k in range(1, SLOTS + 1) for s in ("left", "right")),
-        meaning="not for policies: whether the left and the right finger's pad touches the object, before the action",
+        parts=tuple(
+            Part(tuple(f"object_{k}.{part}" for part in TOUCHING)) for k in range(1, SLOTS + 1)
+        ),
+        meaning="not for policies: whether the left and the right finger's pad touches the object, before the action, "
+        "and whether any part of hand or arm, pads included, touched it since the row before",
         where="simulation",
     ),
     INTRINSICS_KEY: Column(
-        names=("fx", "fy", "cx", "cy"),
-        meaning="focal lengths and principal point [px]; pixel centres are at integers plus one half",
+        parts=(Part(("fx", "fy", "cx", "cy"), "px"),),
+        meaning="focal lengths and principal point; pixel centres are at integers plus one half",
         where="simulation",
     ),
     CAMERA_POSE_KEY: Column(
-        names=_POSE,
-        meaning="the camera's position [m] and quaternion wxyz in the robot's base frame; "
-        "OpenCV's axes: x right, y down, "
-        "z forward",
+        parts=_pose(""),
+        meaning="the camera's position and quaternion; OpenCV's axes: x right, y down, z forward",
         where="simulation",
     ),
     EXECUTED_KEY: Column(
-        names=ACTION_NAMES,
+        parts=ACTION_PARTS["delta_tool"],
         meaning="not for policies: the step of the tool that was carried out, each in [-1, 1]; of "
         "these episodes `action` is a target",
         where="targets",
@@ -154,6 +199,29 @@ def columns_of(episode: Episode) -> dict[str, np.ndarray]:
 def actions_in(info: Mapping[str, Any]) -> Actions | None:
     """Return what the actions of a dataset with this `meta/info.json` say, None where they are not ours."""
     return actions_named(info.get("features", {}).get(ACTION_KEY, {}).get("names"))
+
+
+def state_column(names: Sequence[str]) -> Column:
+    """Return what a state of these entries holds; those after the tool's are the angles of joints."""
+    parts = tuple(part for part in STATE_PARTS if set(part.names) <= set(names))
+    joints = tuple(name for name in names if name not in STATE_NAMES)
+    return Column(
+        parts=parts + ((Part(joints, "rad, of slides m"),) if joints else ()),
+        meaning="the tool's position, rotation vector from straight down and opening; the controller's target minus "
+        "that position, and its target opening",
+    )
+
+
+def action_column(names: Sequence[str]) -> Column:
+    """Return what an action of these entries holds."""
+    actions = actions_named(names) or "delta_tool"
+    joints = (Part(tuple(names[:-1]), "rad, of slides m"), Part(tuple(names[-1:]), OPENING))
+    return Column(
+        parts=ACTION_PARTS.get(actions, joints),
+        meaning="a step, each entry in [-1, 1]; the task's motion_scale stretches the way"
+        if actions == "delta_tool"
+        else "where the tool or the joints shall be after this step",
+    )
 
 
 def state_names(num_states: int) -> tuple[str, ...]:
@@ -204,11 +272,7 @@ def features(
             }
             for camera in cameras
         },
-        STATE_KEY: {
-            "dtype": "float32",
-            "shape": (len(states),),
-            "names": list(states),
-        },
-        ACTION_KEY: {"dtype": "float32", "shape": (len(actions),), "names": list(actions)},
+        STATE_KEY: state_column(states).feature,
+        ACTION_KEY: action_column(actions).feature,
         **{key: column.feature for key, column in COLUMNS.items() if has[column.where]},
     }

@@ -20,6 +20,7 @@ from v2p_data.episodes.dataset.features import (
     CONTACT_KEY,
     INTRINSICS_KEY,
     OBJECT_POSE_KEY,
+    SLOTS,
     STATE_KEY,
     SUCCESS_KEY,
 )
@@ -27,6 +28,7 @@ from v2p_data.episodes.dataset.tables import INFO_FILE, camera_keys, read_info
 from v2p_data.errors import V2PError
 from v2p_data.geometry.camera import Camera
 from v2p_data.geometry.pose import transform_from_pose
+from v2p_data.geometry.rotation import conjugates, product
 
 ASKED = (
     "{}",
@@ -47,6 +49,8 @@ MOVED_M = 0.005
 """An object that is so far from its first place has been moved."""
 STILL_M, GRIPPER_STILL = 0.002, 0.02
 """A tool that moves less in a row, and fingers whose opening (0 to 1) changes less, stand still."""
+TIPPED_RAD = np.pi / 4
+"""An object that leans by more than that from where it stood lies on another side."""
 SHORTEST_ROWS = 2
 """Motions that last less are no words of their own (0.1 s)."""
 
@@ -66,33 +70,43 @@ def paraphrases(task: str) -> list[str]:
 
 def subtasks(
     name: str,
-    places: Float[np.ndarray, "time 3"],
-    touches: Bool[np.ndarray, "time 2"],
+    poses: Float[np.ndarray, "time 7"],
+    touches: Bool[np.ndarray, "time part"],
     success: Bool[np.ndarray, "time"],
 ) -> dict[int, str]:
     """Return what the robot does with an object, by the first row of each part.
 
     Args:
         name: of the object.
-        places: of its centre, in the robot's base frame [m].
-        touches: whether the left, right pad touches it.
+        poses: of its centre [m] and quaternion wxyz, in the robot's base frame.
+        touches: whether the left pad, the right pad, and, where it is known, the hand touches it.
         success: whether success has held by the end of the row's action.
     """
-    rows = np.flatnonzero(touches.any(1))
+    places, rows = poses[:, :3], np.flatnonzero(touches.any(1))
     moved = np.flatnonzero(np.linalg.norm(places - places[0], axis=1) > MOVED_M)
     done = np.flatnonzero(success) + 1
-    is_grasped = bool(touches.all(1).any())
+    is_grasped = bool(touches[:, :2].all(1).any())
     parts = {0: f"reach for the {name}"}
     if len(rows):
         parts[int(rows[0])] = f"grasp the {name}" if is_grasped else f"touch the {name}"
         moved = moved[moved >= rows[0]]
         if len(moved):
-            way = direction(places[rows[-1]] - places[0])
-            parts[int(moved[0])] = f"{'carry' if is_grasped else 'push'} the {name} {way}"
+            tips = not is_grasped and has_tipped(poses)
+            doing = "carry" if is_grasped else "tip" if tips else "push"
+            last = -1 if tips else rows[-1]  # it falls by itself
+            way = direction((places[last] - places[0]) * (1, 1, not tips))
+            parts[int(moved[0])] = f"{doing} the {name} {way}"
         parts[int(rows[-1]) + 1] = f"let go of the {name}"
     if len(done):
         parts[int(done[0])] = "stay"
     return {row: parts[row] for row in sorted(parts) if row < len(places)}
+
+
+def has_tipped(poses: Float[np.ndarray, "time 7"]) -> bool:
+    """Tell whether an object ends on another side; one that rolls keeps its height all the way."""
+    _, x, y, _ = product(poses[-1:, 3:].T, conjugates(poses[:1, 3:].T))
+    leans = 1 - 2 * (x**2 + y**2) < np.cos(TIPPED_RAD)
+    return bool(leans.all() and np.ptp(poses[:, 2]) > MOVED_M)
 
 
 def motions(state: Float[np.ndarray, "time 11"]) -> dict[int, str]:
@@ -169,9 +183,10 @@ def _rows(
         return np.array(table.column(key).to_pylist(), float)
 
     times = table.column("timestamp").to_pylist()
-    places, state = numbers(OBJECT_POSE_KEY)[:, :3], numbers(STATE_KEY)
+    poses, state = numbers(OBJECT_POSE_KEY)[:, :7], numbers(STATE_KEY)
     name = str(entry["labels"].get("2", "object")).replace("_", " ")
-    parts = subtasks(name, places, numbers(CONTACT_KEY)[:, :2] > 0, numbers(SUCCESS_KEY) > 0)
+    touches = numbers(CONTACT_KEY).reshape(len(times), SLOTS, -1)[:, 0] > 0
+    parts = subtasks(name, poses, touches, numbers(SUCCESS_KEY) > 0)
     plan = "\n".join(f"{k}. {part}" for k, part in enumerate(parts.values(), start=1))
     rows = [(0, "user", "task_aug", words) for words in paraphrases(entry["task"])]
     rows += [(0, "assistant", "plan", plan)]
@@ -196,7 +211,11 @@ def _rows(
     ends = [*list(parts)[1:], len(times)]
     for row, end in zip(parts, ends, strict=True):
         for camera in camera_keys(dict(info)):
-            point = {"label": name, "point_format": "xy", "point": seen(places[row : row + 1])[0]}
+            point = {
+                "label": name,
+                "point_format": "xy",
+                "point": seen(poses[row : row + 1, :3])[0],
+            }
             trace = {"label": "gripper", "point_format": "xy", "points": seen(state[row:end, :3])}
             events += [
                 {

@@ -21,6 +21,7 @@ from v2p_data.episodes.dataset.encoding import MASK_CRF, RGB_CRF, encoder_config
 from v2p_data.episodes.dataset.episode_stats import number_stats
 from v2p_data.episodes.dataset.features import (
     ACTION_NAMES,
+    COLUMNS,
     CONTACT_KEY,
     DEMONSTRATION,
     EPISODE_COLUMN,
@@ -176,6 +177,17 @@ def _headings(staged: Sequence[Path]) -> list[Heading]:
                     f"{what.format(theirs)}; collect all episodes "
                     f"with one {options}"
                 )
+        odd = [key for key in SIMULATED if heading.known.get(key) != COLUMNS[key].width]
+        if heading.known and odd:
+            raise V2PError(
+                f"{heading.path} is of another version: it has no {', '.join(odd)} as this one records it;"
+                " collect it anew with 'v2p episodes'"
+            )
+        if bool(heading.known) != bool(first.known):
+            raise V2PError(
+                f"of {heading.path} and {first.path} one has the columns of a simulator and one has none; "
+                "pack them as two datasets"
+            )
         if heading.num_frames < 2:
             raise V2PError(
                 f"{heading.path} has {heading.num_frames} frames; an episode has two at least"
@@ -194,7 +206,6 @@ def _write(
     first = shards[0].episodes[0]
     headings = [heading for shard in shards for heading in shard.episodes]
     has_handovers = any(e.is_handover for e in headings)
-    is_simulated = all(set(SIMULATED) <= set(e.known) for e in headings)
     meta: Any = LeRobotDatasetMetadata.create(
         repo_id,
         fps=FPS,
@@ -204,7 +215,7 @@ def _write(
             actions=first.actions or ACTION_NAMES,
             states=state_names(first.num_states),
             has_handovers=has_handovers,
-            is_simulated=is_simulated,
+            is_simulated=bool(first.known),
         ),
         robot_type=ROBOT_TYPE,
         root=root,

@@ -278,9 +278,12 @@ class BatchEnv:
         """Return a copy of the objects' poses: centre [m] and quaternion wxyz, in the robot's base frame."""
         return self._sim.object_qpos.copy()
 
-    def touches(self) -> Bool[np.ndarray, "env object 2"]:
-        """Return whether the left and the right finger's pad touched each object at the last time step."""
-        return self._touches[:, :, :2] > 0
+    def touches(self) -> Bool[np.ndarray, "env object 3"]:
+        """Return whether the left pad, the right pad, any part of the arm touched each object.
+
+        The pads at the last time step, the arm (with hand and pads) at any during the last control step.
+        """
+        return self._touches > 0
 
     def arm_touches(self) -> Bool[np.ndarray, "env object"]:
         """Return whether any part of the arm touched each object during the last control step."""

@@ -15,7 +15,7 @@ DELTA_NAMES = (
     "delta_rz.pos",
     "gripper_close.pos",
 )
-"""Each in [-1, 1]: x 0.03 m, x 0.2 rad about the world's axes, and x 0.012 m of finger travel (+ closes)."""
+"""Units and frames: `episodes.dataset.features.ACTION_PARTS`."""
 TOOL_NAMES = (
     "target_x.pos",
     "target_y.pos",
@@ -25,8 +25,6 @@ TOOL_NAMES = (
     "target_rz.pos",
     "target_gripper.pos",
 )
-"""The tool's position [m], rotation vector from straight down [rad], gripper opening 0 to 1, as in
-`observation.state`."""
 JOINT_NAME, OPENING_NAME = "joint_{}.pos", "gripper.pos"
 """The arm's joints from 1 on [rad; m of slides], then the gripper's opening 0 to 1."""
 
