@@ -309,8 +309,8 @@ def test_lerobot_rolls_the_policy_out_on_the_simulated_robot_and_on_the_twin(
     )
 
     # LeRobot replaces the root logger's handlers, so the robot's own logger is listened to.
+    log = logging.getLogger("lerobot_policy_v2p.robot.simulated")
     for robot in ("v2p_franka", "v2p_twin"):
-        log = logging.getLogger(f"lerobot_policy_v2p.robot.{robot}")
         log.addHandler(caplog.handler)
         try:
             run_tool(
@@ -330,8 +330,7 @@ def test_lerobot_rolls_the_policy_out_on_the_simulated_robot_and_on_the_twin(
         finally:
             log.removeHandler(caplog.handler)
 
-    assert "task 'rest' succeeded after 6 steps" in caplog.text
-    assert "task 'rest' succeeded in the twin after 6 steps" in caplog.text
+    assert caplog.text.count("task 'rest' succeeded after 6 steps") == 2
 
 
 def test_the_robots_entries_are_the_datasets_in_the_same_order(task_folder, tmp_path):

@@ -16,7 +16,7 @@ from lerobot.configs import parser
 from lerobot.robots import Robot
 
 from lerobot_policy_v2p.robot.config_arm import ArmRobotConfig
-from v2p_data.deployment.checks import check_meaning, names_of
+from v2p_data.deployment.checks import HZ, check_meaning, names_of
 from v2p_data.deployment.limits import STEP_S
 from v2p_data.deployment.rig import MASK_NAME, Rig
 from v2p_data.deployment.robot import ActionScale
@@ -143,6 +143,7 @@ class ArmRobot[A: Arm, C: ArmRobotConfig](Robot):
         self._state = None
         try:
             check_policy_of(self.config, self.action_scale, self.task_description)
+            check_recording()
             self._rig = None if self.picture_name == RGB_NAME else self._own_rig(self.arm)
         except BaseException:
             self.disconnect()
@@ -252,6 +253,23 @@ class ArmRobot[A: Arm, C: ArmRobotConfig](Robot):
         if self.arm is None:
             raise V2PError(f"the robot {self.name} is not connected; call connect() first")
         return self.arm
+
+
+def check_recording() -> None:
+    """Demand that what a LeRobot tool records says the rate of the arm's steps; it says 30 unless told otherwise.
+
+    Raises:
+        V2PError: it would say another.
+    """
+    is_replay = parser.parse_arg("dataset.episode") is not None
+    if parser.parse_arg("dataset.repo_id") is None or is_replay:
+        return
+    fps = parser.parse_arg("dataset.fps") or "30"
+    if float(fps) != HZ:
+        raise V2PError(
+            f"the recording would say {fps} frames a second, and this arm takes {HZ} steps a second;"
+            f" say --dataset.fps={HZ}"
+        )
 
 
 def check_policy_of(config: ArmRobotConfig, scale: ActionScale, task: str) -> None:

@@ -16,7 +16,7 @@ from v2p_data.geometry.pose import matrix_from_quat, transform
 from v2p_data.sim.wrappers.gym_env import V2PEnv
 from v2p_data.task.task import TaskBundle
 
-logger = logging.getLogger("lerobot_policy_v2p.robot.v2p_franka")
+logger = logging.getLogger(__name__)
 
 
 class SimulatedArm:
@@ -88,11 +88,22 @@ class SimulatedArm:
         self.has_succeeded |= bool(info["is_success"])
         if (terminated or truncated) and not self.ended:
             self.ended = True
-            outcome = "succeeded" if info["is_success"] else "ended without success"
-            logger.info("task '%s' %s after %d steps", self.env.task, outcome, self.steps)
+            tell(self.env.task, self.steps, is_success=bool(info["is_success"]))
 
     def hold(self) -> None:
         """Do nothing: time stands still."""
 
     def close(self) -> None:
+        if not self.ended:
+            tell(self.env.task, self.steps, is_success=False)
         self.env.close()
+
+
+def tell(title: str, steps: int, *, is_success: bool) -> None:
+    """Log how an episode went. LeRobot's tools go on for the time or the rows that they were told."""
+    if is_success:
+        logger.info(
+            "task '%s' succeeded after %d steps; what follows no longer counts", title, steps
+        )
+    elif steps:
+        logger.info("task '%s' did not succeed in %d steps", title, steps)

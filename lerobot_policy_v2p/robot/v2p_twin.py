@@ -4,7 +4,6 @@ With `pictures=rgb` it gives what a real arm with a calibrated camera gives. Eve
 it is sim-to-sim. How the episode went is logged, and asked of `arm.mirror` by judges.
 """
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Float, UInt8
 
 from lerobot_policy_v2p.robot.arm_robot import ArmRobot
 from lerobot_policy_v2p.robot.config_v2p_twin import V2PTwinConfig
+from lerobot_policy_v2p.robot.simulated import tell
 from v2p_data.deployment.robot import ActionScale
 from v2p_data.deployment.view import allowing_for_place
 from v2p_data.geometry.camera import Camera
@@ -20,8 +20,6 @@ from v2p_data.task.task import TaskBundle
 from v2p_data.twin.arm import TwinArm
 from v2p_data.twin.judge import true_labels
 from v2p_data.twin.parameters import changed
-
-logger = logging.getLogger(__name__)
 
 
 class TwinBehindRobot(TwinArm):
@@ -58,11 +56,15 @@ class TwinBehindRobot(TwinArm):
         self.steps += 1
         if outcome.held[0] and not self.has_succeeded and self.mirror.referee.verdict()[0]:
             self.has_succeeded = True
-            title = self.mirror.bundle.title
-            logger.info("task '%s' succeeded in the twin after %d steps", title, self.steps)
+            tell(self.mirror.bundle.title, self.steps, is_success=True)
 
     def hold(self) -> None:
         """Do nothing: time stands still."""
+
+    def close(self) -> None:
+        if not self.has_succeeded:
+            tell(self.mirror.bundle.title, self.steps, is_success=False)
+        super().close()
 
 
 class V2PTwin(ArmRobot[TwinBehindRobot, V2PTwinConfig]):

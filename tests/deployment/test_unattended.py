@@ -102,6 +102,43 @@ def test_the_simulated_arm_compares_the_policy_too(task_folder, of_another_scale
     assert not robot.is_connected
 
 
+@pytest.mark.parametrize(
+    ("said", "is_refused"),
+    [
+        ("lerobot-rollout --strategy.type=sentry --dataset.repo_id=user/rollout_a --fps=20", True),
+        ("lerobot-rollout --dataset.repo_id user/rollout_a --dataset.fps 25", True),
+        ("lerobot-rollout --dataset.repo_id=user/rollout_a --dataset.fps=20", False),
+        ("lerobot-replay --dataset.repo_id=user/toys --dataset.episode=0", False),
+        ("lerobot-rollout --strategy.type=base --fps=20", False),
+    ],
+)
+def test_a_recording_that_would_tell_another_rate_is_refused_before_it_begins(
+    twin, monkeypatch, said, is_refused
+):
+    monkeypatch.setattr("sys.argv", said.split())
+    robot = twin()
+
+    if is_refused:
+        with pytest.raises(V2PError, match=r"takes 20 steps a second; say --dataset\.fps=20"):
+            robot.connect()
+    else:
+        robot.connect()
+    assert robot.is_connected is not is_refused
+
+
+def test_a_run_without_success_ends_with_a_word_on_it(twin, caplog):
+    caplog.set_level("INFO", "lerobot_policy_v2p.robot.simulated")
+    robot = twin()
+    robot.connect()
+    for _ in range(2):
+        robot.get_observation()
+        robot.send_action(dict.fromkeys(robot.action_features, 0.0))
+
+    robot.disconnect()
+
+    assert caplog.messages == ["task 'rest' did not succeed in 2 steps"]
+
+
 def test_a_policy_that_is_not_here_is_said_not_to_be_compared(twin, caplog):
     twin(policy_path="somebody/a_policy").connect()
 

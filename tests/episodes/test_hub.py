@@ -12,7 +12,7 @@ from hub_server import CUT, LOST, TOKEN, Hub, Repo
 
 from v2p_data.cli import run
 from v2p_data.episodes.hub.hub import Pushed, push_dataset, push_envhub, push_policy
-from v2p_data.episodes.hub.policy_card import note_results, write_policy_card
+from v2p_data.episodes.hub.policy_card import name_policy, note_results, write_policy_card
 from v2p_data.errors import V2PError
 
 INFO = {
@@ -388,6 +388,21 @@ def test_a_policys_card_names_its_type_and_dataset(
     card = (tmp_path / "README.md").read_text()
     assert "datasets:\n- user/toys\n" in card
     assert "`v2p_bc`, trained on `user/toys`" in card
+    assert "\n# user/policy\n" in card
+    assert "v2p eval user/policy --tasks dataset/v2p/tasks" in card
+
+
+def test_the_card_of_the_demos_policy_names_no_repository_but_its_own(tmp_path: Path):
+    (tmp_path / "config.json").write_text('{"type": "v2p_bc"}')
+    (tmp_path / "train_config.json").write_text('{"dataset": {"repo_id": "v2p/demo"}}')
+    write_policy_card(tmp_path)
+
+    name_policy(tmp_path, "user/policy")
+
+    card = (tmp_path / "README.md").read_text()
+    assert "v2p eval user/policy --tasks TASKS" in card
+    assert "trained on `v2p/demo` (on no Hub)" in card
+    assert card.count("v2p/demo") == 1
 
 
 def test_an_evaluation_is_noted_in_a_policys_card_and_nothing_else_of_it_changes(tmp_path: Path):

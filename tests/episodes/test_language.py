@@ -93,6 +93,17 @@ def test_motions_are_named_from_the_row_in_which_they_begin():
     assert direction(np.array([0.1, -0.3, 0.2])) == "right and up"
 
 
+def test_a_knock_whose_effect_comes_after_it_has_its_word():
+    poses = np.tile([0.5, 0, 0.05, 1, 0, 0, 0], (9, 1))
+    poses[3:, 0], poses[4:, 0] = 0.502, 0.52
+    touches = np.zeros((9, 3), bool)
+    touches[3, 2] = True
+
+    found = subtasks("can", poses, touches, np.zeros(9, bool))
+
+    assert list(found.values())[1:] == ["touch the can", "push the can forward"]
+
+
 @pytest.mark.slow
 def test_lerobot_reads_the_words_and_a_recipe_of_its_own_uses_them(packed: Path, tmp_path: Path):
     from lerobot.configs.recipe import MessageTurn, TrainingRecipe

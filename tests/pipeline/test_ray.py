@@ -225,7 +225,7 @@ def test_without_ray_one_sentence_says_how_to_install_it(tmp_path):
     )
 
     assert done.returncode == 2
-    assert "pip install 'lerobot_policy_v2p[scale]'" in done.stderr
+    assert "'make setup'" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -20,7 +20,7 @@ from v2p_data.sim.env import ranges
 from v2p_data.sim.env.actions import steps_to, targets_of
 from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.model.world import World, build_world
-from v2p_data.sim.render.masks import FIRST_OBJECT, ROBOT, MaskRenderer
+from v2p_data.sim.render.masks import BACKGROUND, FIRST_OBJECT, ROBOT, MaskRenderer, geom_labels
 from v2p_data.sim.robot.arms import FRANKA_MJCF, RobotConfig, robot_from_json, robot_to_json
 from v2p_data.sim.robot.robot import (
     COARSE,
@@ -433,6 +433,36 @@ def test_a_task_for_another_robot_is_simulated_and_drawn_with_it(
     assert env.world.robot.finger_travel_m == 0.04
     assert (image == ROBOT).sum() > 100
     assert (image == FIRST_OBJECT).sum() > 5
+
+
+@pytest.mark.parametrize(
+    ("scenery", "is_robot"),
+    [
+        ('<geom name="s" type="plane" size="3 3 0.1" pos="0 0 -0.01"/>', False),
+        (
+            '<body name="room"><geom name="s" type="box" size="2 2 0.01" pos="0 0 -0.02"/></body>',
+            False,
+        ),
+        ('<geom name="s" type="box" size="0.01 2 1" pos="1.1 0 0.5"/>', False),
+        ('<geom name="s" type="cylinder" size="0.15 0.2" pos="0 0 -0.2"/>', True),  # a pedestal
+    ],
+    ids=["plane", "slab", "wall", "pedestal"],
+)
+def test_a_floor_or_a_wall_in_the_arms_file_is_background(
+    scenery: str, is_robot: bool, six: RobotConfig, world_of: Callable[..., World]
+):
+    plain = world_of(six)
+    six.path.write_text(ARM.replace("<worldbody>", f"<worldbody>{scenery}"))
+
+    world = world_of(six)
+
+    labels, names = (
+        geom_labels(world),
+        [world.model.geom(g).name for g in range(world.model.ngeom)],
+    )
+    assert labels[names.index("robot/s")] == (ROBOT if is_robot else BACKGROUND)
+    rest = np.delete(labels, names.index("robot/s"))
+    assert sorted(rest) == sorted(geom_labels(plain))
 
 
 def test_the_robots_file_and_settings_are_part_of_the_tasks_recipe(

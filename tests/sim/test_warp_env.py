@@ -95,7 +95,7 @@ def test_without_mujoco_warp_one_sentence_names_the_extra(
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     monkeypatch.delitem(sys.modules, "v2p_data.sim.env.warp_physics", raising=False)
 
-    with pytest.raises(V2PError, match="install the extra 'gpu'"):
+    with pytest.raises(V2PError, match="run 'make setup'"):
         BatchEnv(make_bundle(), ON_CUDA, num_envs=2, seed=0)
 
 

@@ -27,7 +27,7 @@ from v2p_data.commands.settings import How, Running, Settings, goes_on, run_fold
 from v2p_data.commands.setup import fetch_preset
 from v2p_data.craft_data import tasks_by_name
 from v2p_data.episodes.dataset.repo_id import check_repo_id, is_repo_id
-from v2p_data.episodes.hub.policy_card import note_results
+from v2p_data.episodes.hub.policy_card import DEMO_REPO_ID, note_results
 from v2p_data.errors import NotAllError, V2PError
 from v2p_data.evaluation.judging import PROGRAMS, Contestant, contestant, task_folders
 from v2p_data.pipeline.artifact import Record, read_record, write_json_atomically
@@ -220,7 +220,7 @@ def demo_command(argv: list[str]) -> int:
         flush=True,
     )
     with only_run_in(root):
-        dataset, code = generate(samples, root, "v2p/demo", cfg, runtime)
+        dataset, code = generate(samples, root, DEMO_REPO_ID, cfg, runtime)
         if dataset is None:
             raise V2PError(f"no sample clip came as far as episodes; see {_page(root)}")
         policy = train(dataset, root, cfg, runtime)

@@ -75,9 +75,7 @@ def fetch_learned(models: Sequence[str]) -> None:
 def _outlines() -> str:
     weights = mobile_sam_setup.installed_weights()
     if weights is not None and not mobile_sam_setup.transformers_is_there():
-        return (
-            f"in {weights}, but transformers is missing: pip install 'lerobot_policy_v2p[learned]'"
-        )
+        return f"in {weights}, but transformers is missing: run 'make setup' in the repository"
     size = f"{mobile_sam_setup.DOWNLOAD_MB} MB to download, {mobile_sam_setup.DISK_MB} MB on disk"
     return f"set up in {weights}" if weights else f"not set up ({size})"
 

@@ -142,9 +142,7 @@ def demand_ray() -> None:
         V2PError: says how to install it.
     """
     if importlib.util.find_spec("ray") is None:
-        raise V2PError(
-            "--engine=ray needs the ray package: pip install 'lerobot_policy_v2p[scale]'"
-        )
+        raise V2PError("--engine=ray needs the ray package: run 'make setup' in the repository")
 
 
 def _connected(address: str) -> Any:

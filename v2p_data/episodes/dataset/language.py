@@ -96,7 +96,7 @@ def subtasks(
             last = -1 if tips else rows[-1]  # it falls by itself
             way = direction((places[last] - places[0]) * (1, 1, not tips))
             parts[int(moved[0])] = f"{doing} the {name} {way}"
-        parts[int(rows[-1]) + 1] = f"let go of the {name}"
+        parts.setdefault(int(rows[-1]) + 1, f"let go of the {name}")
     if len(done):
         parts[int(done[0])] = "stay"
     return {row: parts[row] for row in sorted(parts) if row < len(places)}

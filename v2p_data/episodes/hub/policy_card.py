@@ -1,5 +1,6 @@
 """The card of a policy: written with its folder, given each evaluation, and pushed as it is."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from v2p_data.json_files import json_or_none
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 NOT_JUDGED = "Not evaluated yet: `v2p eval` writes its rates here."
 PLACEHOLDER = "POLICY is this folder, or its name on the Hub. "
+DEMO_REPO_ID = "v2p/demo"
+"""Name of the dataset of `v2p demo`, which nobody pushes by that name."""
 CARD = """\
 ---
 library_name: lerobot
@@ -37,7 +40,8 @@ license: {license}
 
 ## Load, evaluate
 
-{placeholder}The package `lerobot_policy_v2p` knows policies of type `v2p_bc` and the simulated tasks.
+{placeholder}The package `lerobot_policy_v2p` knows policies of type `v2p_bc` and the simulated tasks. It is on
+no package index: in a clone of its repository, `make setup` installs it.
 
 ```bash
 {fetch}v2p eval POLICY --tasks {tasks}
@@ -70,7 +74,10 @@ def write_policy_card(folder: Path) -> None:
     source = recipe.get("dataset")
     dataset = str(source.get("repo_id", "")) if isinstance(source, dict) else ""
     kind = str(config.get("type", "unknown"))
+    is_demo = dataset == DEMO_REPO_ID
     words = f"Policy of type `{kind}`" + (f", trained on `{dataset}`" if dataset else "")
+    words += " (on no Hub)" if is_demo else ""
+    dataset = "" if is_demo else dataset
     if "steps" in recipe and "batch_size" in recipe:
         words += f" for {recipe['steps']} steps of {recipe['batch_size']} frames"
     features = _features(config)
@@ -103,6 +110,7 @@ def name_policy(folder: Path, repo_id: str) -> None:
     path = folder / CARD_FILE
     card = path.read_text(errors="replace", encoding="utf-8")
     if PLACEHOLDER in card:
+        card = re.sub(r"^# .*$", f"# {repo_id}", card, count=1, flags=re.MULTILINE)
         write_whole(path, card.replace(PLACEHOLDER, "").replace("POLICY", repo_id).encode())
 
 

@@ -49,7 +49,7 @@ def load_checkpoint(backend: str, model: str, device: str, dtype: DType) -> Chec
     except ImportError:
         raise V2PError(
             f"backend '{backend}' needs transformers, which is not installed; install it with "
-            "'pip install lerobot_policy_v2p[learned]' or take a backend without downloaded weights"
+            "'make setup' in the repository, or take a backend without downloaded weights"
         ) from None
     model_class = getattr(transformers, MODEL_CLASSES[backend])
     processor_class = getattr(transformers, _PROCESSORS.get(backend, "AutoProcessor"))

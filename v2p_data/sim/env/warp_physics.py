@@ -60,8 +60,8 @@ try:
     import warp as wp
 except ImportError as error:
     raise V2PError(
-        f"the backend 'warp' needs MuJoCo Warp, which is not installed ({error}); install the extra 'gpu' "
-        "(pip install 'lerobot_policy_v2p[gpu]') or use the backend 'cpu'"
+        f"the backend 'warp' needs MuJoCo Warp, which is not installed ({error}); run 'make setup' in the "
+        "repository, or use the backend 'cpu'"
     ) from error
 
 wp.config.log_level = wp.LOG_WARNING  # else every kernel that is loaded prints a line

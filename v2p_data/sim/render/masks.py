@@ -34,6 +34,8 @@ RGB_CAMERA = "rgb"
 PALETTE = (0, 64, 128, 192, 255, 31, 95, 158, 222)
 """Grey level of each label."""
 BACKGROUND, ROBOT, FIRST_OBJECT = 0, 1, 2
+SCENERY_M = 0.5
+"""What stands still beside an arm and reaches farther than this from its middle is a floor, a wall or a table."""
 GL_HINT = "install it with 'apt-get install libegl1 libgl1-mesa-dri'"
 
 _GREYS = np.asarray(PALETTE, np.uint8)
@@ -67,6 +69,8 @@ def label_names(objects: tuple[str, ...]) -> dict[int, str]:
 def geom_labels(world: World) -> UInt8[np.ndarray, "geom"]:
     """Return the label of every geom.
 
+    What stands still in an arm's file is background where it is a plane, or large and no part of the arm's bodies.
+
     Raises:
         V2PError: the scene has more objects than there are greys.
     """
@@ -75,8 +79,13 @@ def geom_labels(world: World) -> UInt8[np.ndarray, "geom"]:
             f"scene '{world.scene.title}' has {len(world.objects)} objects; "
             f"masks tell at most {len(PALETTE) - FIRST_OBJECT} apart"
         )
-    labels = np.full(world.model.ngeom, ROBOT, np.uint8)
-    labels[world.model.geom("table").id] = BACKGROUND
+    model, body = world.model, world.model.geom_bodyid
+    arm = model.body_rootid[model.dof_bodyid[world.robot.arm_dofs.start]]
+    beside = (model.geom_rbound > SCENERY_M) & (model.body_rootid[body] != arm)
+    is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE.value
+    is_scenery = (model.body_weldid[body] == 0) & (beside | is_plane)
+    is_scenery[model.geom("table").id] = True
+    labels = np.where(is_scenery, BACKGROUND, ROBOT).astype(np.uint8)
     for k, obj in enumerate(world.objects):
         labels[list(obj.geom_ids)] = FIRST_OBJECT + k
     return labels

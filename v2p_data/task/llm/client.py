@@ -227,7 +227,7 @@ def _connect(cfg: VlmConfig, key: str) -> Any:
         import openai
     except ImportError as error:
         raise V2PError(
-            "--task.writer=vlm needs the openai package: pip install 'lerobot_policy_v2p[vlm]'"
+            "--task.writer=vlm needs the openai package: run 'make setup' in the repository"
         ) from error
     return openai.OpenAI(
         base_url=cfg.base_url,
