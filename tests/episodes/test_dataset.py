@@ -377,7 +377,7 @@ def test_the_card_of_an_older_dataset_names_its_seven_numbers(packed: Path):
     info["features"]["observation.state"] = state | {"shape": [7], "names": state["names"][:7]}
     card = dataset_card(about, info, "user/toys")
 
-    assert "gripper.pos (0 closed to 1 open) |" in card
+    assert "gripper.pos [0 closed to 1 open] |" in card
     assert "target_gripper.pos" not in card
 
 
