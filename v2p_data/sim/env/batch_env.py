@@ -279,10 +279,7 @@ class BatchEnv:
         return self._sim.object_qpos.copy()
 
     def touches(self) -> Bool[np.ndarray, "env object 3"]:
-        """Return whether the left pad, the right pad, any part of the arm touched each object.
-
-        The pads at the last time step, the arm (with hand and pads) at any during the last control step.
-        """
+        """Return whether the left pad, the right pad (at the last time step) and the arm touched each object."""
         return self._touches > 0
 
     def arm_touches(self) -> Bool[np.ndarray, "env object"]:
