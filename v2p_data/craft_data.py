@@ -121,11 +121,11 @@ def _digests(paths: Iterable[Path]) -> dict[str, str]:
 
 def _digest(path: Path) -> str:
     stat = path.stat()
-    return _digest_as_of(path, stat.st_size, stat.st_mtime_ns)
+    return _digest_as_of(path, (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns))
 
 
 @functools.cache
-def _digest_as_of(path: Path, size: int, mtime_ns: int) -> str:
+def _digest_as_of(path: Path, stamp: tuple[int, int, int]) -> str:
     """Return a file's digest; read once for all videos of a run."""
-    del size, mtime_ns
+    del stamp
     return file_digest(path)

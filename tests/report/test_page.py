@@ -258,6 +258,17 @@ def test_an_evaluation_shows_both_rates_what_went_wrong_and_a_film_of_each_kind(
     assert [a.split(": ")[-1] for a in alts[:2]] == ["success_0000", "failure_0001"]
 
 
+@pytest.mark.parametrize("is_its_own", [True, False])
+def test_a_video_is_held_out_where_its_own_task_is_unseen_and_not_one_of_its_name(run, is_its_own):
+    run.scene("t", "Lifting a can")
+    run.task("t")
+    (own,) = (run.root / "task").glob("t-*")
+    row = {"task": "t", "seen": False, "successes": 3, "trials": 4, "low": 0.3, "high": 0.95}
+    run.evaluation([row | {"folder": own.name if is_its_own else "t-ffffffff"}])
+
+    assert ("held out to judge the policy" in outline(run).text) == is_its_own
+
+
 def test_a_run_with_nothing_in_it_has_a_page(run):
     page = outline(run)
 
