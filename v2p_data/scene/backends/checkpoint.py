@@ -11,17 +11,7 @@ from typing import Any
 import torch
 
 from v2p_data.errors import V2PError
-from v2p_data.scene.backends.config import DEFAULT_MODELS, DType
-
-MODEL_CLASSES = {
-    "grounding_dino": "GroundingDinoForObjectDetection",
-    "sam2": "Sam2VideoModel",
-    "depth_anything": "DepthAnythingForDepthEstimation",
-}
-_PROCESSORS = {
-    "sam2": "Sam2VideoProcessor",
-    "depth_anything": "AutoImageProcessor",
-}
+from v2p_data.scene.backends.config import DEFAULT_MODELS, MODEL_CLASSES, DType
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +41,7 @@ def load_checkpoint(backend: str, model: str, device: str, dtype: DType) -> Chec
             f"backend '{backend}' needs transformers, which is not installed; install it with "
             "'make setup' in the repository, or take a backend without downloaded weights"
         ) from None
-    model_class = getattr(transformers, MODEL_CLASSES[backend])
-    processor_class = getattr(transformers, _PROCESSORS.get(backend, "AutoProcessor"))
+    model_class, processor_class = (getattr(transformers, n) for n in MODEL_CLASSES[backend])
     try:
         config = transformers.AutoConfig.from_pretrained(name)
         wanted = model_class.config_class.model_type

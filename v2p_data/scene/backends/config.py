@@ -17,6 +17,12 @@ DEFAULT_MODELS: dict[str, str] = {
     "depth_anything": "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf",
 }
 """The checkpoint that an empty `model` stands for; `docs/backends.md` has the licence of each."""
+MODEL_CLASSES: dict[str, tuple[str, str]] = {
+    "grounding_dino": ("GroundingDinoForObjectDetection", "AutoProcessor"),
+    "sam2": ("Sam2VideoModel", "Sam2VideoProcessor"),
+    "depth_anything": ("DepthAnythingForDepthEstimation", "AutoImageProcessor"),
+}
+"""Per backend the classes of transformers that read its checkpoint: the model, the processor."""
 
 
 @dataclass(frozen=True, kw_only=True)

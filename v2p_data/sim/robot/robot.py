@@ -21,7 +21,6 @@ NUM_ARM_JOINTS = 7
 FINGER_TRAVEL_M = 0.0425
 """Travel of one finger; the gripper opens by twice as much."""
 TCP_BELOW_FLANGE_M = 0.107 + 0.145
-FINGER_THICKNESS_M = 0.012
 FINGERTIP_BELOW_TCP_M = 0.015
 QUAT_DOWN = (0.0, 1.0, 0.0, 0.0)
 """`quat_wxyz` of the gripper pointing straight down with zero yaw."""
