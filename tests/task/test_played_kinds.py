@@ -1,14 +1,14 @@
 """Each kind of task, played in the real physics by arms that do what its words say, and by arms that do not."""
 
 import contextlib
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-import played
 import pytest
 import torch
-from played import BACK, FORWARD, LEFT, RIGHT, bring, idle, let_go, program, rise, shove, take
 from scipy.spatial.transform import Rotation
 
 from v2p_data.errors import ItemRejectedError
@@ -19,6 +19,10 @@ from v2p_data.sim.env.batch_env import BatchEnv, SimConfig
 from v2p_data.sim.env.start_check import check_poses, check_start
 from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import Task, TaskBundle
+
+sys.path.insert(0, str(Path(__file__).parent))
+import played
+from played import BACK, FORWARD, LEFT, RIGHT, bring, idle, let_go, program, rise, shove, take
 
 pytestmark = pytest.mark.slow
 WORLDS = 4

@@ -1,8 +1,10 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from v2p_data.geometry.camera import Camera, intrinsics, look_at
-from v2p_data.kinds import KINDS
+from v2p_data.kinds import KINDS, meanings_table
 from v2p_data.scene.scene import Scene, SceneObject
 from v2p_data.task.referee import RULES, ObjectTrack, Trajectory, referee_success
 
@@ -223,3 +225,32 @@ def test_the_tool_must_do_the_pushing():
 def test_doing_nothing_is_no_success(kind):
     still = track(HERE, HERE, touched_before=False)
     assert not verdict(kind, [still, STILL], BOX, REF)
+
+
+def test_the_page_prints_the_table_that_the_referee_reads():
+    page = Path(__file__).parents[2] / "docs" / "experts.md"
+
+    assert meanings_table() in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("moves_before", [False, True])
+def test_what_moves_before_the_arms_contact_moves_by_itself(moves_before: bool):
+    way = track(HERE, (0.5, 0.1, 0.02))
+    if moves_before:
+        way.by_arm[:8] = False
+
+    assert verdict("push_left", [way], BOX) != moves_before
+
+
+def test_what_starts_at_its_goal_must_leave_it_and_is_no_success_where_it_comes_back_to():
+    onto = (0.5, 0.2, 0.045)
+    block = thing("block", size=(0.12, 0.12, 0.025), role="reference")
+    low = track(
+        (0.5, 0.2, 0.0125), (0.5, 0.2, 0.0125), touched_before=False, size=(0.12, 0.12, 0.025)
+    )
+    there, elsewhere = track((0.5, 0.16, 0.045), onto), track(HERE, onto)
+    for put in (there, elsewhere):
+        put.pos[4:12, 0, 2] = 0.15
+
+    assert verdict("place_onto", [elsewhere, low], BOX, block)
+    assert not verdict("place_onto", [there, low], BOX, block)
