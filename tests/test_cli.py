@@ -55,10 +55,23 @@ def test_help_imports_no_heavy_library():
 
 def test_reading_a_command_s_options_does_not_wait_for_what_trains():
     code = (
-        "import sys, v2p_data.commands.run;"
+        "import sys, v2p_data.commands.run, v2p_data.commands.show, v2p_data.commands.reward;"
         "assert not {'torchrl', 'tensordict', 'lerobot', 'transformers'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("loads_s", [0.0, 0.4])
+def test_a_command_that_still_loads_says_so_after_a_second(loads_s):
+    code = (
+        "import sys, time; from v2p_data import cli; cli.FIRST_WORD_S = 0.2; sys.argv = ['v2p', 'gc'];"
+        f"cli._command = lambda name: time.sleep({loads_s}) or (lambda argv: time.sleep(0.4) or 0);"
+        "cli.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+
+    assert done.stderr == ("v2p: loading libraries\n" if loads_s else "")
+    assert done.stdout == ""
 
 
 def test_what_takes_long_says_how_far_it_is(capsys, monkeypatch):

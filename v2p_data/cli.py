@@ -8,6 +8,7 @@ import io
 import logging
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -50,6 +51,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 """Command -> module of `v2p_data.commands` that holds it, and what it does; a folder of a second word's name is given
 as `./review`."""
+FIRST_WORD_S = 1.0
+"""After so long a command that still loads says so."""
 EXIT_CODES = {
     0: "made; videos that were rejected are listed, with reasons",
     1: "a check found something wrong (verify, status --check)",
@@ -71,15 +74,21 @@ def main() -> None:
         sys.stdout, io.TextIOWrapper
     ):  # a terminal that is not of UTF-8 shows other letters by number
         sys.stdout.reconfigure(errors="backslashreplace")
+    # Nobody waits for long without a word: libraries take seconds to load, on a busy machine many.
+    word = threading.Timer(
+        FIRST_WORD_S, print, ["v2p: loading libraries"], {"file": sys.stderr, "flush": True}
+    )
+    word.daemon = True
+    word.start()
     # The Ctrl-C of a pipe's reader (`v2p status | head`) is no error of ours.
     try:
-        sys.exit(run(sys.argv[1:]))
+        sys.exit(run(sys.argv[1:], on_loaded=word.cancel))
     except BrokenPipeError:
         os._exit(0)
 
 
-def run(argv: Sequence[str]) -> int:
-    """Return the exit code of `v2p` with these arguments."""
+def run(argv: Sequence[str], on_loaded: Callable[[], object] = lambda: None) -> int:
+    """Return the exit code of `v2p` with these arguments; tell when the command's modules are loaded."""
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(_help())
         return 0
@@ -90,7 +99,9 @@ def run(argv: Sequence[str]) -> int:
         return 0
     name = " ".join(argv[:2]) if " ".join(argv[:2]) in COMMANDS else argv[0]
     try:
-        return _command(name)(list(argv[len(name.split()) :]))
+        command = _command(name)
+        on_loaded()
+        return command(list(argv[len(name.split()) :]))
     except V2PError as error:
         print(f"v2p {name}: {error}" if name in COMMANDS else f"v2p: {error}", file=sys.stderr)
         return NOT_ALL if isinstance(error, NotAllError) else NOTHING

@@ -106,6 +106,7 @@ def test_a_policy_that_is_too_slow_is_refused_before_anything_moves(
             return super().act(labels, state)
 
     rig = restarted(blind_robot)
+    rig.waits = False  # as a real arm
     lazy = Slow(0, 0, 0, 0, 0, 0, 0)
 
     with pytest.raises(V2PError, match=r"20 Hz cannot be kept: a step takes \d+ ms .* --slow"):
@@ -123,7 +124,9 @@ def test_a_loop_that_becomes_too_slow_is_stopped(blind_robot, restarted, steady)
             time.sleep(0.09 if self.calls > 10 else 0.0)
             return super().act(labels, state)
 
-    run = run_of(restarted(blind_robot), Tiring(0, 0, 0, 0, 0, 0, 0), seconds=5.0, slow=False)
+    rig = restarted(blind_robot)
+    rig.waits = False
+    run = run_of(rig, Tiring(0, 0, 0, 0, 0, 0, 0), seconds=5.0, slow=False)
     run.rehearse = lambda: None  # type: ignore[method-assign] - that it was fast enough then is given
     outcome = run.go()
 
@@ -134,6 +137,7 @@ def test_a_loop_that_becomes_too_slow_is_stopped(blind_robot, restarted, steady)
 
 def test_a_robot_that_falls_silent_is_told_to_hold(blind_robot, restarted, steady):
     rig = restarted(blind_robot)
+    rig.waits = False
     held = []
     ask, hold = rig.read, rig.hold
 
@@ -150,6 +154,7 @@ def test_a_robot_that_falls_silent_is_told_to_hold(blind_robot, restarted, stead
 
     assert outcome.ending == "silence"
     assert "no reading came for 500 ms" in outcome.sentence
+    assert "--limits.max-silence-ms" in outcome.sentence
     assert blind_robot.arm.steps == 5  # nothing was done after the silence
     assert held[1] - held[0] > 0.3  # once by the watchdog in time, once at the end
 
@@ -162,14 +167,29 @@ def test_a_policy_that_ponders_too_long_is_named_and_not_the_robot(blind_robot, 
             return super().act(labels, state)
 
     limits = LimitsConfig(max_silence_ms=400.0)
-    outcome = run_of(
-        restarted(blind_robot), Pondering(0, 0, 0, 0, 0, 0, 0), seconds=5.0, limits=limits
-    ).go()
+    rig = restarted(blind_robot)
+    rig.waits = False
+    outcome = run_of(rig, Pondering(0, 0, 0, 0, 0, 0, 0), seconds=5.0, limits=limits).go()
 
     assert outcome.ending == "slow"
+    assert "--limits.max-silence-ms" in outcome.sentence
     assert outcome.sentence.startswith("the policy took more than 400 ms in one step")
     assert "look after" not in outcome.sentence
     assert blind_robot.arm.steps == 5  # what it decided so late is not done
+
+
+def test_a_simulated_arm_waits_for_a_busy_machine(blind_robot, restarted, steady):
+    class Pondering(steady):
+        def act(self, labels, state):
+            time.sleep(0.7 if blind_robot.arm.steps == 3 else 0.06)
+            return super().act(labels, state)
+
+    limits = LimitsConfig(max_silence_ms=400.0)
+    outcome = run_of(
+        restarted(blind_robot), Pondering(0, 0, 0, 0, 0, 0, 0), limits=limits, slow=False
+    ).go()
+
+    assert (outcome.ending, outcome.steps) == ("time", 10)
 
 
 def test_a_policy_that_breaks_leaves_the_arm_at_rest(blind_robot, restarted, steady):

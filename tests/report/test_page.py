@@ -353,6 +353,27 @@ def test_media_beyond_the_budget_are_left_out_and_named(run):
     assert (run.root / "report.html").stat().st_size < 20_000 + 80_000
 
 
+def test_videos_are_filtered_by_where_their_way_ended(run):
+    run.whole()
+
+    page = outline(run)
+
+    ways = [
+        (attrs.get("class") or "").split()[1]
+        for attrs in page.of("tr")
+        if "way" in (attrs.get("class") or "")
+    ]
+    chosen = [str(attrs["id"]).removeprefix("only-") for attrs in page.of("input")]
+    assert chosen[0] == "all"
+    assert sorted(chosen[1:]) == sorted(set(ways))
+    assert len(chosen) > 2
+    html = (run.root / "report.html").read_text()
+    for way in chosen[1:]:
+        assert f"main:has(#only-{way}:checked) .way:not(.{way}) {{ display: none; }}" in html
+        assert f"({ways.count(way)})" in page.text
+    assert_safe(page)
+
+
 def test_beyond_the_limit_videos_are_in_the_table_only(run):
     for k in range(4):
         run.scene(f"clip_{k}", f"Lifting mug {k}")

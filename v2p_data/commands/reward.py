@@ -10,9 +10,8 @@ import tyro
 from v2p_data.cli import parse
 from v2p_data.pipeline.artifact import demand_whole
 from v2p_data.pipeline.runner import Runtime
-from v2p_data.report.rewards import RewardView, reward_view
+from v2p_data.report.rewards import SEARCH_FILE, RewardView, reward_view
 from v2p_data.reward.config import RewardConfig
-from v2p_data.reward.search import SEARCH_FILE, RewardSearch
 from v2p_data.stages import reward_stage, scene_stage, task_stage
 from v2p_data.task.benchmark import benchmark_names, load_benchmark
 from v2p_data.task.task import REWARD_SEARCH_FOLDER, TaskBundle
@@ -54,6 +53,8 @@ def search_command(argv: list[str]) -> int:
             print(f"{share:4.0%}  {words}", flush=True)  # noqa: T201
 
     runtime = Runtime(root=args.out, num_threads=args.workers, progress=tell)
+    from v2p_data.reward.search import RewardSearch
+
     search = RewardSearch(_task(args.task), args.reward, args.out, seed=args.seed, runtime=runtime)
     best = search.run()
     print(  # noqa: T201

@@ -31,6 +31,9 @@ class TooSlowError(V2PError):
 
 
 FASTER = "stop other programs, use a GPU (--device cuda) or a smaller policy"
+LONGER = "--limits.max-silence-ms allows more, where the robot may stand still for longer"
+_PATIENCE_MS = 3.6e6
+"""A simulated robot is waited for, but not for ever."""
 
 Ending = Literal[
     "time", "done", "limit", "lost", "silence", "robot", "slow", "interrupted", "policy"
@@ -111,7 +114,8 @@ class Run:
         if rig.guard is None:
             raise ValueError("a run needs limits")
         self.rig, self.policy, self.cfg = rig, policy, cfg
-        self.max_silence_ms = rig.guard.cfg.max_silence_ms
+        self.max_silence_ms = _PATIENCE_MS if rig.waits else rig.guard.cfg.max_silence_ms
+        self.is_patient = cfg.slow or rig.waits
         self.onlooker = onlooker or Onlooker()
         self._works_on = ""
         """What this side does at the moment; nothing while the robot is awaited."""
@@ -148,13 +152,11 @@ class Run:
                 outcome.ending = "slow"
                 outcome.sentence = (
                     f"{late} took more than {silence:g} ms in one step, so no "
-                    f"reading was asked for; {FASTER}"
+                    f"reading was asked for; {FASTER}; {LONGER}"
                 )
             elif watchdog.has_bitten:
                 outcome.ending = "silence"
-                outcome.sentence = (
-                    f"no reading came for {silence:g} ms; look after the robot and its connection"
-                )
+                outcome.sentence = f"no reading came for {silence:g} ms; look after the robot and its connection; {LONGER}"
         try:
             self._hold()
         except V2PError as error:
@@ -181,7 +183,7 @@ class Run:
         self.rig.look_anew()
         self.policy.reset(1)
         mean = float(np.median(took[2:]))
-        if mean > STEP_S and not self.cfg.slow:
+        if mean > STEP_S and not self.is_patient:
             raise V2PError(_too_slow(mean, "nothing was moved"))
 
     def _steps(self, outcome: Outcome, watchdog: Watchdog) -> None:
@@ -224,7 +226,7 @@ class Run:
     def _check_rate(self, outcome: Outcome) -> None:
         recent = outcome.work_ms[-WINDOW:]
         mean = float(np.mean(recent)) / 1000
-        if len(recent) == WINDOW and mean > STEP_S and not self.cfg.slow:
+        if len(recent) == WINDOW and mean > STEP_S and not self.is_patient:
             raise TooSlowError(_too_slow(mean, "the run was stopped"))
 
     def _hold(self) -> None:

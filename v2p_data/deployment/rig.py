@@ -55,6 +55,8 @@ class Rig:
         self.guard = None if limits is None else Guard(limits, self.scale)
         self.maker = StepMaker(interface, self.scale)
         self._is_seeing = self._is_checked = False
+        self.waits = not getattr(getattr(robot, "arm", None), "is_real", True)
+        """Whether the robot is simulated here: its time stands still until the next action, however long that takes."""
 
     def see(self, reading: Reading) -> Seen:
         """Return what a reading shows; the first one is searched for what was clicked.

@@ -78,6 +78,15 @@ class ItemView:
     notes: list[str] = field(default_factory=list[str])
     """What could not be read, one sentence each."""
 
+    @property
+    def ending(self) -> str:
+        """Where the video's way ended, as a word of the page's filter: the stage that stopped it, or the last one made."""
+        made = [stage for stage, r in self.results.items() if r and r.status == "made"]
+        stopped = [
+            stage for stage, r in self.results.items() if r and r.status in ("rejected", "failed")
+        ]
+        return f"{stopped[0]}-stopped" if stopped else f"{made[-1]}-made" if made else "nothing"
+
 
 def item_view(
     run: Run,

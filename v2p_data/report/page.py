@@ -5,6 +5,7 @@ content policy in its head forbids the browser to load anything that is not insi
 """
 
 import shlex
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -98,6 +99,7 @@ def render_page(root: Path, cfg: PageConfig) -> str:
         summary=_summary(figures),
         figures=_key_figures(figures),
         items=items,
+        endings=Counter(view.ending for view in items),
         item_stages=[s for s in ITEM_STAGES if s != "reward" or run.of_stage(s)],
         joint=[r for stage in JOINT_STAGES for r in run.of_stage(stage)],
         evaluation=evaluation,
