@@ -66,6 +66,15 @@ def test_an_episode_whose_actions_were_changed_does_not_come_back(copied):
     assert report.lines()[-1].startswith("2 of 3 episodes came back")
 
 
+def test_an_episode_that_outlasts_its_task_does_not_come_back(copied):
+    task = json.loads((copied / "v2p/tasks/toy/task.json").read_text())
+    (copied / "v2p/tasks/toy/task.json").write_text(json.dumps({**task, "horizon_steps": 3}))
+
+    report = replay(copied)
+
+    assert not any(e.same_success for e in report.episodes)
+
+
 def test_another_version_of_mujoco_is_named_with_file_and_field(copied):
     about = json.loads((copied / METADATA_FILE).read_text())
     about["provenance"]["packages"]["mujoco"] = "2.0.0"
@@ -92,6 +101,29 @@ def test_another_version_of_mujoco_is_named_with_file_and_field(copied):
                 batch_worlds=10**9
             ),
             "batch_worlds is 1000000000; at most 4096",
+        ),
+        *(
+            (
+                lambda about, new=new: about["provenance"]["items"]["toy"]["recipe"]["config"][
+                    "config"
+                ].update(randomization=new),
+                f"{next(iter(new))} is",
+            )
+            for new in (
+                {"arm_pos_m": [1e9, 0.0, 0.0]},
+                {"arm_pos_m": [0.0, -0.1, 0.0]},
+                {"delay_s": [0.02, 0.01]},
+                {"object_pos_m": 1e9},
+                {"action_noise": 1e300},
+                {"size_scale": [float("nan"), 1.0]},
+                {"mass_scale": [1.0, 1e9]},
+            )
+        ),
+        (
+            lambda about: about["provenance"]["items"]["toy"]["recipe"]["config"]["config"].update(
+                randomization={"arm_pos_m": [0.9, 0.9, 0.9]}
+            ),
+            "out of the arm's reach",
         ),
         (
             lambda about: [e.update(item="../toy") for e in about["episodes"]],

@@ -312,3 +312,23 @@ FOUND: dict[str, Spoil] = {
     "a task of number 10^9": cell(DATA, "task_index", 10**9),
 }
 """These can be read, and are not as they should be."""
+
+UNSOUND: dict[str, Spoil] = {
+    f"{column} {what}": cells(DATA, column, new)
+    for column in ("action", "observation.state", "next.success", "timestamp", "task_index")
+    for what, new in {
+        "is null": lambda c: pa.nulls(len(c), c.type),
+        "is null once": lambda c: pa.array([None, *c.to_pylist()[1:]], type=c.type),
+        "holds texts": lambda c: pa.array(["a"] * len(c)),
+    }.items()
+} | {
+    "an action is too short": cells(
+        DATA, "action", lambda c: pa.array([[0.5], *c.to_pylist()[1:]])
+    ),
+    "the tasks were edited": cells(TASKS, "task", lambda c: pa.array(["push it"] * len(c))),
+    "the episodes' tasks were edited": cells(
+        TABLE, "tasks", lambda c: pa.array([["push it"]] * len(c))
+    ),
+}
+"""What no dataset may be made of."""
+FOUND |= UNSOUND

@@ -69,3 +69,17 @@ def test_what_can_be_read_and_is_wrong_is_listed(
 
     assert run(["verify", str(spoiled)]) == 1
     assert "problem" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", strange_datasets.UNSOUND)
+def test_no_dataset_is_made_of_one_that_is_not_sound(
+    name: str, spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (spoiled / "record.json").unlink(missing_ok=True)
+    strange_datasets.UNSOUND[name](spoiled)
+
+    for command, more in COMMANDS.items():
+        if command in ("drop", "merge"):
+            code = run([command, str(spoiled), *(w.format(out=tmp_path / "out") for w in more)])
+            assert code == 2
+            assert "is not sound" in capsys.readouterr().err

@@ -2,6 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from v2p_data.errors import V2PError
 from v2p_data.sim.robot.arms import RobotConfig, read_arm
 from v2p_data.sim.robot.robot import (
     COARSE,
@@ -74,7 +75,7 @@ def test_joint_angles_for_a_tool_pose_lead_back_to_it():
 
 
 def test_a_tool_pose_out_of_reach_is_refused():
-    with pytest.raises(ValueError, match="out of the arm's reach"):
+    with pytest.raises(V2PError, match="out of the arm's reach"):
         arm_qpos_for(np.array([[1.2, 0.0, 0.3]]), np.zeros(1))
 
 

@@ -29,7 +29,14 @@ from v2p_data.episodes.dataset.features import (
     SUCCESS_KEY,
 )
 from v2p_data.episodes.dataset.intake import demand_bounded
-from v2p_data.episodes.dataset.tables import DATA_GLOB, column, damage_named, read_info, row_spans
+from v2p_data.episodes.dataset.tables import (
+    DATA_GLOB,
+    column,
+    damage_named,
+    demand_sound,
+    read_info,
+    row_spans,
+)
 from v2p_data.episodes.rollouts import Lesson, Rollouts, roll_out
 from v2p_data.errors import V2PError
 from v2p_data.pipeline.settings import from_values
@@ -131,6 +138,7 @@ def replay(
     info = read_info(root)
     demand_bounded(root)
     about = demand_about(root)
+    demand_sound(root, info)
     with damage_named(root):
         batches, skipped = _batches(root, about, num_episodes or int(info["total_episodes"]))
     total = sum(map(len, batches.values()))
@@ -213,8 +221,8 @@ def _played(
 ) -> Rollouts:
     """Return the whole batch, with the recorded actions in the worlds that have some."""
     actions = np.zeros((bundle.horizon_steps, cfg.batch_worlds, 7), np.float32)
-    for e in episodes:
-        actions[: len(e.action), e.world % cfg.batch_worlds] = e.action
+    for e in episodes:  # a longer one than its task lets be is played to the task's end
+        actions[: len(e.action), e.world % cfg.batch_worlds] = e.action[: len(actions)]
     rows = iter(actions)
     return roll_out(
         Lesson(bundle=bundle, expert=StateActor(lambda obs: next(rows))),

@@ -18,7 +18,7 @@ from v2p_data.episodes.dataset.features import DEMONSTRATION, INTERVENTION_KEY, 
 from v2p_data.episodes.dataset.language import write_language
 from v2p_data.episodes.dataset.layout import NewDataset
 from v2p_data.episodes.dataset.repo_id import check_repo_id
-from v2p_data.episodes.dataset.tables import layout_problems, read_info
+from v2p_data.episodes.dataset.tables import demand_sound, layout_problems, read_info
 from v2p_data.episodes.dataset.verify import difference_of_frames
 from v2p_data.errors import V2PError, did_you_mean
 from v2p_data.pipeline.artifact import write_json_atomically
@@ -127,10 +127,7 @@ def drop(
 def _read(root: Path) -> _Source:
     about = demand_ours(root)
     info = read_info(root)
-    if problems := layout_problems(root, info):
-        raise V2PError(
-            f"{root} is not sound ({problems[0].where}: {problems[0].detail}); 'v2p verify {root}' lists everything"
-        )
+    demand_sound(root, info)
     if len(about["episodes"]) != info["total_episodes"]:
         raise V2PError(
             f"{root / METADATA_FILE} names {len(about['episodes'])} episodes, there are {info['total_episodes']}"

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from annotated_types import Ge, Le, Len
 from pydantic import AfterValidator, ConfigDict, StringConstraints
@@ -233,7 +234,10 @@ def _check_episodes(root: Path) -> None:
             table = pq.read_table(path, columns=names)
         except (pa.ArrowException, OSError):
             return
-        if "tasks" in schema.names and not _is_texts(schema.field("tasks").type):
+        words = (
+            pq.read_table(path, columns=["tasks"]).column(0) if "tasks" in schema.names else None
+        )
+        if words is not None and not (_is_texts(words.type) and _is_whole(words)):
             raise V2PError(f"{path}: 'tasks' is no column of lists of texts; {ADVICE}")
         for name, column in zip(table.column_names, table.columns, strict=True):
             if not pa.types.is_integer(column.type) or column.null_count:
@@ -244,6 +248,10 @@ def _check_episodes(root: Path) -> None:
                     f"{path}: '{name}' runs from {values.min()} to {values.max()}, possible are 0 "
                     f"to {MAX_COUNT:,}; {ADVICE}"
                 )
+
+
+def _is_whole(lists: pa.ChunkedArray) -> bool:
+    return not lists.null_count and not pc.call_function("list_flatten", [lists]).null_count
 
 
 def _is_texts(kind: pa.DataType) -> bool:

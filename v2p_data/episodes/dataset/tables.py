@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from v2p_data.episodes.dataset.intake import INFO_FILE, STATS_FILE, check_info
@@ -114,6 +115,18 @@ def layout_problems(root: Path, info: dict[str, Any]) -> list[Problem]:
                 detail=f"cannot be read ({_words(error)})",
             )
         ]
+
+
+def demand_sound(root: Path, info: dict[str, Any]) -> None:
+    """Raise unless `layout_problems` finds nothing.
+
+    Raises:
+        V2PError: names the first thing that is wrong.
+    """
+    if problems := layout_problems(root, info):
+        raise V2PError(
+            f"{root} is not sound ({problems[0].where}: {problems[0].detail}); 'v2p verify {root}' lists everything"
+        )
 
 
 def _layout_problems(root: Path, info: dict[str, Any]) -> list[Problem]:
@@ -284,23 +297,37 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Prob
     """Yield what is wrong with which rows lie in which file."""
     where_is: dict[int, set[str]] = {}
     counted: dict[int, int] = {}
-    num_tasks = len(tasks_of(root))
+    said = episodes.column("tasks").to_pylist()
+    tasks = np.array(tasks_of(root))
     in_tables = [k for k, f in info["features"].items() if f.get("dtype") != "video"]
+    numbers = {
+        k: int(np.prod(f["shape"]))
+        for k, f in info["features"].items()
+        if f["dtype"].startswith(("float", "int", "uint", "bool"))
+    }
     for path in sorted(root.glob(DATA_GLOB)):
         name = _name(root, path)
         absent = [c for c in in_tables if c not in pq.read_schema(path).names]
         if absent:
             yield Problem(check="missing_column", where=name, detail=f"lacks {', '.join(absent)}")
             return
-        table = pq.read_table(path, columns=["episode_index", "task_index"])
-        tasks = column(table, "task_index")
-        if len(tasks) and not 0 <= tasks.min() <= tasks.max() < num_tasks:
-            yield Problem(
-                check="task", where=name, detail=f"names task {tasks.max()} of {num_tasks}"
-            )
-        for number, rows in zip(
-            *np.unique(column(table, "episode_index"), return_counts=True), strict=True
-        ):
+        table = pq.read_table(path, columns=list(numbers))
+        for key, per_row in numbers.items():
+            if not _holds_numbers(table.column(key), per_row):
+                detail = f"does not hold {per_row} numbers in each row of {key}"
+                yield Problem(check="missing_column", where=name, detail=detail)
+                return
+        of_row, shown = column(table, "episode_index"), column(table, "task_index")
+        if len(shown) and not 0 <= shown.min() <= shown.max() < len(tasks):
+            detail = f"names task {shown.max()} of {len(tasks)}"
+            yield Problem(check="task", where=name, detail=detail)
+            return
+        for k, (first, count) in row_spans(of_row).items():
+            named = set(tasks[shown[first : first + count]].tolist())
+            if k < len(said) and not named <= set(said[k]):
+                detail = f"its rows show the task {'; '.join(sorted(named))!r}, the episode table {'; '.join(said[k])!r}"
+                yield Problem(check="task", where=f"episode {k}", detail=detail)
+        for number, rows in zip(*np.unique(of_row, return_counts=True), strict=True):
             where_is.setdefault(int(number), set()).add(name)
             counted[int(number)] = counted.get(int(number), 0) + int(rows)
     for k, length in enumerate(column(episodes, "length")):
@@ -325,6 +352,19 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Prob
                 where=f"episode {k}",
                 detail=f"is noted in {name} and lies in {', '.join(sorted(where_is[k]))}",
             )
+
+
+def _holds_numbers(values: pa.ChunkedArray, per_row: int) -> bool:
+    """Return whether each row of a column holds so many numbers, none of which is missing."""
+    count = len(values)
+    while not values.null_count and hasattr(values.type, "value_type"):
+        values = pc.call_function("list_flatten", [values])
+    kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean)
+    return (
+        not values.null_count
+        and len(values) == count * per_row
+        and any(k(values.type) for k in kinds)
+    )
 
 
 def _video_times(info: dict[str, Any], episodes: pa.Table) -> Iterator[Problem]:

@@ -121,7 +121,8 @@ def verify(
         _check_episode(checks, rows, k, start, length, recorded)
         start += length
         on_progress((k + 1) / len(lengths), f"read {k + 1} episodes")
-    checks.statistics(rows.dataset.meta.stats or {})
+    if all(p.check != "does_not_read" for p in problems):  # statistics are of all rows
+        checks.statistics(rows.dataset.meta.stats or {})
     return VerifyReport(
         root=root,
         num_episodes=len(lengths),
@@ -154,12 +155,11 @@ def _check_episode(
     try:
         for row in rows.episode(start, length):
             episode.look_at(row)
+        episode.finish()
     except Exception as error:  # noqa: BLE001 - whatever LeRobot stumbles over is the finding
         words = (str(error).strip().splitlines() or [""])[0][:200]
         where = f"after frame {len(episode.tasks)}"
         checks.add("does_not_read", f"episode {k}", f"{where}: {type(error).__name__}: {words}")
-    else:
-        episode.finish()
 
 
 def difference_of_frames(root: Path, sources: Sequence[tuple[Path, Sequence[int]]]) -> str:

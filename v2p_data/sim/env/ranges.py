@@ -6,6 +6,16 @@ import numpy as np
 
 from v2p_data.sim.model.world import CAMERA_FOVY_DEG
 
+POSSIBLE = {
+    "_scale": (0.01, 100.0),
+    "delay_s": (0.0, 0.02),
+    "_m": (0.0, 1.0),
+    "_rad": (0.0, 2 * float(np.pi)),
+    "_deg": (0.0, CAMERA_FOVY_DEG - 1.0),
+    "action_noise": (0.0, 10.0),
+}
+"""Lowest and highest value of a range, by how its name ends."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfig:
@@ -44,23 +54,14 @@ class RandomizationConfig:
     """The camera's vertical field of view changes by up to this much."""
 
     def __post_init__(self) -> None:
-        for low, high in (
-            self.size_scale,
-            self.mass_scale,
-            self.friction_scale,
-            self.layout_distance_scale,
-            self.servo_gain_scale,
-        ):
-            if not 0 < low <= high:
-                raise ValueError(f"need 0 < lowest <= highest, got {low} and {high}")
-        if not 0 <= self.delay_s[0] <= self.delay_s[1] <= 0.02:
-            raise ValueError(f"delays of 0 to 20 ms can be simulated, got {self.delay_s} s")
-        moved = (self.camera_pos_m, self.camera_angle_rad, self.camera_fovy_deg)
-        if min(moved) < 0 or self.camera_fovy_deg >= CAMERA_FOVY_DEG:
-            raise ValueError(
-                f"camera_pos_m, camera_angle_rad and camera_fovy_deg must be 0 or more, the last below "
-                f"{CAMERA_FOVY_DEG}, got {moved}"
+        for name, value in vars(self).items():
+            low, high = next(
+                limits for ending, limits in POSSIBLE.items() if name.endswith(ending)
             )
+            if not all(low <= v <= high for v in np.ravel(value)):
+                raise ValueError(f"{name} is {value}; {low:g} to {high:g} can be simulated")
+            if name.endswith(("_scale", "_s")) and value[0] > value[1]:
+                raise ValueError(f"{name} is {value}; the lowest comes first")
 
 
 def none() -> RandomizationConfig:

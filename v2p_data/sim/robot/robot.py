@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from v2p_data.errors import V2PError
 from v2p_data.geometry.rotation import conjugates, product
 
 HOME_QPOS = (0.0, 0.1, 0.0, -2.15, 0.0, 2.25, 0.7853981633974483)
@@ -189,8 +190,9 @@ def arm_qpos_for(
     low, high = np.array(JOINT_RANGES_RAD).T
     bad = (np.abs(error).max(1) > 1e-6) | ((qpos < low) | (qpos > high)).any(1)
     if bad.any():
-        raise ValueError(
-            f"tool position {pos[bad][0]} with yaw {yaw_rad[bad][0]:.2f} is out of the arm's reach"
+        raise V2PError(
+            f"tool position {pos[bad][0]} with yaw {yaw_rad[bad][0]:.2f} is out of the arm's reach; if it was drawn,"
+            " lower randomization.arm_pos_m"
         )
     return qpos
 
