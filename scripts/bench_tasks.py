@@ -64,7 +64,7 @@ def main() -> None:
         default=ExpertConfig().taught_bonus_factor,
         help="see ExpertConfig",
     )
-    parser.add_argument("--teacher", choices=["programs", "none"], default="programs")
+    parser.add_argument("--start", choices=["program", "none", "pretrained"], default="program")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print the results so far and stop")
     args = parser.parse_args()
@@ -73,7 +73,7 @@ def main() -> None:
     if not args.table:
         for seed in args.seeds:
             for task in args.tasks:
-                if (Path(task).name, seed, args.teacher, args.taught_bonus_factor) not in {
+                if (Path(task).name, seed, args.start, args.taught_bonus_factor) not in {
                     _key(r) for r in results_in(args.out)
                 }:
                     _one(task, seed, args)
@@ -83,10 +83,10 @@ def main() -> None:
 def _one(task: str, seed: int, args: argparse.Namespace) -> None:
     bundle = TaskBundle.load(Path(task)) if Path(task).is_dir() else load_benchmark(task)
     task = Path(task).name
-    folder = args.out / f"{task}-{args.teacher}-{args.taught_bonus_factor:g}-{seed}"
-    if args.teacher == "programs":  # a half-made training is not gone on with after imitation anew
+    folder = args.out / f"{task}-{args.start}-{args.taught_bonus_factor:g}-{seed}"
+    if args.start == "program":  # a half-made training is not gone on with after imitation anew
         shutil.rmtree(folder, ignore_errors=True)
-    base = ExpertConfig(teacher=args.teacher, taught_bonus_factor=args.taught_bonus_factor)
+    base = ExpertConfig(start=args.start, taught_bonus_factor=args.taught_bonus_factor)
     cfg = replace(
         base,
         ppo=replace(
@@ -119,7 +119,7 @@ def _one(task: str, seed: int, args: argparse.Namespace) -> None:
     result = {
         "task": task,
         "seed": seed,
-        "teacher": args.teacher,
+        "start": args.start,
         "taught_bonus_factor": args.taught_bonus_factor,
         "commit": commit(),
         "judged": {who: _judged(rollouts) for who, rollouts in judged.items()},
@@ -158,7 +158,7 @@ def _curve(folder: Path, points: int = 12) -> list[list[float | None]]:
 
 
 def _key(result: dict) -> tuple[str, int, str, float]:
-    return result["task"], result["seed"], result["teacher"], result["taught_bonus_factor"]
+    return result["task"], result["seed"], result["start"], result["taught_bonus_factor"]
 
 
 def table(results: list[dict[str, Any]]) -> str:
@@ -175,13 +175,13 @@ def table(results: list[dict[str, Any]]) -> str:
         key=lambda t: (names.index(t) if t in names else len(names), t),
     )
     for task in tasks:
-        by_teacher = {
-            teacher: [r for r in results if (r["task"], r["teacher"]) == (task, teacher)]
-            for teacher in ("programs", "none")
+        by_start = {
+            start: [r for r in results if (r["task"], r["start"]) == (task, start)]
+            for start in ("program", "none")
         }
         lines.append(
-            f"| {task} | {_taught_cells(by_teacher['programs'])} | "
-            f"{_alone_cells(by_teacher['none'])} | {success(task) if task in names else '-'} |"
+            f"| {task} | {_taught_cells(by_start['program'])} | "
+            f"{_alone_cells(by_start['none'])} | {success(task) if task in names else '-'} |"
         )
     return "\n".join(lines)
 

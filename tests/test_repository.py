@@ -149,6 +149,7 @@ def test_every_v2p_command_in_readme_and_docs_parses(page):
         "gc": gc.Gc,
         "setup": setup.Setup,
         "demo": run.Demo,
+        "try": run.Try,
     }
     assert set(kinds) == set(COMMANDS)
     for words in map(shlex.split, shown_commands(page)):

@@ -17,6 +17,7 @@ from typing import Any, get_args, get_type_hints
 from v2p_data.errors import NOT_ALL, NOTHING, NotAllError, V2PError, did_you_mean, write_refusal
 
 COMMANDS: dict[str, tuple[str, str]] = {
+    "try": ("run", "one clip becomes a scene, a task, an expert and episodes, in about a minute"),
     "generate": (
         "run",
         "a folder of videos becomes simulated tasks, experts and a LeRobot dataset",

@@ -47,6 +47,7 @@ from v2p_data.evaluation.judging import (
     row_of,
     task_folders,
 )
+from v2p_data.experts import pretrained
 from v2p_data.experts.config import ExpertConfig
 from v2p_data.experts.labeller import choose_program, labeller_of
 from v2p_data.pipeline.artifact import (
@@ -358,6 +359,8 @@ def expert_stage(task: Stage, cfg: EngineConfig) -> Stage:
     """
     bonus = cfg.reward.bonus_ratio
     named = {} if bonus == RewardConfig().bonus_ratio else {"bonus ratio": f"{bonus:g}"}
+    if cfg.expert.start == "pretrained":
+        named["pretrained experts"] = file_digest(pretrained.FOLDER / pretrained.CARD_FILE)
     return Stage(
         name="expert",
         item=task.item,
@@ -439,7 +442,7 @@ def _learned(
         num_threads=runtime.num_threads,
         bonus_ratio=bonus_ratio,
     )
-    if cfg.config.teacher == "as_expert":
+    if cfg.config.start == "as_program":
         return choose_program(worlds, cfg.config, out)
     return learn(
         worlds,

@@ -45,6 +45,8 @@ class ImitationConfig:
     """Until this round the teacher's share falls to its least."""
     epochs: int = 6
     """Passes over everything seen so far, after each round."""
+    last_epochs: int = 0
+    """Passes after the last round, while the learning rate falls to a tenth."""
     minibatch: int = 1024
     learning_rate: float = 1e-3
     noise: float = 0.2

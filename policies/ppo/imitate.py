@@ -8,7 +8,7 @@ out is an expert's folder, from which PPO goes on.
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +110,11 @@ def _imitate(
                 best_rate, best = rate, weights_of(model)
             if rate >= cfg.target_success:
                 break
+    for k in range(cfg.last_epochs):
+        for group in optimiser.param_groups:
+            group["lr"] = cfg.learning_rate * 0.1 ** ((k + 1) / cfg.last_epochs)
+        data = torch.cat(seen), torch.cat(said)
+        loss = _fit(model, optimiser, *data, replace(cfg, epochs=1), generator)
     if best is not None:
         load_weights(model, best)
     Expert(model).save(out)

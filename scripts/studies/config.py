@@ -200,7 +200,7 @@ class LiftingConfig:
             engine,
             episodes=self.episodes_for(arm),
             cousins=CousinsConfig(count=self.cousins),
-            expert=replace(engine.expert, teacher="as_expert"),
+            expert=replace(engine.expert, start="as_program"),
         )
 
 

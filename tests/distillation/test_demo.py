@@ -106,7 +106,7 @@ def test_the_papers_settings_are_the_papers_numbers():
 
     assert (cfg.task.num_samples, cfg.task.vlm.pick) == (8, "vlm")
     assert (cfg.reward.iterations, cfg.reward.candidates, cfg.reward.bonus_ratio) == (5, 8, 100)
-    assert cfg.expert.teacher == "none"
+    assert cfg.expert.start == "none"
     assert (cfg.episodes.num_episodes, cfg.distillation.rounds) == (100, 0)
     # What `v2p train` reads of it is the preset, whatever stands before the dataset.
     assert cfg.policy == PolicyConfig(preset="paper")

@@ -25,7 +25,7 @@ def lift() -> Worlds:
 @pytest.fixture(scope="module")
 def chosen(lift: Worlds, tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("expert")
-    cfg = ExpertConfig(teacher="as_expert", trial_worlds=8)
+    cfg = ExpertConfig(start="as_program", trial_worlds=8)
     return folder, choose_program(lift, cfg, folder)
 
 

@@ -31,6 +31,7 @@ from v2p_data.task.benchmark import load_benchmark
 from v2p_data.task.task import TaskBundle
 
 TINY = ExpertConfig(
+    start="program",
     trial_worlds=8,
     compare_worlds=16,
     num_envs=48,
@@ -142,7 +143,7 @@ def test_without_a_gradient_step_of_the_actor_the_expert_is_the_taught_one(
 def test_a_budget_that_ends_before_the_first_gradient_step_makes_no_expert(
     bundle: TaskBundle, tmp_path: Path
 ):
-    nothing = replace(TINY, teacher="none", ppo=replace(TINY.ppo, total_steps=0))
+    nothing = replace(TINY, start="none", ppo=replace(TINY.ppo, total_steps=0))
 
     with pytest.raises(ItemRejectedError, match=r"before the best policy of 'lift_up' had"):
         learn(Worlds(bundle=bundle, seed=3), nothing, tmp_path)
@@ -227,7 +228,7 @@ def test_without_a_teacher_ppo_learns_from_nothing(bundle: TaskBundle, tmp_path:
 
     result = learn(
         Worlds(bundle=bundle, seed=3),
-        replace(TINY, teacher="none"),
+        replace(TINY, start="none"),
         tmp_path,
         on_progress=lambda share, words: told.append(share),
     )

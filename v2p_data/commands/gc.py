@@ -80,8 +80,8 @@ def gc_command(argv: list[str]) -> int:
 def wastes(run: Path) -> list[Waste]:
     """Return unfinished work, and results that no dataset, policy, evaluation or rejection came from.
 
-    What the last command asked for is needed too, and without a final result everything finished is. Links, folders that
-    are not named like a result, and results to which somebody added a file are nobody's waste.
+    What the last command asked for is needed too, and without a final result everything finished is. Links, folders
+    that are not named like a result, and results to which somebody added a file are nobody's waste.
     """
     folders = [folder for stage in STAGE_ORDER for folder in _folders(run / stage, OWN_NAME)]
     records = {f.name: record for f in folders if (record := _record_of(f)) is not None}

@@ -11,6 +11,7 @@ from typing import Any
 
 import tyro
 
+from policies.evaluation.rate import Rate
 from v2p_data.cli import parse
 from v2p_data.commands.display import (
     Display,
@@ -88,6 +89,16 @@ class Evaluate(Settings):
     """More task folders (or folders of tasks) to try: these count as unseen."""
     out: Path | None = None
     """Run folder; by default the one the policy lies in, and outputs/NAME of a policy on the Hub."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Try(Settings):
+    clip: tyro.conf.Positional[Path]
+    """One video."""
+    caption: str = ""
+    """What the hand does, e.g. "Lifting a red box up"; without it, what the file beside the clip or its name says."""
+    out: Path = Path("outputs/try")
+    """Run folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,6 +210,30 @@ def eval_command(argv: list[str]) -> int:
         f"Made {outcome.folder / EVALUATION_FILE}",
         "\n".join(rate_lines(rows)) + f"\npage: {page}",
         f"v2p report {shlex.quote(str(root))}" if who.repo_id else goes_on[who.kind],
+    )
+    return 0
+
+
+def try_command(argv: list[str]) -> int:
+    args = with_config(Try, argv, "try")
+    root = run_folder_for(args.out)
+    if not args.clip.is_file():
+        raise V2PError(f"{args.clip} is no video file; v2p generate takes a folder of them")
+    fetch_preset(args.engine.scene)
+    with only_run_in(root):
+        (video,) = _videos(args.clip)
+        last = chain(replace(video, caption=args.caption or video.caption), args.engine)
+        outcomes = _run([last], args.how.runtime(root))
+        page = _page(root)
+    for stage in in_order([last]):
+        _demand(outcomes[(stage.name, stage.folder_name)])
+    folder = last.inputs["expert"].folder(root)
+    expert, count = _record(folder).counts, _record(last.folder(root)).counts["episodes"]
+    rate = Rate(**{k: expert["success"][k] for k in ("successes", "trials", "low", "high")})
+    _say(
+        f"Made {count} episodes in {last.folder(root)}; pictures: {folder / 'sheet.png'}",
+        f"the expert succeeds in {rate} of episodes ({expert['learning']['made_by']}); page: {page}",
+        f"v2p generate {shlex.quote(str(args.clip.parent))} --out outputs/mine --repo-id USER/NAME",
     )
     return 0
 

@@ -145,7 +145,8 @@ class Guard:
             raise LimitStop(
                 "force",
                 f"the contact force was {PRESSES} times above the limit of {cfg.max_force_n:.0f} N within"
-                f" {PRESSES_WITHIN} readings, and is {force:.0f} N now: the tool presses on something; free it, or raise --limits.max-force-n",
+                f" {PRESSES_WITHIN} readings, and is {force:.0f} N now: the tool presses on something; free it,"
+                " or raise --limits.max-force-n",
             )
         outside = self._outside(reading)
         if outside > ESCAPED_M:

@@ -156,7 +156,8 @@ class Run:
                 )
             elif watchdog.has_bitten:
                 outcome.ending = "silence"
-                outcome.sentence = f"no reading came for {silence:g} ms; look after the robot and its connection; {LONGER}"
+                where = "look after the robot and its connection"
+                outcome.sentence = f"no reading came for {silence:g} ms; {where}; {LONGER}"
         try:
             self._hold()
         except V2PError as error:

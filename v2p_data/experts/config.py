@@ -11,10 +11,16 @@ from v2p_data.sim.env.physics import Backend
 class ExpertConfig:
     """How an expert is trained and judged."""
 
-    teacher: Literal["programs", "none", "as_expert"] = "programs"
-    """`none`: PPO from nothing, as in the paper; ten times slower where it works at all.
-    `as_expert`: no network learns the task; the best program itself demonstrates and labels, alike
+    start: Literal["pretrained", "program", "none", "as_program"] = "pretrained"
+    """`pretrained`: the expert of the package that knows many objects; it is the task's expert where it succeeds
+    often enough, else PPO goes on from it. `program`: imitation of a scripted program first.
+    `none`: PPO from nothing, as in the paper; ten times slower where it works at all.
+    `as_program`: no network learns the task; the best program itself demonstrates and labels, alike
     for all objects, and is named as what it is."""
+    pretrained_is_enough: float = 0.9
+    """A pretrained expert that succeeds this often at the task is its expert; above 1, PPO always goes on from it."""
+    least_pretrained_success: float = 0.3
+    """PPO goes on from a pretrained expert that succeeds this often; below, a program teaches."""
     least_teacher_success: float = 0.1
     """A program that succeeds less often teaches nothing."""
     trial_worlds: int = 64
@@ -37,5 +43,6 @@ class ExpertConfig:
     """Experts below this make too few demonstrations to be worth the wait."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.min_success <= 1:
-            raise ValueError(f"min_success must be between 0 and 1, got {self.min_success}")
+        for name in ("min_success", "least_pretrained_success"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")

@@ -1,7 +1,8 @@
-"""How a task becomes an expert: a scripted policy teaches it, and PPO improves it.
+"""How a task becomes an expert: it is there already, or a scripted policy teaches it, and PPO improves it.
 
-`learn` does three steps, each a function with a frozen result:
+`learn` does up to four steps, each a function with a frozen result:
 
+* `ask_pretrained`: the package's expert of this kind plays the task; where it succeeds often it is the task's expert;
 * `teach`: scripted programs are tried; the one that the task's own success function likes best is imitated (DAgger);
 * `improve_by_ppo`: PPO goes on from the taught policy, or from nothing. After a taught
   policy it trains at the fine time step, at which episodes are recorded;
@@ -14,7 +15,7 @@ act itself, see `labeller`.
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from policies.ppo.policy import Expert
 from policies.ppo.train import LAST_FOLDER, ExpertResult, train_expert
 from v2p_data.errors import ItemRejectedError
 from v2p_data.experts.config import ExpertConfig
+from v2p_data.experts.pretrained import FOLDER, pretrained_for
 from v2p_data.experts.record import Comparison, Learned, PolicyScore
 from v2p_data.experts.teacher import EpisodeOutcomes, ProgramScore, Teacher, try_out
 from v2p_data.play import StateActor
@@ -72,12 +74,12 @@ class Worlds:
 
 @dataclass(frozen=True, kw_only=True)
 class Taught:
-    """What came of trying programs and imitating the best one."""
+    """What PPO may start from: the package's expert, or what came of trying programs and imitating the best one."""
 
     program: str
-    """The best program's name."""
-    program_success: float
-    """Share of the trial worlds in which it held success at the end."""
+    """The best program's name; empty for the package's expert."""
+    success: float
+    """Share of the trial worlds in which the program held success at the end, or the package's expert at any time."""
     trials: tuple[ProgramScore, ...]
     folder: Path | None
     """The policy; None where no program succeeds often enough."""
@@ -85,6 +87,41 @@ class Taught:
     """Control steps, trials of programs included."""
     seconds: float
     """Duration of the imitation."""
+
+    def as_learned(self, improved: ExpertResult | None = None) -> Learned:
+        """Return the record of an expert that started here, before any choice between the two."""
+        return Learned(
+            steps=self.steps + (improved.steps if improved else 0),
+            seconds=self.seconds + (improved.seconds if improved else 0.0),
+            actor_updates=0,
+            teacher=self.program if self.folder else "",
+            trials=self.trials,
+            comparison=None,
+            stopped_by=improved.stopped_by if improved else "",
+            is_pretrained=self.folder is not None and not self.program,
+        )
+
+
+def ask_pretrained(
+    worlds: Worlds, cfg: ExpertConfig, out: Path, folder: Path = FOLDER
+) -> Taught | None:
+    """Let the expert in the package's folder play the task; write it into `out` and return its success.
+
+    None where there is none of this kind, where it succeeds too seldom, or where the task observes more than it knows.
+    """
+    expert = pretrained_for(worlds.bundle, folder)
+    if expert is None:
+        return None
+    env = worlds.make(cfg.trial_worlds, "pretrained", fine=True)
+    if env.obs_dim != expert.model.obs_dim:
+        return None
+    success = success_of(env, expert)
+    logger.info("the pretrained expert succeeds in %.0f %%", 100 * success)
+    if success < cfg.least_pretrained_success:
+        return None
+    expert.save(out)
+    steps = env.num_envs * env.horizon
+    return Taught(program="", success=success, trials=(), folder=out, steps=steps, seconds=0.0)
 
 
 def learn(
@@ -100,12 +137,17 @@ def learn(
     Args:
         worlds: the task and the seed.
         cfg: the recipe.
-        out: folder; `taught/` in it is the policy that imitation gave.
+        out: folder; `taught/` in it is the policy that PPO started from.
         device: of the backend `warp`.
         on_progress: told the share that is done and a few words.
     """
-    taught = None
-    if cfg.teacher == "programs":
+    taught = (
+        ask_pretrained(worlds, cfg, out / TAUGHT_FOLDER) if cfg.start == "pretrained" else None
+    )
+    if taught is not None and taught.success >= cfg.pretrained_is_enough:
+        Expert.load(out / TAUGHT_FOLDER).save(out)
+        return taught.as_learned()
+    if taught is None and cfg.start in ("pretrained", "program"):
         trial_env = worlds.make(cfg.trial_worlds, "trials")
         taught = teach(
             worlds,
@@ -136,15 +178,10 @@ def learn(
     else:
         best, updates, _ = better_of_ppo(_exams(worlds, cfg), out, improved)
         best.save(out)
-    return Learned(
-        steps=improved.steps + (taught.steps if taught else 0),
-        seconds=improved.seconds + (taught.seconds if taught else 0.0),
-        actor_updates=updates,
-        teacher=taught.program if taught and student else "",
-        trials=taught.trials if taught else (),
-        comparison=comparison,
-        stopped_by=improved.stopped_by,
+    begun_from = taught or Taught(
+        program="", success=0.0, trials=(), folder=None, steps=0, seconds=0.0
     )
+    return replace(begun_from.as_learned(improved), actor_updates=updates, comparison=comparison)
 
 
 def teach(
@@ -190,7 +227,7 @@ def teach(
         logger.info("no program succeeds at '%s'", worlds.bundle.title)
     return Taught(
         program=best.name,
-        program_success=best.success,
+        success=best.success,
         trials=teacher.trials,
         folder=folder,
         steps=steps,
@@ -208,9 +245,12 @@ def improve_by_ppo(
     on_progress: Progress = lambda share, words: None,
 ) -> ExpertResult:
     """Train by PPO in some worlds, from the policy in the folder `start` where there is one; write into `out`."""
+    actor = cfg.ppo.actor
+    if start is not None:  # a pretrained network is wider than one task's
+        actor = replace(actor, hidden=Expert.load(start).model.cfg.hidden)
     return train_expert(
         env,
-        cfg.ppo,
+        replace(cfg.ppo, actor=actor),
         out,
         seed=seed,
         warm_start=start,

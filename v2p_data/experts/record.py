@@ -69,13 +69,17 @@ class Learned:
     stopped_by: str
     is_program: bool = False
     """No network was trained: the program acts itself."""
+    is_pretrained: bool = False
+    """It started from the package's expert of this kind."""
 
     @property
-    def kept(self) -> Literal["taught", "ppo", "program"]:
-        """Who made the expert: imitation alone, PPO, or nobody: it is a program."""
+    def kept(self) -> Literal["pretrained", "taught", "ppo", "program"]:
+        """Who made the expert: the package has it, imitation alone, PPO, or nobody: it is a program."""
         if self.is_program:
             return "program"
-        return "ppo" if self.actor_updates else "taught"
+        if self.actor_updates:
+            return "ppo"
+        return "pretrained" if self.is_pretrained else "taught"
 
     @property
     def made_by(self) -> str:
@@ -83,8 +87,10 @@ class Learned:
         if self.is_program:
             return f"program: '{self.teacher}' itself, nothing was learned"
         taught = f"imitation of the program '{self.teacher}'" if self.teacher else ""
-        if self.kept == "taught":
-            return f"taught: {taught}"
+        if self.is_pretrained:
+            taught = "the package's expert of this kind, learned on other objects"
+        if self.kept in ("taught", "pretrained"):
+            return f"{self.kept}: {taught}"
         ppo = f"{self.actor_updates:,} gradient steps of PPO"
         return f"{taught}, then {ppo}" if taught else ppo
 

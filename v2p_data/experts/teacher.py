@@ -4,7 +4,7 @@ A program says what to do from any state: grasp what is manipulated and lift it,
 push it, push it with a tool, throw it. Which programs make sense follows from the scene's objects and from how
 far they moved in the video, not from the kind of task; which one is right is found by trying all of them and
 asking the task's own success function. Policies learn from the teacher's actions. It makes datasets itself only where
-`ExpertConfig.teacher` is `as_expert`.
+`ExpertConfig.start` is `as_program`.
 """
 
 import logging

@@ -113,8 +113,8 @@ class Store:
             if (refusal := write_refusal(error)) is None:
                 raise
             raise V2PError(
-                f"cannot write to the store {self.folder}: {refusal}; what is finished is kept in the run folder, and the"
-                " same command publishes it"
+                f"cannot write to the store {self.folder}: {refusal}; what is finished is kept in the run folder, and"
+                " the same command publishes it"
             ) from error
 
     # --- results -------------------------------------------------------------------------------------------------

@@ -80,7 +80,7 @@ class ItemView:
 
     @property
     def ending(self) -> str:
-        """Where the video's way ended, as a word of the page's filter: the stage that stopped it, or the last one made."""
+        """Where the video's way ended, as a word of the page's filter: what stopped it, or the last stage made."""
         made = [stage for stage, r in self.results.items() if r and r.status == "made"]
         stopped = [
             stage for stage, r in self.results.items() if r and r.status in ("rejected", "failed")

@@ -46,7 +46,9 @@ METADATA_SCHEMA = 1
 BASE, TOOL = "base", "tool"
 FRAMES = {
     BASE: "the robot's base: x forward, y left, z up; turns are about these axes",
-    TOOL: "the tool, which points straight down in the vector 0: x forward, y right, z down; turns are about these axes",
+    TOOL: (
+        "the tool, which points straight down in the vector 0: x forward, y right, z down; turns are about these axes"
+    ),
 }
 OPENING = "0 closed to 1 open"
 
