@@ -12,6 +12,7 @@ from v2p_data.experts.labeller import network_actor
 from v2p_data.experts.pretrained import pretrained_for
 from v2p_data.kinds import Kind
 from v2p_data.seeds import seed_for
+from v2p_data.task.benchmark import benchmark_names, load_benchmark
 
 from .learning import JUDGED, solvable_tasks
 
@@ -32,7 +33,10 @@ def judge_kind(kind: Kind, out: Path, *, tasks: int, episodes: int, seed: int) -
             )
             counts[who].append(int(judged.successes.sum()))
     rates = {who: wilson(sum(n), episodes * len(found)) for who, n in counts.items()}
-    print(kind, {who: str(rate) for who, rate in rates.items()}, flush=True)
+    paper = _of_the_paper(kind, seed) if kind in benchmark_names() else None
+    print(
+        kind, {who: str(rate) for who, rate in rates.items()}, "paper's scene", paper, flush=True
+    )
     return {
         "kind": kind,
         "seed": seed,
@@ -40,4 +44,15 @@ def judge_kind(kind: Kind, out: Path, *, tasks: int, episodes: int, seed: int) -
         "episodes": episodes,
         "tasks": [task.bundle.title for task in found],
         "successes": counts,
+        "paper_scene": paper,
     }
+
+
+def _of_the_paper(kind: Kind, seed: int) -> int:
+    """Return the shipped expert's successes in 100 episodes of the paper's scene of this kind."""
+    bundle = load_benchmark(kind)
+    expert = pretrained_for(bundle)
+    assert expert is not None, f"no expert is shipped for {kind}"
+    lesson = Lesson(bundle=bundle, expert=network_actor(expert))
+    judged = judge_expert(lesson, episodes=100, seed=seed_for(seed, "pretraining-judge", kind))
+    return int(judged.successes.sum())
