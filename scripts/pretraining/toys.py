@@ -25,7 +25,7 @@ from v2p_data.task.templates.write import write_samples
 
 OPENING_M = 0.083
 """What fits between the open pads."""
-Form = Literal["box", "cylinder", "sphere", "cup", "bin", "ring", "stack", "bottle"]
+Form = Literal["box", "cylinder", "sphere", "cup", "bin", "ring", "stack", "bottle", "rod", "bent"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,16 +112,19 @@ def _u(rng: Generator, low: float, high: float) -> float:
 
 
 def _graspable(rng: Generator, longest: float = 0.2, tallest: float = 0.22) -> Body:
-    form = str(
-        rng.choice(
-            ["box", "cylinder", "sphere", "stack", "cup", "ring", "bottle"],
-            p=[0.34, 0.2, 0.08, 0.14, 0.1, 0.04, 0.1],
-        )
-    )
+    shares = {"box": 0.26, "cylinder": 0.14, "sphere": 0.06, "stack": 0.12, "cup": 0.1}
+    shares |= {"ring": 0.04, "bottle": 0.08, "rod": 0.1, "bent": 0.1}
+    form = str(rng.choice(list(shares), p=list(shares.values())))
+    if form == "rod":  # a cylinder that lies: a marker, a candle
+        d = _u(rng, 0.012, 0.06)
+        return Body(form="rod", size_m=(_u(rng, max(1.5 * d, 0.05), max(longest, 2 * d)), d, d))
+    if form == "bent":  # a banana, a pair of scissors, a spoon
+        deep = _u(rng, 0.012, 0.04)
+        return Body(form="bent", size_m=(_u(rng, 0.07, max(longest, 0.08)), deep, _u(rng, 0.01, 0.035)))
     if form == "box":
         narrow = _u(rng, 0.012, 0.08)
         long = _u(rng, max(narrow, 0.02), max(longest, narrow))
-        high = _u(rng, 0.012, min(tallest, 5 * narrow))
+        high = _u(rng, 0.01, 0.02 if rng.random() < 0.3 else min(tallest, 5 * narrow))
         pair = (long, narrow) if rng.random() < 0.5 else (narrow, long)
         return Body(form="box", size_m=(*pair, high))
     if form == "sphere":
@@ -263,7 +266,7 @@ def _object(body: Body, name: str, role: str, rng: Generator, folder: Path) -> S
     kind = {"cup": "cylinder", "bin": "box"}.get(body.form, body.form)
     hollow = body.form in ("cup", "bin")
     mesh, files, size = "", (), body.size_m
-    if kind in ("ring", "stack", "bottle"):
+    if kind in ("ring", "stack", "bottle", "rod", "bent"):
         whole, parts = _pieces(body, rng)
         middle = whole.bounds.mean(0)
         x, y, z = (float(v) for v in whole.extents)
@@ -300,6 +303,8 @@ def _pieces(body: Body, rng: Generator) -> tuple[trimesh.Trimesh, list[trimesh.T
         return mesh_for("cylinder", body.size_m, **shape), list(
             parts_for("cylinder", body.size_m, **shape)
         )
+    if body.form in ("rod", "bent"):
+        return _lying(body, rng)
     wide, deep, high = body.size_m
     if body.form == "bottle":
         neck, share = wide * float(rng.uniform(0.3, 0.6)), float(rng.uniform(0.55, 0.8))
@@ -323,6 +328,24 @@ def _pieces(body: Body, rng: Generator) -> tuple[trimesh.Trimesh, list[trimesh.T
         parts += [p.apply_translation(lift) for p in parts_for(form, size)]
         top += size[2]
     whole = trimesh.util.concatenate(meshes)
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole, parts
+
+
+def _lying(body: Body, rng: Generator) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
+    """Return a cylinder on its side, or two bars that meet at an angle, perhaps with a bowl at the end."""
+    long, deep, high = body.size_m
+    if body.form == "rod":
+        side = trimesh.transformations.rotation_matrix(np.pi / 2, [0.0, 1.0, 0.0])
+        whole = mesh_for("cylinder", (deep, deep, long)).apply_transform(side)
+        return whole, [whole.convex_hull]
+    parts = []
+    angle, share = float(rng.uniform(0.2, 1.2)), float(rng.uniform(0.35, 0.65))
+    for turn, length in ((0.0, share * long), (angle, (1 - share) * long)):
+        bar = mesh_for("box", (length + deep / 2, deep, high * float(rng.uniform(0.7, 1.0))))
+        bar.apply_translation([length / 2 if turn else -length / 2, 0.0, bar.extents[2] / 2])
+        parts.append(bar.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1])))
+    whole = trimesh.util.concatenate([p.copy() for p in parts])
     assert isinstance(whole, trimesh.Trimesh)
     return whole, parts
 
