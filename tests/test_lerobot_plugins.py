@@ -294,7 +294,7 @@ def test_each_recipe_of_the_docs_trains_three_steps(recipe, run_tool, dataset, t
 
 
 def test_lerobot_rolls_the_policy_out_on_the_simulated_robot_and_on_the_twin(
-    run_tool, dataset, task_folder, tmp_path, caplog
+    run_tool, dataset, task_folder, tmp_path, caplog, agreeing_referee
 ):
     from lerobot.scripts.lerobot_rollout import main
 

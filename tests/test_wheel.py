@@ -96,8 +96,9 @@ def test_help_and_version_are_there_without_a_clone(v2p: Path, tmp_path: Path):
 def test_the_demo_needs_a_clone_and_says_so(v2p: Path, tmp_path: Path):
     said = call(v2p, "demo", cwd=tmp_path, code=2)
 
-    assert len(said.strip().splitlines()) == 1
-    assert "run the demo from a clone of the repository" in said
+    sentences = [line for line in said.strip().splitlines() if line != "v2p: loading libraries"]
+    assert len(sentences) == 1
+    assert "run the demo from a clone of the repository" in sentences[0]
     assert not list(tmp_path.iterdir())
 
 

@@ -84,7 +84,8 @@ def test_lerobot_reads_who_acted_and_gives_it_to_no_policy(mixed: Path, handover
     assert {row.dtype for row in rows} == {torch.bool}
     assert [bool(row) for row in rows] == MIXED
     assert np.array_equal(dataset[NUM_FRAMES]["action"], handover.action[0])  # the expert's
-    assert dataset.meta.features["intervention"] == {"dtype": "bool", "shape": (1,), "names": None}
+    said = dataset.meta.features["intervention"]
+    assert (said["dtype"], said["shape"], said["names"]) == ("bool", (1,), None)
     assert set(dataset_to_policy_features(dataset.meta.features)) == {
         "observation.images.mask",
         "observation.state",

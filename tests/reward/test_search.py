@@ -171,6 +171,6 @@ def test_the_ratio_of_the_bonus_is_one_setting_for_search_and_expert(video: Vide
         )
     )
 
-    assert searched.sources == plain.sources == {"bonus ratio": "7"}
+    assert searched.sources == plain.sources == {"bonus ratio": "7"} | usual.sources
     assert searched.inputs["task"].config.config.bonus_ratio == 7
-    assert usual.sources == {}
+    assert set(usual.sources) == {"pretrained experts"}

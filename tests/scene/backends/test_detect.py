@@ -159,5 +159,5 @@ def test_without_transformers_the_way_to_install_it_is_named(checkpoint, picture
     monkeypatch.setitem(__import__("sys").modules, "transformers", None)
     load_checkpoint.cache_clear()
 
-    with pytest.raises(V2PError, match="learned"):
+    with pytest.raises(V2PError, match="install it with 'make setup'"):
         detect([picture], ["cup"], config(checkpoint))

@@ -325,7 +325,8 @@ def _rows(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[Prob
         for k, (first, count) in row_spans(of_row).items():
             named = set(tasks[shown[first : first + count]].tolist())
             if k < len(said) and not named <= set(said[k]):
-                detail = f"its rows show the task {'; '.join(sorted(named))!r}, the episode table {'; '.join(said[k])!r}"
+                rows, stated = "; ".join(sorted(named)), "; ".join(said[k])
+                detail = f"its rows show the task {rows!r}, the episode table {stated!r}"
                 yield Problem(check="task", where=f"episode {k}", detail=detail)
         for number, rows in zip(*np.unique(of_row, return_counts=True), strict=True):
             where_is.setdefault(int(number), set()).add(name)
