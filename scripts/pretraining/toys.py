@@ -120,7 +120,9 @@ def _graspable(rng: Generator, longest: float = 0.2, tallest: float = 0.22) -> B
         return Body(form="rod", size_m=(_u(rng, max(1.5 * d, 0.05), max(longest, 2 * d)), d, d))
     if form == "bent":  # a banana, a pair of scissors, a spoon
         deep = _u(rng, 0.012, 0.04)
-        return Body(form="bent", size_m=(_u(rng, 0.07, max(longest, 0.08)), deep, _u(rng, 0.01, 0.035)))
+        return Body(
+            form="bent", size_m=(_u(rng, 0.07, max(longest, 0.08)), deep, _u(rng, 0.01, 0.035))
+        )
     if form == "box":
         narrow = _u(rng, 0.012, 0.08)
         long = _u(rng, max(narrow, 0.02), max(longest, narrow))
