@@ -202,6 +202,29 @@ def test_a_missing_folder_is_named(capsys, tmp_path):
     )
 
 
+def test_trying_takes_one_video_and_folders_are_for_generate(capsys, tmp_path):
+    for place in (tmp_path, tmp_path / "none.mp4"):
+        assert run(["try", str(place), "--out", str(tmp_path / "run")]) == 2
+        assert f"{place} is no video file; v2p generate takes a folder" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_one_clip_becomes_episodes_by_an_expert_of_the_package(capsys, tmp_path):
+    clip = shutil.copy(SAMPLES / "tip_green_carton.mp4", tmp_path / "film.mp4")
+    few = "--episodes.num-episodes=4"
+    out = tmp_path / "run"
+
+    assert (
+        run(["try", str(clip), "--caption", "Tipping a green carton over", "--out", str(out), few])
+        == 0
+    )
+
+    said = capsys.readouterr().out
+    assert "Made 4 episodes in" in said
+    assert "pretrained: the package's expert of this kind" in said
+    assert len(list(out.glob("episodes/*/episodes/*.npz"))) == 4
+
+
 def test_an_empty_folder_says_which_endings_are_known(capsys, tmp_path):
     (tmp_path / "empty").mkdir()
     assert "mp4" in said(capsys, *generate(tmp_path / "empty", tmp_path / "out"))
