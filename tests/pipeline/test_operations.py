@@ -1,5 +1,6 @@
 import contextlib
 import json
+import os
 import time
 
 import pytest
@@ -103,6 +104,23 @@ def test_gc_deletes_only_what_stages_made_and_follows_no_link(run, tmp_path_fact
 
     assert {path: path.read_bytes() for path in before} == before
     assert mine.is_symlink() if how in ("link", "outside") else mine.exists()
+
+
+@pytest.mark.parametrize("edit", ["longer", "same size and time", "link to a copy"])
+def test_gc_keeps_a_result_in_which_somebody_edited_a_file(run, tmp_path_factory, edit):
+    file = dataset("old").inputs["clip"].folder(run) / "bytes"
+    when = file.stat()
+    if edit == "link to a copy":
+        copy = file.rename(tmp_path_factory.mktemp("outside") / "copy")
+        file.symlink_to(copy)
+    else:
+        file.write_bytes(b"1" * (1001 if edit == "longer" else 1000))
+        os.utime(file, ns=(when.st_atime_ns, when.st_mtime_ns))
+    before = file.read_bytes()
+
+    gc_command([str(run), "--delete"])
+
+    assert file.read_bytes() == before
 
 
 def test_a_link_inside_unfinished_work_goes_and_what_it_leads_to_stays(run, tmp_path_factory):

@@ -11,6 +11,7 @@ from v2p_data.commands.status import Shown, run_folder
 from v2p_data.errors import UnusableError, V2PError
 from v2p_data.json_files import json_or_none
 from v2p_data.pipeline.artifact import RECORD_FILE, Record, read_record
+from v2p_data.pipeline.contents import damages
 from v2p_data.pipeline.run_file import RUN_FILE
 from v2p_data.pipeline.store import FETCHING_FOLDER, MARK, key_of
 from v2p_data.pipeline.workers import only_run_in
@@ -81,7 +82,7 @@ def wastes(run: Path) -> list[Waste]:
     """Return unfinished work, and results that no dataset, policy, evaluation or rejection came from.
 
     What the last command asked for is needed too, and without a final result everything finished is. Links, folders
-    that are not named like a result, and results to which somebody added a file are nobody's waste.
+    that are not named like a result, and results in which somebody added or edited a file are nobody's waste.
     """
     folders = [folder for stage in STAGE_ORDER for folder in _folders(run / stage, OWN_NAME)]
     records = {f.name: record for f in folders if (record := _record_of(f)) is not None}
@@ -124,11 +125,13 @@ def _record_of(folder: Path) -> Record | None:
 
 
 def _is_as_made(folder: Path, record: Record) -> bool:
-    """Return whether a result bears its own name and holds nothing but what its stage left there."""
-    held = {
-        p.relative_to(folder).as_posix()
-        for p in folder.rglob("*")
-        if p.is_symlink() or not p.is_dir()
-    }
+    """Return whether a result bears its own name and holds nothing but what its stage left there, as it was left."""
+    held = [p for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()]
+    files = record.files or {}
     own_name = f"{record.stage}/{record.item}-{record.fingerprint}"
-    return key_of(folder) == own_name and held <= {*(record.files or ()), RECORD_FILE}
+    return (
+        key_of(folder) == own_name
+        and not any(p.is_symlink() for p in held)
+        and {p.relative_to(folder).as_posix() for p in held} <= {*files, RECORD_FILE}
+        and not damages(folder, files)
+    )
